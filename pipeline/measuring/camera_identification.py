@@ -1,4 +1,5 @@
-"""The cameras of scans: what trials, plates and drawings say of them, in words, in figures and as JSON."""
+"""Camera identification of scans: trials, camera plates and drawings of the marks, reported as text, figures and
+JSON."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,34 +18,34 @@ from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Polygon
 from pipeline.files.camera_file import CameraFile
 from pipeline.results.measured_record import MeasuredScan
 
-_OTHER_CONE = 0.02  # of the principal distance: cameras of one cone differ by less
+_OTHER_CONE = 0.02  # fraction of the principal distance: cameras with the same lens cone differ by less
 _MAKERS = ("Wild", "Zeiss", "Jena", "Fairchild")
 _PX_PER_MM = 4.0
-_HALF_MM, _OFF_MM = 7.0, 2.0  # of what is compared about a mark's point, and by how much two drawings may lie apart
+_HALF_MM, _OFF_MM = 7.0, 2.0  # half width of the compared windows; largest offset between two drawings
 _BLUR_PX = 1.5
-_NEAR_MM = 6.0  # marks of two cameras that are taken for each other
+_NEAR_MM = 6.0  # mm: marks of two cameras this close correspond
 _ALIKE = (
-    0.75  # correlation from which on it takes a look to tell them apart: forms of the K-17's wings have 0.8 to 0.93
+    0.75  # correlation: above it, drawings must be compared by eye; the variants of the K-17's wings have 0.8 to 0.93
 )
 
-_OUTSTANDING = 2.0  # times what chance finds
-CLOSE = 0.85  # of the best score: a camera that comes so near is not told from it
-_SHRUNK = 0.03  # of its size: more than film and cameras of a model differ by
+_OUTSTANDING = 2.0  # ratio to the score of the stretched layout
+CLOSE = 0.85  # fraction of the best score: cameras above it are not distinguished from the best
+_SHRUNK = 0.03  # relative scale error: more than film shrinkage and differences between cameras of one model
 
 
 def parse_plate(lines: Sequence[Line]) -> dict[str, str]:
-    """Maker, number and principal distance in mm, as far as one plate says them."""
+    """Maker, number and principal distance in mm, as far as the text of a plate gives each without ambiguity."""
     found = {name: {field.value for field in find_fields(lines) if field.name == name} - {""} for name in CAMERA}
     return {name: next(iter(values)) for name, values in found.items() if len(values) == 1}
 
 
 def is_whole_plate(lines: Sequence[Line]) -> bool:
-    """Whether they say all that a plate says."""
+    """Whether the text gives all fields of a plate."""
     return len(parse_plate(lines)) == len(CAMERA)
 
 
 def contradictions(camera: CameraFile, plate: dict[str, str]) -> list[str]:
-    """How a plate says that it is of another camera, a clause each."""
+    """List the contradictions between a camera file and a plate, one clause each."""
     clauses = []
     makers = [maker for maker in _MAKERS if maker.lower() in camera.name.lower()]
     if "camera_type" in plate and makers and plate["camera_type"] not in makers:
@@ -62,8 +63,14 @@ def contradictions(camera: CameraFile, plate: dict[str, str]) -> list[str]:
 def add_plates(
     camera: CameraFile, scans: Sequence[MeasuredScan], cameras: Mapping[str, CameraFile]
 ) -> list[MeasuredScan]:
-    """The scans of one camera with what their plates say. A principal distance that was read changes nothing. cameras:
-    all of the project, by the names that images.csv has for them."""
+    """Add the contradictions and notes of the camera plates to the scans of one camera.
+
+    A principal distance read from a plate changes nothing.
+
+    Parameters
+    ----------
+    cameras : all cameras of the project, by their names in images.csv.
+    """
     plates = {scan.frame.image: parse_plate(scan.frame.writing or ()) for scan in scans}
     numbers = sorted({plate["camera_number"] for plate in plates.values() if "camera_number" in plate})
     known = {other.number: name for name, other in cameras.items() if other.number}
@@ -98,12 +105,11 @@ def _add_plate(
     return replace(scan, frame=frame, notes=(*scan.notes, *notes))
 
 
-# Cameras whose solid marks are drawn much like those of others: wings, notches and arrows of which a scan hardly tells
-# which form they have.
+# Cameras with solid marks (wings, notches, arrows) that resemble those of others: a scan hardly distinguishes them.
 
 
 def drawn_alike(layouts: Mapping[tuple[str, ...], FiducialLayout]) -> dict[str, tuple[str, ...]]:
-    """By name, of cameras of solid marks alone, the others whose marks look much like theirs at about their places."""
+    """For each camera with solid marks only: the other cameras whose marks at nearly the same places look similar."""
     solid = {names: layout for names, layout in layouts.items() if all(is_solid(mark) for mark in layout.marks)}
     pictures = {names: [_picture(mark) for mark in layout.marks] for names, layout in solid.items()}
 
@@ -120,12 +126,12 @@ def drawn_alike(layouts: Mapping[tuple[str, ...], FiducialLayout]) -> dict[str, 
 
 
 def is_solid(mark: LayoutMark) -> bool:
-    """Whether a mark is made of areas alone, as wings, notches and arrows are."""
+    """Whether a mark consists of areas only, like wings, notches and arrows."""
     return isinstance(mark.mark, MarkShape) and all(isinstance(part, Polygon) for part in mark.mark.parts)
 
 
 def _picture(mark: LayoutMark) -> cv2.typing.MatLike:
-    """What is not known of a drawing is ground."""
+    """Rendered image of a mark; unknown parts of the drawing are background."""
     half_px = round(_HALF_MM * _PX_PER_MM)
     matrix = np.array([[_PX_PER_MM, 0.0, half_px], [0.0, -_PX_PER_MM, half_px]])
     size = 2 * half_px + 1
@@ -133,21 +139,29 @@ def _picture(mark: LayoutMark) -> cv2.typing.MatLike:
 
 
 def _likeness(first: cv2.typing.MatLike, second: cv2.typing.MatLike) -> float:
-    """The largest correlation of two drawings that may lie a little apart."""
+    """Largest NCC of two drawings within an offset of _OFF_MM."""
     rim = round(_OFF_MM * _PX_PER_MM)
     return float(cv2.matchTemplate(second, first[rim:-rim, rim:-rim], cv2.TM_CCOEFF_NORMED).max())
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What became of the cameras that share a layout of marks.
+    """Result of the trial of the cameras that share a layout of marks.
 
-    found: marks that are observations, of drawn ones. likeness: their mean correlation with the drawing; snr: the
-    median of contrast over noise. score: 0 to 1, as `_score` has it. chance: the score of the same marks in wrong
-    places, the layout stretched; None where no such comparison is needed. residual_sigmas, residual_mm: what an affine
-    transformation leaves, per axis, in standard deviations of marks and given places; None where it leaves nothing
-    over. expected: how many constellations that answer as well at reduced size chance makes in such a scan, infinite
-    where none answers at the given pitch. pixel_um: what the marks' separations say a pixel measures, None without any.
+    Attributes
+    ----------
+    cameras : names.
+    found : number of marks observed, out of drawn.
+    likeness : mean correlation of the found marks with the drawing.
+    snr : median of contrast over noise.
+    score : 0 to 1, see `measure.fiducials.camera_recognition.likeness`.
+    chance : score of the same marks in wrong places, that is, of the stretched layout; None where the comparison is not
+        needed.
+    residual_sigmas, residual_mm : residuals of an affine transformation per axis, in standard deviations of marks and
+        given places, and in mm; None without redundancy.
+    expected : expected number of false alarms in such a scan: constellations that correlate as well at reduced size;
+        infinite where none is found at the given pitch.
+    pixel_um : pixel pitch from the separations of the marks; None without marks.
     """
 
     cameras: tuple[str, ...]
@@ -177,11 +191,18 @@ class Trial:
 
 @dataclass(frozen=True)
 class Identification:
-    """The trials, best first, and what follows from them. unreported: by name, what cameras without any calibration
-    report rest on. pitch_um: of the scan in x and y, as given or as its file has it. plate: what the camera's own plate
-    says, by field; contradicted: by name, how it says that it is of no such camera. alike: by name, other cameras whose
-    marks are drawn much like its own; reports: on how many calibration reports it rests. board: the calibration board
-    that it shows, as `reseau calibrate` takes it."""
+    """Trials of one scan, best first, and the conclusions.
+
+    Attributes
+    ----------
+    unreported : by name, the source of cameras without a calibration report.
+    pitch_um : of the scan in x and y, as given or from its file.
+    plate : text on the camera's own plate, by field.
+    contradicted : by name, the contradictions between camera and plate.
+    alike : by name, other cameras with similar marks.
+    reports : by name, the number of calibration reports behind a camera.
+    board : the calibration board in the image, as `reseau calibrate` takes it.
+    """
 
     scan: Path
     trials: tuple[Trial, ...]
@@ -195,7 +216,7 @@ class Identification:
 
     @property
     def best(self) -> tuple[Trial, ...]:
-        """The trial that stands out, and those that come too near to be told from it."""
+        """The first trial that stands out, and those that stand out with nearly the same score."""
         standing = [trial for trial in self.trials if trial.stands_out]
         return tuple(trial for trial in standing if trial.score >= CLOSE * standing[0].score)
 
@@ -220,13 +241,13 @@ class Identification:
         return text + self._form_remark() + self._plate_remark() + (f" {against}" if against else "")
 
     def much_alike(self) -> tuple[str, ...]:
-        """Other cameras whose marks are drawn much like those that stand out: wings, notches or arrows."""
+        """Other cameras whose marks resemble those of the best trials."""
         best = [name for trial in self.best for name in trial.cameras]
         others = (other for name in best for other in self.alike.get(name, ()) if other not in best)
         return tuple(dict.fromkeys(others))
 
     def _form_remark(self) -> str:
-        """That a name rests on the form of marks alone, of which others have much the same."""
+        """A warning if the identification rests only on the shape of marks and other cameras have similar ones."""
         others = " or ".join(self.much_alike())
         if not others:
             return ""
@@ -235,7 +256,7 @@ class Identification:
         )
 
     def _plate_remark(self) -> str:
-        """What the plate says of the cameras that stand out."""
+        """Which of the best cameras agree with the plate."""
         if not self.plate:
             return ""
         words = {"camera_type": "{}", "camera_number": "Nr {}", "principal_distance_mm": "principal distance {} mm"}
@@ -248,7 +269,7 @@ class Identification:
         return f" Its plate says {read}{agree}."
 
     def against_pitch(self) -> str:
-        """A sentence where the pitch cannot be right if the scan is of the best camera; else nothing."""
+        """A sentence if the pitch contradicts the best camera; otherwise empty."""
         trial = self.best[0] if self.best else None
         if self.pitch_um is None or trial is None or trial.pixel_um is None:
             return ""

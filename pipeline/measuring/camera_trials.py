@@ -1,4 +1,4 @@
-"""Which camera a scan is of: every camera whose marks are drawn is tried on it, at reduced size."""
+"""Identification of the camera of a scan: every camera with drawn marks is tried, at reduced size."""
 
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -36,32 +36,41 @@ from pipeline.measuring.camera_identification import (
 )
 from pipeline.progress import Count, Reporter
 
-_LARGEST_PX = 1600  # of what is searched: of aerial film a seventh of a millimetre, about as wide as fine lines
-_COARSE_PX = 1024  # the same while the pitch is sought: fine lines are half a pixel wide then
-_SOLID_PX = 800  # of solid marks, which are some millimetres large
-_COARSE_SOLID_PX = 512  # of these while the pitch is sought
-_PITCH_TOLERANCE = 0.02  # of the pitch that a layout came to
-_STRETCHES = (-0.025, 0.025)  # of pixels longer one way: each reaches those of 1.1 to 3.9 % of an aerial camera
-_ALIKE_MM = 0.1  # two cameras whose marks lie so near to one another look alike in a scan
-_BOLD = 4  # marks that are looked for, at least
-_ENOUGH = 12  # marks that are looked at: of more, as of a lattice, only every second
-_SAME_FIGURE = 0.06  # of the root mean square distance of marks from their middle
-_STRETCH = (1.08, 0.93)  # of the layout that only chance can find: no film is so deformed
+_LARGEST_PX = 1600  # px, size of the searched image: for aerial film 1/7 mm per pixel, about the width of fine lines
+_COARSE_PX = 1024  # px, while the pitch is unknown: fine lines are then half a pixel wide
+_SOLID_PX = 800  # px, for solid marks, which have a size of some millimetres
+_COARSE_SOLID_PX = 512  # px, for solid marks while the pitch is unknown
+_PITCH_TOLERANCE = 0.02  # relative, of the pitch found by the coarse search
+_STRETCHES = (-0.025, 0.025)  # affinity of the pixels; each covers 1.1 to 3.9 % for an aerial camera
+_ALIKE_MM = 0.1  # mm: cameras whose marks lie closer to one another cannot be distinguished in a scan
+_BOLD = 4  # smallest number of marks to search
+_ENOUGH = 12  # marks to measure: of layouts with more, such as réseaux, only every second mark is measured
+_SAME_FIGURE = 0.06  # fraction of the rms distance of the marks from their centroid
+_STRETCH = (1.08, 0.93)  # x and y scale of the null layout: no film is so deformed, so all its marks are false alarms
 Array = NDArray[np.float64]
 Names = tuple[str, ...]
 
-_PICTURE_PX = 2400  # of the scan as it is looked at: a tenth of a millimetre of aerial film, in which plates are read
-_FEW = 3  # of the answers while the pitch is sought: those that are tried at the pitch that each comes to
-_BY_CHANCE = 1.0  # constellation expected: chance may have made it
-_HOPELESS = 100.0  # likewise: so many answer as well that its marks need not be looked at
-_ODDS = 1000.0  # times what chance makes of another camera's marks: that one is seen, and not this
+_PICTURE_PX = 2400  # px, size of the measured image: for aerial film 0.1 mm per pixel, enough to read plates
+_FEW = 3  # best results of the search without a pitch, to be refined at the pitch that each found
+_BY_CHANCE = 1.0  # expected false alarms: the constellation may be one
+_HOPELESS = 100.0  # expected false alarms: above it, the marks are not measured
+_ODDS = 1000.0  # ratio of the expected false alarms of two layouts: the rarer one is present, the other is not
 _AFFINE = 6  # parameters
 
 
 @dataclass(frozen=True, eq=False)
 class Tried:
-    """A layout of the marks that are looked at, its boldest marks, and how a picture of the scan answers to these under
-    hypotheses about its pitch; before: how many others had been tried."""
+    """Search result of one layout.
+
+    Attributes
+    ----------
+    layout : the marks to be measured.
+    bold : its boldest marks, which are searched.
+    picture : the searched image, the scan at reduced size.
+    hypotheses : pixel pitches that were tried.
+    before : number of other hypotheses tried before, counted in the expected false alarms.
+    answer : correlation result of the bold marks.
+    """
 
     layout: FiducialLayout
     bold: FiducialLayout
@@ -72,7 +81,7 @@ class Tried:
 
 
 class LayoutSearch:
-    """The search in one scan, or in a thumbnail of it that its marks can be looked at in."""
+    """Search for layouts in one scan, or in a thumbnail of it that is large enough to measure the marks."""
 
     def __init__(self, scan: Scan) -> None:
         self._scan = scan
@@ -83,11 +92,11 @@ class LayoutSearch:
         self._known: list[Tried] = []
 
     def try_pitch(self, layout: FiducialLayout, pitch_um: tuple[float, float]) -> Tried:
-        """At the scan's pitch."""
+        """Search at the scan's pitch."""
         return self._as_given(layout, pitch_um, lambda given: [given], 0)
 
     def longer_one_way(self, layout: FiducialLayout, pitch_um: tuple[float, float]) -> Tried:
-        """With pixels that are longer one way than the other, by more than a search at the scan's pitch allows for."""
+        """Search with non-square pixels, beyond the affinity that a search at the scan's pitch allows."""
         return self._as_given(layout, pitch_um, lambda given: [longer(given, each) for each in _STRETCHES], 1)
 
     def _as_given(
@@ -97,7 +106,7 @@ class LayoutSearch:
         hypotheses: Callable[[PitchHypothesis], Hypotheses],
         before: int,
     ) -> Tried:
-        """By hypotheses that follow from a given pitch."""
+        """Search under hypotheses derived from a given pitch."""
         bold = _boldest(layout)
         picture = self._solid if all(is_solid(mark) for mark in bold.marks) else self._fine
         times = self._scan.width_px / picture.width_px
@@ -106,13 +115,13 @@ class LayoutSearch:
         return self._tried(_some(layout), bold, picture, hypotheses(given), before)
 
     def try_any_pitch(self, layout: FiducialLayout) -> Tried:
-        """Where the frame may fill the scan, its pixels being square."""
+        """Search without a pitch: the frame is assumed to fill the scan, and the pixels to be square."""
         bold = _boldest(layout)
         picture = self._coarse_solid if all(is_solid(mark) for mark in bold.marks) else self._coarse
         return self._tried(_some(layout), bold, picture, pitch_hypotheses(picture, bold, None, FiducialOptions())[0])
 
     def refined(self, coarse: Tried) -> Tried:
-        """At the pitch that the best answer came to, in a larger picture."""
+        """Repeat the search in a larger image, at the pitch of the best placement."""
         if not coarse.answer.placements:
             return coarse
         linear = coarse.answer.placements[0].pixel_from_camera[:, :2]
@@ -122,12 +131,12 @@ class LayoutSearch:
         return self._tried(coarse.layout, coarse.bold, picture, [hypothesis], len(coarse.hypotheses))
 
     def stretched(self, tried: Tried) -> Tried:
-        """The same with marks in wrong places."""
+        """Repeat the search for the stretched layout, whose marks are in wrong places."""
         layout, bold = _stretched(tried.layout), _stretched(tried.bold)
         return self._tried(layout, bold, tried.picture, tried.hypotheses, tried.before)
 
     def recognise(self, tried: Tried) -> Frame | None:
-        """The frame as its marks look."""
+        """Measure the marks of a layout at its best placement."""
         return recognise_frame(self._scan, tried.layout, tried.answer, self._scan.width_px / tried.picture.width_px)
 
     def _tried(
@@ -142,7 +151,7 @@ class LayoutSearch:
 
 
 def same_marks(first: Sequence[LayoutMark], second: Sequence[LayoutMark]) -> bool:
-    """Whether a scan cannot tell the marks of two layouts apart."""
+    """Whether the marks of two layouts cannot be distinguished in a scan."""
     return len(first) == len(second) and all(
         repr(a.mark) == repr(b.mark) and np.hypot(a.xy_mm[0] - b.xy_mm[0], a.xy_mm[1] - b.xy_mm[1]) < _ALIKE_MM
         for a, b in zip(first, second, strict=True)
@@ -150,7 +159,7 @@ def same_marks(first: Sequence[LayoutMark], second: Sequence[LayoutMark]) -> boo
 
 
 def _boldest(layout: FiducialLayout) -> FiducialLayout:
-    """The marks that are the plainest to see, where they are enough: solid ones, or else those of the widest lines."""
+    """The layout's most visible marks, if there are enough: solid ones, or else those with the widest lines."""
     groups: dict[float, list[LayoutMark]] = {}
     for mark in layout.marks:
         groups.setdefault(np.inf if is_solid(mark) else thinnest_mm(mark.mark), []).append(mark)
@@ -159,7 +168,7 @@ def _boldest(layout: FiducialLayout) -> FiducialLayout:
 
 
 def _some(layout: FiducialLayout) -> FiducialLayout:
-    """As many marks as tell whether they are there."""
+    """Thin out a layout with many marks: half of them suffice to detect it."""
     return replace(layout, marks=layout.marks[:: 1 if len(layout.marks) <= _ENOUGH else 2])
 
 
@@ -177,10 +186,16 @@ def identify(
     max_pixels: int | None = None,
     likely: Collection[str] = (),
 ) -> Identification:
-    """Try every camera with drawn marks on the scan, those with the same marks once.
+    """Try every camera with drawn marks on the scan; cameras with the same marks are tried once.
 
-    likely: names that scans of the same kind show. Where one of them stands out beyond chance, only cameras with marks
-    at the same places are tried beside it. Raises MeasurementError for a scan that cannot be read.
+    Parameters
+    ----------
+    likely : names of cameras found in similar scans. If one of them stands out significantly, only cameras with marks
+        at the same places are tried in addition to it.
+
+    Raises
+    ------
+    MeasurementError : the scan cannot be read.
     """
     picture, times, its_pitch_um = _picture(path, max_pixels)
     given, search = its_pitch_um if pitch_um is None else (pitch_um, pitch_um), LayoutSearch(picture)
@@ -189,7 +204,7 @@ def identify(
     with reporter.stage("trying") as count:
         trials, tries = _first_that_stand_out(search, layouts, _layouts_like(layouts, likely), pitch, count)
     alike = _alike_in_scan(search, trials, tries, drawn_alike(layouts))
-    del search, tries  # and the correlations that they hold
+    del search, tries  # frees the correlation images
     sources = {name: camera.source for name, camera in cameras.items()}
     unreported = {name: source.text for name, source in sources.items() if source and not source.reports}
     reports = {name: source.reports for name, source in sources.items() if source}
@@ -202,14 +217,14 @@ def identify(
 
 
 def _layouts_like(layouts: Mapping[Names, FiducialLayout], likely: Collection[str]) -> dict[Names, FiducialLayout]:
-    """Layouts whose boldest marks form the same figure, whatever its size, as those of one with a likely name."""
+    """Layouts whose boldest marks form the same figure, up to scale, as a layout with a likely name."""
     figures = {names: _figure(layout) for names, layout in layouts.items()}
     known = [figure for names, figure in figures.items() if not {*likely}.isdisjoint(names)]
     return {names: layout for names, layout in layouts.items() if any(_is_same(figures[names], each) for each in known)}
 
 
 def _figure(layout: FiducialLayout) -> Array:
-    """(n, 2) the places of the boldest marks about their mean, at a mean square distance of 1."""
+    """(n, 2) places of the boldest marks, centred and scaled to an rms distance of 1."""
     places = np.array([mark.xy_mm for mark in _boldest(layout).marks])
     places = places - places.mean(axis=0)
     return np.asarray(places / np.sqrt((places**2).sum(axis=1).mean()))
@@ -220,16 +235,18 @@ def _is_same(figure: Array, other: Array) -> bool:
 
 
 def _picture(path: Path, max_pixels: int | None) -> tuple[Scan, float, tuple[float, float] | None]:
-    """The scan as it is looked at, how many of its pixels one has a side, and the scan's pitch; of the scan itself
-    nothing is held."""
+    """The reduced scan, its reduction factor and the scan's pitch in µm. The scan itself is closed."""
     with open_scan(path, max_pixels) as whole:
         picture = thumbnail(whole, _PICTURE_PX)
         return picture, whole.width_px / picture.width_px, whole.pitch_um
 
 
 def _limit_drawings(layout: FiducialLayout) -> FiducialLayout:
-    """With the drawings of wings known within the frame alone. What is left of a mark beyond the frame's edge is hardly
-    more than a corner, and answers to many a thing: it is taken as drawn."""
+    """Limit the drawings of marks within the frame (wings) to the frame.
+
+    Marks beyond the frame's edge are left as drawn: little more than a corner of them would remain, which correlates
+    with many structures.
+    """
     half_mm = np.array(layout.frame_mm) / 2
     pairs = zip(layout.marks, limit_to_frame(layout).marks, strict=True)
     marks = tuple(limited if (np.abs(given.xy_mm) < half_mm).all() else given for given, limited in pairs)
@@ -237,7 +254,7 @@ def _limit_drawings(layout: FiducialLayout) -> FiducialLayout:
 
 
 def _plate(picture: Scan) -> dict[str, str]:
-    """What the camera's own plate says in the scan, as far as anything is there that reads."""
+    """Text of the camera's own plate, by field; empty if no text networks are installed."""
     reader = networks()
     return {} if reader is None else parse_plate(read_writing(picture, reader, enough=is_whole_plate))
 
@@ -245,8 +262,10 @@ def _plate(picture: Scan) -> dict[str, str]:
 def _alike_in_scan(
     search: LayoutSearch, trials: Sequence[Trial], tries: Mapping[Names, Tried], drawn: Mapping[str, Names]
 ) -> dict[str, Names]:
-    """By name, of cameras that stand out, those drawn much like them whose marks look nearly as well at the same places
-    of the scan: forms of wings that differ by little in a drawing may differ clearly in a scan.
+    """For each camera that stands out: cameras with similar drawings that also score nearly as well at the same
+    placement.
+
+    Wings that differ little in the drawing may differ clearly in the scan.
     """
     own = {name: names for names in tries for name in names}
     found = dict[str, Names]()
@@ -269,9 +288,10 @@ def _first_that_stand_out(
     pitch_um: tuple[float, float] | None,
     count: Count,
 ) -> tuple[list[Trial], Mapping[Names, Tried]]:
-    """The trials, and how the scan answered to each: of the likely layouts, where one stands out beyond chance; of all
-    at the given pitch, where marks answer there that chance does not put so; where none of them stands out, with pixels
-    that may be longer one way; where still none does, at any pitch.
+    """Try the layouts in stages until one stands out.
+
+    The stages: the likely layouts; all layouts at the given pitch, if some have fewer expected false alarms than the
+    limit; all with non-square pixels; all at any pitch. Returns the trials and the search results.
     """
     if likely:
         trials, tries = _try_pitch(search, likely, pitch_um, count)
@@ -292,8 +312,10 @@ def _first_that_stand_out(
 def _try_pitch(
     search: LayoutSearch, layouts: Mapping[Names, FiducialLayout], pitch_um: tuple[float, float] | None, count: Count
 ) -> tuple[list[Trial], Mapping[Names, Tried]]:
-    """The trials at the given pitch, none where no marks answer there that chance does not put so; at any pitch where
-    none is given."""
+    """Trials at the given pitch, or at any pitch if none is given.
+
+    No trials are made if all layouts have more expected false alarms than the limit.
+    """
     if pitch_um is None:
         return _try_any_pitch(search, layouts, count)
     given = _each(layouts, partial(search.try_pitch, pitch_um=pitch_um), count)
@@ -318,8 +340,7 @@ def _each(
 def _try_any_pitch(
     search: LayoutSearch, layouts: Mapping[Names, FiducialLayout], count: Count
 ) -> tuple[list[Trial], Mapping[Names, Tried]]:
-    """The trials of a scan that the frame may fill: what its pixels then measure each layout says for itself, and those
-    that answer best are tried at that pitch."""
+    """Trials without a pitch: each layout determines its own, and the best ones are refined at it."""
     tries = _each(layouts, search.try_any_pitch, count)
     least = sorted({each.answer.expected for each in tries.values()})[:_FEW]
     best = {names: search.refined(each) for names, each in tries.items() if each.answer.expected in least}
@@ -327,9 +348,11 @@ def _try_any_pitch(
 
 
 def _trials(search: LayoutSearch, tries: Mapping[Names, Tried], count: Count) -> list[Trial]:
-    """Of every layout, those first that answer better than chance. The marks of none are looked at that chance answers
-    as well a hundred times; and once one stands out, only of those that answer better than chance too, and may be more
-    than a part of what was found."""
+    """Try the layouts in order of their expected false alarms.
+
+    Marks are not measured above 100 expected false alarms. Once a layout stands out, the others are measured only if
+    they are significant too and may hold more than a part of the marks found.
+    """
     trials: list[Trial] = []
     ranked = sorted(tries, key=lambda names: _likeliest_first(tries[names]))
     for done, names in enumerate(ranked, len(ranked)):
@@ -344,14 +367,17 @@ def _trials(search: LayoutSearch, tries: Mapping[Names, Tried], count: Count) ->
 
 
 def _likeliest_first(each: Tried) -> tuple[float, int]:
-    """Of those that answer alike, as with the same corners, the one of fewest marks first."""
+    """Sort key: expected false alarms, two digits; among equals (layouts with the same corners) fewest marks first."""
     return float(f"{each.answer.expected:.2g}"), len(each.layout.marks)
 
 
 def _expected_at_most(seen: Trial, marks: int) -> float:
-    """How many constellations chance may make of a layout of so many marks for it to be measured after a trial that
-    stands out: where that is certain, the other has to be so, too. Where it has more marks, nine crosses of a lattice,
-    say, answer to a lattice of nine; but chance makes nine so much more easily than twenty-five."""
+    """Limit on the expected false alarms of a layout with so many marks, given a trial that stands out.
+
+    If that trial is significant, the layout has to be significant as well. If the layout has fewer marks than were
+    found, it may be a part of them: nine crosses of a larger réseau match a layout of nine, but nine marks are a far
+    more probable false alarm than twenty-five.
+    """
     most = CAMERA_BY_CHANCE if seen.expected <= CAMERA_BY_CHANCE else _BY_CHANCE
     return min(most, _ODDS * seen.expected) if seen.found > marks else most
 
@@ -366,7 +392,7 @@ def _skipped_trial(names: Names, each: Tried) -> Trial:
 
 
 def _alike(cameras: Mapping[str, CameraFile]) -> list[Names]:
-    """The names of cameras with drawn marks, those together whose marks a scan cannot tell apart."""
+    """Names of the cameras with drawn marks, grouped by marks that cannot be distinguished in a scan."""
     groups: list[list[str]] = []
     for name, camera in cameras.items():
         own = next((group for group in groups if same_marks(cameras[group[0]].layout_marks, camera.layout_marks)), None)
@@ -378,7 +404,13 @@ def _alike(cameras: Mapping[str, CameraFile]) -> list[Names]:
 
 
 def _trial(search: LayoutSearch, names: Names, each: Tried, close: float) -> Trial:
-    """close: the score from which on it is named beside another: with less it need not be held against chance."""
+    """Measure the marks of one layout.
+
+    Parameters
+    ----------
+    close : score above which the layout will be named next to the best; below it, no comparison with the stretched
+        layout is needed.
+    """
     start, expected = time.perf_counter(), each.answer.expected
     frame = search.recognise(each)
     fits = [fit for fit in frame.fits if fit] if frame else []
@@ -402,7 +434,7 @@ def _trial(search: LayoutSearch, names: Names, each: Tried, close: float) -> Tri
 
 
 def _score_by_chance(search: LayoutSearch, each: Tried) -> float:
-    """Of the same marks in wrong places. What answers there so much less that the marks themselves are seen, none."""
+    """Score of the stretched layout; 0 where it correlates so much less that the marks themselves must be present."""
     wrong = search.stretched(each)
     if wrong.answer.expected > _ODDS * each.answer.expected:
         return 0.0
@@ -415,7 +447,8 @@ def _px_per_mm(frame: Frame) -> float:
 
 
 def _residual(frame: Frame, layout: FiducialLayout) -> tuple[float, float] | None:
-    """Per axis, in standard deviations and in mm, what an affine transformation of the marks leaves."""
+    """Residuals per axis of an affine transformation of the marks, in standard deviations and in mm; None without
+    redundancy."""
     pairs = [(fit, given) for fit, given in zip(frame.fits, layout.marks, strict=True) if fit]
     redundancy = 2 * len(pairs) - _AFFINE
     if redundancy <= 0:
@@ -433,6 +466,7 @@ def _residual(frame: Frame, layout: FiducialLayout) -> tuple[float, float] | Non
 
 
 def _sigma_mm(covariance_px2: Array, given: LayoutMark, px_per_mm: float) -> Array:
-    """Of mark, given place and film in x' and y'; the mark's own is small and nearly round, so its turn is left out."""
+    """Standard deviations in x' and y' of mark, given place and film. The mark's covariance is small and nearly
+    isotropic, so its rotation is neglected."""
     own, film = float(np.trace(covariance_px2)) / 2 / px_per_mm**2, FiducialOptions().film_sigma_mm
     return np.asarray(np.sqrt(np.square(given.sigma_mm) + own + film**2))

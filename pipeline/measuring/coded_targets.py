@@ -1,4 +1,4 @@
-"""Ring-coded targets, on a flat sheet or in space: found in the whole picture, named by their codes."""
+"""Ring-coded targets on a flat sheet or in space: detected in the whole image and identified by their codes."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -27,15 +27,26 @@ from pipeline.text.wording import did_you_mean, listed
 
 Array = NDArray[np.float64]
 
-_LEAST_DIAMETER_PX, _GREATEST_SHARE = 8.0, 0.04  # of a dot; the greatest of the picture's diagonal
-_LEAST_CONTRAST = 0.06  # of the full scale: coded targets are printed to be seen
-_FOUND_WITHIN_PX = 2.0  # how far the fit may move from where the search has a dot
+_LEAST_DIAMETER_PX, _GREATEST_SHARE = (
+    8.0,
+    0.04,
+)  # diameter of a dot: smallest in px, largest as a fraction of the diagonal
+_LEAST_CONTRAST = 0.06  # fraction of full scale: coded targets are printed with high contrast
+_FOUND_WITHIN_PX = 2.0  # px, largest shift of the fit from the candidate
 
 
 @dataclass(frozen=True, eq=False)
 class CodedPoints:
-    """Points of a sheet or of a field in space: ids and coordinates xyz (n, 3); places (n, 2): on the plane that holds
-    them best; is_flat: whether it does; settings: the kind of the targets."""
+    """Points of a sheet or of a field in space.
+
+    Attributes
+    ----------
+    ids : names.
+    xyz : (n, 3) coordinates.
+    places : (n, 2) coordinates in the best-fitting plane.
+    is_flat : whether the points lie in that plane.
+    settings : kind of the targets.
+    """
 
     ids: tuple[str, ...]
     xyz: Array
@@ -45,7 +56,7 @@ class CodedPoints:
 
     @classmethod
     def from_project(cls, project: Project, settings: TargetSettings) -> "CodedPoints":
-        """The points of points.csv. Raises InputError where it holds too few, or lacks a coded one."""
+        """The points of points.csv. Raises InputError where there are too few, or a coded one is missing."""
         if project.given_points is None:
             raise InputError(
                 f'{project.path}: [targets] kind "coded-ring" names the dots by the sheet, and there is no [object] '
@@ -70,14 +81,14 @@ class CodedPoints:
 
 
 def coded_candidates(scan: Scan, coded: CodedPoints) -> list[Candidate]:
-    """The dots of the whole scan that may be such points, the strongest first."""
+    """Candidates for the dots of such points in the whole scan, the strongest first."""
     greatest = max(_GREATEST_SHARE * float(np.hypot(scan.width_px, scan.height_px)), _LEAST_DIAMETER_PX)
     search = DiskSearch((_LEAST_DIAMETER_PX, greatest), coded.settings.polarity, _LEAST_CONTRAST)
     return disk_candidates(scan, search)
 
 
 def read_numbers(scan: Scan, found: Sequence[Candidate], coded: CodedPoints, mirrored: bool = False) -> dict[int, int]:
-    """The number about each dot that has one; mirrored: as the other side of the film shows it."""
+    """Read the number around each dot that has one. mirrored: the film is seen from its other side."""
     code = coded.settings.code
     read = {index: read_code(scan, dot, code) for index, dot in enumerate(found)} if code else {}
     return {
@@ -88,15 +99,15 @@ def read_numbers(scan: Scan, found: Sequence[Candidate], coded: CodedPoints, mir
 
 
 def points_read(numbers: Mapping[int, int], coded: CodedPoints) -> dict[int, int]:
-    """The point (by index) that the ring about each dot says, right or not."""
+    """Point (by index) that the ring around each dot names, right or wrong."""
     row = {id: i for i, id in enumerate(coded.ids)}
     points = {dot: coded.settings.numbers.get(number, str(number)) for dot, number in numbers.items()}
     return {dot: row[point] for dot, point in points.items() if point in row}
 
 
 def named_by_code(points: Mapping[int, int], coded: CodedPoints) -> tuple[dict[int, int], tuple[str, ...]]:
-    """The same but for those that are read at several places: these say nothing, until the others tell which is right;
-    and what is to be said of them."""
+    """Drop points that were read at several places: these do not identify anything, until the others tell which is
+    right. Also returns notes."""
     count = Counter(points.values())
     twice = sorted(coded.ids[point] for point in count if count[point] > 1)
     notes = (f"The codes of {listed(twice)} were read at more than one place and name nothing.",) if twice else ()
@@ -104,7 +115,7 @@ def named_by_code(points: Mapping[int, int], coded: CodedPoints) -> tuple[dict[i
 
 
 def none_coded(found: Sequence[Candidate], numbers: dict[int, int], coded: CodedPoints) -> str:
-    """Why no dot has a name by its code."""
+    """Reason why no dot is identified by its code."""
     bits = coded.settings.code.bits if coded.settings.code else 0
     if not found:
         return "no dot was found"
@@ -115,7 +126,7 @@ def none_coded(found: Sequence[Candidate], numbers: dict[int, int], coded: Coded
 
 
 def measure_sheet(scan: Scan, sheet: CodedPoints) -> tuple[tuple[MarkMeasurement, ...], tuple[str, ...]]:
-    """A mark for every point of the sheet, and what is to be said of the whole."""
+    """Measure every point of a flat sheet. Returns a mark for each, and notes."""
     scan = scan.green_channel()
     found = coded_candidates(scan, sheet)
     numbers = read_numbers(scan, found, sheet)
@@ -141,7 +152,7 @@ def measure_sheet(scan: Scan, sheet: CodedPoints) -> tuple[tuple[MarkMeasurement
 
 
 def _sign(found: Sequence[Candidate], coded: dict[int, int]) -> float:
-    """Whether coded dots are light (1) or dark (-1)."""
+    """1 for light coded dots, -1 for dark ones."""
     return float(np.sign(np.sum([np.sign(found[dot].contrast_dn) for dot in coded]))) or 1.0
 
 
@@ -154,7 +165,7 @@ def _dots(found: Sequence[Candidate], coded: dict[int, int]) -> Dots:
 
 
 def _predictions(sheet: CodedPoints, found: Sequence[Candidate], naming: Naming) -> list[TargetPrediction]:
-    """Each named point where its dot was found; each other point where the sheet's place in the picture puts it."""
+    """Predict each identified point at its dot, and each other point at its place by the fit of the sheet."""
     predictions = []
     for index, id in enumerate(sheet.ids):
         place, shape = naming.places_px[index], naming.pixel_from_disk[index]
@@ -169,7 +180,7 @@ def _predictions(sheet: CodedPoints, found: Sequence[Candidate], naming: Naming)
 def measure_coded_field(
     scan: Scan, points: CodedPoints, field: Field, camera: CameraFile, measured: MeasuredScan
 ) -> tuple[tuple[MarkMeasurement, ...], tuple[str, ...]]:
-    """A mark for every point of the field, and what is to be said of the whole."""
+    """Measure every point of a field in space. Returns a mark for each, and notes."""
     scan = scan.green_channel()
     found = coded_candidates(scan, points)
     numbers = read_numbers(scan, found, points, _is_mirrored(measured))
@@ -206,7 +217,7 @@ def measure_coded_field(
 
 
 def _contradiction(prediction: TargetPrediction, misread: Sequence[tuple[str, Candidate]]) -> Reason:
-    """Why a point is not what lies at its place, if a ring there says so."""
+    """Reason to reject a point if a ring at its place has another code."""
     reach = float(prediction.half_axes_px[0]) + prediction.search_px
     for id, dot in misread:
         if id != prediction.point and np.hypot(*(dot.center_px - prediction.center_px)) < reach:
@@ -215,13 +226,13 @@ def _contradiction(prediction: TargetPrediction, misread: Sequence[tuple[str, Ca
 
 
 def _is_mirrored(measured: MeasuredScan) -> bool:
-    """Whether the scan shows the film from its other side. The camera frame's y goes up, the scan's rows go down."""
+    """Whether the scan shows the film from its other side. The camera frame's y points up, the scan's rows down."""
     place = measured.frame.pixel_from_camera
     return place is not None and bool(np.linalg.det(place[:, :2]) > 0.0)
 
 
 def _set_dot_size(field: Field, named: NamedField, measured: MeasuredScan) -> Field:
-    """The field with the size that its dots have in the picture, where the project does not say it."""
+    """Estimate the radius of the dots from the candidates, where the project does not give it."""
     if field.radius > 0.0:
         return field
     unit = replace(field, radius=1e-4 * float(np.ptp(field.xyz, axis=0).max()))

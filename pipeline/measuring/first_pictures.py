@@ -1,6 +1,6 @@
-"""Where marks that are to be learned lie in one scan, and their pictures there.
+"""First templates of the marks to be learned: their places in one scan, and the image patches there.
 
-It is shown by clicks, or by what all scans have in common near the given coordinates.
+The places come from clicks, or from what recurs in all scans near the given coordinates.
 """
 
 import hashlib
@@ -30,10 +30,10 @@ from pipeline.measuring.scan_task import ScanOptions, ScanTask
 Array = NDArray[np.float64]
 Places = Mapping[str, Array]  # (2,) px by fiducial
 
-_CLICK_MM = 0.3  # how well a mark is clicked
-_REACH = 1.0  # sizes of a mark: how far from its coordinates it is sought
-_COMPARED = 8  # scans: more do not tell better what they have in common
-_LEAST_EXCESS = 0.15  # of correlations, the best less the second best: what chance leaves among landscape is half of it
+_CLICK_MM = 0.3  # mm, standard deviation of a click
+_REACH = 1.0  # search distance from the coordinates, in sizes of the mark
+_COMPARED = 8  # scans: more do not improve the comparison
+_LEAST_EXCESS = 0.15  # of the best correlation over the second best: landscape alone reaches half of it
 _NOT_COMMON = (
     "the marks cannot be learned from what the scans have in common. Click them in one scan in `reseau review`, or "
     'show them here by a table [clicks] with scan = "..." and a table [clicks.px] of column and row by fiducial;'
@@ -41,9 +41,20 @@ _NOT_COMMON = (
 
 
 def first_pictures(camera: CameraFile, tasks: Sequence[ScanTask], workers: Executor | None) -> CameraFile:
-    """The camera with one scan's pictures in the place of marks that are to be learned, and from which scan they are.
-    tasks: to measure the drawn marks of this camera's scans. Raises InputError or MeasurementError where nothing shows
-    the marks."""
+    """Learn first templates of the marks from one scan.
+
+    Parameters
+    ----------
+    tasks : measure the drawn marks of this camera's scans.
+
+    Returns
+    -------
+    The camera with the templates, and with the scan they come from.
+
+    Raises
+    ------
+    InputError, MeasurementError : the places of the marks cannot be determined.
+    """
     return _clicked(camera, camera.clicks, tasks) if camera.clicks else _learn_recurring_marks(camera, tasks, workers)
 
 
@@ -76,9 +87,11 @@ def _clicked(camera: CameraFile, clicks: Clicks, tasks: Sequence[ScanTask]) -> C
 
 
 def _check_orientation(camera: CameraFile, task: ScanTask, scan: Scan, px: Places) -> None:
-    """Raises InputError where clicks show the frame in another scan orientation than the project sets: a viewer that
-    obeys the file's orientation tag shows other columns and rows than the file has. Where the project sets none, and
-    the clicks were not made in `reseau review`, a file with such a tag leaves open which they are."""
+    """Raise InputError where the clicks contradict the scan orientation of the project.
+
+    A viewer that obeys the file's orientation tag counts other columns and rows than the file. If the project sets no
+    orientation and the clicks were not made in `reseau review`, a file with such a tag leaves open which were counted.
+    """
     if len(px) < LEAST_CLICKS or camera.clicks is None or are_collinear(np.array(list(px.values()))):
         return
     given = _up_from_camera(_through_clicks(task.options, scan, px))
@@ -101,7 +114,7 @@ def _check_orientation(camera: CameraFile, task: ScanTask, scan: Scan, px: Place
 
 
 def _learn_recurring_marks(camera: CameraFile, tasks: Sequence[ScanTask], workers: Executor | None) -> CameraFile:
-    """The marks that recur in all scans near their coordinates."""
+    """Learn the marks as what recurs in all scans near their coordinates."""
     if len(tasks) < 2:
         raise InputError(
             f"{camera.path}: the marks are to be learned, and with one scan nothing says what is a mark. Click them in "
@@ -142,14 +155,14 @@ def _recurrence(job: tuple[Window, list[Window], float]) -> Recurrence:
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """About where the frame lies in one scan, and the picture about every learned mark."""
+    """Approximate placement of the frame in one scan, and a window around every learned mark."""
 
     placement: Array
     windows: Mapping[str, Window]
 
 
 def _view(task: ScanTask) -> _View | None:
-    """None where the drawn marks were not found, or the scan cannot be read."""
+    """None where the drawn marks were not found or the scan cannot be read."""
     camera = task.options.camera
     try:
         with task.opened() as scan:
@@ -168,7 +181,7 @@ def _view(task: ScanTask) -> _View | None:
 
 
 def _drawn_placement(options: ScanOptions, scan: Scan) -> Array | None:
-    """The frame as the drawn marks give it."""
+    """Placement of the frame from the drawn marks."""
     if len(options.camera.layout_marks) < 2:
         return None
     pitch = options.pitch_um or scan.pitch_um
@@ -176,7 +189,7 @@ def _drawn_placement(options: ScanOptions, scan: Scan) -> Array | None:
 
 
 def _central_frame(options: ScanOptions, scan: Scan) -> Array:
-    """The frame in the middle of its scan, in the pose that the project gives."""
+    """Placement of a frame in the centre of its scan, in the project's scan orientation."""
     pose = "0" if options.fiducials.pose == "auto" else options.fiducials.pose
     pitch = np.array(_pitch_mm(options, scan))
     linear = np.diag([1.0, -1.0]) @ up_from_camera(pose) / pitch[:, None]
@@ -184,7 +197,7 @@ def _central_frame(options: ScanOptions, scan: Scan) -> Array:
 
 
 def _pitch_mm(options: ScanOptions, scan: Scan) -> tuple[float, float]:
-    """As the project or the file has it, or as if the frame filled the scan."""
+    """Pixel pitch from the project or the file, or as if the frame filled the scan."""
     pitch_um = options.pitch_um or scan.pitch_um
     if pitch_um is not None:
         return (pitch_um[0] / 1000, pitch_um[1] / 1000)
@@ -193,7 +206,7 @@ def _pitch_mm(options: ScanOptions, scan: Scan) -> tuple[float, float]:
 
 
 def _through_clicks(options: ScanOptions, scan: Scan, px: Places) -> Array:
-    """The frame as the clicks give it: mirrored where that fits better."""
+    """Placement of the frame from the clicks; mirrored where that fits better."""
     camera = options.camera
     if len(px) == 1:
         matrix = _central_frame(options, scan)
@@ -211,8 +224,12 @@ def _through_clicks(options: ScanOptions, scan: Scan, px: Places) -> Array:
 def _start(
     camera: CameraFile, task: ScanTask, scan: Scan, placement: Array, px: Places, alike: tuple[str, ...]
 ) -> CameraFile:
-    """One scan's pictures of the marks, which lie in the layout where this scan has them. alike: the scans that are
-    known, or taken, to lie like it."""
+    """Cut templates of the marks from one scan; the layout takes their places in it.
+
+    Parameters
+    ----------
+    alike : scans known or assumed to have the same scan orientation.
+    """
     inverse = np.linalg.inv(placement[:, :2])
     fiducials = []
     for one in camera.fiducials:
@@ -228,12 +245,12 @@ def _start(
 
 
 def _up_from_camera(placement: Array) -> Array:
-    """(2, 2) camera's axes to the scan's (right, up), to a turn."""
+    """(2, 2) rotation, or rotation with reflection, from the camera's axes to the scan's (right, up)."""
     linear = placement[:, :2] / np.sqrt(abs(np.linalg.det(placement[:, :2])))
     return np.asarray(np.diag([1.0, -1.0]) @ linear)
 
 
 def digest(path: Path) -> str:
-    """The SHA-256 of a file."""
+    """SHA-256 of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

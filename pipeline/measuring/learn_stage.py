@@ -1,6 +1,6 @@
-"""Marks that nobody has drawn, learned from the scans of their camera before these are measured.
+"""Learning of marks that have no drawing, from the scans of their camera, before these are measured.
 
-One scan's pictures, its first ones, find the marks in every other, and the mean over all of them is the template.
+First templates from one scan find the marks in every other; the mean over all scans is the final template.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -33,10 +33,20 @@ _BY = f"# Marks learned by reseau {version('reseau')}"
 def learn_marks(
     project: Project, reporter: Reporter, measure: Measure, workers: Executor | None, folder: Path, memory: Memory
 ) -> Project:
-    """The project with templates in the place of marks that are to be learned; the folder then holds the templates
-    and a camera file that names them, as they are to stand in out/learned. Raises InputError or MeasurementError where
-    they cannot be learned. A scan that cannot be measured adds nothing to them. What was learned once
-    stays, whatever scans come or go, as long as its files stand in out/learned."""
+    """Learn the marks of all cameras that need it.
+
+    The folder then holds the templates and a camera file that refers to them, as they will stand in out/learned. Scans
+    that cannot be measured are left out. Marks that were learned once stay, whatever scans are added or removed, as
+    long as their files stand in out/learned.
+
+    Returns
+    -------
+    The project with templates for the marks.
+
+    Raises
+    ------
+    InputError, MeasurementError : the marks cannot be learned.
+    """
     files = _file_names([camera.path for camera in project.cameras.values()], _learned_folder(project))
     known = add_learned_marks(project, memory)
     cameras = dict(known.cameras)
@@ -50,7 +60,7 @@ def learn_marks(
 
 
 def add_learned_marks(project: Project, memory: Memory) -> Project:
-    """The project with what was learned of its marks before; of other cameras they are yet to be learned."""
+    """Add the marks that were learned earlier; the marks of other cameras remain to be learned."""
     cameras = {
         name: (_stored_earlier(project, camera, memory.recall(_key(project, camera))) or camera)
         if camera.learned
@@ -61,13 +71,13 @@ def add_learned_marks(project: Project, memory: Memory) -> Project:
 
 
 def _key(project: Project, camera: CameraFile) -> str:
-    """Of what is learned: of which marks, and by which settings."""
+    """Key of the learned marks: the marks, and the settings they depend on."""
     settings = [project.pitch_um, project.pose, project.film.sigma_mm, MEASURE_REVISION]
     return f"learned {fingerprint([camera.fiducials, camera.frame_mm, camera.clicks, settings])}"
 
 
 def _stored_earlier(project: Project, camera: CameraFile, kept: Mapping[str, str] | None) -> CameraFile | None:
-    """The camera with the marks that were learned before, where their files still stand as they were written."""
+    """The camera with marks that were learned earlier, if their files are unchanged; else None."""
     path = _learned_folder(project) / (kept or {}).get("file", "")
     if kept is None or not path.is_file() or hash_file(path) != kept["sha256"]:
         return None
@@ -80,8 +90,11 @@ def _learned_folder(project: Project) -> Path:
 
 
 def _file_names(cameras: Sequence[Path], learned: Path) -> Mapping[Path, str]:
-    """Under which name in out/learned each camera's files stand: that of its own file, with a number where several
-    folders hold one of that name, or where it would be that very file."""
+    """Names of the files of each camera in out/learned.
+
+    The name is that of the camera file, with a number where several folders have a file of that name, or where it would
+    be that file itself.
+    """
     names: dict[Path, str] = {}
     stems = {path.stem for path in cameras}
     for path in dict.fromkeys(cameras):
@@ -93,8 +106,11 @@ def _file_names(cameras: Sequence[Path], learned: Path) -> Mapping[Path, str]:
 
 
 def _check_learned_scan(project: Project, camera: CameraFile) -> CameraFile:
-    """A camera whose marks were learned before, or drawn. Another scan may have the name of the one they were learned
-    from: then that tells nothing of how this project's scans lie, and none of these has a share in the marks."""
+    """Check the origin of the learned marks of a camera.
+
+    If the project has no such scan, or another one of that name, the marks tell nothing of the scan orientations in
+    this project, and none of its scans has a share in them.
+    """
     learned = camera.learned_from
     if learned is None or (learned.scan in project.scans and digest(project.scans[learned.scan]) == learned.sha256):
         return camera
@@ -103,7 +119,7 @@ def _check_learned_scan(project: Project, camera: CameraFile) -> CameraFile:
 
 
 def _drop_shares(mark: Mark | LearnedMark | None) -> Mark | LearnedMark | None:
-    """A learned mark whose shares are those of no image: a name never holds a line's end."""
+    """Rename the shares of a learned mark so that they match no image: a name never contains a line break."""
     if not isinstance(mark, MarkTemplate):
         return mark
     return replace(mark, shares={f"{scan}\n": share for scan, share in mark.shares.items()})
@@ -129,7 +145,7 @@ def _learned(
 
 
 def _tasks(project: Project, camera: CameraFile, names: Sequence[str]) -> list[ScanTask]:
-    """To measure the fiducials in grey values as they are: chips are pictures in these. camera: as far as it is
+    """Tasks that measure the fiducials in linear grey values, as templates hold these. camera: as far as it is
     learned."""
     own = {name: camera if one.path == camera.path else one for name, one in project.cameras.items()}
     return [task.fiducials_alone("linear") for task in scan_tasks(replace(project, cameras=own), names)]
@@ -142,7 +158,8 @@ def _chips(
     measure: Measure,
     workers: Executor | None,
 ) -> tuple[Mapping[str, list[Chip]], set[str]]:
-    """The pictures of every learned mark, by fiducial, and the poses that some frame's marks do not tell apart."""
+    """Image patches of every learned mark, by fiducial; and the scan orientations that the marks of some frame do not
+    distinguish."""
     frames = {scan.frame.image: scan.frame for scan in measure(tasks)}
     named = [(task, frames[task.name]) for task in tasks if _is_named(frames[task.name], start)]
     chips = dict[str, list[Chip]]()
@@ -153,7 +170,7 @@ def _chips(
 
 
 def _learned_chips(learned: Sequence[GivenFiducial], named: tuple[ScanTask, FrameMeasurement]) -> Mapping[str, Chip]:
-    """The pictures of learned marks in one scan, as far as they were found."""
+    """Image patches of the learned marks found in one scan."""
     task, frame = named
     matrix = frame.pixel_from_camera
     assert matrix is not None
@@ -167,8 +184,8 @@ def _learned_chips(learned: Sequence[GivenFiducial], named: tuple[ScanTask, Fram
 
 
 def _is_named(frame: FrameMeasurement, start: CameraFile) -> bool:
-    """Whether the marks found are those of their names for sure, or but for names that their symmetry leaves equal, or
-    at least if the scan lies as the one clicked in."""
+    """Whether the marks found have certain names, up to their own symmetry, or the scan has the orientation of the
+    clicked one."""
     pose, learned = frame.pose, start.learned_from
     if pose is None or learned is None or frame.pixel_from_camera is None:
         return False
@@ -192,8 +209,8 @@ def _template(job: tuple[list[Chip], float]) -> MarkTemplate:
 
 
 def _average_origins(camera: CameraFile, poses: Collection[str]) -> CameraFile:
-    """The camera with the origins of its learned marks where those poses, which frames do not tell apart, take them to
-    one another, as far as the marks look alike in them."""
+    """Average the origins of the learned marks over scan orientations that frames do not distinguish, as far as the
+    marks look alike in them."""
     learned = [one for one in camera.fiducials if isinstance(one.mark, MarkTemplate) and one.mark.learned_mm]
     if not learned:
         return camera
@@ -208,8 +225,13 @@ def _average_origins(camera: CameraFile, poses: Collection[str]) -> CameraFile:
 
 
 def _stored(camera: CameraFile, place: Path, folder: Path) -> CameraFile:
-    """The camera with its templates written as a file that can be used instead, and as that file has them: so what is
-    measured with it is what is measured now. place: of the file for now; folder: where it is to stand."""
+    """Write the camera with its templates to a file, and return it as read back, so that later runs measure the same.
+
+    Parameters
+    ----------
+    place : of the file for now.
+    folder : its final folder.
+    """
     save = picture_writer(place.parent, f"{place.stem}-")
     write_atomically(place, camera_text(replace(camera, path=place), save))
     stored = replace(camera, fiducials=read_camera(place).fiducials)

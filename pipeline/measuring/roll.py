@@ -1,4 +1,4 @@
-"""The second step of measuring: the scans of one camera together, brought to one direction by their writing."""
+"""Second step of measuring: cross-scan checks of one camera, whose frames get one scan orientation by their text."""
 
 import re
 from collections import Counter, defaultdict
@@ -28,28 +28,33 @@ _ONE_QUESTION = (
     "the frames are named so that what is written lies alike in all of the camera whose writing was read; nothing says "
     "how the camera has it"
 )
-_READ_FIRST = 4  # frames of a camera on which all writing is read
-_WAYS = 2  # in which frames of a roll lie, as far as they are looked for: more take as long as reading all
-_LEAST = 6  # letters and digits of a line by which frames are known
-_TURNS = ("0", "90", "180", "270")  # in which writing may lie in the camera's frame
-CheckedScan = NewType("CheckedScan", MeasuredScan)  # beside the others of its camera
-_SAME = ("run", "frames", "date")  # that name a frame together with its number
+_READ_FIRST = 4  # frames of a camera on which all text is read
+_WAYS = 2  # scan orientations searched by known lines: more would take as long as reading all text
+_LEAST = 6  # letters and digits that a known line needs
+_TURNS = ("0", "90", "180", "270")  # directions of text in the camera's frame
+CheckedScan = NewType("CheckedScan", MeasuredScan)  # after the cross-scan checks of its camera
+_SAME = ("run", "frames", "date")  # fields that identify a frame together with its number
 
 
 @dataclass(frozen=True, eq=False)
 class Roll:
-    """What the frames of a camera say of one another's poses. poses: by image, those that change when all are looked at
-    together; tasks: the scans whose marks then have other names, to be measured again in their new pose."""
+    """Scan orientations of one camera's frames from all of them together.
+
+    Attributes
+    ----------
+    poses : by image, the scan orientations that change.
+    tasks : scans whose marks get other names by this and have to be measured again.
+    """
 
     poses: Mapping[str, Pose]
     tasks: tuple[ScanTask, ...]
 
     def named(self, scans: Sequence[MeasuredScan], again: Mapping[str, MeasuredScan]) -> list[MeasuredScan]:
-        """The scans in these poses, as they were measured or, by image, measured again."""
+        """The scans in these orientations, as measured or, by image, measured again."""
         return [self._named(scan, again.get(scan.frame.image, scan)) for scan in scans]
 
     def _named(self, scan: MeasuredScan, new: MeasuredScan) -> MeasuredScan:
-        if new.failure:  # its file was there before
+        if new.failure:  # the file was readable before: keep the first measurement
             return scan
         frame = scan.frame
         pose = self.poses.get(frame.image, frame.pose)
@@ -57,7 +62,13 @@ class Roll:
 
 
 def build_roll(tasks: Sequence[ScanTask], scans: Sequence[MeasuredScan], places: Sequence[WrittenPlace]) -> Roll:
-    """The roll of one camera's scans, which were measured by these tasks. places: where the camera writes."""
+    """Build the roll of one camera's scans.
+
+    Parameters
+    ----------
+    tasks : the tasks by which the scans were measured.
+    places : where the camera writes text.
+    """
     both = list(zip(tasks, scans, strict=True))
     free = [scan for task, scan in both if task.options.fiducials.pose == "auto" and not scan.failure]
     poses = poses_of_roll(free, places)
@@ -69,8 +80,13 @@ def build_roll(tasks: Sequence[ScanTask], scans: Sequence[MeasuredScan], places:
 def add_known_lines(
     tasks: Sequence[ScanTask], measure: Measure, reporter: Reporter
 ) -> tuple[tuple[ScanTask, ...], Mapping[str, MeasuredScan]]:
-    """The tasks, in their order, with the lines by which to know that a frame lies as others of its camera; and, by
-    image, the few scans that were measured for it. They are no others where one scan comes or goes, but rarely."""
+    """Add known text lines to the tasks, by which frames with the same scan orientation are recognised.
+
+    Returns
+    -------
+    The tasks, in their order; and, by image, the few scans measured for this. This sample rarely changes when scans are
+    added or removed.
+    """
     of_camera = defaultdict[int, list[ScanTask]](list)
     for task in tasks:
         if task.options.fiducials.pose == "auto" and task.options.fiducials.writing == "pose":
@@ -83,7 +99,7 @@ def add_known_lines(
             measured[scan.frame.image] = scan
             count(scan.frame.image, done, len(first))
     known = {camera: known_lines([measured[task.name].frame for task in own]) for camera, own in rolls.items()}
-    options = dict[int, ScanOptions]()  # of those that tasks share
+    options = dict[int, ScanOptions]()  # keeps shared options shared
     knowing = []
     for task in tasks:
         lines = known.get(id(task.options.camera), ())
@@ -95,14 +111,16 @@ def add_known_lines(
 
 
 def _first(tasks: Sequence[ScanTask]) -> list[ScanTask]:
-    """Those of a camera on which all writing is read."""
+    """The sample of a camera's tasks on which all text is read."""
     few = sample_names([task.name for task in tasks], _READ_FIRST)
     return [task for task in tasks if task.name in few]
 
 
 def known_lines(frames: Sequence[FrameMeasurement]) -> tuple[KnownLine, ...]:
-    """The lines by which to know, on frames that are not read yet, that they lie as some of these do: of each way in
-    which two or more lie in their scans the one that tells itself best."""
+    """Lines by which the scan orientation of frames not yet read can be recognised.
+
+    For each scan orientation that occurs in two or more frames, the line with the most distinct orientation.
+    """
     lines = [(known, line) for frame in frames for line in frame.writing or () if (known := _known_line(frame, line))]
     recurring = [
         (known, line)
@@ -116,7 +134,7 @@ def known_lines(frames: Sequence[FrameMeasurement]) -> tuple[KnownLine, ...]:
 
 
 def _known_line(frame: FrameMeasurement, line: Line) -> KnownLine | None:
-    """The line as others of its roll may have it; None where too little is written in it."""
+    """The line as it may recur on other frames of the roll; None where it has too little text."""
     letters = masked_text(line.text)
     if frame.pixel_from_camera is None or frame.pose is None or len(letters) < _LEAST or not letters.strip("0"):
         return None
@@ -127,8 +145,13 @@ def _known_line(frame: FrameMeasurement, line: Line) -> KnownLine | None:
 
 
 def poses_of_roll(scans: Sequence[MeasuredScan], places: Sequence[WrittenPlace]) -> Mapping[str, Pose]:
-    """By image those poses of one camera's frames that change when all are looked at together. scans: of one camera,
-    whose poses nobody has set; places: where the camera writes."""
+    """Scan orientations, by image, that change when all frames of one camera are considered together.
+
+    Parameters
+    ----------
+    scans : of one camera, with scan orientations that nobody has set.
+    places : where the camera writes text.
+    """
     frames = [scan.frame for scan in scans]
     poses = {frame.image: frame.pose for frame in frames if frame.pose is not None and frame.pose.writing}
     if len(poses) < 2:
@@ -142,8 +165,10 @@ def poses_of_roll(scans: Sequence[MeasuredScan], places: Sequence[WrittenPlace])
 
 
 def _writing_likelihoods(frames: Sequence[FrameMeasurement], places: Sequence[WrittenPlace]) -> Mapping[str, float]:
-    """Log-likelihoods of the turns of the writing in the camera's frame, 0 for the best. What stands on several frames,
-    numbers apart, is one title, or one stamp, and counts once."""
+    """Log-likelihoods of the directions of text in the camera's frame, 0 for the best.
+
+    Text that recurs on several frames, except for its digits, is one title or one stamp and counts once.
+    """
     texts: dict[str, tuple[Pose, Line]] = {}
     for frame in frames:
         assert frame.pose is not None
@@ -156,8 +181,13 @@ def _writing_likelihoods(frames: Sequence[FrameMeasurement], places: Sequence[Wr
 
 
 def _together(frame: FrameMeasurement, turn: str, told: bool, frames: int) -> Pose:
-    """The pose of a frame whose writing lies in the camera's frame as in that of so many frames together. told: whether
-    these say so, or only agree."""
+    """Scan orientation of a frame whose text has this direction in the camera's frame, like that of so many other
+    frames.
+
+    Parameters
+    ----------
+    told : whether the frames together determine the direction, or only agree.
+    """
     assert frame.pose is not None
     pose = replace(frame.pose, name=_scan_pose(frame.pose, turn))
     if not _face_is_known(pose) or _is_doubted(frame):
@@ -170,7 +200,7 @@ def _together(frame: FrameMeasurement, turn: str, told: bool, frames: int) -> Po
 
 
 def _face_is_known(pose: Pose) -> bool:
-    """Whether the frame by itself says if its scan is mirrored."""
+    """Whether the frame alone determines if its scan is mirrored."""
     faces = [
         max((value for name, value in pose.written.items() if name.endswith("m") == mirrored), default=0.0)
         for mirrored in (False, True)
@@ -179,23 +209,22 @@ def _face_is_known(pose: Pose) -> bool:
 
 
 def _is_doubted(frame: FrameMeasurement) -> bool:
-    """Whether it may not be the frame at all."""
+    """Whether the frame itself may be a false detection."""
     evidence = frame.pose.evidence if frame.pose else ()
     return not any(mark.status == Status.MEASURED for mark in frame.marks) or any(p in evidence for p in frame.problems)
 
 
 def _turn(pose: Pose) -> str:
-    """How the writing lies in the camera's frame, if the frame lies in that pose."""
+    """Direction of the text in the camera's frame, if the frame has this scan orientation."""
     return pose_in_camera(pose.writing, pose.name)
 
 
 def _scan_pose(pose: Pose, turn: str) -> str:
-    """The pose of a frame whose writing lies so in the camera's frame."""
+    """Scan orientation of a frame whose text has this direction in the camera's frame."""
     return next(name for name in POSES if pose_in_camera(pose.writing, name) == turn)
 
 
-# The second step of measuring: the scans of one camera beside one another. What was measured stays as it is; what is
-# checked is made anew whenever a scan comes to them.
+# Cross-scan checks of one camera. The measurements stay as they are; the checks are repeated whenever a scan is added.
 
 
 def check_scans(
@@ -205,10 +234,16 @@ def check_scans(
     again: Iterable[MeasuredScan],
     film: BelievedFilm,
 ) -> tuple[CheckedScan, ...]:
-    """The scans of one camera as all of them together show them, in their order: their poses, one definition of the
-    places of crossings, the fiducials judged together.
+    """Check the scans of one camera against one another: scan orientations, the definition of crossings, and fiducials.
 
-    camera: with templates in the place of marks that were learned. again: the scans of `roll.tasks`, measured.
+    Parameters
+    ----------
+    camera : with templates for the marks that were learned.
+    again : the measured scans of `roll.tasks`.
+
+    Returns
+    -------
+    The scans in their order.
     """
     scans = roll.named([scan for scan in measured if not scan.failure], {scan.frame.image: scan for scan in again})
     marks = one_definition([scan.frame.marks for scan in scans])
@@ -223,15 +258,19 @@ def check_scans(
 def _check_fiducials(
     camera: CameraFile, frames: Sequence[FrameMeasurement], scans: Sequence[MeasuredScan], film: BelievedFilm
 ) -> Sequence[FrameMeasurement]:
-    """The fiducials judged together, if the camera has any."""
+    """Check the fiducials across frames, if the camera has any."""
     if not camera.layout_marks:
         return frames
     return check_frames(frames, camera.layout(), [scan.pitch_um for scan in scans], film).frames
 
 
 def note_same_frames(scans: Sequence[MeasuredScan], part_of: Callable[[str], str]) -> list[MeasuredScan]:
-    """The scans, with a problem where another one says that it is the same frame. part_of: the frame of which an image
-    is one of several scans, which are meant to be of one frame."""
+    """Add a problem to scans whose text names the same frame.
+
+    Parameters
+    ----------
+    part_of : the frame of which an image is one of several partial scans; these share a frame on purpose.
+    """
     named: dict[tuple[tuple[str, str], ...], list[str]] = {}
     names = {scan.frame.image: _name(scan.frame) for scan in scans}
     for image, name in names.items():
@@ -241,7 +280,7 @@ def note_same_frames(scans: Sequence[MeasuredScan], part_of: Callable[[str], str
 
 
 def _name(frame: FrameMeasurement) -> tuple[tuple[str, str], ...]:
-    """What names the frame: its number, and the run, its frames or the date, as far as they are known."""
+    """Fields that identify the frame: its number and the run, its frames or the date, as far as they are known."""
     values = unique_fields(frame.writing or (), ("frame", *_SAME))
     return tuple(values.items()) if "frame" in values and len(values) > 1 else ()
 

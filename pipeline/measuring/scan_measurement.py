@@ -1,4 +1,4 @@
-"""The first step of measuring: each scan by itself, its fiducials and then the targets that they make predictable."""
+"""First step of measuring: each scan by itself, its fiducials and then the targets predicted from them."""
 
 import sys
 import time
@@ -42,16 +42,21 @@ _COUNTED = Path("/proc/self/io")
 def measure_scans(
     tasks: Iterable[ScanTask], executor: Submits | None = None, in_flight: int | None = None
 ) -> Iterator[MeasuredScan]:
-    """Each scan's result as soon as it is there; of a scan whose process ended, too: then it says so.
+    """Measure scans, yielding each result as soon as it is available.
 
-    executor: None: here, one after the other. in_flight: how many tasks are handed out at a time.
+    If the process of a scan was ended, its result is a failure that says so.
+
+    Parameters
+    ----------
+    executor : None: the scans are measured in this process, one after the other.
+    in_flight : maximum number of tasks submitted at a time.
     """
     for task, result in iterate_results(measured_scan, tasks, executor, in_flight):
         yield ended_scan(task, result) if isinstance(result, Exception) else result
 
 
 def ended_scan(task: ScanTask, error: Exception) -> MeasuredScan:
-    """Of a scan that its executor has lost."""
+    """Result of a scan whose process the executor has lost."""
     detail = "" if isinstance(error, BrokenExecutor) else f" ({' '.join(str(error).split())})"
     return failed_scan(
         task,
@@ -62,8 +67,14 @@ def ended_scan(task: ScanTask, error: Exception) -> MeasuredScan:
 
 
 def measured_scan(task: ScanTask, look: SecondPass | None = None) -> MeasuredScan:
-    """Measure one scan: its fiducials, then its targets. A scan that cannot be measured is a result that says why: this
-    raises nothing but interrupts. look: gets the scan while it is open, and what was measured in it."""
+    """Measure one scan: its fiducials, then its targets.
+
+    A scan that cannot be measured gives a result with the reason. Raises nothing but interrupts.
+
+    Parameters
+    ----------
+    look : called with the open scan and its measurements.
+    """
     start = time.monotonic()
     try:
         measured = _opened_and_measured(task, look)
@@ -73,7 +84,7 @@ def measured_scan(task: ScanTask, look: SecondPass | None = None) -> MeasuredSca
 
 
 def failed_scan(task: ScanTask, code: FailureCode, sentence: str) -> MeasuredScan:
-    """Of a scan that could not be measured: a row for each mark that would have been sought, all of them absent."""
+    """Result of a scan that could not be measured: all its fiducials and targets have the status absent."""
     sentence = public_text(sentence)
     reason = Reason(f"the scan could not be measured: {sentence}", Code.FAILED_SCAN)
     fiducials, targets = [mark.id for mark in task.options.camera.layout_marks], task.options.targets
@@ -125,7 +136,7 @@ def _opened_and_measured(task: ScanTask, look: SecondPass | None) -> MeasuredSca
 
 
 def _measure_window(task: ScanTask, scan: Scan, window: Window) -> MeasuredScan:
-    """The scan with what a window of it shows, all places in pixels of the whole scan."""
+    """Measure a window of a scan; all places are in pixels of the whole scan."""
     try:
         cropped = crop_scan(scan, window)
     except ValueError as error:
@@ -141,8 +152,9 @@ def _measure_window(task: ScanTask, scan: Scan, window: Window) -> MeasuredScan:
 
 
 def _measure(task: ScanTask, scan: Scan, options: ScanOptions) -> MeasuredScan:
-    """What a scan shows, whole or in a window."""
-    # Fiducials are seen through the curve; targets have edges all round, and are measured as they are.
+    """Measure a scan, whole or cropped to a window."""
+    # Fiducials are measured in grey values corrected by the tone curve. Targets have edges on all sides and are
+    # measured in the grey values as they are.
     tone = tone_before(options.tone, options.said, scan.path)
     frame = replace(_fiducials(options, scan.replace_tone(tone)), image=task.name)
     pitch, problems, notes = _pitch(options, scan, frame)
@@ -182,13 +194,13 @@ def _fiducials(options: ScanOptions, scan: Scan) -> FrameMeasurement:
 
 
 def reads_writing(options: ScanOptions) -> bool:
-    """Whether anything would be read: what the result depends on beside scan and options, for what reads is an
-    extra."""
+    """Whether text would be read. The results depend on this in addition to scan and options: the text networks are an
+    optional extra."""
     return options.fiducials.writing != "none" and networks() is not None
 
 
 def _missed_reading(options: ScanOptions, frame: FrameMeasurement) -> tuple[str, ...]:
-    """A note where something would have been read, but nothing is there that reads."""
+    """A note if text should be read and the networks for it are not installed."""
     writing = options.fiducials.writing
     undecided = writing == "pose" and frame.pose is not None and not frame.pose.decided
     is_requested = writing == "all" or undecided
@@ -196,7 +208,7 @@ def _missed_reading(options: ScanOptions, frame: FrameMeasurement) -> tuple[str,
 
 
 def _unknown_lens(options: ScanOptions) -> tuple[str, ...]:
-    """A note where the taking lens is taken as known exactly."""
+    """A note if the calibration of the taking lens has no covariance."""
     lens = options.fiducials.lens
     if not isinstance(lens, CalibratedLens) or lens.is_covariance_known:
         return ()
@@ -209,7 +221,7 @@ def _unknown_lens(options: ScanOptions) -> tuple[str, ...]:
 def _add_sizes(
     measured: FrameMeasurement, layout: FiducialLayout, scan: Scan, pitch_um: tuple[float, float] | None
 ) -> tuple[MarkMeasurement, ...]:
-    """The marks with how large each is drawn in the scan, px, for whoever shows a picture of it."""
+    """Add to each mark the size at which it is drawn in the scan, in px, for the display of image patches."""
     if measured.px_per_mm is not None:
         px_per_mm = measured.px_per_mm
     elif pitch_um is not None:
@@ -226,8 +238,13 @@ def _add_sizes(
 def _pitch(
     options: ScanOptions, scan: Scan, frame: FrameMeasurement
 ) -> tuple[tuple[float, float], tuple[Reason, ...], tuple[str, ...]]:
-    """The pitch of a scan in um, as the project, the file or the marks say it; what needs a look in it, and what is
-    only worth knowing."""
+    """Pixel pitch of a scan in µm.
+
+    Returns
+    -------
+    The pitch in x and y, from the project, the file, the separations of the marks, or the frame's size, in this order;
+    problems that need review; notes.
+    """
     if options.pitch_um is not None:
         return options.pitch_um, (), ()
     if scan.pitch_um is not None:
@@ -248,8 +265,15 @@ def _pitch(
 
 @dataclass(frozen=True)
 class MeasuredFile:
-    """scan: as measured, or why not. parts_hash: of its file. bytes_read: from the file; -1 where nobody counts.
-    thumbnails: cut from what was decoded for it."""
+    """Result of one scan file.
+
+    Attributes
+    ----------
+    scan : the measurements, or the failure.
+    parts_hash : hash of the file.
+    bytes_read : from the file; -1 where the system does not count them.
+    thumbnails : cut from the decoded samples.
+    """
 
     scan: MeasuredScan
     parts_hash: str
@@ -258,7 +282,7 @@ class MeasuredFile:
 
 
 def measure_file(task: ScanTask) -> MeasuredFile:
-    """Measure a scan. Raises nothing but interrupts, as `measured_scan` does."""
+    """Measure the scan of a task. Raises nothing but interrupts, like `measured_scan`."""
     before = _bytes_read()
     thumbnails = TakenThumbnails()
     scan = measured_scan(task, thumbnails.take)
@@ -268,7 +292,7 @@ def measure_file(task: ScanTask) -> MeasuredFile:
 
 
 def _bytes_read() -> int:
-    """By this process, of whatever file or address; mapped pages are not counted."""
+    """Bytes read by this process from any file or address; mapped pages are not counted."""
     if not sys.platform.startswith("linux"):
         return -1
     try:

@@ -1,4 +1,4 @@
-"""What one scan's result depends on: the task that a process gets which measures it, without the project."""
+"""Tasks for measuring single scans: all that a result depends on, without the project."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -28,23 +28,29 @@ _NO_SCAN = "images.csv names it, and the project has no scan of that name. Look 
 
 
 class Memory(Protocol):
-    """Values by keys, which name all that a value depends on."""
+    """Values by keys; a key holds all that its value depends on."""
 
     def recall(self, key: str) -> Mapping[str, Any] | None:
-        """The value of that key; None: there is none yet."""
+        """The value of a key; None if there is none yet."""
 
     def remember(self, key: str, value: Mapping[str, object]) -> None:
-        """Keep a value."""
+        """Store a value."""
 
 
 @dataclass(frozen=True, eq=False)
 class ScanOptions:
-    """How a scan is measured, whichever it is.
+    """Options for measuring a scan, shared by several scans.
 
-    camera: its marks, its frame and, where targets are predicted or nothing else says where the picture is, its lens.
-    pitch_um: as the project gives it; None: the file says it, or the marks. fiducials: pose, film and writing.
-    known_pose: what is told of the pose of a scan from which marks were learned. tone: the curve as the project has it;
-    said: by other scans of the scanner. exterior: an approximate orientation, which targets are named by.
+    Attributes
+    ----------
+    camera : marks, frame and, where targets are predicted or nothing else locates the frame, the lens.
+    pitch_um : as given in the project; None: from the file or the marks.
+    fiducials : scan orientation, film and reading of text.
+    known_pose : scan orientation of a scan from which marks were learned.
+    tone : the tone curve as set in the project.
+    said : information on the curve from other scans of the scanner.
+    targets : the targets to be measured.
+    exterior : approximate exterior orientation for the identification of targets.
     """
 
     camera: CameraFile
@@ -57,12 +63,12 @@ class ScanOptions:
     exterior: Exterior | None = None
 
     def knowing(self, lines: tuple[KnownLine, ...]) -> "ScanOptions":
-        """The same, with lines by which a frame is known to lie as others of its camera."""
+        """Copy with text lines that show that a frame lies like others of its camera."""
         return replace(self, fiducials=replace(self.fiducials, known_lines=lines))
 
     @cached_property
     def json(self) -> str:
-        """All of it as canonical JSON."""
+        """All options as canonical JSON."""
         return canonical_json(self)
 
 
@@ -70,8 +76,11 @@ class ScanOptions:
 class ScanTask:
     """One scan to be measured.
 
-    name: the image's. scan: the path or the address of its file; "" where images.csv names an image that has none.
-    max_pixels: how many are read, as `open_scan` takes it: it changes nothing of a scan that is read.
+    Attributes
+    ----------
+    name : of the image.
+    scan : path or address of the file; "" where images.csv names an image without a file.
+    max_pixels : limit for `open_scan`; it does not change the result of a scan that can be read.
     """
 
     name: str
@@ -80,17 +89,17 @@ class ScanTask:
     max_pixels: int | None = None
 
     def options_json(self) -> str:
-        """Canonical JSON of all that the result depends on beside the scan itself: equal options give equal text, and
-        whatever may change the result changes it."""
+        """Canonical JSON of all that the result depends on in addition to the scan. Equal options give equal text; any
+        option that may change the result changes the text."""
         return self.options.json
 
     @property
     def shown_scan(self) -> str:
-        """The scan as it may be shown and kept."""
+        """The scan's address without secrets, for display and storage."""
         return public_address(self.scan)
 
     def opened(self) -> "Scan":
-        """The scan. Raises MeasurementError where it cannot be read."""
+        """Open the scan. Raises MeasurementError where it cannot be read."""
         if not self.scan:
             raise MissingError(_NO_SCAN)
         from measure.scans.opening import open_scan
@@ -98,25 +107,33 @@ class ScanTask:
         return open_scan(scan_path(self.scan), self.max_pixels).replace_name(self.name)
 
     def posed(self, pose: str) -> "ScanTask":
-        """The same scan in a pose that is known, nothing read in it."""
+        """Copy with a known scan orientation; no text is read."""
         fiducials = replace(self.options.fiducials, pose=pose, writing="none", known_lines=())
         return replace(self, options=replace(self.options, fiducials=fiducials))
 
     def fiducials_alone(self, tone: float | str) -> "ScanTask":
-        """The same scan, of which the fiducials alone are sought, seen through that curve."""
+        """Copy that measures only the fiducials, with the given tone curve."""
         fiducials = replace(self.options.fiducials, writing="none", known_lines=())
         options = replace(self.options, fiducials=fiducials, tone=tone, said=(), targets=None, exterior=None)
         return replace(self, options=options)
 
 
-Measure = Callable[[Iterable[ScanTask]], Iterator[MeasuredScan]]  # how tasks get done: `measure_scans`, or from a store
+Measure = Callable[[Iterable[ScanTask]], Iterator[MeasuredScan]]  # runs tasks: `measure_scans`, or a store of results
 
 
 def scan_tasks(
     project: Project, names: Sequence[str], said: Mapping[str, tuple[ToneInformation, ...]] | None = None
 ) -> tuple[ScanTask, ...]:
-    """Tasks of these images, in their order; scans that have all in common share their options. said: by image what
-    other scans say of its scanner's curve. Raises InputError for marks that cannot be sought."""
+    """Tasks of these images, in their order; scans with the same options share one object.
+
+    Parameters
+    ----------
+    said : by image, information on the scanner's tone curve from other scans.
+
+    Raises
+    ------
+    InputError : some marks cannot be searched for.
+    """
     options = image_options(project, said or {})
     scans = {name: project.scans.get(name) for name in names}
     return tuple(
@@ -126,7 +143,7 @@ def scan_tasks(
 
 
 def image_options(project: Project, said: Mapping[str, tuple[ToneInformation, ...]]) -> Callable[[str], ScanOptions]:
-    """How each image is to be measured, by its name; as `scan_tasks` has it."""
+    """Function that returns the options of an image by its name; see `scan_tasks`."""
     cameras = {name: _sought(project, camera) for name, camera in project.cameras.items()}
     key_of = {id(camera): name for name, camera in project.cameras.items()}
     targets = _targets(project)
@@ -167,14 +184,17 @@ def _targets(project: Project) -> "SoughtTargets | None":
 
 
 def sample_names(names: Sequence[str], count: int) -> list[str]:
-    """So many of them, in their order: the same ones where another name comes to them, but rarely."""
+    """A reproducible sample of count names, in their order. It rarely changes when names are added."""
     chosen = set(sorted(names, key=lambda name: sha256(name.encode("utf-8", "surrogateescape")).digest())[:count])
     return [name for name in names if name in chosen]
 
 
 def _pose(project: Project, camera: CameraFile, name: str) -> tuple[str, Pose | None]:
-    """As the project sets it; a scan whose marks were clicked lies as these say, and what recurs in all scans, nobody
-    having clicked, was looked for in one pose."""
+    """Scan orientation of an image: as set in the project, or known from the learning of marks.
+
+    A scan whose marks were clicked has the orientation of the clicks. Marks that recur in all scans, without clicks,
+    were searched in one assumed orientation.
+    """
     learned = camera.learned_from
     if learned is None or project.pose != "auto" or name not in learned.alike:
         return project.pose, None
@@ -185,7 +205,7 @@ def _pose(project: Project, camera: CameraFile, name: str) -> tuple[str, Pose | 
 
 
 def _sought(project: Project, camera: CameraFile) -> CameraFile:
-    """What of a camera the measurement of a scan depends on: no name, no file, and of its lens only values."""
+    """Reduce a camera to what the measurement of a scan depends on: no name, no file, and only values of its lens."""
     if any(not one.passed_over for one in camera.fiducials):
         camera.layout()  # raises where a mark has no drawing
     camera = replace(

@@ -1,4 +1,4 @@
-"""The points of a flat sheet or board checked over all pictures of it: what one picture alone shows off its place."""
+"""Check of the points of a flat sheet or board across all its images."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -23,12 +23,12 @@ from pipeline.results.measured_record import MeasuredScan
 
 Array = NDArray[np.float64]
 
-_WITNESSES = 3  # other pictures: two just tell where a point is that lies off its sheet
+_WITNESSES = 3  # other images: two only determine the place of a point that lies off its sheet, and check nothing
 
 
 @dataclass(frozen=True, eq=False)
 class _Sheet:
-    """The points of a sheet: their ids, and places (n, 3) along it and above it."""
+    """Points of a sheet: their ids, and coordinates (n, 3) in its plane and perpendicular to it."""
 
     ids: tuple[str, ...]
     places: Array
@@ -36,9 +36,15 @@ class _Sheet:
 
 @dataclass(frozen=True)
 class _Verdict:
-    """off_px: how far a mark lies from where all else puts it; chance: that of all pictures any right one lies so far
-    off; others: how many other pictures show the point; is_beyond: it is farther than the point itself can be off its
-    sheet."""
+    """Test result of one mark.
+
+    Attributes
+    ----------
+    off_px : distance from its predicted place.
+    chance : p-value, corrected for the number of marks in all images.
+    others : number of other images that show the point.
+    is_beyond : whether it is farther off than the point can lie off its sheet.
+    """
 
     off_px: float
     chance: float
@@ -47,8 +53,8 @@ class _Verdict:
 
 
 def check_sheet(project: Project, scans: Sequence[MeasuredScan]) -> tuple[MeasuredScan, ...]:
-    """The scans, those points of a sheet or board doubted or refused that lie where neither the other points of their
-    picture nor the other pictures of the sheet put them."""
+    """Doubt or reject sheet points that contradict the other points of their image and the other images of the
+    sheet."""
     sheet = _sheet(project)
     if sheet is None:
         return tuple(scans)
@@ -58,7 +64,7 @@ def check_sheet(project: Project, scans: Sequence[MeasuredScan]) -> tuple[Measur
 
 
 def _sheet(project: Project) -> _Sheet | None:
-    """The points of the project's board, as it was printed, or of its coded sheet, if that is one."""
+    """Points of the project's board, as printed, or of its flat coded sheet; None without either."""
     settings = project.targets
     if settings is not None and settings.board is not None:
         points = settings.board.object_points()
@@ -70,7 +76,7 @@ def _sheet(project: Project) -> _Sheet | None:
 
 
 def _images(project: Project, scans: Sequence[MeasuredScan], sheet: _Sheet) -> dict[str, ImagePoints]:
-    """What each image shows of the sheet, by its name; those of one camera share a lens."""
+    """Sheet points in each image, by its name; the images of one camera share a lens."""
     row = {id: i for i, id in enumerate(sheet.ids)}
     images: dict[str, ImagePoints] = {}
     for camera in project.cameras.values():
@@ -92,7 +98,7 @@ def _sheet_image(scan: MeasuredScan, row: Mapping[str, int]) -> SheetImage:
 
 
 def _verdicts(images: Sequence[ImagePoints], sheet: _Sheet) -> list[dict[str, _Verdict]]:
-    """Of each image, by point."""
+    """Test results by point, for each image."""
     if not images:
         return []
     shown = Counter(int(point) for image in images for point in image.index)
@@ -120,8 +126,10 @@ def _apply_verdicts(scan: MeasuredScan, verdicts: Mapping[str, _Verdict]) -> Mea
 
 
 def _apply_verdict(mark: MarkMeasurement, verdict: _Verdict) -> MarkMeasurement:
-    """Without another picture nobody knows whether the mark is off its place, or the point on the sheet; of a few which
-    one is off."""
+    """Set the status of a mark by its test.
+
+    Without another image, the mark and the point on the sheet may be at fault; with few others, any of them.
+    """
     if verdict.chance > SHEET_POINT_OFF_PLACE:
         return mark
     witnesses = "the sheet's other points" + (" and other pictures" if verdict.others else "")

@@ -1,4 +1,4 @@
-"""The single targets of a project: where they are in space, how they look, and which were seen elsewhere."""
+"""Single targets of a project: coordinates, prediction of their images, and checks of their measured places."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,21 +24,28 @@ from pipeline.results.measured_record import MeasuredScan
 Array = NDArray[np.float64]
 
 _ANGLES = np.arange(8) * np.pi / 4.0
-_CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)  # enough for what a lens does within a target
-_FLAT = 1e-6  # of the field's size: points this near a plane lie on a board
-LEAST_DIAMETER_PX = 2.5  # of a target in the scan: of a smaller one, size and blur cannot be told apart
-_TURN_RAD, _SHIFT = 0.1, 0.1  # how wrong an orientation may be, the latter of the distance
-_STEP = 1e-3  # of these, for derivatives
+_CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)  # enough to sample the lens distortion within a target
+_FLAT = 1e-6  # fraction of the field's size: points this close to a plane lie on a board
+LEAST_DIAMETER_PX = 2.5  # of a target in the scan: for a smaller one, size and blur are not separable
+_TURN_RAD, _SHIFT = 0.1, 0.1  # standard deviations of an orientation, the shift as a fraction of the distance
+_STEP = 1e-3  # fraction of these, for numerical derivatives
 
 
 def eccentricity_mm(model: ImageModel, centers: Array, normals: Array, radius: float) -> Array:
-    """The centre of each disk's image less the image of its centre, in the comparator, (n, 2) mm.
+    """Eccentricity of disks: centre of each disk's image less the image of its centre, in the comparator, (n, 2) mm.
 
-    centers (n, 3) and radius in object units, normals (n, 3) of unit length. With c the centre and n the normal in the
-    camera frame, z forward, the centre of the perspective ellipse is off by
-    `f r² [n_xy n_z + (c_xy / c_z) (1 - n_z²)] / (c_z² - r² (1 - n_z²))`: the pole of the disk's plane section, as from
-    the dual conic of its circle. The lens bends this ellipse; its centre of gravity, which a fitted ellipse finds, is
-    that of its outline as distortion and film image it.
+    Parameters
+    ----------
+    centers : (n, 3) in object units.
+    normals : (n, 3) of unit length.
+    radius : in object units.
+
+    Notes
+    -----
+    With c the centre and n the normal in the camera frame, z forward, the centre of the perspective ellipse is off by
+    `f r² [n_xy n_z + (c_xy / c_z) (1 - n_z²)] / (c_z² - r² (1 - n_z²))`: the pole of the disk's plane section, from the
+    dual conic of its circle. The lens distorts this ellipse. A fitted ellipse gives its centre of gravity, which is
+    computed from the outline after distortion and film deformation.
     """
     model, centers = model.reduced_to(centers)
     forward = np.array([1.0, 1.0, -1.0])
@@ -62,10 +69,10 @@ def eccentricity_mm(model: ImageModel, centers: Array, normals: Array, radius: f
 
 
 def _centre_of_gravity(outline: Array) -> Array:
-    """(n, 2) of the areas within outlines (n, k, 2) that are, but for a little, affine images of _CIRCLE.
+    """(n, 2) centres of gravity of the areas within outlines (n, k, 2) that are nearly affine images of _CIRCLE.
 
-    In the affine frame, a displacement of the unit circle moves its centre of gravity by twice the mean of its part
-    along the radius, times the radius vector.
+    In the affine frame, a displacement of the unit circle moves its centre of gravity by twice the mean of its radial
+    component times the radius vector.
     """
     mean = outline.mean(axis=1)
     linear = 2.0 * np.einsum("nki,kj->nij", outline - mean[:, None], _CIRCLE) / len(_CIRCLE)
@@ -78,8 +85,13 @@ def _centre_of_gravity(outline: Array) -> Array:
 def disk_images(
     model: ImageModel, pitch_um: tuple[float, float], centers: Array, normals: Array, radius: float
 ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-    """Predicted centres (n, 2) px, maps (n, 2, 2) from each disk's two radius vectors to pixels, perspective (n, 2) per
-    px, by which what is nearer to the camera is larger, and what is visible."""
+    """Predict the images of disks.
+
+    Returns
+    -------
+    Centres (n, 2) px; maps (n, 2, 2) from each disk's two radius vectors to pixels; perspective (n, 2) per px, the
+    relative change of scale across the disk; mask of the visible disks.
+    """
     first, second = across(normals)
     place, visible = model.comparator_from_object(centers)
     columns = []
@@ -98,9 +110,10 @@ def disk_images(
 def disk_normals(
     ids: Sequence[str], coordinates: Array, given: Mapping[str, Array], plane: Array | None, station: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Unit normals (n, 3) of disks at coordinates (n, 3), and which of them are known.
+    """Unit normals (n, 3) of disks at coordinates (n, 3), and a mask of the known ones.
 
-    Known are those that are given, and all of a flat field: its plane's normal. Others are taken to face the station.
+    Given normals are known, and those of a flat field: the normal of its plane. Other disks are assumed to face the
+    station.
     """
     towards = station - coordinates
     normals = towards / np.linalg.norm(towards, axis=1, keepdims=True)
@@ -114,7 +127,7 @@ def disk_normals(
 
 
 def plane_normal(coordinates: Array) -> Array | None:
-    """The normal of the plane that holds all points (n, 3); None where they are not flat, or too few to say."""
+    """Normal of the plane that contains all points (n, 3); None where they are not coplanar or fewer than four."""
     if len(coordinates) < 4:
         return None
     spread = np.linalg.svd(coordinates - coordinates.mean(axis=0), full_matrices=False)
@@ -123,7 +136,7 @@ def plane_normal(coordinates: Array) -> Array | None:
 
 
 def across(normals: Array) -> tuple[Array, Array]:
-    """Two unit vectors at right angles to each of the unit vectors (n, 3) and to one another."""
+    """Two unit vectors perpendicular to each of the unit vectors (n, 3) and to each other."""
     helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     first = np.cross(normals, helper)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -132,8 +145,16 @@ def across(normals: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class Field:
-    """The targets that a prediction can name: ids, coordinates (n, 3) and their standard deviations (n, 3), inf where
-    they are free; normals by id, the radius of the disks or half the length of the crosses."""
+    """Targets that can be predicted.
+
+    Attributes
+    ----------
+    ids : names.
+    xyz : (n, 3) coordinates.
+    sigmas : (n, 3) their standard deviations, inf where they are free.
+    normals : by id.
+    radius : of the disks, or half the length of the crosses.
+    """
 
     ids: tuple[str, ...]
     xyz: Array
@@ -142,12 +163,11 @@ class Field:
     radius: float
 
     def select(self, rows: Sequence[int]) -> "Field":
-        """Some of them."""
+        """A subset of the targets."""
         return replace(self, ids=tuple(self.ids[row] for row in rows), xyz=self.xyz[rows], sigmas=self.sigmas[rows])
 
     def predictions(self, model: ImageModel, scan: MeasuredScan, search_px: float) -> tuple[TargetPrediction, ...]:
-        """Where and how every target before the camera should be seen; crosses upright, their arms along the horizontal
-        and at right angles to it."""
+        """Predict the image of every target in front of the camera. Crosses are upright, with one arm horizontal."""
         normals, _ = disk_normals(self.ids, self.xyz, self.normals, plane_normal(self.xyz), model.station)
         centers, maps, perspective, visible = disk_images(model, scan.pitch_um, self.xyz, normals, self.radius)
         return tuple(
@@ -157,7 +177,7 @@ class Field:
 
 
 def target_field(project: Project) -> Field:
-    """The targets whose coordinates are known at least roughly."""
+    """Field of the targets whose coordinates are known, at least approximately."""
     places = {id: (point.X, point.Y, point.Z) for id, point in project.object_points.items()}
     known = {id: [prior for prior in priors if prior is not None] for id, priors in places.items()}
     complete = {id: priors for id, priors in known.items() if len(priors) == 3}
@@ -170,7 +190,7 @@ def target_field(project: Project) -> Field:
 
 
 def target_candidates(scan: Scan, settings: TargetSettings, diameters_px: tuple[float, float]) -> list[Candidate]:
-    """What looks like the targets anywhere in the scan, the strongest first."""
+    """Candidates for the targets in the whole scan, the strongest first."""
     smallest = max(diameters_px[0], LEAST_DIAMETER_PX)
     sizes = (smallest, max(diameters_px[1], smallest))
     if settings.cross_line is None:
@@ -183,7 +203,7 @@ def target_candidates(scan: Scan, settings: TargetSettings, diameters_px: tuple[
 def measure_single_targets(
     scan: Scan, predictions: Sequence[TargetPrediction], settings: TargetSettings
 ) -> tuple[MarkMeasurement, ...]:
-    """A mark for each prediction, fitted as the kind of target it is."""
+    """Measure each predicted target by the fit for its kind. Returns a mark for each."""
     options = TargetOptions(settings.polarity)
     if settings.cross_line is None:
         return measure_disks(scan, predictions, options)
@@ -193,8 +213,12 @@ def measure_single_targets(
 def checked_places(
     marks: Sequence[MarkMeasurement], field: Field, model: ImageModel, scan: MeasuredScan
 ) -> tuple[MarkMeasurement, ...]:
-    """The marks, those doubted or refused that lie where a right one seldom or never does; model: the image, oriented
-    to some degrees."""
+    """Compare the measured places with one another: improbable marks become weak, or are rejected.
+
+    Parameters
+    ----------
+    model : the image, with an orientation known to some degrees.
+    """
     observed = {mark.point: mark for mark in marks if mark.status.is_observation}
     places_px = np.array([mark.center_px for mark in observed.values()]).reshape(-1, 2)
     covariances = np.array([mark.covariance_px2 for mark in observed.values()]).reshape(-1, 2, 2)
@@ -221,7 +245,8 @@ def _apply_verdict(mark: MarkMeasurement, verdicts: Mapping[str, tuple[float, fl
 
 
 def target_places(field: Field, model: ImageModel, scan: MeasuredScan) -> TargetPlaces:
-    """Where an image shows the points of a field, by its orientation and their coordinates."""
+    """Predicted places of a field's points, with their derivatives with respect to the orientation and their
+    covariances from the coordinates."""
 
     def places(image: ImageModel, xyz: Array) -> Array:
         comparator, _ = image.comparator_from_object(xyz)

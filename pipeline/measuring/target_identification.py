@@ -1,4 +1,4 @@
-"""Which of the marks found in a scan is which target."""
+"""Identification of targets among the candidates of a scan."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -28,24 +28,31 @@ from pipeline.results.measured_record import MeasuredScan
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-_PAIRS = 60  # long pairs of targets that suggest where the pattern lies
-_TESTED = 400  # suggestions that are tested on all targets
-_OF_POSE = 3  # targets that can always be brought onto marks...
-_POSES = 4  # ...by so many poses
-_SIGMA_PX = 0.5  # of a mark as the search has it, eccentricity and lens included as far as they change quickly
-_FOUND_WITHIN_PX = 2.0  # how far the fit may move from where the search has a target
-_STRAYS = 1.5  # strongest marks a target: dust and texture are weaker than what was painted to be seen
-_NEIGHBOURS = 4  # named targets next to one that was missed, that tell how far off its place is
-_SIZES = 4.0  # how far a target's size may be from that in a picture that the whole field fills
+_PAIRS = 60  # distant pairs of targets that generate hypotheses on the placement
+_TESTED = 400  # hypotheses that are tested on all targets
+_OF_POSE = 3  # targets that always fit three marks, in P3P,
+_POSES = 4  # by up to four exterior orientations
+_SIGMA_PX = 0.5  # px, of a candidate, including locally varying effects of eccentricity and lens
+_FOUND_WITHIN_PX = 2.0  # px, largest shift of the fit from the candidate
+_STRAYS = 1.5  # candidates per target, the strongest: dust and texture are weaker than painted targets
+_NEIGHBOURS = 4  # identified targets next to a missed one, from which its offset is estimated
+_SIZES = 4.0  # largest ratio of a target's size to that in an image filled by the whole field
 
 
-_IN_THE_PICTURE = 0.4  # of its size: a principal point is no farther from its middle, unless much was cut off
+_IN_THE_PICTURE = 0.4  # of the scan's size: largest offset of the principal point from its centre, if not cropped
 
 
 @dataclass(frozen=True)
 class PatternOptions:
-    """How far the prediction may be off: a shift in px, a relative change of scale, a turn in rad; and, after these are
-    removed, what is left of tilt and relief as a share of the pattern's size."""
+    """Tolerances of a predicted pattern.
+
+    Attributes
+    ----------
+    shift_px : shift.
+    scale : relative change of scale.
+    turn_rad : rotation.
+    distortion : residuals after these are removed, due to tilt and relief, as a fraction of the pattern's size.
+    """
 
     shift_px: float = 1500.0
     scale: float = 0.15
@@ -60,20 +67,24 @@ class PatternOptions:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """matrix (2, 3): an affine map that takes predicted places onto marks; tried: of how many placements it is the one
-    that explains most."""
+    """Best placement of a pattern. matrix (2, 3): affine transformation from predicted places to candidates, px; tried:
+    number of placements it was chosen from."""
 
     matrix: Array
     tried: int
 
     def places(self, predicted_px: Array) -> Array:
-        """(n, 2) px."""
+        """(n, 2) places of the targets in px."""
         return _mapped(self.matrix, predicted_px)
 
 
 def recognise(predicted_px: Array, found_px: Array, options: PatternOptions | None = None) -> Placement | None:
-    """The placement that brings most of the predicted places (n, 2) onto marks found (m, 2), be it by chance; None
-    where there are too few of either, or all are too far off."""
+    """Find the placement with the most predicted places (n, 2) on candidates (m, 2), false alarm or not.
+
+    Returns
+    -------
+    None where there are fewer than three of either, or no placement is within the tolerances.
+    """
     options = options or PatternOptions()
     if len(predicted_px) < 3 or len(found_px) < 3:
         return None
@@ -88,9 +99,15 @@ def recognise(predicted_px: Array, found_px: Array, options: PatternOptions | No
 
 
 def log10_of_chance(places_px: Array, found_px: Array, gate_px: float, tried: int) -> float:
-    """The logarithm of the expected number of orientations by which so many marks (m, 2) would lie within the gate of
-    the places (n, 2) of targets by chance, marks being as dense as they are about these places; tried: placements, each
-    of which any three of its targets could orient."""
+    """Log10 of the expected number of false orientations with as many agreements.
+
+    Null hypothesis: candidates (m, 2) are random, with their density around the places (n, 2), px. An agreement is a
+    candidate within gate_px of a place.
+
+    Parameters
+    ----------
+    tried : number of placements; each could be oriented by any three of its targets.
+    """
     n = len(places_px)
     if n <= _OF_POSE or not len(found_px):
         return 0.0
@@ -101,7 +118,7 @@ def log10_of_chance(places_px: Array, found_px: Array, gate_px: float, tried: in
 
 
 def assign(predicted_px: Array, found_px: Array, gate_px: float) -> list[tuple[int, int]]:
-    """Pairs (target, mark), one to one, of least total distance, none farther apart than gate_px."""
+    """Pairs (target, candidate), one to one, with the least total distance; none farther apart than gate_px."""
     if not len(predicted_px) or not len(found_px):
         return []
     distances = cdist(predicted_px, found_px)
@@ -111,7 +128,7 @@ def assign(predicted_px: Array, found_px: Array, gate_px: float) -> list[tuple[i
 
 
 def _suggestions(predicted: Array, found: Array, options: PatternOptions) -> Array:
-    """Similarities (k, 2, 3) that bring a long pair of targets onto a pair of marks and stay near the prediction."""
+    """Similarities (k, 2, 3) that map a distant pair of targets onto a pair of candidates, within the tolerances."""
     first, second = _long_pairs(predicted)
     across = predicted[second] - predicted[first]
     a, b = (grid.ravel() for grid in np.meshgrid(np.arange(len(found)), np.arange(len(found)), indexing="ij"))
@@ -134,7 +151,7 @@ def _suggestions(predicted: Array, found: Array, options: PatternOptions) -> Arr
 
 
 def _long_pairs(points: Array) -> tuple[Indices, Indices]:
-    """The longest pairs, none of whose points takes part in too many."""
+    """The longest pairs, with a limited number per point."""
     first, second = np.triu_indices(len(points), 1)
     order = np.argsort(-np.linalg.norm(points[second] - points[first], axis=1), kind="stable")
     uses = np.zeros(len(points), dtype=int)
@@ -155,7 +172,7 @@ def _similarities(start: Array, across: Array, found_start: Array, found_across:
 
 
 def _most_agreed(similarities: Array, predicted: Array, found: Array) -> Array:
-    """The suggestions that most others repeat: near each other in where they put the pattern's ends."""
+    """The hypotheses with the most similar ones, in terms of the places of the pattern's corners."""
     if len(similarities) <= _TESTED:
         return similarities
     corners = np.array([predicted.min(axis=0), predicted.max(axis=0)])
@@ -167,7 +184,7 @@ def _most_agreed(similarities: Array, predicted: Array, found: Array) -> Array:
 
 
 def _support(matrix: Array, predicted: Array, tree: cKDTree, tolerance_px: float) -> NDArray[np.bool_]:
-    """Which targets have a mark within the tolerance, a mark counting once."""
+    """Mask of the targets with a candidate within the tolerance; each candidate counts once."""
     distances, nearest = _nearest(tree, _mapped(matrix, predicted))
     supported: NDArray[np.bool_] = distances <= tolerance_px
     order = np.argsort(distances, kind="stable")
@@ -180,7 +197,7 @@ def _support(matrix: Array, predicted: Array, tree: cKDTree, tolerance_px: float
 def _tightened(
     candidates: Array, predicted: Array, found: Array, tree: cKDTree, size: float, options: PatternOptions
 ) -> Array:
-    """The best candidate after affine refits with a shrinking tolerance."""
+    """The best candidate matrix after affine fits with a decreasing tolerance."""
     refined: list[Array] = []
     for matrix in candidates:
         for share in (1.0, 0.7, 0.5, 0.35, 0.35):
@@ -195,20 +212,20 @@ def _tightened(
 
 
 def _score(matrix: Array, predicted: Array, tree: cKDTree, tolerance_px: float) -> float:
-    """Targets explained, each counting less the farther off it is."""
+    """Number of targets explained, with weights that decrease with distance."""
     supported = _support(matrix, predicted, tree, tolerance_px)
     distances, _ = _nearest(tree, _mapped(matrix, predicted[supported]))
     return float(np.sum(1.0 - (distances / tolerance_px) ** 2))
 
 
 def _nearest(tree: cKDTree, points: Array) -> tuple[Array, Indices]:
-    """Distance and index of the mark nearest to each place."""
+    """Distance and index of the candidate nearest to each place."""
     distances, nearest = tree.query(points)
     return np.asarray(distances, dtype=np.float64), np.asarray(nearest, dtype=np.intp)
 
 
 def _affine(source: Array, target: Array) -> Array:
-    """Least squares; a similarity where three points would leave no check."""
+    """Least-squares affine transformation; a similarity if three points would leave no redundancy."""
     if len(source) < 4:
         return _similarity(source, target)
     design = np.column_stack([source, np.ones(len(source))])
@@ -228,7 +245,7 @@ def _mapped(matrix: Array, points: Array) -> Array:
 
 
 def likely_diameters_px(field: Field, measured: MeasuredScan) -> tuple[float, float]:
-    """The smallest and the largest that a target may have, if the field fills the picture more or less."""
+    """Smallest and largest plausible diameter of a target, if the field roughly fills the image."""
     size = float(np.linalg.norm(np.ptp(field.xyz, axis=0)))
     filling = 2.0 * field.radius / size * float(np.hypot(measured.width_px, measured.height_px))
     return filling / _SIZES, filling * _SIZES
@@ -236,15 +253,22 @@ def likely_diameters_px(field: Field, measured: MeasuredScan) -> tuple[float, fl
 
 @dataclass(frozen=True, eq=False)
 class NamedField:
-    """The image as oriented by the names; candidates: of the points that have one, by id; gate_px: how far a target
-    may lie from the place that the image gives it."""
+    """Oriented image with identified targets.
+
+    Attributes
+    ----------
+    model : the oriented image.
+    candidates : the identified candidates, by point.
+    gate_px : largest distance of a target from its place by the model.
+    """
 
     model: ImageModel
     candidates: Mapping[str, Candidate]
     gate_px: float
 
     def predictions(self, field: Field, measured: MeasuredScan) -> tuple[TargetPrediction, ...]:
-        """Named targets where they were found, the others where the image and the named ones about them put them."""
+        """Predict the targets: identified ones at their candidates, others at the model's place plus the median offset
+        of the neighbours."""
         predicted = field.predictions(self.model, measured, self.gate_px)
         named = [one for one in predicted if one.point in self.candidates]
         off = np.array([self.candidates[one.point].center_px - one.center_px for one in named])
@@ -275,10 +299,17 @@ def name_field(
     candidates: Sequence[Candidate],
     codes: Mapping[int, int] | None = None,
 ) -> NamedField | str:
-    """Name the candidates, which come in the order of their strength; or why they have no names.
+    """Identify the candidates, which are sorted by strength.
 
-    model: the image's camera and film, its orientation not used, nor its principal distance where the camera's file
-    gives none; codes: the point (by index) that a code says some candidates (by index) are.
+    Parameters
+    ----------
+    model : camera and film of the image. Its exterior orientation is not used, nor its principal distance where the
+        camera file gives none.
+    codes : point, by index, of some candidates, by index, from their codes.
+
+    Returns
+    -------
+    The oriented image, or the reason of the failure.
     """
     places = np.array([one.center_px for one in candidates]).reshape(-1, 2)
     ideal = _ideal(model, measured, places)
@@ -308,15 +339,17 @@ def _named(
 
 
 def _ideal(model: ImageModel, measured: MeasuredScan, places_px: Array) -> Array:
-    """(n, 2) mm about the principal point, free of what is known of the distortion."""
+    """(n, 2) mm, image coordinates relative to the principal point, corrected for the known distortion."""
     camera = model.camera_from_comparator(comparator_from_pixel(places_px, measured.pitch_um))
     ideal, found = model.lens.ideal_from_observed(camera)
     return np.asarray(np.where(found[:, None], ideal, camera) - model.lens.interior[1:])
 
 
 def camera_model(camera: CameraFile, measured: MeasuredScan) -> ImageModel | str:
-    """The image with its orientation left open; or what is missing. Where the camera's file gives no principal
-    distance, it is the scan's diagonal, as good as nothing."""
+    """Image model with the exterior orientation left open, or the reason why there is none.
+
+    Where the camera file gives no principal distance, the scan's diagonal serves as a rough value.
+    """
     film = _camera_from_comparator(camera, measured)
     if film is None:
         return "too few fiducials were measured to know where the camera's frame lies in the scan"
@@ -328,8 +361,8 @@ def camera_model(camera: CameraFile, measured: MeasuredScan) -> ImageModel | str
 
 
 def misplaced_principal_point(camera: CameraFile, measured: MeasuredScan) -> str:
-    """A sentence where a camera without fiducials has a principal point that is hardly in the picture: as if it counted
-    from the middle of the scan."""
+    """A sentence if the principal point of a camera without fiducials is hardly within the scan, as if counted from its
+    centre."""
     if camera.fiducials or camera.principal_point_mm is None:
         return ""
     size = comparator_from_pixel(np.array([measured.width_px - 1, measured.height_px - 1]), measured.pitch_um)
@@ -344,7 +377,7 @@ def misplaced_principal_point(camera: CameraFile, measured: MeasuredScan) -> str
 
 
 def frame_mm(camera: CameraFile, model: ImageModel, measured: MeasuredScan) -> Array:
-    """(2, 2) least and greatest camera coordinates of what the scan shows of the exposed frame."""
+    """(2, 2) mm, smallest and largest camera coordinates of the exposed frame within the scan."""
     last = np.array([measured.width_px - 1, measured.height_px - 1])
     corners = comparator_from_pixel(np.array([(0, 0), (1, 0), (0, 1), (1, 1)]) * last, measured.pitch_um)
     shown_mm = model.camera_from_comparator(corners)
@@ -355,7 +388,7 @@ def frame_mm(camera: CameraFile, model: ImageModel, measured: MeasuredScan) -> A
 
 
 def _camera_from_comparator(camera: CameraFile, measured: MeasuredScan) -> Film | None:
-    """The film as the measurement of the fiducials took it to be; none for a camera that has none."""
+    """Film transformation from the measured fiducials; the identity for a camera without fiducials."""
     if not camera.fiducials:
         return Film("none", np.zeros(0), np.zeros(2))
     if measured.frame.pixel_from_camera is None:

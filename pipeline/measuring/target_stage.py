@@ -1,4 +1,4 @@
-"""The targets of one scan: boards name their own points; single disks and crosses get their names by prediction."""
+"""Targets of one scan: boards identify their own points; single disks and crosses are identified by prediction."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -45,23 +45,31 @@ _MIRRORED = (
     "The board is mirrored: in a mirror, from its back, or the picture is flipped. Its points are named as on the "
     "board. If that is meant, write transparent = true under [targets]; else flip the picture."
 )
-LEAST_PAIRS = 4  # of points and marks that name an image's targets
+LEAST_PAIRS = 4  # pairs of points and marks needed to identify an image's targets
 Array = NDArray[np.float64]
 
-_GATE_SHARE = 0.01  # of the scan's size: what tilt and relief leave between the pattern laid on and its marks
-_SLACK_PX = 3.0  # beyond what the resection's residuals say, within which a mark is the target predicted there
+_GATE_SHARE = 0.01  # fraction of the scan's diagonal: residuals of an affine placement due to tilt and relief
+_SLACK_PX = 3.0  # a mark within this plus _SLACK_SIGMAS of the resection is the target predicted there
 _SLACK_SIGMAS = 6.0
-_MOST_LOG10_CHANCE = -1.0  # of agreements as good by chance: the project says that the pattern is in the scan
-_STRONGEST = 3  # patches a target, by contrast: dust and texture are weaker than what was painted to be seen
-_NEAR = 0.65  # of the scan's size from its middle: targets there may be in it
-_SIZE_SLACK = 1.5  # how wrong the approximate distance may make a target's size
+_MOST_LOG10_CHANCE = -1.0  # log10 of the expected false alarms; lenient, since the pattern is known to be in the scan
+_STRONGEST = 3  # candidates per target, by contrast: dust and texture are weaker than painted targets
+_NEAR = 0.65  # of the scan's size, from its centre: targets predicted closer may be in the scan
+_SIZE_SLACK = 1.5  # largest factor of the error of a target's size due to the approximate distance
 
 
 @dataclass(frozen=True, eq=False)
 class SoughtTargets:
-    """settings: what the targets are. field: those whose coordinates are known, if only roughly; coded: the same where
-    some bear codes. surveyed: whether a file of points gives them one by one. unit: of their coordinates, which is that
-    many mm."""
+    """Targets to be measured.
+
+    Attributes
+    ----------
+    settings : kind of the targets.
+    field : the targets with coordinates, known at least approximately.
+    coded : the points of a sheet or field with coded targets; None without codes.
+    surveyed : whether a file of points gives their coordinates.
+    unit : of the coordinates.
+    unit_mm : length of the unit in mm.
+    """
 
     settings: TargetSettings
     field: Field
@@ -72,7 +80,8 @@ class SoughtTargets:
 
     @classmethod
     def from_project(cls, project: Project) -> "SoughtTargets":
-        """Raises InputError for single targets and rings that nothing in the project could name."""
+        """Build from a project. Raises InputError for single targets and rings that nothing in the project can
+        identify."""
         settings = project.targets
         assert settings is not None
         coded = CodedPoints.from_project(project, settings) if settings.code is not None else None
@@ -83,7 +92,7 @@ class SoughtTargets:
 
     @property
     def ids(self) -> tuple[str, ...]:
-        """The names of the marks that are sought."""
+        """Names of the marks to be measured."""
         if self.coded is not None:
             return self.coded.ids
         return tuple(self.settings.board.object_points()) if self.settings.board else self.field.ids
@@ -102,7 +111,7 @@ def _check(project: Project, settings: TargetSettings, field: Field) -> None:
         )
     nearest = cKDTree(field.xyz).query(field.xyz, k=[2])[0]
     spacing, diameter = float(np.quantile(nearest, 0.9)), 2.0 * field.radius
-    if diameter > spacing:  # coordinates in another unit than the project says
+    if diameter > spacing:  # probably the unit of the coordinates is wrong
         raise InputError(
             f"{project.path}: [targets] of {diameter * project.unit_mm:g} mm would cover one another: nine of ten "
             f"points of [object] lie within {spacing * project.unit_mm:.3g} mm of the next one if their coordinates "
@@ -110,12 +119,11 @@ def _check(project: Project, settings: TargetSettings, field: Field) -> None:
         )
 
 
-# What is known of an image before its targets are: the camera as its file gives it, on the film as its fiducials show
-# it lying in the scan.
+# The image model before the targets are known: the camera from its file, and the film from the fiducials.
 
 
 def measure_targets(options: ScanOptions, scan: Scan, measured: MeasuredScan) -> MeasuredScan:
-    """The scan with its targets beside its fiducials: a mark for each target that could be in it."""
+    """Measure the targets of a scan, in addition to its fiducials: one mark for each target that could be in it."""
     sought = options.targets
     if sought is None:
         return measured
@@ -132,7 +140,7 @@ def measure_targets(options: ScanOptions, scan: Scan, measured: MeasuredScan) ->
         problems = (f"The board was not found: {board.reason}.",) if board.reason else refused
         if board.ambiguous:
             problems = (f"No point of the board is used: {board.ambiguous}. Cover all but one, or cut the scan.",)
-        # A board that is the same after a half turn may be named either way, unless its points were surveyed singly.
+        # A board with symmetry under a half turn may be named either way, unless its points were surveyed.
         notes = tuple(f"{note}." for note in board.notes) if sought.surveyed else ()
         mirrored = (_MIRRORED,) if board.is_mirrored and not settings.transparent else ()
         return replace_targets(measured, board.marks, (*problems, *mirrored, *notes), Code.NO_BOARD)
@@ -152,7 +160,7 @@ def replace_targets(
     problems: Sequence[str] = (),
     code: Code = Code.UNNAMED,
 ) -> MeasuredScan:
-    """The scan with these targets instead of the ones it has; code: of the problems."""
+    """Replace the targets of a scan. code: of the problems."""
     frame = measured.frame
     fiducials = tuple(mark for mark in frame.marks if mark.kind in ON_FILM)
     reasons = (Reason(problem, code) for problem in problems)
@@ -162,8 +170,13 @@ def replace_targets(
 def _oriented_by_targets(
     options: ScanOptions, sought: SoughtTargets, scan: Scan, measured: MeasuredScan
 ) -> tuple[tuple[ImageModel, Sequence[TargetPrediction]] | str, tuple[str, ...]]:
-    """The image and where each target should be, by the approximate orientation or, without one that fits, by the
-    pattern alone; or why not. And what is to be said of the image."""
+    """Orient the image by its targets: from the approximate orientation or, if there is none that fits, from the
+    pattern alone.
+
+    Returns
+    -------
+    The model with the predicted targets, or the reason of the failure; and notes.
+    """
     camera, settings, field = options.camera, sought.settings, sought.field
     model = camera_model(camera, measured)
     if isinstance(model, str):
@@ -195,7 +208,8 @@ def _too_small(sought: SoughtTargets, largest_px: float) -> str:
 
 
 def _diameters_px(predictions: Sequence[TargetPrediction], measured: MeasuredScan) -> tuple[float, float] | None:
-    """The sizes that the targets in or near the scan should have; None where none is large enough."""
+    """Smallest and largest expected diameter of the targets in or near the scan, with tolerance; None where none is
+    large enough."""
     size = np.array([measured.width_px, measured.height_px])
     near = [p for p in predictions if np.all(np.abs(p.center_px - size / 2.0) < _NEAR * size)]
     axes = np.array([p.half_axes_px for p in near]).reshape(-1, 2)
@@ -207,8 +221,11 @@ def _diameters_px(predictions: Sequence[TargetPrediction], measured: MeasuredSca
 def _oriented(
     model: ImageModel, field: Field, scan: Scan, measured: MeasuredScan, settings: TargetSettings
 ) -> NamedField | str:
-    """The image oriented by the disks found and the pattern they make, and which of them are which targets: what a lens
-    that is not known moves by far more than a pixel has its name, too. Or why there are no names."""
+    """Orient the image by matching the detected disks with the predicted pattern, and identify the targets.
+
+    Targets that an unknown lens distortion displaces by far more than a pixel are identified, too. Returns the reason
+    if the identification fails.
+    """
     size = float(np.hypot(measured.width_px, measured.height_px))
     predictions = field.predictions(model, measured, _SLACK_PX)
     predicted = np.array([prediction.center_px for prediction in predictions]).reshape(-1, 2)
@@ -244,7 +261,7 @@ def _oriented(
 def _resected(
     model: ImageModel, field: Field, named: Sequence[tuple[str, Array]], measured: MeasuredScan
 ) -> tuple[ImageModel, float] | None:
-    """The image oriented by named marks, and how far off they may lie from it, px."""
+    """Space resection from identified marks. Returns the model and the gate for further marks in px, or None."""
     if len(named) < LEAST_PAIRS:
         return None
     row = {id: i for i, id in enumerate(field.ids)}

@@ -1,4 +1,4 @@
-"""The third step of measuring: all scans of a project together, with joins of parts and natural points."""
+"""Third step of measuring: all scans of a project together, with joins between partial scans and natural tie points."""
 
 import re
 from collections.abc import Sequence
@@ -25,23 +25,26 @@ from pipeline.text.wording import capitalised
 
 Array = NDArray[np.float64]
 
-_LEAST_MARK_PX = 20.0  # about a mark whose size nobody has noted
-_CHECKED = 3  # fiducials that agree by themselves: fewer fit any frame
-_GATE_MM, _GATE_SHARE = 0.3, 0.003  # of fiducials beside where the other scan puts them: film, and a share of the way
-_FEWEST = 3  # joins that tell how two scans lie to one another
+_LEAST_MARK_PX = 20.0  # px, assumed for a mark without a recorded size
+_CHECKED = 3  # fiducials that check one another: fewer fit any frame
+_GATE_MM, _GATE_SHARE = 0.3, 0.003  # largest discrepancy of fiducials: film deformation, and a fraction of the span
+_FEWEST = 3  # joins needed to estimate the transformation between two scans
 _TIE_NAME = re.compile(r"tie\d+")
 
 _NO_FRAME = Reason(
     "No natural points are sought here: without fiducials nobody knows where the frame lies.", Code.NO_FRAME
 )
-TiedScan = NewType("TiedScan", MeasuredScan)  # beside all others of its project
+TiedScan = NewType("TiedScan", MeasuredScan)  # after the checks against all others of its project
 
 
 def add_joins(
     project: Project, scans: Sequence[MeasuredScan], count: Count, workers: Executor | None
 ) -> tuple[MeasuredScan, ...]:
-    """The scans, those of one frame with the joins that they share; where their fiducials contradict these, with a
-    problem, and then those of the scan that shows fewer are rejected."""
+    """Add joins to the partial scans of each frame.
+
+    Where the fiducials contradict the joins, both scans get a problem, and the fiducials of the scan with fewer of them
+    are rejected.
+    """
     by_frame: dict[str, list[MeasuredScan]] = {}
     for scan in scans:
         if frame := project.scanned_frame(scan.frame.image):
@@ -85,7 +88,7 @@ def _add_marks(scan: MeasuredScan, marks: Sequence[MarkMeasurement], problems: S
 
 
 def _agreed(scans: Sequence[MeasuredScan]) -> list[MeasuredScan]:
-    """The scans, their fiducials held against those of the others through the joins."""
+    """Check the fiducials of each pair of scans against one another through the joins."""
     result = {scan.frame.image: scan for scan in scans}
     checked = set[str]()
     for i, first in enumerate(scans):
@@ -105,7 +108,7 @@ def _agreed(scans: Sequence[MeasuredScan]) -> list[MeasuredScan]:
 
 
 def _excuse_outside(scan: MeasuredScan, parts: Sequence[MeasuredScan]) -> MeasuredScan:
-    """Fiducials outside of a scan that another part shows are not missed."""
+    """Give another reason to fiducials outside of a scan that another partial scan shows: they are not missing."""
     shown = {point: part.frame.image for part in reversed(parts) for point in _fiducials(part)}
     marks = [
         replace(mark, reason=Reason(f"it lies in {shown[mark.point]}, another scan of its frame", Code.OTHER_PART))
@@ -125,7 +128,8 @@ def _fiducials(scan: MeasuredScan) -> dict[str, Array]:
 
 
 def _movement(first: MeasuredScan, second: MeasuredScan) -> Array | None:
-    """(2, 3) from pixels of the first scan to those of the second, by their joins; None where these are too few."""
+    """(2, 3) similarity from pixels of the first scan to those of the second, from their joins; None where there are
+    too few."""
     places = [
         {mark.point: mark.center_px for mark in scan.frame.marks if mark.kind == "join" and mark.status.is_observation}
         for scan in (first, second)
@@ -140,7 +144,7 @@ def _movement(first: MeasuredScan, second: MeasuredScan) -> Array | None:
 
 
 def _discrepancy_mm(first: MeasuredScan, second: MeasuredScan, second_from_first: Array) -> float | None:
-    """How far, rms, the fiducials of the second lie from where the frame of the first puts them, through the joins."""
+    """RMS distance of the second scan's fiducials from their places by the first scan's frame and the joins, in mm."""
     frame, second_frame = first.frame.pixel_from_camera, second.frame.pixel_from_camera
     if frame is None or second_frame is None or not _fiducials(second):
         return None
@@ -158,7 +162,7 @@ def _span_mm(first: MeasuredScan, second: MeasuredScan) -> float:
 
 
 def _contradicted(scan: MeasuredScan, other: MeasuredScan, off_mm: float) -> MeasuredScan:
-    """With a problem; the fiducials of the scan that shows no more of them are rejected."""
+    """Add a problem; reject the fiducials of this scan if it has no more of them than the other."""
     what = (
         f"the fiducial marks contradict those of {other.frame.image}, another part of this frame: what joins both puts "
         f"them {off_mm:.1f} mm apart"
@@ -175,7 +179,8 @@ def _contradicted(scan: MeasuredScan, other: MeasuredScan, off_mm: float) -> Mea
 
 
 def _unchecked(scan: MeasuredScan, is_checked: bool) -> MeasuredScan:
-    """Few fiducials that nothing checks are weak; what the joins check needs no word on its few fiducials."""
+    """Mark fiducials that are too few to check one another as weak, unless the joins check them; then drop that
+    problem."""
     if is_checked:
         problems = tuple(problem for problem in scan.frame.problems if problem.codes != (Code.NO_CHECK,))
         return replace(scan, frame=replace(scan.frame, problems=problems))
@@ -187,7 +192,7 @@ def _unchecked(scan: MeasuredScan, is_checked: bool) -> MeasuredScan:
 
 
 def _changed(scan: MeasuredScan, status: Status, reason: Reason) -> list[MarkMeasurement]:
-    """The marks, those fiducials that are observations with another status."""
+    """The marks, with another status for those fiducials that are observations."""
     return [
         replace(mark, status=status, reason=reason) if mark.kind == "fiducial" and mark.status.is_observation else mark
         for mark in scan.frame.marks
@@ -195,7 +200,7 @@ def _changed(scan: MeasuredScan, status: Status, reason: Reason) -> list[MarkMea
 
 
 def check_tie_names(project: Project) -> None:
-    """Raises InputError where a given point has a name that a natural point would take."""
+    """Raise InputError where a given point has a name reserved for natural points."""
     reserved = sorted(id for id in project.object_points if _TIE_NAME.fullmatch(id)) if project.ties else []
     if reserved:
         raise InputError(
@@ -207,7 +212,7 @@ def check_tie_names(project: Project) -> None:
 def add_ties(
     project: Project, settings: TieSettings, scans: Sequence[MeasuredScan], count: Count, workers: Executor | None
 ) -> tuple[MeasuredScan, ...]:
-    """The scans with the natural points that they share."""
+    """Measure natural tie points and add them to the scans."""
     frames = {scan.frame.image: _tie_frame(project, scan) for scan in scans}
     placed = [frame for frame in frames.values() if frame is not None]
     ties = measure_ties(placed, settings.options, count, workers)
@@ -226,7 +231,7 @@ def add_ties(
 
 
 def _tie_frame(project: Project, scan: MeasuredScan) -> TieFrame | None:
-    """None where the camera has fiducials and too few of them were measured."""
+    """Frame for the tie points; None where the camera has fiducials and too few of them were measured."""
     camera = project.image_camera(scan.frame.image)
     taken = [
         (*mark.center_px, max(mark.quality.get("size_px", 0.0), _LEAST_MARK_PX))
@@ -248,8 +253,12 @@ def _tie_frame(project: Project, scan: MeasuredScan) -> TieFrame | None:
 def tie_scans(
     project: Project, scans: Sequence[MeasuredScan], reporter: Reporter, executor: Executor | None = None
 ) -> tuple[TiedScan, ...]:
-    """Checked scans as all of the project together show them, in their order: points of a sheet or board that
-    contradict its other pictures, what joins the parts of frames, and natural points."""
+    """Check and complete the scans across the whole project: sheet points, joins of partial scans, natural tie points.
+
+    Returns
+    -------
+    The scans in their order.
+    """
     together = check_sheet(project, [scan for scan in scans if not scan.failure])
     if project.has_parts:
         with reporter.stage("parts joined of") as count:

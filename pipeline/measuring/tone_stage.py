@@ -1,5 +1,5 @@
-"""The tone curve of each scanner: as the project sets it, as the files say it, or else from a few of its scans, before
-all are measured."""
+"""Tone curve of each scanner: from the project, the files, or estimated from some of its scans before all are
+measured."""
 
 from collections.abc import Mapping, Sequence
 from hashlib import sha256
@@ -19,21 +19,33 @@ from pipeline.progress import Reporter
 from pipeline.provenance import fingerprint
 from pipeline.results.measured_record import read_tone_information, tone_information_record
 
-_SAMPLES = 8  # scans of a scanner that tell its curve to the others
+_SAMPLES = 8  # scans of a scanner from which its curve is estimated
 _SET = "it is set in the project"
 
 
 def tone_before(setting: float | str, said: Sequence[ToneInformation], scan: Path) -> Tone:
-    """What is believed of the curve of a scan before it is measured, as the project, the file and other scans say: what
-    it says itself is not in it yet. setting: as the project has it; said: by the others."""
+    """Prior tone curve of a scan, from the project, the file and other scans. The scan's own estimate is not yet
+    included.
+
+    Parameters
+    ----------
+    setting : from the project.
+    said : information from other scans.
+    """
     return _prior(setting, scan).include_information(said)
 
 
 def collect_tones(
     project: Project, reporter: Reporter, measure: Measure, memory: Memory
 ) -> Mapping[str, tuple[ToneInformation, ...]]:
-    """By image what others of its scanner say of the curve: some scans of each, where marks of the camera lean on it. A
-    scan that cannot be measured says nothing. What was said once stays, whatever scans come or go."""
+    """Estimate the tone curve of each scanner from a sample of scans whose marks depend on it.
+
+    Scans that cannot be measured are left out. Estimates are kept, whatever scans are added or removed.
+
+    Returns
+    -------
+    By image, the information from other scans of its scanner.
+    """
     names = [name for name in project.scans if _leans_on_tone(project.image_camera(name))]
     if project.tone != "auto" or len(names) < 2:
         return {}
@@ -62,7 +74,7 @@ def collect_tones(
 
 
 def _key(project: Project, kind: str, names: Sequence[str]) -> str:
-    """Of what the scans of a scanner say: by which marks and settings they are asked."""
+    """Key of a scanner's estimates: the marks and settings that they depend on."""
     firsts = {project.image_camera(name).path: name for name in reversed(names)}
     tasks = scan_tasks(project, sorted(firsts.values()))
     options = sorted(task.fiducials_alone(project.tone).options_json() for task in tasks)
@@ -78,14 +90,14 @@ def _prior(setting: float | str, scan: Path) -> Tone:
 
 
 def _kind(project: Project, image: str) -> str:
-    """One scanner codes light in one way, but for files of another kind or that say another curve."""
+    """Group of scans with one tone curve: same scanner, file type and declared curve."""
     scan = project.scans[image]
     curve_hash = sha256(np.ascontiguousarray(_prior(project.tone, scan).base).tobytes()).hexdigest()[:8]
     return f"{project.image_scanner(image)} {scan.suffix.lower()} {curve_hash}"
 
 
 def _leans_on_tone(camera: CameraFile) -> bool:
-    """Whether it has marks that another curve moves: those with edges on one side only."""
+    """Whether a camera has marks that an error of the curve displaces: those with edges on one side only."""
     return any(_has_tip(one.mark) for one in camera.layout_marks)
 
 
