@@ -1,1 +1,1 @@
-"""What the program writes, each format beside its reader."""
+"""Result files: each module writes and reads one format."""

@@ -1,4 +1,4 @@
-"""From the adjustment to the record of it that `adjustment.json` keeps."""
+"""Conversion of an adjustment to the record that `adjustment.json` holds."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -64,7 +64,7 @@ from pipeline.types import Array
 ANGLES = ("omega", "phi", "kappa", "angle")
 DEG_PER_RAD = 180.0 / math.pi
 UM_PER_MM = 1e3
-MOST_IMAGES = 500  # up to which projection is worth its time with every adjustment
+MOST_IMAGES = 500  # in larger networks projection_uncertainty takes too long to run with every adjustment
 
 
 def adjustment_record(
@@ -72,7 +72,7 @@ def adjustment_record(
     frames_mm: Mapping[str, tuple[float, float]] | None = None,
     made_from: Mapping[str, str] | None = None,
 ) -> AdjustmentRecord:
-    """The record of an adjustment; see `write_adjustment` for the parameters."""
+    """Convert an adjustment to its record; parameters as in `write_adjustment`."""
     network, variance = adjustment.network, adjustment.variance
     used = {image.camera for image in network.images}
     sizes_mm = frames_mm or {}
@@ -177,7 +177,7 @@ def _camera(adjustment: Adjustment, camera: Camera, frame_mm: tuple[float, float
 
 
 def _projection(adjustment: Adjustment, camera: str) -> Iterator[ProjectionRecord]:
-    """How well a camera projects at infinity, and at the median distance of its targets."""
+    """Precision of projected points at infinity and at the median distance of the targets."""
     if len(adjustment.network.images) > MOST_IMAGES:
         return
     by_images = adjustment.cluster_covariance_of if adjustment.unmodelled_mm else lambda _: None
@@ -200,7 +200,7 @@ def _board(adjustment: Adjustment, number: int) -> BoardRecord:
 def _terms(
     adjustment: Adjustment, kind: Kind, owner: str, terms: Mapping[str, Prior]
 ) -> tuple[dict[str, Quantity], tuple[GroupTestRecord, ...]]:
-    """Every term with its test, and the test of all together."""
+    """Terms with their significance tests, and the tests of groups."""
     tests, together = _tests(adjustment, kind, owner)
     quantities = {
         name: _tested(_quantity(adjustment, Parameter(kind, owner, "", name), prior), tests.get(name))
@@ -212,7 +212,7 @@ def _terms(
 def _tests(
     adjustment: Adjustment, kind: Kind, owner: str
 ) -> tuple[dict[str, SignificanceTest], tuple[GroupTestRecord, ...]]:
-    """Tests of significance: of single parameters by name, and of groups."""
+    """Significance tests: of single parameters by name, and of groups."""
     tests = adjustment.significance.get((kind, owner), ())
     groups = (GroupTestRecord(each.name, each.parameters, each.statistic, each.p) for each in tests if each.is_group)
     return {each.name: each for each in tests if not each.is_group}, tuple(groups)
@@ -247,7 +247,7 @@ def _image(adjustment: Adjustment, image: Image) -> ImageRecord:
 
 
 def _point(adjustment: Adjustment, point: ObjectPoint) -> PointRecord:
-    """Where it is, and what was given of it; a point of a bent board is off the place that is given."""
+    """Coordinates of a point with their priors; the deflection of a bent board is added."""
     given = {"X": point.X, "Y": point.Y, "Z": point.Z}
     place = {axis: _quantity(adjustment, Parameter.point(point.id, axis), prior) for axis, prior in given.items()}
     for board in adjustment.network.boards:
@@ -264,7 +264,7 @@ def _point(adjustment: Adjustment, point: ObjectPoint) -> PointRecord:
 
 
 def _quantity(adjustment: Adjustment, parameter: Parameter, given: Prior | None = None, scale: float = 1.0) -> Quantity:
-    """Value and a-posteriori sigma, NaN without a solution: a zero would say that the quantity was fixed."""
+    """Value and a-posteriori sigma; NaN without a solution, since zero means that the quantity was fixed."""
     return Quantity(
         value=scale * adjustment.value(parameter),
         sigma=scale * adjustment.sigma(parameter) if _has_solution(adjustment) else math.nan,
@@ -304,7 +304,7 @@ def _residuals(adjustment: Adjustment) -> tuple[ResidualRecord, ...]:
 
 
 def _camera_places(adjustment: Adjustment, xy_mm: Array) -> Array:
-    """Every observation's comparator coordinates (n, 2) in its own camera, mm."""
+    """Transform comparator coordinates (n, 2) of all observations to camera coordinates (n, 2), mm."""
     images = np.array(adjustment.network.observations.image)
     camera_mm = np.empty_like(xy_mm)
     for name in sorted(set(images)):
@@ -314,7 +314,7 @@ def _camera_places(adjustment: Adjustment, xy_mm: Array) -> Array:
 
 
 def _larger(w: Array) -> float:
-    """The standardised residual of the axis that fits worse; NaN where neither axis is checked."""
+    """Standardised residual of larger absolute value; NaN if neither axis is checked."""
     known = w[np.isfinite(w)]
     return float(known[np.argmax(np.abs(known))]) if known.size else math.nan
 
@@ -362,7 +362,7 @@ def _contradiction(test: CalibrationTest) -> ContradictionRecord:
 
 
 def _reliability(result: Reliability, marks: int) -> ReliabilityRecord:
-    """marks: the first that are tested, whose numbers stand with the residuals."""
+    """Record of the reliability without its first units, the marks: those are in the residuals."""
     return ReliabilityRecord(
         result.probabilities.alpha,
         result.probabilities.power,
@@ -379,7 +379,7 @@ def _reliability(result: Reliability, marks: int) -> ReliabilityRecord:
 
 
 def _tested_given(result: Reliability, unit: int, axis: int) -> TestedGiven:
-    """An error is infinite where nothing checks the coordinate."""
+    """Test of a given coordinate; the smallest error is infinite if it is unchecked."""
     tested = result.tested[unit]
     scale, at = _scale(tested, axis), (unit, axis)
     return TestedGiven(

@@ -1,4 +1,4 @@
-"""`adjustment.json`, the result with everything it came from, and `adjustment.npz`, its full covariance."""
+"""`adjustment.json`, the adjustment with its input, and `adjustment.npz`, its covariance."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,26 +22,26 @@ def write_adjustment(
     made_from: Mapping[str, str] | None = None,
     frames_mm: Mapping[str, tuple[float, float]] | None = None,
 ) -> None:
-    """Write the result to `path` and its covariance beside it, each by way of a temporary file.
+    """Write the adjustment to `path` and its covariance to `adjustment.npz` in the same folder, atomically.
 
-    Angles are in degrees in the JSON file and in rad in the covariance. A camera without an image and a point that no
-    image shows are not in it. Where no object point is observed, there is no exterior orientation (null) and no
-    calibration (a camera's values are those given, their sigmas null).
+    Angles are in degrees in the JSON file and in rad in the covariance. Cameras without images and unobserved points
+    are left out. If no object point is observed, the exterior orientations are null, and the cameras keep their given
+    values with null sigmas.
 
     Parameters
     ----------
     made_from
-        Fingerprints of all that was adjusted; the covariance has that of the JSON file.
+        Fingerprints of the input; the covariance file holds the fingerprint of the JSON file.
     frames_mm
-        By camera the size of its frame.
+        Frame size (width, height) by camera.
 
     Raises
     ------
     InputError
-        Where a file cannot be written.
+        If a file cannot be written.
     """
     record = adjustment_record(adjustment, frames_mm, made_from)
-    # Both are whole before either takes its place: a covariance belongs to its adjustment.
+    # Both files are complete before either is replaced, so that the covariance always matches the adjustment.
     with atomic_path(covariance_path(path)) as covariance, atomic_path(path) as result:
         with result.open("w", encoding="utf-8", newline="\n") as file:
             file.writelines(json_text(record))
@@ -52,7 +52,7 @@ def write_adjustment(
 
 
 def observed_mm(path: Path, content: AdjustmentRecord, camera: str) -> Array:
-    """Where a camera has observations (n, 2), in its frame. Raises InputError where it has none."""
+    """Camera coordinates (n, 2) of a camera's observations, mm. Raises InputError if it has none."""
     places = content.observed_mm(camera)
     if not len(places):
         raise InputError(f"{path}: no image of {camera!r} has an observation, so nothing says how large its frame is.")
@@ -65,7 +65,7 @@ def read_adjustment(path: Path) -> AdjustmentRecord:
     Raises
     ------
     InputError
-        For a file that is missing, no JSON, or lacks a key or has a wrong value at one.
+        If the file is missing, is not JSON, lacks a key, or has an invalid value.
     """
     try:
         return read_record(AdjustmentRecord, path, AGAIN)

@@ -1,7 +1,7 @@
-"""What `adjustment.json` holds, as its readers take it: one class a table of the file.
+"""Content of `adjustment.json`: one class per table of the file.
 
-Angles are in degrees, other units stand in the names; NaN is a number that means nothing. Defaults are for files of
-earlier versions.
+Angles are in degrees; other units are in the names. NaN: undefined, null in the file. Defaults serve files of earlier
+versions.
 """
 
 import math
@@ -38,7 +38,7 @@ from pipeline.types import Array
 
 @dataclass(frozen=True, slots=True)
 class GivenQuantity:
-    """What was known beforehand; sigma 0: it was fixed, NaN: nothing was."""
+    """Prior value of a quantity; sigma 0: fixed, NaN: free."""
 
     value: float
     sigma: float
@@ -46,9 +46,9 @@ class GivenQuantity:
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """An estimate with its a-posteriori standard deviation, 0 of a fixed value and NaN without a solution.
+    """Estimate with its a-posteriori standard deviation, 0 if fixed and NaN without a solution.
 
-    given: what was known of it; t, p: its significance test, where there is one.
+    given: prior; t, p: statistic and p-value of its significance test, None if not tested.
     """
 
     value: float
@@ -60,7 +60,7 @@ class Quantity:
 
 @dataclass(frozen=True, slots=True)
 class GroupTestRecord:
-    """An F-test of several parameters together."""
+    """F-test of several parameters together."""
 
     group: str
     parameters: tuple[str, ...]
@@ -70,7 +70,7 @@ class GroupTestRecord:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DistortionRecord:
-    """A distortion family with its settings; axes: said where they are not the camera's; parameters: by name."""
+    """Distortion family with its settings. axes: None if those of the camera; parameters: estimates by name."""
 
     family: str
     r0_mm: float = 0.0
@@ -80,11 +80,11 @@ class DistortionRecord:
     parameters: Mapping[str, Quantity] = field(default_factory=dict, metadata={REST: True})
 
     def __post_init__(self) -> None:
-        """Raises ValueError for settings that there are not."""
+        """Raises ValueError for invalid settings."""
         self.settings()
 
     def settings(self) -> Distortion:
-        """The distortion without what is known of its parameters."""
+        """Distortion family with its settings, without parameters."""
         return Distortion(
             self.family,
             decentering=self.decentering or "reduced",
@@ -94,7 +94,7 @@ class DistortionRecord:
 
     @classmethod
     def from_distortion(cls, distortion: Distortion, parameters: Mapping[str, Quantity]) -> "DistortionRecord":
-        """Of a distortion with the estimates of its parameters."""
+        """Record of a distortion with the estimates of its parameters."""
         model = family(distortion.family)
         return cls(
             family=distortion.family,
@@ -116,7 +116,7 @@ class PrincipalPointRecord:
 
 @dataclass(frozen=True, slots=True)
 class FiducialRecord:
-    """rho: correlation of x and y."""
+    """Fiducial mark of a camera. rho: correlation of x and y."""
 
     x_mm: Quantity
     y_mm: Quantity
@@ -134,7 +134,7 @@ class FiducialRecord:
 
 @dataclass(frozen=True, slots=True)
 class LensReachRecord:
-    """How far out a lens is known (see `LensReach`); share: of the way to the corner of the frame."""
+    """Extent of the observations of a lens (see `LensReach`). share: radius_mm as a fraction of corner_mm."""
 
     radius_mm: float
     corner_mm: float
@@ -144,7 +144,7 @@ class LensReachRecord:
     share: float
 
     def sentence(self, camera: str, unit: ImageUnit = FILM_UNIT) -> str:
-        """How far out the lens of a camera is known, how well there and beyond."""
+        """State the radius up to which the distortion is known, and its precision within and beyond."""
         inside, corner = (f"{um * unit.per_um:.2g} {unit.short_name}" for um in (self.sigma_um, self.corner_sigma_um))
         is_known = math.isfinite(self.corner_sigma_um)
         beyond = f"there its standard deviation is {corner}" if is_known else "the lens shows nothing there"
@@ -158,9 +158,9 @@ class LensReachRecord:
 
 @dataclass(frozen=True, slots=True)
 class ProjectionRecord:
-    """Standard deviations of projected points at the nodes of a grid over a camera's picture, both axes ascending.
+    """Standard deviations of projected points at the nodes of a grid over the image, both axes ascending.
 
-    distance: of the points, object units, NaN at infinity; sigma_um: by rows of y_mm.
+    distance: of the points, object units, NaN at infinity; sigma_um: one row for each y_mm.
     """
 
     distance: float
@@ -171,7 +171,8 @@ class ProjectionRecord:
 
 @dataclass(frozen=True, slots=True)
 class ConvertedFrom:
-    """Of a converted lens: the family that it was given in, and how far the two are apart over the frame."""
+    """Source of a converted lens. source: its distortion before conversion; same: whether the two models agree;
+    largest_um, rms_um: their difference over the frame."""
 
     source: DistortionRecord = field(metadata={KEY: "from"})
     same: bool
@@ -181,7 +182,11 @@ class ConvertedFrom:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraRecord:
-    """An interior orientation, its distortion, and the fiducial marks by their names."""
+    """Interior orientation, distortion and fiducial marks by name.
+
+    significance: F-tests of groups of parameters; lens_known: None without observations or a solution; projection:
+    empty if it was not computed; converted: source of a converted lens.
+    """
 
     principal_distance_mm: Quantity
     principal_point_mm: PrincipalPointRecord
@@ -194,17 +199,17 @@ class CameraRecord:
 
     @property
     def is_calibrated(self) -> bool:
-        """Whether there is an interior orientation, and not just fiducials."""
+        """Whether the interior orientation was determined, not only the fiducials."""
         return math.isfinite(self.principal_distance_mm.sigma)
 
     @property
     def interior(self) -> Mapping[str, Quantity]:
-        """c, x0, y0 and the distortion's parameters by their names."""
+        """c, x0, y0 and the distortion parameters by name."""
         point = self.principal_point_mm
         return {"c": self.principal_distance_mm, "x0": point.x, "y0": point.y, **self.distortion.parameters}
 
     def lens(self) -> Lens:
-        """The lens, without its covariance."""
+        """Lens without its covariance."""
         distortion, known = self.distortion.settings(), self.interior
         values = [known[name].value if name in known else 0.0 for name in parameter_names(distortion.family)]
         interior = np.array([known[name].value for name in INTERIOR_NAMES])
@@ -213,7 +218,7 @@ class CameraRecord:
 
 @dataclass(frozen=True, slots=True)
 class TakingLensRecord:
-    """The lens of a digital camera that photographed the film; interior_mm: c, x0', y0' in the comparator."""
+    """Lens of a digital camera that photographed the film. interior_mm: c, x0', y0' in comparator coordinates."""
 
     family: str
     interior_mm: tuple[float, float, float]
@@ -232,8 +237,8 @@ class TakingLensRecord:
 
 @dataclass(frozen=True, slots=True)
 class ScannerRecord:
-    """How far a scanner puts a point off its place, mm, as products of Legendre polynomials over an extent; lens: of
-    the digital camera that is the scanner."""
+    """Geometric error of a scanner, mm: products of Legendre polynomials over an extent given by center_mm and half_mm.
+    lens: that of the digital camera used as a scanner, None otherwise."""
 
     center_mm: tuple[float, float]
     half_mm: tuple[float, float]
@@ -242,13 +247,13 @@ class ScannerRecord:
     lens: TakingLensRecord | None = None
 
     def __post_init__(self) -> None:
-        """Raises ValueError for a term that there is not."""
+        """Raises ValueError for an unknown term."""
         unknown = [name for name in self.terms if not is_term(name)]
         if unknown:
             raise ValueError(f"has the term {unknown[0]!r}, which no bend has")
 
     def bend(self) -> tuple[Bend, Array]:
-        """The bend with the values (k,) of its terms."""
+        """Scanner error model and the values (k,) of its terms."""
         values = np.array([term.value for term in self.terms.values()], dtype=float)
         lens = None if self.lens is None else self.lens.lens()
         return Bend(tuple(self.terms), self.center_mm, self.half_mm, lens), values
@@ -256,7 +261,7 @@ class ScannerRecord:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoardRecord:
-    """How far a board's middle stands off its plane, object units; points: how many it has."""
+    """Bending of a board: deflection of its middle from its plane, object units. points: number of its points."""
 
     points: int
     terms: Mapping[str, Quantity] = field(metadata={REST: True})
@@ -265,20 +270,20 @@ class BoardRecord:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilmRecord:
-    """A film transformation; its parameters by their keys in the file."""
+    """Film transformation of an image; parameters by their keys in the file."""
 
     kind: str
     mirrored: bool = False
     parameters: Mapping[str, Quantity] = field(default_factory=dict, metadata={REST: True})
 
     def __post_init__(self) -> None:
-        """Raises ValueError for a kind that there is not, or one of its parameters missing."""
+        """Raises ValueError for an unknown kind or a missing parameter."""
         for name in film_parameter_names(self.kind):
             if not self.parameters.keys() & {name, f"{name}_deg"}:
                 raise ValueError(f"has no key {name!r}")
 
     def film(self, middle_mm: Array) -> Film:
-        """middle_mm (2,): a place about in the middle of the image, in the comparator."""
+        """Film transformation. middle_mm: (2,) approximate centre of the image in comparator coordinates."""
         known = self.parameters
         values = [
             known[name].value if name in known else math.radians(known[f"{name}_deg"].value)
@@ -289,7 +294,7 @@ class FilmRecord:
 
 @dataclass(frozen=True, slots=True)
 class ExteriorRecord:
-    """An exterior orientation, object units and degrees."""
+    """Exterior orientation, object units and degrees."""
 
     X0: Quantity
     Y0: Quantity
@@ -309,7 +314,7 @@ class ExteriorRecord:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImageRecord:
-    """An image: its camera, its scanner ("" without one), the frame that it is a part of."""
+    """Image. scanner: "" without one; part_of: the frame of which it is a partial scan, None if whole."""
 
     camera: str = ""
     scanner: str = ""
@@ -320,7 +325,7 @@ class ImageRecord:
 
 @dataclass(frozen=True, slots=True)
 class PointRecord:
-    """An object point, in the unit of the object coordinates."""
+    """Object point, in object units."""
 
     X: Quantity
     Y: Quantity
@@ -337,14 +342,17 @@ class PointRecord:
 
 @dataclass(frozen=True, slots=True)
 class PartRecord:
-    """A scan of a frame in parts: the standard deviation of its film transformation at its corners."""
+    """Partial scan of a frame. corner_sigma_um: largest standard deviation of its film transformation at a corner."""
 
     corner_sigma_um: float
 
 
 @dataclass(frozen=True, slots=True)
 class JoinRecord:
-    """Where two scans of a frame show one place, and how far they differ there."""
+    """Tie point of two partial scans of a frame.
+
+    images: the two scans; x_mm, y_mm: mean camera coordinates; dx_um, dy_um: second scan minus first.
+    """
 
     point: str
     images: tuple[str, ...]
@@ -356,7 +364,10 @@ class JoinRecord:
 
 @dataclass(frozen=True, slots=True)
 class PartMarkRecord:
-    """A mark of a frame in parts, in its camera frame."""
+    """Mark of a frame scanned in parts: camera coordinates, standard deviations and correlation.
+
+    image: the partial scan in which it was measured.
+    """
 
     image: str
     point: str
@@ -370,7 +381,7 @@ class PartMarkRecord:
 
 @dataclass(frozen=True, slots=True)
 class JoinedFrameRecord:
-    """A frame that was scanned in parts."""
+    """Frame scanned in parts."""
 
     parts: Mapping[str, PartRecord]
     joins: tuple[JoinRecord, ...]
@@ -379,7 +390,7 @@ class JoinedFrameRecord:
 
 @dataclass(frozen=True, slots=True)
 class Sigma0Record:
-    """What sigma0 was estimated from (see `VarianceFactor`)."""
+    """Basis of sigma0 (see `VarianceFactor`)."""
 
     redundancy: Finite
     a_priori: bool
@@ -388,10 +399,18 @@ class Sigma0Record:
 
 @dataclass(frozen=True, kw_only=True)
 class AdjustmentRecord:
-    """An adjustment as it is kept: the result with everything that it came from.
+    """Adjustment as stored: the results with their input.
 
-    made_from: fingerprints of all that was adjusted, by its kind. observations, conditions: a prior is one of each, a
-    measured point two. left_out: by image why it was left out. covariance: what of it adjustment.npz holds.
+    Attributes
+    ----------
+    made_from : fingerprints of the input by kind.
+    observations, conditions : a prior counts as one, a measured point as two.
+    sigma0_from : None in files of earlier versions; see `variance_factor`.
+    covariance : description of the content of adjustment.npz.
+    left_out : reason for each image that was left out.
+    variance_factors, variance_sigmas : estimated variance factors of groups of observations, and their standard
+        deviations.
+    cameras, scanners, boards, images, frames, points : by name; frames are those scanned in parts.
     """
 
     reseau: str
@@ -436,7 +455,7 @@ class AdjustmentRecord:
     history: tuple[Iteration, ...] = ()
 
     def __post_init__(self) -> None:
-        """Raises ValueError for names that nothing in the file has."""
+        """Raises ValueError for references to undefined cameras or images."""
         for name, image in self.images.items():
             if image.camera not in (*self.cameras, ""):
                 raise ValueError(f"images[{name!r}].camera is {image.camera!r}, which cameras do not hold")
@@ -446,23 +465,23 @@ class AdjustmentRecord:
 
     @property
     def variance_factor(self) -> Sigma0Record:
-        """What sigma0 was estimated from; files of earlier versions do not say it."""
+        """Basis of sigma0; derived from the redundancy for files of earlier versions."""
         return self.sigma0_from or Sigma0Record(self.redundancy, self.redundancy <= 0, ())
 
     @property
     def has_sigma0(self) -> bool:
-        """Whether sigma0 was estimated, and standard deviations are not a priori ones."""
+        """Whether sigma0 was estimated, so that standard deviations are a posteriori."""
         return not self.variance_factor.a_priori
 
     def image_camera(self, image: str) -> str:
-        """The name of an image's camera; the only one where the file does not say."""
+        """Name of an image's camera; the only camera if the file gives none."""
         return self.images[image].camera or next(iter(self.cameras))
 
     def camera_images(self, camera: str) -> list[str]:
         return [image for image in self.images if self.image_camera(image) == camera]
 
     def films(self, images: Iterable[str]) -> dict[str, Film]:
-        """The film transformations of some images, in their order."""
+        """Film transformations of images, in the given order."""
         places = defaultdict[str, list[tuple[float, float]]](list)
         for row in self.residuals:
             places[row.image].append((row.x_mm, row.y_mm))
@@ -470,7 +489,7 @@ class AdjustmentRecord:
         return {image: self.images[image].transformation.film(middle) for image, middle in middles.items()}
 
     def estimated_lenses(self) -> Iterator[tuple[str, LensReachRecord]]:
-        """How far out the lenses are known of which a parameter was estimated, where their frame's size is known."""
+        """Extents of the lenses with an estimated distortion parameter and a known frame size, by camera."""
         for name, camera in self.cameras.items():
             reach = camera.lens_known
             is_estimated = any(each.sigma > 0.0 for each in camera.distortion.parameters.values())
@@ -478,7 +497,7 @@ class AdjustmentRecord:
                 yield name, reach
 
     def observed_mm(self, camera: str) -> Array:
-        """(n, 2) where a camera has observations, in its frame."""
+        """(n, 2) camera coordinates of a camera's observations, mm."""
         rows = (row for row in self.residuals if self.image_camera(row.image) == camera)
         places = np.array([(row.camera_x_mm, row.camera_y_mm) for row in rows], dtype=float).reshape(-1, 2)
         return np.asarray(places[np.isfinite(places).all(axis=1)])

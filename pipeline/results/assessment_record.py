@@ -1,4 +1,4 @@
-"""What `adjustment.json` holds of residuals, tests and reliability: one class a table of the file."""
+"""Residuals, tests and reliability in `adjustment.json`: one class per table of the file."""
 
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -11,7 +11,20 @@ ParameterText = Annotated[str, parameter_from_text]  # as `Parameter.text`
 
 @dataclass(frozen=True, slots=True)
 class ResidualRecord:
-    """An observation: its residual in the scan and in the camera, and what tests it. w: of the axis that fits worse."""
+    """Residual of an image observation, with its tests.
+
+    Attributes
+    ----------
+    vx_um, vy_um : residual in comparator coordinates.
+    redundancy_x, redundancy_y : redundancy numbers.
+    w_x, w_y, w : standardised residuals by axis, and that of larger absolute value.
+    weight : weight factor of the robust estimation, 1 if it was not used.
+    sx_um, sy_um : a-priori standard deviations.
+    x_mm, y_mm : comparator coordinates.
+    camera_x_mm, camera_y_mm, camera_vx_um, camera_vy_um : camera coordinates and the residual in them.
+    tau_x, tau_y, statistic, smallest_error_x_um, smallest_error_y_um, effect_sigmas : see `Reliability`; effect_sigmas
+        is the larger of both axes. None if the reliability was not computed.
+    """
 
     image: str
     point: str
@@ -46,7 +59,7 @@ class ResidualRecord:
 
 @dataclass(frozen=True, slots=True)
 class DistanceRecord:
-    """A given distance, in the unit of the object coordinates; see `FurtherResidual`."""
+    """Residual of a given distance, object units; see `FurtherResidual`."""
 
     start: str = field(metadata={KEY: "from"})
     end: str = field(metadata={KEY: "to"})
@@ -64,7 +77,7 @@ class DistanceRecord:
 
 @dataclass(frozen=True, slots=True)
 class FiducialDistanceRecord:
-    """A given distance between two fiducials of a camera, mm; its residual and detectable error in µm."""
+    """Residual of a given distance between two fiducials of a camera, mm; residual and detectable error in µm."""
 
     camera: str
     start: str = field(metadata={KEY: "from"})
@@ -87,7 +100,7 @@ class FiducialDistanceRecord:
 
 @dataclass(frozen=True, slots=True)
 class ObservedQuantity:
-    """A quantity of an earlier calibration (mm) or a coordinate of an antenna (object unit), as observed."""
+    """Residual of a quantity of an earlier calibration (mm) or of an antenna coordinate (object units)."""
 
     name: str
     value: float
@@ -100,7 +113,7 @@ class ObservedQuantity:
 
 @dataclass(frozen=True, slots=True)
 class ContradictionDirection:
-    """Where the images put a quantity less where it was observed, with the standard deviation of that."""
+    """Value from the images minus observed value of a quantity, and its standard deviation."""
 
     name: ParameterText
     difference: float
@@ -109,7 +122,11 @@ class ContradictionDirection:
 
 @dataclass(frozen=True, slots=True)
 class ContradictionRecord:
-    """An earlier calibration as a whole: whether the images contradict it, and in what, the most telling first."""
+    """Compatibility (F) test of the images with an earlier calibration.
+
+    freedom: degrees of freedom of the numerator; direction: the quantities in contradiction, the most significant
+    first.
+    """
 
     F: float
     freedom: int
@@ -119,7 +136,7 @@ class ContradictionRecord:
 
 @dataclass(frozen=True, slots=True)
 class NullDirectionRecord:
-    """What the observations cannot see: what moves together, why, and what would remove it."""
+    """Null direction of a singular network: its parameters, cause and remedy."""
 
     parameters: tuple[ParameterText, ...]
     cause: str
@@ -128,7 +145,7 @@ class NullDirectionRecord:
 
 @dataclass(frozen=True, slots=True)
 class CorrelationRecord:
-    """Quantities that the observations hardly separate."""
+    """Highly correlated quantities. rho: correlation."""
 
     parameters: tuple[ParameterText, ...]
     rho: float
@@ -138,7 +155,7 @@ class CorrelationRecord:
 
 @dataclass(frozen=True, slots=True)
 class SuspectRecord:
-    """A suspect observation (see `Suspect`); its error in mm, object units or degrees."""
+    """Suspected gross error (see `Suspect`); error in mm, object units or degrees."""
 
     name: str
     group: str
@@ -158,7 +175,7 @@ class SuspectRecord:
 
 @dataclass(frozen=True, slots=True)
 class OuterRecord:
-    """What the worst undetected error does to a camera parameter."""
+    """Outer reliability of a camera parameter: the effect of the worst undetected error, absolute and in sigmas."""
 
     parameter: ParameterText
     effect: float
@@ -168,7 +185,7 @@ class OuterRecord:
 
 @dataclass(frozen=True, slots=True)
 class TestedGiven:
-    """A given coordinate, tested, in mm, object units or degrees."""
+    """Test of a given coordinate, in mm, object units or degrees; see `Reliability`."""
 
     name: str
     group: str
@@ -183,7 +200,11 @@ class TestedGiven:
 
 @dataclass(frozen=True, slots=True)
 class ReliabilityRecord:
-    """What the observations check, and what an undetected error would do (see `Reliability`)."""
+    """Inner and outer reliability (see `Reliability`).
+
+    alpha, power, family: significance level and power of a single test, and family-wise level; outer: by camera
+    parameter; unchecked: coordinates without redundancy; given: tests of given coordinates.
+    """
 
     alpha: float
     power: float

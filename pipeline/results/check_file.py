@@ -1,4 +1,4 @@
-"""`check.json`, the adjustment against OpenCV's calibration: per camera a verdict, its reason and a table."""
+"""`check.json`: comparison of the adjustment with OpenCV's calibration, by camera a verdict, its reason and a table."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ Verdict = Literal["agrees", "differs", "not possible"]
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value with its a-posteriori standard deviation."""
+    """Value with its a-posteriori standard deviation."""
 
     value: float
     sigma: float
@@ -20,7 +20,8 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Row:
-    """One parameter of OpenCV's model by both programs; difference_sigmas: in those of the adjustment."""
+    """Parameter of OpenCV's model from both programs. difference_sigmas: absolute difference in standard deviations of
+    the adjustment."""
 
     name: str
     unit: str
@@ -36,7 +37,8 @@ class Row:
 
 @dataclass(frozen=True)
 class PixelCalibration:
-    """Camera matrix and rms a point of OpenCV's calibration, in pixels from the centre of the first one, y down."""
+    """Camera matrix and RMS per point of OpenCV's calibration, in pixels; origin at the centre of the first pixel, y
+    down."""
 
     fx: Finite
     fy: Finite
@@ -47,8 +49,8 @@ class PixelCalibration:
 
 @dataclass(frozen=True)
 class CornersCheck:
-    """OpenCV's calibration of a board's points as measured here (reseau) and as OpenCV itself finds them (opencv), in
-    the images and points that both have; detector: OpenCV's functions; not_found: images where these find no board."""
+    """OpenCV's calibration from board corners measured by reseau and by OpenCV, with the images and points that both
+    found. detector: OpenCV's functions; not_found: images in which these found no board."""
 
     detector: str
     images: int
@@ -60,8 +62,14 @@ class CornersCheck:
 
 @dataclass(frozen=True)
 class CameraCheck:
-    """The comparison of one camera. rms in um a point (not an axis); the refit's residual in um, rms over the image;
-    corners_px: of a digital camera's board, where its pictures are at hand."""
+    """Comparison of one camera.
+
+    Attributes
+    ----------
+    rms_opencv_um, rms_reseau_um : RMS residual per point, not per axis.
+    refit_residual_um : RMS over the image of the residual of the refit.
+    corners_px : check of the board corners of a digital camera; None if its images are not available.
+    """
 
     verdict: Verdict
     reason: str
@@ -76,7 +84,7 @@ class CameraCheck:
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """The comparison of every camera, and the verdict on the whole; made_from: the adjustment's fingerprint."""
+    """Comparison of all cameras with the overall verdict. made_from: fingerprint of the adjustment."""
 
     reseau: str = ""
     made_from: Mapping[str, str] = field(default_factory=dict)
@@ -95,5 +103,5 @@ class Check:
 
 
 def read_check(path: Path) -> Check:
-    """Read `check.json`. Raises FileNotFoundError, and InputError for what is no such file."""
+    """Read `check.json`. Raises FileNotFoundError, and InputError for invalid content."""
     return read_record(Check, path, "Run `reseau check` again; it writes this file.")

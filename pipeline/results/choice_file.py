@@ -1,4 +1,4 @@
-"""`choose.json`: the models that were compared, their tests, the one chosen and why."""
+"""`choose.json`: the models compared, their tests, the chosen model and the reasons."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -14,7 +14,7 @@ from pipeline.results.record_json import read_record
 
 @dataclass(frozen=True)
 class ModelRecord:
-    """A film transformation, a distortion family with its estimated parameters, the terms of scanners' bends."""
+    """Film transformation, distortion family with its estimated parameters, and terms of scanner errors by scanner."""
 
     transformation: str
     family: str
@@ -28,7 +28,7 @@ class ModelRecord:
 
 @dataclass(frozen=True)
 class ParameterCorrelation:
-    """Two parameters that the data hardly separate."""
+    """Two highly correlated parameters."""
 
     parameters: tuple[str, str]
     correlation: float
@@ -36,7 +36,7 @@ class ParameterCorrelation:
 
 @dataclass(frozen=True, kw_only=True)
 class CandidateRecord:
-    """A model as it was adjusted; with a problem (why it has no solution) it has no figures."""
+    """Adjusted model. problem: why it has no solution; the statistics are then None."""
 
     name: str
     transformation: str
@@ -85,7 +85,7 @@ class CandidateRecord:
 
 @dataclass(frozen=True)
 class ModelTest:
-    """The F-test of a model against a richer one, by their names."""
+    """F-test of a model against one with more parameters. degrees: of freedom, numerator and denominator."""
 
     simpler: str
     richer: str
@@ -96,7 +96,7 @@ class ModelTest:
 
 @dataclass(frozen=True, kw_only=True)
 class ChoiceRecord:
-    """The choice as it is kept; given: the project's own model; made_from: fingerprints of all that was adjusted."""
+    """Model choice as stored. given: the model in the project; made_from: fingerprints of the input."""
 
     reseau: str = ""
     made_from: Mapping[str, str] = field(default_factory=dict)
@@ -109,7 +109,7 @@ class ChoiceRecord:
 
 
 def choice_record(choice: Choice, made_from: Mapping[str, str]) -> ChoiceRecord:
-    """The record of a choice."""
+    """Convert a choice to its record."""
     return ChoiceRecord(
         reseau=version("reseau"),
         made_from=made_from,
@@ -123,5 +123,5 @@ def choice_record(choice: Choice, made_from: Mapping[str, str]) -> ChoiceRecord:
 
 
 def read_choice(path: Path) -> ChoiceRecord:
-    """Read `choose.json`. Raises FileNotFoundError, and InputError for what is no such file."""
+    """Read `choose.json`. Raises FileNotFoundError, and InputError for invalid content."""
     return read_record(ChoiceRecord, path, "Run `reseau choose` again; it writes this file.")

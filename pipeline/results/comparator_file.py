@@ -1,4 +1,4 @@
-"""comparator.csv: comparator coordinates of every mark, also of those that were not found."""
+"""comparator.csv: comparator coordinates of all marks, including those not found."""
 
 import math
 import os
@@ -28,10 +28,10 @@ from pipeline.types import Array
 COLUMNS = (
     "image", "point", "kind", "x_mm", "y_mm", "sx_mm", "sy_mm", "rho", "col_px", "row_px", "status", "reason",
 )  # fmt: skip
-PIXEL_SIGMAS = ("scol_px", "srow_px")  # of lists of pixels; rho then is that of column and row
+PIXEL_SIGMAS = ("scol_px", "srow_px")  # columns of files in pixels only; rho then correlates column and row
 _KINDS: dict[str, ObservationKind] = {kind: kind for kind in get_args(ObservationKind)}
 
-CameraPerson = tuple[str, str]  # camera, and who
+CameraPerson = tuple[str, str]  # camera and name of the reviewer
 _NOBODY: Mapping[CameraPerson, int] = MappingProxyType({})
 _DECISIONS = re.compile(r'^"?# (\d+) decisions of (.+), camera (.+?)"?$', re.MULTILINE)
 _HEAD = 4096
@@ -40,7 +40,14 @@ _PITCH = re.compile(r'^"?# pitch of (.+): ([0-9.e+-]+) um across, ([0-9.e+-]+) u
 
 @dataclass(frozen=True, slots=True)  # archives have many
 class ComparatorPoint:
-    """A mark in an image. xy_mm (2,) and sigma_mm (2,), None where it has none; rho: correlation of x and y."""
+    """Mark in an image, in comparator coordinates.
+
+    Attributes
+    ----------
+    xy_mm, sigma_mm : (2,) coordinates and standard deviations, None if unknown.
+    rho : correlation of x and y.
+    line : line number in the file, 0 if it was not read from one.
+    """
 
     image: str
     point: str
@@ -54,8 +61,8 @@ class ComparatorPoint:
 
 
 class MarkRow(NamedTuple):
-    """A mark in an image as it was measured. center_px: column and row; covariance_px2: variances of the column and the
-    row, and their covariance. None where it has none."""
+    """Mark in an image as measured. center_px: column and row; covariance_px2: variances of column and row, and their
+    covariance; both None if unknown."""
 
     image: str
     point: str
@@ -67,7 +74,7 @@ class MarkRow(NamedTuple):
 
 
 def mark_rows(frames: Iterable[FrameMeasurement]) -> Iterator[MarkRow]:
-    """Every mark of every frame, by the frames' names."""
+    """Yield all marks of all frames, sorted by frame."""
     for frame in sorted(frames, key=lambda frame: frame.image):
         for mark in frame.marks:
             center = None if mark.center_px is None else (float(mark.center_px[0]), float(mark.center_px[1]))
@@ -83,22 +90,25 @@ def write_comparator(
     measurement: str = "",
     decided: Mapping[CameraPerson, int] | None = None,
 ) -> None:
-    """Write every mark, in their order. Raises InputError where the file cannot be written.
+    """Write comparator.csv, marks in the given order. Raises InputError if the file cannot be written.
 
-    pitch_um: by image, NaN of a scan that could not be measured. measurement: the digest of the judging in
-    measurement.db that has the same marks. decided: how many decisions of whom stand behind the marks of a camera.
+    Parameters
+    ----------
+    pitch_um : pixel pitch across and down by image; NaN for a scan that could not be measured.
+    measurement : digest of the checked results in measurement.db with the same marks.
+    decided : number of review decisions by camera and reviewer.
     """
     rows = (_line(mark, *pitch_um[mark.image]) for mark in marks)
     with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
         file.writelines(
             f"{line}\n" for line in chain(_head(pitch_um, measurement, decided or {}), rows)
-        )  # an archive's are many
+        )  # streamed: an archive has many marks
         file.flush()
         os.fsync(file.fileno())
 
 
 def points_text(points: Sequence[ComparatorPoint], pitch_um: Mapping[str, tuple[float, float]]) -> str:
-    """The same file of marks that were read, or came otherwise; pixels stay empty where no pitch is known."""
+    """Text of comparator.csv for points; pixel coordinates stay empty if the pitch is unknown."""
     lines = _head(pitch_um)
     return "\n".join([*lines, *(_point_line(point, pitch_um.get(point.image)) for point in points)]) + "\n"
 
@@ -136,17 +146,17 @@ def _single_line(name: str) -> str:
 
 
 def comparator_from_pixel(center_px: Array, pitch_um: tuple[float, float]) -> Array:
-    """(..., 2) column and row to x (right) and y (up) in mm."""
+    """Convert (..., 2) column and row to x (right) and y (up), mm."""
     return np.multiply(center_px, np.array([pitch_um[0], -pitch_um[1]]) / 1000.0)
 
 
 def pixel_from_comparator(xy_mm: Array, pitch_um: tuple[float, float]) -> Array:
-    """(..., 2) x (right) and y (up) in mm to column and row."""
+    """Convert (..., 2) x (right) and y (up), mm, to column and row."""
     return np.divide(xy_mm, np.array([pitch_um[0], -pitch_um[1]]) / 1000.0)
 
 
 def _line(mark: MarkRow, across_um: float, down_um: float) -> str:
-    """As `comparator_from_pixel` has it, one by one: an archive has many."""
+    """Line of a mark; equivalent to `comparator_from_pixel`, but faster for single marks."""
     place = pixel = ","
     sigma_rho = ",,"
     x_mm, y_mm = across_um / 1000.0, -down_um / 1000.0
@@ -169,7 +179,7 @@ def _start(image: str, point: str, kind: str) -> str:
 def comparator_points(
     marks: Iterable[MarkRow], pitch_um: Mapping[str, tuple[float, float]]
 ) -> Iterator[ComparatorPoint]:
-    """What `read_comparator` reads of the marks that were written, but for the last digits and the lines."""
+    """Yield the points that `read_comparator` would read from the written marks, unrounded and without line numbers."""
     for mark in marks:
         x_mm, y_mm = pitch_um[mark.image][0] / 1000.0, -pitch_um[mark.image][1] / 1000.0
         xy = sigma = None
@@ -185,15 +195,15 @@ def comparator_points(
 
 
 def read_measurement_hash(path: Path) -> str:
-    """The fingerprint of the measurement that a comparator file was written from; "" of one that does not say so, as
-    one that a user made."""
+    """Fingerprint of the measurement from which a comparator file was written; "" if the file has none, such as one
+    made by a user."""
     with path.open("rb") as file:
         found = re.search(rb"^\W*# measurement ([0-9a-f]{64})\b", file.read(_HEAD), re.MULTILINE)
     return found[1].decode() if found else ""
 
 
 def read_decision_counts(path: Path) -> dict[CameraPerson, int]:
-    """How many decisions of whom stand behind the marks of each camera, as the lines above the table tell it."""
+    """Read the numbers of review decisions by camera and reviewer from the lines above the table."""
     with path.open("rb") as file:
         head = takewhile(lambda line: line.lstrip(b'"\xef\xbb\xbf').startswith(b"#"), file)
         text = b"".join(line for line in head if b" decisions of " in line).decode("utf-8", "replace")
@@ -201,7 +211,7 @@ def read_decision_counts(path: Path) -> dict[CameraPerson, int]:
 
 
 def describe_decisions(decided: Mapping[CameraPerson, int]) -> str:
-    """That in a sentence; "" where there are none."""
+    """State the numbers of review decisions in a sentence; "" if there are none."""
     cameras = sorted({camera for camera, _ in decided})
     parts = [
         ", ".join(f"{count} of {who}" for (own, who), count in sorted(decided.items()) if own == camera)
@@ -212,7 +222,7 @@ def describe_decisions(decided: Mapping[CameraPerson, int]) -> str:
 
 
 def read_pitches(path: Path) -> dict[str, tuple[float, float]]:
-    """The pitch of every scan in um, across and down, as the lines above the table tell it; of those that they tell."""
+    """Read the pixel pitch by image, µm across and down, from the lines above the table."""
     text = read_bytes(path).decode("utf-8", "replace")
     return {image: (float(x), float(y)) for image, x, y in _PITCH.findall(text)}
 
@@ -223,12 +233,12 @@ def read_comparator(path: Path, pitch_um: tuple[float, float] | None = None) -> 
     Parameters
     ----------
     path : the file
-    pitch_um : width and height of a pixel, where a list of pixels (col_px, row_px) may give no mm; None refuses it
+    pitch_um : pixel width and height for files without mm columns; None: such files are refused
 
     Raises
     ------
     InputError
-        Names the line: a duplicated mark, an unknown kind, no number, neither mm nor pixels.
+        Names the line of a duplicate mark, an unknown kind, an invalid number, or a mark with neither mm nor pixels.
     """
     points: dict[tuple[str, str, str], ComparatorPoint] = {}
     for row in csv_rows(path, COLUMNS[:2], COLUMNS[2:] + PIXEL_SIGMAS):
@@ -246,7 +256,7 @@ def read_comparator(path: Path, pitch_um: tuple[float, float] | None = None) -> 
 
 
 def has_pixels_alone(path: Path) -> bool:
-    """Whether a comparator file has columns of pixels and none of mm. Raises InputError where it has neither."""
+    """Whether a comparator file has pixel columns but no mm columns. Raises InputError if it has neither."""
     row = next(csv_rows(path, COLUMNS[:2], COLUMNS[2:] + PIXEL_SIGMAS), None)
     return row is not None and _has_pixels_alone(row)
 
@@ -292,7 +302,7 @@ def _point(row: Row, pitch_um: tuple[float, float] | None) -> ComparatorPoint:
     if names[0] == "col_px" and pitch_um is not None:
         xy = None if xy is None else comparator_from_pixel(xy, pitch_um)
         sigma = None if sigma is None else sigma * pitch_um / 1000.0
-        rho = -rho  # y is turned round
+        rho = -rho  # y counts upward, row downward
     return ComparatorPoint(
         image=intern(image_name(row.name("image"))),
         point=intern(row.name("point")),

@@ -1,4 +1,4 @@
-"""`compare.json`: calibrations of a camera compared with the first of them, over the frame."""
+"""`compare.json`: comparison of calibrations of a camera with the first one, over the frame."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ DRIFT, NO_DRIFT = "drift", "no drift"
 
 @dataclass(frozen=True)
 class ChiSquareTest:
-    """probability: of as much by chance."""
+    """Chi-square test. freedom: degrees of freedom; probability: p-value."""
 
     chi_square: float
     freedom: int
@@ -30,7 +30,7 @@ class ChiSquareTest:
 
 @dataclass(frozen=True)
 class ComparedCalibration:
-    """time: in the user's unit, or the number of the calibration."""
+    """Calibration in a comparison. time: in the user's unit, or the number of the calibration."""
 
     name: str
     time: float
@@ -39,8 +39,11 @@ class ComparedCalibration:
 
 @dataclass(frozen=True)
 class ParameterDifference:
-    """A parameter of two calibrations: values, difference and its standard deviation, in mm and powers of it; sigmas:
-    the difference in these, NaN where both are fixed."""
+    """Difference of a parameter between two calibrations.
+
+    first, other, difference: values and other minus first, mm or powers of mm; sigma: standard deviation of the
+    difference; sigmas: difference / sigma, NaN if both are fixed.
+    """
 
     name: str
     first: float
@@ -52,7 +55,7 @@ class ParameterDifference:
 
 @dataclass(frozen=True)
 class MarkDifference:
-    """How far a fiducial mark stands off that of the first calibration, after a similarity."""
+    """Difference of a fiducial mark from the first calibration after a similarity, and its standard deviation."""
 
     um: Pair
     sigma_um: Pair
@@ -60,7 +63,8 @@ class MarkDifference:
 
 @dataclass(frozen=True)
 class CalibrationDifference:
-    """A calibration less the first one: its parameters, the field at the places, its fiducial marks."""
+    """Differences of a calibration from the first one: parameters, image displacements at places_mm with their standard
+    deviations, and fiducial marks by name."""
 
     parameters: tuple[ParameterDifference, ...]
     field_um: tuple[Pair, ...]
@@ -70,8 +74,16 @@ class CalibrationDifference:
 
 @dataclass(frozen=True)
 class ComparisonRecord:
-    """The comparison as it is kept. level: the probability below which there is drift; same, trend: whether all
-    calibrations are one, and whether there is no steady change; places_mm: of the field."""
+    """Comparison as stored; see `Comparison`.
+
+    Attributes
+    ----------
+    verdict, probability, level : drift if probability, a p-value, is below the significance level.
+    same : test of the hypothesis that all calibrations are equal.
+    trend : test of a linear change with time; None for two calibrations.
+    places_mm : places of the displacements in `CalibrationDifference` and of the trend.
+    trend_um, trend_sigma_um : linear change from the first time to the last, by place; None without a trend.
+    """
 
     verdict: str
     probability: float
@@ -88,8 +100,7 @@ class ComparisonRecord:
 
 
 def comparison_record(comparison: Comparison, remarks: Sequence[str], level: float) -> ComparisonRecord:
-    """The record of a comparison: drift where calibrations that are the same would differ as much in fewer than
-    `level` of all cases."""
+    """Convert a comparison to its record. level: significance level of the test for drift."""
     trend = comparison.trend
     return ComparisonRecord(
         verdict=DRIFT if comparison.probability < level else NO_DRIFT,
@@ -111,7 +122,7 @@ def comparison_record(comparison: Comparison, remarks: Sequence[str], level: flo
 
 
 def read_comparison(path: Path) -> ComparisonRecord:
-    """Read `compare.json`. Raises FileNotFoundError, and InputError for what is no such file."""
+    """Read `compare.json`. Raises FileNotFoundError, and InputError for invalid content."""
     return read_record(ComparisonRecord, path, "Run `reseau compare` again; it writes this file.")
 
 
@@ -131,7 +142,7 @@ def _difference(comparison: Comparison, number: int) -> CalibrationDifference:
 
 
 def _parameters(first: CameraCalibration, other: CameraCalibration) -> list[ParameterDifference]:
-    """Of the parameters that both have."""
+    """Differences of the parameters that both calibrations have."""
     alike = first.lens.distortion.family == other.lens.distortion.family
     values = [each.lens.values for each in (first, other)]
     deviations = [np.sqrt(np.diag(each.covariance)) for each in (first, other)]

@@ -1,4 +1,4 @@
-"""`adjustment.npz`: the covariance of all quantities of an adjustment, or, of a large network, its parts."""
+"""`adjustment.npz`: covariance matrix of all quantities of an adjustment; for a large network, blocks of it."""
 
 import io
 import zipfile
@@ -20,16 +20,20 @@ from pipeline.text.text_file import MOST_MB, read_bytes
 from pipeline.types import Array, Indices
 
 AGAIN = "Run `reseau adjust` again; it writes both files."
-AFFORDABLE = 3000  # quantities whose covariance is written as one matrix
+AFFORDABLE = 3000  # largest number of quantities whose covariance is written as one matrix
 
 
 @dataclass(frozen=True)
 class Covariance:
-    """The a-posteriori covariance of all unknowns: parameters (n), values (n,), matrix (n, n); mm, object units, rad.
+    """A-posteriori covariance of the unknowns, in mm, object units and rad.
 
-    adjustment: the fingerprint of the adjustment.json that it belongs to; "" where the file does not say it. clusters:
-    the covariance of quantities of cameras by leaving out one image at a time, where errors within an image may be
-    correlated; None where it was not computed.
+    Attributes
+    ----------
+    parameters, values : (n,).
+    matrix : (n, n) covariance matrix.
+    adjustment : fingerprint of the adjustment.json to which it belongs; "" if the file has none.
+    clusters : jackknife covariance of camera parameters, leaving out one image at a time, for correlated errors within
+        images; None if it was not computed.
     """
 
     parameters: tuple[Parameter, ...]
@@ -39,8 +43,8 @@ class Covariance:
     clusters: "Covariance | None" = None
 
     def select(self, parameters: Iterable[Parameter | str]) -> Array:
-        """The covariance (k, k) of some unknowns, by keys or by their texts in the file; one that is not listed was
-        fixed, its row is zero."""
+        """Covariance (k, k) of unknowns given by keys or by their texts in the file; zero for fixed ones, which the
+        file does not list."""
         at = np.array([self._positions.get(as_parameter(each), -1) for each in parameters], dtype=int)
         block: Array = self.matrix[np.ix_(at, at)]
         block[at < 0, :] = 0.0
@@ -53,17 +57,17 @@ class Covariance:
 
 
 def covariance_path(path: Path) -> Path:
-    """Where the covariance of `adjustment.json` stands."""
+    """Path of the covariance file of an `adjustment.json`."""
     return path.with_suffix(".npz")
 
 
 def covariance_arrays(adjustment: Adjustment) -> dict[str, NDArray[np.generic]]:
-    """The a-posteriori covariance by the names of the file's arrays; mm, object units, rad.
+    """Arrays of the covariance file by name; mm, object units, rad.
 
-    names (n), values (n), matrix (n, n): of all quantities, or, where these are more than AFFORDABLE, of cameras and
-    images, and where these are more, of cameras. The points, and then the images, stand each by itself, without their
-    covariances with others: point_names (p, 3), point_values (p, 3), point_matrices (p, 3, 3), image_names (i, k) and
-    so on, with empty names and zeros behind an image that has less than k quantities.
+    names (n), values (n) and matrix (n, n) hold all quantities if there are at most AFFORDABLE; otherwise those of
+    cameras and images; if these exceed it too, those of cameras. The remaining points (and images) are stored as
+    diagonal blocks, without covariances between them: point_names (p, 3), point_values (p, 3), point_matrices
+    (p, 3, 3), image_names (i, k) and so on, padded with empty names and zeros for images with fewer than k quantities.
     """
     parts = _parts(adjustment)
     whole = _named(adjustment, parts.whole)
@@ -83,7 +87,7 @@ def covariance_arrays(adjustment: Adjustment) -> dict[str, NDArray[np.generic]]:
 
 
 def _cluster_arrays(adjustment: Adjustment) -> dict[str, NDArray[np.generic]]:
-    """cluster_names (k), cluster_matrix (k, k): of interior orientations, where an unmodelled error is estimated."""
+    """cluster_names (k), cluster_matrix (k, k) of the interior orientations, if an unmodelled error was estimated."""
     keys = [key for key in adjustment.parameters if key.kind == "interior"] if adjustment.unmodelled_mm else []
     matrix = adjustment.cluster_covariance_of(keys) if keys else None
     if matrix is None:
@@ -92,7 +96,7 @@ def _cluster_arrays(adjustment: Adjustment) -> dict[str, NDArray[np.generic]]:
 
 
 def covariance_note(adjustment: Adjustment) -> str:
-    """What of the covariance is in the file, in words."""
+    """State which parts of the covariance the file holds."""
     count, alone = len(adjustment.parameters), " and every ".join(_parts(adjustment).groups)
     if not alone:
         return "adjustment.npz holds the covariance of all quantities."
@@ -105,7 +109,7 @@ def covariance_note(adjustment: Adjustment) -> str:
 
 @dataclass(frozen=True)
 class _Parts:
-    """Positions of the quantities: those of the whole matrix, and by kind the groups of those that are not in it."""
+    """Positions of quantities. whole: those in the matrix; groups: by kind, those of each diagonal block."""
 
     whole: Indices
     groups: dict[str, list[Indices]]
@@ -115,7 +119,7 @@ def _parts(adjustment: Adjustment) -> _Parts:
     parameters = adjustment.parameters
     whole = np.arange(len(parameters))
     groups: dict[str, list[Indices]] = {}
-    # The quantities of a point or an image stand together, and begin with X or X0.
+    # The quantities of a point or an image are contiguous and begin with X or X0.
     for kind, kinds, first in (("point", ("point",), "X"), ("image", ("exterior", "film"), "X0")):
         members = np.array([parameters[i].kind in kinds for i in whole], dtype=bool)
         if len(whole) <= AFFORDABLE or not members.any():
@@ -128,13 +132,13 @@ def _parts(adjustment: Adjustment) -> _Parts:
 
 
 def _named(adjustment: Adjustment, positions: Indices) -> dict[str, NDArray[np.generic]]:
-    """Names and values at some positions; empty and zero at -1."""
+    """Names and values at positions; "" and 0 at -1."""
     names = np.array([*adjustment.names, ""], dtype=np.str_)
     return {"names": names[positions], "values": np.append(adjustment.values, 0.0)[positions]}
 
 
 def read_covariance(path: Path) -> Covariance:
-    """The covariance beside the `adjustment.json` at `path`. Raises InputError where it is missing or broken."""
+    """Read the covariance of the `adjustment.json` at `path`. Raises InputError if it is missing or damaged."""
     file = covariance_path(path)
     try:
         data = read_bytes(file)
@@ -153,7 +157,7 @@ def read_covariance(path: Path) -> Covariance:
 
 
 def _named_matrix(data: bytes, prefix: str, file: Path) -> tuple[tuple[Parameter, ...], Array]:
-    """Parameters and their covariance matrix. Raises InputError where these do not fit."""
+    """Read parameters and their covariance matrix. Raises InputError if their shapes or types do not match."""
     names, matrix = (_array(data, prefix + name, file) for name in ("names", "matrix"))
     if names.dtype.kind != "U" or matrix.dtype.kind != "f":
         kinds = f"{names.dtype} and {matrix.dtype}"
@@ -171,7 +175,7 @@ def _named_matrix(data: bytes, prefix: str, file: Path) -> tuple[tuple[Parameter
 
 
 def read_own_covariance(path: Path) -> Covariance:
-    """The same, refused where it says that it is of another adjustment than that at `path`."""
+    """Read the covariance as `read_covariance` does. Raises InputError if it belongs to another adjustment."""
     covariance = read_covariance(path)
     if covariance.adjustment not in ("", hash_file(path)):
         raise InputError(
@@ -182,10 +186,10 @@ def read_own_covariance(path: Path) -> Covariance:
 
 
 def _array(data: bytes, name: str, file: Path) -> NDArray[Any]:
-    """One array of an npz file, unpacked up to the size that is read of any file."""
+    """Read an array of an npz file, limited to the size allowed for any file."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive, archive.open(f"{name}.npy") as member:
             unpacked = io.BytesIO(member.read(MOST_MB * 1_000_000))
         return np.asarray(np.lib.format.read_array(unpacked, allow_pickle=False))
-    except Exception as error:  # whatever zipfile, zlib and numpy's reader of headers raise at a damaged file
+    except Exception as error:  # zipfile, zlib and numpy raise various errors for a damaged file
         raise InputError(f"{file}: is not a covariance file ({name}: {error}). {AGAIN}") from None

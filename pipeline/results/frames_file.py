@@ -1,4 +1,4 @@
-"""frames.csv: what is written about each frame, line by line, with the fields that are understood."""
+"""frames.csv: writing read around each frame, by line, with the fields recognised in it."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
@@ -18,7 +18,7 @@ HEAD = """# written about the frames, reseau {version}: as far as it was read. p
 
 
 def write_frames(path: Path, scans: Iterable[MeasuredScan]) -> bool:
-    """Write frames.csv, and say so, where anything was read. Raises InputError where it cannot be written."""
+    """Write frames.csv if any writing was read; returns whether it was. Raises InputError if writing fails."""
     rows = [csv_line(row) for scan in scans for row in _rows(scan.frame)]
     if rows:
         write_atomically(path, HEAD.format(version=version("reseau")) + "\n".join([csv_line(COLUMNS), *rows]) + "\n")
@@ -26,7 +26,7 @@ def write_frames(path: Path, scans: Iterable[MeasuredScan]) -> bool:
 
 
 def for_images(scans: Iterable[MeasuredScan], names: Sequence[str]) -> Mapping[str, Mapping[str, str]]:
-    """By image the fields of these names."""
+    """Values of the named fields by image."""
     return {scan.frame.image: unique_fields(scan.frame.writing or (), names) for scan in scans}
 
 
@@ -43,7 +43,7 @@ def _rows(frame: FrameMeasurement) -> list[tuple[str, ...]]:
 
 
 def unique_fields(lines: Sequence[Line], names: Sequence[str]) -> dict[str, str]:
-    """The fields of these names that lines of writing say, as far as one line says them, or several alike."""
+    """Values of the named fields that are unambiguous: read from one line, or alike from several."""
     fields = find_fields(lines)
     values = {name: {field.value for field in fields if field.name == name} for name in names}
     return {name: next(iter(own)) for name, own in values.items() if len(own) == 1 and "" not in own}

@@ -1,4 +1,4 @@
-"""The unit in which lengths in a camera's image are stated: mm and µm, or pixels of a digital camera."""
+"""Unit of lengths in the image: mm and µm for film, pixels for a digital camera."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ UM_PER_MM = 1000.0
 
 @dataclass(frozen=True)
 class ImageUnit:
-    """mm for places and µm for residuals; of a digital camera, whose pixels are pixel_um wide, px for both."""
+    """Unit of image coordinates. pixel_um None: mm for coordinates and µm for residuals; otherwise px for both."""
 
     pixel_um: float | None = None
 
@@ -17,27 +17,27 @@ class ImageUnit:
 
     @property
     def long_name(self) -> str:
-        """Of places and principal distances."""
+        """Unit of image coordinates and principal distances."""
         return "px" if self.is_pixel else "mm"
 
     @property
     def short_name(self) -> str:
-        """Of residuals, distortion and their standard deviations."""
+        """Unit of residuals, distortion and their standard deviations."""
         return "px" if self.is_pixel else "µm"
 
     @property
     def per_mm(self) -> float:
-        """Places and principal distances in this unit to a mm."""
+        """Units of coordinates per mm."""
         return 1.0 if self.pixel_um is None else UM_PER_MM / self.pixel_um
 
     @property
     def per_um(self) -> float:
-        """Residuals in this unit to a µm."""
+        """Units of residuals per µm."""
         return 1.0 if self.pixel_um is None else 1.0 / self.pixel_um
 
     @property
     def decimals(self) -> int:
-        """Of a residual as it is printed."""
+        """Decimals of a printed residual."""
         return 3 if self.is_pixel else 1
 
 

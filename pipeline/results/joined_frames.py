@@ -1,5 +1,4 @@
-"""Frames that were scanned in parts, as `adjustment.json` holds them: how well they are joined, and every mark of all
-scans in the one camera frame."""
+"""Frames scanned in parts: differences at tie points, and the marks of all partial scans in camera coordinates."""
 
 from collections import defaultdict
 
@@ -14,13 +13,13 @@ from pipeline.results.adjustment_record import JoinedFrameRecord, JoinRecord, Pa
 from pipeline.types import Array, Indices
 
 _UM_PER_MM = 1000.0
-_STEP = 1e-6  # of a parameter, for derivatives by it: films are linear in theirs, or nearly
+_STEP = 1e-6  # relative step of central differences; film transformations are linear in their parameters, or nearly
 
 
 def joined_frames(adjustment: Adjustment) -> dict[str, JoinedFrameRecord]:
-    """By frame: its scans (parts), each with the standard deviation of its film transformation at its corners; joins,
-    where they differ between the scans; marks, where each was measured. All in mm of the camera frame, sigmas a
-    posteriori. Empty where no frame was scanned in parts, or without a solution.
+    """Records of the frames scanned in parts, by frame; empty without such frames or without a solution.
+
+    Coordinates are camera coordinates in mm, sigmas a posteriori.
     """
     if not adjustment.converged:
         return {}
@@ -48,7 +47,7 @@ def _frame(adjustment: Adjustment, frame: str, parts: list[Image]) -> JoinedFram
 
 
 class _Part:
-    """One scan of a frame, as adjusted."""
+    """Adjusted partial scan of a frame."""
 
     def __init__(self, adjustment: Adjustment, image: Image) -> None:
         self.adjustment, self.image = adjustment, image
@@ -57,12 +56,12 @@ class _Part:
         self.film_covariance = adjustment.sigma0**2 * adjustment.cofactor_of(film)
 
     def camera_mm(self, rows: list[int] | Indices) -> Array:
-        """(n, 2) where the film transformation puts observations."""
+        """(n, 2) camera coordinates of observations by the film transformation."""
         return np.asarray(self.model.camera_from_comparator(self.adjustment.network.observations.xy_mm[rows]))
 
     def marks(self) -> list[PartMarkRecord]:
-        """Every mark that is an observation. A join's place and a fiducial's is the adjusted one. A target's is the
-        measured one, with its own covariance and that of the film transformation, taken as independent."""
+        """Marks that are observations. Tie points and fiducials have adjusted coordinates. Targets have measured ones;
+        their covariance is that of the measurement plus that of the film transformation, taken as independent."""
         network = self.adjustment.network
         rows = np.flatnonzero(network.image_numbers == network.images.index(self.image))
         observations = network.observations
@@ -82,7 +81,7 @@ class _Part:
         return found
 
     def corner_sigma_um(self) -> float:
-        """The largest standard deviation that the film transformation has at a corner of what was measured."""
+        """Largest standard deviation of the film transformation at the corners of the observations' bounding box."""
         xy_mm = self.adjustment.network.observations.xy_mm
         rows = self.adjustment.network.image_numbers == self.adjustment.network.images.index(self.image)
         low, high = xy_mm[rows].min(axis=0), xy_mm[rows].max(axis=0)
@@ -90,7 +89,7 @@ class _Part:
         return float(_UM_PER_MM * np.sqrt(np.linalg.eigvalsh(self._film_covariances(corners))[:, -1].max()))
 
     def _film_covariances(self, xy_mm: Array) -> Array:
-        """(n, 2, 2) of camera coordinates of places (n, 2), for what is not known of the film transformation."""
+        """(n, 2, 2) covariances of camera coordinates at (n, 2), propagated from the film transformation."""
         film = self.model.film
         by_parameters = np.empty((len(xy_mm), 2, len(film.parameters)))
         for k, value in enumerate(film.parameters.tolist()):
@@ -101,7 +100,7 @@ class _Part:
 
 
 def _own_unknowns(network: Network, image: Image, row: int) -> list[Parameter]:
-    """The unknowns that are the camera coordinates of an observation, none where it has none."""
+    """Unknowns that are the camera coordinates of an observation; empty for a target."""
     kind, point = network.observations.kind[row], network.observations.point[row]
     if kind == "join":
         return [Parameter.join(image.frame, point, axis) for axis in "xy"]

@@ -1,4 +1,4 @@
-"""What one scan gave: the value that measuring hands on, and the JSON and the rows that the results database keeps."""
+"""Measurement of one scan: its record, and the JSON and rows stored in the results database."""
 
 import json
 import math
@@ -28,7 +28,7 @@ _TONE_NUMBERS = ("least", "greatest", "scatter", "apart")
 
 
 class FailureCode(StrEnum):
-    """Why a scan could not be measured at all, in a word that one can filter by."""
+    """Reason code of a scan that could not be measured."""
 
     MISSING = "missing"
     UNREACHABLE = "unreachable"
@@ -56,7 +56,7 @@ MEANING = {
 
 @dataclass(frozen=True)
 class Failure:
-    """code: from the table above; sentence: what happened, and what to do."""
+    """Failure to measure a scan. sentence: what happened, and the remedy."""
 
     code: FailureCode
     sentence: str
@@ -64,12 +64,17 @@ class Failure:
 
 @dataclass(frozen=True)
 class MeasuredScan:
-    """A scan and what was measured in it.
+    """Scan with its measured marks.
 
-    scan: the path or the address of its file. pitch_um: what a pixel measures, across and down. notes: what is worth
-    knowing of the file, and needs no action. failure: why nothing was measured; then every mark of the frame is absent,
-    size and pitch are not known (0 and NaN), and the sentence is the frame's problem. seconds: that measuring took; no
-    part of what was measured, and of no record. decided_by: how many decisions of whom stand behind it.
+    Attributes
+    ----------
+    scan : path or address of the file.
+    pitch_um : pixel pitch across and down.
+    notes : remarks on the file that need no action.
+    failure : why nothing was measured; all marks are then absent, size and pitch are 0 and NaN, and the sentence is a
+        problem of the frame. None if the scan was measured.
+    seconds : computing time; neither compared nor stored.
+    decided_by : number of review decisions by reviewer.
     """
 
     scan: str
@@ -84,15 +89,15 @@ class MeasuredScan:
 
     @classmethod
     def failed(cls, scan: str, frame: FrameMeasurement, failure: Failure) -> "MeasuredScan":
-        """frame: its marks, none of them measured."""
+        """Scan that could not be measured. frame: its marks, all absent."""
         return cls(scan, 0, 0, (math.nan, math.nan), frame, failure=failure)
 
 
-# Numbers that are not finite, which JSON has not, stand there by their names, as `float` reads them.
+# JSON has no non-finite numbers: they are written as strings that `float` reads.
 
 
 def scan_detail(measured: MeasuredScan, uri: str) -> dict[str, object]:
-    """All that a scan gave but its marks, as values of JSON. uri: of its file, as the database has it."""
+    """Measurement of a scan without its marks, as JSON values. uri: of the file, as stored in the database."""
     frame = measured.frame
     detail: dict[str, object] = {
         "scan": uri,
@@ -113,9 +118,9 @@ def scan_detail(measured: MeasuredScan, uri: str) -> dict[str, object]:
 
 
 def read_scan(image: str, detail: Mapping[str, Any], marks: Sequence[MarkMeasurement], scan: str) -> MeasuredScan:
-    """The scan of a detail and its marks. image: its name; scan: the path or the address of its file.
+    """Read the output of `scan_detail`, with the marks. image: name; scan: path or address of the file.
 
-    Raises KeyError, TypeError or ValueError for what is no such detail.
+    Raises KeyError, TypeError or ValueError for invalid content.
     """
     across, down = detail["pitch_um"]
     frame = FrameMeasurement(
@@ -135,12 +140,12 @@ def read_scan(image: str, detail: Mapping[str, Any], marks: Sequence[MarkMeasure
 
 
 def scan_location(uri: str, folder: Path) -> str:
-    """The path of a scan's file whose uri counts from the folder; an address, and "" of none, as it is."""
+    """Path of a scan's file from its uri relative to the folder; addresses and "" are returned unchanged."""
     return uri if "://" in uri or not uri else str(folder / uri)
 
 
 def mark_row(mark: MarkMeasurement) -> tuple[object, ...]:
-    """A mark as a row of MARK_COLUMNS. The sum of the causes is for those who read the table."""
+    """Convert a mark to a row of MARK_COLUMNS. The sum of the covariances is for other readers of the database."""
     col, row = (None, None) if mark.center_px is None else mark.center_px.tolist()
     causes, variances = None, list[float | None]([None] * 3)
     if mark.covariance is not None:
@@ -154,7 +159,7 @@ def mark_row(mark: MarkMeasurement) -> tuple[object, ...]:
 
 
 def read_mark_row(row: Sequence[Any]) -> MarkMeasurement:
-    """The mark of a row. Raises KeyError, TypeError or ValueError for what is none."""
+    """Read a mark from a row. Raises KeyError, TypeError or ValueError for invalid content."""
     point, kind, col, row_px, _, _, _, causes, status, code, reason, quality = row
     parts = json.loads(causes)["of"] if causes else None
     return MarkMeasurement(
@@ -169,12 +174,12 @@ def read_mark_row(row: Sequence[Any]) -> MarkMeasurement:
 
 
 def finite_or_none(value: float) -> float | None:
-    """A number for SQLite, which has none that is not finite."""
+    """Replace a non-finite number by None, for columns that hold finite numbers only."""
     return float(value) if math.isfinite(value) else None
 
 
 def _numbers(values: Any) -> Any:
-    """Of a number, or of arrays of them."""
+    """JSON of a number or nested array; non-finite numbers as strings."""
     if values is None:
         return None
     if np.ndim(values) > 0:
@@ -188,7 +193,7 @@ def _array(values: Any) -> Array:
 
 
 def pose_record(pose: Pose) -> dict[str, object]:
-    """A pose with its evidence as JSON."""
+    """Scan orientation (pose) with its evidence, as JSON."""
     return {**asdict(pose), "written": {name: _numbers(value) for name, value in pose.written.items()},
             "evidence": list(pose.evidence), "rivals": list(pose.rivals)}  # fmt: skip
 
@@ -199,7 +204,7 @@ def _read_pose(pose: Mapping[str, Any]) -> Pose:
 
 
 def _line(line: Line) -> dict[str, object]:
-    """The text of the way that is taken for the right one is written for others than this reader."""
+    """JSON of a line of writing; text is the chosen reading, for other readers of the database."""
     ways = {pose: {"text": one.text, "confidence": _numbers(one.confidence), "legible": _numbers(one.legible)}
             for pose, one in line.ways.items()}  # fmt: skip
     outline = [_numbers(corner) for corner in line.outline_px]
@@ -242,7 +247,7 @@ def _read_frame_tone(tone: Mapping[str, Any]) -> FrameTone:
 
 
 def sharpening_record(sharpening: Sharpening) -> dict[str, object] | None:
-    """As JSON, None where there is none."""
+    """Sharpening as JSON; None if there is none."""
     if not sharpening:
         return None
     return {
@@ -253,14 +258,14 @@ def sharpening_record(sharpening: Sharpening) -> dict[str, object] | None:
 
 
 def read_sharpening(record: Mapping[str, Any] | None) -> Sharpening:
-    """What `sharpening_record` wrote."""
+    """Read the output of `sharpening_record`."""
     if record is None:
         return Sharpening()
     return Sharpening(float(record["amount"]), float(record["radius_px"]), _array(record["covariance"]))
 
 
 def _base(base: Array) -> Any:
-    """The exponent of a power, the name of sRGB's curve, or a thousand numbers."""
+    """Tone curve as its exponent, the name of sRGB, or its table of values."""
     middle = len(base) // 2
     exponent = round(float(np.log(base[middle]) / np.log(middle / (len(base) - 1))), 9)
     if np.array_equal(base, power(exponent)):
@@ -275,7 +280,7 @@ def _read_base(base: Any) -> Array:
 
 
 def tone_information_record(tone: ToneInformation) -> dict[str, object]:
-    """What a scan says of its scanner's curve, as JSON."""
+    """Normal equations of a scan for the tone curve of its scanner, as JSON."""
     return {
         "information": _numbers(tone.matrix),
         "right": _numbers(tone.right_side),
@@ -287,7 +292,7 @@ def tone_information_record(tone: ToneInformation) -> dict[str, object]:
 
 
 def read_tone_information(tone: Mapping[str, Any]) -> ToneInformation:
-    """What `tone_information_record` wrote."""
+    """Read the output of `tone_information_record`."""
     information, right = _array(tone["information"]), _array(tone["right"])
     square, count, alike = float(tone["square"]), int(tone["count"]), float(tone["alike"])
     return ToneInformation(information, right, square, count, alike, read_sharpening(tone.get("sharpening")))

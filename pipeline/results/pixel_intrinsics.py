@@ -1,4 +1,4 @@
-"""The interior orientation of a digital camera in pixels, as OpenCV has it."""
+"""Interior orientation of a digital camera in pixels, in OpenCV's convention."""
 
 from collections.abc import Mapping
 
@@ -10,9 +10,9 @@ CENTRE = ("fx", "fy", "cx", "cy")
 
 
 def pixel_intrinsics(mm: Mapping[str, float], pixel_mm: float) -> tuple[dict[str, float], Array]:
-    """fx, fy, cx, cy and the distortion from c, x0', y0' and its parameters, and their derivatives (m, n).
+    """Convert c, x0', y0' and distortion parameters to fx, fy, cx, cy and distortion; returns derivatives (m, n) too.
 
-    The unit of x is c (1 + b1), that of y is c; y0' counts upward (`adjust.functional_model.opencv_family`).
+    fx = c (1 + b1), fy = c; y0' counts upward, cy downward (`adjust.functional_model.opencv_family`).
     """
     stretch = 1.0 + mm.get("b1", 0.0)
     values = {"fx": mm["c"] * stretch / pixel_mm, "fy": mm["c"] / pixel_mm}

@@ -1,9 +1,9 @@
-"""Records as JSON: dataclasses and named tuples, written and read by one mechanism for every result file.
+"""Serialisation of records, dataclasses and named tuples, as JSON, for all result files.
 
-A record's fields are the file's keys, in their order. What the annotations say is what a reader takes; further keys are
-welcome. `float` is a number, or null for one that has no meaning (NaN), `Finite` a number always. A field of None by
-default is written only where it has a value. Metadata of a field: KEY, where it is called otherwise in the file; REST,
-for a mapping whose entries stand among the other keys.
+The fields of a record are the keys of the file, in order. Readers check values against the annotations and ignore
+unknown keys. `float` is a number, or null for NaN; `Finite` is never null. A field with default None is written only
+if it is set. Metadata of a field: KEY, its name in the file if different; REST, for a mapping whose entries are
+written among the other keys.
 """
 
 import json
@@ -27,12 +27,12 @@ Field = tuple[str, str, Any]  # name, key, default
 FINITE, KEY, REST = "finite", "key", "rest"
 Finite = Annotated[float, FINITE]
 
-_AT_A_TIME = 10_000  # words of JSON
+_AT_A_TIME = 10_000  # JSON tokens written at once
 _NAMES: Mapping[type, str] = {str: "a text", bool: "true or false", int: "a whole number", float: "a number"}
 
 
 class WrongForm(Exception):
-    """A value that a record does not take: its place within the record, and what is wrong."""
+    """Invalid value in a record. problem: what is wrong; place: path of the value within the record."""
 
     def __init__(self, problem: str, place: str = "") -> None:
         super().__init__(problem)
@@ -43,7 +43,7 @@ class WrongForm(Exception):
 
 
 def json_text(record: object, ensure_ascii: bool = False) -> Iterator[str]:
-    """A record as JSON, some of it at a time: as one text a large result takes several times as much memory."""
+    """Yield a record as JSON in pieces: a large result as one string takes several times as much memory."""
     encoder = json.JSONEncoder(indent=1, ensure_ascii=ensure_ascii, allow_nan=False, default=_content)
     parts = encoder.iterencode(_plain(record))
     while some := "".join(islice(parts, _AT_A_TIME)):
@@ -52,20 +52,20 @@ def json_text(record: object, ensure_ascii: bool = False) -> Iterator[str]:
 
 
 def write_record(record: object, path: Path) -> None:
-    """Write a record to a file. Raises WriteError where that cannot be done."""
+    """Write a record to a file. Raises WriteError if that fails."""
     write_atomically(path, "".join(json_text(record)))
 
 
 def plain_json(record: object) -> Any:
-    """A record as mappings, lists, texts and numbers."""
+    """Convert a record to dicts, lists, strings and numbers."""
     return json.loads("".join(json_text(record)))
 
 
 def read_record(kind: type[Record], path: Path, remedy: str) -> Record:
-    """The record that a file holds. remedy: what to do where it holds none.
+    """Read a record from a file. remedy: sentence appended to the error message.
 
-    Raises FileNotFoundError and IsADirectoryError, and InputError for a file that is no JSON, or has a wrong value: the
-    message says where, and what would be right.
+    Raises FileNotFoundError and IsADirectoryError, and InputError if the file is not JSON or has an invalid value; the
+    message names the place and the expected value.
     """
     content = read_json(path)
     try:
@@ -76,14 +76,14 @@ def read_record(kind: type[Record], path: Path, remedy: str) -> Record:
 
 
 def parsed(kind: type[Record], content: Any) -> Record:
-    """The record of the content of a JSON file. Raises WrongForm where it has another form."""
+    """Convert parsed JSON to a record. Raises WrongForm for invalid content."""
     key: Any = kind
     reader: Callable[[Any], Record] = _reader(key)
     return reader(content)
 
 
 def _content(record: object) -> dict[str, Any]:
-    """A record's keys with their values, records within it left as they are."""
+    """Keys and values of a record; nested records are not converted."""
     content: dict[str, Any] = {}
     kind: Any = type(record)
     for name, key, default in _fields(kind):
@@ -98,7 +98,7 @@ def _content(record: object) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """A value as JSON has it, null for numbers that are not finite; dataclasses are left to the encoder."""
+    """Convert a value for JSON, non-finite numbers to null; dataclasses are left to the encoder."""
     if isinstance(value, str | int | None):
         return value
     if isinstance(value, float):
@@ -124,13 +124,13 @@ def _fields(kind: type) -> tuple[Field, ...]:
 
 @cache
 def _reader(kind: Any) -> Read:
-    """What reads a value of a kind; it raises WrongForm."""
+    """Function that reads a value of a type or raises WrongForm."""
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is Annotated:
         return _annotated(arguments[0], arguments[1])
     if origin in (Union, UnionType):
         inner = next(each for each in arguments if each is not NoneType)
-        return _number if inner is float else _optional(_reader(inner))  # None is a number that is not there
+        return _number if inner is float else _optional(_reader(inner))  # for numbers, null is NaN
     if origin is Literal:
         return _word(arguments)
     if origin is tuple:
@@ -171,7 +171,7 @@ def _finite(value: Any, others: str = "") -> float:
 
 
 def _annotated(kind: Any, note: Any) -> Read:
-    """FINITE, or a function that raises ValueError at what it cannot take."""
+    """Reader of an annotated type. note: FINITE, or a function that raises ValueError for invalid values."""
     if note == FINITE:
         return _plain_reader(kind, is_finite=True)
     read = _reader(kind)
@@ -212,7 +212,7 @@ def _list(read: Read, length: int | None) -> Read:
         made: list[Any] = []
         try:
             for item in value:
-                made.append(read(item))  # noqa: PERF401  # as many are made as were right
+                made.append(read(item))  # noqa: PERF401  # its length gives the index of the invalid item
         except WrongForm as wrong:
             raise wrong.nested_in_list(f"[{len(made)}]") from None
         return tuple(made)
@@ -257,7 +257,7 @@ def _record_reader(kind: type) -> Read:
             raise wrong.nested_in_list("" if key == REST else f".{key}") from None
         try:
             return kind(**made)
-        except ValueError as error:  # what does not go together
+        except ValueError as error:  # from __post_init__: inconsistent fields
             raise WrongForm(str(error)) from None
 
     return read

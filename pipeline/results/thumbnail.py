@@ -1,4 +1,4 @@
-"""Small pictures of a scan, cut from what is decoded when it is measured: a window about each mark, and the whole."""
+"""Thumbnails of a scan, cut while it is decoded for measurement: a window around each mark, and the whole scan."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,21 +11,21 @@ from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
 from pipeline.results.measured_record import MeasuredScan
 
-_FIDUCIAL_PX, _TARGET_PX = 81, 41  # the least width of a window
-_SHOWN_PX = 96  # a larger window is reduced to about this many pixels
-_REACH_SIZES = 2.0  # a window's width in the mark's own
-_WHOLE_PX = 480  # the longer side of the whole scan, at most
-_WHOLE = ("", "frame")  # as a mark's name and kind
-_LOST_PER_MILLE = 1  # of a window's pixels, that may be darker or lighter than all that is told apart
+_FIDUCIAL_PX, _TARGET_PX = 81, 41  # px, smallest width of a window
+_SHOWN_PX = 96  # px, larger windows are reduced to about this width
+_REACH_SIZES = 2.0  # width of a window in widths of the mark
+_WHOLE_PX = 480  # px, largest side of the thumbnail of the whole scan
+_WHOLE = ("", "frame")  # point and kind of the thumbnail of the whole scan
+_LOST_PER_MILLE = 1  # per mille of the pixels clipped at each end of the grey values
 _QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 75]
 
 
 @dataclass(frozen=True)
 class Thumbnail:
-    """A mark cut from its scan.
+    """Window of a scan around a mark.
 
-    pixels (rows, columns): grey values on any scale; origin_px: column and row, in the scan, of the centre of its
-    top-left pixel; step_px: scan pixels to a thumbnail pixel, above 1 where it was reduced.
+    pixels: (rows, columns) grey values on any scale; origin_px: column and row in the scan of the centre of its
+    top-left pixel; step_px: scan pixels per thumbnail pixel, above 1 if reduced.
     """
 
     pixels: NDArray[np.generic]
@@ -40,7 +40,7 @@ class Thumbnail:
 
     @property
     def jpeg(self) -> bytes:
-        """In 8 bits, from its darkest to its lightest but for a few."""
+        """JPEG in 8 bits, stretched between the extreme percentiles of the grey values."""
         grey = self.pixels.astype(np.float64)
         low, high = np.percentile(grey, [_LOST_PER_MILLE / 10, 100 - _LOST_PER_MILLE / 10])
         stretched = np.rint(np.clip((grey - low) / max(high - low, 1e-12), 0.0, 1.0) * 255.0)
@@ -49,7 +49,7 @@ class Thumbnail:
 
 @dataclass(frozen=True)
 class StoredThumbnail:
-    """A thumbnail as a file's content. point, kind: of the mark; "" and "frame" of the whole scan."""
+    """Encoded thumbnail. point, kind: of the mark; "" and "frame" for the whole scan."""
 
     point: str
     kind: str
@@ -72,7 +72,7 @@ class StoredThumbnail:
 
 
 def stored_thumbnails(scan: Scan, measured: MeasuredScan) -> tuple[StoredThumbnail, ...]:
-    """All of a scan that was just measured: of its marks, and of the whole where measuring looked at it."""
+    """Thumbnails of a scan just measured: of its marks, and of the whole scan if a reduced image was decoded."""
     marks = [(mark, cut(scan, mark)) for mark in measured.frame.marks]
     whole = [StoredThumbnail.from_thumbnail(picture, *_WHOLE) for picture in _whole(scan)]
     return (
@@ -82,14 +82,15 @@ def stored_thumbnails(scan: Scan, measured: MeasuredScan) -> tuple[StoredThumbna
 
 
 class TakenThumbnails(list[StoredThumbnail]):
-    """What is cut of scans while they are open."""
+    """Collector of the thumbnails of scans while they are open."""
 
     def take(self, scan: Scan, measured: MeasuredScan) -> None:
         self.extend(stored_thumbnails(scan, measured))
 
 
 def cut(scan: Scan, mark: MarkMeasurement) -> Thumbnail | None:
-    """The window about a mark; None where it has no place in the scan. Raises MeasurementError as the scan does."""
+    """Cut the window around a mark; None if it has no position within the scan. Raises MeasurementError as the scan
+    does."""
     if mark.center_px is None:
         return None
     half = _half_px(mark)
@@ -106,7 +107,7 @@ def cut(scan: Scan, mark: MarkMeasurement) -> Thumbnail | None:
 
 
 def _half_px(mark: MarkMeasurement) -> int:
-    """Half the width of the window about a mark."""
+    """Half the width of the window around a mark."""
     least = _FIDUCIAL_PX if mark.kind == "fiducial" else _TARGET_PX
     return max(least // 2, int(np.ceil(_REACH_SIZES * mark.quality.get("size_px", 0.0) / 2.0)))
 
