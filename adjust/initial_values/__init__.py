@@ -1,1 +1,1 @@
-"""Initial values for an adjustment: nobody has to supply approximations."""
+"""Initial values for an adjustment: the user need not supply approximations."""

@@ -1,4 +1,4 @@
-"""Initial values for an adjustment, from the network alone: nobody has to supply approximations."""
+"""Initial values of an adjustment, computed from the network: the user need not supply approximations."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -22,25 +22,36 @@ from adjust.problem.network import Approximations, Image, Network
 from adjust.problem.reduction import Reduction
 from adjust.validation import validate
 
-MOST_FOLDED = 0.05  # part of an image's points that gross errors may put where the distortion has no image
+MOST_FOLDED = 0.05  # largest fraction of points outside the invertible range of the distortion (gross errors)
 
 
 def approximate(network: Network) -> Approximations:
-    """Where the adjustment starts: film transformations, interior and exterior orientations, unknown object points.
+    """Compute the initial values of an adjustment.
 
-    Film transformations from the fiducial marks; a principal distance nobody knows from resections of the known
-    points; exterior orientations as given, or by resection (gross errors tolerated), image after image, with points
-    intersected from the images already oriented; where too little is known to begin with, from a model of the images
-    themselves. Independent of the order of images, points and observations. An image that shows fiducials alone gets
-    its film transformation and nothing else. Frames that were scanned in parts are taken as wholes.
-    Raises AdjustmentError, naming the image, camera or point, where something cannot be found, and what would help.
+    Returns
+    -------
+    Film transformations, interior and exterior orientations, and unknown object points.
+
+    Raises
+    ------
+    AdjustmentError
+        If a value cannot be determined. The message names the image, camera or point, and the remedy.
+
+    Notes
+    -----
+    Film transformations are fitted to the fiducial marks. An unknown principal distance follows from space resections
+    on the known points. Exterior orientations are taken as given, or follow from robust space resection, image after
+    image, in turn with the intersection of points from the oriented images. Where there is too little control for the
+    first resection, a model is formed from the images alone. The result does not depend on the order of images, points
+    and observations. An image that shows only fiducials gets its film transformation and nothing else. A frame that was
+    scanned in parts is treated as one image.
     """
     validate(network)
     return initial_values(network)
 
 
 def initial_values(network: Network) -> Approximations:
-    """As `approximate`, of a network that was validated."""
+    """Compute the initial values of a validated network; see `approximate`."""
     reduction = Reduction.to_centroid(network)
     return reduction.inverse.approximations(_initial_values(reduction.network(network)))
 
@@ -66,7 +77,8 @@ def _initial_values(network: Network) -> Approximations:
 
 
 def _joined_values(network: Network) -> Approximations:
-    """Where frames were scanned in parts: those of the whole frames, and how the parts lie in them."""
+    """Initial values of a network with frames scanned in parts: of the whole frames, with the placement of the
+    parts."""
     films, joins = dict[str, Film](), dict[tuple[str, str], Array]()
     for frame in joined_frames(network):
         films |= frame.films
@@ -84,7 +96,7 @@ def _joined_values(network: Network) -> Approximations:
 
 
 def _film_transformations(network: Network) -> dict[str, Film]:
-    """Of the frames that one scan shows, by image name the parameters, and whether mirrored."""
+    """Fit the film transformations of frames in a single scan: {image name: (parameters, mirrored)}."""
     observations = network.observations
     rows = np.flatnonzero(observations.is_fiducial)
     rows = rows[np.lexsort((np.array([observations.point[row] for row in rows]), network.image_numbers[rows]))]
@@ -121,7 +133,7 @@ def _interior(camera: Camera, frames: Frames) -> Array:
 
 
 def _why_no_distance(fields: Sequence[KnownField]) -> str:
-    """Why images of known points do not tell the principal distance, and what would."""
+    """Explain why images of known points do not determine the principal distance, and name the remedy."""
     if not any(len(field.xyz) >= FEWEST for field in fields):
         return (
             f"none shows {FEWEST} points whose X, Y and Z are known. Give an approximate principal_distance_mm, or the "
@@ -135,7 +147,7 @@ def _why_no_distance(fields: Sequence[KnownField]) -> str:
 
 
 def _known_fields(camera: Camera, frames: Frames, principal_point_mm: Array) -> list[KnownField]:
-    """The points of every image of a camera, in the order of their names, whose coordinates are all known."""
+    """For each image of a camera, sorted by name, the points of which X, Y and Z are known."""
     network = frames.network
     names, number = network.observations.numbered_points
     xyz = np.array([_known_place(network, name) for name in names])[number[frames.rows]]
@@ -155,7 +167,10 @@ def _known_place(network: Network, name: str) -> tuple[float, float, float]:
 
 
 def _sights(camera: Camera, frames: Frames, interior: Array) -> dict[str, Sight]:
-    """Freed of the distortion as it is known beforehand. Raises AdjustmentError where that folds an image over."""
+    """Correct the image coordinates of a camera for its prior distortion.
+
+    Raises AdjustmentError where this distortion is not invertible within an image (it folds the image over).
+    """
     known = camera.distortion.parameters
     lens = Lens(camera.distortion, interior, camera.distortion.values)
     images = frames.camera_images(camera.name)
@@ -177,7 +192,7 @@ def _sights(camera: Camera, frames: Frames, interior: Array) -> dict[str, Sight]
 
 
 def _exterior(image: Image, pose: Pose) -> Array:
-    """X0, Y0, Z0, omega, phi, kappa (6,); the angles as near as can be to those given."""
+    """X0, Y0, Z0, omega, phi, kappa (6,); of equivalent angles those nearest to the given ones."""
     if image.exterior is None:
         return np.concatenate([pose.center, angles_from_rotation(pose.rotation)])
     return np.concatenate([pose.center, angles_near(pose.rotation, image.exterior.values[3:])])

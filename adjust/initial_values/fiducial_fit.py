@@ -1,4 +1,4 @@
-"""The film transformation of one image from its fiducial marks, gross errors tolerated."""
+"""Robust fit of the film transformation of one image to its fiducial marks."""
 
 from itertools import combinations
 from math import comb
@@ -12,21 +12,31 @@ from adjust.linear_algebra.small_matrices import applied
 from adjust.problem.network import Transformation
 
 MOST_SUBSETS = 100
-GROSS = 13.8  # squared distance, in variances of a coordinate, beyond which a mark is left out (0.1 % point)
-PLAINLY = 0.01  # of the squared distances left upright, below which those left mirrored tell that a scan is so
-LEAST_VARIANCE_MM2 = 1e-4  # of a coordinate: film and scanner may well do that
-LEAST_ASPECT = 0.1  # of marks, across their longest extent: nearer to a line, their errors may pass for a mirror
+GROSS = 13.8  # squared distance, in variances of a coordinate, above which a mark is an outlier (0.1 % point)
+PLAINLY = 0.01  # ratio of the squared residuals, mirrored over upright, below which a scan is mirrored
+LEAST_VARIANCE_MM2 = 1e-4  # of a coordinate: film deformation and scanner errors reach this
+LEAST_ASPECT = 0.1  # width over length of the marks: on a narrower strip, errors may be mistaken for mirroring
 LATTICE = np.stack(np.meshgrid(*2 * [np.linspace(-1.0, 1.0, 8)]), axis=-1).reshape(-1, 2)
 
 
 def fit_transformation(transformation: Transformation, comparator_mm: Array, camera_mm: Array) -> tuple[Array, bool]:
-    """Parameters in the order of `film_parameter_names`; whether the scan is mirrored.
+    """Fit a film transformation to fiducial marks, robustly against gross errors.
 
-    comparator_mm, camera_mm (n, 2): the same marks, at least `fewest_marks`. Fitted by least
-    squares, a projective one to its equations without fractions, to all marks where these agree, and otherwise to those
-    that the least trimmed squares over the smallest subsets find in agreement. With fewer marks than a transformation
-    takes, it is the simpler one of its family that they determine. A scan is mirrored where a mirrored similarity
-    leaves far less; two marks, and marks on one line, cannot tell, and are taken as not mirrored.
+    Parameters
+    ----------
+    comparator_mm, camera_mm : (n, 2) measured and calibrated coordinates of the same marks, at least `fewest_marks`.
+
+    Returns
+    -------
+    Parameters in the order of `film_parameter_names`, and whether the scan is mirrored.
+
+    Notes
+    -----
+    Least squares on all marks if they agree; otherwise on the inliers of a least-trimmed-squares estimate over minimal
+    subsets. A projective transformation is fitted to its equations multiplied by the denominator. With too few marks
+    for the transformation, the simpler one of its family that they determine is fitted instead. A scan is mirrored if a
+    mirrored similarity has far smaller residuals; two marks, or marks on a line, do not decide this and count as
+    upright.
     """
     if transformation == "none":
         return np.zeros(0), False
@@ -40,7 +50,7 @@ def fit_transformation(transformation: Transformation, comparator_mm: Array, cam
 
 
 def _is_mirrored(comparator_mm: Array, camera_mm: Array) -> bool:
-    """At once where all marks agree, as in most scans: else all subsets of them are tried, upright and mirrored."""
+    """Decide whether a scan is mirrored: quickly if all marks agree, else by robust fits, upright and mirrored."""
     if len(comparator_mm) < 3:
         return False
     kinds = [film_kind("similarity", mirrored) for mirrored in (False, True)]
@@ -54,8 +64,10 @@ def _is_mirrored(comparator_mm: Array, camera_mm: Array) -> bool:
 
 
 def _determinant_where_marks_agree(comparator_mm: Array, camera_mm: Array) -> float | None:
-    """Of the affine transformation that they agree on, negative in a mirrored scan; None where they agree on none, are
-    too few to show it, or lie about on one line."""
+    """Determinant of the affine transformation on which all marks agree, negative for a mirrored scan.
+
+    None if the marks do not agree, are too few for a check, or are nearly collinear.
+    """
     affine = film_kind("affine", False)
     if (
         len(comparator_mm) <= least_marks(affine)
@@ -76,7 +88,7 @@ def _are_nearly_collinear(xy_mm: Array) -> bool:
 
 
 def _robust_fit(kind: FilmKind, comparator_mm: Array, camera_mm: Array) -> tuple[Array, float]:
-    """Parameters, and the trimmed sum of squared distances that chose them."""
+    """Fit by least trimmed squares; returns the parameters and the trimmed sum of squared distances."""
     n, fewest = len(comparator_mm), least_marks(kind)
     half = (n + fewest + 1) // 2
     best = _fit(kind, comparator_mm, camera_mm)
@@ -98,12 +110,12 @@ def _robust_fit(kind: FilmKind, comparator_mm: Array, camera_mm: Array) -> tuple
 
 
 def _agree(squared: Array) -> bool:
-    """Whether marks are no farther off than film and scanner may well put them."""
+    """Whether all residuals are within what film deformation and scanner errors explain."""
     return bool((squared < GROSS * LEAST_VARIANCE_MM2).all())
 
 
 def _subsets(n: int, size: int) -> Indices:
-    """(subsets, size): all of some of n marks, or as many at random as are enough."""
+    """(subsets, size): all subsets of n marks, or MOST_SUBSETS random ones if there are more."""
     if comb(n, size) <= MOST_SUBSETS:
         return np.array(list(combinations(range(n), size)))
     generator = np.random.default_rng(0)
@@ -111,13 +123,13 @@ def _subsets(n: int, size: int) -> Indices:
 
 
 def _squared(kind: FilmKind, parameters: Array, comparator_mm: Array, camera_mm: Array) -> Array:
-    with np.errstate(all="ignore"):  # a subset of bad geometry may send other marks to infinity
+    with np.errstate(all="ignore"):  # a subset of poor geometry may map other marks to infinity
         squared = ((kind.apply(parameters, comparator_mm) - camera_mm) ** 2).sum(axis=-1)
     return np.where(np.isfinite(squared), squared, np.inf)
 
 
 def _fit(kind: FilmKind, comparator_mm: Array, camera_mm: Array) -> Array:
-    """(..., u) of marks (..., n, 2): least squares about their means; what they do not determine has the least norm."""
+    """Least-squares parameters (..., u) of centred marks (..., n, 2); of minimum norm where they are rank-deficient."""
     center, half = comparator_mm.mean(axis=-2, keepdims=True), _half(comparator_mm)
     target = camera_mm.mean(axis=-2, keepdims=True)
     moved, count = camera_mm - target, len(kind.names)
@@ -137,15 +149,15 @@ def _fit(kind: FilmKind, comparator_mm: Array, camera_mm: Array) -> Array:
 
 
 def _solved(design: Array, values: Array) -> Array:
-    """(..., u) by least squares, of the least norm: design (..., n, 2, u), values (..., n, 2)."""
+    """Minimum-norm least-squares solution (..., u); design (..., n, 2, u), values (..., n, 2)."""
     rows = design.reshape(*design.shape[:-3], -1, design.shape[-1])
-    smallest = max(rows.shape[-2:]) * float(np.finfo(np.float64).eps)  # of the largest singular value, as lstsq has it
+    smallest = max(rows.shape[-2:]) * float(np.finfo(np.float64).eps)  # relative to the largest one, as lstsq
     inverse: Array = np.linalg.pinv(rows, rcond=smallest).astype(np.float64)
     return applied(inverse, values.reshape(*values.shape[:-2], -1))
 
 
 def _half(xy_mm: Array) -> Array:
-    """(...): half the larger side of what marks (..., n, 2) enclose."""
+    """(...) half the longer side of the bounding box of marks (..., n, 2); 1 where it is 0."""
     half = np.ptp(xy_mm, axis=-2).max(axis=-1) / 2.0
     return np.where(half > 0.0, half, 1.0)
 
@@ -160,7 +172,7 @@ def _congruent(kind: Congruent, xy: Array, moved: Array, center: Array, target: 
 
 
 def _projective(xy: Array, moved: Array, center: Array, half: Array, target: Array) -> Array:
-    """From x' (1 + c1 x + c2 y) = a1 + a2 x + a3 y and the like for y', about the means (Hartley's normalisation)."""
+    """Solve x' (1 + c1 x + c2 y) = a1 + a2 x + a3 y, and likewise for y', after Hartley's normalisation."""
     size = _half(moved)[..., None, None]
     rows = np.zeros((*xy.shape, 8))
     for row in (0, 1):
@@ -176,7 +188,7 @@ def _projective(xy: Array, moved: Array, center: Array, half: Array, target: Arr
 
 
 def _scaled(size: Array, origin: Array) -> Array:
-    """(..., 3, 3): to places about an origin (..., 2) from those in units of a size (...) of it."""
+    """Homogeneous matrices (..., 3, 3) that scale by size (...) and then shift to origin (..., 2)."""
     matrix = np.zeros((*size.shape, 3, 3))
     matrix[..., [0, 1], [0, 1]], matrix[..., :2, 2], matrix[..., 2, 2] = size[..., None], origin, 1.0
     return matrix

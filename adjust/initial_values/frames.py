@@ -1,4 +1,4 @@
-"""What the images of a network show of object points: in the camera frame, and freed of what is known of the lens."""
+"""Image coordinates of the object points of a network: in the fiducial system, and corrected for the known lens."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,10 +14,14 @@ from adjust.problem.network import Network
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """The object points of all images in the camera frame, image after image, those of one by name.
+    """Object points of all images in the fiducial system, image by image, sorted by point name within each.
 
-    rows (n,): their observations; xy_mm (n, 2); starts (images + 1,): where those of every image begin; sigma_mm
-    (images,): their typical standard deviation, 0 where there are none.
+    Attributes
+    ----------
+    rows : (n,) numbers of the observations.
+    xy_mm : (n, 2) image coordinates.
+    starts : (images + 1,) index of the first point of each image; the last is n.
+    sigma_mm : (images,) median standard deviation of an image coordinate; 0 for an image without points.
     """
 
     network: Network
@@ -30,18 +34,18 @@ class Frames:
         return slice(int(self.starts[image]), int(self.starts[image + 1]))
 
     def camera_images(self, camera: str) -> list[int]:
-        """The images of a camera that show object points, by number."""
+        """Numbers of the camera's images that show object points."""
         images = enumerate(self.network.images)
         return [i for i, image in images if image.camera == camera and self.starts[i] < self.starts[i + 1]]
 
     def places(self, images: list[int]) -> Indices:
-        """Where the points of some images stand, one image after the other."""
+        """Indices of the points of the given images, one image after the other."""
         return np.concatenate([np.arange(self.starts[i], self.starts[i + 1]) for i in images])
 
     def sights(self, camera: str, lens: Lens) -> dict[str, Sight]:
-        """The images of a camera, by name, freed of the lens's principal point and distortion.
+        """Reduce the images of a camera to the principal point and correct them for distortion; by image name.
 
-        A coordinate that the distortion cannot have produced stays as it is.
+        Coordinates outside the invertible range of the distortion are not corrected for it.
         """
         images, names = self.camera_images(camera), self.network.observations.point
         if not images:
@@ -62,7 +66,10 @@ class Frames:
 
 
 def camera_frames(network: Network, transformation: Mapping[str, Array], mirrored: frozenset[str]) -> Frames:
-    """The object points of all images through their film transformations, parameters by image name."""
+    """Transform the object points of all images into the fiducial system.
+
+    transformation: parameters of the film transformation by image name; mirrored: names of the mirrored scans.
+    """
     observations, count = network.observations, len(network.images)
     names, number = observations.numbered_points
     rank = np.empty(len(names), dtype=np.intp)
@@ -81,7 +88,7 @@ def camera_frames(network: Network, transformation: Mapping[str, Array], mirrore
 
 
 def _medians(values: Array, group: Indices, starts: Indices) -> Array:
-    """The medians (g,) of values (n,), group after group; 0 of an empty one."""
+    """Medians (g,) of values (n,) by group, the groups one after the other; 0 for an empty group."""
     if not len(values):
         return np.zeros(len(starts) - 1)
     ordered = values[np.lexsort((values, group))]

@@ -1,8 +1,8 @@
-"""Frames that were scanned in overlapping parts: how the parts lie to one another, before any adjustment.
+"""Initial film transformations of frames that were scanned in overlapping parts.
 
-One part after the other is brought to the comparator of the first by a similarity through the points that it has in
-common with those placed already. There all fiducial marks of the frame give its film transformation, as if it had been
-scanned at once; each part's own follows from it.
+The parts are transformed one after the other into the comparator system of the first, by a similarity fitted to the
+points in common with the parts placed so far. All fiducial marks of the frame then determine its film transformation,
+as if it had been scanned at once. The film transformation of each part follows from it.
 """
 
 from collections import defaultdict
@@ -21,12 +21,19 @@ from adjust.problem.observations import Observations
 Film = tuple[Array, bool]  # parameters, and whether the scan is mirrored
 Mark = tuple[str, str]  # kind and point
 
-FEWEST_COMMON = 3  # points of two parts: through two a mirrored part would fit as well
+FEWEST_COMMON = 3  # common points of two parts: a mirrored similarity fits two points as well
 
 
 @dataclass(frozen=True)
 class JoinedFrame:
-    """name: of the frame. films: of every part, by name; joins: places (2,) in the camera frame in mm, by point."""
+    """Frame scanned in parts.
+
+    Attributes
+    ----------
+    name : name of the frame.
+    films : film transformation of each part, by its name.
+    joins : (2,) coordinates of each join point in the fiducial system, mm.
+    """
 
     name: str
     films: Mapping[str, Film]
@@ -34,8 +41,10 @@ class JoinedFrame:
 
 
 def joined_frame(network: Network, parts: Sequence[Image]) -> JoinedFrame:
-    """The film transformations of the parts of one frame. Raises AdjustmentError where parts have too little in common,
-    or the frame has too few fiducial marks."""
+    """Determine the film transformations of the parts of one frame.
+
+    Raises AdjustmentError if the parts have too few points in common, or the frame has too few fiducial marks.
+    """
     marks_by_part = {part.name: _marks(network, part) for part in parts}
     first_from, place = _placed(parts[0].part_of, marks_by_part)
     given = network.camera_by_name[parts[0].camera].fiducials
@@ -58,7 +67,7 @@ def joined_frame(network: Network, parts: Sequence[Image]) -> JoinedFrame:
 
 
 def _marks(network: Network, part: Image) -> dict[Mark, Array]:
-    """Where a part shows what, in its comparator, in the order of the names."""
+    """Comparator coordinates of all marks of a part, sorted by kind and name."""
     rows = np.flatnonzero(network.image_numbers == network.images.index(part))
     observations = network.observations
     return {
@@ -68,8 +77,10 @@ def _marks(network: Network, part: Image) -> dict[Mark, Array]:
 
 
 def _placed(frame: str, marks_by_part: Mapping[str, Mapping[Mark, Array]]) -> tuple[dict[str, Film], dict[Mark, Array]]:
-    """Similarities from every part's comparator to that of the first, and where the marks lie there; the part that has
-    most in common comes next."""
+    """Place the parts in the comparator system of the first; the part with most common points comes next.
+
+    Returns the similarity of each part, and the coordinates (2,) of all marks in the system of the first.
+    """
     left = list(marks_by_part)
     films: dict[str, Film] = {left[0]: (np.array([0.0, 0.0, 1.0, 0.0]), False)}
     place = dict(marks_by_part[left.pop(0)])
@@ -91,7 +102,7 @@ def _placed(frame: str, marks_by_part: Mapping[str, Mapping[Mark, Array]]) -> tu
 
 
 def joined_frames(network: Network) -> Iterator[JoinedFrame]:
-    """Every frame that was scanned in parts."""
+    """Iterate over the frames that were scanned in parts."""
     parts = defaultdict(list)
     for image in network.images:
         if image.part_of:
@@ -101,9 +112,9 @@ def joined_frames(network: Network) -> Iterator[JoinedFrame]:
 
 
 def whole_frames(network: Network, films: Mapping[str, Film]) -> Network:
-    """The network as if every frame's points had been measured in the camera frame itself, each once.
+    """Reduce a network to whole frames, with each point measured once and in the fiducial system.
 
-    It holds the frames that show object points; film transformations, joins and fiducial marks are no part of it.
+    The result holds the frames that show object points, without film transformations, join points and fiducial marks.
     """
     first: dict[str, Image] = {}
     for image in network.images:

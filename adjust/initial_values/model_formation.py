@@ -1,5 +1,6 @@
-"""Exterior orientations without known points: two images oriented relatively, a model of all that resection and
-intersection add to them, and its absolute orientation by what coordinates are known.
+"""Model formation: relative orientation of two images, extension by resection and intersection, absolute orientation.
+
+The known coordinates are needed for the absolute orientation only.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,32 +18,42 @@ from adjust.initial_values.pose import KnownField, Pose, image_distances
 from adjust.initial_values.resection import resect_images
 
 SAMPLES = 150
-CANDIDATES = 4  # poses handed on: the two interpretations of a flat scene must both be among them
-REAL = 1e-6  # imaginary part, relative, of a root that is real
+CANDIDATES = 4  # poses returned: must include both interpretations of a flat scene
+REAL = 1e-6  # largest relative imaginary part of a real root
 
 # The monomials in x, y, z of Stewénius's elimination: ten cubic ones, then the basis of the quotient ring.
 CUBIC = ((3, 0, 0), (2, 1, 0), (1, 2, 0), (0, 3, 0), (2, 0, 1), (1, 1, 1), (0, 2, 1), (1, 0, 2), (0, 1, 2), (0, 0, 3))
 BASIS = ((2, 0, 0), (1, 1, 0), (0, 2, 0), (1, 0, 1), (0, 1, 1), (0, 0, 2), (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0))
 POWERS = np.array([*CUBIC, *BASIS])
-CUBIC_TIMES_X = (0, 1, 2, 4, 5, 7)  # x times the first six of the basis: which cubic monomial it is
-BASIS_TIMES_X = (0, 1, 3, 6)  # x times x, y, z, 1: which of the basis it is
-STARTS = 400  # attitudes tried, some 25 degrees apart
+CUBIC_TIMES_X = (0, 1, 2, 4, 5, 7)  # cubic monomials that equal x times the first six of the basis
+BASIS_TIMES_X = (0, 1, 3, 6)  # members of the basis that equal x times x, y, z, 1
+STARTS = 400  # trial attitudes, some 25 degrees apart
 REFINED = 12
-AS_GOOD = 1e-5  # sum of squares, relative to that of the coordinates: a solution as good as the best
-REWEIGHTINGS = 6  # of least distances
-SINGULAR = 1e-6  # smallest over largest singular value of the derivatives by a turn
-SURE_RESECTION = 6  # points that make a resection trustworthy; with fewer it waits until nothing better comes
+AS_GOOD = 1e-5  # excess sum of squares, relative to that of the coordinates, of a solution as good as the best
+REWEIGHTINGS = 6  # for the least sum of distances
+SINGULAR = 1e-6  # smallest singular value of the derivatives by the rotation, relative to the norm of the coordinates
+SURE_RESECTION = 6  # points of a trustworthy resection; one with fewer is postponed
 WELL_DETERMINED = 1e-3  # determination (see intersect) from which an intersected point may orient further images
 FEWEST_SHARED = 8  # common points from which the relative orientation of two images has some redundancy
-PAIRS = 3
+PAIRS = 3  # pairs of images tried as the start of a model
 
 
 def relative_poses(first: Array, second: Array, rng: np.random.Generator) -> list[Pose]:
-    """Poses of the second image, the first one at the origin with rotation I and a base of length 1, the best first.
+    """Determine the relative orientation of two images robustly.
 
-    first, second (n, 3): rays to the same points in the two camera frames, n >= 5. Essential matrices of samples of
-    five (Stewénius, Engels and Nistér 2006) ranked by the smaller half of the coplanarity errors, so that gross errors
-    do no harm; of the four poses of each, the one with most points in front of both cameras.
+    Parameters
+    ----------
+    first, second : (n, 3) rays to the same points in the two camera frames, n >= 5.
+
+    Returns
+    -------
+    Poses of the second image, the best first, with the first image at the origin with rotation I and a base of 1.
+
+    Notes
+    -----
+    Essential matrices of random samples of five points (Stewénius, Engels and Nistér 2006) are ranked by the smaller
+    half of the coplanarity errors. Of the four poses of each, the one with most points in front of both cameras is
+    taken.
     """
     first, second = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (first, second))
     samples = np.array([rng.choice(len(first), 5, replace=False) for _ in range(SAMPLES)])
@@ -62,7 +73,7 @@ def relative_poses(first: Array, second: Array, rng: np.random.Generator) -> lis
 
 
 def _essential_matrices(first: Array, second: Array) -> Array:
-    """All real solutions (k, 3, 3) of samples (m, 5, 3): second' E first = 0."""
+    """All real essential matrices (k, 3, 3) of samples (m, 5, 3): second' E first = 0."""
     coplanarity = np.einsum("msi,msj->msij", second, first).reshape(len(first), 5, 9)
     null = np.linalg.svd(coplanarity)[2][:, 5:].reshape(-1, 4, 3, 3)
     coefficients = _constraint_coefficients(null)
@@ -84,7 +95,7 @@ def _essential_matrices(first: Array, second: Array) -> Array:
 def _constraint_coefficients(null: Array) -> Array:
     """Coefficients (m, 10, 20) of det E = 0 and 2 E E' E - tr(E E') E = 0, E = x N1 + y N2 + z N3 + N4.
 
-    Found by interpolation: the constraints are evaluated at twenty places and the monomials' matrix is inverted.
+    By interpolation: the constraints are evaluated at twenty points and the system of monomials is solved.
     """
     places = np.random.default_rng(0).uniform(-1.0, 1.0, (20, 3))
     monomials = (places[:, None, :] ** POWERS).prod(axis=2)
@@ -98,7 +109,7 @@ def _constraint_coefficients(null: Array) -> Array:
 
 
 def _coplanarity(essential: Array, first: Array, second: Array) -> Array:
-    """Squared angles (k, n), nearly, by which rays miss the epipolar planes (Sampson's distance on the sphere)."""
+    """Approximate squared angles (k, n) between rays and epipolar planes (Sampson's distance on the sphere)."""
     right, left = first @ np.swapaxes(essential, 1, 2), second @ essential
     error = (second * right).sum(axis=2)
     slope = ((right - error[..., None] * second) ** 2).sum(axis=2) + ((left - error[..., None] * first) ** 2).sum(
@@ -108,7 +119,7 @@ def _coplanarity(essential: Array, first: Array, second: Array) -> Array:
 
 
 def _pose(essential: Array, first: Array, second: Array) -> Pose:
-    """Of the four poses of an essential matrix, that with most points in front of both cameras."""
+    """The one of the four poses of an essential matrix with most points in front of both cameras."""
     u, _, vt = np.linalg.svd(essential)
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     rotations = [u @ w @ vt * np.sign(np.linalg.det(u @ vt)) for w in (turn, turn.T)]
@@ -117,7 +128,7 @@ def _pose(essential: Array, first: Array, second: Array) -> Pose:
 
 
 def _pairs_in_front(pose: Pose, first: Array, second: Array) -> int:
-    """How many pairs of rays meet at positive distances from both cameras."""
+    """Number of pairs of rays that intersect at positive distances from both cameras."""
     turned = second @ pose.rotation
     cosine = (first * turned).sum(axis=1)
     along_first, along_second = first @ pose.center, turned @ pose.center
@@ -128,7 +139,7 @@ def _pairs_in_front(pose: Pose, first: Array, second: Array) -> int:
 
 
 def _angle(pose: Pose, other: Pose) -> float:
-    """How different two poses are: the turn between them and the angle between their bases, in rad."""
+    """Difference of two poses: angle of the relative rotation plus angle between the bases, in rad."""
     turn = np.arccos(np.clip((np.trace(pose.rotation @ other.rotation.T) - 1) / 2, -1.0, 1.0))
     return float(turn + np.arccos(np.clip(pose.center @ other.center, -1.0, 1.0)))
 
@@ -146,12 +157,23 @@ class Similarity:
 
 
 def absolute_orientation(model: Array, known: Array, stations: Array) -> Similarity | None:
-    """The similarity that brings model points (n, 3) to their known coordinates (n, 3), nan where one is not known.
+    """Determine the similarity from the model to the object system.
 
-    stations (k, 3): the cameras in the model. A minimal datum, two points and the height of a third say, has two
-    solutions, mirrored about the line of the two: that with the cameras higher above the points is taken. None where
-    the known coordinates do not determine the similarity. Once the attitude is given, scale and shift are linear; so
-    the attitude is sought from starts all over.
+    Parameters
+    ----------
+    model : (n, 3) points in the model.
+    known : (n, 3) their object coordinates, nan where unknown.
+    stations : (k, 3) projection centres in the model.
+
+    Returns
+    -------
+    The similarity; None where the known coordinates do not determine it.
+
+    Notes
+    -----
+    Scale and shift are linear for a given rotation; so the rotation is optimised from starts all over the rotation
+    group. A minimal datum, for example two points and the height of a third, has two solutions, rotated around the line
+    through the two points. The one with the cameras higher above the points is taken.
     """
     from scipy.optimize import least_squares  # takes longer to import than most adjustments
 
@@ -159,7 +181,7 @@ def absolute_orientation(model: Array, known: Array, stations: Array) -> Similar
     if given.sum() < 7 or not given.any(axis=0).all():
         return None
     target = _centred(known, given)
-    starts = Rotation.from_quat(np.random.default_rng(0).normal(size=(STARTS, 4))).as_matrix()  # even over all turns
+    starts = Rotation.from_quat(np.random.default_rng(0).normal(size=(STARTS, 4))).as_matrix()  # uniform over SO(3)
     costs = np.array([(_misfit(start, model, target, given) ** 2).sum() for start in starts])
     found: list[tuple[float, bool, Array]] = []
 
@@ -183,11 +205,18 @@ def absolute_orientation(model: Array, known: Array, stations: Array) -> Similar
 
 
 def levelled(model: Array, heights: Array, stations: Array) -> Similarity | None:
-    """The similarity that brings model points (n, 3) to their heights (n,), gross errors tolerated; X and Y are level
-    axes through the model's middle, whichever.
+    """Level and scale a model by heights alone, robustly; origin and azimuth of X and Y are arbitrary.
 
-    stations (k, 3): the cameras in the model, which stand above the points. None where heights do not tell the scale:
-    over a flat field they are alike, and in a model of poor images they may fall where it rises.
+    Parameters
+    ----------
+    model : (n, 3) points in the model.
+    heights : (n,) their heights.
+    stations : (k, 3) projection centres in the model, above the points.
+
+    Returns
+    -------
+    The similarity; None where the heights do not determine the scale: they are equal (flat field), or decrease where
+    the model rises (poor model).
     """
     weights = np.ones(len(model))
     for _ in range(REWEIGHTINGS):
@@ -211,19 +240,19 @@ def levelled(model: Array, heights: Array, stations: Array) -> Similarity | None
 
 
 def _centred(xyz: Array, given: Mask) -> Array:
-    """Each axis less its mean over the given coordinates; 0 where not given."""
+    """Coordinates reduced by the mean of the given ones, axis by axis; 0 where not given."""
     mean = np.where(given, xyz, 0.0).sum(axis=0) / given.sum(axis=0)
     return np.where(given, xyz - mean, 0.0)
 
 
 def _misfit(rotation: Array, model: Array, target: Array, given: Mask) -> Array:
-    """What the best scale and shift leave of the coordinates with this attitude."""
+    """Residuals of the given coordinates with this rotation and the best scale and shift."""
     turned = _centred(model @ rotation.T, given)
     return np.asarray((_scale(turned, target) * turned - target)[given])
 
 
 def _scale(turned: Array, target: Array) -> float:
-    """A negative one is no solution."""
+    """Least-squares scale; 0 instead of a negative one, which is no solution."""
     return max(float((turned * target).sum() / (turned**2).sum()), 0.0)
 
 
@@ -235,17 +264,17 @@ def _similarity(rotation: Array, model: Array, known: Array, given: Mask) -> Sim
 
 @dataclass
 class Block:
-    """What is known and what is oriented so far, by image and point name."""
+    """Images, known coordinates, and the poses and points determined so far, by image and point name."""
 
     sights: Mapping[str, Sight]
-    firm: Mapping[str, Array]  # coordinates (3,) with a standard deviation, nan where there is none
-    rough: Mapping[str, Array]  # the same with mere approximations filled in
+    firm: Mapping[str, Array]  # coordinates (3,) with a finite standard deviation, nan for the others
+    rough: Mapping[str, Array]  # these, and mere approximations
     poses: dict[str, Pose] = field(default_factory=dict)
     points: dict[str, Array] = field(default_factory=dict)  # intersected
 
 
 def extend(block: Block) -> None:
-    """Orient and intersect in turn until nothing more comes; the images with the surest points first."""
+    """Resect images and intersect points in turn until no more can be oriented; images with most control first."""
     while True:
         block.points = intersected(block, WELL_DETERMINED)
         waiting = [name for name in sorted(block.sights) if name not in block.poses]
@@ -258,8 +287,7 @@ def extend(block: Block) -> None:
 
 
 def _resected(block: Block, images: Sequence[str], fewest: int) -> dict[str, Pose]:
-    """The poses of those images whose points give one: of firm points where there are enough, else of all that have
-    coordinates by now."""
+    """Resect the images that have enough points: from firm points, else from all points with coordinates so far."""
     poses: dict[str, Pose] = {}
     for coordinates in (block.firm, {**block.rough, **block.points}):
         fields = {name: known_field(block.sights[name], coordinates) for name in images if name not in poses}
@@ -270,14 +298,17 @@ def _resected(block: Block, images: Sequence[str], fewest: int) -> dict[str, Pos
 
 
 def known_field(sight: Sight, coordinates: Mapping[str, Array]) -> KnownField:
-    """The points of an image whose three coordinates are known."""
+    """Points of an image of which all three coordinates are known."""
     xyz = np.array([coordinates[name] for name in sight.points]).reshape(-1, 3)
     usable = ~np.isnan(xyz).any(axis=1)
     return KnownField(xyz[usable], sight.xy_mm[usable], sight.sigma_mm)
 
 
 def intersected(block: Block, weakest: float) -> dict[str, Array]:
-    """Coordinates (3,) of the points that the oriented images determine, given coordinates kept."""
+    """Intersect the points that are not fully known, with given coordinates fixed.
+
+    Returns coordinates (3,) by point, of those with a determination above `weakest`.
+    """
     names = [name for name in sorted(block.firm) if np.isnan(block.firm[name]).any()]
     position = {name: i for i, name in enumerate(names)}
     rows = [
@@ -299,12 +330,22 @@ def intersected(block: Block, weakest: float) -> dict[str, Array]:
 
 
 def orient_free_model(sights: Mapping[str, Sight], known: Mapping[str, Array]) -> dict[str, Pose]:
-    """Poses of all images that one model reaches; empty where there is none, or where its datum is lacking.
+    """Orient images by model formation and absolute orientation.
 
-    known: coordinates (3,) by point, nan where unknown. A pair of images is oriented relatively, all others are
-    resected from its points, and so on; of several pairs, and several solutions of each, the model that holds most
-    images, and among these the smallest residuals, is taken and oriented absolutely; by heights alone where nothing
-    else is known. With no coordinate known at all the model keeps the axes of its first image and a base of 1.
+    Parameters
+    ----------
+    known : coordinates (3,) by point, nan where unknown.
+
+    Returns
+    -------
+    Poses of the images in the model; empty if no model can be formed, or if it cannot be oriented absolutely.
+
+    Notes
+    -----
+    Several pairs of images are oriented relatively, each with several solutions, and extended by resection and
+    intersection. The model with most images is taken; of equals, the one with the smallest residuals. It is oriented
+    absolutely, by heights alone if nothing else is known. Without any known coordinate it keeps the axes of its first
+    image and a base of 1.
     """
     models = [model for first, second in _pairs(sights) for model in _models(sights, first, second)]
     if not models:
@@ -329,7 +370,7 @@ def orient_free_model(sights: Mapping[str, Sight], known: Mapping[str, Array]) -
 
 
 def _pairs(sights: Mapping[str, Sight]) -> list[tuple[str, str]]:
-    """The pairs with most points in common."""
+    """Pairs of images with most common points."""
     shared = {
         pair: len(set(sights[pair[0]].points) & set(sights[pair[1]].points)) for pair in combinations(sorted(sights), 2)
     }
@@ -338,7 +379,7 @@ def _pairs(sights: Mapping[str, Sight]) -> list[tuple[str, str]]:
 
 
 def _models(sights: Mapping[str, Sight], first: str, second: str) -> list[Block]:
-    """One for each relative orientation of a pair, with all images that can be joined."""
+    """Models of a pair, one for each relative orientation, extended by all images that can be joined."""
     common = sorted(set(sights[first].points) & set(sights[second].points))
     rays = [_rays(sights[image], common) for image in (first, second)]
     nothing = {name: np.full(3, np.nan) for sight in sights.values() for name in sight.points}
@@ -356,7 +397,7 @@ def _rays(sight: Sight, points: list[str]) -> Array:
 
 
 def typical_residual(model: Block) -> float:
-    """Median distance in mm of projected from observed points; a point that was not intersected counts as gross."""
+    """Median distance in mm between projected and observed points; a point not intersected counts as infinite."""
     distances = []
     for image, pose in model.poses.items():
         sight = model.sights[image]

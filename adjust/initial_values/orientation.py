@@ -1,4 +1,4 @@
-"""Exterior orientations and unknown points: as given, from known points, or from the images alone."""
+"""Initial exterior orientations and object points: given, from known points, or from the images alone."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -23,14 +23,19 @@ from adjust.initial_values.vertical_block import orient_vertical_block
 from adjust.problem.network import Exterior, Network
 from adjust.problem.observations import Distance
 
-TILTED = 0.005  # typical residual, in principal distances, that frames tilted by three degrees leave a vertical block
-CLEARLY_WORSE = 5.0  # a given orientation whose residuals are this many times a resection's is set aside
+TILTED = 0.005  # in principal distances: median residual of a block computed as vertical, if tilted by three degrees
+CLEARLY_WORSE = 5.0  # ratio of the median residuals above which a resection replaces a given orientation
 
 
 def orient(network: Network, sights: Mapping[str, Sight]) -> tuple[dict[str, Pose], dict[str, Array]]:
-    """Poses of all images and coordinates (3,) of all points that are seen or wholly known.
+    """Determine the poses of all images, and the coordinates (3,) of all points that are observed or fully known.
 
-    Raises UnorientedError for images, AdjustmentError for a point that cannot be found.
+    Raises
+    ------
+    UnorientedError
+        If images cannot be oriented.
+    AdjustmentError
+        If a point cannot be intersected.
     """
     block = Block(sights, _coordinates(network, firm=True), _coordinates(network, firm=False))
     for image in network.images:
@@ -49,8 +54,11 @@ def orient(network: Network, sights: Mapping[str, Sight]) -> tuple[dict[str, Pos
 
 
 def _oriented_by_images(block: Block) -> dict[str, Pose]:
-    """Poses where too few points are known to begin with: as if all frames looked straight down, or, where that leaves
-    residuals as tilted frames do, of a model in space, if this leaves less."""
+    """Orient images with too few known points for resection.
+
+    The images are first treated as a vertical block. If its residuals are those of tilted images, a spatial model is
+    formed and taken if its residuals are smaller.
+    """
     vertical = orient_vertical_block(block.sights, block.firm)
     left = _relative_residual(block, vertical)
     if left < TILTED:
@@ -60,7 +68,7 @@ def _oriented_by_images(block: Block) -> dict[str, Pose]:
 
 
 def _relative_residual(block: Block, poses: Mapping[str, Pose]) -> float:
-    """The typical residual of images in these poses, in principal distances; infinite where there are none."""
+    """Median residual of images in these poses, in principal distances; infinite without poses."""
     if not poses:
         return np.inf
     trial = replace(block, poses=dict(poses), points={})
@@ -69,7 +77,7 @@ def _relative_residual(block: Block, poses: Mapping[str, Pose]) -> float:
 
 
 def _coordinates(network: Network, firm: bool) -> dict[str, Array]:
-    """What is known of every point (3,), nan where nothing is."""
+    """Known coordinates (3,) of every point, nan where unknown. firm: without mere approximations (infinite sigma)."""
     priors = {point.id: (point.X, point.Y, point.Z) for point in network.points}
     return {
         name: np.array([np.nan if p is None or (firm and np.isinf(p.sigma)) else p.value for p in three])
@@ -78,7 +86,7 @@ def _coordinates(network: Network, firm: bool) -> dict[str, Array]:
 
 
 def _given_or_resected(exterior: Exterior, block: Block, image: str) -> Pose:
-    """The given orientation, or a resection where known points contradict it and it is not held fixed."""
+    """The given orientation; a resection instead if known points contradict it and it is not fixed."""
     given = Pose(rotation_from_angles(exterior.values[3:]), exterior.center)
     field, c = known_field(block.sights[image], block.firm), block.sights[image].principal_distance_mm
     if (exterior.sigmas == 0).any() or len(field.xyz) < 4:
@@ -91,7 +99,7 @@ def _given_or_resected(exterior: Exterior, block: Block, image: str) -> Pose:
 
 
 def _scale_by_distances(block: Block, distances: Sequence[Distance]) -> None:
-    """Scale a model of an arbitrary base so that measured distances come out, on the average."""
+    """Scale a model of arbitrary base by the median ratio of the measured distances to those in the model."""
     places = {image: pose.center for image, pose in block.poses.items()} | block.points
     ratios = [
         each.value / np.linalg.norm(places[each.end] - places[each.start])
@@ -105,7 +113,7 @@ def _scale_by_distances(block: Block, distances: Sequence[Distance]) -> None:
 
 
 def _all_points(block: Block) -> dict[str, Array]:
-    """Every point's coordinates: as known, else intersected, else as roughly given."""
+    """Coordinates of every point: known, else intersected, else the given approximation."""
     points = {**block.rough, **intersected(block, 0.0)}
     unknown = {name for name, xyz in points.items() if np.isnan(xyz).any()}
     for name in sorted(unknown):

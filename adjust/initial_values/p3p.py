@@ -1,4 +1,4 @@
-"""Where a camera can stand that sees three points as observed: Grunert's solution, for many triples at once."""
+"""P3P: poses of a camera from three known points by Grunert's solution, for many triples at once."""
 
 import numpy as np
 
@@ -6,9 +6,19 @@ from adjust.array_types import Array, Indices
 
 
 def triple_poses(points: Array, tangents: Array) -> tuple[Array, Array, Indices]:
-    """Rotations (k, 3, 3) and shifts (k, 3), camera = R X + t, of every triple, and which one (k,) each is of: points
-    (m, 3, 3), tangents (m, 3, 2).
+    """Solve P3P for many triples of points.
 
+    Parameters
+    ----------
+    points : (m, 3, 3) object coordinates.
+    tangents : (m, 3, 2) image coordinates over c.
+
+    Returns
+    -------
+    rotations (k, 3, 3) and shifts (k, 3), camera = R X + t, and the number (k,) of the triple of each.
+
+    Notes
+    -----
     Grunert's solution (Haralick et al. 1994, eqs. 7-9): a quartic in the ratio of two of the three distances.
     """
     rays = np.concatenate([tangents, np.full((*tangents.shape[:2], 1), -1.0)], axis=2)
@@ -30,7 +40,7 @@ def triple_poses(points: Array, tangents: Array) -> tuple[Array, Array, Indices]
 
 
 def _grunert_quartic(a: Array, c: Array, cos_a: Array, cos_b: Array, cos_g: Array) -> Array:
-    """Coefficients (m, 5), highest first; a, c are the squared sides over b²."""
+    """Coefficients (m, 5) of the quartic, highest degree first; a, c: squared sides over b²."""
     d, s = a - c, a + c
     return np.stack(
         [
@@ -46,7 +56,7 @@ def _grunert_quartic(a: Array, c: Array, cos_a: Array, cos_b: Array, cos_g: Arra
 
 
 def _quartic_roots(coefficients: Array) -> Array:
-    """Real parts (m, 4) of the roots: noise turns the double root of a camera over its points into a complex pair."""
+    """Real parts (m, 4) of the roots: noise turns the double root of a camera above its points into a complex pair."""
     monic = coefficients[:, 1:] / coefficients[:, :1]
     sound = np.logical_and.reduce(np.isfinite(monic), axis=1)
     companion = np.zeros((len(monic), 4, 4))
@@ -56,7 +66,7 @@ def _quartic_roots(coefficients: Array) -> Array:
 
 
 def _triad(points: Array) -> Array:
-    """An orthonormal frame (..., 3, 3), axes in columns, fixed to three points (..., 3, 3)."""
+    """Orthonormal axes (..., 3, 3), in columns, attached to three points (..., 3, 3)."""
     x = points[..., 1, :] - points[..., 0, :]
     z = np.cross(x, points[..., 2, :] - points[..., 0, :])
     x = x / np.linalg.norm(x, axis=-1, keepdims=True)

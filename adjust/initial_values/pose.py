@@ -1,7 +1,7 @@
-"""Poses, what images show of known points, and the refinement of many poses at once by least squares.
+"""Poses, known points in images, and least-squares refinement of many poses at once.
 
-Object points are in units of their extent about their mean, image coordinates are tangents: over c.
-Arrays (k, n) hold n points of k images; those that an image does not have are there with the weight 0.
+Object points are centred on their mean and divided by their extent; image coordinates are divided by c (tangents).
+Arrays (k, n) hold n points of k images; points that an image does not show have weight 0.
 """
 
 from dataclasses import dataclass
@@ -12,15 +12,15 @@ from adjust.array_types import Array
 from adjust.functional_model.rotation import rotation_from_vector
 
 LM_ITERATIONS = 12
-SETTLED = 1e-6  # relative change of a sum of squares that is none
+SETTLED = 1e-6  # relative change of a sum of squares at convergence
 BEHIND = 1e6  # squared residual, in squared principal distances, of a point behind the camera
-LARGEST_CHANGE = 0.5  # of a principal distance's logarithm in a step
-USUAL_BEND = 0.3  # standard deviation of a lens's third-degree distortion, at an angle of 45 degrees
+LARGEST_CHANGE = 0.5  # of the logarithm of the principal distance in one step
+USUAL_BEND = 0.3  # prior standard deviation of third-degree radial distortion, at an angle of 45 degrees
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a camera stood: rotation (3, 3) object to camera, center (3,) in object units."""
+    """Exterior orientation: rotation (3, 3) from object to camera, projection centre (3,) in object units."""
 
     rotation: Array
     center: Array
@@ -28,7 +28,7 @@ class Pose:
 
 @dataclass(frozen=True, eq=False)
 class KnownField:
-    """What one image shows of known points: xyz (n, 3), xy_mm (n, 2) about the principal point, their sigma in mm."""
+    """Known points in one image: xyz (n, 3); xy_mm (n, 2) relative to the principal point, and their sigma in mm."""
 
     xyz: Array
     xy_mm: Array
@@ -36,7 +36,7 @@ class KnownField:
 
 
 def image_distances(pose: Pose, xyz: Array, xy_mm: Array, principal_distance_mm: float) -> Array:
-    """Distances (n,) in mm from observed to projected points; inf behind the camera."""
+    """Distances (n,) in mm between observed and projected points; inf behind the camera."""
     shift = -pose.rotation @ pose.center
     squared = squared_residuals(pose.rotation[None], shift[None], xyz, xy_mm / principal_distance_mm)[0]
     return np.where(squared < BEHIND, principal_distance_mm * np.sqrt(squared), np.inf)
@@ -45,9 +45,16 @@ def image_distances(pose: Pose, xyz: Array, xy_mm: Array, principal_distance_mm:
 def refined_poses(
     rotations: Array, shifts: Array, points: Array, tangents: Array, weights: Array
 ) -> tuple[Array, Array]:
-    """Rotations (k, 3, 3) and shifts (k, 3), camera = R X + t, of least weighted squares (Levenberg and Marquardt).
+    """Refine k poses by weighted least squares (Levenberg and Marquardt).
 
-    points (k, n, 3), tangents (k, n, 2), weights (k, n).
+    Parameters
+    ----------
+    rotations, shifts : (k, 3, 3) and (k, 3) approximations, camera = R X + t.
+    points, tangents, weights : (k, n, 3), (k, n, 2), (k, n).
+
+    Returns
+    -------
+    Rotations and shifts.
     """
     rotations, shifts, damping = rotations.copy(), shifts.copy(), np.full(len(rotations), 1e-4)
     cost = (weights * squared_residuals(rotations, shifts, points, tangents)).sum(axis=1)
@@ -56,7 +63,7 @@ def refined_poses(
         fields = points[going], tangents[going]
         normal, right = _normal_equations(rotations[going], shifts[going], *fields, weights[going])
         diagonal = np.einsum("kii->ki", normal)
-        diagonal += damping[going, None] * diagonal + 1e-14  # the constant keeps a pose without a solution harmless
+        diagonal += damping[going, None] * diagonal + 1e-14  # the constant avoids singular matrices
         step = np.asarray(np.linalg.solve(normal, right[..., None])[..., 0], dtype=np.float64)
         moved = _stepped(rotations[going], shifts[going], step)
         new_cost = (weights[going] * squared_residuals(*moved, *fields)).sum(axis=1)
@@ -74,13 +81,28 @@ def refined_poses(
 def refined_distance(
     rotations: Array, shifts: Array, points: Array, xy_mm: Array, weights: Array, distance_mm: float, sigma_mm: float
 ) -> tuple[float, float]:
-    """The principal distance in mm of all images together, and the standard deviation of its logarithm, infinite where
-    the points do not determine it.
+    """Estimate one principal distance from all images together.
 
-    points (k, n, 3), image coordinates xy_mm (k, n, 2) of standard deviation sigma_mm at least. Gauss-Newton steps from
-    nearby, with the poses eliminated. A radial distortion of the third degree, about 0, is estimated besides and
-    forgotten: without it a principal distance would take its place. Raises numpy.linalg.LinAlgError where points come
-    behind the camera, for gross errors.
+    Parameters
+    ----------
+    rotations, shifts : (k, 3, 3) and (k, 3) approximate poses, camera = R X + t.
+    points, xy_mm, weights : (k, n, 3), (k, n, 2), (k, n).
+    distance_mm : approximate principal distance.
+    sigma_mm : lower bound of the standard deviation of image coordinates.
+
+    Returns
+    -------
+    Principal distance in mm, and the standard deviation of its logarithm: infinite if the points do not determine it.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If gross errors bring points behind the camera.
+
+    Notes
+    -----
+    Gauss-Newton steps with the poses eliminated. Radial distortion of the third degree, with prior 0, is estimated as a
+    nuisance parameter: otherwise it would bias the principal distance.
     """
     c, bend, noise = distance_mm, 0.0, sigma_mm / distance_mm
     by_bend_mm = xy_mm * ((xy_mm / c) ** 2).sum(axis=2, keepdims=True)
@@ -106,7 +128,7 @@ def refined_distance(
 
 
 def squared_residuals(rotations: Array, shifts: Array, points: Array, tangents: Array) -> Array:
-    """Squared residuals (k, n), in squared principal distances, of points (n, 3) or (k, n, 3)."""
+    """Squared residuals (k, n), in squared principal distances, of points (n, 3) or (k, n, 3); BEHIND at most."""
     u, v, w = _camera_coordinates(rotations, shifts, points)
     in_front = w < 0.0
     depth = np.where(in_front, w, -1.0)
@@ -120,15 +142,18 @@ def _stepped(rotations: Array, shifts: Array, step: Array) -> tuple[Array, Array
 
 
 def _camera_coordinates(rotations: Array, shifts: Array, points: Array) -> Array:
-    """U, V, W (3, k, n) of points (n, 3), or (k, n, 3), in the axes of k cameras."""
+    """U, V, W (3, k, n) of points (n, 3) or (k, n, 3) in the axes of k cameras."""
     return np.asarray((rotations @ points.swapaxes(-1, -2) + shifts[..., None]).swapaxes(0, 1))
 
 
 def _normal_equations(
     rotations: Array, shifts: Array, points: Array, tangents: Array, weights: Array, by_bend: Array | None = None
 ) -> tuple[Array, Array]:
-    """J'WJ (k, 6, 6) and J'Wr (k, 6) for a small turn of the camera and a shift in its frame; by_bend (k, n, 2): and
-    two more, for the logarithm of the principal distance and for what these tangents are multiplied with."""
+    """Normal equations J'WJ (k, 6, 6) and J'Wr (k, 6) for a small rotation of the camera and a shift in its axes.
+
+    by_bend (k, n, 2): derivatives of the tangents with respect to distortion; adds two unknowns, the logarithm of the
+    principal distance and the distortion parameter.
+    """
     u, v, w = _camera_coordinates(rotations, shifts, points)
     inverse = -1.0 / np.minimum(w, -1e-9)
     p, q = u * inverse, v * inverse

@@ -1,7 +1,7 @@
-"""An approximate principal distance from images of known points, where the camera brings none.
+"""Approximate principal distance from images of known points, for cameras without a given one.
 
-Of a pinhole a single image of a plane may leave it open; of a lens that is none while its parameters are 0, a fisheye,
-not even a single image of a plane fits with a wrong one.
+A single image of a plane may not determine the principal distance of a pinhole camera. It does determine that of a
+fisheye, whose projection differs from a pinhole even with all distortion parameters 0.
 """
 
 from collections.abc import Sequence
@@ -14,22 +14,22 @@ from adjust.initial_values.pose import KnownField
 from adjust.initial_values.resection import distance_together, resections
 
 GRID = np.geomspace(0.35, 16.0, 14)  # principal distances tried, in radii of the imaged field: 140 to 7 degrees
-FEWEST = 4  # points of an image
+FEWEST = 4  # known points of an image
 COARSE_IMAGES, COARSE_POINTS = 5, 30
 FINE_IMAGES = 12
 LARGEST_RELATIVE_SIGMA = 0.15
-ANGLES_DEG = np.arange(88.0, 8.0, -4.0)  # off the axis at which the outermost point of all images is tried
+ANGLES_DEG = np.arange(88.0, 8.0, -4.0)  # trial angles between the axis and the outermost point of all images
 WIDE_IMAGES = 5
-FEWEST_WIDE = 6  # points of an image
-HALVES = 4  # of the step between angles, for the last search
+FEWEST_WIDE = 6  # known points of an image
+HALVES = 4  # halvings of the step between trial angles in the fine search
 
 
 def find_principal_distance(fields: Sequence[KnownField]) -> float | None:
-    """The principal distance in mm with which resections of all images leave the least; None where they do not tell.
+    """Estimate the principal distance of a pinhole camera, in mm; None if it is not determined.
 
-    Images are resected with principal distances on a logarithmic grid; from the best, least squares over all images.
-    They do not tell it when it has a standard deviation above 15 %: a flat field parallel to the image, where a change
-    of it is a change of the height.
+    The images are resected with principal distances on a logarithmic grid. The best one starts a least-squares estimate
+    over all images. A standard deviation above 15 % counts as not determined: on a flat field parallel to the image, a
+    change of the principal distance cannot be separated from a change of the height.
     """
     fields = _largest_fields(fields, FEWEST, FINE_IMAGES)
     if not fields:
@@ -48,14 +48,15 @@ def find_principal_distance(fields: Sequence[KnownField]) -> float | None:
             return None
         c, sigma = together
         if all(each is not None and each.inliers.all() for each in resected):
-            break  # a better distance leaves out no other points
+            break  # all points are inliers: another round would use the same ones
     return c if sigma < LARGEST_RELATIVE_SIGMA else None
 
 
 def find_wide_distance(fields: Sequence[KnownField], distortion: Distortion) -> float | None:
-    """The principal distance in mm with which resections leave the least; None where no image tells it.
+    """Estimate the principal distance of a wide-angle or fisheye lens, in mm; None if no image determines it.
 
-    fields: places about the principal point; distortion: as it is given.
+    It minimises the residuals of the resections. fields: image coordinates relative to the principal point; distortion:
+    as given.
     """
     fields = _largest_fields(fields, FEWEST_WIDE, WIDE_IMAGES)
     if not fields:
@@ -75,13 +76,13 @@ def find_wide_distance(fields: Sequence[KnownField], distortion: Distortion) -> 
 
 
 def _thin_field(field: KnownField) -> KnownField:
-    """An image with as many of its points as a coarse search needs, evenly taken."""
+    """Thin out the points of an image evenly, for the coarse search."""
     step = -(-len(field.xyz) // COARSE_POINTS)
     return KnownField(field.xyz[::step], field.xy_mm[::step], field.sigma_mm)
 
 
 def _largest_fields(fields: Sequence[KnownField], fewest: int, most: int) -> list[KnownField]:
-    """Those with most points, up to a number of them; none with too few points."""
+    """The images with most points, at most `most`; none with fewer points than `fewest`."""
     return sorted((each for each in fields if len(each.xyz) >= fewest), key=lambda each: -len(each.xyz))[:most]
 
 
@@ -90,7 +91,7 @@ def _radius_mm(fields: Sequence[KnownField]) -> float:
 
 
 def _misfit_mm2(fields: Sequence[KnownField], lens: Lens) -> float:
-    """The median squares by which the points of images miss where they were observed; inf where one has no pose."""
+    """Sum over the images of the median squared residual, mm²; inf if an image has no pose."""
     ideal_mm, found = zip(*(lens.ideal_from_observed(each.xy_mm) for each in fields), strict=True)
     if not all(each.all() for each in found):
         return np.inf

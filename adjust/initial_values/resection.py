@@ -1,9 +1,8 @@
-"""Resection in space: poses of images from their known points, of many images at once, gross errors tolerated.
+"""Robust space resection: poses of many images at once from their known points.
 
-Candidates are the poses from triples of points (P3P), whether the field is flat or deep. The best of them by least
-trimmed squares (Rousseeuw and Van Driessen 2006) are refined on the half of the points that they explain best, and the
-best of these on all points that agree. A few triples do where most points agree on a pose; where they do not, many are
-tried.
+Candidates are the P3P poses of triples of points; the field may be flat or deep. The best ones by least trimmed squares
+(Rousseeuw and Van Driessen 2006) are refined on the half of the points with the smallest residuals, and the best of
+these on all inliers. A few triples suffice where most points agree on a pose; otherwise many are tried.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,23 +17,28 @@ from adjust.array_types import Array, Indices, Mask
 from adjust.initial_values.p3p import triple_poses
 from adjust.initial_values.pose import KnownField, Pose, refined_distance, refined_poses, squared_residuals
 
-MAX_TRIPLES = 120  # enough for one free of gross errors among them when every third point is wrong
-FEWEST_QUICK = 16  # points of an image, half of which show whether they agree
-WORSE = 3.0  # times the usual standard deviation that residuals may have where points agree
-TYPICAL = 10  # images from which on their median tells what a lens that is not known yet leaves everywhere
-LARGEST_TYPICAL = 0.01  # of that, in principal distances: where most images leave more, all may be wrong
+MAX_TRIPLES = 120  # enough for one without gross errors if every third point is wrong
+FEWEST_QUICK = 16  # points of an image, half of which suffice to test whether they agree
+WORSE = 3.0  # ratio of the residuals to their usual standard deviation up to which points agree
+TYPICAL = 10  # images needed to estimate the residuals due to a still unknown lens by their median
+LARGEST_TYPICAL = 0.01  # in principal distances: a larger median may mean that all resections are wrong
 REJECTION = 13.8  # 0.1 % point of the squared residual's chi-square (2) distribution, in sigma²
-IMPLAUSIBLE = 0.05  # residuals, in principal distances, of a pose whose points cannot be the ones they are named
-EXACT = 1e-12  # squared residual of three points that are met
-SAME_PLACE = 1e-4  # poses nearer than this, in extents of the points, are one
-LINE = 1e-5  # width over length of points that lie on a line, about which a camera may turn
+IMPLAUSIBLE = 0.05  # in principal distances: larger residuals mean misidentified points
+EXACT = 1e-12  # largest squared residual of an exact solution for three points
+SAME_PLACE = 1e-4  # in extents of the points: poses nearer than this are the same
+LINE = 1e-5  # width over length of collinear points: the camera may rotate around their line
 POINTS_AT_ONCE = 20_000
 
 
 class Effort(NamedTuple):
-    """triples of every image; of their poses, tested on so many points, those that are refined, and how often.
+    """Effort of a resection.
 
-    The two minima of a flat field must both be among these.
+    Attributes
+    ----------
+    triples : triples of points per image.
+    points : largest number of points on which poses are tested.
+    refined : poses refined per image; must include both minima of a flat field.
+    rounds : number of refinements.
     """
 
     triples: int
@@ -48,10 +52,7 @@ QUICK, THOROUGH = Effort(5, 30, 2, 1), Effort(MAX_TRIPLES, 200, 16, 2)
 
 @dataclass(frozen=True)
 class Resection:
-    """A pose and how well it explains the points.
-
-    inliers (n,): the points that agree; sigma_mm: the robust standard deviation of one image coordinate.
-    """
+    """Result of a space resection: pose, inlier mask (n,), robust standard deviation of an image coordinate in mm."""
 
     pose: Pose
     inliers: Mask
@@ -59,14 +60,18 @@ class Resection:
 
 
 def resect_images(fields: Sequence[KnownField], principal_distances_mm: Sequence[float]) -> list[Pose | None]:
-    """The poses of images from their known points; None where these give none, or several.
+    """Determine the poses of images from their known points.
 
     Parameters
     ----------
     fields : sequence of KnownField
-        Three points of an image at least; of three their only pose is taken.
+        At least three points per image.
     principal_distances_mm : sequence of float
-        Of the images.
+        One per image.
+
+    Returns
+    -------
+    Poses; None for an image without a plausible one, or with several solutions of its three points.
     """
     poses: list[Pose | None] = []
     found = resections(fields, principal_distances_mm)
@@ -80,10 +85,17 @@ def resect_images(fields: Sequence[KnownField], principal_distances_mm: Sequence
 
 
 def resect(xyz: Array, xy_mm: Array, principal_distance_mm: float, floor_mm: float = 1e-4) -> Resection | None:
-    """The pose that explains most of the points best; None where the points decide none (all on one line, say).
+    """Resect one image robustly.
 
-    xyz (n, 3) object points, flat or not, n >= 4; xy_mm (n, 2) ideal image coordinates about the principal point, y up.
-    floor_mm: residuals this small are never gross.
+    Parameters
+    ----------
+    xyz : (n, 3) object points, flat or not, n >= 4.
+    xy_mm : (n, 2) distortion-free image coordinates relative to the principal point, y up.
+    floor_mm : lower bound of the standard deviation of image coordinates: limits the rejection of outliers.
+
+    Returns
+    -------
+    The pose that fits most points; None where the points do not determine one (collinear, for example).
     """
     return _resected([KnownField(xyz, xy_mm, floor_mm)], np.array([principal_distance_mm]), THOROUGH)[0]
 
@@ -91,10 +103,20 @@ def resect(xyz: Array, xy_mm: Array, principal_distance_mm: float, floor_mm: flo
 def resections(
     fields: Sequence[KnownField], principal_distances_mm: Sequence[float], only_quick: bool = False
 ) -> list[Resection | None]:
-    """The resections of images of four points and more; None for the others, and where the points decide none.
+    """Resect images with at least four known points.
 
-    Points agree where most residuals are as large as the standard deviations say, or as those of most images are: a
-    lens that is not known yet leaves some everywhere. only_quick: images whose points do not agree are not tried again.
+    Parameters
+    ----------
+    only_quick : do not repeat the resection with more effort for images whose points do not agree.
+
+    Returns
+    -------
+    Resections; None for images with fewer points, or points that do not determine a pose.
+
+    Notes
+    -----
+    Points agree if the residuals match their standard deviations, or those of most images: a still unknown lens causes
+    residuals everywhere.
     """
     c = np.array(principal_distances_mm, dtype=np.float64)
     found: list[Resection | None] = [None] * len(fields)
@@ -117,7 +139,7 @@ def resections(
 
 
 def three_point_poses(xyz: Array, xy_mm: Array, principal_distance_mm: float) -> list[Pose]:
-    """All poses (up to four) from which three points appear where they are observed. xyz (3, 3), xy_mm (3, 2)."""
+    """All exact poses (up to four) for three points, xyz (3, 3), observed at xy_mm (3, 2)."""
     field = _Fields.from_fields([KnownField(xyz, xy_mm, 0.0)], np.array([principal_distance_mm]))
     rotations, shifts, of = triple_poses(field.points, field.tangents)
     points, tangents = field.points[of], field.tangents[of]
@@ -134,8 +156,10 @@ def three_point_poses(xyz: Array, xy_mm: Array, principal_distance_mm: float) ->
 def distance_together(
     fields: Sequence[KnownField], found: Sequence[Resection | None], principal_distance_mm: float
 ) -> tuple[float, float] | None:
-    """The principal distance in mm by least squares over all images that were resected with one nearby, and the
-    standard deviation of its logarithm; None where there is none.
+    """Estimate a principal distance by least squares over all images resected with an approximate one.
+
+    Returns the principal distance in mm and the standard deviation of its logarithm; None if no image was resected or
+    the estimate fails.
     """
     pairs = [(field, each) for field, each in zip(fields, found, strict=True) if each is not None]
     if not pairs:
@@ -156,10 +180,16 @@ def distance_together(
 
 @dataclass(frozen=True, eq=False)
 class _Fields:
-    """Fields of k images: points (k, n, 3) in units of their extent about their mean, tangents (k, n, 2), and which are
-    present (k, n), those of an image first.
+    """Padded arrays of the known points in k images.
 
-    origin (k, 3), size (k,): the way back; c (k,) in mm; floor (k,): least standard deviation of a tangent.
+    Attributes
+    ----------
+    points : (k, n, 3), reduced to their mean and divided by their extent.
+    tangents : (k, n, 2) image coordinates over c.
+    present : (k, n) mask of the points that exist, the padding last.
+    origin, size : (k, 3) mean and (k,) extent of the points.
+    c : (k,) principal distances, mm.
+    floor : (k,) lower bounds of the standard deviation of a tangent.
     """
 
     points: Array
@@ -184,15 +214,15 @@ class _Fields:
 
     @property
     def counts(self) -> Indices:
-        """(k,)"""
+        """(k,) numbers of points."""
         return np.asarray(self.present.sum(axis=1))
 
     def pose(self, k: int, rotation: Array, shift: Array) -> Pose:
-        """Of one image, in object units."""
+        """Pose of image k in object units."""
         return Pose(rotation, self.origin[k] - self.size[k] * rotation.T @ shift)
 
     def sample(self, most: int) -> "_Fields":
-        """The same of so many points an image, drawn at random, where it has more."""
+        """Draw `most` points per image at random, if some image has more."""
         if self.present.shape[1] <= most:
             return self
         drawn = (np.random.default_rng(0).random(most) * self.counts[:, None]).astype(np.intp)
@@ -201,13 +231,12 @@ class _Fields:
         return _Fields(self.points[at], self.tangents[at], present, self.origin, self.size, self.c, self.floor)
 
     def squared(self, rotations: Array, shifts: Array, image: Indices) -> Array:
-        """Squared residuals (c, n) of poses of some images (c,); inf of points that are not present."""
+        """Squared residuals (c, n) of c poses, each of one image (c,); inf for the padding."""
         squared = squared_residuals(rotations, shifts, self.points[image], self.tangents[image])
         return np.where(self.present[image], squared, np.inf)
 
     def triples(self, most: int) -> Indices:
-        """Triples of points (k, m, 3), all of them or the first of those drawn that are not slender: such give poor
-        poses."""
+        """Triples of points (k, m, 3): all, or random ones without slender triangles, which give poor poses."""
         counts = self.counts
         if comb(int(counts.max()), 3) <= MAX_TRIPLES:
             every = np.array(list(combinations(range(int(counts[0])), 3)), dtype=np.intp)
@@ -219,7 +248,7 @@ class _Fields:
         return np.take_along_axis(drawn, np.argsort(slender, axis=1, kind="stable")[:, :most, None], axis=1)
 
     def candidates(self, effort: Effort) -> tuple[Array, Array, Indices]:
-        """The best poses of triples: rotations (c, 3, 3), shifts (c, 3), image by image (c,)."""
+        """Best P3P poses: rotations (c, 3, 3), shifts (c, 3), and the image (c,) of each, image by image."""
         triples = self.triples(effort.triples)
         image = np.repeat(np.arange(len(triples)), triples.shape[1])
         at = image[:, None], triples.reshape(-1, 3)
@@ -228,7 +257,7 @@ class _Fields:
         return rotations[best], shifts[best], image[of][best]
 
     def best(self, rotations: Array, shifts: Array, image: Indices, most: int) -> Indices:
-        """Of every image the poses of least trimmed squares, up to a number of them."""
+        """Indices of each image's poses with the least trimmed squares, at most `most`."""
         cost = np.sort(self.squared(rotations, shifts, image), axis=1).cumsum(axis=1)
         half = _trimmed_counts(self.counts[image])
         order = np.lexsort((cost[np.arange(len(cost)), half - 1], image))
@@ -236,7 +265,7 @@ class _Fields:
 
 
 def _batches(fields: Sequence[KnownField]) -> Iterator[Indices]:
-    """Images of about as many points, some at a time; of as many where all their triples are taken."""
+    """Batches of images with similar numbers of points; with equal ones where all triples are used."""
     counts = np.array([len(field.xyz) for field in fields], dtype=np.intp)
     order = np.argsort(-counts, kind="stable")
     while len(order):
@@ -248,7 +277,7 @@ def _batches(fields: Sequence[KnownField]) -> Iterator[Indices]:
 
 
 def _resected(fields: Sequence[KnownField], c: Array, effort: Effort) -> list[Resection | None]:
-    """The resections of all fields, of four points and more each, with the same effort."""
+    """Resect all fields, of at least four points each, with the same effort."""
     found: list[Resection | None] = [None] * len(fields)
     for some in _batches(fields):
         batch = _Fields.from_fields([fields[i] for i in some], c[some])
@@ -276,14 +305,14 @@ def _resected(fields: Sequence[KnownField], c: Array, effort: Effort) -> list[Re
 
 
 def _trimmed_counts(counts: Indices) -> Indices:
-    """The numbers of residuals that least trimmed squares keeps, for poses of three points."""
+    """Numbers of residuals kept by least trimmed squares, for poses from three points."""
     return (counts + 4) // 2
 
 
 def _robust_sigmas(squared: Array, counts: Indices) -> Array:
-    """Standard deviations (k,) of a coordinate from the smallest half of chi-square (2) distributed squares (k, n).
+    """Standard deviations (k,) of a coordinate from the smaller half of chi-square (2) distributed squares (k, n).
 
-    Of these, counts (k,) are there, the others are infinite.
+    counts (k,): numbers of existing points; the squares of the padding are infinite.
     """
     half = _trimmed_counts(counts)
     left_out = 1 - half / counts

@@ -1,4 +1,4 @@
-"""A block of near-vertical frames from their common points alone: a chain of plane similarities."""
+"""Orientation of a near-vertical block from its common points: plane similarities, adjusted together."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,19 +13,28 @@ from adjust.initial_values.pose import Pose
 
 FEWEST_SHARED = 2
 REWEIGHTINGS = 6
-HEIGHTS = np.geomspace(1.5, 300.0, 25)  # flying heights tried, in ranges of the relief
+HEIGHTS = np.geomspace(1.5, 300.0, 25)  # trial flying heights, in units of the range of the relief
 
 
 def orient_vertical_block(sights: Mapping[str, Sight], known: Mapping[str, Array]) -> dict[str, Pose]:
-    """Poses of the frames that hang together, as if all looked straight down.
+    """Orient a connected block as if all images were vertical.
 
-    known: coordinates (3,) by point, nan where unknown. Every frame is a similarity of the ground: all similarities
-    and unknown ground points are found in one linear adjustment of the sum of distances (complex numbers for the
-    plane), repeated with the relief displacement taken off. The scale gives the flying height above the mean of the
-    known heights. With no planimetry known the first frame's axes are kept, and the scale is that at which the relief
-    displacements fit; over a flat field, where there are none, it is arbitrary. Empty where one point alone is known
-    in planimetry, or where fewer than half of the points have a height and nothing else: that is the field such frames
-    are flown over. A start within a few degrees of the vertical.
+    Parameters
+    ----------
+    known : coordinates (3,) by point, nan where unknown.
+
+    Returns
+    -------
+    Poses by image name, good to a few degrees of tilt. Empty if only one point has planimetric control, or if fewer
+    than half of the points have height control only (the usual field of such a block).
+
+    Notes
+    -----
+    Each image is a plane similarity of the ground. One linear adjustment in complex numbers, which minimises the sum of
+    distances, determines all similarities and unknown ground points; it is repeated with the image coordinates
+    corrected for relief displacement. The scale gives the flying height above the mean of the known heights. Without
+    planimetric control the axes of the first image are kept, and the scale is chosen to fit the relief displacements;
+    over flat ground it is arbitrary.
     """
     images = _connected(sights, known)
     if not images:
@@ -47,9 +56,7 @@ def orient_vertical_block(sights: Mapping[str, Sight], known: Mapping[str, Array
 
 
 def _connected(sights: Mapping[str, Sight], known: Mapping[str, Array]) -> list[str]:
-    """The group of frames, each sharing points with another, that sees most points of known X and Y; of alike, the
-    largest.
-    """
+    """Select the connected group of images with most planimetric control (counted up to 2); of equals, the largest."""
     planimetric = {name for name, xyz in known.items() if not np.isnan(xyz[:2]).any()}
     points = {image: set(sight.points) for image, sight in sights.items()}
     left, groups = set(sights), []
@@ -65,9 +72,14 @@ def _connected(sights: Mapping[str, Sight], known: Mapping[str, Array]) -> list[
 
 @dataclass(frozen=True, eq=False)
 class _Rays:
-    """Points seen in frames: the number of frame and of point (n,), where (n,) in mm, and the principal distance (n,).
+    """Image points of a block.
 
-    known (p, 3): the points' coordinates, nan where unknown.
+    Attributes
+    ----------
+    image, point : (n,) numbers of the image and of the object point.
+    z : (n,) image coordinates x + iy, mm.
+    c : (n,) principal distances, mm.
+    known : (p, 3) coordinates of the object points, nan where unknown.
     """
 
     image: Indices
@@ -86,12 +98,12 @@ class _Rays:
 
     @property
     def relief(self) -> Array:
-        """(n,) the points' heights above the mean, 0 where unknown."""
+        """(n,) heights of the points above the mean, 0 where unknown."""
         heights = self.known[self.point, 2]
         return np.asarray(np.nan_to_num(heights - np.nanmean(heights), nan=0.0))
 
     def scale_of_relief(self, plane: Complex) -> float:
-        """Object units a unit of the plane at which the relief displacements leave least."""
+        """Scale of the plane, in object units per unit, with the smallest residuals after relief displacement."""
         if np.ptp(self.relief) == 0.0:
             return 1.0
         scales = np.ptp(self.relief) / (np.abs(plane[2 * self.image]) * self.c).min() * HEIGHTS
@@ -99,14 +111,15 @@ class _Rays:
         return float(scales[int(np.argmin(left))])
 
     def flattening(self, plane: Complex) -> Array:
-        """What image coordinates (n,) are multiplied by to be those of points at the mean height: 1 - dZ / H."""
+        """(n,) factors 1 - dZ / H that correct image coordinates for relief displacement."""
         return np.asarray(1.0 - self.relief / (np.abs(plane[2 * self.image]) * self.c))
 
     def similarities(self, flattening: Array) -> tuple[Complex, float]:
-        """Scale-and-turn and shift of every image in turn (2 images,): ground = a z + b; the median distance left.
+        """Adjust the similarities ground = a z + b of all images, minimising the sum of distances by reweighting.
 
-        Where no planimetry is known, the first image keeps its own coordinates: held by two of its points alone, all
-        others would shrink to one place, where their distances are none.
+        Returns a and b of each image in turn (2 images,), and the median residual. Without planimetric control the
+        similarity of the first image is fixed: a datum of only two of its points would let all others shrink to a
+        single point, where all distances vanish.
         """
         rows = np.arange(len(self.z))
         design = np.zeros((len(rows), 2 * int(self.image[-1]) + 2), dtype=np.complex128)
@@ -116,7 +129,7 @@ class _Rays:
         held = 0 if np.isfinite(given).any() else 2
         weights = np.ones(len(rows))
         for _ in range(REWEIGHTINGS):
-            # An unknown ground point is eliminated: it is the weighted mean of what its frames say.
+            # Eliminate unknown ground points: each is the weighted mean of its images' transformed coordinates.
             share = weights / np.bincount(self.point, weights)[self.point]
             mean = np.asarray(sparse.csr_array((share, (self.point, rows))) @ design)
             reduced = design - np.where(np.isnan(given)[:, None], mean[self.point], 0.0)
