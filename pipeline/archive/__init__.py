@@ -1,1 +1,1 @@
-"""The archive of measured scans: what is kept of each, by which key, and what is still to be measured."""
+"""Archive of measured scans: what is stored of each, under which key, and what remains to be measured."""

@@ -1,4 +1,4 @@
-"""What scans there are: found in folders and stores, grouped by their heads, copies and unreadable files set apart."""
+"""Catalogue of the scans in folders and stores: grouped by file head, with copies and unreadable files set apart."""
 
 import os
 from collections import Counter, defaultdict
@@ -18,8 +18,15 @@ from pipeline.text.names import SCAN_ENDINGS
 
 @dataclass(frozen=True, eq=False)
 class Catalogue:
-    """groups: of whole scans, by folder; broken: by file why it cannot be read; copies: by file the first one of the
-    same bytes; endings: how many files were not looked at, by how their names end."""
+    """Catalogue of scans.
+
+    Attributes
+    ----------
+    groups : groups of readable scans, per folder, without copies.
+    broken : {file: why it cannot be read}.
+    copies : {file: the file with the same bytes that stands for it}.
+    endings : number of files that are not scans, by file name ending.
+    """
 
     groups: tuple[ScanGroup, ...]
     broken: Mapping[Path, str]
@@ -28,13 +35,22 @@ class Catalogue:
 
     @property
     def files(self) -> int:
-        """How many were looked at."""
+        """Number of files that were examined."""
         return sum(len(group.paths) for group in self.groups) + len(self.broken) + len(self.copies)
 
 
 def catalogue(given: Sequence[Path], count: Count, max_pixels: int | None = None) -> Catalogue:
-    """All scans among the files and addresses, and in and below the folders, also those of stores and servers. Held is
-    of each its name. Raises InputError where there is none, MeasurementError for an address that is not listed."""
+    """Catalogue the scans given as files, addresses and folders (with all subfolders), including stores and servers.
+
+    Only the files' names are held in memory.
+
+    Raises
+    ------
+    InputError
+        There is no scan.
+    MeasurementError
+        An address cannot be listed.
+    """
     files, endings = find_scan_files(given)
     found = group_scans(files, count, max_pixels)
     copies = dict(_copies([path for path in files if path not in found.unread], max_pixels))
@@ -43,8 +59,11 @@ def catalogue(given: Sequence[Path], count: Count, max_pixels: int | None = None
 
 
 def find_scan_files(given: Sequence[Path]) -> tuple[list[Path], Counter[str]]:
-    """The files, and all scans in and below the folders, in the order of their names, and how other files end; what is
-    hidden is not looked at. Raises InputError where there is no scan."""
+    """Return the given files and all scans in and below the folders, sorted by name, and a count of other files by
+    ending.
+
+    Hidden files are skipped. Raises InputError where there is no scan.
+    """
     files, endings = dict[Path, None](), Counter[str]()
     for path in given:
         is_listed = isinstance(path, Address) and path.suffix.lower() not in SCAN_ENDINGS
@@ -66,7 +85,7 @@ def find_scan_files(given: Sequence[Path]) -> tuple[list[Path], Counter[str]]:
 
 
 def _files_below(folder: Path) -> Iterator[Path]:
-    """Those that are not hidden."""
+    """Files in and below a folder that are not hidden."""
     for place in folders_below(folder):
         with suppress(OSError), os.scandir(folder / place) as entries:
             names = [entry.name for entry in entries if not entry.is_dir() and not entry.name.startswith(".")]
@@ -74,8 +93,11 @@ def _files_below(folder: Path) -> Iterator[Path]:
 
 
 def _copies(files: Sequence[Path], max_pixels: int | None) -> Iterator[tuple[Path, Path]]:
-    """Files with the same bytes as another one, and that one: of the shortest name, for copies are called `Copy of
-    0001` or `0001 (1)`, and the first of these. What tells most files apart is read first."""
+    """Yield (copy, original) for files with identical bytes.
+
+    The original is the first file with the shortest name, since copies are called `Copy of 0001` or `0001 (1)`. Size
+    and a hash of parts of the file are compared first, since they distinguish most files cheaply.
+    """
     for of_one_size in _equal_groups(lambda path: path.stat().st_size, files):
         for alike in _equal_groups(lambda path: parts_hash(path, max_pixels), of_one_size):
             for same in _equal_groups(content_hash, alike):
@@ -84,7 +106,7 @@ def _copies(files: Sequence[Path], max_pixels: int | None) -> Iterator[tuple[Pat
 
 
 def _equal_groups(value: Callable[[Path], object], paths: Sequence[Path]) -> list[list[Path]]:
-    """The files, those together that have the same value; of a single one none is made."""
+    """Group files by a value; a single file is returned without computing it."""
     if len(paths) == 1:
         return [list(paths)]
     groups = defaultdict[object, list[Path]](list)

@@ -1,7 +1,8 @@
 """Statuses after the cross-scan checks: stored beside the raw results; they can be rebuilt.
 
-A judging is written whole and named by its digest, which comparator.csv names too: so both belong together whenever a
-process is ended. The one before is dropped when the files that name this one are in their places.
+The results of one run of the checks (a judging) are stored completely under a digest, which comparator.csv also names:
+database and file can be matched even if the process was ended in between. The earlier judging is dropped once the files
+that name the new one are in place.
 """
 
 import hashlib
@@ -41,14 +42,22 @@ from pipeline.results.measured_record import (
     scan_location,
 )
 
-_AT_A_TIME = 500  # frames in a transaction
+_AT_A_TIME = 500  # frames per transaction
 _WRITTEN = "comparator.csv"
-_UNFINISHED = "digest like 'unfinished%'"  # the process that made it was ended
+_UNFINISHED = "digest like 'unfinished%'"  # its process was ended before the judging was complete
 
 
 @dataclass(frozen=True)
 class Judging:
-    """digest: of all that it says. made_from: fingerprints by name, as `made_from` has them. input: what was judged."""
+    """One run of the cross-scan checks.
+
+    Attributes
+    ----------
+    row : row in the database.
+    digest : SHA-256 of its whole content.
+    made_from : {name: fingerprint} of its inputs, as from `made_from`.
+    input : SHA-256 of the results that were checked.
+    """
 
     row: int
     digest: str
@@ -58,8 +67,14 @@ class Judging:
 
 @dataclass(frozen=True)
 class CheckedResult:
-    """result: the row of what was measured. scan: as it is now, beside all others. decisions: a hash of those about the
-    image that were taken in."""
+    """A scan after the cross-scan checks.
+
+    Attributes
+    ----------
+    result : row of the raw result.
+    scan : the scan with its checked statuses.
+    decisions : hash of the review decisions about the image that were applied.
+    """
 
     result: int
     scan: MeasuredScan
@@ -68,21 +83,29 @@ class CheckedResult:
 
 @dataclass(frozen=True)
 class Lot:
-    """Frames that are judged beside one another, and beside no others. input: SHA-256 of all that this starts from, ""
-    where that is not known; frames: gives them judged, when they are needed."""
+    """Frames that are checked against each other and no others.
+
+    Attributes
+    ----------
+    input : SHA-256 of all inputs of the checks; "" if unknown.
+    frames : function that runs the checks when their result is needed.
+    """
 
     input: str
     frames: Callable[[], Iterable[CheckedResult]]
 
 
 def judge(store: Store, made_from: Mapping[str, str], input_hash: str, frames: Iterable[CheckedResult]) -> str:
-    """`judge_lots` of a single one, which is taken from no other judging."""
+    """Store a judging of a single lot, without reuse of earlier judgings; see `judge_lots`."""
     return judge_lots(store, made_from, input_hash, [Lot("", lambda: frames)])
 
 
 def judge_lots(store: Store, made_from: Mapping[str, str], input_hash: str, lots: Iterable[Lot]) -> str:
-    """Keep a judging of all frames, whole or not at all, and give its digest. A lot whose input was judged before is
-    taken from there. Of a frame only what is another than it was measured takes room."""
+    """Store a judging of all frames, completely or not at all, and return its digest.
+
+    A lot whose input is unchanged is copied from an earlier judging. Of each frame only differences from the raw result
+    are stored.
+    """
     hasher = hashlib.sha256(json.dumps([dict(made_from), input_hash], sort_keys=True).encode())
     db = store.connection
     with store.writing():
@@ -104,7 +127,8 @@ def judge_lots(store: Store, made_from: Mapping[str, str], input_hash: str, lots
 
 
 def _copy_lot(store: Store, judging: int, number: int, lot: Lot) -> str:
-    """Take a lot from an earlier judging, and give the hash of its content; "" where none has it."""
+    """Copy a lot from an earlier judging with the same input and return the hash of its content; "" if there is
+    none."""
     if not lot.input:
         return ""
     db = store.connection
@@ -136,7 +160,7 @@ def _copy_lot(store: Store, judging: int, number: int, lot: Lot) -> str:
 
 
 def _is_lot_sound(db: sqlite3.Connection, judging: int, lot: int) -> bool:
-    """Whether its frames and their own marks are as they were written."""
+    """Whether the digests of the lot's frames and of their own marks are correct."""
     rows = db.execute(
         f"select result, own_marks, marks_digest, {is_sound('judged_frame')} from judged_frame "
         "where judging = ? and lot = ?",
@@ -149,15 +173,15 @@ def _is_lot_sound(db: sqlite3.Connection, judging: int, lot: int) -> bool:
 
 
 def _own_marks(db: sqlite3.Connection, judging: int, result: int) -> list[tuple[Any, ...]]:
-    """The rows of the marks of a frame that are other ones than were measured."""
+    """Rows of a frame's marks that the checks have stored because they differ from the measured ones."""
     query = f"select number, {MARKS} from judged where judging = ? and result = ? order by number"
     return db.execute(query, (judging, result)).fetchall()
 
 
 def _write_lot(store: Store, judging: int, number: int, frames: Iterable[CheckedResult]) -> str:
-    """Judge a lot, and give the hash of its content."""
+    """Check the frames of a lot, store them, and return the hash of the content."""
     hasher, left = hashlib.sha256(), iter(frames)
-    while some := list(islice(left, _AT_A_TIME)):  # what makes them may have to measure, and write, meanwhile
+    while some := list(islice(left, _AT_A_TIME)):  # no open transaction here: the checks may measure and store scans
         with store.writing():
             for frame in some:
                 hasher.update(_write_frame(store, judging, number, frame))
@@ -165,13 +189,13 @@ def _write_lot(store: Store, judging: int, number: int, frames: Iterable[Checked
 
 
 def drop_all_but(store: Store, digest: str) -> None:
-    """Drop every other judging."""
+    """Delete all judgings except one."""
     with store.writing():
         store.connection.execute("delete from judging where digest <> ?", (digest,))
 
 
 def find_judging(store: Store, digest: str) -> Judging | None:
-    """The judging of that digest. Raises DamagedError where it is not as it was written."""
+    """Judging with that digest, None if there is none. Raises DamagedError where its row is damaged."""
     query = f"select {IS_JUDGING_SOUND}, id, digest, made_from, input from judging where digest = ?"
     found = store.connection.execute(query, (digest,)).fetchone()
     if found is None:
@@ -183,7 +207,7 @@ def find_judging(store: Store, digest: str) -> Judging | None:
 
 
 def rejudge(store: Store, before: Judging, scans: Sequence[MeasuredScan]) -> str:
-    """Keep another judging of the same results, after a second pass that a later `measure` does not make; give its
+    """Store a judging of the same results after a second pass, which a later `measure` does not repeat; return its
     digest."""
     check_judging(store.connection, before.row, store.path)
     query = "select name, result, decisions from judged_frame where judging = ?"
@@ -197,7 +221,7 @@ def rejudge(store: Store, before: Judging, scans: Sequence[MeasuredScan]) -> str
 
 
 def latest(store: Store) -> Judging | None:
-    """The one that was made last. Raises DamagedError where one is lost, or not as it was written."""
+    """Latest judging, None if there is none. Raises DamagedError where one is missing or damaged."""
     check_judgings(store.connection, store.path)
     found = store.connection.execute(
         f"select digest from judging where not {_UNFINISHED} order by id desc limit 1"
@@ -205,7 +229,7 @@ def latest(store: Store) -> Judging | None:
     if found is None:
         return None
     judging = find_judging(store, found[0])
-    if judging is None:  # its row is there, and the index of digests, by which it is looked up, has lost it
+    if judging is None:  # the row exists, but the index of digests used for the lookup lacks it
         raise damaged_judging(store.path)
     return judging
 
@@ -213,11 +237,17 @@ def latest(store: Store) -> Judging | None:
 def checked_scans(
     store: Store, judging: Judging, folder: Path, images: Collection[str] | None = None
 ) -> Iterator[MeasuredScan]:
-    """Every scan, by name: where its file is now, and as all scans together show it. One that is not as it was written
-    is a failure.
+    """Yield every scan after the cross-scan checks, sorted by name; a damaged one as a failure.
 
-    folder: that the paths of scans count from. images: of these alone. Raises DamagedError where the list of the frames
-    is not as it was written.
+    Parameters
+    ----------
+    folder : base folder of relative scan paths.
+    images : only these images; None for all.
+
+    Raises
+    ------
+    DamagedError
+        The list of frames is damaged.
     """
     db = store.connection
     if images is None:
@@ -244,12 +274,12 @@ def checked_scans(
 
 
 def remember_written(store: Store, digest: str, comparator: Path) -> None:
-    """The file has the marks of that judging now."""
+    """Record that the file now holds the marks of that judging."""
     store.remember(_WRITTEN, _written(digest, comparator))
 
 
 def marks_as_written(store: Store, digest: str, comparator: Path) -> bool:
-    """Whether the file has the marks of that judging, and nobody has changed it since."""
+    """Whether the file holds the marks of that judging and has not been changed since."""
     return store.recall(_WRITTEN) == _written(digest, comparator)
 
 
@@ -258,8 +288,10 @@ def _written(digest: str, comparator: Path) -> dict[str, str]:
 
 
 def checked_marks(store: Store, judging: Judging, images: Collection[str] | None = None) -> Iterator[MarkRow]:
-    """Every mark of every frame, by the frames' names, as all scans together show it. images: of these alone. Raises
-    DamagedError where one of them is not as it was written."""
+    """Yield the marks of every frame after the cross-scan checks, sorted by frame name.
+
+    images: only these; None for all. Raises DamagedError where a frame is damaged.
+    """
     db = store.connection
     check_judging(db, judging.row, store.path)
     as_measured = f"select number, {MARKS} from mark where result = ? order by number"
@@ -281,7 +313,8 @@ def checked_marks(store: Store, judging: Judging, images: Collection[str] | None
 
 
 def _covariance(spread: Sequence[float | None], causes: str | None) -> tuple[float, float, float] | None:
-    """Numbers that are not finite stand in the causes alone."""
+    """(col², row², col·row) elements of the covariance; values that are not finite are stored only in the JSON of the
+    causes."""
     of_col, of_row, both = spread
     if of_col is not None and of_row is not None and both is not None:
         return of_col, of_row, both
@@ -292,7 +325,7 @@ def _covariance(spread: Sequence[float | None], causes: str | None) -> tuple[flo
 
 
 def _write_frame(store: Store, judging: int, lot: int, frame: CheckedResult) -> bytes:
-    """Write what of a frame is another than it was measured, and give all that was written."""
+    """Store the differences of a checked frame from its raw result, and return the stored content for hashing."""
     db, measured = store.connection, json.loads(store.detail(frame.result))
     now = scan_detail(frame.scan, measured["scan"])
     changed = {key: value for key, value in now.items() if value != measured.get(key)}

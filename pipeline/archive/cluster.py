@@ -1,4 +1,4 @@
-"""Scans measured by a cluster: Dask's scheduler as an ordinary executor, asked first whether its workers can do it."""
+"""Measurement on a cluster: Dask's scheduler as an ordinary executor, after a check of its workers."""
 
 import os
 import platform
@@ -27,11 +27,18 @@ _NAMED = 3
 
 @contextmanager
 def cluster_executor(address: str, scans: Sequence[str], workers: int | None = None) -> Iterator[Executor]:
-    """The executor of a scheduler that is there, or of one that is started here for as long as the block lasts.
+    """Executor of a running scheduler, or of a local one that lives as long as the block.
 
-    address: such as tcp://host:8786, or `local`. scans: paths and addresses, of which one a folder is looked for by
-    every worker.
-    Raises InputError where Dask is not installed, nobody answers, or a worker has other versions or cannot read them.
+    Parameters
+    ----------
+    address : address such as tcp://host:8786, or `local`.
+    scans : paths and addresses of the scans; every worker must be able to read one of each folder.
+    workers : number of local workers.
+
+    Raises
+    ------
+    InputError
+        Dask is not installed, no scheduler answers, or a worker has other versions or cannot read the scans.
     """
     try:
         from distributed import Client, LocalCluster
@@ -55,8 +62,10 @@ def cluster_executor(address: str, scans: Sequence[str], workers: int | None = N
 
 
 class SubmittedAgain(Executor):
-    """Hands to another executor, and again what that lost: a task that raises nothing itself has an exception only
-    where its worker is gone. Lost as often as a process may be killed, it is given up."""
+    """Executor that resubmits lost tasks to another executor.
+
+    Tasks raise nothing themselves, so an exception means that the worker is gone. A task lost KILLS times is given up.
+    """
 
     def __init__(self, executor: Executor) -> None:
         self._executor = executor
@@ -72,7 +81,7 @@ class SubmittedAgain(Executor):
     def _begin(self, outer: Future[Any], call: Callable[[], Any], losses: int) -> None:
         try:
             inner = self._executor.submit(call)
-        except Exception as error:  # of the connection
+        except Exception as error:  # lost connection to the scheduler
             outer.set_exception(BrokenExecutor(str(error)))
             return
         inner.add_done_callback(partial(self._done, outer, call, losses))
@@ -100,7 +109,7 @@ def _client(client: "type[Client]", address: str) -> "Client":
 
 
 def _check_workers(client: "Client", address: str, scans: Sequence[str]) -> None:
-    """Before the first task, not in the middle of the night."""
+    """Check versions and access to the scans on every worker before the first task."""
     try:
         client.wait_for_workers(1, timeout=_ANSWER_S)
     except TimeoutError:
@@ -132,7 +141,7 @@ def _check_workers(client: "Client", address: str, scans: Sequence[str]) -> None
 
 
 def versions() -> dict[str, str]:
-    """What a result depends on beside scan and options: the same on every machine, or it is not the same result."""
+    """Versions that a result depends on in addition to scan and options; they must agree on all machines."""
     return {
         "Python": platform.python_version(),
         **{name: version(name) for name in _LIBRARIES if _is_installed(name)},
@@ -149,12 +158,12 @@ def _is_installed(name: str) -> bool:
 
 
 def _versions_and_unreachable(scans: Sequence[str]) -> tuple[dict[str, str], list[tuple[str, str]]]:
-    """Asked of a worker: its versions, and which of these scans it cannot read, and why."""
+    """Run on a worker: return its versions and the scans that it cannot read, each with the reason."""
     return versions(), [(scan, why) for scan in scans if (why := _why_unreadable(scan))]
 
 
 def _why_unreadable(scan: str) -> str:
-    """Of a file or an address; "" of one that can be read."""
+    """Reason why a file or address cannot be read; "" if it can."""
     try:
         with scan_path(scan).open("rb") as file:
             file.read(1)
@@ -166,8 +175,11 @@ def _why_unreadable(scan: str) -> str:
 
 
 def _one_a_folder(scans: Sequence[str]) -> list[str]:
-    """The first scan of each folder that is there for us: one that nobody has says nothing of a worker. An address that
-    does not answer is asked four times, so of these only the first is tried."""
+    """First scan of each folder that is readable here.
+
+    A scan that nobody can read does not disqualify a worker. An unresponsive address costs four attempts, so only the
+    first address of a folder is tried.
+    """
     firsts: dict[str, str] = {}
     for scan in filter(None, scans):
         folder = scan.rpartition("/")[0] if is_address(scan) else os.path.dirname(scan)
@@ -177,7 +189,7 @@ def _one_a_folder(scans: Sequence[str]) -> list[str]:
 
 
 def _alone_plugin() -> Any:
-    """Every worker, also one that takes another's place, works in one thread."""
+    """Dask plugin that limits every worker, including replacements, to one thread."""
     from distributed.diagnostics.plugin import WorkerPlugin
 
     class WorkAlone(WorkerPlugin):  # type: ignore[misc]

@@ -1,4 +1,4 @@
-"""The cross-scan checks: all scans of a project checked together, from the results database and into it."""
+"""Cross-scan checks: all scans of a project checked together, read from and stored in the results database."""
 
 import hashlib
 import json
@@ -22,9 +22,9 @@ from pipeline.measuring.scan_task import ScanTask
 from pipeline.provenance import content_hash, fingerprint, shard_number
 from pipeline.results.measured_record import MeasuredScan
 
-_TOGETHER = 2000  # frames of a camera that are checked beside one another: more would only take memory
+_TOGETHER = 2000  # most frames of a camera that are checked together, to limit memory
 OfCamera = tuple[CameraFile, Sequence[ScanTask]]
-Remarks = Mapping[str, tuple[tuple[Reason, ...], tuple[str, ...]]]  # by image problems and notes
+Remarks = Mapping[str, tuple[tuple[Reason, ...], tuple[str, ...]]]  # problems and notes by image
 
 
 def check_lots(
@@ -35,10 +35,20 @@ def check_lots(
     share: Callable[[Sequence[MeasuredScan]], Iterable[MeasuredScan]],
     input_hash: str,
 ) -> Iterator[Lot]:
-    """Every scan as all of them show it, in lots: those whose scans are as they were need not be judged again.
+    """Check all scans together, in lots: a lot whose scans are unchanged need not be checked again.
 
-    project: with its learned marks. copies: by image the one whose file its own is a copy of. share: the third step of
-    measuring; input_hash: `hash_inputs` of all. A lot is held at a time.
+    Parameters
+    ----------
+    project : with its learned marks.
+    tasks : of all scans.
+    work : access to the results.
+    copies : {image: image whose file its own is a copy of}.
+    share : third step of the measurement: targets and natural points shared between scans.
+    input_hash : `hash_inputs` of all scans.
+
+    Yields
+    ------
+    Lots; one is held in memory at a time.
     """
     own = [task for task in tasks if task.name not in copies]
     keys, remarks = work.keys(), _writing_remarks(project, own, work)
@@ -73,8 +83,10 @@ def check_lots(
 
 
 def find_copies(store: Store, tasks: Sequence[ScanTask], work: Work) -> dict[str, str]:
-    """By image the first one, by name, whose file has the same content. Whole files are read only where size and
-    telling parts are the same."""
+    """Return {image: first image, by name, with the same file content}.
+
+    Whole files are read only where size and the hash of parts agree.
+    """
     groups = defaultdict[tuple[int, str], list[ScanTask]](list)
     identities = store.identities()
     for task in tasks:
@@ -96,7 +108,7 @@ def find_copies(store: Store, tasks: Sequence[ScanTask], work: Work) -> dict[str
 
 
 def hash_inputs(tasks: Sequence[ScanTask], work: Work, copies: Mapping[str, str], made_from: Mapping[str, str]) -> str:
-    """SHA-256 of all that judging starts from: the results, and what the project has."""
+    """SHA-256 of all inputs of the cross-scan checks: the results and the project's own inputs."""
     keys = work.keys()
     results = [[task.name, keys[task.name]] for task in tasks]
     made_by = [version("reseau"), MEASURE_REVISION]
@@ -105,15 +117,15 @@ def hash_inputs(tasks: Sequence[ScanTask], work: Work, copies: Mapping[str, str]
 
 
 def _lots(project: Project, tasks: Sequence[ScanTask]) -> Sequence[Sequence[OfCamera]]:
-    """Which scans are looked at beside one another, by camera. Natural points may be in any of all; of a sheet of
-    targets the pictures of a lot tell as much."""
+    """Scans that are checked together, by camera. Natural points may link any scans, so they need one lot; targets on a
+    sheet and parts of frames are checked in one lot only in small projects."""
     of_cameras = _camera_lots(project, tasks)
     are_few = len(tasks) <= _TOGETHER and (project.targets is not None or project.has_parts)
     return [of_cameras] if project.ties is not None or are_few else [[each] for each in of_cameras]
 
 
 def _project_inputs(project: Project, tasks: Sequence[ScanTask], input_hash: str) -> object:
-    """What of the project the third step depends on, beside the scans themselves."""
+    """Inputs of the third step from the project, in addition to the scans."""
     if project.ties is not None:
         return input_hash
     points = None if project.targets is None else project.object_points
@@ -125,8 +137,11 @@ def _project_inputs(project: Project, tasks: Sequence[ScanTask], input_hash: str
 
 
 def _camera_lots(project: Project, tasks: Sequence[ScanTask]) -> list[OfCamera]:
-    """The scans of each camera that are checked beside one another: all of them, or of many as good as half of
-    `_TOGETHER` or more, by chance, of which one scan more changes a single lot. The parts of a frame are in one."""
+    """Split the scans of each camera into lots.
+
+    All scans of a camera form one lot up to `_TOGETHER`; more are split by a hash of the frame's name, so that a new
+    scan changes a single lot. Parts of one frame are in one lot.
+    """
     found = list[OfCamera]()
     for camera in project.cameras.values():
         own = [task for task in tasks if project.image_camera(task.name) is camera]
@@ -143,7 +158,8 @@ def _camera_lots(project: Project, tasks: Sequence[ScanTask]) -> list[OfCamera]:
 def _check_camera(
     project: Project, camera: CameraFile, tasks: Sequence[ScanTask], work: Work
 ) -> tuple[CheckedScan, ...]:
-    """The second step. Scans whose marks change names beside the others are measured again."""
+    """Second step of the measurement. Scans whose marks are renamed by the comparison with others are measured
+    again."""
     scans = [work.read(task.name) for task in tasks]
     roll = build_roll(tasks, scans, camera.writing)
     again = list(work.measure(roll.tasks)) if roll.tasks else []
@@ -151,8 +167,8 @@ def _check_camera(
 
 
 def _writing_remarks(project: Project, tasks: Sequence[ScanTask], work: Work) -> Remarks:
-    """What is written on the scans says of others: plates of other cameras, frames that were scanned twice. No more of
-    the scans is held than that."""
+    """Remarks from the writing on scans about other scans: plates of other cameras, frames scanned twice. Only the
+    writing of the scans is held in memory."""
     names = work.written([task.name for task in tasks])
     bare = dict[str, MeasuredScan]()
     for camera in project.cameras.values():
@@ -174,7 +190,7 @@ def _checked_result(scan: MeasuredScan, work: Work) -> CheckedResult:
 
 
 def _copy(scan: MeasuredScan, original: str) -> MeasuredScan:
-    """A scan of which none of the marks counts, for they count in another one."""
+    """Scan with all observations rejected, since they count in the scan of which its file is a copy."""
     reason = Reason(f"its file is a copy of that of {original}, which counts", Code.COPY)
     marks = [
         replace(mark, status=Status.REJECTED, reason=reason) if mark.status.is_observation else mark

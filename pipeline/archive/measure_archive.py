@@ -1,4 +1,4 @@
-"""A project's scans measured into its results database: only what is missing or changed."""
+"""Measure a project's scans into its results database: only what is missing or changed."""
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -31,7 +31,7 @@ from pipeline.workers import WorkOptions, worker_pool
 
 
 def check_measurable(project: Project) -> tuple[str, ...]:
-    """The names of the images that are to be measured. Raises InputError for what is wrong in the user's own files."""
+    """Return the names of the images to be measured. Raises InputError for errors in the user's files."""
     if not project.scans:
         raise InputError(f'{project.path}: scans is missing: which pictures to measure, such as ["scans/*.tif"].')
     _check_anything_to_measure(project)
@@ -39,12 +39,13 @@ def check_measurable(project: Project) -> tuple[str, ...]:
     _check_marks(project)
     listed = project.given_images.exterior if project.given_images else {}
     names = (*project.scans, *(name for name in listed if name not in project.scans and name not in project.left_out))
-    scan_tasks(project, names)  # raises for targets that nothing names and for marks that nobody has drawn
+    scan_tasks(project, names)  # raises for undefined targets and for fiducials that have no drawing
     return names
 
 
 def _check_anything_to_measure(project: Project) -> None:
-    """Without fiducials, targets and natural points comparator.csv would hold nothing."""
+    """Raise InputError where neither fiducials nor targets nor natural points are sought: comparator.csv would be
+    empty."""
     sought = [one for camera in project.cameras.values() for one in camera.fiducials if not one.passed_over]
     if not sought and project.targets is None and project.ties is None:
         raise InputError(
@@ -54,7 +55,7 @@ def _check_anything_to_measure(project: Project) -> None:
 
 
 def _check_marks(project: Project) -> None:
-    """One mark by itself tells neither the turn nor the scale of a frame."""
+    """Raise InputError for a camera with a single mark, which determines neither rotation nor scale of a frame."""
     for camera in project.cameras.values():
         if len(camera.layout_marks) + len(camera.learned) == 1:
             raise InputError(
@@ -64,9 +65,10 @@ def _check_marks(project: Project) -> None:
 
 
 def find_moved(store: Store, project: Project, reporter: Reporter) -> dict[str, str]:
-    """Give files that the store does not know as they are the results of those whose whole content they have, and say
-    what fingerprints these have now, by the earlier ones. Only results count whose content was hashed: an earlier call
-    with `--moved` did that."""
+    """Re-key the results of moved files by content hash and return {old fingerprint: new}.
+
+    Only results whose content was hashed by an earlier call with `--moved` are found.
+    """
     known, files = store.identities(), FileStates(project.path.resolve().parent)
     by_size = defaultdict[int, dict[str, str]](dict)
     for uri, content in store.content_hashes().items():
@@ -96,7 +98,7 @@ def find_moved(store: Store, project: Project, reporter: Reporter) -> dict[str, 
 
 
 def hash_contents(store: Store, tasks: Sequence[ScanTask], work: Work, reporter: Reporter) -> None:
-    """Hash the whole files of all scans whose content is not known, so that they are known when they are moved."""
+    """Hash the whole files of all scans without a content hash, so that they are recognised after a move."""
     hashed = store.content_hashes()
     left = {
         work.state(task).uri: scan_path(task.scan) for task in tasks if task.scan and work.state(task).uri not in hashed
@@ -115,17 +117,30 @@ def measure_archive(
     reporter: Reporter,
     options: WorkOptions | None = None,
 ) -> str:
-    """Measure what is missing of the project's scans, and judge all of them together, unless that is as it was.
+    """Measure the missing scans of a project and check all of them together, unless nothing has changed.
 
-    Returns the digest of that judging; "" of a shard, which does not judge. Raises InputError for what is wrong in the
-    user's own files, before anything is measured, and MeasurementError where no scan at all could be measured; a scan
-    that fails is a result. made_from: what a judging says that it is of, asked when all is measured; learned_folder:
-    where what is learned of marks is written.
+    Parameters
+    ----------
+    project, store : project and its results database.
+    made_from : function that returns {name: fingerprint} of the inputs of the checks, called after the measurement.
+    learned_folder : folder for the learned marks.
+    reporter, options : progress, and how the work is done.
+
+    Returns
+    -------
+    Digest of the judging; "" for a shard, which has no cross-scan checks.
+
+    Raises
+    ------
+    InputError
+        Errors in the user's files, before anything is measured.
+    MeasurementError
+        No scan could be measured; single failures are results.
     """
     options = options or WorkOptions()
     names = check_measurable(project)
     with open_executor(project, options) as executor, ThumbnailStore.open(store.path) as thumbnails:
-        # Once nothing stands in the way of measuring again.
+        # After all checks that could prevent a new measurement.
         lost = store.forget_damaged() if options.retry or store.has_damaged_rows() else 0
         if lost:
             reporter.say(f"{store.path}: {counted(lost, 'result')} stored there not as written: measured again")
@@ -161,7 +176,7 @@ def measure_archive(
 
 
 def open_executor(project: Project, options: WorkOptions) -> AbstractContextManager[Executor]:
-    """What works on the project's scans: processes here, or the workers of a cluster."""
+    """Executor for the project's scans: local processes or the workers of a cluster."""
     if options.cluster is not None:
         return cluster_executor(
             options.cluster, [fetch_location(path) for path in project.scans.values()], options.workers
@@ -170,7 +185,7 @@ def open_executor(project: Project, options: WorkOptions) -> AbstractContextMana
 
 
 def _check_any(store: Store) -> None:
-    """Raises MeasurementError where no scan at all could be measured, with all that was said of them."""
+    """Raise MeasurementError with the reasons of all failures where no scan could be measured."""
     failures = store.failures()
     if failures is not None:
         raise MeasurementError("\n".join(gathered(failures)))

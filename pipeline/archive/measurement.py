@@ -1,4 +1,4 @@
-"""What was measured of a project, and checked, as others read it from out/measurement.db."""
+"""Read access to out/measurement.db: raw results and results of the cross-scan checks."""
 
 import json
 import math
@@ -34,22 +34,22 @@ _AT_A_TIME = 50_000  # rows
 
 
 def read_measurement(path: Path, digest: str = "") -> tuple[MeasuredScan, ...]:
-    """Every scan of a store, by name, as all of them together show it. digest: of the judging, if not the latest.
+    """Scans of a store after the cross-scan checks, sorted by name. digest: of the judging; "" for the latest.
 
-    Raises InputError where there is no such store, or nothing in it is judged.
+    Raises InputError where there is no such store, or no judging in it.
     """
     return tuple(measured_scans(path, digest))
 
 
 def read_inputs(path: Path, digest: str) -> Mapping[str, str] | None:
-    """What a judging was made from; None where the store has not that one."""
+    """{name: fingerprint} of the inputs of a judging; None where the store lacks it."""
     with Store(path) as store:
         judging = find_judging(store, digest)
     return None if judging is None else judging.made_from
 
 
 def pitches(store: Store, digest: str) -> dict[str, tuple[float, float]]:
-    """By image what a pixel measures, um; NaN of scans of which nobody knows."""
+    """{image: pixel pitch across and down, µm}; NaN where it is unknown."""
     rows = store.connection.execute(
         "select judged_frame.name, pitch_x_um, pitch_y_um from judged_frame join result on result.id = result "
         "join judging on judging.id = judging where judging.digest = ?",
@@ -60,7 +60,7 @@ def pitches(store: Store, digest: str) -> dict[str, tuple[float, float]]:
 
 
 def picture_sizes_mm(path: Path, digest: str) -> dict[str, tuple[float, float]]:
-    """By image width and height of its scan; without those of which nobody knows a pitch."""
+    """{image: width and height of the scan, mm}; scans of unknown pitch are left out."""
     if not digest or not path.exists():
         return {}
     query = (
@@ -74,7 +74,7 @@ def picture_sizes_mm(path: Path, digest: str) -> dict[str, tuple[float, float]]:
 
 
 def count_decisions(store: Store, digest: str) -> dict[CameraPerson, int]:
-    """How many decisions of whom stand behind a judging, by camera."""
+    """Number of decisions in a judging, by camera and person."""
     counts = Counter[CameraPerson]()
     rows = store.connection.execute(
         "select camera, judged_frame.detail ->> '$.decided_by' as told from judged_frame join scan on scan.id = scan "
@@ -87,7 +87,7 @@ def count_decisions(store: Store, digest: str) -> dict[CameraPerson, int]:
 
 
 def written_scans(store: Store, digest: str) -> Iterator[MeasuredScan]:
-    """Those scans of a judging on which something is written, by name."""
+    """Scans of a judging on which writing was found."""
     rows = store.connection.execute(
         "select judged_frame.name, result from judged_frame join judging on judging.id = judging "
         "where judging.digest = ?",
@@ -98,7 +98,7 @@ def written_scans(store: Store, digest: str) -> Iterator[MeasuredScan]:
 
 
 def read_fingerprints(path: Path, digest: str, images: Collection[str]) -> dict[str, str]:
-    """Of some images of a judging the fingerprints of their results; of none where there is no such judging."""
+    """{image: fingerprint of its result} for some images of a judging; empty where there is no such judging."""
     if not digest or not path.exists():
         return {}
     query = (
@@ -111,14 +111,14 @@ def read_fingerprints(path: Path, digest: str, images: Collection[str]) -> dict[
 
 
 def remember_place(store: Store, project_folder: Path) -> None:
-    """Let the store know where the paths of its scans begin, seen from itself: so a whole project can be moved."""
+    """Store the project folder relative to the store, so that a project can be moved as a whole."""
     relative = os.path.relpath(project_folder.resolve(), store.path.resolve().parent)
     if store.recall(_PLACE) != {"path": relative}:
         store.remember(_PLACE, {"path": relative})
 
 
 def measured_scans(path: Path, digest: str = "", images: Collection[str] | None = None) -> Iterator[MeasuredScan]:
-    """The same one after the other. images: of these alone."""
+    """Yield the scans of a store one by one; see `read_measurement`. images: only these; None for all."""
     if not path.exists():
         raise InputError(f"{path}: there is no such file. Run `reseau measure` first.")
     with Store(path) as store:
@@ -133,8 +133,15 @@ def measured_scans(path: Path, digest: str = "", images: Collection[str] | None 
 
 @dataclass(frozen=True, eq=False)
 class MarkColumns:
-    """Marks of frames, one a row: frame, the place of its frame among so many; kind and status as numbers of the names
-    that there are of each; center_px (n, 2), NaN where there is none."""
+    """Marks of frames by column.
+
+    Attributes
+    ----------
+    frame : (n,) index of the frame.
+    kind, status : (n,) indices into kinds and statuses.
+    center_px : (n, 2) column and row; NaN where there is none.
+    kinds, statuses : their names.
+    """
 
     frame: NDArray[np.int64]
     kind: NDArray[np.int64]
@@ -146,7 +153,7 @@ class MarkColumns:
 
 @dataclass(frozen=True)
 class StoredFrame:
-    """A frame that needs no look: its name, and its scan's file."""
+    """Frame that needs no look: its name, its scan's file and the row of its result."""
 
     image: str
     scan: str
@@ -154,14 +161,14 @@ class StoredFrame:
 
 
 class StoredMarks:
-    """The marks of comparator.csv, which stands as it was written from the store."""
+    """Marks of comparator.csv, unchanged since it was written from the store."""
 
     def __init__(self, path: Path, judging: Judging) -> None:
         self._path, self._judging = path, judging
 
     @classmethod
     def open(cls, path: Path, comparator: Path) -> "StoredMarks | None":
-        """path: of the store. None where the file has other marks than the store, or somebody has changed either."""
+        """Marks of a store. None where the file holds other marks, or either was changed since."""
         if not path.exists() or not comparator.exists() or not (digest := read_measurement_hash(comparator)):
             return None
         with Store(path) as store:
@@ -174,13 +181,13 @@ class StoredMarks:
 
     @cached_property
     def names(self) -> frozenset[str]:
-        """Of all frames."""
+        """Names of all frames."""
         with Store(self._path) as store:
             query = "select name from judged_frame where judging = ?"
             return frozenset(name for (name,) in store.connection.execute(query, (self._judging.row,)))
 
     def rows(self, images: Collection[str]) -> list[ComparatorPoint]:
-        """The marks of some images as comparator.csv has them."""
+        """Marks of some images, as in comparator.csv."""
         with Store(self._path) as store:
             marks = checked_marks(store, self._judging, images)
             return list(comparator_points(marks, pitches(store, self._judging.digest)))
@@ -190,13 +197,14 @@ class StoredMarks:
 
     @cached_property
     def plain(self) -> tuple[StoredFrame, ...]:
-        """The frames of which nothing but totals is told: good ones, of whose targets, if any, one was measured."""
+        """Frames that are reported only in totals: good ones in which, if they have targets, at least one is
+        measured."""
         with Store(self._path) as store:
             rows = store.connection.execute(_PLAIN, (self._judging.row, str(Verdict.GOOD)))
             return tuple(StoredFrame(*row) for row in rows)
 
     def columns(self) -> MarkColumns:
-        """Of the marks of the plain frames."""
+        """Marks of the plain frames."""
         place = {frame.result: number for number, frame in enumerate(self.plain)}
         kinds, statuses = dict[str, int](), dict[str, int]()
         parts: list[Array] = [np.empty((0, 5))]

@@ -1,4 +1,4 @@
-"""Stores of shards joined: a result has the same key on every machine."""
+"""Merge the results databases of shards: a result has the same key on every machine."""
 
 import sqlite3
 from collections.abc import Sequence
@@ -18,8 +18,8 @@ _MARK = f"number, {MARKS}"
 
 @dataclass(frozen=True)
 class Merged:
-    """Of one store: its results, how many of them were new here, and how many are not as they were written and were
-    not taken."""
+    """Outcome of merging one store: number of its results, of those new here, and of damaged ones, which were not
+    taken."""
 
     path: Path
     results: int
@@ -28,8 +28,11 @@ class Merged:
 
 
 def merge(store: Store, others: Sequence[Path]) -> list[Merged]:
-    """Take in what other stores hold and this one does not. Each is taken whole or not at all, and none is changed but
-    to bring it to this version. Raises InputError for a file that is no store, before anything is taken."""
+    """Import the results that other stores hold and this one lacks.
+
+    Each store is imported completely or not at all. The others are not changed, except for migration to this version.
+    Raises InputError for a file that is no store, before anything is imported.
+    """
     for path in others:
         if not path.is_file():
             raise InputError(
@@ -59,13 +62,13 @@ def _merge_store(store: Store, path: Path) -> Merged:
 
 
 def _insert(db: sqlite3.Connection) -> int:
-    """Every table in the order in which they refer to one another; rows that are there stay as they are."""
+    """Insert the rows of all tables in the order of their references; existing rows stay."""
     before = db.execute("select coalesce(max(id), 0) from main.result").fetchone()[0]
     db.execute(
         f"insert into main.scan ({_SCAN}, name) select {_SCAN}, null from other.scan where {is_sound('scan')} "
         "on conflict (uri) do update set bytes = excluded.bytes, mtime_ns = excluded.mtime_ns, etag = excluded.etag, "
         "identity_hash = excluded.identity_hash, content_hash = excluded.content_hash "
-        "where excluded.mtime_ns > mtime_ns"  # a file that was changed meanwhile
+        "where excluded.mtime_ns > mtime_ns"  # a file that was changed in between
     )
     for table, columns in (("program", "version, measure_revision, python, libraries"), ("options", "hash, json")):
         db.execute(f"insert or ignore into main.{table} ({columns}) select {columns} from other.{table}")

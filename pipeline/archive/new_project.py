@@ -1,4 +1,4 @@
-"""`reseau init`: a project made of the scans that there are, with what could not be told of them."""
+"""`reseau init`: create a project from scans, and report what could not be determined."""
 
 import glob
 import os
@@ -28,20 +28,27 @@ from pipeline.workers import worker_pool
 
 OUTPUT = "out"
 _LIST = ".txt"
-_SHOWN = 12  # of each kind of remark on the terminal
+_SHOWN = 12  # remarks of each kind on the terminal
 _BROKEN = "cannot be read"
 _COPIES = "the same bytes as another scan"
 _NAMESAKES = "another picture of the same name is taken"
 _UNKNOWN = "their camera is unknown: add them to images.csv with one, and remove them from `exclude`"
 _DIGITAL = "pictures by a digital camera, which `reseau calibrate` takes"
 TEMPLATE_COMMAND = "reseau template camera --marks cross --square 212 > camera.toml"
-_FORMATS = ("JPEG", "JPEG 2000", "PNG", "TIFF")  # the later the better, of one name and size
+_FORMATS = ("JPEG", "JPEG 2000", "PNG", "TIFF")  # in ascending order of preference among scans of one name and size
 
 
 @dataclass(frozen=True, eq=False)
 class NewProject:
-    """A project to be written at `folder`. given: where scans were looked for; left_out: by reason the files that are
-    not measured."""
+    """A project to be written to `folder`.
+
+    Attributes
+    ----------
+    folder : for project.toml and images.csv.
+    given : files and folders that were searched.
+    found : catalogue of the scans.
+    left_out : {reason: files that are not measured}.
+    """
 
     folder: Path
     given: tuple[Path, ...]
@@ -59,23 +66,23 @@ class NewProject:
 
     @property
     def digital(self) -> list[ScanGroup]:
-        """Groups of pictures by digital cameras."""
+        """Groups of images taken by digital cameras."""
         return [group for group in self.found.groups if group.digital]
 
     @property
     def unknown(self) -> list[ScanGroup]:
-        """Groups of film scans whose camera is not known."""
+        """Groups of film scans of an unknown camera."""
         return [group for group in self.found.groups if not group.camera and not group.digital]
 
     @property
     def cameras(self) -> dict[Path, str]:
-        """The camera of each scan that is to be measured; "" where none is told of any."""
+        """{scan to be measured: its camera}; "" where no camera of the project is known."""
         out = {path for paths in self.left_out.values() for path in paths}
         return {path: group.camera for group in self.found.groups for path in group.paths if path not in out}
 
     @property
     def sentence(self) -> str:
-        """How many scans can be measured, and why the others cannot."""
+        """Sentence with the number of measurable scans, and why the others are not."""
         scans = {"without a camera": self.unknown, "by a digital camera": self.digital}
         rest = {word: sum(len(group.paths) for group in groups) for word, groups in scans.items()}
         rest |= {"broken": len(self.left_out[_BROKEN])}
@@ -83,7 +90,7 @@ class NewProject:
         return count_sentence("can be measured", len(self.cameras) if self.named else 0, self.found.files, rest)
 
     def remarks(self) -> Iterator[tuple[str, list[str]]]:
-        """What needs a look, and the single cases of it."""
+        """Yield what needs a look, with its cases."""
         yield "cannot be read, and are left out", list(self.found.broken.values())
         yield (
             "show no known camera" + ("" if self.named else ": draw it, or have its marks learned"),
@@ -120,7 +127,7 @@ class NewProject:
         yield "have a resolution in their files that their marks contradict", [*self._contradicted_pitches()]
 
     def notes(self) -> Iterator[str]:
-        """What is worth knowing and needs no action."""
+        """Yield information that needs no action."""
         for reason in (_COPIES, _NAMESAKES):
             if paths := self.left_out[reason]:
                 yield f"{len(paths)} left out: {reason} ({', '.join(map(str, paths[:3]))}{'...' * (len(paths) > 3)})."
@@ -160,7 +167,7 @@ class NewProject:
         }
 
     def _alike_cameras(self) -> Mapping[tuple[str, ...], list[str]]:
-        """By cameras that have the same marks, the one that is taken first, the folders of their scans."""
+        """{cameras with the same marks, the chosen one first: folders of their scans}."""
         alike = defaultdict[tuple[str, ...], list[str]](list)
         for group in self.named:
             if group.cameras[1:]:
@@ -176,8 +183,10 @@ class NewProject:
 
 
 def init_project(given: Sequence[Path], folder: Path, reporter: Reporter, max_pixels: int | None = None) -> NewProject:
-    """Look at every file's head and try some of each kind and folder on the camera library; write project.toml and
-    images.csv. Raises InputError where a file of that name is there already, or no scan is found."""
+    """Examine all files' heads, identify cameras from samples of each group, and write project.toml and images.csv.
+
+    Raises InputError where one of these files exists, or no scan is found.
+    """
     for path in (folder / "project.toml", folder / "images.csv"):
         if path.exists():
             raise InputError(f"{path} is there already, and init writes over nothing. Give another folder by --out.")
@@ -200,7 +209,7 @@ def init_project(given: Sequence[Path], folder: Path, reporter: Reporter, max_pi
 
 
 def _given_paths(given: Path) -> list[Path]:
-    """Itself, or all that a list of paths and addresses names, a line each."""
+    """The path itself, or the entries of a list file: one path or address per line."""
     if isinstance(given, Address) or given.suffix.lower() != _LIST or not given.is_file():
         return [given]
     lines = [line.strip() for line in given.read_text(encoding="utf-8-sig", errors="surrogateescape").splitlines()]
@@ -209,7 +218,7 @@ def _given_paths(given: Path) -> list[Path]:
 
 
 def _identify_cameras(found: Catalogue, reporter: Reporter, max_pixels: int | None) -> Catalogue:
-    """The groups with the cameras of the library that their samples show, tried in processes side by side."""
+    """Catalogue with the cameras of the library identified on samples, in parallel processes."""
     with worker_pool(sum(len(group.to_try) for group in found.groups)) as workers:
         grouped = GroupedScans(found.groups, found.broken)
         named = name_cameras(grouped, trial_of_cameras(read_library(), None, max_pixels), reporter, workers)
@@ -217,13 +226,13 @@ def _identify_cameras(found: Catalogue, reporter: Reporter, max_pixels: int | No
 
 
 def _only_digital(new: NewProject) -> str:
-    """What pictures there are, and the command for each group of them."""
+    """Message that lists groups of digital images, each with its command."""
     lines = [f"{_place(group)}, {group.digital}: {group.calibrate_command}" for group in new.digital]
     return "\n".join([f"{listed(list(map(str, new.given)))}: no scan of film. SIZE: of a square, as 25mm.", *lines])
 
 
 def project_text(new: NewProject) -> str:
-    """project.toml. Raises InputError where no scan is left."""
+    """Content of project.toml. Raises InputError where no scan is left."""
     cameras = new.cameras
     if not cameras:
         given, reason = ", ".join(map(str, new.given)), next(iter(new.found.broken.values()), "")
@@ -250,14 +259,14 @@ def project_text(new: NewProject) -> str:
 
 
 def images_text(new: NewProject) -> str:
-    """images.csv."""
+    """Content of images.csv."""
     named = zip(names_below(new.cameras), new.cameras.values(), strict=True)
     rows = sorted((name, f"{PREFIX}{camera}" if camera else "") for name, camera in named)
     return "\n".join([csv_line(("image", "camera")), *map(csv_line, rows)]) + "\n"
 
 
 def print_new_project(new: NewProject, console: Console) -> None:
-    """Totals by camera; what needs a look; what to do next."""
+    """Print totals by camera, what needs a look, and what was written."""
 
     def say(text: str, style: str = "") -> None:
         console.print(text, style=style, highlight=False, soft_wrap=True, markup=False)
@@ -278,7 +287,8 @@ def print_new_project(new: NewProject, console: Console) -> None:
 
 
 def _left_out(found: Catalogue) -> dict[str, list[Path]]:
-    """By reason. Where no camera is told at all, the project's own file has to say it, and is of all scans."""
+    """{reason: files}. Where no camera at all was identified, the camera file to be added to the project covers all
+    scans, so none is left out for it."""
     is_named = any(group.camera for group in found.groups)
     broken = [path for path in found.broken if isinstance(path, Address) or path.exists() or path.is_symlink()]
     unknown = [
@@ -297,7 +307,7 @@ def _left_out(found: Catalogue) -> dict[str, list[Path]]:
 
 
 def _namesakes(scans: Iterable[tuple[Path, ScanHead]]) -> list[Path]:
-    """Pictures beside which a better one of the same name stands in their folder."""
+    """Scans for which a better one of the same name exists in their folder."""
     best = dict[str, tuple[tuple[int, int], Path]]()
     worse = list[Path]()
     for path, head in scans:
@@ -312,7 +322,7 @@ def _namesakes(scans: Iterable[tuple[Path, ScanHead]]) -> list[Path]:
 
 
 def _patterns(new: NewProject) -> list[str]:
-    """Of the scans below each given folder, as the project finds them: every ending of one as it is written."""
+    """Patterns of the scans below each given folder for `scans`; one for each spelling of an ending."""
     patterns = dict[str, None]()
     for given in new.given:
         if isinstance(given, Address):
@@ -329,7 +339,7 @@ def _patterns(new: NewProject) -> list[str]:
 
 
 def _address_patterns(new: NewProject, given: Address) -> list[str]:
-    """Stores find what a pattern names; of servers every scan is named."""
+    """Patterns for stores; for servers, which cannot be searched, the address of every scan."""
     below = [path for path in new.cameras if path.is_relative_to(given)]
     if below == [given] or not _has_patterns(given):
         return [path.location if isinstance(path, Address) else str(path) for path in below]
@@ -341,7 +351,7 @@ def _has_patterns(path: Path) -> bool:
 
 
 def _exclude_lines(new: NewProject) -> list[str]:
-    """With the reason of each; the project's own results are no scans of it."""
+    """Lines of `exclude` with their reasons; the project's own output is excluded, too."""
     excluded = list[str]()
     if any((new.folder.absolute() / OUTPUT).is_relative_to(given.absolute()) for given in new.given):
         excluded += [f"    {quoted(f'{OUTPUT}/**/*')},    # what the project itself writes"]
@@ -358,7 +368,7 @@ def _relative_name(folder: Path, path: Path) -> str:
 
 
 def _totals(new: NewProject) -> dict[str, tuple[int, int]]:
-    """Scans and folders by camera."""
+    """{camera: (number of scans, number of folders)}."""
     scans, folders = defaultdict[str, int](int), defaultdict[str, set[Path]](set)
     for group in new.found.groups:
         key = group.camera or ("digital camera" if group.digital else "camera unknown")
@@ -374,13 +384,13 @@ def _place(group: ScanGroup) -> str:
 
 
 def _rests_on_form(group: ScanGroup) -> bool:
-    """Whether nothing but wings, notches or arrows names the camera."""
+    """Whether the camera was identified by solid marks (wings, notches, arrows) alone."""
     marks = read_camera(library_path(group.camera)).layout().marks
     return not group.has_telling_plate and all(map(is_solid, marks))
 
 
 def _candidate_lines(names: Sequence[str]) -> list[str]:
-    """Cameras of the library with what tells them apart, a line each."""
+    """One line for each camera of the library, with what distinguishes it."""
     library = {name: read_camera(library_path(name)) for name in names}
     return [f"    {name}: {camera_words(camera)}" for name, camera in library.items()]
 

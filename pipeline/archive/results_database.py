@@ -1,6 +1,6 @@
-"""out/measurement.db: what every scan gave, kept by its key, and what all of them together make of it.
+"""out/measurement.db: the raw result of every scan by its key, and the results of the cross-scan checks.
 
-One process writes it, each scan in a transaction of its own; any other may read meanwhile.
+One process writes, each scan in its own transaction; other processes may read meanwhile.
 """
 
 import json
@@ -44,8 +44,16 @@ _LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "tifffile", "i
 
 @dataclass(frozen=True)
 class Kept:
-    """A result to be kept: what a scan gave by which options, and the bytes that were read for it. camera: the name of
-    the camera's file."""
+    """Result to be stored.
+
+    Attributes
+    ----------
+    identity : of the scan's file.
+    options_json : options of the measurement.
+    scan : the measured scan.
+    bytes_read : bytes read for the measurement.
+    camera : name of the camera's file.
+    """
 
     identity: Identity
     options_json: str
@@ -59,10 +67,10 @@ class Kept:
 
 
 class Store:
-    """The store of a project, open. Closed behind the `with` block."""
+    """Open results database of a project; closed at the end of the `with` block."""
 
     def __init__(self, path: Path) -> None:
-        """Raises InputError for a file that is no such store."""
+        """Open or create a store. Raises InputError for a file that is no such store."""
         self.path = path
         self._db = opened(path)
 
@@ -70,7 +78,8 @@ class Store:
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        """Raises InputError for whatever SQLite refused in the block: of a damaged file any read may be that."""
+        """Close the store. Raises InputError for errors of SQLite in the block, since any read of a damaged file may
+        cause one."""
         self.close()
         if isinstance(error, STORE_ERRORS):
             raise store_error(self.path, "measurements", error) from error
@@ -81,23 +90,25 @@ class Store:
     # --- scans
 
     def identities(self) -> dict[str, Identity]:
-        """Of every scan that was ever measured, by uri, as it was then."""
+        """{uri: identity at its last measurement} of every scan ever measured."""
         rows = self._db.execute(f"select uri, bytes, mtime_ns, etag, identity_hash from scan where {is_sound('scan')}")
         return {uri: Identity(FileState(uri, *state), parts) for uri, *state, parts in rows}
 
     def fingerprints(self) -> dict[str, int]:
-        """Every result's row by its fingerprint, as the table has it and not an index of it."""
+        """{fingerprint: row} of every sound result, read from the table itself and not from an index, which may be
+        damaged."""
         return dict(self._db.execute(f"select fingerprint, id from result not indexed where {is_sound('result')}"))
 
     def set_project(self, names: Mapping[str, str]) -> None:
-        """names: of the images that the project has now, by uri. None of them is current until it is said."""
+        """Set the project's current images. names: {uri: image}. No scan counts as current until `set_current`."""
         with self.writing():
             self._db.execute("update scan set name = null, is_current = 0")
             self._db.executemany("update scan set name = ? where uri = ?", ((n, uri) for uri, n in names.items()))
             self._db.execute(seal("scan"))
 
     def set_current(self, results: Mapping[int, str]) -> None:
-        """These results are those of their scans by today's file and options, and by what is asked of each."""
+        """Mark results as current: they match their scans' present file and options. results: {row: hash of the
+        request}."""
         with self.writing():
             self._db.executemany(
                 "update scan set result = ?1, is_current = 1, asked = ?2 "
@@ -109,8 +120,15 @@ class Store:
     # --- results
 
     def keep(self, kept: Kept, name: str | None = None, current: bool = False, asked: str | None = None) -> int:
-        """Keep a result, whole or not at all, and give its row. name: the image's, where it is one of the project;
-        current: the scan's own by today's file and options, and not only what it tells others; asked: of it."""
+        """Store a result, completely or not at all, and return its row.
+
+        Parameters
+        ----------
+        name : image of the project; None if the scan is not one of it.
+        current : whether it is the scan's own result by its present file and options, not an auxiliary one for other
+            scans.
+        asked : hash of the request.
+        """
         with self.writing():
             scan = self._scan(kept, name)
             result = self._result(kept, scan)
@@ -121,17 +139,17 @@ class Store:
             return result
 
     def scan(self, result: int, image: str, folder: Path, with_marks: bool = True) -> MeasuredScan:
-        """The scan of a result, as it was kept. folder: that its path counts from. Raises DamagedError where what is
-        stored was changed since."""
+        """Raw result of a scan. folder: base of its relative path. Raises DamagedError where stored content is
+        damaged."""
         rows = self.mark_rows(result) if with_marks else []
         try:
             detail = json.loads(self.detail(result))
             return read_scan(image, detail, list(map(read_mark_row, rows)), scan_location(detail["scan"], folder))
-        except (ValueError, TypeError, KeyError):  # of a file that was damaged before its rows had digests
+        except (ValueError, TypeError, KeyError):  # damaged before its rows had digests
             raise self._damaged(result) from None
 
     def mark_rows(self, result: int) -> list[tuple[Any, ...]]:
-        """The rows of its marks. Raises DamagedError as `scan`."""
+        """Rows of the marks of a result. Raises DamagedError where they are damaged."""
         rows = self._db.execute(f"select number, {MARKS} from mark where result = ? order by number", (result,))
         numbered = rows.fetchall()
         digest = self._db.execute(
@@ -142,7 +160,7 @@ class Store:
         return [tuple(row) for _, *row in numbered]
 
     def detail(self, result: int) -> str:
-        """All else that it gave, as JSON. Raises DamagedError as `scan`."""
+        """JSON of the remaining content of a result. Raises DamagedError where it is damaged."""
         query = f"select detail from result where id = ? and {is_sound('result')}"
         found = self._db.execute(query, (result,)).fetchone()
         if found is None:
@@ -157,21 +175,21 @@ class Store:
         return DamagedError.from_image(str(found[0]) if found else "(unknown)", self.path)
 
     def has_damaged_rows(self) -> bool:
-        """Whether a scan, a result or what scans tell others is not as it was written; marks are not looked at."""
+        """Whether a row of a scan, result, judging or value kept for other scans is damaged; marks are not checked."""
         tables = ("scan", "result", "kept")
         found = [f"exists (select 1 from {table} not indexed where not {is_sound(table)})" for table in tables]
         found += [f"exists (select 1 from judging where digest not like 'unfinished%' and not {IS_JUDGING_SOUND})"]
         return bool(self._db.execute(f"select {' or '.join(found)}").fetchone()[0])
 
     def forget_damaged(self) -> int:
-        """Away with results and scans that are not as they were written, so that they are measured again, and with all
-        that was made of them; how many. Raises sqlite3.Error where the file itself is damaged."""
+        """Delete damaged results and scans and everything derived from them, so that they are measured again; return
+        their number. Raises sqlite3.Error where the file itself is damaged."""
         with self.writing():
             lost = damaged_results(self._db)
             scans = self._db.execute(f"select id from scan where not {is_sound('scan')}").fetchall()
             for (scan,) in scans:
                 lost |= {row for (row,) in self._db.execute("select id from result where scan = ?", (scan,))}
-            for table in ("judged", "judged_frame", "judged_lot", "judging"):  # also of a judging that is lost
+            for table in ("judged", "judged_frame", "judged_lot", "judging"):  # including those of a missing judging
                 self._db.execute(f"delete from {table}")
             rows = [(row,) for row in sorted(lost)]
             self._db.executemany("delete from mark where result = ?", rows)
@@ -184,12 +202,12 @@ class Store:
         return len(lost)
 
     def written(self) -> set[int]:
-        """The rows of the results of scans on which something is written."""
+        """Rows of results of scans on which writing was found."""
         rows = self._db.execute("select id from result where coalesce(detail ->> '$.writing', '[]') <> '[]'")
         return {row for (row,) in rows}
 
     def forget_failed(self) -> int:
-        """Of the scans of the project those results that are failures, so that they are tried again; how many."""
+        """Delete failed results, so that the scans are measured again; return their number."""
         with self.writing():
             self._db.execute("delete from judging")
             failed = f"select id from result where verdict = '{Verdict.FAILED}'"
@@ -199,7 +217,7 @@ class Store:
             return self._db.execute(f"delete from result where id in ({failed})").rowcount
 
     def failures(self) -> list[tuple[str, str, str]] | None:
-        """Of every scan of the project its name, its file and why it failed; None where one was measured."""
+        """(name, file, reason) of every scan of the project if all failed; None where one was measured."""
         rows = self._db.execute(
             "select verdict, name, detail from scan join result on result.id = scan.result where is_current "
             f"order by verdict = '{Verdict.FAILED}', name"
@@ -215,7 +233,7 @@ class Store:
     # --- the content of whole files
 
     def content_hashes(self) -> dict[str, str]:
-        """Of the scans whose content was hashed, by uri."""
+        """{uri: SHA-256 of the whole file} where it is known."""
         return dict(self._db.execute("select uri, content_hash from scan where content_hash <> ''"))
 
     def set_content_hashes(self, hashes: Mapping[str, str]) -> None:
@@ -226,7 +244,7 @@ class Store:
             self._db.executemany(f"{seal('scan')} where uri = ?", ((uri,) for uri in hashes))
 
     def set_copies(self, copies: Mapping[str, str]) -> None:
-        """copies: by uri the name of the image whose file it is a copy of. No other scan is one."""
+        """Set which scans are copies. copies: {uri: image whose file it is a copy of}; no other scan is a copy."""
         with self.writing():
             before = self._db.execute("select uri from scan where duplicate_of is not null").fetchall()
             self._db.execute("update scan set duplicate_of = null where duplicate_of is not null")
@@ -237,11 +255,11 @@ class Store:
             self._db.executemany(f"{seal('scan')} where uri = ?", (*before, *((uri,) for uri in copies)))
 
     def move(self, uri: str, identity: Identity) -> dict[str, str]:
-        """A scan's file is elsewhere or touched, its content the same: its results have the key of what it is now.
-        These keys by the earlier ones."""
+        """Re-key the results of a scan whose file was moved or touched with unchanged content; return {old fingerprint:
+        new}."""
         state = identity.state
         with self.writing():
-            if uri != state.uri:  # what stood there before is another scan, whose results nobody can ask for any more
+            if uri != state.uri:  # the earlier scan at that place is gone, and its results cannot be requested any more
                 self._forget(state.uri)
             self._db.execute(
                 "update scan set uri = ?, bytes = ?, mtime_ns = ?, etag = ?, identity_hash = ? where uri = ?",
@@ -273,10 +291,10 @@ class Store:
         self._db.execute(f"delete from result where id in ({own})", (uri,))
         self._db.execute("delete from scan where uri = ?", (uri,))
 
-    # --- what scans of a project tell the others
+    # --- what scans of a project contribute to others
 
     def recall(self, key: str) -> Mapping[str, Any] | None:
-        """What was kept by `remember`. Raises DamagedError where that was changed since."""
+        """Value stored by `remember`, None if there is none. Raises DamagedError where it is damaged."""
         row = self._db.execute(f"select value, {is_sound('kept')} from kept where key = ?", (key,)).fetchone()
         if row is not None and not row[1]:
             raise DamagedError(
@@ -286,7 +304,7 @@ class Store:
         return None if row is None else json.loads(row[0])
 
     def remember(self, key: str, value: Mapping[str, object]) -> None:
-        """Keep what some scans of the project say, for others."""
+        """Store what scans of the project contribute to others."""
         with self.writing():
             self._db.execute("insert or replace into kept (key, value) values (?, ?)", (key, json.dumps(value)))
             self._db.execute(f"{seal('kept')} where key = ?", (key,))
@@ -302,20 +320,20 @@ class Store:
             yield
             self._db.execute("commit")
         except BaseException:
-            if self._db.in_transaction:  # of a full disk SQLite takes it back itself
+            if self._db.in_transaction:  # on a full disk SQLite itself has rolled back
                 self._db.execute("rollback")
             raise
 
     def pose_name(self, result: int) -> str | None:
-        """The name of the pose in which a result's marks have their names."""
+        """Name of the pose under which the marks of a result are named."""
         found = self._db.execute("select pose from result where id = ?", (result,)).fetchone()
         return None if found is None else found[0]
 
-    # --- the inside
+    # --- implementation
 
     def _scan(self, kept: Kept, name: str | None) -> int:
         state, scan = kept.identity.state, kept.scan
-        if name is not None:  # another scan may have had it
+        if name is not None:  # another scan may have had the name
             self._db.execute("update scan set name = null where name = ? and uri <> ?", (name, state.uri))
         values = (
             name, state.uri, state.bytes, state.mtime_ns, state.etag, kept.identity.parts_hash,
@@ -385,7 +403,7 @@ class Store:
 
 
 def known_identities(path: Path) -> dict[str, Identity]:
-    """`Store.identities` of a store; nothing where there is none."""
+    """`Store.identities` of a store; empty where there is none."""
     if not path.exists():
         return {}
     with Store(path) as store:
@@ -393,7 +411,7 @@ def known_identities(path: Path) -> dict[str, Identity]:
 
 
 def seal_result(db: sqlite3.Connection, result: int) -> None:
-    """Set the digests of a result that was written with its marks, as the table has them now."""
+    """Set the digests of a result and its marks."""
     rows = db.execute(f"select number, {MARKS} from mark where result = ? order by number", (result,))
     db.execute("update result set marks_digest = ? where id = ?", (marks_digest(rows), result))
     db.execute(f"{seal('result')} where id = ?", (result,))

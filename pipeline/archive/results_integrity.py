@@ -1,4 +1,4 @@
-"""Digests of a store's rows, by which each is known to be as it was written: a changed one is no result any more."""
+"""Integrity of a store: each row has a digest, and a row that does not match it is not used."""
 
 import hashlib
 import json
@@ -24,18 +24,18 @@ _KEPT = ("key", "value")
 
 
 def row_digest_sql(table: str, columns: Sequence[str]) -> str:
-    """The digest of a row as an SQL expression. table: its name, or the alias that a query gives it."""
+    """SQL expression for the digest of a row. table: name or alias."""
     return f"row_digest({', '.join(f'{table}.{column}' for column in columns)})"
 
 
 def is_sound(table: str, alias: str = "") -> str:
-    """Whether a row is as it was written, as an SQL expression. alias: that a query gives the table."""
+    """SQL expression: whether a row matches its digest. alias: of the table in the query."""
     name = alias or table
     return f"({name}.digest is {row_digest_sql(name, _COLUMNS[table])})"
 
 
 def seal(table: str) -> str:
-    """What sets the digests of rows that were written just now, as SQL that a `where` may follow."""
+    """SQL statement that sets the digests of rows just written; a `where` clause may follow."""
     return f"update {table} set digest = {row_digest_sql(table, _COLUMNS[table])}"
 
 
@@ -43,7 +43,7 @@ _COLUMNS = {"scan": _SCAN, "result": _RESULT, "judged_frame": _FRAME, "kept": _K
 
 
 class DamagedError(InputError):
-    """What stands in a store is not as it was written."""
+    """Stored content does not match its digest."""
 
     @classmethod
     def from_image(cls, image: str, path: object) -> "DamagedError":
@@ -51,7 +51,7 @@ class DamagedError(InputError):
 
 
 def damaged_sentence(image: str, path: object) -> str:
-    """What is said of a scan whose stored result is damaged."""
+    """Message about a scan whose stored result is damaged."""
     return (
         f"{path}: what is stored of image {image!r} is not what was measured: the file was changed or is damaged. "
         "This result is not used. Run `reseau measure --retry`, which measures the image again."
@@ -65,12 +65,12 @@ def row_digest(*values: Any) -> str:
 
 
 def marks_digest(rows: Iterable[Sequence[Any]]) -> str:
-    """That of all marks of a result, in their order, each with its number and MARK_COLUMNS."""
+    """Digest of all marks of a result in their order, each with its number and MARK_COLUMNS."""
     return row_digest(*map(tuple, rows))
 
 
 def add_digests(db: sqlite3.Connection) -> None:
-    """Of every row of a store that has none yet."""
+    """Set the digests of all rows of a store from a version without digests."""
     for table, key in (("mark", "result"), ("judged", "judging, result")):
         parent = "result" if table == "mark" else "judged_frame"
         rows = db.execute(f"select {key}, {_MARK_ROW} from {table} order by {key}, number")
@@ -91,14 +91,14 @@ def add_digests(db: sqlite3.Connection) -> None:
 
 
 def seal_judging(db: sqlite3.Connection, judging: int) -> None:
-    """Set the digests of a judging, and of all its frames together."""
+    """Set the digest of a judging and the common digest of its frames."""
     frames = _frames_digest(db, judging)
     db.execute("update judging set frames_digest = ? where id = ?", (frames, judging))
     db.execute(f"update judging set seal = {_JUDGING} where id = ?", (judging,))
 
 
 def check_judging(db: sqlite3.Connection, judging: int, path: object) -> None:
-    """Raises DamagedError where a judging is not as it was written, or has not all its frames."""
+    """Raise DamagedError where a judging is damaged or lacks frames."""
     query = f"select frames_digest from judging where id = ? and {IS_JUDGING_SOUND}"
     found = db.execute(query, (judging,)).fetchone()
     if found is None or found[0] != _frames_digest(db, judging):
@@ -106,7 +106,7 @@ def check_judging(db: sqlite3.Connection, judging: int, path: object) -> None:
 
 
 def check_judgings(db: sqlite3.Connection, path: object) -> None:
-    """Raises DamagedError where any judging that was finished is not as it was written, or is lost."""
+    """Raise DamagedError where any finished judging is damaged or missing."""
     lost = db.execute(
         f"select exists (select 1 from judging where seal is not null and not {IS_JUDGING_SOUND}) or "
         "exists (select 1 from judged_frame where judging not in (select id from judging))"
@@ -132,12 +132,12 @@ IS_JUDGING_SOUND = f"(seal is {_JUDGING})"
 
 
 def damaged_results(db: sqlite3.Connection) -> set[int]:
-    """The rows of all results that are not as they were written, with their marks."""
+    """Rows of all damaged results; their marks are checked as well."""
     return {row for row, is_whole in _results(db).items() if not is_whole}
 
 
 def damaged_frames(db: sqlite3.Connection, judging: int) -> dict[int, str]:
-    """The results of a judging that are not as they were written, or are judged by what is not; and their images."""
+    """{result: image} of the frames of a judging whose raw result, scan or checked marks are damaged."""
     results, own = _results(db), dict(_digests(db, "judged", f"judging = {judging:d}"))
     rows = db.execute(
         f"select f.result, f.name, f.marks_digest, {is_sound('judged_frame', 'f')} and {is_sound('scan')} "
@@ -152,14 +152,14 @@ def damaged_frames(db: sqlite3.Connection, judging: int) -> dict[int, str]:
 
 
 def _results(db: sqlite3.Connection) -> dict[int, bool]:
-    """Of every result whether it is as it was written."""
+    """{row: whether the result and its marks match their digests}."""
     marks = dict(_digests(db, "mark", "true"))
     rows = db.execute(f"select id, marks_digest, {is_sound('result')} from result not indexed")
     return {row: bool(is_whole) and marks.get(row, _NO_MARKS) == digest for row, digest, is_whole in rows}
 
 
 def _digests(db: sqlite3.Connection, table: str, where: str) -> Iterable[tuple[int, str]]:
-    """The digest of the marks of every result that has some."""
+    """Yield (result, digest of its marks) for every result that has marks."""
     query = f"select result, {_MARK_ROW} from {table} where {where} order by result, number"
     result, marks = None, list[Sequence[Any]]()
     for of, *row in db.execute(query):

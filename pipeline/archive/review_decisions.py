@@ -1,4 +1,5 @@
-"""Review decisions as input of measuring: which count for a scan, what they change, which lines change nothing."""
+"""Review decisions as input of the measurement: which ones apply to a scan, what they change, which lines have no
+effect."""
 
 import json
 from collections import Counter, defaultdict
@@ -22,7 +23,7 @@ from pipeline.provenance import fingerprint, options_hash
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.wording import did_you_mean
 
-_MEASURED = (Choice.PLACE, Choice.POSE, Choice.UNDO)  # decisions that change what is measured
+_MEASURED = (Choice.PLACE, Choice.POSE, Choice.UNDO)  # decisions that change the measurement
 KeyOf = Callable[[ScanTask], str]
 PoseOf = Callable[[str], str | None]
 if TYPE_CHECKING:
@@ -31,11 +32,12 @@ if TYPE_CHECKING:
 _INAPPLICABLE = "decisions that do not apply"
 _NAMED = 10
 
-Marks = Mapping[tuple[str, str], bool]  # by point and kind whether something was measured
+Marks = Mapping[tuple[str, str], bool]  # by point and kind: whether something was measured
 
 
 def request_hasher(project: Project) -> Callable[[str], str]:
-    """A hash of it, by the image's name. Raises InputError for marks that cannot be sought."""
+    """Function from an image's name to the hash of its request: options, revision of measuring and decisions that
+    change the measurement. Raises InputError for marks that cannot be sought."""
     options, hashes = image_options(project, {}), dict[int, str]()
     decisions_of = {
         image: [one for one in decisions if one.decision in _MEASURED]
@@ -52,23 +54,23 @@ def request_hasher(project: Project) -> Callable[[str], str]:
     return request_hash
 
 
-# What a person decided, as input of measuring: which decisions count for a scan, and what they change.
+# Review decisions as input of the measurement: which ones apply to a scan, and what they change.
 #
-# A decision counts for the result that was looked at, which its fingerprint names: after the scan's file, the options
-# or the way of measuring changed, somebody has to look again. Places and poses change what is measured; results that
-# follow from decisions by those before them are the same scan still.
+# A decision applies to the result that was reviewed, which its fingerprint identifies: after a change of the scan's
+# file, the options or the revision of measuring, the scan has to be reviewed again. Places and poses change the
+# measurement; results that follow from earlier decisions still belong to the same scan.
 
 
 @dataclass(frozen=True)
 class ReviewedTask:
-    """A scan's task as decisions leave it, and those that count, by what they are about."""
+    """Task of a scan after decisions, and the decisions that apply, by subject."""
 
     task: ScanTask
     counting: Mapping[About, Decision]
 
 
 def group_decisions(decisions: Sequence[Decision]) -> Mapping[str, Sequence[Decision]]:
-    """The decisions about each scan, the oldest first; those about a camera's marks left out."""
+    """Decisions about each scan, the oldest first, without those about a camera's marks."""
     grouped = defaultdict[str, list[Decision]](list)
     for one in decisions:
         if one.subject[2] != LEARNED:
@@ -77,7 +79,7 @@ def group_decisions(decisions: Sequence[Decision]) -> Mapping[str, Sequence[Deci
 
 
 def decisions_hash(decisions: Sequence[Decision]) -> str:
-    """Of all decisions about an image; "" where there are none."""
+    """Hash of all decisions about an image; "" where there are none."""
     if not decisions:
         return ""
     values = [
@@ -88,12 +90,19 @@ def decisions_hash(decisions: Sequence[Decision]) -> str:
 
 
 def apply_decisions(task: ScanTask, decisions: Sequence[Decision], key_of: KeyOf, pose_of: PoseOf) -> ReviewedTask:
-    """decisions: about this scan, the oldest first. key_of: the fingerprint of a task's result; pose_of: the pose in
-    which the result of a fingerprint names its marks, None where it is not known."""
+    """Apply decisions to the task of their scan.
+
+    Parameters
+    ----------
+    task : of the scan, before decisions.
+    decisions : about this scan, the oldest first.
+    key_of : fingerprint of a task's result.
+    pose_of : from the fingerprint of a result, the pose under which its marks are named; None where it is unknown.
+    """
     if not decisions:
         return ReviewedTask(task, {})
     counted, now, key = list[Decision](), task, key_of(task)
-    current_keys = {key}  # of the results that a decision may have been made about
+    current_keys = {key}  # of the results that a decision may refer to
     ever = set(current_keys)
     for one in decisions:
         known = ever if one.decision is Choice.POSE else current_keys
@@ -108,18 +117,19 @@ def apply_decisions(task: ScanTask, decisions: Sequence[Decision], key_of: KeyOf
 
 
 def _names_alike(before: ScanTask, now: ScanTask, pose: str | None) -> bool:
-    """Whether marks keep their names: they have others in another pose than that in which they were found."""
+    """Whether marks keep their names, which depend on the pose."""
     was, will = before.options.fiducials.pose, now.options.fiducials.pose
     return was == will or (will == pose and was == "auto")
 
 
 def before_checks(scan: MeasuredScan, counting: Mapping[About, Decision]) -> MeasuredScan:
-    """The scan without the marks that are none, by which no other is judged then."""
+    """The scan with all decisions except acceptance, so that rejected and absent marks do not affect the checks of
+    other scans."""
     return _changed(scan, {about: one for about, one in counting.items() if one.decision is not Choice.ACCEPT})
 
 
 def after_checks(scan: MeasuredScan, counting: Mapping[About, Decision]) -> MeasuredScan:
-    """The scan as decisions have it, whatever the checks say, and who made how many of them."""
+    """The scan with all decisions, which override the checks, and the number of decisions by person."""
     marks = {(scan.frame.image, mark.point, mark.kind) for mark in scan.frame.marks}
     applied = [one for about, one in counting.items() if not about[1] or about in marks]
     people = Counter(one.who or "somebody" for one in applied)
@@ -158,7 +168,7 @@ def _apply_to_mark(mark: MarkMeasurement, decision: Decision | None) -> MarkMeas
         case Choice.ABSENT:
             reason = Reason(f"absent, {by}", Code.DECIDED)
             return replace(mark, status=Status.ABSENT, center_px=None, covariance=None, reason=reason)
-        case Choice.PLACE if mark.kind != "fiducial":  # fiducials are matched from there
+        case Choice.PLACE if mark.kind != "fiducial":  # fiducials are matched from the clicked place
             place = np.array([decision.col_px, decision.row_px], dtype=np.float64)
             covariance = Covariance({Cause.CLICK: CLICK_SIGMA_PX**2 * np.eye(2)})
             reason = Reason(f"placed {by}", Code.DECIDED)
@@ -167,7 +177,7 @@ def _apply_to_mark(mark: MarkMeasurement, decision: Decision | None) -> MarkMeas
 
 
 def tell_inapplicable(project: Project, store: Store, digest: str, work: "Work") -> None:
-    """Keep, beside a judging, what is to be said of decisions that it could not take in."""
+    """Store messages about the decisions that a judging could not apply."""
     lines = [*unknown_images(project), *_known_images(project, store, digest, work)]
     store.remember(
         _INAPPLICABLE, {"digest": digest, "lines": [f"line {number}: {why}" for number, why in sorted(lines)]}
@@ -175,19 +185,20 @@ def tell_inapplicable(project: Project, store: Store, digest: str, work: "Work")
 
 
 def inapplicable(store: Store, digest: str) -> tuple[str, ...]:
-    """What is to be said of the decisions that a judging could not take in; the first of them, if they are many."""
+    """Messages about the decisions that a judging could not apply, shortened."""
     kept = store.recall(_INAPPLICABLE) or {}
     return shortened(kept["lines"]) if kept.get("digest") == digest else ()
 
 
 def shortened(lines: Sequence[str]) -> tuple[str, ...]:
-    """The first of many."""
+    """The first of many lines, and the number of the others."""
     left = len(lines) - _NAMED
     return (*lines[:_NAMED], *([f"and {left} lines more"] if left > 0 else []))
 
 
 def unknown_images(project: Project) -> Iterator[tuple[int, str]]:
-    """Lines about images that the project has not, and a last line that was cut short."""
+    """Yield (line, message) for decisions about images that the project lacks, and for a last line that is cut
+    short."""
     if project.decisions_cut_short:
         yield project.decisions_cut_short, "is cut short, or has a typing error. Mend the line, or take it out."
     unknown = {one.image for one in project.decisions} - project.scans.keys() if project.scans else set()
@@ -198,10 +209,10 @@ def unknown_images(project: Project) -> Iterator[tuple[int, str]]:
 
 
 def _known_images(project: Project, store: Store, digest: str, work: "Work") -> Iterator[tuple[int, str]]:
-    """Lines about images of the project that change nothing."""
+    """Yield (line, message) for decisions about images of the project that have no effect."""
     decisions = {image: own for image, own in work.decisions.items() if image in project.scans}
     judging, marks = find_judging(store, digest), defaultdict[str, dict[tuple[str, str], bool]](dict)
-    assert judging is not None  # it was made just now
+    assert judging is not None  # it was stored just before
     query = (
         "select image, point, kind, causes is not null from checked_mark "
         "where judging = ? and image in (select value from json_each(?))"
@@ -226,7 +237,7 @@ def _idle_lines(
 
 
 def _why(one: Decision, counted: Decision | None, marks: Marks) -> str:
-    """Why a decision that stands does not apply; "" of one that does."""
+    """Why a standing decision does not apply; "" if it does."""
     _, point, kind = one.subject
     if point and (point, kind) not in marks:
         hint = did_you_mean(point, [name for name, of_kind in marks if of_kind == kind])

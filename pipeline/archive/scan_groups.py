@@ -1,4 +1,4 @@
-"""Scan groups: scans of one format, size and resolution, of which a few are tried to name the camera of all."""
+"""Scan groups: scans of one format, size and resolution, of which samples are tried to identify the camera of all."""
 
 import shlex
 from collections import Counter, defaultdict
@@ -21,20 +21,27 @@ from pipeline.measuring.camera_trials import identify
 from pipeline.progress import Count, Reporter
 from pipeline.text.wording import counted
 
-SAMPLES = 3  # scans of each group
-_ALIKE = 0.03  # of their sides: scans of one roll are cut by hand
+SAMPLES = 3  # scans tried of each group
+_ALIKE = 0.03  # largest relative difference of sides: scans of one roll are cut by hand
 _SAME_PITCH = 0.01
-_EVERY = 200  # files after which it is told how far it is
-_SHAPES = (4 / 3, 3 / 2, 16 / 9)  # of digital cameras' pictures, whose sides are multiples of this:
+_EVERY = 200  # files between progress reports
+_SHAPES = (4 / 3, 3 / 2, 16 / 9)  # aspect ratios of digital cameras' images; their sides are multiples of:
 _SIDES_PX = 8
-CANDIDATES = 3  # cameras that are named where several may be it
-_TELLING = {"camera_type", "principal_distance_mm"}  # of a plate's fields: what tells cameras apart
+CANDIDATES = 3  # cameras that are named where several are possible
+_TELLING = {"camera_type", "principal_distance_mm"}  # fields of a plate that distinguish cameras
 
 
 @dataclass(frozen=True, eq=False)
 class ScanGroup:
-    """Scans that are alike. head: that of the first; folder: where they stand; samples: what those show that were
-    tried."""
+    """Scans of one format, size and resolution.
+
+    Attributes
+    ----------
+    folder : of the scans.
+    head : of the first scan.
+    paths : of the scans.
+    samples : identifications of the scans that were tried.
+    """
 
     folder: Path
     head: ScanHead
@@ -43,13 +50,14 @@ class ScanGroup:
 
     @property
     def to_try(self) -> list[Path]:
-        """The samples among the scans, from the first to the last."""
+        """Scans to be tried, spread evenly from the first to the last."""
         chosen = np.unique(np.linspace(0, len(self.paths) - 1, SAMPLES).round().astype(int))
         return [self.paths[index] for index in chosen]
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Those that most samples name, no sample with a camera contradicts, and no plate."""
+        """Cameras that are common to the samples with a result, if most have one, without those that a sample's plate
+        contradicts."""
         named = [names for names in self._named if names]
         if 2 * len(named) <= len(self.samples):
             return ()
@@ -58,21 +66,21 @@ class ScanGroup:
 
     @property
     def candidates(self) -> tuple[str, ...]:
-        """The few cameras that most samples show, of these those with the most calibration reports."""
+        """The few cameras that most samples show; among equals, those with the most calibration reports."""
         counts, reports = Counter(name for names in self._named for name in names), self._reports
         ranked = sorted(counts, key=lambda name: (-counts[name], -reports.get(name, 0), name))
         return tuple(ranked[:CANDIDATES])
 
     @property
     def board(self) -> str:
-        """The calibration board that most samples show, as `reseau calibrate` takes it."""
+        """Calibration board that at least half of the samples show, as an argument of `reseau calibrate`."""
         boards = Counter(sample.board for sample in self.samples if sample.board)
         ((board, count),) = boards.most_common(1) or [("", 0)]
         return board if 2 * count >= len(self.samples) else ""
 
     @property
     def digital(self) -> str:
-        """What tells that these are pictures by a digital camera, a part of a sentence; "" of scans of film."""
+        """Why these are images of a digital camera, as part of a sentence; "" for scans of film."""
         if self.head.camera:
             return f"taken by {self.head.camera}"
         if self.board:
@@ -82,20 +90,23 @@ class ScanGroup:
 
     @property
     def calibrate_command(self) -> str:
-        """The command that calibrates the camera of such pictures."""
+        """Command that calibrates the camera of digital images."""
         return f"reseau calibrate {shlex.quote(str(self.folder))} {self.board or '--board COLUMNSxROWS'} --square SIZE"
 
     @property
     def camera(self) -> str:
-        """Of cameras with the same marks the one that rests on most calibration reports; "" without any, and where the
-        form of marks alone names them: then they may be of a camera that is not in the library."""
+        """The identified camera; among cameras with the same marks, the one with the most calibration reports.
+
+        "" where none is identified, or solid marks alone identify it although another camera has similar ones: the true
+        camera may then be missing from the library.
+        """
         if self.much_alike or self.digital:
             return ""
         return max(self.cameras, key=lambda name: self._reports.get(name, 0), default="")
 
     @property
     def much_alike(self) -> tuple[str, ...]:
-        """Other cameras whose solid marks are drawn much like those that are named, where no plate says which."""
+        """Other cameras with similar solid marks, where no plate decides."""
         if self.has_telling_plate:
             return ()
         others = dict.fromkeys(name for sample in self.samples for name in sample.much_alike())
@@ -103,28 +114,28 @@ class ScanGroup:
 
     @property
     def has_telling_plate(self) -> bool:
-        """Whether a plate in a sample tells cameras apart."""
+        """Whether a plate in a sample distinguishes cameras."""
         return any(_TELLING & sample.plate.keys() for sample in self.samples)
 
     @property
     def numbers(self) -> tuple[str, ...]:
-        """Of cameras, as their plates in the samples have them."""
+        """Serial numbers of cameras on the plates in the samples."""
         return tuple(sorted({sample.plate.get("camera_number", "") for sample in self.samples} - {""}))
 
     @property
     def pixel_um(self) -> float | None:
-        """What the marks say of a pixel, the median of the samples."""
+        """Pixel pitch from the separations of marks, µm: the median of the samples."""
         pixels = [trial.pixel_um for sample in self.samples for trial in sample.best[:1] if trial.pixel_um]
         return float(np.median(pixels)) if pixels else None
 
     def sentence(self) -> str:
-        """How many scans of which size, and their camera."""
+        """Sentence with the number and size of the scans, and their camera."""
         count, size = len(self.paths), f"about {self.head.width_px} x {self.head.height_px} px"
         names = f"{' or '.join(self.cameras)}, by {len(self.samples)} of them" if self.camera else self.why_not()
         return f"{count} scan{'s' * (count > 1)} of {size}: {names}."
 
     def why_not(self) -> str:
-        """Why no camera is named, a part of a sentence."""
+        """Why no camera is named, as part of a sentence."""
         if self.digital:
             board = f"the command has the board that they show ({self.board})" if self.board else "no board was found"
             return f"{self.digital}, no film: {board}"
@@ -150,11 +161,11 @@ class ScanGroup:
 
     @property
     def _named(self) -> list[frozenset[str]]:
-        """The cameras that each sample names."""
+        """Cameras that each sample names."""
         return [frozenset(name for trial in sample.best for name in trial.cameras) for sample in self.samples]
 
     def as_json(self) -> Mapping[str, object]:
-        """For programs."""
+        """Content for JSON output."""
         return {
             "scans": [str(path) for path in self.paths],
             "size_px": [self.head.width_px, self.head.height_px],
@@ -170,18 +181,18 @@ class ScanGroup:
 
 @dataclass(frozen=True)
 class GroupedScans:
-    """unread: by path, why a scan cannot be read."""
+    """Groups of scans. unread: {path: why a scan cannot be read}."""
 
     groups: tuple[ScanGroup, ...]
     unread: Mapping[Path, str]
 
     @property
     def all_named(self) -> bool:
-        """Whether every scan is of a camera that is known."""
+        """Whether the camera of every scan is known."""
         return not self.unread and all(group.camera for group in self.groups)
 
     def as_json(self) -> Mapping[str, object]:
-        """For programs."""
+        """Content for JSON output."""
         unread = [{"scan": str(path), "reason": reason} for path, reason in self.unread.items()]
         return {"kinds": [group.as_json() for group in self.groups], "unread": unread}
 
@@ -189,9 +200,9 @@ class GroupedScans:
 def group_scans(
     files: Sequence[Path], count: Count, max_pixels: int | None = None, by_folder: bool = True
 ) -> GroupedScans:
-    """Group scans by format, channels, bits, resolution and about their size. Of each some kilobytes are read.
+    """Group scans by format, channels, bits, camera, resolution and approximate size. Some kilobytes of each are read.
 
-    by_folder: whether the scans of each folder are groups of their own.
+    by_folder: form separate groups for each folder.
     """
     heads, unread = defaultdict[tuple[object, ...], list[tuple[int, ScanHead]]](list), dict[Path, str]()
     members = defaultdict[tuple[Path, int], list[tuple[Path, ScanHead]]](list)
@@ -224,19 +235,23 @@ def _is_like(one: ScanHead, other: ScanHead) -> bool:
 
 
 def has_sensor_size(head: ScanHead) -> bool:
-    """Whether a picture is as digital cameras make them: of one of their shapes, without a resolution."""
+    """Whether an image has the size of a digital camera's: one of their aspect ratios, and no resolution in its
+    file."""
     short, long = sorted((head.width_px, head.height_px))
     is_whole = short % _SIDES_PX == long % _SIDES_PX == 0
     return is_whole and head.pitch.um is None and any(abs(long / short / shape - 1) < 1e-3 for shape in _SHAPES)
 
 
-Sample = tuple[Path, tuple[str, ...]]  # a scan, and cameras that another one of its group shows
+Sample = tuple[Path, tuple[str, ...]]  # a scan, and the cameras that another one of its group shows
 Try = Callable[[Sample], Identification | str]
 
 
 def name_cameras(grouped: GroupedScans, identified: Try, reporter: Reporter, workers: Executor | None) -> GroupedScans:
-    """The groups with what their samples show. identified: of a scan, or why it cannot be read. Cameras that the first
-    sample of a group shows are the first to be tried on the others."""
+    """Identify the cameras of groups from samples.
+
+    identified: identification of a scan, or why it cannot be read. Cameras found in the first sample of a group are
+    tried first on the others.
+    """
     total = sum(len(group.to_try) for group in grouped.groups)
     of_groups = f"scans of {counted(len(grouped.groups), 'group')} on the camera library"
     answers = dict[Path, Identification | str]()
@@ -261,7 +276,7 @@ def name_cameras(grouped: GroupedScans, identified: Try, reporter: Reporter, wor
 
 
 def _split_cameras(group: ScanGroup) -> list[ScanGroup]:
-    """The group; where all its scans were tried and show several cameras, the scans of each."""
+    """The group itself, or one group per camera if all its scans were tried and show several cameras."""
     if group.camera or group.digital or len(group.samples) < len(group.paths) or len(group.paths) < 2:
         return [group]
     parts = defaultdict[str, list[Identification]](list)
@@ -271,13 +286,13 @@ def _split_cameras(group: ScanGroup) -> list[ScanGroup]:
 
 
 def _camera_names(answer: Identification | str) -> tuple[str, ...]:
-    """Those that a sample shows."""
+    """Cameras that a sample shows."""
     best = answer.best if isinstance(answer, Identification) else ()
     return tuple(name for trial in best for name in trial.cameras)
 
 
 def trial_of_cameras(cameras: Mapping[str, CameraFile], pitch_um: float | None, max_pixels: int | None) -> Try:
-    """What tries cameras on a scan, in any process."""
+    """Function that tries cameras on a scan; it can be sent to other processes."""
     return partial(_identified, cameras=cameras, pitch_um=pitch_um, max_pixels=max_pixels)
 
 
@@ -303,7 +318,7 @@ def _board(path: Path, max_pixels: int | None) -> str:
 
 
 def print_groups(grouped: GroupedScans, console: Console) -> None:
-    """Every group with its samples."""
+    """Print every group with its samples."""
     for group in grouped.groups:
         console.print(group.sentence(), style="bold", highlight=False, soft_wrap=True)
         for sample in group.samples:

@@ -1,7 +1,7 @@
-"""The tables of the project's SQLite files, and how files of earlier versions become files of this one: forward only.
+"""Tables of the project's SQLite files, and migrations from earlier versions: forward only.
 
-The number of the version stands in the file (`pragma user_version`). A change of the tables is a new entry at the end
-of MIGRATIONS, and none that stands there is changed any more.
+The file holds its version number (`pragma user_version`). A change of the tables is appended to MIGRATIONS; existing
+entries are never changed.
 """
 
 import math
@@ -14,8 +14,8 @@ from measure.scans.remote import public_address
 from pipeline.archive.results_integrity import add_digests, row_digest
 from pipeline.errors import InputError, what_to_do_about_store
 
-STORE_ERRORS = (sqlite3.Error, UnicodeDecodeError)  # of a damaged file; SQLite's own sentence may be damaged, too
-APPLICATION = 0x52455345  # "RESE": `file` and this program know the file by it
+STORE_ERRORS = (sqlite3.Error, UnicodeDecodeError)  # damaged files: even SQLite's message may be undecodable
+APPLICATION = 0x52455345  # "RESE": identifies the file for `file` and this program
 
 _FIRST = """
 create table scan (
@@ -110,10 +110,10 @@ create index judged_lot_by_input on judged_lot (input);
 alter table judged_frame add column lot integer not null default 0;
 """
 
-# A hash of what the project asked for when it was known last whether the scan's result is current.
+# Hash of the project's request when it was last determined whether the scan's result is current.
 _ASKED = "alter table scan add column asked text"
 
-# BLAKE2b of rows, see `digests`; decisions: a hash of those about the image that were taken in.
+# BLAKE2b of rows, see `results_integrity`; decisions: hash of the applied decisions about the image.
 _DIGESTS = """
 alter table scan add column digest text;
 alter table result add column marks_digest text;
@@ -126,7 +126,7 @@ alter table judged_frame add column digest text;
 alter table kept add column digest text;
 """
 
-# The marks of every judging as the checks left them: those of the result where the checks changed none.
+# Marks of every judging after the checks: those of the raw result where the checks changed none.
 _CHECKED_MARKS = """
 create view checked_mark as
 select f.judging, f.name as image, f.scan, f.verdict, m.* from judged_frame f
@@ -152,7 +152,8 @@ VERSION = len(MIGRATIONS)
 
 @dataclass(frozen=True)
 class Schema:
-    """A kind of file. application: its number, by which it is known; what: it holds."""
+    """Schema of a kind of file. application: SQLite's application id; migrations: scripts, one per version; what: its
+    content, for messages."""
 
     application: int
     migrations: tuple[str, ...]
@@ -160,8 +161,10 @@ class Schema:
 
 
 def opened(path: Path, schema: Schema | None = None) -> sqlite3.Connection:
-    """The file, brought to this version; made where there is none. schema: if it is not that of measurements. Raises
-    InputError for a file of another kind, or of a later version."""
+    """Open a file and migrate it to this version; create it where there is none.
+
+    schema: None for that of measurements. Raises InputError for a file of another kind or of a later version.
+    """
     schema = schema or _measurements()
     path.parent.mkdir(parents=True, exist_ok=True)
     connection = _connection(path)
@@ -183,17 +186,18 @@ def opened(path: Path, schema: Schema | None = None) -> sqlite3.Connection:
 
 
 def _connection(path: Path) -> sqlite3.Connection:
-    """To read and write; to read alone where the folder cannot be written, for SQLite makes files beside its own."""
+    """Open for reading and writing; read-only where the folder is not writable, since SQLite creates files beside its
+    own."""
     name, is_address = str(path), path.exists() and not all(os.access(one, os.W_OK) for one in (path.parent, path))
     if is_address:
-        log = path.with_name(f"{path.name}-wal")  # of a process that has it open
+        log = path.with_name(f"{path.name}-wal")  # exists while another process has the file open
         is_open = log.exists() and log.stat().st_size > 0
         name = f"{path.absolute().as_uri()}?mode=ro{'' if is_open else '&immutable=1'}"
     return sqlite3.connect(name, timeout=60.0, isolation_level=None, uri=is_address)
 
 
 def migrate(connection: sqlite3.Connection, schema: Schema | None = None) -> None:
-    """To this version from any earlier one, each step whole or not at all."""
+    """Migrate from any earlier version to this one, each step completely or not at all."""
     schema = schema or _measurements()
     version = connection.execute("pragma user_version").fetchone()[0]
     for number, script in enumerate(schema.migrations[version:], version + 1):
@@ -211,8 +215,8 @@ def migrate(connection: sqlite3.Connection, schema: Schema | None = None) -> Non
 
 
 def _forget_secrets(connection: sqlite3.Connection) -> None:
-    """Away with scans that an earlier version kept by addresses with passwords or signatures: they are not asked for by
-    these any more."""
+    """Delete scans that an earlier version stored under addresses with passwords or signatures, which are not used as
+    keys any more."""
     rows = connection.execute("select id, uri from scan where uri like '%://%'").fetchall()
     secret = [(row,) for row, uri in rows if public_address(uri) != uri]
     if secret:
@@ -229,7 +233,7 @@ def _measurements() -> Schema:
 
 
 def store_error(path: Path, what: str, error: Exception) -> InputError:
-    """What is said of a file that cannot be read or written as a store."""
+    """Error for a file that cannot be read or written as a store."""
     next_step = what_to_do_about_store(error) or _MOVE
     return InputError(f"{path}: cannot be used as a database of {what} ({error}). {next_step}")
 

@@ -1,4 +1,4 @@
-"""Where the scans of a project stand: counted by verdict, those that need a look, and what measure says of them."""
+"""`reseau status`: scans of a project counted by verdict, with those that need a look and why."""
 
 import csv
 import io
@@ -31,12 +31,12 @@ from pipeline.provenance import FileStates
 from pipeline.results.measured_record import FailureCode
 
 NAMED = 20  # scans that a summary names
-_LOOK = (Verdict.FAILED, Verdict.POOR, Verdict.LOOK)  # the worst first
+_LOOK = (Verdict.FAILED, Verdict.POOR, Verdict.LOOK)  # from the worst
 
 
-class ScanStatus(NamedTuple):  # archives have many
-    """Where a scan stands, and why: the first thing that speaks against it. failure: its kind, where nothing was
-    measured."""
+class ScanStatus(NamedTuple):  # a tuple, since archives have many
+    """Status of a scan. why: its first problem; failure: code, where nothing was measured; seconds: duration of the
+    measurement; finished: time of its end."""
 
     image: str
     scan: str
@@ -50,7 +50,8 @@ class ScanStatus(NamedTuple):  # archives have many
 
 @dataclass(frozen=True)
 class ArchiveStatus:
-    """Every scan of a project, by name. idle_decisions: lines of decisions.jsonl that do not apply, and why."""
+    """Status of every scan of a project, sorted by name. idle_decisions: lines of decisions.jsonl that do not apply,
+    and why."""
 
     scans: tuple[ScanStatus, ...]
     idle_decisions: tuple[str, ...] = ()
@@ -62,7 +63,7 @@ class ArchiveStatus:
 
     @property
     def sentence(self) -> str:
-        """How many scans are measured, and how the rest stands."""
+        """Sentence with the number of measured scans and of scans by verdict."""
         return scan_counts(self.counts)
 
     @property
@@ -70,14 +71,14 @@ class ArchiveStatus:
         return not self.idle_decisions and not any(scan.verdict.needs_look for scan in self.scans)
 
     def select(self, verdict: Verdict | None) -> "ArchiveStatus":
-        """The scans of one verdict; None: all."""
+        """Status of the scans of one verdict; None: all."""
         scans = self.scans if verdict is None else tuple(s for s in self.scans if s.verdict is verdict)
         return replace(self, scans=scans)
 
 
 def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
-    """By the store, and by which files there are and how they look from outside: no scan is opened. path: of the store,
-    if not that of the project."""
+    """Status from the store and from the files' sizes and times; no scan is opened. path: of the store; None for the
+    project's."""
     path = path or project.measurement_path
     rows, idle = {}, tuple[str, ...]()
     if path.exists():
@@ -106,8 +107,8 @@ def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
 
 
 def _status_rows(store: Store) -> Iterator[Sequence[Any]]:
-    """The rows of the query; one that is not as it was written says that, and nothing else. Of frames of which a mark's
-    reason may be told, the marks are checked, too."""
+    """Rows of the query; a damaged row is reported as a failure. Marks are checked only in frames where the reason of
+    one may be shown."""
     judging = latest(store)
     rows = store.connection.execute(_QUERY, (-1 if judging is None else judging.row,)).fetchall()
     damaged = set[str]()
@@ -125,7 +126,7 @@ def _status_rows(store: Store) -> Iterator[Sequence[Any]]:
 
 
 _VERDICTS = {str(verdict): verdict for verdict in Verdict}
-# Of most scans, which are good, there is nothing to say.
+# Most scans are good, and need no reason.
 _QUERY = """
 with frame as (
     select scan.uri, scan.bytes, scan.mtime_ns, scan.etag, scan.is_current, scan.asked,
@@ -159,7 +160,7 @@ from frame
 
 
 def status_json(status: ArchiveStatus) -> dict[str, object]:
-    """For programs: the totals, and every scan that needs a look."""
+    """JSON: totals, and every scan that needs a look."""
     return {
         "scans": len(status.scans),
         "verdicts": {
@@ -182,7 +183,7 @@ def status_json(status: ArchiveStatus) -> dict[str, object]:
 
 
 def status_csv(status: ArchiveStatus) -> str:
-    """A line a scan."""
+    """CSV with one line per scan."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(("image", "verdict", "why", "failure", "scan", "camera", "seconds", "finished"))
@@ -195,7 +196,7 @@ def status_csv(status: ArchiveStatus) -> str:
 
 
 def print_status(status: ArchiveStatus, console: Console, every: bool = False) -> None:
-    """Totals, and what to do; then the scans that need a look. every: name all of them."""
+    """Print totals with remedies, then the scans that need a look. every: name all scans."""
     table = Table("verdict", "scans", "what it means", "remedy")
     for verdict, count in status.counts.items():
         if count:
@@ -212,6 +213,6 @@ def print_status(status: ArchiveStatus, console: Console, every: bool = False) -
 
 
 def worst_named(scans: Sequence[ScanStatus], most: int, every: bool) -> tuple[list[ScanStatus], int]:
-    """The first of those that need a look, the worst first; and how many there are beside them."""
+    """The first of the scans that need a look, from the worst, and the number of the remaining ones."""
     to_name = [scan for verdict in _LOOK for scan in scans if scan.verdict is verdict] if not every else list(scans)
     return to_name[:most], max(len(to_name) - most, 0)

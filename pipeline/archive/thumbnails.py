@@ -1,6 +1,6 @@
-"""out/thumbnails.db: small pictures of all that was measured, so that nobody opens the scans again to look at a mark.
+"""out/thumbnails.db: thumbnails of all measured marks, so that viewing a mark does not reopen its scan.
 
-It holds nothing that the scans do not: it may be deleted, and then pictures are cut from the scans again.
+It may be deleted: thumbnails are then cut from the scans again.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -30,30 +30,30 @@ create table thumbnail (
     primary key (fingerprint, point, kind)
 );
 """
-_DIGESTS = "alter table thumbnail add column digest text"  # BLAKE2b of the picture and where it lies; null: not known
+_DIGESTS = "alter table thumbnail add column digest text"  # BLAKE2b of the thumbnail and its location; null: unknown
 _SCHEMA = Schema(0x52455354, (_FIRST, _DIGESTS), "thumbnails")  # "REST"
 _DIGEST = "row_digest(point, kind, col_px, row_px, step_px, jpeg)"
 _COLUMNS = "point, kind, col_px, row_px, step_px, jpeg"
-_OFF_MIDDLE = 0.25  # of a picture's width: a mark farther off was measured again since
+_OFF_MIDDLE = 0.25  # fraction of a thumbnail's width: a mark farther off its middle was measured again since
 
 
 class ThumbnailStore:
-    """The thumbnails beside a store of measurements, open. Closed behind the `with` block."""
+    """Open store of thumbnails beside a results database; closed at the end of the `with` block."""
 
     def __init__(self, path: Path) -> None:
-        """Raises InputError for a file that is no such store."""
+        """Open a store. Raises InputError for a file that is no such store."""
         self._path, self._db = path, opened(path, _SCHEMA)
 
     @classmethod
     def open(cls, measurement: Path) -> "ThumbnailStore":
-        """Those of a store of measurements."""
+        """Open the thumbnails of a results database."""
         return cls(thumbnails_path(measurement))
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        """Raises InputError for what SQLite refused of this file in the block."""
+        """Close the store. Raises InputError for errors of SQLite in the block."""
         self.close()
         if isinstance(error, STORE_ERRORS):
             raise store_error(self._path, "thumbnails", error) from error
@@ -62,7 +62,7 @@ class ThumbnailStore:
         self._db.close()
 
     def keep(self, fingerprint: str, thumbnails: Sequence[StoredThumbnail]) -> None:
-        """Of one result, all or none."""
+        """Store the thumbnails of one result, all or none."""
         self._db.execute("begin immediate")
         self._db.executemany(
             f"insert or replace into thumbnail (fingerprint, {_COLUMNS}) values (?, ?, ?, ?, ?, ?, ?)",
@@ -72,13 +72,13 @@ class ThumbnailStore:
         self._db.execute("commit")
 
     def get(self, fingerprint: str, point: str = "", kind: str = "frame") -> StoredThumbnail | None:
-        """That of a mark of a result, or of the whole scan; None where there is none that is as it was written."""
+        """Thumbnail of a mark, or of the whole scan; None where it is missing or damaged."""
         where = f"fingerprint = ? and point = ? and kind = ? and digest is {_DIGEST}"
         try:
             found = self._db.execute(
                 f"select {_COLUMNS} from thumbnail where {where}", (fingerprint, point, kind)
             ).fetchone()
-        except STORE_ERRORS:  # the scan itself is there
+        except STORE_ERRORS:  # fall back to the scan itself
             return None
         if found is None:
             return None
@@ -86,7 +86,7 @@ class ThumbnailStore:
         return StoredThumbnail(point, kind, (col_px, row_px), step_px, jpeg)
 
     def rekey(self, keys: Mapping[str, str]) -> None:
-        """Results have other fingerprints now; keys: the new ones by the old."""
+        """Replace fingerprints of results. keys: {old: new}."""
         self._db.execute("begin immediate")
         self._db.executemany(
             "update or ignore thumbnail set fingerprint = ? where fingerprint = ?",
@@ -95,7 +95,7 @@ class ThumbnailStore:
         self._db.execute("commit")
 
     def take(self, measurements: Sequence[Path]) -> None:
-        """Those beside other stores of measurements, as far as there are any."""
+        """Import the thumbnails of other results databases that have some."""
         for path in filter(Path.is_file, map(thumbnails_path, measurements)):
             opened(path, _SCHEMA).close()
             self._db.execute("attach ? as other", (str(path),))
@@ -105,12 +105,12 @@ class ThumbnailStore:
 
 
 def thumbnails_path(measurement: Path) -> Path:
-    """Where the thumbnails of a store of measurements stand."""
+    """Path of the thumbnails of a results database."""
     return measurement.with_name(f"thumbnails{measurement.name.removeprefix('measurement')}")
 
 
 class Thumbnails:
-    """Windows about marks, by image, point and kind; one scan is open at a time, none behind the `with` block."""
+    """Windows around marks, by image, point and kind. One scan is open at a time, until the end of the `with` block."""
 
     def __init__(
         self,
@@ -119,7 +119,10 @@ class Thumbnails:
         measurement: Path | None = None,
         fingerprints: Mapping[str, str] | None = None,
     ) -> None:
-        """measurement: the store beside which thumbnails were kept; fingerprints: by image, of the results in it."""
+        """Prepare the windows of the scans' marks.
+
+        measurement: results database that has stored thumbnails; fingerprints: {image: fingerprint of its result}.
+        """
         self._max_pixels = max_pixels
         self._scans = {scan.frame.image: scan for scan in scans}
         self._marks = {
@@ -129,7 +132,7 @@ class Thumbnails:
         is_kept = measurement is not None and thumbnails_path(measurement).exists()
         self._kept: ThumbnailStore | None = None
         if is_kept and measurement is not None:
-            with suppress(InputError):  # of a damaged file, without which pictures are cut from the scans
+            with suppress(InputError):  # a damaged file: thumbnails are cut from the scans instead
                 self._kept = ThumbnailStore.open(measurement)
         self._open: tuple[Path, Scan] | None = None
 
@@ -143,7 +146,7 @@ class Thumbnails:
             self._kept.close()
 
     def get(self, image: str, point: str, kind: str) -> Thumbnail | None:
-        """The picture of a mark; None where it has no place, or its scan cannot be read any more."""
+        """Thumbnail of a mark; None where the mark has no place or its scan cannot be read."""
         mark = self._marks.get((image, point, kind == "fiducial"))
         if mark is None or mark.center_px is None:
             return None

@@ -1,4 +1,4 @@
-"""What became of a scan, in one table: the documentation and `reseau status` are made from it."""
+"""Verdicts on scans, in one table: source of the documentation and of `reseau status`."""
 
 from collections.abc import Collection, Mapping, Sequence
 from enum import StrEnum
@@ -9,7 +9,7 @@ from pipeline.text.wording import count_sentence
 
 
 class Verdict(StrEnum):
-    """Of a scan: the worst of its marks and problems. From the best to what is not known yet."""
+    """Verdict on a scan: the worst of its marks and problems, ordered from the best to not yet known."""
 
     GOOD = "good"
     DECIDED = "decided"
@@ -47,12 +47,12 @@ NEXT_STEP = {
 _MARK_VERDICTS = {status: Verdict.GOOD if status is Status.MEASURED else Verdict.LOOK for status in Status}
 _MEASURED = (Verdict.GOOD, Verdict.DECIDED, Verdict.LOOK, Verdict.POOR)
 _ANSWERED = frozenset((Code.DECIDED, Code.CLICKED))
-_LEAST_FIDUCIALS = 3  # two give a frame, and nothing to check it by
+_LEAST_FIDUCIALS = 3  # two determine an interior orientation without any check
 MarkState = tuple[str, Status, Collection[str]]  # kind, status, codes of the reason
 
 
 def scan_counts(counts: Mapping[Verdict, int]) -> str:
-    """How many scans are measured, and how many there are of each verdict."""
+    """Sentence with the number of measured scans and of scans of each verdict."""
     measured = sum(counts.get(verdict, 0) for verdict in _MEASURED)
     return count_sentence(
         "measured", measured, sum(counts.values()), {str(each): counts.get(each, 0) for each in Verdict}
@@ -60,7 +60,7 @@ def scan_counts(counts: Mapping[Verdict, int]) -> str:
 
 
 def scan_verdict(scan: MeasuredScan) -> Verdict:
-    """The verdict of a scan."""
+    """Verdict on a scan."""
     frame, marks = scan.frame, [(mark.kind, mark.status, mark.reason.codes) for mark in scan.frame.marks]
     if scan.failure:
         return Verdict.FAILED
@@ -68,14 +68,14 @@ def scan_verdict(scan: MeasuredScan) -> Verdict:
 
 
 def has_problem(scan: MeasuredScan) -> bool:
-    """Whether something of the frame as a whole needs a look, as an orientation that nothing decides."""
+    """Whether the frame as a whole needs a look, for example because its pose is assumed."""
     frame = scan.frame
     return bool(frame.problems) or (frame.pose is not None and not frame.pose.decided)
 
 
 def frame_verdict(marks: Sequence[MarkState], has_frame: bool, is_doubtful: bool, has_decisions: bool) -> Verdict:
-    """The verdict of a frame that was measured. has_frame: whether its fiducials tell where it lies; is_doubtful: what
-    `has_problem` says."""
+    """Verdict on a measured frame. has_frame: its interior orientation is known; is_doubtful: result of
+    `has_problem`."""
     fiducials = [mark for mark in marks if mark[0] == "fiducial" and Code.OTHER_PART not in mark[2]]
     observed = [kind for kind, status, _ in marks if status.is_observation]
     too_few = observed.count("fiducial") < min(_LEAST_FIDUCIALS, len(fiducials))
@@ -93,8 +93,11 @@ def is_answered(codes: Collection[str]) -> bool:
 
 
 def _mark_verdict(kind: str, status: Status, codes: Collection[str]) -> Verdict:
-    """A target that was not seen costs the others nothing; a fiducial is in every frame of its camera, be it in another
-    scan of it. What a person has decided of a mark is not asked again."""
+    """Verdict on one mark.
+
+    An unobserved target does not affect the others. A fiducial must be found in every frame, unless it lies on another
+    part of it. A mark that a person has decided about needs no further look.
+    """
     if is_answered(codes):
         return Verdict.DECIDED
     if Code.OTHER_PART in codes or (status is Status.PREDICTED and kind != "fiducial"):

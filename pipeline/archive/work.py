@@ -1,4 +1,4 @@
-"""What is missing of a project's scans measured, and kept as each is done."""
+"""Measure the missing scans of a project, and store each as soon as it is done."""
 
 import os
 from collections import Counter, defaultdict
@@ -32,10 +32,11 @@ _hash_of = lru_cache(maxsize=4096)(options_hash)
 
 
 class ExpectedTime:
-    """Counts what is done of each kind: scans of one camera, of one sort of file."""
+    """Estimate of the remaining time, by kind of scan: camera and file format."""
 
     def __init__(self, tasks: Sequence[ScanTask], cameras: Sequence[str], at_a_time: int) -> None:
-        """tasks: all that are to be measured; cameras: of each; at_a_time: how many processes measure them."""
+        """Count the scans of each kind. tasks: all scans to be measured; cameras: of each; at_a_time: number of
+        processes."""
         kinds = zip(tasks, cameras, strict=True)
         self._kind = {task.name: f"{camera} {task.shown_scan.rpartition('.')[2].lower()}" for task, camera in kinds}
         self._left = Counter(self._kind.values())
@@ -49,7 +50,7 @@ class ExpectedTime:
 
     @property
     def left_s(self) -> float:
-        """A kind of which nothing is done takes as long as all others on the average."""
+        """Remaining time, s. A kind without finished scans is assumed to take the mean time of all others."""
         all_s = [seconds for each in self._done.values() for seconds in each]
         usual = sum(all_s) / len(all_s) if all_s else 0.0
         means = {kind: sum(each) / len(each) for kind, each in self._done.items()}
@@ -57,18 +58,18 @@ class ExpectedTime:
 
     @property
     def groups(self) -> str:
-        """How many kinds are done."""
+        """Number of finished kinds, as text."""
         done = sum(not self._left[kind] for kind in self._left)
         return f"{done} of {counted(len(self._left), 'group')}"
 
 
 def file_state(task: ScanTask, files: FileStates) -> FileState:
-    """The state of a task's file."""
+    """State of a task's file."""
     return files.get(scan_path(task.scan)) if task.scan else FileState(f"(none) {task.name}", -1)
 
 
 class Work:
-    """Scans measured as tasks ask for them: what the store holds is read there, all else measured and kept at once."""
+    """Measurement of scans on request: stored results are read, missing ones measured and stored at once."""
 
     def __init__(
         self,
@@ -88,12 +89,12 @@ class Work:
         self._states: dict[str, FileState] = {}
         self._asked = request_hasher(project)
         self._decisions = group_decisions(project.decisions)
-        self._counting: dict[str, Mapping[About, Decision]] = {}  # by image, of what was asked for last
-        self._now: set[int] = set()  # rows that were measured now
-        self.results: dict[str, int] = {}  # by image, the row of what was asked for last
+        self._counting: dict[str, Mapping[About, Decision]] = {}  # by image, for its last request
+        self._now: set[int] = set()  # rows measured in this run
+        self.results: dict[str, int] = {}  # by image, row of the result of its last request
 
     def measure(self, tasks: Iterable[ScanTask]) -> Iterator[MeasuredScan]:
-        """What each task gives, measured or kept, without the marks that are none by decision: a `Measure`."""
+        """Yield the scan of each task, measured or stored, with the decisions that precede the checks: a `Measure`."""
         missing = []
         for task in map(self._reviewed_task, tasks):
             row = self._row(task)
@@ -105,12 +106,12 @@ class Work:
             yield self._read_row(task, row)
 
     def complete(self, tasks: Sequence[ScanTask], reporter: Reporter) -> None:
-        """Measure what is missing of the scans of the project, and say how much that is. Nothing of it is held."""
+        """Measure the missing scans of the project and report how many there are. The scans are not held in memory."""
         tasks = [self._reviewed_task(task) for task in tasks]
         known = {task.name: row for task in tasks if (row := self._row(task)) is not None}
         missing = [task for task in tasks if task.name not in known]
         self.results |= known
-        now = sum(row in self._now for row in known.values())  # for what they tell the others
+        now = sum(row in self._now for row in known.values())  # measured for other scans in the steps before
         self._store.set_current({row: self._asked(name) for name, row in known.items()})
         if known or len(missing) > 1:
             rest = {"in the steps before": now, "to measure": len(missing)}
@@ -119,54 +120,54 @@ class Work:
             self._complete(missing, len(tasks), reporter)
 
     def read(self, name: str) -> MeasuredScan:
-        """What was asked for last of an image, without the marks that are none by decision."""
+        """Scan of an image as last requested, with the decisions that precede the checks."""
         scan = self._store.scan(self.results[name], name, self._folder)
         return before_checks(scan, self._counting.get(name, {}))
 
     def written(self, names: Sequence[str]) -> list[str]:
-        """Those of the images on which something is written."""
+        """Images on whose scans writing was found."""
         written = self._store.written()
         return [name for name in names if self.results[name] in written]
 
     def read_writing(self, name: str) -> MeasuredScan:
-        """What was asked for last of an image, without its marks, problems and notes."""
+        """Scan of an image as last requested, without marks, problems and notes."""
         scan = self._store.scan(self.results[name], name, self._folder, with_marks=False)
         return replace(scan, frame=replace(scan.frame, problems=()), notes=())
 
     @property
     def decisions(self) -> Mapping[str, Sequence[Decision]]:
-        """All about scans, by image, the oldest first."""
+        """All decisions about scans, by image, the oldest first."""
         return self._decisions
 
     def counting_decisions(self, name: str) -> Mapping[About, Decision]:
-        """The decisions that count of an image, by what they are about."""
+        """Decisions that apply to an image, by subject."""
         return self._counting.get(name, {})
 
     def counting(self, name: str) -> list[Decision]:
-        """The decisions that count of an image."""
+        """Decisions that apply to an image."""
         return [one for _, one in sorted(self._counting.get(name, {}).items())]
 
     def decisions_hash(self, name: str) -> str:
-        """Of the decisions about an image, whether they count or not."""
+        """Hash of all decisions about an image, whether they apply or not."""
         return decisions_hash(self._decisions.get(name, ()))
 
     def apply_decisions(self, scan: MeasuredScan) -> MeasuredScan:
-        """A scan that was checked, as decisions have it."""
+        """Checked scan with all decisions applied."""
         return after_checks(scan, self._counting.get(scan.frame.image, {}))
 
     def keys(self) -> dict[str, str]:
-        """By image the fingerprint of what was asked for last."""
+        """{image: fingerprint of its last requested result}."""
         of_row = {row: key for key, row in self._rows.items()}
         return {name: of_row[row] for name, row in self.results.items()}
 
     def state(self, task: ScanTask) -> FileState:
-        """Of the task's file, as it was when it was first asked for."""
+        """State of the task's file when it was first requested."""
         if task.scan not in self._states or not task.scan:
             self._states[task.scan] = file_state(task, self._files)
         return self._states[task.scan]
 
     def _complete(self, tasks: Sequence[ScanTask], scans: int, reporter: Reporter) -> None:
-        """Measure these, the last of so many scans: those that are measured already count as done."""
+        """Measure the missing scans. scans: number of all scans; those measured earlier count as done."""
         cameras = [self._project.image_camera(task.name).path.stem for task in tasks]
         expected = ExpectedTime(tasks, cameras, self._at_a_time)
         failed = defaultdict[str, list[str]](list)
@@ -177,7 +178,7 @@ class Work:
                 expected.is_done(task.name, kept.scan.seconds)
                 if kept.scan.failure:
                     same = drop_file_name(kept.scan.failure.sentence, task.shown_scan)
-                    if same not in failed:  # that of many others would be the same
+                    if same not in failed:  # one message for all scans with the same failure
                         reporter.say(f"failed: {task.name}: {same}")
                     failed[same].append(task.name)
                 failures = sum(map(len, failed.values()))
@@ -188,7 +189,7 @@ class Work:
                 reporter.say(f"failed as {first} did: {counted(len(others), 'scan')} more, {listed(others)}")
 
     def _reviewed_task(self, task: ScanTask) -> ScanTask:
-        """The task as decisions about its scan have it."""
+        """Task with the decisions about its scan applied."""
         decisions = self._decisions.get(task.name)
         if decisions is None:
             return task
@@ -207,7 +208,7 @@ class Work:
         return now.task
 
     def _row(self, task: ScanTask) -> int | None:
-        """The row of its result, where its file and options are those of it."""
+        """Row of the stored result for the task's present file and options; None if there is none."""
         state = self.state(task)
         known = self._identities.get(state.uri)
         if known is None or known.state != state:
@@ -219,7 +220,8 @@ class Work:
         return self.read(task.name)
 
     def _measure(self, tasks: Sequence[ScanTask], as_scans: bool = False) -> Iterator[tuple[ScanTask, int, Kept]]:
-        """Each kept as soon as it is there. as_scans: of the project, and not only for what they tell the others."""
+        """Measure tasks, and store each result at once. as_scans: as results of the project's own scans, not auxiliary
+        ones for other scans."""
         if tasks and self._only_kept:
             raise NotMeasured
         states = {task.name: self.state(task) for task in tasks}
@@ -248,5 +250,5 @@ class Work:
 
 
 def _options_json(task: ScanTask) -> str:
-    """All that a result depends on beside the scan: also whether there is something that reads writing."""
+    """JSON of all that a result depends on in addition to the scan, including whether writing can be read."""
     return task.options_json() if not reads_writing(task.options) else task.options_json()[:-1] + ',"reads":true}'
