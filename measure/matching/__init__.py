@@ -1,1 +1,1 @@
-"""Least-squares matching: a mark, or a corner, measured to the noise of the film."""
+"""Least-squares matching of marks and frame corners."""

@@ -1,4 +1,4 @@
-"""Lengths of the arms of a cross, over those drawn."""
+"""Measured lengths of the arms of a cross relative to the drawn ones."""
 
 from dataclasses import replace
 
@@ -11,32 +11,33 @@ from measure.matching.models import background_planes
 from measure.matching.window import ScanWindow
 from measure.results import MarkFit
 
-_CHANGE = 0.3  # of a length: a column of the design is the picture of a longer arm less that of a shorter one
-_LEAST = 0.1  # of the drawn mark's contrast
+_CHANGE = 0.3  # fraction of the arm's length, step of the central differences in the design matrix
+_LEAST = 0.1  # fraction of the fitted contrast: a smaller gain is replaced by it
 
 
 def is_cross(mark: MarkShape) -> bool:
-    """Whether a mark is drawn of lines alone, whose ends are those of its arms and known."""
+    """Whether a mark consists of bars only, with the ends of all arms known."""
     return mark.known_mm is None and all(isinstance(part, Bar) for part in mark.parts)
 
 
 def measure_arms(window: ScanWindow, mark: MarkShape, pixel_from_mark: Array, fit: MarkFit) -> tuple[Array, Array]:
-    """Lengths of the arms of a cross over those drawn, by linear least squares with gain, offset and slopes.
+    """Estimate the lengths of the arms of a cross, relative to the drawn ones, by linear least squares.
 
-    A picture of a longer arm less that of a shorter one is as bright along the end as it is at its tip: of an arm that
-    lacks a part of that stretch the same part lacks, however sharp the picture is. What the match cut out as damage
-    counts, for an arm that is not there is cut out, too.
+    Gain, offset and slopes are further unknowns. The derivative with respect to a length is the difference of images
+    with a longer and a shorter arm, which is uniform along the end of the arm: the estimate is proportional to the
+    missing part, regardless of the blur. Pixels masked as damage are used, since a missing arm is masked, too.
 
     Parameters
     ----------
     window : ScanWindow
-        That shows the cross.
+        Window with the cross.
     pixel_from_mark : (2, 3)
-        Of the scan: the place as matched, the linear part as the frame has it, for an arm's end moves the mark's own.
+        In pixels of the scan. The place is the matched one. The linear part is that of the frame, since the mark's own
+        depends on the ends of its arms.
 
     Returns
     -------
-    (arms,) in the order in which the bars name their ends, and their standard deviations.
+    (arms,) relative lengths, in the order of the bars' ends, and their standard deviations.
     """
     place = pixel_from_mark - np.column_stack([np.zeros((2, 2)), window.origin_px])
     height, width = window.grey.shape
@@ -52,7 +53,7 @@ def measure_arms(window: ScanWindow, mark: MarkShape, pixel_from_mark: Array, fi
     inverse: Array = np.asarray(np.linalg.pinv(design @ design.T), float)
     solution = inverse @ (design @ grey)
     left = grey - solution @ design
-    # Noise that neighbours share by rho, along columns and rows, is of fewer pixels.
+    # Noise correlated by rho along columns and rows reduces the effective number of pixels.
     rho = float(np.clip(fit.neighbour_correlation, 0.0, 0.9))
     variance = float(left @ left) / max(len(grey) - len(design), 1) * ((1 + rho) / (1 - rho)) ** 2
     gain = solution[len(changes)]
@@ -62,12 +63,12 @@ def measure_arms(window: ScanWindow, mark: MarkShape, pixel_from_mark: Array, fi
 
 
 def _arm_variants(mark: MarkShape) -> list[tuple[MarkShape, MarkShape]]:
-    """Of each arm the mark with a longer and with a shorter one."""
+    """For each arm: the mark with that arm longer, and with it shorter."""
     pairs = list[tuple[MarkShape, MarkShape]]()
     for index, bar in enumerate(mark.parts):
         assert isinstance(bar, Bar)
         for tip, other in ((bar.from_mm, bar.to_mm), (bar.to_mm, bar.from_mm)):
-            if np.dot(tip, np.subtract(tip, other)) > 0:  # where an arm begins beside the middle is no tip
+            if np.dot(tip, np.subtract(tip, other)) > 0:  # the start of an arm near the centre is no tip
                 ends = ((tip[0] * share, tip[1] * share) for share in (1 + _CHANGE, 1 - _CHANGE))
                 longer, shorter = (_with_part(mark, index, Bar(other, end, bar.line_mm)) for end in ends)
                 pairs.append((longer, shorter))

@@ -18,31 +18,39 @@ from measure.noise.noise_model import SCALE_VARIANCE, NoiseModel, autocovariance
 from measure.noise.robust_estimation import robust_scale
 from measure.results import Covariance, MarkFit, OwnShape, SecondPlace
 
-_ALIKE_PX = 1.5  # standard deviation of the weights by distance of what neighbours leave alike
-_BESIDE_DAMAGE_PX = 1.0  # standard deviation of the weights by distance of what damage leaves beside itself
-_TEXTURE_PX = 8  # up to which texture is taken as alike
-_SMOOTH_PX = 0.8  # of residuals, by which texture is told from noise: as damage is
-_CUT_SIGMAS = 3.2  # of the noise: what stands out more is cut out as damage
-_LEAST_SLOPE = 1e-3  # of a clipped grey value: what tells less tells nothing
-_MOSTLY = 0.5  # of the light of a pixel, that is one side's
-_LEAST_PX = 400  # of the frame beside the notch: fewer do not tell how uneven it is
-# Of the contrast and the logarithm of its change, how much half tones are off: anything between nothing and what a glow
-# makes that stays as it is while the light changes, which is a half.
+_ALIKE_PX = 1.5  # px, standard deviation of the Gaussian weights for the correlation of model misfit
+_BESIDE_DAMAGE_PX = 1.0  # px, standard deviation of the Gaussian weights for faint damage around masked pixels
+_TEXTURE_PX = 8  # px, largest lag of the autocovariance of texture
+_SMOOTH_PX = 0.8  # px, smoothing of residuals that separates texture from noise, as for damage
+_CUT_SIGMAS = 3.2  # noise standard deviations beyond which residuals are masked as damage
+_LEAST_SLOPE = 1e-3  # lower bound of the slope of a clipped grey value, to divide by
+_MOSTLY = 0.5  # fraction of a pixel's light that assigns it to one side of the edge
+_LEAST_PX = 400  # pixels of the frame needed to estimate the background's texture
+# Standard deviation of the error of half tones, in units of contrast times log contrast change: uniform between 0 and
+# 1/2, the value for a glow that stays constant while the light changes.
 _HALF_TONES = 0.5 / np.sqrt(3)
-_MOST = 1.0  # of that logarithm: more is another scanner's scale
-_SMOOTHING = 1.5  # times the scan's blur: noise of about 1.3 times the match's, while a line's two edges stay apart
-_LEAST_SMOOTHING_PX = 1.0  # below it pixels sample the derivative too coarsely
-_WORST_CONDITION = 1e6  # of a normal matrix: beyond it double precision leaves no figure of a place in small windows
-_OWN = 0.9  # of what is known of rotation and scale: where the picture gives so much, little is the frame's
-_LEAST_SQUARES = 0.1  # of the slopes' squares: less would tell nothing
+_MOST = 1.0  # limit of the log contrast change: a larger one is a different scanner scale
+_SMOOTHING = 1.5  # in blurs: noise is about 1.3 times that of the match, and the two edges of a line stay separate
+_LEAST_SMOOTHING_PX = 1.0  # px; with less smoothing the derivative is undersampled
+_WORST_CONDITION = 1e6  # of the normal matrix: beyond it a place in a small window has no significant digits
+_OWN = 0.9  # share of the image in rotation and scale above which the frame contributes little
+_LEAST_SQUARES = 0.1  # lower bound of the mark's fraction of the squared slopes
 
 
 @dataclass(frozen=True, eq=False)
 class LinearFit:
-    """residuals (height, width), where used; design (unknowns, height, width): derivatives of the model by the
-    unknowns, the first two the place by column and row, the last four gain, offset and slopes of the ground; by_grey,
-    alike: derivatives of the fitted unknowns by the grey values; noise: of these. All images are
-    multiplied by steadiness (height, width), so that their noise is alike everywhere."""
+    """Fit linearised at its solution.
+
+    Attributes
+    ----------
+    residuals : (height, width).
+    used : (height, width) mask of the pixels used.
+    design : (unknowns, height, width) derivatives of the model with respect to the unknowns. The first two are column
+        and row of the place, the last four gain, offset and slopes of the background.
+    by_grey : (unknowns, height, width) derivatives of the estimated unknowns with respect to the grey values.
+    noise : of the grey values.
+    steadiness : (height, width) factor of all images, so that their noise is uniform.
+    """
 
     residuals: Array
     used: Mask
@@ -52,17 +60,18 @@ class LinearFit:
     steadiness: Array
 
     def covariance(self, by_grey: Array) -> Array:
-        """(n, n) that the noise gives to n figures, whose derivatives by the grey values are (n, height, width)."""
+        """(n, n) covariance by noise of n quantities with derivatives by_grey (n, height, width) with respect to the
+        grey values."""
         white = self.noise.variance_dn2 * by_grey
         covariance = products(by_grey, white if self.noise.is_white else correlated(by_grey, self.noise))
         return np.asarray((covariance + covariance.T) / 2)
 
     def unlike_drawing_px2(self, by_noise: Array) -> Array:
-        """(2, 2) by which the place is known less well than by_noise, (2, 2) px2, says: by what is left at the mark's
-        edges, and alike in neighbours, beyond the noise."""
+        """(2, 2) covariance of the place due to model misfit: correlated residuals at the mark's edges in excess of the
+        noise. by_noise (2, 2) px2: covariance due to noise."""
         place, left = self.by_grey[:2], np.where(self.used, self.residuals, 0.0)[None]
         expected = self.covariance(place)
-        if self.noise.is_grain:  # that weighed the fit: as if it were white, so that neighbours share none
+        if self.noise.is_grain:  # whiten, so that neighbours are uncorrelated under the null hypothesis
             place, left = correlated(place, self.noise, 0.5), correlated(left, self.noise, -0.5)
             expected = products(place, place)
         shares = place * left
@@ -73,22 +82,24 @@ class LinearFit:
         return np.asarray((axes * np.maximum(sizes, 0.0)) @ axes.T)
 
     def damage_px2(self, damaged: Mask) -> Array:
-        """(2, 2) of the place, by damage (height, width) that was cut out: it goes on beside itself, too faintly to be
-        cut out there. Each of its regions is taken to leave any amount up to what is just not cut out, smoothed."""
+        """(2, 2) covariance of the place due to damage that continues undetected around the masked pixels, damaged
+        (height, width). Each region is assumed to leave a uniformly distributed fraction of the limited, smoothed
+        residuals."""
         about = _about(np.where(self.used, self.by_grey[:2], 0.0), _BESIDE_DAMAGE_PX)
         _, regions = cv2.connectedComponents(damaged.astype(np.uint8), connectivity=4)
         by_region = np.stack([np.bincount(regions.ravel(), each.ravel()) for each in about * self._uncut])[:, 1:]
-        return np.asarray(by_region @ by_region.T / 3)  # the variance of an even distribution from 0 to 1
+        return np.asarray(by_region @ by_region.T / 3)  # 1/3: mean square of a uniform distribution from 0 to 1
 
     def texture_px2(self, area: Mask) -> Array:
-        """(2, 2) of the place, by texture that one side of the mark's edges has, inside or outside, beyond the noise of
-        both together. area (height, width): the pixels about the mark; what was cut out of it as damage may be the
-        texture's blotches."""
+        """(2, 2) covariance of the place due to texture inside or outside the mark in excess of the noise.
+
+        area (height, width): pixels around the mark, including those masked as damage, which may be texture.
+        """
         shown = self.design[-GREY] / self.steadiness
         return self._texture_px2(shown, area) + self._texture_px2(1 - shown, area)
 
     def _texture_px2(self, share: Array, area: Mask) -> Array:
-        """Of one side; share (height, width): of that side in the light of each pixel."""
+        """(2, 2) covariance due to the texture of one side. share (height, width): its fraction of each pixel."""
         side = area & (share > _MOSTLY)
         if not side.any():
             return np.zeros((2, 2))
@@ -96,7 +107,7 @@ class LinearFit:
         texture = np.where(side, self._uncut, 0.0)
         texture[side] -= texture[side].mean()
         lags = faded(autocovariance(texture, side, _TEXTURE_PX))
-        alike = lags[_TEXTURE_PX, _TEXTURE_PX + 1]  # of neighbours: the noise of single pixels counts already
+        alike = lags[_TEXTURE_PX, _TEXTURE_PX + 1]  # of neighbours: noise of single pixels is accounted for elsewhere
         if beyond_dn2 == 0.0 or alike <= 0.0:
             return np.zeros((2, 2))
         lags[_TEXTURE_PX, _TEXTURE_PX] = alike
@@ -104,11 +115,11 @@ class LinearFit:
         return _positive(products(moved, correlated(moved, NoiseModel(beyond_dn2, lags * (beyond_dn2 / alike), 1.0))))
 
     def _texture_dn2(self, side: Mask) -> float:
-        """The variance of smoothed residuals, dust left out, beyond what the noise leaves of itself and chance."""
+        """Robust variance of smoothed residuals in excess of the smoothed noise; 0 if not significant (3 sigma)."""
         smooth = np.asarray(cv2.GaussianBlur(np.where(side, self.residuals, 0.0), (0, 0), _SMOOTH_PX), float)
         reach = len(self.noise.autocovariance_dn2) // 2
         lag2 = np.add.outer(*2 * [np.arange(-reach, reach + 1) ** 2])
-        pixels = 4 * np.pi * _SMOOTH_PX**2  # that are one, smoothed
+        pixels = 4 * np.pi * _SMOOTH_PX**2  # effective area of the smoothing kernel
         noise_dn2 = float(np.sum(self.noise.autocovariance_dn2 * np.exp(-lag2 / (4 * _SMOOTH_PX**2))) / pixels)
         chance = 3 * np.sqrt(2 * SCALE_VARIANCE * pixels / side.sum())
         beyond_dn2 = robust_scale(np.asarray(smooth[side], np.float64)) ** 2 - noise_dn2
@@ -116,130 +127,165 @@ class LinearFit:
 
     @property
     def _uncut(self) -> Array:
-        """(height, width) residuals, at most as large as noise makes them: dust stands out more, texture hardly."""
+        """(height, width) residuals limited to the range of the noise, which affects dust but hardly texture."""
         limit_dn = _CUT_SIGMAS * np.sqrt(self.noise.variance_dn2)
         return np.clip(self.residuals, -limit_dn, limit_dn)
 
 
 def second_order(design: Array, slopes: Array, used: Mask, covariance: Array, priors_dn2: Array) -> float:
-    """By what share of itself the variance of a place is larger than a linearised adjustment has it.
+    """Relative increase of the place's variance over that of the linearised adjustment, by second-order terms.
 
-    design (unknowns, height, width): derivatives of the model, the first two by column and row, the last four by the
-    greys; slopes (height, width): their part in what clipped grey values tell, 1 elsewhere; used (height, width): the
-    pixels that count; covariance (unknowns, unknowns); priors_dn2 (unknowns,): weights of the priors, that of a pixel
-    being 1. The bends are compared pixel by pixel, with grain in the covariance only: its weights amplify them as no
-    noise does."""
-    moving = len(design) - GREY + 1  # all but the ground's
+    Parameters
+    ----------
+    design : (unknowns, height, width)
+        Derivatives of the model; the first two by column and row, the last four by the greys.
+    slopes : (height, width)
+        Slopes of clipped grey values, 1 elsewhere.
+    used : (height, width)
+        Mask of the pixels used.
+    covariance : (unknowns, unknowns)
+    priors_dn2 : (unknowns,)
+        Weights of the priors relative to that of a pixel.
+
+    Notes
+    -----
+    Second derivatives are weighted pixel by pixel. Grain enters through the covariance only, because its weights would
+    amplify the second derivatives as they amplify no noise.
+    """
+    moving = len(design) - GREY + 1  # all but the background's
     among, used_design = covariance[:moving, :moving], design * used
-    # All that moves with the mark changes by its slope, against the move.
+    # Second derivatives by the place: minus the gradients of all columns that move with the mark.
     whole = design[:moving] / np.maximum(slopes, _LEAST_SLOPE)
     changes = np.concatenate(np.gradient(whole, axis=(2, 1))) * (-slopes * used)
     normal, shared = products(used_design, used_design), products(used_design, changes)
     inverse: Array = np.asarray(np.linalg.inv(normal + np.diag(priors_dn2)), float)
     taken_up = np.asarray(inverse @ shared, float)
-    by_unknown = np.trace(taken_up[:2].reshape(2, 2, moving))  # of the variance's logarithm, negative
+    by_unknown = np.trace(taken_up[:2].reshape(2, 2, moving))  # first-order term of the variance's logarithm
     both = taken_up.T @ shared
     left = products(changes, changes) - both - both.T + taken_up.T @ normal @ taken_up
     turning = np.einsum("jl,ijml->im", among, left.reshape(2, moving, 2, moving))
     by_noise = np.asarray(inverse @ normal @ inverse, float)
     curvature = np.trace(by_noise[:2, :2] @ turning) / 2
-    # Lags that are noise themselves may leave the covariance of the other unknowns indefinite.
+    # Noisy lags of the autocovariance may leave the covariance of the other unknowns indefinite.
     return max(float(curvature + by_unknown @ among @ by_unknown / 2), 0.0)
 
 
-# What a place is uncertain by that its residuals do not show: light that is uneven in the mark, tones that changed.
+# Causes of uncertainty that leave no residuals: background texture within the mark, and changed half tones.
 #
-# A notch is cut into the frame's border and exposed as the frame is: its light is no more even than the terrain. A
-# slope of that light is a shift of the edges where it ends, and leaves little else in a small notch. How uneven it may
-# be, the frame beside the notch shows.
+# A notch in the frame's border is exposed like the frame: its light varies like the terrain. A gradient of that light
+# shifts the edges where it ends and leaves few residuals in a small notch. Its size is estimated from the frame around
+# the notch.
 #
-# An edge between dark and light is a slope of grey values. Light that is stronger than in the pictures that a chip was
-# learned from climbs that slope elsewhere: the film saturates, or what glows beside it does not grow as it does. Its
-# half tones then are lighter or darker between the same ends, and where all edges face one side that is a shift and
-# leaves next to nothing else.
+# Half tones at an edge depend on the exposure. If the light is stronger than in the images from which a chip was
+# learned, the film saturates, or a glow does not grow in proportion. The half tones then are lighter or darker between
+# the same extremes. Where all edges face one side this is a shift that leaves almost no residuals.
 
 
 @dataclass(frozen=True, eq=False)
 class Landscape:
-    """A landscape in a mark that varies as beside it. light (height, width): grey values, and frame_pixels, which of
-    them show the frame; share (height, width): of the landscape in the light of the mark's own window."""
+    """Background texture within a mark, assumed to vary as in the frame around it.
+
+    light: (height, width) grey values; frame_pixels: mask of those that show the frame; share: (height, width) fraction
+    of the background in the light of the mark's window.
+    """
 
     light: Array
     frame_pixels: Mask
     share: Array
 
     def covariance(self, by_grey: Array) -> Array:
-        """(n, n) of figures, column and row of a place for example, whose derivatives by the grey values of the mark's
-        window are by_grey (n, height, width)."""
+        """(n, n) covariance of quantities, such as the place, with derivatives by_grey (n, height, width) with respect
+        to the grey values of the mark's window."""
         if self.frame_pixels.sum() < _LEAST_PX:
             return np.zeros((len(by_grey),) * 2)
         moved, reach = by_grey * self.share, max(self.share.shape)
         uneven = np.where(self.frame_pixels, self.light - self.light[self.frame_pixels].mean(), 0.0)
         lags = autocovariance(uneven, self.frame_pixels, reach)
-        # The noise of single pixels counts already; what neighbours have in common is the landscape.
+        # Noise of single pixels is accounted for elsewhere; the covariance of neighbours is the texture.
         lags[reach, reach] = max(lags[reach, reach + 1], 0.0)
         return _positive(products(moved, correlated(moved, NoiseModel(float(lags[reach, reach]), lags, 1.0))))
 
 
 def _about(images: Array, sigma_px: float) -> Array:
-    """Images (n, height, width), smoothed by a Gaussian, with nothing beyond their borders."""
+    """Smooth images (n, height, width) by a Gaussian, with zeros beyond their borders."""
     return np.asarray(gaussian_filter(images, (0.0, sigma_px, sigma_px), mode="constant"))
 
 
 def _positive(covariance: Array) -> Array:
-    """(n, n) without its negative directions: far lags are chance, and may leave less than none."""
+    """(n, n) positive semidefinite part: noisy far lags may produce negative eigenvalues."""
     sizes, axes = np.linalg.eigh((covariance + covariance.T) / 2)
     return np.asarray((axes * np.maximum(sizes, 0.0)) @ axes.T)
 
 
 def covariance_of_changed_tone(half_tones: Array, by_grey: Array, contrast_change: float) -> Array:
-    """(2, 2) px2 of a place, for what the tones may have changed.
+    """(2, 2) px2 covariance of a place due to changed half tones.
 
-    half_tones (height, width): grey values, the picture's contrast in the middle between dark and light, none at both
-    ends; by_grey (unknowns, height, width): the unknowns' derivatives by the grey values, column and row first.
-    contrast_change: the contrast over that of the pictures that the chip was learned from.
+    Parameters
+    ----------
+    half_tones : (height, width)
+        Grey values: the contrast at half height between dark and light, 0 at both extremes.
+    by_grey : (unknowns, height, width)
+        Derivatives of the unknowns with respect to the grey values, column and row first.
+    contrast_change : float
+        Contrast over that of the images from which the chip was learned.
     """
     bent = _HALF_TONES * min(abs(float(np.log(contrast_change))), _MOST)
     moved = bent * products(by_grey[:2], half_tones[None])
     return np.asarray(moved @ moved.T)
 
 
-# A second place of a mark, by another method, beside the matched one: by its edges, or with paint that slopes.
+# A second place of a mark, by another method: by its edges, or with a contrast gradient.
 #
-# Both are linear in the residuals of the match, so that the covariance of their difference to the matched place is
-# known: noise moves both places, in part together. What it cannot explain is damage or a mark unlike its drawing.
+# Both are linear in the residuals of the match, so the covariance of their difference to the matched place is known,
+# including the common part of the noise. A significant difference indicates damage or model misfit.
 
 
 def edge_place(fit: LinearFit, blur_px: float) -> SecondPlace | None:
-    """The place by the mark's edges, None where they do not give one.
+    """Compute the place from the mark's edges; None where they do not determine it.
 
-    Least-squares matching weighs grey values by how fast the mark's picture changes. An edge detector (Haralick, 1984,
-    Digital step edges from zero crossing of second directional derivatives) asks instead where the second derivative
-    across an edge, under a Gaussian, passes through nothing. Summed round the mark that gives a place of its own: gain,
-    offset and whatever is smooth have no part in it, and a mark whose opposite edges are alike needs no drawing for it.
+    Notes
+    -----
+    Least-squares matching weights grey values by the gradient of the mark's image. An edge detector (Haralick, 1984,
+    Digital step edges from zero crossing of second directional derivatives) finds the zero crossing of the second
+    derivative across an edge, under a Gaussian. Summed along the outline this gives an independent place. It does not
+    depend on gain, offset and smooth background, nor on the drawing where opposite edges are alike.
     """
     weights = across_edges(fit.design[:2] * fit.used, max(_SMOOTHING * blur_px, _LEAST_SMOOTHING_PX)) * fit.used
     response = products(weights, fit.design)
-    # What noise the match has taken up already has left the residuals.
+    # The residuals no longer contain the noise absorbed by the match: subtract that part of the weights.
     return _second_place(fit, np.eye(2), response[:, :2], weights, weights - combined(response, fit.by_grey))
 
 
 def sloping_place(fit: LinearFit) -> SecondPlace | None:
-    """The place with two more unknowns, slopes of the contrast, in one step from the fit; None where they are not told
-    from the others.
+    """Compute the place with two more unknowns, gradients of the contrast, in one step from the fit. None where they
+    are not estimable.
 
-    Dust on one side of a small disk, soft at its edge, moves the disk as it moves an edge, and leaves of itself only
-    that the disk is darker on that side. A disk whose paint may grow lighter or darker across takes that up.
+    Soft-edged dust on one side of a small disk shifts the disk and leaves a gradient of its contrast as its only trace.
+    The additional unknowns absorb that.
     """
     sloping = fit.design[-GREY] * fit.design[-2:] * fit.used
-    left = (sloping - combined(products(sloping, fit.design), fit.by_grey)) * fit.used  # by what the match has taken up
+    left = (sloping - combined(products(sloping, fit.design), fit.by_grey)) * fit.used  # not absorbed by the match
     return _second_place(fit, -products(fit.by_grey[:2], sloping), products(left, sloping), left, left)
 
 
 def _second_place(fit: LinearFit, by_unknown: Array, normal: Array, weights: Array, left: Array) -> SecondPlace | None:
-    """The place by sums of residuals by weights (2, height, width), which change by two unknowns as normal (2, 2) says;
-    by_unknown (2, 2): the place's derivatives by these; left: the sums' derivatives by the noise. None where nothing
-    determines it, or the noise's lags, which are noise themselves, make no covariance."""
+    """Compute a second place from weighted sums of the residuals.
+
+    Parameters
+    ----------
+    by_unknown : (2, 2)
+        Derivatives of the place with respect to two unknowns.
+    normal : (2, 2)
+        Derivatives of the sums with respect to these unknowns.
+    weights : (2, height, width)
+        Weights of the residuals in the sums.
+    left : (2, height, width)
+        Derivatives of the sums with respect to the grey values.
+
+    Returns
+    -------
+    SecondPlace, or None where normal is singular or noisy lags leave the covariance indefinite.
+    """
     if not np.linalg.cond(normal) < _WORST_CONDITION:
         return None
     by_sums = np.asarray(by_unknown @ np.linalg.inv(normal), float)
@@ -250,8 +296,8 @@ def _second_place(fit: LinearFit, by_unknown: Array, normal: Array, weights: Arr
 
 
 def across_edges(slopes: Array, smoothing_px: float) -> Array:
-    """(2, height, width): what each grey value counts in the sums, along columns and rows, of the second derivatives
-    across the edges; slopes (2, height, width): of the mark's picture."""
+    """(2, height, width) weights of the grey values in the sums, along columns and rows, of second derivatives across
+    the edges. slopes (2, height, width): gradient of the mark's image."""
     square = np.maximum((slopes**2).sum(axis=0), 1e-300)
     across = (slopes[0] ** 2 / square, 2 * slopes[0] * slopes[1] / square, slopes[1] ** 2 / square)
     smooth, slope, bend = _kernels(smoothing_px)
@@ -268,7 +314,7 @@ def across_edges(slopes: Array, smoothing_px: float) -> Array:
 
 
 def _kernels(sigma_px: float) -> tuple[Array, Array, Array]:
-    """A Gaussian and its first two derivatives; the second sums to nothing, so that an even ground has none."""
+    """Kernels of a Gaussian and its first two derivatives. The second sums to zero, so a uniform area gives zero."""
     reach = int(np.ceil(4 * sigma_px))
     place = np.arange(-reach, reach + 1.0)
     smooth = np.exp(-(place**2) / (2 * sigma_px**2))
@@ -277,22 +323,33 @@ def _kernels(sigma_px: float) -> tuple[Array, Array, Array]:
     return smooth, -place * smooth / sigma_px**2, bend - bend.mean()
 
 
-# The rotation and scale that a mark's own picture gives, where it was matched with those of the frame.
+# Rotation and scale by the mark's own image, where it was matched with those of the frame.
 #
-# A wedge's or a notch's edges hardly tell its scale from its place, so the frame gives it. But what touches an edge
-# moves the place as it changes that scale, and leaves no other trace: both are in the picture, and may be compared.
+# The edges of a wedge or a notch hardly separate its scale from its place, so the scale is taken from the frame. But an
+# object that touches an edge changes place and apparent scale together and leaves no other trace. Comparing the mark's
+# own scale with the frame's reveals it.
 
 
 def own_shape(fit: LinearFit, shape: slice, strain: slice, departures: Array) -> OwnShape | None:
-    """What the picture says of the two unknowns of a shape, None where they were its own anyway, or it says nothing.
+    """Estimate rotation and scale of a mark without the prior from the frame.
 
-    shape: which unknowns of the fit these are; strain: those of stretch and shear, which stay held by the frame;
-    departures (unknowns,): of the match from what the frame gave.
+    Parameters
+    ----------
+    shape : slice
+        Indices of scale and rotation among the unknowns.
+    strain : slice
+        Indices of stretch and shear, whose prior is kept.
+    departures : (unknowns,)
+        Deviations of the match from the frame's values.
+
+    Returns
+    -------
+    OwnShape, or None where the image determined them anyway or does not determine them at all.
     """
     resolution = products(fit.by_grey, fit.design)
     if np.diag(resolution)[shape].min() > _OWN:
         return None
-    let_go = resolution.copy()  # as if no other unknown were held: each column is how far that unknown itself decides
+    let_go = resolution.copy()  # resolution matrix without the priors of all other unknowns
     let_go[:, strain] = np.eye(len(resolution))[:, strain]
     try:
         freed = np.asarray(np.linalg.inv(let_go), float)[shape]
@@ -307,11 +364,11 @@ def own_shape(fit: LinearFit, shape: slice, strain: slice, departures: Array) ->
 
 
 def honest_covariance(template: MarkTemplate, scan: str, fit: MarkFit) -> Covariance:
-    """Of a mark measured in a scan that has a share in its template.
+    """Correct the covariance of a mark measured in a scan that contributed to the mark's template.
 
-    The scan's noise is in the template too and so is missing from the residuals, in which only the rest, one less its
-    share, is left. Where the template is that scan's picture alone nothing is left: then noise from the picture itself.
-    Slopes of the template that are noise tell nothing of the place, but the fit took them for slopes of the mark.
+    The template contains a share of the scan's noise, so the residuals contain only the fraction 1 - share. If the
+    template comes from that scan alone there are no residuals, and the noise is that of the template.
+    Slopes of the template that are noise carry no information on the place, but the fit used them.
     """
     share = template.shares.get(scan, 0.0)
     if share == 1.0:
@@ -320,8 +377,7 @@ def honest_covariance(template: MarkTemplate, scan: str, fit: MarkFit) -> Covari
 
 
 def _slope_noise_factor(template: MarkTemplate, fit: MarkFit) -> Array:
-    """(2, 2) what an error of the place is to be multiplied by: the squares of all slopes that the fit saw over those
-    of the mark's."""
+    """(2, 2) factor of an error of the place: squared slopes of the template over those of the mark itself."""
     linear, blur_px2 = fit.pixel_from_mark[:, :2], SMOOTHED_PX2 + fit.blur_px**2
     px_per_sample = linear_scale(linear) * template.pitch_um / 1000
     side = int(np.ceil(len(template.image) * px_per_sample))
@@ -329,14 +385,15 @@ def _slope_noise_factor(template: MarkTemplate, fit: MarkFit) -> Array:
     shown = render(template, place, side, side, float(np.sqrt(blur_px2)))
     slopes = np.stack([shown.by_col, shown.by_row]).astype(float)
     noise = template.slope_noise_dn / max(float(np.ptp(template.image)), 1e-9) / px_per_sample
-    noise *= SMOOTHED_PX2 / blur_px2  # more blur takes as much of the slopes of white noise
+    noise *= SMOOTHED_PX2 / blur_px2  # blur reduces the slopes of white noise by this factor
     squares, axes = np.linalg.eigh(products(slopes, slopes))
     marks = np.maximum(squares - noise**2 * side**2, _LEAST_SQUARES * squares)
     return np.asarray(axes * (squares / marks) @ axes.T)
 
 
 def _covariance_of_noise(template: MarkTemplate, fit: MarkFit) -> Array:
-    """Of a shift, gain and offset, from the picture's slopes and its noise, as grain of GRAIN_PX correlates it."""
+    """(2, 2) covariance of the place from the template's slopes and noise, estimated with gain and offset, for grain of
+    GRAIN_PX."""
     side = template.image.shape[0]
     place = Affine.from_linear(fit.pixel_from_mark[:, :2], np.full(2, side / 2)).matrix
     shown = render(template, place, side, side, 0.0)
@@ -344,5 +401,5 @@ def _covariance_of_noise(template: MarkTemplate, fit: MarkFit) -> Array:
     normal = products(np.stack(columns), np.stack(columns))
     size = np.sqrt(np.diag(normal))
     inverse = np.linalg.pinv(normal / np.outer(size, size)) / np.outer(size, size)
-    # As many pixels as such grain is wide are one observation: the sum of its correlations.
+    # 4 pi GRAIN_PX^2: sum of the grain's correlations, the number of pixels per independent observation.
     return np.asarray(4 * np.pi * GRAIN_PX**2 * max(template.noise_dn, 1e-3) ** 2 * inverse[:2, :2])

@@ -1,10 +1,11 @@
-"""An edge of the exposed frame: a straight line, by many profiles across it; a corner of the frame, where two meet.
+"""Measurement of frame edges as straight lines through many edge profiles, and of frame corners as their intersection.
 
-Across an edge the light is a step under the scanner's blur, an error function; it is fitted to every profile. The line
-through them is a robust one (Tukey), for stamps, dust and marks lie on the edge too. The landscape's contrast with the
-border differs from profile to profile, the place does not. A neighbouring frame's edge steps the other way.
+Across an edge the light is a step blurred by the scanner, an error function, which is fitted to every profile. The line
+through the profiles is fitted robustly (Tukey), since stamps, dust and marks lie on the edge, too. The contrast of the
+background with the border differs from profile to profile, the place does not. The edge of a neighbouring frame has
+the opposite polarity.
 
-What a wrong tone curve leaves of a step is alike in all profiles, and the scatter among them says how well it is known.
+A wrong tone curve leaves the same residuals in all profiles; their scatter gives the covariance of its estimate.
 """
 
 from collections.abc import Sequence
@@ -27,30 +28,32 @@ from measure.tone.curve import Tone, ToneInformation
 from measure.tone.estimate import MarkTone
 from measure.tone.score import ToneScore, tone_score
 
-PROFILES = 60  # along an edge, each the median over its share of it
-_LEAST_SHARE = 0.5  # of the profiles that lie on the line: with fewer it may be another line
-_LEAST_SNR = 3.0  # of the step in one profile: less is texture
-_ABOUT_PX = 5.0  # about the line: what an edge under any usual blur takes
-_STEP_PX = 0.5  # of the samples across the edge
-_SMOOTH_PX = 1.5  # across the edge, before its slope is taken
-_TILT = 0.02  # rad: the placement knows the edge's direction better
-_ITERATIONS, _DAMPING = 12, 1e-9  # of the steps across an edge
-_ROUNDS = 20  # of Tukey's line, which rests after a few
-_START_BLUR_PX = 1.5  # about that of scans
-_RIM_PX = 2.0  # of a profile: a step so near its end may be another's
-_MOST_ALIKE = 0.9  # correlation of neighbouring profiles: nineteen count as one
-_BLUR_RANGE_PX = (0.3, 4.0)  # from where pixels hide it to where an edge is no line
-_SCATTER_FLOOR_PX = 0.01  # under the scatter about a line: clean pictures have none
-_LEAST = 1e-6  # of the variance of all that edges show: what they hardly show
-_DRAWN = 0.005  # of a step: what is left of it below that may be the drawing's own
-_ROUNDED = 0.1  # of the reach: left out at every corner, for few are sharp
+PROFILES = 60  # profiles along an edge, each the median over its section
+_LEAST_SHARE = 0.5  # fraction of the profiles that must lie on the line; with fewer it may be a different line
+_LEAST_SNR = 3.0  # of the step in one profile; less may be texture
+_ABOUT_PX = 5.0  # px on either side of the line, enough for an edge under any usual blur
+_STEP_PX = 0.5  # px, sampling interval across the edge
+_SMOOTH_PX = 1.5  # px, smoothing across the edge before differentiation
+_TILT = 0.02  # rad, search range of the edge's direction around the predicted one
+_ITERATIONS, _DAMPING = 12, 1e-9  # Gauss-Newton steps of the profiles' fit, and their damping
+_ROUNDS = 20  # iterations of the robust line, which converges after a few
+_START_BLUR_PX = 1.5  # px, typical of scans
+_RIM_PX = 2.0  # px: a step so near the end of a profile may belong to a different edge
+_MOST_ALIKE = 0.9  # limit of the correlation of neighbouring profiles: 19 then count as one
+_BLUR_RANGE_PX = (0.3, 4.0)  # px: smaller blur is hidden by the pixel, with larger blur an edge is no line
+_SCATTER_FLOOR_PX = 0.01  # px, floor of the scatter around a line, which is zero in clean images
+_LEAST = 1e-6  # regularisation, fraction of the trace of the covariance floor
+_DRAWN = 0.005  # fraction of the step: smaller residuals may be errors of the model
+_ROUNDED = 0.1  # fraction of the reach excluded at every corner, since few corners are sharp
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeTone:
-    """What an edge says of the tone curve. score: of each profile; floor (k, k): the least covariance of one profile's;
-    on_line (2, k): by how much the offset and slope change for each departure of 1. codes: the least and the greatest,
-    shares of full scale, between which it steps."""
+    """Information of an edge on the tone curve.
+
+    score: one per profile; floor: (k, k) lower bound of a profile's covariance; on_line: (2, k) derivatives of offset
+    and slope with respect to the departures; codes: smallest and largest code of the step, fractions of full scale.
+    """
 
     score: ToneScore
     floor: Array
@@ -60,9 +63,16 @@ class EdgeTone:
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """across = offset + slope * along, px from the start, line (2,) being both, and covariance (2, 2); share: of the
-    profiles that lie on it, of which there are count; contrast_dn, noise_dn, blur_px, likeness: medians over these;
-    tone: None where the curve is known."""
+    """Straight edge: across = offset + slope * along, in px from the start.
+
+    Attributes
+    ----------
+    line : (2,) offset and slope.
+    covariance : (2, 2) of the line.
+    share, count : fraction and number of the profiles on the line.
+    contrast_dn, noise_dn, blur_px, likeness : medians over these profiles.
+    tone : information on the tone curve; None where the curve is known.
+    """
 
     line: Array
     covariance: Array
@@ -77,8 +87,8 @@ class Edge:
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """Where an edge is expected to run: from the start (2,) in the scan along, the frame's inside lying across, both
-    (2,) of length 1."""
+    """Expected course of an edge: start (2,) px in the scan, unit vectors along (2,) the edge and across (2,) towards
+    the inside of the frame; weights: of the channels."""
 
     scan: Scan
     start: Array
@@ -87,8 +97,9 @@ class Course:
     weights: Sequence[float] | None
 
     def profiles(self, middle: Array, offset: Array, share: float, half: float) -> tuple[Array, Mask]:
-        """(n, samples) light across the edge about an offset (n,), each the median over its share of the edge, and
-        which of them lie in the scan. A median is the same through any curve, and where noise is cut off at black."""
+        """(n, samples) light across the edge around an offset (n,), each the median over its section of the edge, and
+        mask (n,) of the profiles inside the scan. A median is invariant under any tone curve and under clipping at
+        black."""
         samples = np.arange(-round(half / _STEP_PX), round(half / _STEP_PX) + 1) * _STEP_PX
         run = np.linspace(-0.5, 0.5, max(int(share), 2), endpoint=False) * share
         slope = np.gradient(offset, middle) if len(middle) > 1 else np.zeros(1)
@@ -111,19 +122,19 @@ def edge_along(
     Parameters
     ----------
     course : Course
-        Where it is expected.
+        Expected course.
     extent : (float, float)
-        From which to which distance from the start, px.
+        First and last distance from the start along the course, px.
     search_px : float
-        How far from the course it may lie.
+        Largest distance of the edge from the course.
     polarity : int
-        1 where the frame's inside is lighter than its outside, -1 where it is darker, 0 where nobody knows.
+        1 if the inside of the frame is lighter than the outside, -1 if darker, 0 if unknown.
     count : int
-        Of profiles.
+        Number of profiles.
 
     Returns
     -------
-    Edge, or None where no straight line is to be seen.
+    Edge, or None if no straight edge is found.
     """
     share = (extent[1] - extent[0]) / count
     middle: Array = np.asarray(extent[0] + share * (np.arange(count) + 0.5), dtype=float)
@@ -143,8 +154,11 @@ def edge_along(
 
 
 def pool_edge_tones(edges: Sequence[EdgeTone], tone: Tone) -> ToneInformation:
-    """What several of them say of the curve by which they were fitted, known as well as the scatter of their profiles
-    says, and that from edge to edge: what is alike along an edge, a landscape or what JPEG made of it, counts once."""
+    """Pool the information of several edges on the tone curve.
+
+    The covariance comes from the scatter of the profiles, enlarged by the scatter from edge to edge: errors common to
+    an edge (background, JPEG) are counted once.
+    """
     values = np.concatenate([edge.score.value for edge in edges])
     normals = np.concatenate([edge.score.normal for edge in edges])
     least = np.average([edge.floor for edge in edges], axis=0, weights=[len(edge.score.value) for edge in edges])
@@ -158,8 +172,8 @@ def pool_edge_tones(edges: Sequence[EdgeTone], tone: Tone) -> ToneInformation:
 
 
 def _straightest(grey: Array, along: Array, half: float) -> tuple[float, float]:
-    """Offset and slope of the straight line along which most profiles step up: a stone's edge may be stronger in some
-    of them, and so counts no more there than the frame's does elsewhere."""
+    """Offset and slope of the straight line on which most profiles step up (Hough transform). Gradients are limited to
+    their median maximum, so that a strong edge in a few profiles does not outweigh the frame's."""
     rise = np.gradient(cv2.GaussianBlur(grey, (0, 0), _SMOOTH_PX / _STEP_PX, sigmaY=1e-3), axis=1)
     rise = np.clip(rise, 0.0, float(np.median(rise.max(axis=1))))
     middle, samples = float(along.mean()), np.arange(grey.shape[1])
@@ -175,8 +189,8 @@ def _straightest(grey: Array, along: Array, half: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class _Steps:
-    """(n,) of every profile: where it steps (px), by how much, under which blur, and how well that describes it; drawn,
-    residuals (n, samples) and design (n, 4, samples): the light by that, what it leaves, and its derivatives."""
+    """Steps fitted to n profiles. place (px), contrast, blur, noise, likeness, good: (n,) each; drawn, residuals:
+    (n, samples) model and residuals; design: (n, 4, samples) derivatives."""
 
     place: Array
     contrast: Array
@@ -190,7 +204,7 @@ class _Steps:
 
 
 def _fit_steps(grey: Array) -> _Steps:
-    """The step level + contrast * Phi((s - place) / blur) in every profile, by Gauss-Newton."""
+    """Fit the step level + contrast * Phi((s - place) / blur) to every profile by Gauss-Newton."""
     s = _samples(grey)
     place, blur = np.zeros((len(grey), 1)), np.full((len(grey), 1), _START_BLUR_PX)
     for rounds_left in range(_ITERATIONS, -1, -1):
@@ -213,13 +227,13 @@ def _fit_steps(grey: Array) -> _Steps:
 
 
 def _samples(profiles: Array) -> Array:
-    """(samples,) px across the edge, of profiles (n, samples)."""
+    """(samples,) positions in px across the edge of profiles (n, samples)."""
     return np.asarray((np.arange(profiles.shape[1]) - (profiles.shape[1] - 1) / 2) * _STEP_PX)
 
 
 def _fit_line(scan: Scan, along: Array, across: Array, steps: _Steps, good: Mask) -> Edge | None:
-    """Tukey's line through the good profiles, its covariance from the scatter about it and from how far along the edge
-    that is alike."""
+    """Fit a robust line (Tukey) through the good profiles. Its covariance comes from the scatter around it and the
+    correlation of that along the edge."""
     design = np.stack([np.ones_like(along), along])[:, good]
     line = tukey_fit(design, across[good], _ROUNDS, _SCATTER_FLOOR_PX)
     residuals, on, share = line.residuals, line.weights > 0, float((line.weights > 0).sum() / len(along))
@@ -245,7 +259,7 @@ def _fit_line(scan: Scan, along: Array, across: Array, steps: _Steps, good: Mask
 
 
 def _alike(residuals: Array, on: Mask) -> float:
-    """How many neighbouring residuals count as one, their correlation falling geometrically with the distance."""
+    """Number of neighbouring residuals per independent one, for correlations that fall geometrically with distance."""
     pairs = on[1:] & on[:-1]
     if not pairs.any():
         return 1.0
@@ -255,10 +269,12 @@ def _alike(residuals: Array, on: Mask) -> float:
 
 
 def _edge_tone(scan: Scan, steps: _Steps, kept: NDArray[np.intp], by_place: Array) -> EdgeTone:
-    """By the profiles kept, (n,) of all; by_place (2, n): derivatives of the line's offset and slope by their places.
+    """Score the tone curve with the profiles kept (n,). by_place (2, n): derivatives of the line's offset and slope
+    with respect to their places.
 
-    Light that is uneven on either side says nothing of the curve, nor does the shape of the blur, as long as it is
-    even; pixels and what lies between them make it no Gaussian."""
+    Uneven light on either side and the symmetric part of the blur's shape are eliminated as further unknowns: pixels
+    and their interpolation make the blur non-Gaussian.
+    """
     drawn, design = steps.drawn[kept], steps.design[kept]
     z = (_samples(drawn) - steps.place[kept, None]) / steps.blur[kept, None]
     changes = np.moveaxis(scan.tone.derivatives(drawn, scan.full_scale_dn), 0, 1)
@@ -286,22 +302,23 @@ def fit_frame_corner(
     polarity: int,
     weights: Sequence[float] | None = None,
 ) -> MarkFit:
-    """Fit a corner of the exposed frame: the edges along both sides, each a straight line, and where they meet. What is
-    rounded at the corner is left out.
+    """Fit a corner of the exposed frame as the intersection of its two straight edges, excluding the rounded part.
 
     Parameters
     ----------
-    pixel_from_mark, search_px
-        Where the corner is predicted, (2, 3), and how far from there it may lie.
+    pixel_from_mark : (2, 3)
+        Predicted place of the corner.
+    search_px : float
+        Largest distance from there.
     polarity : int
-        Whether its frame is lighter (1) or darker (-1) than its border.
+        1 if the frame is lighter than its border, -1 if darker.
     weights : optional
-        Of the scan's channels.
+        Weights of the scan's channels.
 
     Returns
     -------
     MarkFit
-        Not converged, with a reason, where either edge is not to be seen.
+        Not converged, with a reason, if either edge is not found.
     """
     inward = pixel_from_mark[:, :2] * np.array(mark.toward)  # columns: along x', y' into the frame, px per mm
     per_mm = np.hypot(*inward)
@@ -321,11 +338,11 @@ def fit_frame_corner(
 
 
 def _intersect_edges(edges: Sequence[Edge], unit: Array, pixel_from_mark: Array, tone: Tone) -> MarkFit:
-    """The corner: along the first edge x, y = a + b x, and along the second x = c + d y."""
+    """Intersect the first edge, y = a + b x, with the second, x = c + d y."""
     (a, b), (c, d) = (edge.line for edge in edges)
     scale = 1 / (1 - b * d)
     x, y = scale * (c + d * a), scale * (a + b * c)
-    # Of column and row by each edge's offset and slope.
+    # Derivatives of column and row with respect to each edge's offset and slope.
     by_lines = [unit @ (scale * np.array(by)) for by in ([[d, d * x], [1.0, x]], [[1.0, y], [b, b * y]])]
     covariance = sum(by @ edge.covariance @ by.T for by, edge in zip(by_lines, edges, strict=True))
     center = pixel_from_mark[:, 2] + unit @ (x, y)
@@ -351,7 +368,8 @@ def _intersect_edges(edges: Sequence[Edge], unit: Array, pixel_from_mark: Array,
 
 
 def _corner_tone(tones: Sequence[EdgeTone], by_lines: Sequence[Array], tone: Tone) -> MarkTone:
-    """by_lines (2, 2) each: derivatives of the corner's column and row by an edge's offset and slope."""
+    """Combine the edges' information for a corner. by_lines: for each edge (2, 2) derivatives of the corner's column
+    and row with respect to its offset and slope."""
     on_place = sum(by @ each.on_line for by, each in zip(by_lines, tones, strict=True))
     least, greatest = min(each.codes[0] for each in tones), max(each.codes[1] for each in tones)
     return MarkTone(pool_edge_tones(tones, tone), np.asarray(on_place), float(least), float(greatest))

@@ -1,4 +1,4 @@
-"""The one Gauss-Newton driver, and one mark's adjustment by it: plain, robust, undamaged, weighted by the grain."""
+"""Gauss-Newton driver, and the adjustment of one mark in stages: plain, robust, damage masked, weighted by grain."""
 
 from dataclasses import replace
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -19,70 +19,70 @@ from measure.noise.robust_estimation import robust_scale, solution, tukey_loss, 
 
 UNSETTLED = Reason("the adjustment did not converge", Code.NO_FIT)
 UNDETERMINED = Reason("the picture does not determine the mark's place", Code.NO_FIT)
-EDGE_BLURS = 3.0  # from the frame's border, in which a mark ends: a thousandth of its step is seen farther off
+EDGE_BLURS = 3.0  # in blurs from the frame's border: a thousandth of its step is left beyond
 
-_SCALE_FLOOR = 0.015  # of the contrast, under Tukey's scale: without it clean data drive it to nothing
-_DRAWN = 0.001  # of the contrast: a picture is drawn and linearised no better, which no prior must give way to
-_FLOOR = 0.005  # of the contrast: residuals below it may be the drawing's own
-_ITERATIONS, _HALVINGS = 15, 4  # more steps, or shorter ones, settle no fit that these do not
-_AREA_PX = 0.5  # of the margin: by so much an area may be another one
-_LEAST_AREA_PX = 40  # pixels about a mark
-_DAMAGE_SIGMAS = 3.2  # of smoothed residuals: one pixel in seven hundred of a window without damage goes beyond
-_PLAIN, _PLAIN_SHARE = 2.0, 0.7  # times the variance, that grain may feign; and how much of it may be damaged
-_LEAST_VARIANCE_DN2 = 1e-12  # of a picture without noise, to divide by
-_ROUNDING_VARIANCE = 1 / 12  # of evenly spread light less the number it is rounded to, in steps
-_WEIGHTED_STEPS = 4  # by the grain's weights: the place is nearly right before
-_CLOSE_PX, _SETTLED_PX = 0.002, 0.02  # a last step that needs no further one; the longest that may be the last
-_OUTLINE_BLUR_PX, _SHOWN = 0.3, 0.02  # what counts as the mark itself
-_GROUND = 0.1  # of the mark: what shows less is its ground
+_SCALE_FLOOR = 0.015  # fraction of the contrast, floor of Tukey's scale: clean data would drive it to zero
+_DRAWN = 0.001  # fraction of the contrast, accuracy of rendering and linearisation: lower bound of the noise for priors
+_FLOOR = 0.005  # fraction of the contrast: smaller residuals may be errors of the drawing
+_ITERATIONS, _HALVINGS = 15, 4  # fits that need more steps or more halvings do not converge at all
+_AREA_PX = 0.5  # px: a larger movement of the mark requires a new area
+_LEAST_AREA_PX = 40  # pixels required around a mark
+_DAMAGE_SIGMAS = 3.2  # of smoothed residuals: exceeded by one pixel in 700 without damage
+_PLAIN, _PLAIN_SHARE = 2.0, 0.7  # variance ratio that grain may produce; fraction of far pixels that must be undamaged
+_LEAST_VARIANCE_DN2 = 1e-12  # lower bound for images without noise, to divide by
+_ROUNDING_VARIANCE = 1 / 12  # variance of the rounding error, in squared steps
+_WEIGHTED_STEPS = 4  # steps with the grain's weights; the place is nearly final before
+_CLOSE_PX, _SETTLED_PX = 0.002, 0.02  # px: step that ends the iteration; longest last step accepted as converged
+_OUTLINE_BLUR_PX, _SHOWN = 0.3, 0.02  # blur (px) and fraction of the contrast that delimit the mark itself
+_GROUND = 0.1  # fraction of the mark's contrast: pixels that show less are background
 
 
 class Model(Protocol):
-    """What is fitted to a picture: residuals, derivatives, weights and priors are its own."""
+    """Model fitted to an image. It owns residuals, derivatives, weights and priors."""
 
     def solve(self) -> Array | None:
-        """The step (unknowns,) by the normal equations of the present state, None where they are singular."""
+        """Solve the normal equations at the current state. Returns the step (unknowns,), None if they are singular."""
 
     def step(self, step: Array) -> float:
-        """Take a step and linearise there; how far the mark moved, px."""
+        """Apply a step and linearise there. Returns the mark's movement in px."""
 
     def failure(self) -> Reason:
-        """Why the present state is no solution, empty where it may be one."""
+        """Reason why the current state is no solution; empty if it may be one."""
 
 
 @runtime_checkable
 class ReversibleModel(Protocol):
-    """A model whose steps may be halved. state: what a step replaces."""
+    """Model whose steps can be halved. state: replaced by each step."""
 
     state: Any
 
     def step(self, step: Array) -> float:
-        """As `Model.step`."""
+        """Apply a step, like `Model.step`."""
 
     def cost(self) -> float:
-        """What the steps make small."""
+        """Objective function that the steps reduce."""
 
 
 class Outcome(NamedTuple):
-    """reason: why the model did not come to rest, empty where it did; moved_px: the length of the last step."""
+    """Outcome of the iteration. reason: why it did not converge, empty if it did; moved_px: length of the last step."""
 
     reason: Reason
     moved_px: float
 
 
 def gauss_newton(model: Model, tolerance_px: float, iterations: int, halvings: int = 0) -> Outcome:
-    """Step a model until it moves less than a tolerance.
+    """Iterate a model until a step is shorter than a tolerance.
 
     Parameters
     ----------
     model : Model
-        Is left at its last state.
+        Left at its last state.
     tolerance_px : float
-        A step shorter than it is the last.
+        A shorter step ends the iteration.
     iterations : int
-        Steps at most.
+        Maximum number of steps.
     halvings : int
-        How often a step of a `ReversibleModel` is halved, at most, as long as it does not lessen the cost.
+        Maximum number of halvings of a step of a `ReversibleModel` that does not reduce the cost.
 
     Returns
     -------
@@ -104,7 +104,7 @@ def gauss_newton(model: Model, tolerance_px: float, iterations: int, halvings: i
 
 
 def _halved_step(model: ReversibleModel, step: Array, tolerance_px: float, halvings: int) -> float:
-    """Take a step, or the part of it that lessens the cost; none where no part does and the last was short."""
+    """Apply a step, halved until it reduces the cost; none if no part does and the last one was short."""
     before, cost_before = model.state, model.cost()
     moved_px = model.step(step)
     if moved_px < tolerance_px:
@@ -115,16 +115,25 @@ def _halved_step(model: ReversibleModel, step: Array, tolerance_px: float, halvi
         step, model.state = step / 2, before
         moved_px = model.step(step)
     if model.cost() > cost_before and float(np.hypot(*step[:2])) < tolerance_px:
-        # Where size, blur and contrast hang together the cost ends flat.
+        # Size, blur and contrast are correlated here: the cost is flat at the minimum.
         model.state = before
         return model.step(np.zeros_like(step))
     return moved_px
 
 
 class PictureFit:
-    """The fit of a model to a window in progress. area: the pixels about the mark that are there; used: those of them
-    that are undamaged; reason: why it failed. variance_dn2: of a pixel whose weight is 1; scale_dn: of Tukey's weights,
-    infinite for squares; weighted (unknowns, height, width): derivatives times the grain's weights, None before."""
+    """Fit of a model to a window in progress.
+
+    Attributes
+    ----------
+    area : (height, width) usable pixels around the mark.
+    used : (height, width) undamaged pixels of the area.
+    far : (height, width) pixels farther than plain_px from the mark.
+    reason : why the fit failed.
+    variance_dn2 : variance of unit weight.
+    scale_dn : scale of Tukey's weights; infinite for plain least squares.
+    weighted : (unknowns, height, width) derivatives times the grain's weights; None before these are used.
+    """
 
     def __init__(self, model: PictureModel, window: ScanWindow) -> None:
         self.model, self.window, self.options = model, window, model.options
@@ -136,7 +145,7 @@ class PictureFit:
 
     @property
     def state(self) -> State:
-        """The model's."""
+        """State of the model."""
         return self.model.state
 
     @state.setter
@@ -144,7 +153,7 @@ class PictureFit:
         self.model.state = state
 
     def approach(self) -> None:
-        """Plain, then roughly robust; stops with a reason where something gives way."""
+        """Adjust by plain least squares, then robustly with a loose tolerance. Sets the reason on failure."""
         model, begun = self.model, self.state
         self.choose_area()
         if not self.reason and np.ptp(model.grey[self.area]) == 0.0:
@@ -155,13 +164,13 @@ class PictureFit:
         self._adjust(0.1)
         if self.reason not in (NO_REASON, UNSETTLED):
             return
-        self.reason = NO_REASON  # dust may keep squares from settling, and not what holds against it
+        self.reason = NO_REASON  # dust may prevent plain least squares from converging, but not the robust adjustment
         if model.has_moved(begun, _AREA_PX):
             self.choose_area()
         self._adjust(0.05, robust=True)
 
     def refine(self) -> None:
-        """Robust from there, then on what is undamaged."""
+        """Adjust robustly from there, then mask damage and readjust in rounds."""
         self.model.bent = BENT
         self._adjust(0.005, robust=True)
         for round_ in range(self.options.damage_rounds):
@@ -179,11 +188,11 @@ class PictureFit:
             self._adjust(0.002)
 
     def choose_area(self) -> None:
-        """The pixels within margin_px of the mark: beyond it the background only disturbs."""
+        """Select the pixels within margin_px of the mark; farther background only disturbs."""
         height, width = self.model.grey.shape
         mark, place = self.model.mark, self.model.place_drawn()
         if isinstance(mark, MarkTemplate):
-            # Where it is known how steady each pixel is, those count by it that are not.
+            # Where the steadiness of each pixel is known, unsteady ones are weighted instead of masked.
             own = near = chip_mask(
                 mark if mark.steadiness is None else replace(mark, steady=None), place, width, height
             )
@@ -201,7 +210,7 @@ class PictureFit:
             self.reason = self.reason or Reason(hardly, Code.OUTSIDE)
 
     def _adjust(self, tolerance_px: float, robust: bool = False) -> None:
-        """Gauss-Newton until the mark moves less than tolerance_px, unless something gave way before."""
+        """Iterate until the mark moves less than tolerance_px, unless the fit has failed."""
         if self.reason:
             return
         model = self.model
@@ -209,19 +218,19 @@ class PictureFit:
             self._take_steadiness()
         if model.is_clipped:
             noise_dn = max(robust_scale(model.residuals[self.telling]), ROUNDING_DN)
-            if self.used is not self.area:  # damage is cut out: what is left is noise
+            if self.used is not self.area:  # damage is masked: the rest is noise
                 least_dn = max(self.floor_dn, ROUNDING_DN)
                 noise_dn = noise_scale(model.uncensored[self.used], model.clipped[self.used], noise_dn, least_dn)
             model.take_noise(noise_dn)
         model.linearise(self.used)
         noise_dn = max(robust_scale(model.residuals[self.telling]), _DRAWN * self.contrast_dn, 1e-9)
-        clipping_dn = model.noise_dn if model.is_clipped else 0.0  # what clipped grey values were judged by
+        clipping_dn = model.noise_dn if model.is_clipped else 0.0  # noise assumed for clipped grey values
         self.variance_dn2 = max(noise_dn**2, clipping_dn**2)
         self.scale_dn = max(noise_dn, _SCALE_FLOOR * self.contrast_dn) if robust else np.inf
         self.reason = gauss_newton(self, tolerance_px, _ITERATIONS, _HALVINGS).reason
 
     def _take_steadiness(self) -> None:
-        """Take into account by how much noise grows with light, as the residuals of the present state show it."""
+        """Estimate from the current residuals how the noise grows with light, and set the steadiness."""
         model, coding = self.model, self.window.coding
         if not (coding.tone.is_identity or model.is_chip):
             drawn, shown = model.drawn_light, np.abs(model.design[-GREY] / model.steadiness)
@@ -229,7 +238,7 @@ class PictureFit:
             model.take_steadiness(steadiness(model.light - drawn, drawn / coding.full_scale_dn, ground, self.telling))
 
     def solve(self) -> Array | None:
-        """The step by Tukey's or the grain's weights; a blur at its limit stays there instead of pulling the others."""
+        """Solve the normal equations with Tukey's or the grain's weights. A blur at its limit is held fixed there."""
         model, weights = self.model, self.weighted
         if weights is None:
             weights = model.design * (self.used * tukey_weights(model.residuals, self.scale_dn))
@@ -244,23 +253,28 @@ class PictureFit:
         return step
 
     def step(self, step: Array) -> float:
-        """Take a step and linearise there."""
+        """Apply a step and linearise there."""
         moved_px = self.model.step(step)
         self.model.linearise(self.used)
         return moved_px
 
     def failure(self) -> Reason:
-        """Why the mark is none where one was expected."""
+        """Reason why the state is not acceptable."""
         return self.model.ran_away()
 
     def cost(self) -> float:
-        """Tukey's loss, and the priors'."""
+        """Tukey's loss plus that of the priors."""
         priors = np.sum(self.model.prior_weights * self.model.departures**2)
         return float(tukey_loss(self.model.residuals * self.used, self.scale_dn) + self.variance_dn2 * priors)
 
     def weigh(self, noise: NoiseModel) -> tuple[Array, Array]:
-        """Adjust once more with the weights of grain, if it is grain: the unknowns' covariance (unknowns, unknowns),
-        and their derivatives by the grey values (unknowns, height, width)."""
+        """Adjust once more by generalised least squares if the noise is grain.
+
+        Returns
+        -------
+        The covariance of the unknowns (unknowns, unknowns), and their derivatives with respect to the grey values
+        (unknowns, height, width).
+        """
         if not noise.is_grain:
             return self._plain_covariance(noise)
         model, before = self.model, self.state
@@ -271,8 +285,8 @@ class PictureFit:
         self.variance_dn2, moved = held, np.asarray(self.state.pixel_from_mark[:, 2] - start)
         if settled:
             by_grain = self._covariance(self.weighted, smeared)
-            # What has more weight now measures the same place, or the noise is not what it was taken for. The plain
-            # covariance, which decides, takes its time and is larger than the weighed one, but for approximations.
+            # Accept the weighted place only if it agrees with the unweighted one; otherwise the noise model is wrong.
+            # The plain covariance decides, but is slow to compute and nearly always larger: try the weighted one first.
             if may_be_noise(moved, by_grain[0][:2, :2]) or may_be_noise(
                 moved, self._plain_covariance(noise)[0][:2, :2]
             ):
@@ -280,41 +294,41 @@ class PictureFit:
         self.state = before
         model.linearise(self.used)
         covariance, by_grey = self._plain_covariance(noise)
-        if settled:  # a hair along a line, say: neither place is known better than they differ
+        if settled:  # e.g. a hair along a line: the difference bounds the accuracy of both places
             covariance[:2, :2] += np.sum(moved**2) / 2 * np.eye(2)
         return covariance, by_grey
 
     def _plain_covariance(self, noise: NoiseModel) -> tuple[Array, Array]:
-        """As `weigh` gives them, of an adjustment that took the noise as white."""
+        """Covariance and derivatives, as of `weigh`, of the adjustment with weights for white noise."""
         variance = max(noise.variance_dn2, _LEAST_VARIANCE_DN2)
         design, bent = self.model.design * self.used, np.sqrt(self.model.curvature)
-        plain = design * bent / variance  # of residuals that are as large as their information says
+        plain = design * bent / variance  # residuals scaled to their information
         smeared = plain * variance if noise.is_white else correlated(plain, noise) * self.used
         return self._covariance(plain * bent, smeared / bent, self.variance_dn2 / variance)
 
     def _covariance(self, weights: Array, smeared: Array, held: float = 1.0) -> tuple[Array, Array]:
-        """As `weigh` gives them, from weighted derivatives and the noise's covariance matrix times these. held: how
-        many times as much as their variances say the priors counted."""
+        """Covariance and derivatives, as of `weigh`, from weighted derivatives and the product of the noise covariance
+        with them. held: factor of the priors' weights in the adjustment relative to their variances."""
         priors = np.diag(self.model.prior_weights)
         inverse: Array = np.asarray(np.linalg.inv(products(weights, self.model.design) + held * priors))
         covariance = np.asarray(inverse @ (products(weights, smeared) + held**2 * priors) @ inverse.T)
         if not np.all(np.linalg.eigvalsh(covariance[:2, :2] + covariance[:2, :2].T) > 0):
-            covariance = inverse  # lags that are noise themselves: as if it were white
+            covariance = inverse  # the estimated lags are noisy: fall back to white noise
         return np.asarray((covariance + covariance.T) / 2), combined(inverse, weights)
 
     @property
     def contrast_dn(self) -> float:
-        """Of a mark darker than its ground, too."""
+        """Absolute contrast of the mark."""
         return abs(self.model.contrast_dn)
 
     @property
     def floor_dn(self) -> float:
-        """Residuals that tell nothing of the film."""
+        """Grey value below which residuals may be errors of the drawing."""
         return _FLOOR * self.contrast_dn
 
     @property
     def rounding_variance_dn2(self) -> float:
-        """What rounding to whole grey values adds to the noise; 0 where they were compressed or smoothed since."""
+        """Variance of rounding to whole grey values; 0 if the values were compressed or smoothed afterwards."""
         model = self.model
         ordinary = self.used & (model.clipped == 0)
         is_whole = not (self.window.is_lossy or model.is_chip) and model.background_px is None
@@ -323,18 +337,18 @@ class PictureFit:
 
     @property
     def telling(self) -> Mask:
-        """The pixels used whose residuals say how large the noise is."""
+        """Mask of the used pixels whose residuals carry information on the noise."""
         return self.used & self.model.tells
 
     @property
     def damaged_fraction(self) -> float:
-        """Of the pixels about the mark, as far as the ground has to be plain there: those on damage or next to it."""
+        """Fraction of the pixels within plain_px of the mark that are damaged or adjacent to damage."""
         near = self.area & ~self.far
         return 1.0 - float((near & self._clear).sum() / max(near.sum(), 1))
 
     @property
     def lost_fraction(self) -> float:
-        """What lies on damage of what the picture tells of the place, in the direction in which least is left."""
+        """Fraction of the place's information lost to damage, in the direction with the largest loss."""
         if not np.any(self.area & ~self.used):
             return 0.0
         priors = np.diag(self.model.prior_weights) * self.variance_dn2
@@ -346,11 +360,11 @@ class PictureFit:
 
     @property
     def _clear(self) -> Mask:
-        """The pixels used that do not touch damage."""
+        """Mask of the used pixels that are not adjacent to damage."""
         return self.used if self.window.is_lossy else self.used & ~grown(self.area & ~self.used)
 
     def _is_plain(self) -> bool:
-        """Whether undamaged pixels far from the mark vary as the nearer ones do."""
+        """Whether undamaged pixels far from the mark scatter like the nearer ones."""
         near, far = self._clear & ~self.far, self._clear & self.far
         squares = self.model.residuals**2
         plain = far.sum() >= _PLAIN_SHARE * (self.area & self.far).sum()

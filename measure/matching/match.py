@@ -1,10 +1,10 @@
-"""Least-squares matching: a mark measured to the noise of the film, by fitting its own picture to the scan.
+"""Least-squares matching of a mark: its rendered image is fitted to the scan.
 
-The model of a window is `gain * picture(mark) + offset + slopes`; unknown are the mark's place, if wished its rotation,
-scale and shear, the blur, and four grey-value parameters, all in one Gauss-Newton adjustment. Dust and scratches
-are first weighted down (Tukey's biweight), then cut out where smoothed residuals stand out; the rest decides.
-Where grain correlates the noise, its autocovariance, from the residuals and from blank film beside the mark, weighs the
-last steps and gives the covariance (generalised least squares).
+The model of a window is `gain * picture(mark) + offset + slopes`. The unknowns are the mark's place, optionally its
+rotation, scale and shear, the blur, and four grey-value parameters, all in one Gauss-Newton adjustment. Dust and
+scratches are first weighted down (Tukey's biweight), then masked where smoothed residuals stand out.
+Where grain correlates the noise, its autocovariance is estimated from the residuals and from blank film around the
+mark. It weights the last steps and gives the covariance (generalised least squares).
 """
 
 from dataclasses import replace
@@ -43,27 +43,28 @@ from measure.tone.sharpening import SharpeningScore
 __all__ = ["MarkFit", "MatchOptions", "mark_window", "match"]
 
 
-_SPARE_PX = 2.0  # beyond the margin: room for the mark to move
+_SPARE_PX = 2.0  # px beyond the margin, so that the mark can move
 
 
 def match(window: ScanWindow, mark: Mark, pixel_from_mark: Array, options: MatchOptions | None = None) -> MarkFit:
-    """Fit the mark to a window of the scan. Never raises for what the picture holds.
+    """Fit a mark to a window of the scan. Never raises because of the image content.
 
     Parameters
     ----------
     window : ScanWindow
-        In one that was compressed with loss grain tells nothing, and dust is seen otherwise.
+        If it was compressed with loss, the grain model is not estimated from blank film and damage is detected by
+        another rule.
     mark : Mark
-        What is fitted.
+        The mark to fit.
     pixel_from_mark : (2, 3)
-        Affine matrix from (x_mm, y_mm, 1) to the scan's (col, row): its last column is the approximate centre, right to
-        a pixel or two.
+        Affine matrix from (x_mm, y_mm, 1) to the scan's (col, row). Its last column is the approximate centre, correct
+        to a pixel or two.
     options : MatchOptions, optional
 
     Returns
     -------
     MarkFit
-        In the scan's pixels; not converged, with a reason, where the mark was not fitted.
+        In pixels of the scan. Not converged, with a reason, if the fit failed.
     """
     options, start = options or MatchOptions(), np.array(pixel_from_mark, dtype=float)
     grey = np.where(window.usable, np.asarray(window.grey, float), 0.0)
@@ -72,14 +73,14 @@ def match(window: ScanWindow, mark: Mark, pixel_from_mark: Array, options: Match
     if not _is_right(fit):
         detail = _fit_part(window, mark, start, options, background_px(mark, start))
         if not detail.reason:
-            # A large speck carries the first steps, plain least squares, away from a mark, and not those of its detail.
+            # A large speck can carry the first steps, plain least squares, away from the mark. Its detail resists that.
             whole = _continued(window, mark, start, detail) if fit.reason else fit
             fit = whole if _is_right(whole) else detail
     return _mark_fit(fit, window, grey)
 
 
 def mark_window(mark: Mark, pixel_from_mark: Array, margin_px: float) -> tuple[int, int, int, int]:
-    """col0, row0, width, height of the window that holds the mark and margin_px about it."""
+    """col0, row0, width, height of the window that holds the mark and margin_px around it."""
     least, greatest = extent_px(mark, np.asarray(pixel_from_mark, dtype=float))
     col0, row0 = np.floor(least - margin_px).astype(int)
     col1, row1 = np.ceil(greatest + margin_px).astype(int)
@@ -89,12 +90,12 @@ def mark_window(mark: Mark, pixel_from_mark: Array, margin_px: float) -> tuple[i
 def _fit_part(
     window: ScanWindow, mark: Mark, start: Array, options: MatchOptions, coarse_px: float | None = None
 ) -> PictureFit:
-    """The mark fitted in the part of the window about it. coarse_px: of a background that does not count, if one does
-    not."""
+    """Fit the mark in the part of the window around it. coarse_px: blur (px) whose result is subtracted as background;
+    None: the background is modelled."""
     fit = _start_fit(window, mark, start, options, coarse_px)
     fit.approach()
     reach_px = options.margin_blurs * fit.model.blur_px
-    if not fit.reason and reach_px > options.margin_px:  # the blur spreads the mark beyond its margin
+    if not fit.reason and reach_px > options.margin_px:  # the blur spreads the mark beyond the margin
         wide = _start_fit(window, mark, start, replace(options, margin_px=reach_px), coarse_px)
         wide.state = fit.state.shifted(np.subtract(fit.window.origin_px, wide.window.origin_px))
         wide.choose_area()
@@ -104,7 +105,7 @@ def _fit_part(
 
 
 def _continued(window: ScanWindow, mark: Mark, start: Array, detail: PictureFit) -> PictureFit:
-    """The mark fitted with its ground from where its detail alone was fitted."""
+    """Fit the mark together with its background, starting from the fit of its detail."""
     fit = _start_fit(window, mark, start, detail.options, None)
     fit.state = detail.state.shifted(np.zeros(2))
     fit.choose_area()
@@ -115,7 +116,7 @@ def _continued(window: ScanWindow, mark: Mark, start: Array, detail: PictureFit)
 def _start_fit(
     window: ScanWindow, mark: Mark, start: Array, options: MatchOptions, coarse_px: float | None
 ) -> PictureFit:
-    """A fit of the part of the window about the mark, where it is expected."""
+    """Set up a fit of the part of the window around the mark's expected place."""
     local = start - np.column_stack([np.zeros((2, 2)), window.origin_px])
     col0, row0, width, height = mark_window(mark, local, options.margin_px + _SPARE_PX)
     rows, cols = (
@@ -124,19 +125,19 @@ def _start_fit(
     )
     part = window.part(rows, cols)
     if coarse_px is not None:
-        # What is left of a clipped grey value without its surroundings is no limit of anything.
+        # With the background subtracted, a clipped grey value is no longer a limit: exclude it.
         part = replace(part.exclude(part.sides != 0), clipped=None)
     local[:, 2] -= (cols.start, rows.start)
     return PictureFit(PictureModel(part, mark, local, options, coarse_px), part)
 
 
 def _is_right(fit: PictureFit) -> bool:
-    """Whether it came to an end and leaves no landscape."""
+    """Whether the fit converged and its residuals show no background texture."""
     return not fit.reason and not is_textured(fit.model.residuals, fit.telling, fit.floor_dn)
 
 
 def _mark_fit(fit: PictureFit, window: ScanWindow, grey: Array) -> MarkFit:
-    """What a fit to a part of a window, of these grey values, comes to in the scan's pixels."""
+    """Convert the fit of a part of a window, with its grey values, to a result in pixels of the scan."""
     model, used = fit.model, fit.telling
     information = float(model.information[fit.used].sum())
     noise, is_white = as_if_white(model.scores, fit.used, len(model.design), information)
@@ -160,7 +161,7 @@ def _mark_fit(fit: PictureFit, window: ScanWindow, grey: Array) -> MarkFit:
         if not is_white or is_coloured(patches):
             noise = grain_model(model.residuals, used, model.design, noise.neighbour_correlation, patches)
         result = _add_precision(result, fit, noise, (grey, frame))
-    # The weights of grain may have moved the mark since.
+    # The grain's weights may have moved the mark.
     place = fit.state.shifted(np.asarray(fit.window.origin_px)).pixel_from_mark
     ground_dn, stored = float(fit.state.greys[1]), fit.window.coding.stored_contrast_dn
     return replace(
@@ -169,7 +170,7 @@ def _mark_fit(fit: PictureFit, window: ScanWindow, grey: Array) -> MarkFit:
         pixel_from_mark=place,
         contrast_dn=model.contrast_dn,
         stored_contrast_dn=stored(ground_dn, model.contrast_dn),
-        # The scan's own blur; beside a chip only what it has more than that.
+        # The blur of the scan; for a chip only its excess over the chip's own smoothing.
         blur_px=float(np.sqrt(max(fit.state.variance_px2 - model.smoothed_px2, 0.0))),
         damaged_fraction=fit.damaged_fraction,
         redundancy=int(used.sum()) - len(model.design),
@@ -178,8 +179,8 @@ def _mark_fit(fit: PictureFit, window: ScanWindow, grey: Array) -> MarkFit:
 
 
 def _surroundings(fit: PictureFit, window: ScanWindow) -> tuple[Mask, Mask]:
-    """Which pixels of the whole window about a mark may be blank film as that under the mark, and which are the
-    frame's, where the mark is cut into that."""
+    """Masks of the whole window: pixels that may be blank film like that under the mark, and pixels of the exposed
+    frame, for a mark that is cut into it."""
     offset, (height, width), mark = (
         np.subtract(fit.window.origin_px, window.origin_px),
         window.grey.shape,
@@ -187,7 +188,7 @@ def _surroundings(fit: PictureFit, window: ScanWindow) -> tuple[Mask, Mask]:
     )
     where = fit.state.shifted(offset).pixel_from_mark, width, height, EDGE_BLURS * fit.model.total_blur_px
     free = window.usable & (window.sides == 0) & known_mask(mark, *where)
-    # A chip's picture is smoothed for the fit, and blank film beside it is not.
+    # A chip's window is smoothed for the fit, the blank film around it is not.
     free &= not (window.is_lossy or fit.model.is_chip)
     col, row = np.rint(offset).astype(int)
     free[row : row + fit.area.shape[0], col : col + fit.area.shape[1]] &= ~fit.area
@@ -195,8 +196,10 @@ def _surroundings(fit: PictureFit, window: ScanWindow) -> tuple[Mask, Mask]:
 
 
 def _add_precision(result: MarkFit, fit: PictureFit, noise: NoiseModel, about: tuple[Array, Mask]) -> MarkFit:
-    """The fit ended with the weights of its noise; how well it is known, and what it says beside its unknowns. about:
-    the grey values about the mark, and which of them are the frame's."""
+    """Finish the fit with the weights of its noise and add covariances and derived estimates to the result.
+
+    about: grey values around the mark, and the mask of those that belong to the exposed frame.
+    """
     model, used = fit.model, fit.telling
     covariance, by_grey = fit.weigh(noise)
     landscape = Landscape(*about, model.design[-GREY])
@@ -240,8 +243,8 @@ def _add_precision(result: MarkFit, fit: PictureFit, noise: NoiseModel, about: t
 
 
 def _mark_tone(fit: PictureFit, linear: LinearFit, priors_dn2: Array, landscape: Landscape) -> MarkTone | None:
-    """What the picture says of the tone curve, None where that is known, or the mark is a chip, cut from scans of the
-    same curve."""
+    """Information of the mark on the tone curve. None if the curve is known, or for a chip, which comes from scans with
+    the same curve."""
     model, coding = fit.model, fit.window.coding
     if coding.tone.is_known or model.is_chip:
         return None
@@ -255,8 +258,8 @@ def _mark_tone(fit: PictureFit, linear: LinearFit, priors_dn2: Array, landscape:
 
 
 def _sharpening_score(fit: PictureFit, linear: LinearFit, priors_dn2: Array) -> SharpeningScore | None:
-    """What the picture says of the scan's sharpening, None where it is not drawn with its surroundings. What counted as
-    damage counts: halos do, until they are drawn."""
+    """Score of the scan's sharpening. None where the background is not modelled. Pixels masked as damage are included,
+    since halos are taken for damage until they are modelled."""
     model = fit.model
     is_asked = model.options.tells_sharpening or fit.window.coding.tone.sharpening
     if not is_asked or model.background_px is not None or model.is_chip:
@@ -267,7 +270,7 @@ def _sharpening_score(fit: PictureFit, linear: LinearFit, priors_dn2: Array) -> 
 
 
 def _likeness(fit: PictureFit) -> float:
-    """The correlation of the fitted picture with the window, less its plane background."""
+    """Correlation of the fitted model with the window after subtraction of its plane background."""
     counts = fit.used * fit.model.steadiness
     background, grey = fit.model.ground * counts, fit.model.grey * counts
     if fit.used.sum() <= len(background):

@@ -1,4 +1,4 @@
-"""The model of a window that shows a mark: `gain * picture(mark) + offset + slopes`, its state and its derivatives."""
+"""Functional model of a window with a mark: `gain * picture(mark) + offset + slopes`, its state and derivatives."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ from measure.matching.saturation import censored, tells
 from measure.matching.window import ScanWindow
 from measure.noise.noise_model import combined, factors
 
-# Changes of the mark's linear part: (I + e G) times it, G a generator of two ones.
+# Changes of the mark's linear part L: (I + e G) L. Each generator G has two entries of absolute value 1.
 _GENERATORS = {
     "scale": ((1.0, 0.0), (0.0, 1.0)),
     "turn": ((0.0, -1.0), (1.0, 0.0)),
@@ -29,22 +29,22 @@ _FREEDOMS: dict[Freedom, tuple[str, ...]] = {
     "affine": ("scale", "turn", "stretch", "shear"),
     "ellipse": ("scale", "stretch", "shear"),
 }
-GREY = 4  # unknowns: gain, offset and two slopes, the last ones
-ROUNDING_DN = 0.3  # standard deviation of what rounding to whole grey values adds
-BENT, ROUGHLY_BENT = 0.075, 0.4  # of the mark's outline, times the blur: so far a series replaces a new drawing
-PIXEL_VARIANCE_PX2 = 1 / 12  # the mean over a pixel's square, taken as a little more blur
-_AS_NOISY = 0.02  # a change of the noise by a smaller share leaves what clipped grey values tell as it is
-_LEAST = 1e-300  # squared slope of a clipped grey value that tells nothing
-_BLUR_RANGE_PX = (0.3, 6.0)  # from where pixels hide it to where marks can hardly be seen
-_MOST_DISTORTION = 0.3  # of scale, rotation (rad) and shear: more is another mark
-_LONGEST_SHIFT_PX, _LONGEST_CHANGE = 1.5, 0.1  # of a step: beyond it the linearisation tells nothing
-_MOST_BLURRED = 2.0  # times the blur, likewise
-_LINEAR = 0.015  # times the blur: within it a linearisation is as good as a new one, to 1e-4 of the blur
-_CHIP_SMOOTHED_PX = 0.7  # and of what it is compared with: as sharp as pixels, edges are sampled falsely in both
+GREY = 4  # grey-value unknowns, the last ones: gain, offset and two slopes
+ROUNDING_DN = 0.3  # standard deviation of rounding to whole grey values
+BENT, ROUGHLY_BENT = 0.075, 0.4  # in blurs: outline displacement up to which a Taylor series replaces rendering
+PIXEL_VARIANCE_PX2 = 1 / 12  # px², averaging over the pixel, treated as additional blur
+_AS_NOISY = 0.02  # relative change of the noise below which clipped grey values are not re-evaluated
+_LEAST = 1e-300  # lower bound of the squared slope of a clipped grey value, to divide by
+_BLUR_RANGE_PX = (0.3, 6.0)  # px: smaller blur is hidden by the pixel, with larger blur marks are hardly visible
+_MOST_DISTORTION = 0.3  # limit of scale, rotation (rad) and shear against the start
+_LONGEST_SHIFT_PX, _LONGEST_CHANGE = 1.5, 0.1  # px and linear part: longest step for which the linearisation holds
+_MOST_BLURRED = 2.0  # largest factor of the blur in one step
+_LINEAR = 0.015  # in blurs: displacement up to which the design matrix is kept, exact to 1e-4 of the blur
+_CHIP_SMOOTHED_PX = 0.7  # px, smoothing of chip and window: edges as sharp as a pixel are undersampled in both
 
 
 def is_round(mark: Mark) -> bool:
-    """Whether every rotation leaves the mark as it is."""
+    """Whether the mark is invariant under rotation."""
     if isinstance(mark, MarkTemplate):
         return False
     centred = all(isinstance(part, Disk | Ring) and part.center_mm == (0.0, 0.0) for part in mark.parts)
@@ -52,41 +52,52 @@ def is_round(mark: Mark) -> bool:
 
 
 def background_px(mark: Mark, pixel_from_mark: Array) -> float:
-    """The standard deviation of a blur that leaves nothing of the mark's lines."""
+    """Standard deviation (px) of a blur that removes the mark's lines, for background subtraction."""
     return max(1.5 * linear_scale(pixel_from_mark) * thinnest_mm(mark), 1.0) + 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """pixel_from_mark (2, 3); variance_px2 of the blur; greys (4,): gain, offset, slopes, 0 until fitted."""
+    """State of the model. pixel_from_mark (2, 3); variance_px2: of the blur; greys (4,): gain, offset and slopes, 0
+    until fitted."""
 
     pixel_from_mark: Array
     variance_px2: float
     greys: Array
 
     def shifted(self, shift_px: Array) -> "State":
-        """The same state where all places are (2,) px farther on; the greys are still to be fitted there."""
+        """Translate the state by shift_px (2,); the greys are reset and must be fitted again."""
         place = self.pixel_from_mark.copy()
         place[:, 2] += shift_px
         return State(place, self.variance_px2, np.zeros(GREY))
 
 
 class PictureModel:
-    """The model at its present state: design (unknowns, height, width) and residuals (height, width). The unknowns are
-    column and row, the generators' parameters, the blur's variance if it is estimated, and the greys.
+    """Linearised model of a window at its current state.
 
-    bent: how far, in units of the blur, a series may bend the drawing before it is drawn anew.
-    start: where the mark is expected, where the state begins too.
-    light (height, width): grey values with their surroundings, grey: what is fitted of them; background_px: the blur
-    that takes the surroundings away, None where they are fitted too.
-    ground (3, height, width): offset and slopes of the background.
-    clipped (height, width): as `clipped_sides` gives it. noise_dn: standard deviation of the noise, which clipped grey
-    values need; tells (height, width): False where a clipped one says nothing of it. slopes and information (height,
-    width), 1 where a grey value is ordinary: as `censored` gives them. uncensored (height, width): residuals as if
-    none were clipped, where some are.
-    steadiness (height, width): the noise of an ordinary pixel over that of each, a chip's as `chip_steadiness` gives
-    it. Residuals and design are multiplied by it: so their noise is alike everywhere. half_tones (height, width): of a
-    chip, as `covariance_of_changed_tone` needs it."""
+    The unknowns are column and row, the parameters of the generators, the variance of the blur if it is estimated, and
+    the greys.
+
+    Attributes
+    ----------
+    design : (unknowns, height, width) design matrix.
+    residuals : (height, width) residuals.
+    bent : in blurs, outline displacement by which a Taylor series may deform the rendered mark before it is rendered
+        again.
+    start : (2, 3) expected place of the mark, also the initial state.
+    light : (height, width) grey values including the background.
+    grey : (height, width) grey values to be fitted.
+    background_px : blur whose result is subtracted as background; None: the background is modelled.
+    ground : (3, height, width) offset and slopes of the background.
+    clipped : (height, width) from `clipped_sides`.
+    noise_dn : standard deviation of the noise, needed for clipped grey values.
+    tells : (height, width) False where a clipped grey value carries no information on the noise.
+    slopes, information : (height, width) from `censored`; 1 for ordinary grey values.
+    uncensored : (height, width) residuals as if no grey value were clipped; set only where some are.
+    steadiness : (height, width) noise of an ordinary pixel over that of each pixel, for a chip from `chip_steadiness`.
+        Residuals and design are multiplied by it, so that their noise is uniform.
+    half_tones : (height, width) of a chip, for `covariance_of_changed_tone`.
+    """
 
     def __init__(
         self, window: ScanWindow, mark: Mark, start: Array, options: MatchOptions, background_px: float | None = None
@@ -112,25 +123,25 @@ class PictureModel:
         moving = 2 + len(names) + options.estimate_blur
         self.linear = slice(2, 2 + len(names))
         self.blur = moving - 1 if options.estimate_blur else None
-        self.prior_weights = np.zeros(moving + GREY)  # 1 / variance; 0 for what is not known before
+        self.prior_weights = np.zeros(moving + GREY)  # 1 / variance; 0 without a prior
         self.prior_weights[self.linear] = np.array(sigmas) ** -2.0
         if self.blur is not None:
             total_px2 = options.blur_px**2 + PIXEL_VARIANCE_PX2
             self.prior_weights[self.blur] = 1 / (2 * total_px2 * options.blur_sigma) ** 2
-        # A chip already has its scan's blur: where none is estimated, none is added.
+        # A chip contains the blur of its scan already: add none unless it is estimated.
         added_px2 = 0.0 if self.is_chip and not options.estimate_blur else options.blur_px**2
         self.state = State(start.copy(), added_px2 + self.smoothed_px2, np.zeros(GREY))
         self.bent = BENT
         self._drawn, self._mark_from_drawn = start[:, :2].copy(), np.linalg.inv(start[:, :2])
         self._mark_from_start = np.linalg.inv(start[:, :2])
-        self._linearised: tuple[State, Array] | None = None  # the state that the design is of, and its residuals
+        self._linearised: tuple[State, Array] | None = None  # state of the design matrix, and its residuals
         self.reach_px = reach_px(mark, start[:, :2])
         self.ground = background_planes(*grey.shape)
         self.design = np.zeros((moving + GREY, *grey.shape))
 
     def linearise(self, used: Mask) -> None:
-        """Design and residuals of the present state; the greys from a linear fit to what is used, at first. Close to
-        where the design was last computed it stays, and the residuals follow from it."""
+        """Compute design matrix and residuals at the current state. Initial greys come from a linear fit to the used
+        pixels. Near the state of the last design matrix it is kept and the residuals are extrapolated."""
         if self._linearised is not None:
             before, residuals = self._linearised
             if not self.has_moved(before, _LINEAR * self.total_blur_px) and not self._is_bent():
@@ -146,7 +157,7 @@ class PictureModel:
         columns[0], columns[1] = shown.by_col, shown.by_row
         col, row = np.arange(width) - place[0, 2], (np.arange(height) - place[1, 2])[:, None]
         moves = np.stack([slope * along for slope in columns[:2] for along in (col, row)])
-        # The blur does not bend with the mark: else a soft disk's size, blur and contrast run away together.
+        # The blur is not deformed with the mark; otherwise size, blur and contrast of a soft disk diverge together.
         moves += self.total_blur_px**2 * np.stack([shown.by_col_col, *[shown.by_col_row] * 2, shown.by_row_row])
         columns[self.linear] = combined(self.generators.reshape(-1, 4), moves)
         if self.blur is not None:
@@ -164,7 +175,7 @@ class PictureModel:
         self._linearised = self.state, self.residuals
 
     def _censor(self) -> None:
-        """Clipped grey values hold the model on their side of the limit only."""
+        """Replace the residuals of clipped grey values by deviance residuals (see `saturation`)."""
         if not self.is_clipped:
             return
         clipped = self.clipped != 0
@@ -175,16 +186,16 @@ class PictureModel:
         self.tells[clipped] = tells(censoring.slopes)
 
     def take_noise(self, noise_dn: float) -> None:
-        """Judge clipped grey values by noise of that standard deviation, unless it changes nothing of their part."""
+        """Set the standard deviation of the noise for clipped grey values; ignored if the change is negligible."""
         if abs(noise_dn / self.noise_dn - 1) > _AS_NOISY:
             self.noise_dn, self._linearised = noise_dn, None
 
     def take_steadiness(self, steadiness: Array) -> None:
-        """Another noise of each pixel (height, width) over that of an ordinary one."""
+        """Set the steadiness (height, width), the noise of an ordinary pixel over that of each pixel."""
         self.steadiness, self._linearised = steadiness, None
 
     def step(self, step: Array) -> float:
-        """Take a step, shortened where it leaves the range of a linearisation; its length in px."""
+        """Apply a step, shortened to the range of the linearisation. Returns its length in px."""
         shift, linear = step[:2], step[self.linear]
         largest = np.abs(linear).max(initial=0.0)
         longest = max(np.hypot(*shift) / _LONGEST_SHIFT_PX, largest / _LONGEST_CHANGE, 1.0)
@@ -193,7 +204,7 @@ class PictureModel:
         place[:, :2] += combined(linear / longest, self.generators) @ place[:, :2]
         variance = self.state.variance_px2
         if self.blur is not None:
-            # As a change of the standard deviation, the pixel's share included: so a blur far off is near in a step.
+            # As a relative change of the total standard deviation, so that a distant blur is reached in one step.
             total_px = self.total_blur_px
             ratio = np.clip(1 + step[self.blur] / longest / (2 * total_px**2), 1 / _MOST_BLURRED, _MOST_BLURRED)
             variance = float(np.clip((total_px * ratio) ** 2 - PIXEL_VARIANCE_PX2, *self._variance_range))
@@ -202,7 +213,7 @@ class PictureModel:
 
     @property
     def departures(self) -> Array:
-        """(unknowns,) how far the parameters under a prior are from where it has them."""
+        """(unknowns,) deviations of the parameters from their priors."""
         departures = np.zeros(len(self.design))
         departures[self.linear] = self._parameters(self._distortion)
         if self.blur is not None:
@@ -210,7 +221,7 @@ class PictureModel:
         return departures
 
     def ran_away(self) -> Reason:
-        """Why the present state is no mark where one was expected; empty where it may be."""
+        """Reason why the state is not acceptable: too far from the start or too distorted; empty if acceptable."""
         moved = float(np.hypot(*(self.state.pixel_from_mark[:, 2] - self.start[:, 2])))
         if moved > self.options.max_shift_px:
             return Reason(f"the fit ran {moved:.1f} px away from where the mark was expected", Code.NO_FIT)
@@ -219,7 +230,7 @@ class PictureModel:
         return NO_REASON
 
     def blur_is_held(self, step: Array) -> bool:
-        """Whether a step would take the blur out of its range, at whose limit it is already."""
+        """Whether the blur is at a limit of its range and the step leads beyond it."""
         if self.blur is None:
             return False
         low, high = self._variance_range
@@ -237,15 +248,15 @@ class PictureModel:
         return (0.0 if self.is_chip else low**2), high**2
 
     def has_moved(self, before: State, by_px: float) -> bool:
-        """Whether the mark's outline lies farther from that of a state before; blurring counts double, for the standard
-        deviations' sake."""
+        """Whether the mark's outline has moved by more than by_px since an earlier state. A change of the blur counts
+        twice, because the standard deviations depend on it."""
         change = self._change(before)
         length = float(np.hypot(*change[:2])) + self.reach_px * float(np.abs(change[self.linear]).max(initial=0.0))
         blurred = abs(float(np.sqrt(self.state.variance_px2) - np.sqrt(before.variance_px2)))
         return length + 2 * blurred > by_px
 
     def _change(self, before: State) -> Array:
-        """(unknowns,) from a state before to the present one, both alike."""
+        """(unknowns,) change of the parameters from an earlier, nearby state to the current one."""
         change = np.zeros(len(self.design))
         place, linear = self.state.pixel_from_mark, before.pixel_from_mark[:, :2]
         change[:2] = place[:, 2] - before.pixel_from_mark[:, 2]
@@ -256,8 +267,8 @@ class PictureModel:
         return change
 
     def _parameters(self, change: Array) -> Array:
-        """The generators' parameters of a change (2, 2) of the linear part."""
-        return np.asarray(self.generators.reshape(-1, 4) @ change.ravel() / 2)  # of two ones each
+        """Parameters of the generators for a change (2, 2) of the linear part."""
+        return np.asarray(self.generators.reshape(-1, 4) @ change.ravel() / 2)  # 2: squared norm of a generator
 
     @property
     def _distortion(self) -> Array:
@@ -265,23 +276,23 @@ class PictureModel:
 
     @property
     def drawn_light(self) -> Array:
-        """(height, width) the light that the present state draws, with the surroundings if these do not count."""
+        """(height, width) modelled light at the current state, background included."""
         return self.light - (self.uncensored if self.is_clipped else self.residuals) / self.steadiness
 
     @property
     def scores(self) -> Array:
-        """(height, width) the residuals times their slopes: what each pixel adds to the normal equations. They are 0 on
-        average and vary with the information."""
+        """(height, width) scores, residuals times slopes: each pixel's contribution to the normal equations. Their mean
+        is 0, their variance proportional to the information."""
         return self.residuals * self.slopes
 
     @property
     def curvature(self) -> Array:
-        """(height, width) the information over the square of the slopes, one to two: what a residual's bend adds."""
+        """(height, width) information over squared slopes, 1 to 2: the effect of the residual's second derivative."""
         return np.maximum(self.information / np.maximum(self.slopes**2, _LEAST), 1.0)
 
     @property
     def contrast_dn(self) -> float:
-        """The mark's grey value less that of its ground."""
+        """Grey value of the mark minus that of its background."""
         return float(self.state.greys[0])
 
     @property
@@ -290,29 +301,29 @@ class PictureModel:
 
     @property
     def total_blur_px(self) -> float:
-        """The standard deviation of blur and pixel."""
+        """Standard deviation of blur and pixel combined."""
         return float(np.sqrt(self.state.variance_px2 + PIXEL_VARIANCE_PX2))
 
     def detail(self, image: NDArray[np.floating]) -> Array:
-        """(height, width) grey values, or their model, without what is coarser than the mark's lines."""
+        """(height, width) detail of an image: the background, coarser than the mark's lines, is subtracted."""
         if self.background_px is None:
             return np.asarray(image, float)
         return np.asarray(image - cv2.GaussianBlur(image, (0, 0), self.background_px))
 
     def place_drawn(self) -> Array:
-        """(2, 3) the present place of the mark as it was last drawn: its linear part is close to the present one."""
+        """(2, 3) current place with the linear part of the last rendering, which is close to the current one."""
         place = self.state.pixel_from_mark
         if self._is_bent():
             self._drawn, self._mark_from_drawn = place[:, :2].copy(), np.linalg.inv(place[:, :2])
         return np.column_stack([self._drawn, place[:, 2]])
 
     def _is_bent(self) -> bool:
-        """Whether the present mark is bent farther than a series reaches; column by column of the linear part."""
+        """Whether the mark is deformed beyond the range of the Taylor series; column by column of the linear part."""
         most = float(np.hypot(*self._bend()).max()) * self.reach_px
         return most > self.bent * self.total_blur_px
 
     def _bend(self) -> Array:
-        """(2, 2) how far the present mark is bent from the one drawn."""
+        """(2, 2) deformation of the current mark relative to the rendered one."""
         return np.asarray(self.state.pixel_from_mark[:, :2] @ self._mark_from_drawn - np.eye(2))
 
     def _render_mark(self, width: int, height: int) -> Rendering:
@@ -323,7 +334,7 @@ class PictureModel:
 
 
 def background_planes(height: int, width: int) -> Array:
-    """(3, height, width) offset and slopes of the background."""
+    """(3, height, width) design matrix of the background's offset and slopes."""
     scale = max(height, width) / 2
     planes = np.ones((3, height, width))
     planes[1] = (np.arange(width) - (width - 1) / 2) / scale

@@ -1,4 +1,4 @@
-"""How a mark is matched."""
+"""Options of least-squares matching."""
 
 from dataclasses import dataclass
 from math import inf
@@ -10,21 +10,28 @@ FREEDOMS: tuple[Freedom, ...] = get_args(Freedom)
 
 @dataclass(frozen=True)
 class MatchOptions:
-    """How a mark is matched.
+    """Options of least-squares matching.
 
-    freedom: what is estimated beside the shift; "ellipse" is an affinity without rotation, for disks.
-    blur_px: standard deviation of the scan's blur; the start of its estimation, if estimate_blur has it estimated.
-    blur_sigma: prior standard deviation of the logarithm of the blur, the pixel's share included, as known from the
-    other marks.
-    linear_sigma: prior standard deviation of rotation (rad) and scale, and strain_sigma of stretch and shear, as known
-    from the other marks; the defaults hold only what the picture does not show at all.
-    margin_px: how far about the mark grey values are used; in a blurred scan margin_blurs standard deviations of the
-    blur, where that is more.
-    plain_px: where grey values farther from the mark vary much more than the nearer ones, the match fails.
-    damage_rounds: how often damage is sought, cut out and the rest adjusted; 0: it stays in.
-    max_shift_px: how far from its start the mark may move.
-    tells_sharpening: whether the picture is asked for sharpening even in a scan that is not known to be sharpened.
-    Raises ValueError, naming the option, for a value that is none.
+    Attributes
+    ----------
+    freedom : parameters estimated in addition to the shift; "ellipse" is an affinity without rotation, for disks.
+    blur_px : standard deviation of the scan's blur; its initial value if estimate_blur is set.
+    blur_sigma : prior standard deviation of the logarithm of the blur, pixel included, as known from other marks.
+    estimate_blur : whether the blur is an unknown.
+    linear_sigma : prior standard deviation of rotation (rad) and scale, as known from other marks. The default only
+        regularises what the image does not determine.
+    strain_sigma : prior standard deviation of stretch and shear, likewise.
+    margin_px : grey values are used up to this distance around the mark.
+    margin_blurs : the margin in standard deviations of the blur, used where it is larger.
+    plain_px : distance beyond which grey values must not vary much more than the nearer ones, else the match fails.
+    damage_rounds : rounds of detecting and masking damage and readjusting; 0: damage stays in.
+    max_shift_px : largest distance from the initial place.
+    tells_sharpening : estimate sharpening even if the scan is not known to be sharpened.
+
+    Raises
+    ------
+    ValueError
+        Names the option whose value is invalid.
     """
 
     freedom: Freedom = "similarity"

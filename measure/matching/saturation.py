@@ -1,10 +1,10 @@
-"""Grey values at the end of a scanner's range: they say only that there was at least, or at most, so much light.
+"""Saturation and clipping: grey values at the end of a scanner's range bound the light from one side only.
 
-Such an observation is censored (Tobin, 1958, Estimation of relationships for limited dependent variables): its
-likelihood is the probability that noise takes it beyond the limit. Least squares take it in as a residual whose square
-is -2 log of that probability (a deviance residual): where the model lies well within the range it is the ordinary one,
-where it lies well beyond there is none, and nothing has to be left out by a threshold, which would bias what stays.
-How much it tells of the model is the curvature of that likelihood.
+Such an observation is censored (Tobin, 1958, Estimation of relationships for limited dependent variables). Its
+likelihood is the probability that noise takes it beyond the limit. It enters least squares as a residual whose square
+is -2 log of that probability (a deviance residual): the ordinary residual where the model lies well within the range,
+zero where it lies well beyond. No observation is excluded by a threshold, which would bias the rest.
+Its information is the curvature of that likelihood.
 """
 
 from collections.abc import Sequence
@@ -21,21 +21,30 @@ from measure.scans.scan import Scan
 
 Sides = NDArray[np.int8]
 
-_BITS = (8, 10, 12, 14, 16)  # of scanners' converters; their numbers are stored as they are, or moved up
-_LOG_DENSITY = -0.5 * np.log(2 * np.pi)  # of the normal distribution at its middle
-_TAIL = 2.0  # standard deviations below the greatest value
-_LEAST_STEPS = 1.5  # of the scan's grey values in a standard deviation: in less noise an even ground is a pile as well
-_FEWEST = 20  # pixels: fewer bend no fit
-_GROSS = 3.5  # standard deviations: beyond it a residual is damage
-_SCALE_ROUNDS = 8  # each leaves at most two fifths of what was wrong
-_CLEAR = 3.0  # standard deviations of the noise
-_TELLS = 0.5  # derivative of the residual, from which on it is a residual like the others
+_BITS = (8, 10, 12, 14, 16)  # bit depths of scanners' converters; values are stored unchanged or shifted up
+_LOG_DENSITY = -0.5 * np.log(2 * np.pi)  # log density of the standard normal distribution at 0
+_TAIL = 2.0  # noise standard deviations below the maximum: the tail of the histogram
+_LEAST_STEPS = 1.5  # grey-value steps per noise standard deviation; with less noise a uniform area piles up as well
+_FEWEST = 20  # pixels; fewer clipped ones do not affect a fit
+_GROSS = 3.5  # standard deviations beyond which a residual is damage
+_SCALE_ROUNDS = 8  # iterations; each leaves at most two fifths of the error
+_CLEAR = 3.0  # noise standard deviations between the model and a clipping limit
+_TELLS = 0.5  # derivative of the residual above which it counts as an ordinary one
 
 
 def clipped_sides(scan: Scan, col0: int, row0: int, width: int, height: int, weights: Sequence[float] | None) -> Sides:
-    """(height, width): 1 where a grey value of the window is at the upper end of the scanner's range, or where whites
-    were cut off below it, -1 at the lower end, 0 elsewhere. weights: of the channels of a colour scan; none is
-    negative, so that a channel at its end, of those that count, is a limit of the whole."""
+    """Find the clipped grey values of a window.
+
+    Parameters
+    ----------
+    weights : of the channels of a colour scan. None is negative, so a clipped channel of positive weight bounds the
+        weighted sum.
+
+    Returns
+    -------
+    (height, width) int8: 1 at the upper end of the scanner's range or where whites are clipped below it, -1 at the
+    lower end, 0 elsewhere.
+    """
     sides = np.zeros((height, width), np.int8)
     for channel in range(scan.channels):
         if weights is None or weights[channel] > 0:
@@ -48,8 +57,11 @@ def clipped_sides(scan: Scan, col0: int, row0: int, width: int, height: int, wei
 
 
 class Censored(NamedTuple):
-    """Of clipped grey values, each (n,): residuals; slopes, their derivatives by the ordinary ones, between 0 and 1;
-    and information on the model, 1 being what an ordinary grey value tells: one to two times the slope's square."""
+    """Deviance residuals of n clipped grey values.
+
+    residuals: (n,); slopes: (n,) derivatives with respect to the ordinary residuals, 0 to 1; information: (n,) relative
+    to an ordinary grey value, one to two times the squared slope.
+    """
 
     residuals: Array
     slopes: Array
@@ -57,7 +69,8 @@ class Censored(NamedTuple):
 
 
 def censored(residuals: Array, sides: Sides, sigma_dn: float) -> Censored:
-    """What clipped grey values say. residuals, sides (n,): grey value less model; sigma_dn: of the noise."""
+    """Compute the deviance residuals of clipped grey values. residuals (n,): grey value minus model; sides (n,):
+    clipped end; sigma_dn: standard deviation of the noise."""
     within = sides * residuals / sigma_dn
     log_chance = np.asarray(log_ndtr(-within), dtype=float)
     hazard = _hazard(within, log_chance)
@@ -67,11 +80,11 @@ def censored(residuals: Array, sides: Sides, sigma_dn: float) -> Censored:
 
 
 def noise_scale(residuals: Array, sides: Sides, start_dn: float, least_dn: float) -> float:
-    """The most likely standard deviation of noise, at least least_dn, from residuals and sides (n,), some of them
-    clipped, and a rough one, start_dn.
+    """Estimate the standard deviation of the noise by maximum likelihood from residuals and sides (n,), some clipped.
 
-    The score of an observation, its residual where it is ordinary, has on average the square that its information has,
-    in units of the variance. What lies _GROSS standard deviations within the range is damage.
+    Returns at least least_dn; start_dn: rough initial value. The mean square of an observation's score (its residual
+    if ordinary) equals its information in units of the variance. Residuals more than _GROSS standard deviations within
+    the range are damage.
     """
     clipped = sides != 0
     ordinary, within = residuals[~clipped], (sides * residuals)[clipped]
@@ -86,7 +99,8 @@ def noise_scale(residuals: Array, sides: Sides, start_dn: float, least_dn: float
 
 
 def clear_of_ends(drawn: Array, grey: Array, sides: Sides, sigma_dn: float) -> Mask:
-    """(height, width): where what is drawn lies so far from limits of what was clipped that noise goes either way."""
+    """(height, width) mask of pixels whose modelled value lies so far from the clipping limits that noise is not cut
+    off."""
     clear = np.ones(drawn.shape, dtype=bool)
     for side in (1, -1):
         if np.any(sides == side):
@@ -95,18 +109,18 @@ def clear_of_ends(drawn: Array, grey: Array, sides: Sides, sigma_dn: float) -> M
 
 
 def tells(slopes: Array) -> Mask:
-    """Which residuals are as large as the noise makes them, and say how large it is."""
+    """Mask of residuals that have the full scatter of the noise and so can estimate it."""
     return np.asarray(slopes > _TELLS)
 
 
 def _hazard(within: Array, log_chance: Array) -> Array:
-    """The density over the probability of what lies so many standard deviations within the range or beyond it."""
+    """Hazard function of the normal distribution: density over tail probability."""
     return np.asarray(np.exp(_LOG_DENSITY - within**2 / 2 - log_chance))
 
 
 def _is_cut(grey: NDArray[np.floating]) -> bool:
-    """Whether the greatest value is where whites were cut off. Of the values within _TAIL standard deviations of the
-    noise below it, the last one of a tail that falls by itself has no more than an even share."""
+    """Whether whites were clipped at the maximum. In the unclipped tail of a histogram, of the values within _TAIL
+    noise standard deviations of the maximum, the maximum itself has at most a uniform share."""
     greatest = grey.max()
     pile = int((grey == greatest).sum())
     if pile < _FEWEST:

@@ -1,4 +1,4 @@
-"""What a mark's picture says of the tone curve, and how far another curve moves the mark."""
+"""Information of a mark's fit on the tone curve, and the derivatives of its place with respect to the curve."""
 
 from collections.abc import Callable
 
@@ -14,9 +14,9 @@ from measure.tone.estimate import MarkTone
 from measure.tone.score import ToneScore, tone_score
 from measure.tone.sharpening import SharpeningScore
 
-_PIECE_PX = 8  # of a mark's edges that tell the curve by themselves, and of what JPEG rounds by itself
-_LEAST_CONTRAST = 1e-6  # of the light that is drawn: rounding is about that large
-_LEAST_VARIANCE = 1e-9  # of what is left of departures, over that of the departures themselves
+_PIECE_PX = 8  # px, side of the squares compared with one another, equal to the blocks of JPEG
+_LEAST_CONTRAST = 1e-6  # fraction of the modelled light: a smaller contrast is numerical rounding
+_LEAST_VARIANCE = 1e-9  # floor of the score's variance relative to that of the departures
 
 
 def mark_tone_information(
@@ -30,28 +30,28 @@ def mark_tone_information(
     full_scale_dn: float,
     landscape: Landscape,
 ) -> MarkTone:
-    """What a linearised fit says of the curve beside its unknowns.
+    """Compute the information of a linearised fit on the tone curve, with the fit's unknowns eliminated.
 
-    The changes by the curve are taken at the drawn light: at the observed one, they would go along with the noise.
-    Light that is not even on the mark or about it says nothing of the curve, but might seem to: bends of both are
-    unknowns, too. What another curve moves the mark by follows from the observed light, with all that the drawing
-    leaves unexplained.
+    The derivatives by the curve are taken at the modelled light; at the observed one they would be correlated with the
+    noise. Uneven light on the mark or around it could be mistaken for the curve, so gradients and curvatures of both
+    are further unknowns. The shift of the mark by another curve is computed from the observed light, including all that
+    the model does not explain.
 
     Parameters
     ----------
     drawn, grey : (height, width)
-        The light that the fit draws, and that it was fitted to.
+        Modelled and observed light.
     clear : (height, width)
-        Where that is not near an end of the scanner's range, where noise is cut off, which bends an edge as a curve
-        does.
+        Mask of pixels far from the ends of the scanner's range. Near an end noise is cut off, which changes an edge as
+        a curve does.
     priors_dn2, departures : (unknowns,)
-        As of `tone_score`.
+        See `tone_score`.
     landscape : Landscape
-        In the mark.
+        Background texture within the mark.
     """
     on_place = _moved_px(fit, tone.derivatives(grey, full_scale_dn))
     information = ToneInformation.empty()
-    if np.ptp(drawn) > _LEAST_CONTRAST * np.abs(drawn).max():  # else nothing is drawn: there are no edges
+    if np.ptp(drawn) > _LEAST_CONTRAST * np.abs(drawn).max():  # otherwise the model has no edges
         counts = fit.used & clear
         uneven = _uneven(fit.design[-GREY], fit.steadiness)
         design = np.concatenate([fit.design, uneven]) * counts
@@ -63,8 +63,7 @@ def mark_tone_information(
         score = tone_score(flat, flat_changes, residuals.ravel(), priors, departures)
         left, by_prior = score.left.reshape(changes.shape), score.by_unknown * np.sqrt(priors)[:, None]
         covariance = fit.covariance(left) + landscape.covariance(left) + fit.noise.variance_dn2 * by_prior.T @ by_prior
-        # Of departures that the picture's own unknowns take up whole, only rounding is left: it must not tell of the
-        # curve.
+        # Where the fit's unknowns absorb a departure completely only numerical rounding is left: give it no weight.
         whole = fit.noise.variance_dn2 * float(np.sum(changes**2))
         covariance += _LEAST_VARIANCE * max(whole, 1e-30) * np.eye(len(covariance))
         covariance *= _disagreement(score, left, residuals, covariance, on_place)
@@ -75,8 +74,8 @@ def mark_tone_information(
 def tone_without_information(
     fit: LinearFit, light: Array, detail: Callable[[Array], Array], tone: Tone, full_scale_dn: float
 ) -> MarkTone:
-    """Of a mark whose detail alone was fitted: the curve moves it all the same, but its picture says nothing of the
-    curve, for its surroundings are not drawn. light (height, width): with these; detail: takes them away."""
+    """Effect of the curve on a mark of which only the detail was fitted. It gives no information on the curve, since
+    its background is not modelled. light (height, width): with background; detail: subtracts the background."""
     changes = np.stack([detail(each) for each in tone.derivatives(light, full_scale_dn)])
     return _mark_tone(fit, ToneInformation.empty(), _moved_px(fit, changes), light, tone, full_scale_dn)
 
@@ -84,25 +83,29 @@ def tone_without_information(
 def sharpening_score(
     fit: LinearFit, drawn: Array, priors_dn2: Array, departures: Array, coding: Coding
 ) -> SharpeningScore | None:
-    """What a linearised fit says of the scan's sharpening, beside its unknowns and the tone curve.
+    """Score the scan's sharpening together with the tone curve, with the fit's unknowns eliminated.
 
     Parameters
     ----------
     fit : LinearFit
-        used: of pixels where halos count, too.
+        Its mask used includes halos.
     drawn : (height, width)
-        The light that the fit draws.
+        Modelled light.
     priors_dn2, departures : (unknowns,)
-        As of `tone_score`.
+        See `tone_score`.
     coding : Coding
-        How light was stored.
+        Relation of light to stored grey values.
+
+    Returns
+    -------
+    SharpeningScore, or None where the model has no contrast.
     """
     if not np.ptp(drawn) > _LEAST_CONTRAST * np.abs(drawn).max():
         return None
     tone, full_scale_dn, used = coding.tone, coding.full_scale_dn, fit.used
     codes, slope = tone.code(drawn, full_scale_dn), tone.slope(drawn, full_scale_dn)
     halos = tone.sharpening.changes(codes)
-    # The light through a wrong curve lacks what the right one would add; of halos it has too much.
+    # Sign: light by a wrong curve lacks the departure, whereas sharpening adds halos to it.
     changes = np.concatenate([tone.derivatives(drawn, full_scale_dn), -slope * halos]) * (used * fit.steadiness)
     flat = fit.design.reshape(len(fit.design), -1) * used.ravel()
     residuals = np.where(used, fit.residuals, 0.0).ravel()
@@ -116,8 +119,11 @@ def sharpening_score(
 
 
 def _disagreement(score: ToneScore, left: Array, residuals: Array, covariance: Array, on_place: Array) -> float:
-    """How many times larger the covariance of the score is than the noise makes it. Each piece of a mark's edges tells
-    the curve: where they differ by more than the noise makes them, in what moves the mark, they are not as drawn."""
+    """Variance factor (at least 1) of the score, from the disagreement of the pieces of the mark's edges.
+
+    Each piece gives an estimate of the curve's effect on the place. If they scatter by more than the noise, the edges
+    are not as drawn.
+    """
     weighted = np.linalg.solve(covariance, score.normal).T
     estimate: Array = np.asarray(np.linalg.inv(np.eye(len(covariance)) + weighted @ score.normal) @ weighted, float)
     moved = on_place @ estimate
@@ -134,21 +140,22 @@ def _piece_sums(images: Array) -> Array:
 
 
 def _moved_px(fit: LinearFit, changes: Array) -> Array:
-    """(2, k) how far the departures move the place; changes (k, height, width): of what was fitted, by these."""
+    """(2, k) derivatives of the place with respect to the departures. changes (k, height, width): those of the fitted
+    light."""
     return products(fit.by_grey[:2], changes * fit.used * fit.steadiness)
 
 
 def _mark_tone(
     fit: LinearFit, information: ToneInformation, on_place: Array, light: Array, tone: Tone, full_scale_dn: float
 ) -> MarkTone:
-    """light (height, width): of the picture."""
+    """Assemble a MarkTone. light (height, width): of the window."""
     codes = tone.code(np.quantile(light[fit.used], (0.0, 1.0)), full_scale_dn) / full_scale_dn
     return MarkTone(information, on_place, float(codes[0]), float(codes[1]))
 
 
 def _uneven(shown: Array, about: Array) -> Array:
-    """(8, height, width) slopes and bends of the light of a mark's picture, and bends of that about it. shown, about
-    (height, width): the picture and 1, times the steadiness."""
+    """(8, height, width) derivatives by gradients and curvatures of the light on a mark, and by curvatures of that
+    around it. shown, about (height, width): the rendered mark and 1, times the steadiness."""
     height, width = shown.shape
     col = np.broadcast_to(np.linspace(-1.0, 1.0, width), shown.shape)
     row = np.broadcast_to(np.linspace(-1.0, 1.0, height)[:, None], shown.shape)

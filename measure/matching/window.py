@@ -1,4 +1,4 @@
-"""A window of a scan as a fit takes it: its light, where it lies, and what is known of its pixels."""
+"""Window of a scan as input of a fit: linear light, position, and the state of its pixels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,25 +15,28 @@ from measure.matching.saturation import Sides, clipped_sides
 from measure.scans.scan import Scan
 from measure.tone.curve import LINEAR, Tone
 
-FAINT = 1 / 500  # of full scale: contrast below it is rounding, not a mark
-_BESIDE_PX = 6.0  # about the drawing: the mark's own ground
-_FAR = 5.0  # standard deviations of the mark's side, the mark being part of it: so far off is no ground of this mark
-_EDGE_PX = 4.0  # an edge's blur: of 1.4 px it leaves a five hundredth of the edge so far off
-_DRAWN, _SHOWN = 0.05, 0.5  # of the mark's contrast: all of it, and what is plainly its own
+FAINT = 1 / 500  # fraction of full scale: a smaller contrast may be rounding
+_BESIDE_PX = 6.0  # px around the drawing: the mark's own background
+_FAR = 5.0  # standard deviations of the mark's side, mark included: a larger step is not the mark's background
+_EDGE_PX = 4.0  # px reached by an edge's blur: at 1.4 px blur, 1/500 of the step is left at this distance
+_DRAWN, _SHOWN = 0.05, 0.5  # fractions of the mark's contrast: the whole mark, and its certain pixels
 
 
 @dataclass(frozen=True, eq=False)
 class Coding:
-    """How the light of a window was stored: by the tone curve of a scan whose largest grey value is full_scale_dn.
-    stored (height, width): the grey values themselves, None where the light is a mixture of channels."""
+    """Relation of a window's light to the stored grey values.
+
+    stored: (height, width) grey values, None where the light is a mixture of channels; tone: tone curve of the scan;
+    full_scale_dn: its largest grey value.
+    """
 
     stored: NDArray[np.floating] | None
     tone: Tone = LINEAR
     full_scale_dn: float = 65535.0
 
     def steps_dn(self, used: Mask) -> Array | None:
-        """(height, width) the light between the limits from which each value was rounded; None where the values used
-        are no multiples of one step, or not known."""
+        """(height, width) quantisation steps in light. None where the used values are unknown or not multiples of one
+        step."""
         if self.stored is None:
             return None
         gaps = np.diff(np.unique(np.asarray(self.stored[used], float)))
@@ -46,7 +49,7 @@ class Coding:
         return np.asarray(above - below, float)
 
     def light_of_step_dn(self, light: NDArray[np.floating], step_dn: float) -> Array:
-        """How much more light than this grey values are that are a step larger."""
+        """Change of the light for a change of step_dn in the stored grey value."""
         if self.tone.is_identity:
             return np.full(light.shape, step_dn)
         code = self.tone.code(light, self.full_scale_dn)
@@ -54,8 +57,8 @@ class Coding:
         return np.asarray(above - here, float)
 
     def stored_contrast_dn(self, ground: float, contrast: float) -> float:
-        """The difference of grey values that a contrast in light is, on ground of such light. Of a line finer than a
-        pixel it may be more than the scanner's range: no pixel shows it whole."""
+        """Convert a contrast in light over a background to a difference of stored grey values. For lines thinner than a
+        pixel it may exceed the scanner's range, since no pixel shows the full contrast."""
         if self.tone.is_identity:
             return contrast
         ends = np.clip([ground, ground + contrast], 0.0, self.full_scale_dn)
@@ -65,10 +68,17 @@ class Coding:
 
 @dataclass(frozen=True, eq=False)
 class ScanWindow:
-    """grey (height, width), in light; its top-left pixel's centre is at origin_px (col, row) of the scan; valid: which
-    pixels are true ones, None if all; clipped: which are at an end of the scanner's range, as `clipped_sides` gives it,
-    None if none. is_lossy: whether it was compressed with loss. coded: how the light was stored, None where grey is
-    what is stored."""
+    """Window of a scan in light.
+
+    Attributes
+    ----------
+    grey : (height, width) light.
+    origin_px : (col, row) of the centre of its top-left pixel in the scan.
+    valid : (height, width) mask of the valid pixels; None: all.
+    clipped : (height, width) pixels at an end of the scanner's range, from `clipped_sides`; None: none.
+    is_lossy : whether the scan was compressed with loss.
+    coded : relation of light to stored grey values; None: grey holds the stored values.
+    """
 
     grey: NDArray[np.floating]
     origin_px: tuple[float, float] = (0.0, 0.0)
@@ -79,7 +89,7 @@ class ScanWindow:
 
     @property
     def usable(self) -> Mask:
-        """(height, width): which pixels tell a grey value."""
+        """(height, width) mask of the valid, finite pixels."""
         known = np.asarray(np.isfinite(self.grey))
         return known if self.valid is None else known & self.valid
 
@@ -92,11 +102,11 @@ class ScanWindow:
         return np.zeros(self.grey.shape, np.int8) if self.clipped is None else self.clipped
 
     def exclude(self, lost: Mask) -> "ScanWindow":
-        """The same, some of its pixels (height, width) no longer being true ones."""
+        """Copy of the window with the pixels of a mask (height, width) marked as invalid."""
         return replace(self, valid=self.usable & ~lost)
 
     def part(self, rows: slice, cols: slice) -> "ScanWindow":
-        """Some of its rows and columns."""
+        """Crop to the given rows and columns."""
         coding, (col0, row0) = self.coding, self.origin_px
         stored = None if coding.stored is None else coding.stored[rows, cols]
         return ScanWindow(
@@ -110,7 +120,7 @@ class ScanWindow:
 
 
 def read_window(scan: Scan, place_px: tuple[int, int, int, int], weights: Sequence[float] | None = None) -> ScanWindow:
-    """The window at col0, row0, width, height of the scan, in light. weights: what each channel counts, as for
+    """Read the window at col0, row0, width, height of the scan, in light. weights: of the channels, as in
     `Scan.window`."""
     col0, row0, _, _ = place_px
     grey = scan.light(*place_px, weights).astype(float)
@@ -121,9 +131,20 @@ def read_window(scan: Scan, place_px: tuple[int, int, int, int], weights: Sequen
 
 
 def pixels_beyond_edge(window: NDArray[np.floating], mark: Mark, pixel_from_mark: Array) -> Mask:
-    """Which pixels of a window (height, width), in which the mark stands about as pixel_from_mark (2, 3) says, lie
-    beyond an edge that is far stronger than the mark is, or in its blur: that of the frame, or of the pad on which the
-    mark stands. None where there is no such edge, or the mark itself lies beyond it."""
+    """Mask the pixels of a window beyond an edge that is far stronger than the mark, or within the edge's blur.
+
+    Such an edge is that of the frame, or of the pad on which the mark stands.
+
+    Parameters
+    ----------
+    window : (height, width)
+    pixel_from_mark : (2, 3)
+        Approximate place of the mark in the window.
+
+    Returns
+    -------
+    (height, width) mask, all False where there is no such edge or the mark itself lies beyond it.
+    """
     drawn = picture(mark, pixel_from_mark, window.shape[1], window.shape[0], 1.0)
     away_px = cv2.distanceTransform((drawn <= _DRAWN).astype(np.uint8), cv2.DIST_L2, 5)
     near, shown = away_px <= _BESIDE_PX, drawn > _SHOWN * drawn.max()
