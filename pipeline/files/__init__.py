@@ -1,1 +1,1 @@
-"""The user's files, checked key by key and column by column."""
+"""Readers of the user's files, checked key by key and column by column."""

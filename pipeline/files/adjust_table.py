@@ -1,4 +1,4 @@
-"""The table [adjust] of project.toml: the model of the film, the datum, the weights, the tests."""
+"""The table [adjust] of project.toml: film deformation model, datum, weights, tests."""
 
 import math
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ SCANNER_WORDS = ("none", "auto", "bend")
 
 
 def _datum_choice(wanted: Datum) -> Key:
-    """The coordinates or points that a datum names; none where the program is to choose."""
+    """Key for the coordinates or points that a datum names; absent: the program chooses."""
 
     def read(table: Table, key: str) -> tuple[str, ...]:
         datum = table.text("datum", "control")
@@ -97,7 +97,7 @@ class AdjustSettings:
 
 
 def read_adjust(table: Table) -> AdjustSettings:
-    """Read the table. Raises InputError naming the key that is wrong."""
+    """Read the table. Raises InputError with the key that is wrong."""
     settings = read_model(table, AdjustSettings)
     if settings.robust and settings.snooping:
         raise table.error("snooping", "and robust both take out gross errors. Set one of the two to false.")
@@ -105,7 +105,7 @@ def read_adjust(table: Table) -> AdjustSettings:
 
 
 def read_scanner(table: Table, words: Sequence[str]) -> ScannerSetting:
-    """The key `scanner`: one of some words, or a list of terms. Raises InputError."""
+    """Value of the key `scanner`: one of some words, or a list of terms. Raises InputError."""
     if not table.is_list("scanner"):
         return cast(ScannerSetting, table.text("scanner", "none", words))
     terms = table.texts("scanner")
@@ -122,7 +122,7 @@ def read_scanner(table: Table, words: Sequence[str]) -> ScannerSetting:
 
 
 def read_scanner_sigma(table: Table) -> float:
-    """The key `scanner_sigma_um`, inf where it is absent. Raises InputError."""
+    """Value of the key `scanner_sigma_um`, inf where it is absent. Raises InputError."""
     sigma_um = table.sigma("scanner_sigma_um", math.inf)
     if sigma_um == 0.0:
         raise table.error("scanner_sigma_um", 'is 0, which would fix every term at 0: write scanner = "none" for that.')
@@ -130,7 +130,7 @@ def read_scanner_sigma(table: Table) -> float:
 
 
 def _robust(table: Table) -> bool | WeightFunction:
-    """Huber's weights are those of `true`."""
+    """Value of the key `robust`; `true` stands for Huber's weights."""
     if "robust" not in table or table.is_flag("robust"):
         return table.flag("robust", False)
     name = table.text("robust")
@@ -151,7 +151,7 @@ def _variance_components(table: Table) -> bool | tuple[str, ...]:
 
 
 def read_transformation(table: Table) -> Transformation | None:
-    """The key `transformation`; None where it is absent. Raises InputError."""
+    """Value of the key `transformation`; None where it is absent. Raises InputError."""
     if "transformation" not in table:
         return None
     spelling = table.text("transformation")

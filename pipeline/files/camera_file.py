@@ -1,4 +1,4 @@
-"""camera.toml: the camera as it is given, for the measurement (its marks) and for the adjustment (its priors)."""
+"""camera.toml: the given camera, for the measurement (its marks) and for the adjustment (its priors)."""
 
 import dataclasses
 import math
@@ -24,13 +24,13 @@ from pipeline.text.tables import Table, read_toml
 from pipeline.text.text_file import SMALLEST_SIGMA
 from pipeline.text.wording import did_you_mean
 
-FIELD_RATIO = 50.0  # of half the diagonal and principal distance, or the fiducials' extent: 178 degrees of field
-LONGEST_RATIO = 500.0  # of principal distance and half the diagonal: small plates of astrographs of 10 m
+FIELD_RATIO = 50.0  # largest half diagonal over principal distance, or frame over fiducials' extent: 178° field of view
+LONGEST_RATIO = 500.0  # largest principal distance over half the diagonal: small plates of astrographs with c = 10 m
 
-NO_MARK = "none"  # a fiducial that is not to be looked for in scans
-CORNER_REACH = 1 / 6  # of half the frame: how far along its edges a corner is measured where nobody says
-_FEWEST_ABOUT_ORIGIN = 3  # fiducials that show where their middle is...
-_OFF_MIDDLE = 0.25  # ...and how far the origin lies from it, in their extent, where it is none of their middle
+NO_MARK = "none"  # for a fiducial that is not sought in scans
+CORNER_REACH = 1 / 6  # default length of the measured edges of a frame corner, fraction of half the frame
+_FEWEST_ABOUT_ORIGIN = 3  # fiducials needed to determine their middle
+_OFF_MIDDLE = 0.25  # fraction of the fiducials' extent: an origin farther from their middle is not the frame's centre
 
 
 def check_units(
@@ -39,9 +39,9 @@ def check_units(
     distance_mm: float | None,
     fiducials: Sequence[tuple[Table, shapes.Point, shapes.Mark | shapes.LearnedMark | None]],
 ) -> None:
-    """Raises InputError for lengths that are impossible in a frame of that size.
+    """Raise InputError for lengths that are impossible for the size of the frame.
 
-    distance_mm: the principal distance, None where it is not given. fiducials: each one's table, place and mark.
+    distance_mm: principal distance, None where it is not given; fiducials: table, coordinates and mark of each.
     """
     frame = f"the frame of {frame_mm[0]:g} x {frame_mm[1]:g} mm"
     half_diagonal = math.hypot(*frame_mm) / 2
@@ -60,7 +60,7 @@ def check_units(
 
 
 def _size_mm(mark: shapes.Mark | shapes.LearnedMark | None) -> float:
-    """Width or height, whichever is larger; 0 where nothing is drawn, or the frame's edges themselves are."""
+    """Larger of width and height of a mark; 0 without a drawing, and for frame corners."""
     if mark is None or isinstance(mark, shapes.FrameCorner):
         return 0.0
     if isinstance(mark, shapes.LearnedMark):
@@ -70,8 +70,16 @@ def _size_mm(mark: shapes.Mark | shapes.LearnedMark | None) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class GivenFiducial:
-    """A fiducial of the camera file; mark None: it can be adjusted but not measured. passed_over: and need not be.
-    seen_mm: where a learned mark's template has its origin in the scan that it was first cut from."""
+    """Fiducial of a camera file.
+
+    Attributes
+    ----------
+    id : name of the mark.
+    xy_mm, sigma_mm : given coordinates and their standard deviations, mm.
+    mark : drawing; None if the fiducial can be adjusted but not measured.
+    passed_over : whether it is not to be measured.
+    seen_mm : origin of a learned mark's template in the scan from which it was first cut, mm.
+    """
 
     id: str
     xy_mm: shapes.Point
@@ -82,14 +90,17 @@ class GivenFiducial:
 
     @property
     def prior_sigma_mm(self) -> tuple[float, float]:
-        """For the adjustment: a learned mark is measured where its template has its origin, somewhere on the mark. What
-        the file fixes stays fixed."""
+        """Standard deviations for the adjustment, mm.
+
+        A learned mark is measured at the origin of its template, which may lie anywhere on the mark: its uncertainty is
+        added. Fixed coordinates stay fixed.
+        """
         sx, sy = (sigma and math.hypot(sigma, shapes.LEARNED_ORIGIN * self.learned_mm) for sigma in self.sigma_mm)
         return sx, sy
 
     @property
     def learned_mm(self) -> float:
-        """The size of a learned mark, or of one that is to be; 0 of others."""
+        """Size of a mark that is learned or to be learned, mm; 0 for others."""
         if isinstance(self.mark, shapes.MarkTemplate):
             return self.mark.learned_mm
         return self.mark.size_mm if isinstance(self.mark, shapes.LearnedMark) else 0.0
@@ -97,13 +108,17 @@ class GivenFiducial:
 
 @dataclasses.dataclass(frozen=True)
 class CameraFile:
-    """A camera file as read: mm, a standard deviation of 0 fixes, inf frees.
+    """Content of a camera file. Lengths in mm; a standard deviation of 0 fixes a value, inf frees it.
 
-    principal_distance_mm and principal_point_mm are None where the file leaves them to the points. number: of the
-    camera or its lens cone, as its plate in the picture has it; "" where the file is of a type. writing: where the
-    camera writes on its film, as far as the file says. calibration: an earlier one, which takes the place of the
-    standard deviations of all that it gives. distances: observed between the fiducials. clicks: None where nobody has
-    shown the learned marks; learned_from: None before they are learned.
+    Attributes
+    ----------
+    principal_distance_mm, principal_point_mm : None where they are to be determined from the points.
+    number : serial number of the camera or its lens cone on the plate; "" for a type of camera.
+    writing : where the camera writes on its film, as far as the file states it.
+    calibration : an earlier calibration, which replaces the standard deviations of its quantities.
+    distances : measured distances between fiducials.
+    clicks : places of the marks to be learned; None if nobody has clicked them.
+    learned_from : origin of learned marks; None before they are learned.
     """
 
     path: Path
@@ -125,17 +140,18 @@ class CameraFile:
 
     @property
     def learned(self) -> tuple[GivenFiducial, ...]:
-        """The fiducials whose marks are yet to be learned from the scans."""
+        """Fiducials whose marks have yet to be learned from the scans."""
         return tuple(one for one in self.fiducials if isinstance(one.mark, shapes.LearnedMark))
 
     @property
     def needs_clicks(self) -> bool:
-        """Whether a person may be asked where its marks are: they are to be learned, and its own file shows none."""
+        """Whether a person may be asked to click the marks: they are to be learned, and the camera file itself has no
+        clicks."""
         return bool(self.learned) and (self.clicks is None or bool(self.clicks.who))
 
     @property
     def layout_marks(self) -> tuple[shapes.LayoutMark, ...]:
-        """The fiducials that can be found in a scan."""
+        """Fiducials that can be found in a scan."""
         return tuple(
             shapes.LayoutMark(one.id, one.seen_mm or one.xy_mm, one.sigma_mm, one.mark)
             for one in self.fiducials
@@ -143,8 +159,10 @@ class CameraFile:
         )
 
     def layout(self) -> shapes.FiducialLayout:
-        """The marks to be measured, those yet to be learned left out. Raises InputError where one has no drawing, and
-        is not to be passed over, or the frame's size is missing."""
+        """Layout of the marks to be measured, without those yet to be learned.
+
+        Raises InputError where a mark has no drawing and is not passed over, or the frame's size is missing.
+        """
         if self.frame_mm is None:
             raise InputError(f"{self.path}: frame_mm is missing: the size of the exposed frame, [width, height] in mm.")
         for fiducial in self.fiducials:
@@ -157,7 +175,7 @@ class CameraFile:
         return shapes.FiducialLayout(self.layout_marks, self.frame_mm, self.writing)
 
     def camera(self, center_mm: tuple[float, float] = (0.0, 0.0)) -> Camera:
-        """The camera for the adjustment. center_mm: where the principal point is sought when the file has none."""
+        """Camera for the adjustment. center_mm: initial value of a principal point that the file does not give."""
         distance, point = self.principal_distance_mm, self.principal_point_mm
         sx, sy = self.principal_point_sigma_mm
         return Camera(
@@ -181,12 +199,12 @@ class CameraFile:
 
 
 def read_camera(path: Path) -> CameraFile:
-    """Read camera.toml. Raises InputError naming file, line and key."""
+    """Read camera.toml. Raises InputError with file, line and key."""
     return parse_camera(read_toml(path))
 
 
 def parse_camera(table: Table) -> CameraFile:
-    """The camera that stands in a table: a whole camera file, or a part of another file in the same words."""
+    """Read a camera from a table: a whole camera file, or a part of another file with the same keys."""
     if "data_strip" in table:
         raise table.error(
             "data_strip",
@@ -225,7 +243,7 @@ def parse_camera(table: Table) -> CameraFile:
 
 
 def _fiducials(entries: Sequence[Table], given: CameraTable) -> tuple[GivenFiducial, ...]:
-    """The fiducials with their drawings. Raises InputError where two have one name or place, or none has a drawing."""
+    """Fiducials with their drawings. Raises InputError where two share a name or place, or a drawing is missing."""
     fiducials: dict[str, GivenFiducial] = {}
     for entry, one in zip(entries, given.fiducial, strict=True):
         if one.id in fiducials:
@@ -248,7 +266,7 @@ def _fiducials(entries: Sequence[Table], given: CameraTable) -> tuple[GivenFiduc
 
 
 def read_fiducial_distances(table: Table, ids: Sequence[str]) -> tuple[FiducialDistance, ...]:
-    """[[fiducial_distance]]: from and to, of the ids of the fiducials, mm and sigma_mm."""
+    """Distances of the tables [[fiducial_distance]]: from and to (ids of fiducials), mm and sigma_mm."""
     distances = []
     for entry in table.tables("fiducial_distance") if "fiducial_distance" in table else ():
         start, end = (entry.text(key) for key in ("from", "to"))
@@ -266,8 +284,11 @@ def read_fiducial_distances(table: Table, ids: Sequence[str]) -> tuple[FiducialD
 def _placed(
     mark: shapes.Mark | shapes.LearnedMark, radial: bool, xy_mm: shapes.Point
 ) -> shapes.Mark | shapes.LearnedMark:
-    """A radial mark is drawn as on the positive x' axis; elsewhere its own x axis points away from the centre. What is
-    learned is learned at each place by itself; a frame's corner lies as its quadrant says."""
+    """Mark at its place in the frame.
+
+    A radial mark is drawn as on the positive x' axis and rotated so that its x axis points away from the centre. A
+    frame corner is oriented by its quadrant. A mark to be learned is learned at each place separately.
+    """
     if isinstance(mark, shapes.LearnedMark):
         return mark
     if isinstance(mark, shapes.FrameCorner):
@@ -277,8 +298,8 @@ def _placed(
 
 
 def _default_principal_point(fiducials: Sequence[GivenFiducial]) -> tuple[tuple[float, float] | None, float]:
-    """Where a file that gives none has it, and its standard deviation: the origin, where the fiducials lie about it;
-    else, where they count from a corner of the frame, near their middle, and nothing is known of it."""
+    """Default principal point and its standard deviation: the origin where the fiducials surround it; else (coordinates
+    counted from a corner of the frame) the middle of the fiducials, with infinite standard deviation."""
     if not fiducials:
         return None, math.inf
     xy = np.array([fiducial.xy_mm for fiducial in fiducials])
@@ -291,14 +312,14 @@ def _default_principal_point(fiducials: Sequence[GivenFiducial]) -> tuple[tuple[
 def _distortion(table: Table, camera: CameraTable) -> Distortion:
     given = camera.distortion
     name, needs_half = given.family, family(given.family).needs == "half_mm"
-    in_dm = name == "juhl"  # Juhl counts in decimetres
+    in_dm = name == "juhl"  # Juhl uses decimetres
     for key, is_wrong in (("r0_mm", in_dm), ("r0_dm", not in_dm), ("half_mm", not needs_half)):
         if is_wrong and key in table:
             raise table.error(key, f"is no key of this table where the family is {name}. Take it out.")
     r0_mm = 100.0 * table.number("r0_dm", above=0.0) if in_dm else given.r0_mm
     half_mm = _half(table, given, camera.frame_mm) if needs_half else (0.0, 0.0)
     values, sigmas = table.table("value"), table.table("sigma")
-    every = sigmas.sigma("all", 0.0)  # a set of 44 parameters is not named one by one
+    every = sigmas.sigma("all", 0.0)  # default for all: a set of 44 parameters is not listed one by one
     known = parameter_names(name)
     parameters = {each: Prior(values.number(each, 0.0), sigmas.sigma(each, every)) for each in known}
     values.done()
@@ -308,7 +329,7 @@ def _distortion(table: Table, camera: CameraTable) -> Distortion:
 
 
 def _half(table: Table, given: DistortionTable, frame_mm: shapes.Point | None) -> shapes.Point:
-    """Half the frame, the unit of length of a self-calibration set."""
+    """Half the frame: unit of length of a self-calibration set, mm."""
     if given.half_mm is not None:
         if min(given.half_mm) <= 0.0:
             raise table.error("half_mm", f"must be positive, not {list(given.half_mm)}.")

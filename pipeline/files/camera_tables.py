@@ -1,4 +1,4 @@
-"""The tables of camera.toml: keys with type, unit, default and meaning, and values that need more than a type."""
+"""Tables of camera.toml: keys with type, unit, default and meaning, and values that need special checks."""
 
 import re
 from collections.abc import Mapping
@@ -31,8 +31,8 @@ from pipeline.text.table_models import (
 from pipeline.text.tables import Table
 from pipeline.text.wording import did_you_mean
 
-DEFAULT_SIGMA_MM = 1.0  # Torlegård's a-priori standard deviation where only a datum is wanted
-READS: Mapping[str, str] = {"rightward": "0", "upward": "90", "leftward": "180", "downward": "270"}  # by the pose
+DEFAULT_SIGMA_MM = 1.0  # Torlegård's a-priori standard deviation for a prior that only fixes the datum
+READS: Mapping[str, str] = {"rightward": "0", "upward": "90", "leftward": "180", "downward": "270"}  # poses
 _WRITTEN = re.compile(
     rf"(?P<side>{'|'.join(get_args(shapes.Side))})(?::(?P<plate> plate)?(?: reads (?P<reads>{'|'.join(READS)}))?)?"
 )
@@ -40,7 +40,8 @@ _WRITTEN = re.compile(
 
 @dataclass(frozen=True, config=TABLE)
 class Source:
-    """[source] of a camera file: where its numbers come from, and how many reports or frames stand behind them."""
+    """[source] of a camera file: where its numbers come from, and the number of calibration reports or frames behind
+    them."""
 
     text: Annotated[str, TEXT] = Field(description="Where the numbers come from.")
     reports: Annotated[int, whole()] = Field(default=0, description="How many calibration reports.")
@@ -173,7 +174,7 @@ def _number(table: Table) -> str:
 
 
 def _writing(table: Table) -> tuple[shapes.WrittenPlace, ...]:
-    """Places as "left: reads upward", "right: plate reads downward", or "left" where the direction is not known."""
+    """Places such as "left: reads upward", "right: plate reads downward", or "left" where the direction is unknown."""
     places = []
     for text in table.texts("writing"):
         match = _WRITTEN.fullmatch(text.strip())
@@ -189,7 +190,7 @@ def _writing(table: Table) -> tuple[shapes.WrittenPlace, ...]:
 
 
 def written_place_text(place: shapes.WrittenPlace) -> str:
-    """A place as a camera file has it."""
+    """Text of a place in a camera file."""
     direction = [word for word, pose in READS.items() if pose == place.pose]
     parts = [*(["plate"] if place.plate else []), *(f"reads {word}" for word in direction)]
     return f"{place.side}: {' '.join(parts)}" if parts else place.side

@@ -1,4 +1,4 @@
-"""A short camera file from the kind of its marks and their distances, for a camera that no library has."""
+"""Write a short camera file from the kinds and distances of its marks, for a camera that the library lacks."""
 
 import math
 import re
@@ -9,23 +9,27 @@ from measure.marks.shapes import Point
 from pipeline.errors import InputError
 from pipeline.text.wording import did_you_mean, quoted
 
-FORMATS_MM = (56.0, 60.0, 70.0, 100.0, 130.0, 180.0, 228.0, 232.0, 240.0, 300.0)  # sides of frames
-_AERIAL_MM = 220.0  # about the distance of marks at which the sizes below are found
-_LEAST_SCALE = 0.5  # marks of small cameras are no smaller than half of these
-_RIM_MM = 1.0  # of the frame beyond its outermost mark
-_PLACES: Mapping[str, Mapping[str, Point]] = {  # of the marks, in their distances, as calibration reports number them
+FORMATS_MM = (56.0, 60.0, 70.0, 100.0, 130.0, 180.0, 228.0, 232.0, 240.0, 300.0)  # usual sides of frames
+_AERIAL_MM = 220.0  # approximate distance of marks of aerial cameras, to which the sizes below apply
+_LEAST_SCALE = 0.5  # smallest factor of these sizes for small cameras
+_RIM_MM = 1.0  # margin of the frame beyond its outermost mark
+_PLACES: Mapping[str, Mapping[str, Point]] = {  # in units of the distances, numbered as in calibration reports
     "square": {"1": (-0.5, -0.5), "2": (0.5, 0.5), "3": (-0.5, 0.5), "4": (0.5, -0.5)},
     "side": {"5": (-0.5, 0.0), "6": (0.5, 0.0), "7": (0.0, 0.5), "8": (0.0, -0.5)},
 }
-_NAMES = {"square": "corner", "side": "side"}  # of their drawings
+_NAMES = {"square": "corner", "side": "side"}  # of the tables [mark.NAME]
 
 
 @dataclass(frozen=True)
 class MarkKind:
-    """What a template draws of a kind: its lines in [mark.NAME], and how it lies to the frame's edge.
+    """How the template draws a kind of mark.
 
-    lines: by scale and the angle of a cross. reach_mm: how far it extends about its point. edge_mm: how far beyond the
-    point of a side mark the frame ends; None of marks that stand free. at: where the kind stands.
+    Attributes
+    ----------
+    lines : function of the scale and the angle of a cross, deg, to the lines of [mark.NAME].
+    reach_mm : extent from the mark's point.
+    edge_mm : distance of the frame's edge beyond the point of a side mark; None for free-standing marks.
+    at : where the kind is used: "square" (corners), "side".
     """
 
     lines: Callable[[float, float], Sequence[str]]
@@ -56,7 +60,7 @@ def _ring(scale: float) -> list[str]:
 
 
 def _polygon(*vertices_mm: Point) -> MarkKind:
-    """A solid mark of a side, drawn as on the right one."""
+    """Solid mark of a side, drawn for the right side."""
 
     def lines(scale: float, _: float) -> list[str]:
         corners = ", ".join(f"[{_mm(scale * x)}, {_mm(scale * y)}]" for x, y in vertices_mm)
@@ -99,13 +103,21 @@ MARK_KINDS: Mapping[str, MarkKind] = {
     "frame-corner": MarkKind(lambda scale, _: [], 0.0, 0.0, ("square",)),
     "learned": MarkKind(lambda scale, _: [_line(f"size_mm = {_mm(6 * scale)}", "width of its picture")], 3.0),
 }
-_WRITTEN = {"wedge": "polygon", "notch": "polygon", "wing": "polygon"}  # as formats have it
+_WRITTEN = {"wedge": "polygon", "notch": "polygon", "wing": "polygon"}  # names in the camera file
 
 
 @dataclass(frozen=True)
 class CameraSizes:
-    """What is known of a camera: kinds of its marks, of the corners and of the sides, and distances in mm, (width,
-    height). square: of corner marks; side: of side marks; frame: None: from these."""
+    """What is known of a camera.
+
+    Attributes
+    ----------
+    marks : kinds of the marks of corners and sides, in this order.
+    square, side : distances of corner marks and of side marks (width, height), mm; None where there are none.
+    frame : size of the frame (width, height), mm; None: derived from the marks.
+    distance : principal distance, mm.
+    name : of the camera.
+    """
 
     marks: tuple[str, ...]
     square: Point | None = None
@@ -118,7 +130,7 @@ class CameraSizes:
     def from_words(
         cls, marks: str, square: str | None, side: str | None, frame: str | None, distance: float | None, name: str
     ) -> "CameraSizes":
-        """As the command line has them. Raises InputError."""
+        """Parse the arguments of the command line. Raises InputError."""
         kinds = tuple(kind.strip() for kind in marks.split(","))
         sizes = (_size("--square", square), _size("--side", side), _size("--frame", frame))
         return cls(kinds, *sizes, distance, name)
@@ -149,7 +161,7 @@ class CameraSizes:
 
     @property
     def kinds(self) -> dict[str, tuple[str, Point]]:
-        """By place, square or side, the kind of its marks and their distances."""
+        """{"square" or "side": (kind of the marks, their distances in mm)}."""
         given = [(place, size) for place, size in (("square", self.square), ("side", self.side)) if size]
         return {
             place: (self.marks[min(number, len(self.marks) - 1)], size) for number, (place, size) in enumerate(given)
@@ -157,12 +169,12 @@ class CameraSizes:
 
     @property
     def scale(self) -> float:
-        """Of the marks' sizes against those of aerial cameras."""
+        """Factor of the marks' sizes relative to aerial cameras."""
         return min(1.0, max(_LEAST_SCALE, max(max(size) for _, size in self.kinds.values()) / _AERIAL_MM))
 
     @property
     def frame_mm(self) -> Point:
-        """As given; else as marks at the frame's edge say, or the smallest usual frame that holds all marks."""
+        """Size of the frame: as given, from marks at its edge, or the smallest usual format that holds all marks."""
         if self.frame is not None:
             return self.frame
         for kind, size in self.kinds.values():
@@ -183,7 +195,7 @@ class CameraSizes:
 
 
 def _size(option: str, text: str | None) -> Point | None:
-    """212, or 212x150. Raises InputError."""
+    """Parse 212 or 212x150, mm. Raises InputError."""
     if text is None:
         return None
     found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*(?:mm)?(?:\s*[xX×]\s*(\d+(?:\.\d+)?)\s*(?:mm)?)?\s*", text)
@@ -194,7 +206,7 @@ def _size(option: str, text: str | None) -> Point | None:
 
 
 def camera_template(sizes: CameraSizes) -> str:
-    """A complete camera file. Its lines say which values are typical ones, and where to look for better."""
+    """Text of a complete camera file, with comments on which values are typical ones and where to find better ones."""
     given = [f"{kind}, {width:g} x {height:g} mm" for kind, (width, height) in sizes.kinds.values()]
     distance = (
         "# principal_distance_mm = 153.0" if sizes.distance is None else f"principal_distance_mm = {sizes.distance:g}"

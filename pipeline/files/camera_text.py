@@ -1,4 +1,4 @@
-"""A camera as the text of a camera file: what `read_camera` reads back."""
+"""Write a camera as the text of a camera file that `read_camera` can read."""
 
 import dataclasses
 import os
@@ -15,8 +15,10 @@ from pipeline.text.wording import numbers, quoted, sigma, sigmas, table_lines
 
 
 def camera_text(camera: CameraFile, save: SavePicture) -> str:
-    """The contents of camera.path, where they are to stand. save(name, picture) stores a picture beside it and returns
-    its path there."""
+    """Text of a camera file to be written at camera.path.
+
+    save(name, picture) stores an image beside it and returns its relative path.
+    """
     marks = _mark_names(camera.fiducials)
     lines = [f"name = {quoted(camera.name)}"]
     if camera.frame_mm is not None:
@@ -57,7 +59,7 @@ def camera_text(camera: CameraFile, save: SavePicture) -> str:
 
 
 def fiducial_distance_lines(distances: Iterable[FiducialDistance]) -> list[str]:
-    """Tables [[fiducial_distance]]."""
+    """Lines of the tables [[fiducial_distance]]."""
     lines = []
     for one in distances:
         lines += ["", "[[fiducial_distance]]", f"from = {quoted(one.start)}", f"to = {quoted(one.end)}"]
@@ -72,7 +74,7 @@ def _learned_from_lines(learned: LearnedFrom) -> list[str]:
 
 
 def _mark_names(fiducials: tuple[GivenFiducial, ...]) -> Mapping[shapes.Mark | shapes.LearnedMark, str]:
-    """A name for every different mark."""
+    """A name for each different mark."""
     marks = dict.fromkeys(fiducial.mark for fiducial in fiducials if fiducial.mark is not None)
     return {mark: f"mark-{number}" for number, mark in enumerate(marks, 1)}
 

@@ -1,4 +1,4 @@
-"""A decision about a mark or an orientation, and its line in decisions.jsonl: one JSON object, checked key by key."""
+"""Decision about a mark or a scan orientation, and its line in decisions.jsonl: one JSON object, checked key by key."""
 
 import json
 from collections import defaultdict, deque
@@ -19,11 +19,11 @@ from pipeline.text.text_file import quote_value
 from pipeline.text.wording import did_you_mean
 
 KINDS = ("fiducial", "target", "tie")
-LEARNED = "learned"  # the kind of what is said of how a camera's marks look, and not of where they are
+LEARNED = "learned"  # kind of decisions about the appearance of a camera's marks, not about their places
 
 
 class Choice(StrEnum):
-    """What can be decided."""
+    """Kinds of decisions."""
 
     ACCEPT = "accept"
     REJECT = "reject"
@@ -44,15 +44,28 @@ MEANING = {
     Choice.UNDO: "The last decision about this mark, or this pose, is taken back.",
 }
 About = tuple[str, str, str]  # image, point, kind; of a pose: image, "", ""; of marks to be learned: image, "", LEARNED
-OF_SCANS = (Choice.POSE, Choice.LEARN, Choice.UNDO)  # and of no single mark
+OF_SCANS = (Choice.POSE, Choice.LEARN, Choice.UNDO)  # may concern a whole scan
 _NO_PLACES: Mapping[str, tuple[float, float]] = {}
 
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """One line. point, kind: of the mark; "" for a pose. col_px, row_px: of `place`. fingerprint: of the result that
-    was looked at, and of `learn` the SHA-256 of the scan's file; window: what of it was seen, first column, first row,
-    width and height in px. px: of `learn`. when: ISO 8601. line: its number in the file, 0 of one that is in none."""
+    """One decision.
+
+    Attributes
+    ----------
+    image : name of the image.
+    decision : kind of decision.
+    point, kind : of the mark; "" for a pose.
+    col_px, row_px : place of the mark (`place`).
+    pose : of the scan (`pose`).
+    note, who : remark and person.
+    when : ISO 8601.
+    fingerprint : of the result that was reviewed; for `learn` SHA-256 of the scan's file.
+    window : part of the scan that was visible: first column, first row, width, height, px.
+    px : places of the marks by fiducial (`learn`).
+    line : number of the line in the file; 0 outside a file.
+    """
 
     image: str
     decision: Choice
@@ -71,7 +84,7 @@ class Decision:
 
     @property
     def subject(self) -> About:
-        """What of which scan it is about. A line that names no kind is about the fiducial."""
+        """(image, point, kind) that the decision is about. The default kind is a fiducial."""
         return self.image, self.point, self.kind or (KINDS[0] if self.point else "")
 
 
@@ -88,7 +101,7 @@ def decision_line(decision: Decision) -> str:
 
 
 class LineError(Exception):
-    """What is wrong in a line, as it goes on behind the line's number."""
+    """Error in a line; its text follows the line's number."""
 
     number: int
 
@@ -104,7 +117,7 @@ _read_json = json.JSONDecoder(parse_constant=_no_number).decode
 
 
 def is_cut_short(line: bytes) -> bool:
-    """Whether a line ends before its object does, as after a crash; a line with a typing error does not."""
+    """Whether a line ends within its JSON object, as after a crash, rather than having a typing error."""
     try:
         _read_json(line.decode("utf-8", "replace"))
     except json.JSONDecodeError as error:
@@ -116,7 +129,7 @@ def is_cut_short(line: bytes) -> bool:
 
 
 def decisions_of_lines(numbered: Sequence[tuple[int, bytes]]) -> list[Decision]:
-    """The decisions of lines, all lines at once, and one by one only where that fails: to name the line."""
+    """Decisions of lines, parsed all at once; one by one only after an error, to find its line."""
     numbers, lines = [number for number, _ in numbered], [line for _, line in numbered]
     if {line[:1] + line[-1:] for line in lines} == {b"{}"}:
         with suppress(ValueError, RecursionError, LineError):
@@ -141,7 +154,7 @@ def _json_object(line: bytes) -> Any:
 
 
 def _decisions(objects: Sequence[Any], numbers: Sequence[int]) -> list[Decision]:
-    """Objects of lines, checked key by key, each key for all lines that have the same keys and decide the same."""
+    """Decisions of JSON objects, checked by key for all objects with the same keys and kind of decision."""
     groups = defaultdict[tuple[str, ...], list[tuple[int, dict[str, Any]]]](list)
     for number, content in zip(numbers, objects, strict=True):
         if not isinstance(content, dict):
@@ -154,7 +167,7 @@ def _decisions(objects: Sequence[Any], numbers: Sequence[int]) -> list[Decision]
 
 
 def _decisions_alike(keys: Sequence[str], numbers: Sequence[int], objects: Sequence[dict[str, Any]]) -> list[Decision]:
-    """Decisions of one choice whose objects have these keys."""
+    """Decisions of one kind whose objects have the same keys."""
     for key in keys:
         if key not in _CHECKS:
             raise LineError(f"there is no such key.{did_you_mean(key, _CHECKS)} Known: {', '.join(_CHECKS)}.", key)
@@ -171,7 +184,7 @@ def _decisions_alike(keys: Sequence[str], numbers: Sequence[int], objects: Seque
         raise LineError(f"is of no use: {what} is of the whole scan. Take it out.", "point")
     values["line"] = numbers
     fixed = {"decision": choice, **_FIXED.get(choice, {"pose": "", "px": _NO_PLACES})}
-    decisions = [object.__new__(Decision) for _ in objects]  # the constructor takes most of the time of a million
+    decisions = [object.__new__(Decision) for _ in objects]  # for a million, the constructor takes most of the time
     for key, default in {**_DEFAULTS, **fixed, "line": 0}.items():
         column = values[key] if key in values and key not in fixed else repeat(default)
         deque(map(getattr(Decision, key).__set__, decisions, column), maxlen=0)
@@ -179,7 +192,7 @@ def _decisions_alike(keys: Sequence[str], numbers: Sequence[int], objects: Seque
 
 
 def _check_values(key: str, values: Sequence[Any]) -> Sequence[Any]:
-    """The values of a key in many lines. Each text is checked once, and held once."""
+    """Values of a key in many lines. Equal texts are checked once and share one object."""
     check = _CHECKS[key]
     if set(map(type, values)) != {str}:
         return [check(key, value) for value in values]
@@ -284,11 +297,11 @@ _DEFAULTS: Mapping[str, Any] = {
     **dict.fromkeys(("col_px", "row_px", "window")),
     "px": _NO_PLACES,
 }
-_FIXED: Mapping[Choice, Mapping[str, Any]] = {  # whatever a line says
+_FIXED: Mapping[Choice, Mapping[str, Any]] = {  # override the line's own values
     Choice.POSE: {"kind": "", "px": _NO_PLACES},
     Choice.LEARN: {"kind": LEARNED, "pose": ""},
 }
-_RULES: Mapping[str, tuple[Choice, tuple[str, ...]]] = {  # the choice, and the keys that it needs
+_RULES: Mapping[str, tuple[Choice, tuple[str, ...]]] = {  # kind of decision, and the keys that it requires
     "accept": (Choice.ACCEPT, ("image", "point")),
     "reject": (Choice.REJECT, ("image", "point")),
     "absent": (Choice.ABSENT, ("image", "point")),

@@ -1,7 +1,7 @@
-"""decisions.jsonl: what a person decided about marks and poses, one JSON object a line, the oldest first.
+"""decisions.jsonl: a person's decisions about marks and poses, one JSON object per line, the oldest first.
 
-The last line about a mark counts; an `undo` takes back the last one before it. Nothing is ever changed in the file: it
-only grows, so that who decided what, and when, can be seen for ever.
+The last line about a mark applies; an `undo` cancels the last one before it. Lines are only appended, never changed, so
+that the file keeps a record of who decided what, and when.
 """
 
 import gc
@@ -27,7 +27,7 @@ from pipeline.text.text_file import read_bytes
 
 try:
     import fcntl
-except ImportError:  # not every system has it
+except ImportError:  # not available on every system
     fcntl = None  # type: ignore[assignment]
 
 FILE = "decisions.jsonl"
@@ -39,14 +39,17 @@ _MOST_MB = 2000
 
 
 def read_decisions(path: Path) -> tuple[Decision, ...]:
-    """All of them; none where there is no such file. A last line that was cut short does not count, and
-    `cut_short_line` names it. Raises InputError naming the line."""
+    """All decisions of a file; none where there is no file.
+
+    A last line that was cut short is ignored; `cut_short_line` reports it. Raises InputError with the line that is
+    wrong.
+    """
     return parse_decisions(path, decisions_bytes(path))
 
 
 def decisions_bytes(path: Path, start: int = 0) -> bytes:
-    """The file as it stands, from a byte on, without lines that a process was ended over before all of them were
-    written; nothing where there is no file. Raises InputError for what is no file."""
+    """Content of the file from byte `start` on, without lines of an unfinished write; empty where there is no file.
+    Raises InputError for a folder."""
     try:
         with _locked(path):
             data, confirmed = read_bytes(path, _MOST_MB), _confirmed_bytes(path)
@@ -58,7 +61,7 @@ def decisions_bytes(path: Path, start: int = 0) -> bytes:
 
 
 def parse_decisions(path: Path, data: bytes, first_line: int = 1) -> tuple[Decision, ...]:
-    """The same of lines of the file, from one on. path: for messages."""
+    """Decisions of lines of the file. path: for messages; first_line: number of the first line."""
     decisions, start, number = list[Decision](), 0, first_line
     with _pause_garbage_collection():
         while start < len(data):
@@ -76,20 +79,24 @@ def parse_decisions(path: Path, data: bytes, first_line: int = 1) -> tuple[Decis
 
 
 def cut_short_line(data: bytes) -> int:
-    """The number of the last line of a file where that was cut short and does not count; else 0."""
+    """Number of a last line that was cut short and is ignored; 0 if there is none."""
     return data.count(b"\n") + 1 if is_cut_short(data[data.rfind(b"\n") + 1 :]) else 0
 
 
 def append_decisions(path: Path, decisions: Iterable[Decision]) -> None:
-    """Add lines, all or none of them, and return when they are on the disk.
+    """Append lines, all or none, and return when they are on the disk.
 
-    Raises InputError for a decision that would not be read again, before anything is written, and WriteError where
-    the lines cannot be written; then the file is as it was.
+    Raises
+    ------
+    InputError
+        A decision could not be read again; nothing is written.
+    WriteError
+        The lines cannot be written; the file is unchanged.
     """
     text = "".join(decision_line(decision) for decision in decisions)
     with writing(path), path.open("a+b") as file, _locked(path, exclusive=True):
         confirmed = _confirmed_bytes(path)
-        if confirmed is not None:  # a process was ended over its lines
+        if confirmed is not None:  # an earlier process ended before it had written all its lines
             file.truncate(confirmed)
         _end_last_line(file, path)
         size, journal = file.seek(0, os.SEEK_END), _journal_path(path)
@@ -106,7 +113,7 @@ def append_decisions(path: Path, decisions: Iterable[Decision]) -> None:
 
 
 def standing(decisions: Sequence[Decision]) -> Mapping[About, Decision]:
-    """The one that counts, by what it is about, the others and what was taken back left out."""
+    """{subject: decision that applies}, without superseded and undone ones."""
     stacks = dict[About, list[Decision]]()
     for decision in decisions:
         push_decision(stacks, decision)
@@ -114,7 +121,7 @@ def standing(decisions: Sequence[Decision]) -> Mapping[About, Decision]:
 
 
 def push_decision(stacks: dict[About, list[Decision]], decision: Decision) -> None:
-    """Add one to those about the same, by what they are about, or take the last of these back."""
+    """Push a decision onto the stack of its subject; an undo pops the last one."""
     stack = stacks.setdefault(decision.subject, [])
     if decision.decision is not Choice.UNDO:
         stack.append(decision)
@@ -123,13 +130,13 @@ def push_decision(stacks: dict[About, list[Decision]], decision: Decision) -> No
 
 
 def learned_from(decisions: Sequence[Decision], images: Collection[str]) -> Decision | None:
-    """By which the marks of a camera that has these images are learned: the last one that was made, and stands."""
+    """Last standing decision by which the marks of the camera with these images are learned; None if there is none."""
     own = [one for one in decisions if one.subject[2] == LEARNED and one.image in images]
     left = standing(own).values()
     return max(left, key=own.index, default=None)
 
 
-# --- writing: the size before the lines stands in a file beside them until all of them are on the disk
+# --- writing: the file's size before the new lines is kept in a file beside it until all lines are on the disk
 
 
 def _journal_path(path: Path) -> Path:
@@ -137,7 +144,7 @@ def _journal_path(path: Path) -> Path:
 
 
 def _confirmed_bytes(path: Path) -> int | None:
-    """How many bytes of the file count, where a process was ended over its lines; None: all."""
+    """Number of valid bytes after an unfinished write; None: all."""
     try:
         return int(_journal_path(path).read_bytes())
     except (OSError, ValueError):
@@ -146,7 +153,7 @@ def _confirmed_bytes(path: Path) -> int | None:
 
 @contextmanager
 def _locked(path: Path, exclusive: bool = False) -> Iterator[None]:
-    """While nobody else writes the file; where the file system has no locks, at once."""
+    """Lock the file; no lock where the file system has none."""
     with path.open("rb") as file:
         if fcntl is not None:
             with suppress(OSError):
@@ -155,14 +162,16 @@ def _locked(path: Path, exclusive: bool = False) -> Iterator[None]:
 
 
 def _truncate(path: Path, size: int) -> None:
-    """To what stood there before. What a buffer still holds is not written any more: it would be an error again."""
+    """Restore the earlier size, ignoring errors. Buffered data is not written: that would fail again."""
     with suppress(OSError):
         os.truncate(path, size)
 
 
 def _end_last_line(file: BinaryIO, path: Path) -> None:
-    """A line that somebody wrote without its end gets it; half a line goes. Raises InputError for any other line that
-    is none: with an end it would spoil all that is written behind it."""
+    """Complete the last line: add a missing line end, drop a line that was cut short.
+
+    Raises InputError for any other invalid line, since appended text would become part of it.
+    """
     size = file.seek(0, os.SEEK_END)
     file.seek(max(0, size - _LONGEST_LINE))
     data = file.read()
@@ -179,7 +188,7 @@ def _end_last_line(file: BinaryIO, path: Path) -> None:
 
 @contextmanager
 def _pause_garbage_collection() -> Iterator[None]:
-    """A million objects without any cycle are made in half the time."""
+    """Disable the garbage collector, which doubles the time of creating a million objects without cycles."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:

@@ -1,4 +1,4 @@
-"""An earlier calibration of a camera, `adjustment.json` with its covariance, as an observation of the present one."""
+"""Earlier calibration of a camera, `adjustment.json` with its covariance, as a correlated prior observation."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -24,16 +24,21 @@ Array = NDArray[np.float64]
 
 INTERIOR = ("c", "x0", "y0")
 
-_ALIKE = 1e-6  # two numbers that differ by less were only rounded
+_ALIKE = 1e-6  # relative difference of numbers that differ only by rounding
 _TOGETHER = "Take both files as one adjustment wrote them."
 
 
 @dataclass(frozen=True)
 class EarlierCalibration:
-    """What an earlier adjustment found of a camera, with the a-posteriori covariance.
+    """A-posteriori values of a camera from an earlier adjustment.
 
-    parameters: its camera's, which may have another name than the present one; values and covariance are theirs. held:
-    the values of what that adjustment held fixed.
+    Attributes
+    ----------
+    path : of adjustment.json.
+    distortion : its distortion model.
+    parameters : its n estimated parameters; its camera may have another name than the present one.
+    values, covariance : (n,) and (n, n) of these parameters.
+    held : values of parameters that it held fixed.
     """
 
     path: Path
@@ -48,7 +53,7 @@ class EarlierCalibration:
         return any(each.kind == "fiducial" for each in (*self.parameters, *self.held))
 
     def applied(self, camera: Camera) -> tuple[Camera, Calibration]:
-        """The camera without priors where the calibration takes their place, and the calibration for the network."""
+        """The camera, with priors removed where the calibration replaces them, and the calibration for the network."""
         here = tuple(each._replace(owner=camera.name) for each in self.parameters)
         given = dict(zip(here, self.values.tolist(), strict=True))
 
@@ -80,9 +85,9 @@ class EarlierCalibration:
 
 
 def read_calibration(sigma: Table, camera: Camera) -> EarlierCalibration | None:
-    """The earlier calibration that the table [sigma] of a camera file names; None where it names none.
+    """Earlier calibration that the table [sigma] of a camera file names; None where it names none.
 
-    Raises InputError where there is none of this camera, or of another lens model.
+    Raises InputError where the file has no calibration of this camera, or another lens model.
     """
     fiducials = sigma.flag("calibration_fiducials", True)
     if "calibration" not in sigma:
@@ -103,7 +108,7 @@ def read_calibration(sigma: Table, camera: Camera) -> EarlierCalibration | None:
 
 
 def _check_agreement(sigma: Table, path: Path, name: str, camera: CameraRecord, covariance: Covariance) -> None:
-    """Both files are to say the same of the camera: what the network takes is the covariance's."""
+    """Check that JSON and covariance file agree on the camera; the network uses the latter."""
     stored = _quantities(name, camera)
     listed = {each for each in covariance.parameters if each.kind in ("interior", "fiducial") and each.owner == name}
     for each in sorted(stored.keys() ^ listed):
@@ -129,7 +134,7 @@ def _check_agreement(sigma: Table, path: Path, name: str, camera: CameraRecord, 
 
 
 def _quantities(name: str, camera: CameraRecord) -> dict[Parameter, Quantity]:
-    """What adjustment.json says of a camera."""
+    """Quantities of a camera in adjustment.json."""
     quantities = {Parameter.interior(name, key): quantity for key, quantity in camera.interior.items()}
     for id, mark in camera.fiducials.items():
         quantities[Parameter.fiducial(name, id, "x")], quantities[Parameter.fiducial(name, id, "y")] = (
@@ -140,7 +145,7 @@ def _quantities(name: str, camera: CameraRecord) -> dict[Parameter, Quantity]:
 
 
 def _no_covariance(parameters: Sequence[Parameter], matrix: Array) -> str:
-    """Why a matrix is none of covariances, and where; "" where it is one."""
+    """Why a matrix is not a covariance matrix, and where; "" if it is one."""
     finite = np.isfinite(matrix)
     known = np.where(finite, matrix, 0.0)
     variance = np.clip(np.diag(known), 0.0, None)
@@ -160,7 +165,7 @@ def _no_covariance(parameters: Sequence[Parameter], matrix: Array) -> str:
 
 
 def _find_camera(sigma: Table, path: Path, content: AdjustmentRecord, name: str) -> str:
-    """The camera of that name; where the file has just one, that one."""
+    """Name of the camera in the file: the given one, or the file's only camera."""
     names = list(content.cameras)
     if name not in names and len(names) != 1:
         raise sigma.error(
@@ -208,8 +213,9 @@ def _calibration(
 
 
 def _check_held(sigma: Table, earlier: EarlierCalibration, camera: Camera) -> None:
-    """What the earlier adjustment held fixed must be fixed at the same value: the rest is right for that one only."""
-    given: dict[tuple[str, str], Prior | None] = {  # by the id of a fiducial, and the quantity
+    """Check that parameters held fixed by the earlier adjustment are fixed at the same values here: its other values
+    are conditional on them."""
+    given: dict[tuple[str, str], Prior | None] = {  # by fiducial id and quantity
         ("", "c"): camera.principal_distance_mm,
         ("", "x0"): camera.x0_mm,
         ("", "y0"): camera.y0_mm,

@@ -1,4 +1,4 @@
-"""images.csv: exterior orientations, approximate or observed, the camera and the scanner of each image."""
+"""images.csv: exterior orientations (approximate or observed), camera and scanner of each image."""
 
 import csv
 import io
@@ -20,17 +20,23 @@ from pipeline.text.text_file import read_bytes
 ELEMENTS = ("X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg")
 SIGMAS = tuple(f"s{element}" for element in ELEMENTS)
 _FURTHER = ("camera", "scanner", "part_of", "page", "window", "turned_deg")
-WRITTEN = ("run", "frame", "date", "time", "height", "scale", "camera_number")  # what may be read on the film
+WRITTEN = ("run", "frame", "date", "time", "height", "scale", "camera_number")  # columns for the writing on the film
 
 
 @dataclass(frozen=True)
 class GivenImages:
-    """By image name: exterior orientation (None where the line gives none), the camera file's name and the scanner's
-    ("" where none), and the frame of which it is one of several overlapping scans ("" where it is the only one): such
-    parts have the orientation that one of their lines gives. cuts: the page and the window of a scan's file that the
-    image is, where a line says either. turned_deg: by how much a digital picture was turned counter-clockwise, where it
-    was. asks_writing: whether there is a column for what may be
-    read on the film."""
+    """Content of images.csv, by image name.
+
+    Attributes
+    ----------
+    exterior : exterior orientation; None where the line gives none. All parts of a frame have the one given at any of
+        them.
+    camera, scanner : names of the camera file and the scanner; "" where none is given.
+    asks_writing : whether there is a column for writing on the film.
+    turned_deg : counter-clockwise rotation of a digital image, where it was rotated.
+    part_of : frame of which the scan is one of several overlapping parts; "" for a whole frame.
+    cuts : page and window of the scan's file, where either is given.
+    """
 
     exterior: Mapping[str, Exterior | None]
     camera: Mapping[str, str]
@@ -41,14 +47,14 @@ class GivenImages:
     cuts: Mapping[str, tuple[int | None, Window | None]] = field(default_factory=dict)
 
     def frame_parts(self, frame: str) -> tuple[str, ...]:
-        """The scans of a frame that was scanned in parts, in the order of their names."""
+        """Scans of a frame that was scanned in parts, sorted by name."""
         return tuple(sorted(image for image, whole in self.part_of.items() if whole and whole == frame))
 
 
 def read_images(path: Path, antenna: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> GivenImages:
-    """Read images.csv. An image may be named with or without its file's ending. Raises InputError naming the line.
+    """Read images.csv. Images may be named with or without the file's ending. Raises InputError with the line.
 
-    antenna: the offset of the point whose X0, Y0, Z0 are given from the projection centre, as in `Exterior`.
+    antenna: offset of the point with the given X0, Y0, Z0 from the projection centre, as in `Exterior`.
     """
     exterior: dict[str, Exterior | None] = {}
     camera, scanner, part_of, cuts, asks_writing = {}, {}, {}, dict[str, tuple[int | None, Window | None]](), False
@@ -101,8 +107,8 @@ def _window(row: Row) -> Window | None:
 def _join(
     path: Path, exterior: dict[str, Exterior | None], camera: Mapping[str, str], part_of: Mapping[str, str]
 ) -> None:
-    """Give all parts of a frame its orientation. Raises InputError where parts contradict each other, or a frame has
-    one part only."""
+    """Copy the orientation of a frame to all its parts. Raises InputError where parts contradict each other, or a frame
+    has only one part."""
     for frame in sorted({frame for frame in part_of.values() if frame}):
         parts = [image for image in part_of if part_of[image] == frame]
         if len(parts) == 1:
@@ -125,8 +131,8 @@ def _join(
 
 
 def fill_images(path: Path, values: Mapping[str, Mapping[str, str]]) -> None:
-    """Write values by image and column into the cells of images.csv that are empty, and leave all else as it stands.
-    Raises InputError where the file cannot be read or written."""
+    """Fill empty cells of images.csv with values by image and column; everything else stays unchanged. Raises
+    InputError where the file cannot be read or written."""
     text = read_bytes(path).decode("utf-8")
     lines = text.splitlines(keepends=True)
     header: list[str] = []

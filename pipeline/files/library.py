@@ -1,4 +1,4 @@
-"""The camera library: camera files of typical cameras that come with the program, named as `library:NAME`."""
+"""Camera library: files of common cameras that come with the program, named as `library:NAME`."""
 
 from pathlib import Path
 from typing import Any
@@ -18,12 +18,12 @@ Json = dict[str, Any]
 
 
 def camera_path(text: str, folder: Path) -> Path:
-    """The file of a camera that a project names: `library:NAME`, or a path relative to the folder."""
+    """File of a camera that a project names: `library:NAME`, or a path relative to the folder."""
     return library_path(text.removeprefix(PREFIX)) if text.startswith(PREFIX) else folder / text
 
 
 def library_path(name: str) -> Path:
-    """The file of one camera of the library. Raises InputError with the names near to a misspelt one."""
+    """File of a camera of the library. Raises InputError with names similar to a misspelt one."""
     names = library_names()
     if name not in names:
         plain = name.casefold().replace(" ", "-").replace("_", "-")
@@ -38,12 +38,12 @@ def library_names() -> tuple[str, ...]:
 
 
 def read_library() -> dict[str, CameraFile]:
-    """Every camera of the library, by name."""
+    """All cameras of the library, by name."""
     return {name: read_camera(library_path(name)) for name in library_names()}
 
 
 def camera_words(camera: CameraFile) -> str:
-    """What tells a camera from others: frame, principal distance, marks, and what its figures rest on."""
+    """Text that distinguishes a camera: frame, principal distance, marks, source of its numbers."""
     frame_mm = " x ".join(f"{side:g}" for side in camera.frame_mm or ())
     corners = sum(abs(x) > 0.5 * abs(y) and abs(y) > 0.5 * abs(x) for x, y in (one.xy_mm for one in camera.fiducials))
     sides = len(camera.fiducials) - corners
@@ -57,7 +57,7 @@ def library_json() -> list[Json]:
 
 
 def print_library(console: Console) -> None:
-    """The library for a person: a line a camera, a source line a kind of camera, and how to use one."""
+    """Print the library: one line per camera, one source per kind of camera, and how to use one."""
     table, widest = Table(box=None, pad_edge=False), max(map(len, library_names()))
     for heading in ("camera", "frame, mm", "c, mm", "marks", "shape", "reports"):
         table.add_column(heading, no_wrap=True, min_width=widest if heading == "camera" else None)

@@ -1,4 +1,4 @@
-"""Fiducial marks in a camera file: drawn ones, templates with their pictures, and what is said of learned ones."""
+"""Fiducial marks in a camera file: drawn marks, templates with their images, and learned marks."""
 
 import dataclasses
 import io
@@ -38,11 +38,11 @@ from pipeline.text.wording import numbers, quoted
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint16]
-Picture01 = Array | None  # values between 0 and 1 of the pixels of a template
+Picture01 = Array | None  # pixels of a template, values between 0 and 1
 SavePicture = Callable[[str, Picture], str]
 
 _FULL = 65535
-_ANY_CORNER = (-1.0, -1.0)  # which one it is says the fiducial's place
+_ANY_CORNER = (-1.0, -1.0)  # placeholder: the fiducial's place determines the quadrant
 
 
 def _vertices(table: Table, key: str) -> tuple[Point, ...]:
@@ -60,9 +60,14 @@ VERTICES = Key("list of [x, y]", _vertices)
 
 @dataclasses.dataclass(frozen=True)
 class Clicks:
-    """Where somebody saw the marks in one scan: px by fiducial, column and row.
+    """Clicked places of the marks in one scan.
 
-    sha256: of the scan's file, as it was then, and who saw them; "" where the camera's file says it.
+    Attributes
+    ----------
+    scan : image name.
+    px : column and row by fiducial.
+    sha256 : of the scan's file when it was clicked; "" where the camera file has the clicks.
+    who : the person; "" where the camera file has the clicks.
     """
 
     scan: str
@@ -73,9 +78,17 @@ class Clicks:
 
 @dataclass(frozen=True, config=TABLE)
 class LearnedFrom:
-    """[learned_from] of a camera file: the scan whose pictures the learned marks were first found by, the SHA-256 of
-    its file, the pose in which it lies, and whether clicks show that. alike: the scans that lie like it: itself; and
-    all that were there, where the marks were found by recurring in one place."""
+    """[learned_from] of a camera file.
+
+    Attributes
+    ----------
+    scan : scan from which the first templates were cut.
+    sha256 : of its file.
+    pose : scan orientation.
+    clicked : whether the pose is known from clicks.
+    alike : scans in the same orientation: the scan itself, or all scans where the marks were found by recurring in one
+        place.
+    """
 
     scan: Annotated[str, TEXT]
     sha256: Annotated[str, TEXT]
@@ -86,14 +99,14 @@ class LearnedFrom:
 
 @dataclasses.dataclass(frozen=True)
 class Drawing:
-    """A mark as drawn; is_radial: whether it is turned with its place."""
+    """Drawn mark. is_radial: whether it is rotated with its place."""
 
     mark: shapes.Mark | shapes.LearnedMark
     is_radial: bool
 
 
 def read_clicks(table: Table, learned: Sequence[str]) -> Clicks:
-    """learned: the fiducials to be learned. Raises InputError where some of them are not clicked."""
+    """Read clicks on learned marks. Raises InputError where some of them are not clicked."""
     scan = image_name(table.text("scan"))
     places = table.table("px")
     px = {id: places.pair(id) for id in learned if id in places}
@@ -107,13 +120,13 @@ def read_clicks(table: Table, learned: Sequence[str]) -> Clicks:
     return Clicks(scan, px)
 
 
-# A mark's template in a camera file, and the pictures beside it: `[mark.NAME]` of kind "template".
+# Template of a mark in a camera file, with its images in files beside it: `[mark.NAME]` of kind "template".
 #
-# What was learned from scans stands in `[mark.NAME.learned]`: a chip that somebody cut out has none of it.
+# `[mark.NAME.learned]` holds what was learned from scans; a manually cut chip has no such table.
 
 
 def picture_writer(folder: Path, prefix: str = "") -> SavePicture:
-    """What stores pictures in a folder, their names beginning with the prefix."""
+    """Function that stores images in a folder, under names that begin with the prefix."""
 
     def save(name: str, picture: Picture) -> str:
         file = f"{prefix}{name}.tif"
@@ -124,7 +137,7 @@ def picture_writer(folder: Path, prefix: str = "") -> SavePicture:
 
 
 def picture_file(picture: Picture) -> bytes:
-    """A picture as the TIFF file that `picture_writer` stores."""
+    """Image as the content of the TIFF file that `picture_writer` stores."""
     import tifffile
 
     file = io.BytesIO()
@@ -133,7 +146,7 @@ def picture_file(picture: Picture) -> bytes:
 
 
 def template_lines(template: MarkTemplate, name: str, save: SavePicture) -> list[str]:
-    """The table [mark.NAME]. save(name, picture) stores a picture and returns its path there."""
+    """Lines of the table [mark.NAME]. save(name, picture) stores an image and returns its path there."""
     least, range_dn = float(template.image.min()), float(np.ptp(template.image))
     image = save(name, _picture((template.image - least) / (range_dn or 1.0)))
     lines = ['kind = "template"', f"image = {quoted(image)}", f"pitch_um = {template.pitch_um!r}"]
@@ -158,17 +171,17 @@ def _learned_lines(template: MarkTemplate, range_dn: float, name: str, save: Sav
 
 
 def _picture(shares: NDArray[np.float64] | NDArray[np.bool_]) -> Picture:
-    """Of values between 0 and 1."""
+    """16-bit image of values between 0 and 1."""
     return np.asarray(np.rint(np.asarray(shares, float) * _FULL), np.uint16)
 
 
 def read_template(table: Table) -> MarkTemplate:
-    """Raises InputError naming the key that is wrong."""
+    """Read a template. Raises InputError with the key that is wrong."""
     return read_model(table, TemplateTable).mark(table)
 
 
 def read_marks(table: Table) -> dict[str, Drawing]:
-    """Every drawn mark by name. Raises InputError naming the key that is wrong."""
+    """Read all drawn marks by name. Raises InputError with the key that is wrong."""
     marks = {}
     for name in table.names():
         entry = table.table(name)
@@ -179,7 +192,7 @@ def read_marks(table: Table) -> dict[str, Drawing]:
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
 class MarkTable(ABC):
-    """What every table [mark.NAME] has."""
+    """Keys of every table [mark.NAME]."""
 
     kind: Annotated[str, TEXT] = Field(description="Shape of the mark.")
     rotate: Annotated[str, choice("none", "radial")] = Field(
@@ -188,12 +201,12 @@ class MarkTable(ABC):
 
     @abstractmethod
     def mark(self, table: Table) -> shapes.Mark | shapes.LearnedMark:
-        """The mark. table: for messages."""
+        """Mark of the table. table: for messages."""
 
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
 class LearnedTable(MarkTable):
-    """A mark that is to be learned from the scans."""
+    """Mark to be learned from the scans."""
 
     size_mm: Annotated[float, POSITIVE] = Field(description="Width of the template.")
 
@@ -203,7 +216,7 @@ class LearnedTable(MarkTable):
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
 class PaintedTable(MarkTable):
-    """A mark that is lighter or darker than its ground."""
+    """Mark that is lighter or darker than its background."""
 
     polarity: Annotated[shapes.Polarity, choice("auto", "light", "dark")] = Field(
         default="auto", description="Whether the mark is lighter than its background."
@@ -212,7 +225,7 @@ class PaintedTable(MarkTable):
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
 class FrameCornerTable(PaintedTable):
-    """Where two edges of the exposed frame meet."""
+    """Corner of the exposed frame."""
 
     reach_mm: Annotated[float, NOT_NEGATIVE] = Field(
         default=0.0, description="How far along its edges it is measured; 0: a sixth of half the frame."
@@ -229,7 +242,7 @@ class FrameCornerTable(PaintedTable):
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
 class LearnedPicture:
-    """[mark.NAME.learned]: what the scans told of a template, as the program writes it."""
+    """[mark.NAME.learned]: properties of a template estimated from scans, as the program writes them."""
 
     size_mm: Annotated[float, POSITIVE]
     range_dn: Annotated[float, POSITIVE]
@@ -243,7 +256,7 @@ class LearnedPicture:
     )
 
     def applied(self, template: MarkTemplate, table: Table) -> MarkTemplate:
-        """The template with what the scans told of it."""
+        """Template with its learned properties."""
         for key, values in (("steadiness", self.steadiness), ("steady", self.steady)):
             if values is not None and values.shape != template.image.shape:
                 px = template.image.shape[::-1]
@@ -277,7 +290,7 @@ def _image(table: Table, key: str) -> Array:
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
 class TemplateTable(PaintedTable):
-    """A chip cut from a scan."""
+    """Chip cut from a scan."""
 
     image: Annotated[Array, Key("path", _image)] = Field(description="The chip.")
     pitch_um: Annotated[float, POSITIVE] = Field(description="Of its pixels.")
@@ -307,7 +320,7 @@ class TemplateTable(PaintedTable):
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
 class DrawnTable(PaintedTable):
-    """A mark drawn by its sizes."""
+    """Mark drawn by its dimensions."""
 
     true_mm: Annotated[tuple[Point, Point] | None, Key("[[x, y], [x, y]]", lambda table, key: _true_mm(table))] = Field(
         default=None, description="Corners of the rectangle in which the drawing is true; absent: everywhere."
@@ -318,7 +331,7 @@ class DrawnTable(PaintedTable):
 
     @abstractmethod
     def parts(self, table: Table) -> tuple[shapes.Part, ...]:
-        """The simple shapes of the mark. table: for messages."""
+        """Primitive shapes of the mark. table: for messages."""
 
 
 def _true_mm(table: Table) -> tuple[Point, Point]:
@@ -331,7 +344,7 @@ def _true_mm(table: Table) -> tuple[Point, Point]:
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
 class DotTable(DrawnTable):
-    """A disk."""
+    """Disk."""
 
     radius_mm: Annotated[float, POSITIVE] = Field(description="Of the disk.")
 
@@ -341,7 +354,7 @@ class DotTable(DrawnTable):
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
 class RingTable(DrawnTable):
-    """A mark with a ring."""
+    """Mark with a ring."""
 
     ring_mm: Annotated[float, POSITIVE] = Field(description="Mean radius of the ring.")
     ring_line_mm: Annotated[float, POSITIVE] = Field(description="Width of the ring.")
@@ -349,7 +362,7 @@ class RingTable(DrawnTable):
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
 class RingDotTable(RingTable, DotTable):
-    """A disk in a ring."""
+    """Disk in a ring."""
 
     def parts(self, table: Table) -> tuple[shapes.Part, ...]:
         return shapes.ring_dot(self.ring_mm, self.ring_line_mm, self.radius_mm)
@@ -357,7 +370,7 @@ class RingDotTable(RingTable, DotTable):
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
 class CrossTable(DrawnTable):
-    """A cross."""
+    """Cross."""
 
     arm_mm: Annotated[float, POSITIVE] = Field(description="Half its length.")
     line_mm: Annotated[float, POSITIVE] = Field(description="Width of its bars.")
@@ -368,7 +381,7 @@ class CrossTable(DrawnTable):
         return shapes.cross(*self.sizes(table))
 
     def sizes(self, table: Table) -> tuple[float, float, float, float]:
-        """Arm, line, gap and angle. table: for messages."""
+        """Arm, line width, gap (mm) and angle (deg). table: for messages."""
         if self.gap_mm >= self.arm_mm:
             message = f"must be smaller than arm_mm ({self.arm_mm:g}), not {self.gap_mm:g}: no arm would be left."
             raise table.error("gap_mm", message)
@@ -377,7 +390,7 @@ class CrossTable(DrawnTable):
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
 class RingCrossTable(RingTable, CrossTable):
-    """A cross in a ring."""
+    """Cross in a ring."""
 
     def parts(self, table: Table) -> tuple[shapes.Part, ...]:
         return shapes.ring_cross(self.ring_mm, self.ring_line_mm, *self.sizes(table))
@@ -385,7 +398,7 @@ class RingCrossTable(RingTable, CrossTable):
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
 class PolygonTable(DrawnTable):
-    """A wedge, notch or wing."""
+    """Wedge, notch or wing."""
 
     vertices_mm: Annotated[tuple[Point, ...], VERTICES] = Field(description="Corners in the order of the outline.")
 
@@ -395,7 +408,7 @@ class PolygonTable(DrawnTable):
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
 class PartsTable(DrawnTable):
-    """Disks, rings, bars and polygons together."""
+    """Combination of disks, rings, bars and polygons."""
 
     part: Annotated[tuple[shapes.Part, ...], Key("tables", lambda table, key: _parts(table))] = Field(
         description="The simple shapes, one table each."

@@ -1,4 +1,4 @@
-"""A camera in a file of cv2.FileStorage: matrix, distortion and size of its pictures, in pixels."""
+"""Read a camera from a file of cv2.FileStorage: camera matrix, distortion and image size, in pixels."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ from pipeline.errors import InputError
 from pipeline.text.text_file import read_bytes
 from pipeline.types import Array
 
-FISHEYE = "fisheye"  # of cv2.fisheye, as ROS and others call the key and the model ("equidistant" too)
-COVARIANCE = "intrinsics_covariance"  # of fx, fy, cx, cy and the distortion coefficients, in camera.yaml
+FISHEYE = "fisheye"  # model of cv2.fisheye, also called "equidistant", and the key that ROS and others use
+COVARIANCE = "intrinsics_covariance"  # key in camera.yaml: covariance of fx, fy, cx, cy and the distortion coefficients
 MOST_MB = 4
 _MATRIX = ("camera_matrix", "K", "Camera_Matrix", "cameraMatrix", "M1")
 _LENS = ("distortion_coefficients", "D", "Distortion_Coefficients", "distCoeffs", "D1")
@@ -23,8 +23,16 @@ _WIDTH, _HEIGHT = ("image_width", "image_Width"), ("image_height", "image_Height
 
 @dataclass(frozen=True, eq=False)
 class PixelCamera:
-    """fx, fy, cx, cy (4,); distortion: by the names of a family, without zeros at the end; size_px: None if unknown;
-    covariance: of the four and the distortion's first coefficients, None if the file has none."""
+    """Camera in pixels.
+
+    Attributes
+    ----------
+    interior_px : fx, fy, cx, cy.
+    family : distortion model.
+    distortion : values by parameter, without trailing zeros.
+    size_px : width and height of the images; None if unknown.
+    covariance : of fx, fy, cx, cy and the first distortion coefficients; None if the file has none.
+    """
 
     interior_px: tuple[float, float, float, float]
     family: str
@@ -34,7 +42,8 @@ class PixelCamera:
 
 
 def read_pixel_camera(path: Path) -> tuple[PixelCamera, Any]:
-    """The camera of a YAML, XML or JSON file, and the file's storage, for what else it holds. Raises InputError."""
+    """Read the camera of a YAML, XML or JSON file; also return the file's storage, for its other content. Raises
+    InputError."""
     try:
         text = read_bytes(path, MOST_MB).decode("utf-8")
         storage: Any = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
@@ -59,7 +68,7 @@ def _pixel_camera(path: Path, storage: Any) -> PixelCamera:
     values = np.zeros(0) if lens is None else np.ravel(lens.mat()).astype(float)
     is_fisheye = storage.getNode("distortion_model").string() in (FISHEYE, "equidistant")
     family = "opencv_fisheye" if is_fisheye else "opencv"
-    names = parameter_names(family)[:-2]  # without b1 and b2, which are in the matrix
+    names = parameter_names(family)[:-2]  # b1 and b2 are part of the matrix
     if values.size > len(names) or not (np.isfinite([*values, *k.ravel()]).all() and k[0, 0] > 0.0):
         raise InputError(f"{path}: the camera matrix and up to {len(names)} distortion values are to be finite.")
     covariance, count = storage.getNode(COVARIANCE), 4 + values.size

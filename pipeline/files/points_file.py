@@ -1,4 +1,4 @@
-"""points.csv, with the normals of disks where they are known, and distances.csv."""
+"""points.csv, with normals of disks where they are known, and distances.csv."""
 
 import math
 from collections.abc import Mapping
@@ -21,14 +21,15 @@ COLUMNS = ("from", "to", "distance", "sigma")
 
 @dataclass(frozen=True)
 class GivenPoints:
-    """Object points in the user's unit, by their ids; normals (3,) of unit length for the disks that have one."""
+    """Object points in the user's unit, sorted by id, and unit normals (3,) of disks by id, where they are given."""
 
     points: tuple[ObjectPoint, ...]
     normals: Mapping[str, NDArray[np.float64]]
 
 
 def read_points(path: Path) -> GivenPoints:
-    """Read points.csv. Raises InputError naming the line: a duplicated point, a sigma without a value, no number."""
+    """Read points.csv. Raises InputError with the line of a repeated point, a sigma without a value, or an invalid
+    number."""
     points: dict[str, ObjectPoint] = {}
     lines: dict[str, int] = {}
     normals = {}
@@ -45,13 +46,14 @@ def read_points(path: Path) -> GivenPoints:
             normals[id] = normal
     if not points:
         raise InputError(f"{path}: holds no point, only a header.")
-    # Not as they stand in the file: sums, random draws and which target has a disk fitted first go by this order, and
-    # no digit of a result should.
+    # Sorted, so that results do not depend on the order in the file: sums, random draws and the order of disk fits
+    # follow it.
     return GivenPoints(tuple(points[id] for id in sorted(points)), normals)
 
 
 def _coordinate(row: Row, axis: str) -> Prior | None:
-    """0 fixes, a blank sigma frees, a blank coordinate is unknown; without the sigma's column the value is fixed."""
+    """Prior of a coordinate. A sigma of 0 fixes it, a blank sigma frees it, a blank coordinate is unknown. Without a
+    sigma column the value is fixed."""
     value, sigma = row.number(axis), row.sigma(f"s{axis}")
     if value is None:
         if sigma is not None:
@@ -75,14 +77,14 @@ def _normal(row: Row) -> NDArray[np.float64] | None:
 
 @dataclass(frozen=True)
 class GivenDistance:
-    """A distance and its line in the file, for messages."""
+    """Distance and its line in the file, for messages."""
 
     distance: Distance
     row: Row
 
 
 def read_distances(path: Path) -> tuple[GivenDistance, ...]:
-    """Read distances.csv, in the unit of the object coordinates. Raises InputError naming line and column."""
+    """Read distances.csv, in the unit of the object coordinates. Raises InputError with line and column."""
     distances = tuple(GivenDistance(_distance(row), row) for row in read_csv(path, COLUMNS))
     if not distances:
         raise InputError(f"{path}: holds no distance, only a header.")

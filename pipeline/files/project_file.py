@@ -35,28 +35,35 @@ if TYPE_CHECKING:
     from measure.scans.scan import Scan
     from pipeline.files.taking_lens import CalibratedLens
 
-ASSUMED_PITCH_UM = 5.0  # of digital cameras where nobody says it: results are in pixels, and it cancels
-DEFAULT_SCANNER = "1"  # the name of that of all images that name none
+ASSUMED_PITCH_UM = 5.0  # for digital cameras of unknown pitch: results are in pixels, so it cancels
+DEFAULT_SCANNER = "1"  # scanner of all images that name none
 
 
 @dataclasses.dataclass(frozen=True)
 class Project:
-    """A project file as read; paths are resolved against the file's folder.
+    """Content of a project file; paths are resolved against the file's folder.
 
-    cameras: by file name; the first one serves where images.csv names none. scans: by image name, in their order;
-    left_out: the images that `exclude` leaves out.
-    tone: the curve of the scans: auto, one of TONES, or the power of the grey value that light grows as.
-    unit_mm: how many mm the user's unit of object coordinates has. max_pixels: of a scan, if the user says it.
-    decisions: that a person made about marks and poses, the oldest first. decisions_hash: SHA-256 of their file, ""
-    where there are none. decisions_cut_short: the number of their last line where that was cut short and does not
-    count, else 0.
-    board_bend_sigma: of how far the middle of the board, which is all object points, stands off its plane, in the
-    user's unit; 0 flat, inf unknown.
-    transparent: whether a flat field of object points can be seen from both sides.
-    crs: what the object coordinates are, as "EPSG:25832"; empty where nobody says it.
-    writing: in which scans is read what is written about the frame, as in `FiducialOptions`.
-    missing_camera: the default camera's file where it is still to be drawn; then there are no cameras.
-    lens: of the digital camera that photographed the film, None where a scanner scanned it.
+    Attributes
+    ----------
+    cameras : by file name; the first one is the default where images.csv names none.
+    scans : by image name, in their order.
+    comparator, output : comparator.csv and the folder of the results.
+    pitch_um : pixel pitch of the scans; None: from the files.
+    pose : scan orientation.
+    tone : tone curve of the scans: auto, one of TONES, or the exponent of the grey value that is proportional to light.
+    unit_mm : user's unit of object coordinates, mm.
+    max_pixels : limit for a scan, if the user states one.
+    writing : scans in which the writing about the frame is read, as in `FiducialOptions`.
+    left_out : images that `exclude` leaves out.
+    crs : coordinate reference system, as "EPSG:25832"; empty if not stated.
+    board_bend_sigma : standard deviation of the board's middle off its plane, user's unit, for a board that holds all
+        object points; 0: flat, inf: unknown.
+    transparent : whether a flat field of object points is visible from both sides.
+    decisions : review decisions about marks and poses, the oldest first.
+    decisions_hash : SHA-256 of their file; "" where there are none.
+    decisions_cut_short : number of a last line that was cut short and is ignored; else 0.
+    missing_camera : default camera's file where it has yet to be drawn; then there are no cameras.
+    lens : of the digital camera that photographed the film; None for film that was scanned.
     """
 
     path: Path
@@ -88,35 +95,35 @@ class Project:
     lens: "CalibratedLens | None" = None
 
     def open_scan(self, name: str) -> "Scan":
-        """The scan of an image. Raises MeasurementError where it cannot be read."""
+        """Open the scan of an image. Raises MeasurementError where it cannot be read."""
         from measure.scans.opening import open_scan
 
         return open_scan(self.scans[name], self.max_pixels)
 
     @property
     def reads(self) -> Reads:
-        """In which scans writing is read: in all where images.csv asks for what it says, unless the user forbids it."""
+        """Scans in which writing is read: all if images.csv has a column for it, unless the user forbids it."""
         is_requested = self.given_images is not None and self.given_images.asks_writing
         return "all" if is_requested and self.writing == "pose" else self.writing
 
     @property
     def film(self) -> BelievedFilm:
-        """What film and scanner scatter a mark by, and how film is deformed, as the project says it, or else as it is
-        believed of any film."""
+        """Standard deviation of film and scanner and film deformation model: stated by the project, or default
+        values."""
         stated_mm, model = self.adjust.film_sigma_um / 1000.0, self.adjust.transformation or ANY_FILM.model
         return BelievedFilm(stated_mm or ANY_FILM.sigma_mm, bool(stated_mm), model, self.lens)
 
     @property
     def list_pitch_um(self) -> tuple[float, float] | None:
-        """Of a pixel of a comparator.csv that gives no mm: as the project says; assumed for digital cameras, of which
-        results are in pixels; None of film, and where a camera file gives lengths in mm."""
+        """Pixel pitch for a comparator.csv without mm: that of the project; assumed for digital cameras, whose results
+        are in pixels; None for film, and where a camera file gives lengths in mm."""
         in_mm = any(each.fiducials or each.principal_distance_mm or each.frame_mm for each in self.cameras.values())
         is_digital = self.adjust.transformation in (None, "none") and not in_mm
         return self.pitch_um or ((ASSUMED_PITCH_UM, ASSUMED_PITCH_UM) if is_digital else None)
 
     @property
     def title(self) -> str:
-        """The project's folder, unless the project file has a name of its own."""
+        """Name of the project's folder, or of the project file unless it is called project.toml."""
         name = self.path.resolve().parent.name if self.path.stem == "project" else self.path.stem
         return name.encode("utf-8", "replace").decode("utf-8")
 
@@ -145,7 +152,7 @@ class Project:
         return self.output / "thumbnails.db"
 
     def shard_path(self, part: int, parts: int) -> Path:
-        """The store of one of several parts of the scans."""
+        """Results database of one of several parts of the scans."""
         return self.output / f"measurement.{part}-of-{parts}.db"
 
     @property
@@ -157,12 +164,12 @@ class Project:
         return self.output / "report.html"
 
     def frame_page_path(self, image: str) -> Path:
-        """The page of one image, in folders as its name has them. Raises InputError for a name that is no path."""
+        """HTML page of one image, in folders as in its name. Raises InputError for a name that is not a valid path."""
         return path_below(self.output / "frames", image, ".html")
 
     @property
     def results(self) -> tuple[Path, ...]:
-        """What the program may write: an earlier result at most may stand there."""
+        """Files that the program may write; only its own earlier results may exist there."""
         stores = (self.measurement_path, self.thumbnails_path)
         measured = (self.comparator, *stores, self.frames_path) if self.scans else ()
         adjusted = (self.adjustment_path, covariance_path(self.adjustment_path), self.check_path, self.choice_path)
@@ -170,24 +177,24 @@ class Project:
 
     @property
     def unit(self) -> str:
-        """The user's unit of object coordinates."""
+        """User's unit of object coordinates."""
         return next(name for name, mm in UNITS_MM.items() if mm == self.unit_mm)
 
     @property
     def disk_radius(self) -> float:
-        """The radius of the disk targets in the unit of the object coordinates; 0 where nothing is said of it."""
+        """Radius of the disk targets in object units; 0 if unknown."""
         diameter = self.targets.diameter_mm if self.targets else None
         return 0.0 if diameter is None else diameter / 2.0 / self.unit_mm
 
     @property
     def target_radius(self) -> float:
-        """That of the disks, or half the length of the crosses, in the unit of the object coordinates."""
+        """Radius of the disks, or half the length of the crosses, in object units."""
         arm = self.targets.arm_mm if self.targets else None
         return self.disk_radius if arm is None else arm / self.unit_mm
 
     @cached_property
     def object_points(self) -> Mapping[str, ObjectPoint]:
-        """The points of points.csv, or else those of the board, by id."""
+        """Object points of points.csv, or else of the board, by id."""
         if self.given_points is not None:
             return {point.id: point for point in self.given_points.points}
         if self.targets is None or self.targets.board is None:
@@ -205,34 +212,37 @@ class Project:
         return self.cameras[name] if name else self.default_camera
 
     def scanned_frame(self, image: str) -> str:
-        """The frame of which an image is one of several scans, "" where it is the only one."""
+        """Frame of which an image is one of several scans; "" for a whole frame."""
         return self.given_images.part_of.get(image, "") if self.given_images else ""
 
     def turned_deg(self, image: str) -> int:
-        """By how much a digital picture was turned counter-clockwise against the sensor."""
+        """Counter-clockwise rotation of a digital image relative to the sensor."""
         return self.given_images.turned_deg.get(image, 0) if self.given_images else 0
 
     @property
     def has_parts(self) -> bool:
-        """Whether a frame was scanned in several parts."""
+        """Whether any frame was scanned in several parts."""
         return self.given_images is not None and any(self.given_images.part_of.values())
 
     def image_scanner(self, image: str) -> str:
-        """The name of the scanner of an image; all images that name none are of one."""
+        """Scanner of an image; all images that name none share one."""
         return (self.given_images.scanner.get(image, "") if self.given_images else "") or DEFAULT_SCANNER
 
 
 def read_project(path: Path) -> Project:
-    """Read project.toml and the camera, points, images and distances files it names.
+    """Read project.toml and the camera, points, images and distances files that it names.
 
-    Raises InputError with file, line and key: for what is wrong in the project file itself before any other file.
+    Raises InputError with file, line and key; errors in the project file itself are reported first.
     """
     return _read_tables(read_toml(path))
 
 
 def read_undrawn(path: Path, scans: Sequence[Path] = ()) -> Project:
-    """A project whose default camera may still have to be drawn. scans: instead of a project file, which path then only
-    names. Raises InputError as `read_project` does."""
+    """Read a project whose default camera may have yet to be drawn.
+
+    scans: replace the content of the project file, whose path then only names the project. Raises InputError as
+    `read_project` does.
+    """
     if not scans:
         return _read_tables(read_toml(path), needs_camera=False)
     names = [glob.escape(os.path.relpath(scan, path.parent)) for scan in scans]
@@ -292,7 +302,7 @@ def _read_tables(table: Table, needs_camera: bool = True) -> Project:
 
 
 def _taking_lens(table: Table, given: ProjectTable) -> "CalibratedLens | None":
-    """Raises InputError where a lens cannot be that of film which was photographed."""
+    """Lens of the digital camera that photographed the film. Raises InputError where other settings contradict it."""
     name, scanner = given.scanner.lens, table.table("scanner")
     if name is None:
         return None
@@ -304,14 +314,14 @@ def _taking_lens(table: Table, given: ProjectTable) -> "CalibratedLens | None":
         raise scanner.error(
             "lens", "goes with pitch_um, one number: how many µm of film a pixel shows. A photograph does not say it."
         )
-    from pipeline.files.taking_lens import read_lens  # and OpenCV, which few projects need so early
+    from pipeline.files.taking_lens import read_lens  # imports OpenCV, which few projects need here
 
     return read_lens(table.file.parent / name, given.pitch_um[0])
 
 
 def reload_decisions(project: Project) -> Project:
-    """The project with what is decided now. Marks that are to be learned, and that the camera's own file does not show,
-    are shown where a person decided. Raises InputError naming the line, or the marks that are missing."""
+    """Project with the present content of decisions.jsonl, including clicks on marks to be learned that the camera file
+    lacks. Raises InputError with the line, or with the missing marks."""
     data = decisions_bytes(project.decisions_path)
     decisions, cut_short = parse_decisions(project.decisions_path, data), cut_short_line(data)
     cameras = dict(project.cameras)
@@ -346,7 +356,7 @@ def _lacks_camera(camera: str, folder: Path) -> bool:
 
 
 def _check_named(table: Table, objects: Table, camera: str, named: Mapping[str, Path]) -> None:
-    """Name every file that is not there, not just the first."""
+    """Raise InputError that lists all missing files."""
     try:
         keys = {"camera": (table, camera_path(camera, table.file.parent))} if camera else {}
     except InputError as error:
@@ -362,7 +372,7 @@ def _check_named(table: Table, objects: Table, camera: str, named: Mapping[str, 
 
 
 def _check_written(table: Table, project: Project, named: Mapping[str, Path]) -> None:
-    """Refuse to write results over a file that the project is made from, or over one another."""
+    """Raise InputError where a result would overwrite an input or another result."""
     if project.scans and project.comparator.is_dir():
         raise table.error("comparator", f"{project.comparator} is a folder. Name a file to be written there.")
     given = {"the project itself": project.path, **{f"[object] {key}": path for key, path in named.items()}}
@@ -373,7 +383,7 @@ def _check_written(table: Table, project: Project, named: Mapping[str, Path]) ->
             given[f"the covariance of {camera.name}'s earlier calibration"] = covariance_path(camera.calibration.path)
     if not project.scans:
         given["the comparator coordinates"] = project.comparator
-    written = {path.resolve().name for path in project.results}  # of the scans only those are looked at
+    written = {path.resolve().name for path in project.results}  # only scans with these names are checked
     scans = as_named(project.scans).items()
     given |= {f"the scan {name}": Path(file) for name, file in scans if os.path.basename(file) in written}
     places = {path.resolve(): f"{what}, {path}" for what, path in given.items()}

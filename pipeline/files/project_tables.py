@@ -1,4 +1,4 @@
-"""The tables of project.toml, and all keys as documentation shows them."""
+"""Tables of project.toml, and all keys for the documentation."""
 
 import math
 from typing import Annotated, get_args
@@ -16,8 +16,8 @@ from pipeline.text.table_models import FLAG, PATH, PATHS, SIGMA, TABLE, TEXT, TR
 from pipeline.text.tables import Table
 from pipeline.text.text_file import FINEST_PITCH_UM
 
-_COARSEST_PITCH_UM = 1e4  # above it nm were meant: film of a few pixels shows no mark
-TONES = ("linear", "srgb")  # beside auto and a power
+_COARSEST_PITCH_UM = 1e4  # larger values were probably meant as nm: at this pitch no mark is visible
+TONES = ("linear", "srgb")  # in addition to auto and an exponent
 _ADJUST = Key("table", lambda table, key: read_adjust(table.table(key)), AdjustSettings)
 _TONE = Key(
     '"auto", "linear", "srgb" or a power',
@@ -114,7 +114,7 @@ def _pitch(table: Table) -> tuple[float, float]:
 
 
 def keys_text() -> str:
-    """The tables of all keys of project.toml and camera.toml, in Markdown."""
+    """Tables of all keys of project.toml and camera.toml, in Markdown."""
     tables: list[tuple[str, type]] = [
         ("project.toml", ProjectTable),
         ("[measure]", MeasureTable),

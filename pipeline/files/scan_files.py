@@ -1,4 +1,4 @@
-"""The scans that a project names: files, addresses and patterns, each real file once, and their images' names."""
+"""Scans that a project names by files, addresses and patterns: each real file once, with the names of their images."""
 
 import glob
 import os
@@ -17,11 +17,11 @@ from pipeline.text.names import names_below
 from pipeline.text.tables import Table
 
 _ANY_DEPTH = "**"
-Named = str | Path  # a file by its text; an address by itself, for it knows what its store said of it
+Named = str | Path  # a file as text, which is fast; an address as an object, which caches what its store reported
 
 
 def found_names(pattern: str, folder: Path) -> set[str]:
-    """Files, and folders, by their paths from the folder; what is hidden is not looked at."""
+    """Paths of the files and folders that a pattern matches, relative to the folder; hidden ones are skipped."""
     parts = pattern.split(os.sep)
     if _ANY_DEPTH not in parts:
         return set(glob.glob(pattern, root_dir=folder))
@@ -36,10 +36,10 @@ def found_names(pattern: str, folder: Path) -> set[str]:
 
 
 def folders_below(root: Path) -> Iterator[str]:
-    """The folder itself, "", and all below it but hidden ones, by their paths from it.
+    """Yield the folder itself, "", and all folders below it that are not hidden, as relative paths.
 
-    Each real folder comes once, by a path without links where there is one. A link to a folder that contains it is not
-    followed.
+    Each real folder is yielded once, by a path without links if there is one. A link to a folder that contains it is
+    not followed.
     """
     entered = set[str]()
     waiting, links = deque([("", os.path.realpath(root))]), deque[tuple[str, str]]()
@@ -58,8 +58,11 @@ def folders_below(root: Path) -> Iterator[str]:
 
 
 def each_once(files: Mapping[str, bool], without: Iterable[str]) -> set[str]:
-    """The paths that are kept: of several to one real file the first that was named as it stands (True), else its own,
-    else the first; none to a file to which a path of `without` leads, too."""
+    """Keep one path for each real file.
+
+    Among several paths the first explicitly named one (True) is kept, else the file's own path, else the first one.
+    Files to which a path of `without` leads are dropped.
+    """
     folder_of = cache(os.path.realpath)
 
     def real_path(file: str) -> str:
@@ -78,7 +81,7 @@ def each_once(files: Mapping[str, bool], without: Iterable[str]) -> set[str]:
 
 
 def _list_folders(folder: str) -> list[tuple[str, bool]]:
-    """The names of its folders, and whether each is a link; none of a folder that may not be listed."""
+    """Names of the folders in a folder, and whether each is a link; empty for a folder that may not be listed."""
     with suppress(OSError), os.scandir(folder) as entries:
         return sorted((one.name, one.is_symlink()) for one in entries if one.is_dir() and not one.name.startswith("."))
     return []
@@ -88,11 +91,11 @@ def _contains(folder: str, path: str) -> bool:
     return os.path.commonpath([folder, path]) == folder
 
 
-# The scans that a project names: files and addresses, and patterns of them at any depth; what their images are called.
+# Scans that a project names: files, addresses and patterns at any depth; names of their images.
 
 
 class ScanFiles(Mapping[str, Path]):
-    """Paths by image name. Each is made when it is asked for: of fifty thousand that takes longer than to find them."""
+    """Paths by image name. A Path is created on access: creating fifty thousand takes longer than finding the files."""
 
     def __init__(self, named: Mapping[str, Named]) -> None:
         self.named = named
@@ -109,17 +112,19 @@ class ScanFiles(Mapping[str, Path]):
 
 @dataclass(frozen=True, eq=False)
 class FoundScans:
-    """files: by image name, in their order; left_out: the names of the images that `exclude` leaves out."""
+    """Scans found. files: by image name, in their order; left_out: names of the images that `exclude` leaves out."""
 
     files: Mapping[str, Path]
     left_out: frozenset[str]
 
 
 def find_scans(table: Table, patterns: Sequence[str], exclude: Sequence[str]) -> FoundScans:
-    """The scan files that the patterns find, without those that `exclude` names or finds. Raises InputError for a
-    pattern that finds nothing, and for files whose images would have the same name."""
+    """Find the scan files that patterns match, without excluded ones.
+
+    Raises InputError for a pattern that matches nothing, and for files whose images would share a name.
+    """
     folder = table.file.parent
-    found, is_named = dict[str, Named](), dict[str, bool]()  # paths are slow keys
+    found, is_named = dict[str, Named](), dict[str, bool]()  # texts as keys, since hashing paths is slow
     for pattern in patterns:
         try:
             own = _find_files(pattern, folder)
@@ -155,8 +160,10 @@ def find_scans(table: Table, patterns: Sequence[str], exclude: Sequence[str]) ->
 
 
 def add_cuts(scans: Mapping[str, Path], images: GivenImages | None, path: Path | None) -> Mapping[str, Path]:
-    """The scans, those of which images.csv names pages or windows replaced by these. Such an image is called as its
-    scan, or so with something behind it. Raises InputError where it is called as no scan."""
+    """Replace scans by the pages and windows of them that images.csv names.
+
+    The name of such an image begins with that of its scan. Raises InputError where it does not.
+    """
     if images is None or not images.cuts:
         return scans
     named = dict(as_named(scans))
@@ -173,18 +180,21 @@ def add_cuts(scans: Mapping[str, Path], images: GivenImages | None, path: Path |
             raise InputError(f"{path}: image {image!r}: pages and windows are of files, not of {named[scan]}. Copy it.")
         cut[image] = part_text(str(named[scan]), page, window)
         replaced.add(scan)
-    replaced -= images.exterior.keys()  # a line of its own makes it an image beside them
+    replaced -= images.exterior.keys()  # a scan with a line of its own stays an image as well
     return ScanFiles({name: file for name, file in named.items() if name not in replaced} | cut)
 
 
 def as_named(scans: Mapping[str, Path]) -> Mapping[str, Named]:
-    """The same, for those who need no paths."""
+    """The scans as texts or addresses, without creating paths."""
     return scans.named if isinstance(scans, ScanFiles) else scans
 
 
 def _find_files(pattern: str, folder: Path) -> Sequence[Named]:
-    """The file of that very name, brackets and all, or those that the pattern finds in the folder, also links
-    that lead nowhere: a scan that is named is opened or refused. `**` is any number of folders."""
+    """Files of a pattern in the folder. `**` stands for any number of folders.
+
+    A file with exactly that name has precedence, even with brackets in it. Broken links are included, so that they are
+    reported when opened.
+    """
     if is_address(pattern):
         return find_addresses(pattern)
     if (folder / pattern).is_file():
@@ -193,17 +203,17 @@ def _find_files(pattern: str, folder: Path) -> Sequence[Named]:
 
 
 def _below(folder: Path, names: Sequence[str]) -> list[str]:
-    """Names in a folder as its paths have them, without those that end as only folders do."""
+    """Full paths of names in a folder, without names that end with a separator (folders)."""
     places = [(name[: (end := name.rfind(os.sep) + 1)], name[end:]) for name in names]
     begins = {place: str(folder / place / "_")[:-1] for place in {place for place, _ in places}}
     return [begins[place] + name for place, name in places if name]
 
 
 def _drop_folders(files: Sequence[str]) -> list[str]:
-    """What is a folder is asked once for all that stands in one."""
+    """Drop folders. Each parent folder is listed only once."""
     folders = set[str]()
     for parent in {text[: text.rfind(os.sep) + 1] for text in files}:
-        with suppress(OSError), os.scandir(parent or os.curdir) as entries:  # it may be opened, and not listed
+        with suppress(OSError), os.scandir(parent or os.curdir) as entries:  # it may be accessible but not listable
             folders |= {parent + entry.name for entry in entries if entry.is_dir()}
     return [text for text in files if text not in folders]
 

@@ -1,4 +1,4 @@
-"""The lens of a digital camera that photographed the film: `[scanner] lens`, a calibration in OpenCV's YAML."""
+"""Lens of the digital camera that photographed the film: `[scanner] lens`, a calibration in OpenCV's YAML."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,8 +16,14 @@ from pipeline.types import Array
 
 @dataclass(frozen=True, eq=False)
 class CalibratedLens:
-    """A lens in the comparator of scans that its camera took: its interior orientation in mm at their pitch, with its
-    covariance where the calibration gives one. size_px: of its pictures, width and height."""
+    """Lens in comparator coordinates of the scans that its camera took.
+
+    Attributes
+    ----------
+    lens : interior orientation, mm at the scans' pitch, with its covariance if the calibration gives one.
+    pitch_um : pixel pitch across and down.
+    size_px : width and height of its images.
+    """
 
     lens: Lens
     pitch_um: tuple[float, float]
@@ -28,19 +34,20 @@ class CalibratedLens:
         return self.lens.covariance.size > 0
 
     def ideal_px(self, scan_px: Array) -> Array:
-        """Pixels (..., 2) of the scan in a picture without distortion; as they are where the lens shows nothing."""
+        """Distortion-free pixel coordinates of scan pixels (..., 2); unchanged outside the lens's field of view."""
         scan_mm = comparator_from_pixel(np.reshape(scan_px, (-1, 2)), self.pitch_um)
         ideal_mm, found = self.lens.ideal_from_observed(scan_mm)
         return self._px(np.where(found[:, None], ideal_mm, scan_mm), np.shape(scan_px))
 
     def scan_px(self, ideal_px: Array) -> Array:
-        """The other way."""
+        """Inverse of `ideal_px`: scan pixels of distortion-free pixels (..., 2)."""
         ideal_mm = comparator_from_pixel(np.reshape(ideal_px, (-1, 2)), self.pitch_um)
         scan_mm, found = self.lens.camera_from_ray((ideal_mm - self.lens.interior[1:]) / self.lens.interior[0])
         return self._px(np.where(found[:, None], scan_mm, ideal_mm), np.shape(ideal_px))
 
     def covariance_px2(self, scan_px: Array) -> Array:
-        """(2n, 2n) of ideal pixels of pixels (n, 2), all together; 0 where the calibration gives none."""
+        """(2n, 2n) joint covariance of the ideal pixels of scan pixels (n, 2), propagated from the lens's covariance,
+        px²; 0 where the calibration gives none."""
         if not self.is_covariance_known:
             return np.zeros((scan_px.size, scan_px.size))
         scan_mm = comparator_from_pixel(scan_px, self.pitch_um)
@@ -56,13 +63,13 @@ class CalibratedLens:
         return np.asarray(by_lens @ self.lens.covariance @ by_lens.T)
 
     def crop(self, col: int, row: int) -> "CalibratedLens":
-        """The lens of a part of the scan that begins at a pixel."""
+        """Lens for a part of the scan whose first pixel is (col, row)."""
         interior = self.lens.interior.copy()
         interior[1:] -= comparator_from_pixel(np.array([col, row], float), self.pitch_um)
         return replace(self, lens=replace(self.lens, interior=interior))
 
     def misfit(self, scan: Scan) -> str:
-        """A sentence where a scan cannot be a picture of the lens's camera, for its size; else empty."""
+        """Message where a scan's size differs from that of the lens's images; else ""."""
         size = scan.width_px, scan.height_px
         if size == self.size_px:
             return ""
@@ -78,7 +85,8 @@ class CalibratedLens:
 
 
 def read_lens(path: Path, pitch_um: float) -> CalibratedLens:
-    """The lens of camera.yaml, as `reseau calibrate` or OpenCV writes it, for scans of a pitch. Raises InputError."""
+    """Read the lens of camera.yaml, as `reseau calibrate` or OpenCV writes it, for scans of a pixel pitch. Raises
+    InputError."""
     camera, _ = read_pixel_camera(path)
     if camera.size_px is None:
         raise InputError(f"{path}: does not say the picture's size. Give image_width and image_height in px.")

@@ -1,4 +1,4 @@
-"""The tables [targets] and [ties] of project.toml: what is to be measured apart from the fiducials."""
+"""The tables [targets] and [ties] of project.toml: what is to be measured in addition to the fiducials."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -42,7 +42,7 @@ KINDS = (
     "squares",
 )
 
-_MOST_OF_A_BOARD = 500  # columns, and rows
+_MOST_OF_A_BOARD = 500  # limit of columns and of rows
 POLARITY = choice("auto", "light", "dark")
 if TYPE_CHECKING:
     from measure.tie_points.find_points import TieOptions
@@ -50,12 +50,20 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class TargetSettings:
-    """What the targets are: single disks or crosses, or a board whose corners or dots have their places on it.
+    """Description of the targets: single disks or crosses, or a board with corners or dots.
 
-    diameter_mm: of the disks, also those of a board, in object space; None for corners, and where nothing is to be
-    corrected. arm_mm: half the length of a cross in object space; cross_line: the width of its bars in that unit, None
-    where the targets are no crosses. code: the ring about some of the disks; numbers: the point that each number of
-    that code is, those of numbers that are not named here having the number as their name.
+    Attributes
+    ----------
+    kind : one of KINDS.
+    diameter_mm : of disks, also those of a board, in object space; None for corners, and where no eccentricity is
+        corrected.
+    arm_mm : half the length of a cross in object space.
+    cross_line : width of a cross's bars in units of arm_mm; None where the targets are no crosses.
+    polarity : whether targets are lighter or darker than their background.
+    board : specification of a board.
+    code : of the rings around some of the disks.
+    numbers : {code number: point}; a number that is not listed is itself the name of its point.
+    transparent : whether a flat field is visible from both sides.
     """
 
     kind: str
@@ -71,7 +79,7 @@ class TargetSettings:
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
 class TargetTable:
-    """What every table [targets] has."""
+    """Keys of every table [targets]."""
 
     kind: Annotated[str, choice(*KINDS)] = Field(description="What the targets are.")
     transparent: Annotated[bool, FLAG] = Field(
@@ -81,7 +89,7 @@ class TargetTable:
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
 class SingleTargetTable(TargetTable):
-    """What targets have that stand by themselves."""
+    """Keys of targets that are not part of a board."""
 
     polarity: Annotated[Polarity, POLARITY] = Field(
         default="auto", description="Whether marks are lighter than their background."
@@ -105,7 +113,7 @@ class CrossTable(SingleTargetTable):
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
 class CodedRingTable(SingleTargetTable):
-    """[targets] of dots of which some have a ring of segments about them."""
+    """[targets] of dots, some with a ring of coded segments around them."""
 
     diameter_mm: Annotated[float | None, POSITIVE] = Field(default=None, description="Of the dots, in object space.")
     bits: Annotated[int | None, whole()] = Field(default=None, description="Segments of a ring; absent: 12.")
@@ -119,7 +127,7 @@ class CodedRingTable(SingleTargetTable):
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
 class BoardTable(TargetTable):
-    """What every board has."""
+    """Keys of every board."""
 
     columns: Annotated[int, whole(1, _MOST_OF_A_BOARD)] = Field(description="Inner corners, squares, dots or markers.")
     rows: Annotated[int, whole(1, _MOST_OF_A_BOARD)] = Field(description="As columns.")
@@ -202,7 +210,7 @@ TARGET_TABLES: Mapping[str, type[TargetTable]] = dict(
 
 
 def read_targets(table: Table) -> TargetSettings:
-    """Read the table. Raises InputError naming the key that is wrong."""
+    """Read the table. Raises InputError with the key that is wrong."""
     kind = table.text("kind", choices=KINDS)
     given = read_model(table, TARGET_TABLES[kind])
     try:
@@ -239,7 +247,7 @@ def _settings(given: TargetTable, table: Table) -> TargetSettings:
 
 
 def _numbers(table: Table, code: "RingCode") -> dict[int, str]:
-    """The point of each number that the table names, the number as it is read from a picture."""
+    """{number as decoded from an image: point} for the numbers in the table."""
     codes = table.table("codes")
     points: dict[int, str] = {}
     for point in codes.names():
@@ -258,7 +266,7 @@ def _board(given: TargetTable) -> "BoardSpec":
 
     match given:
         case CircleGridTable():
-            counts_dots = given.kind == "asymmetric-circle-grid"  # of a row, as OpenCV does; else places
+            counts_dots = given.kind == "asymmetric-circle-grid"  # dots per row, as in OpenCV; else grid places
             columns, staggered = given.columns * (2 if counts_dots else 1), given.asymmetric or counts_dots
             return specs.CircleGridSpec(
                 columns, given.rows, given.spacing_mm, given.diameter_mm, staggered, given.row_spacing_mm
@@ -296,19 +304,19 @@ class TieTable:
 
 @dataclasses.dataclass(frozen=True)
 class TieSettings:
-    """height: of the ground on which the natural points lie, object units, with its standard deviation; None where it
-    is not known."""
+    """Settings of the natural points. height: of the ground on which they lie, with its standard deviation, object
+    units; None if unknown."""
 
     options: "TieOptions"
     height: Prior | None = None
 
     def point(self, id: str) -> ObjectPoint:
-        """A natural point as an object point: unknown but for its height, where that is given."""
+        """Natural point as an object point: unknown except for its height, where that is given."""
         return ObjectPoint(id, None, None, self.height)
 
 
 def read_ties(table: Table) -> TieSettings:
-    """Read the table. Raises InputError naming the key that is wrong."""
+    """Read the table. Raises InputError with the key that is wrong."""
     from measure.tie_points.find_points import TieOptions
 
     given, usual = read_model(table, TieTable), TieOptions()
