@@ -1,1 +1,1 @@
-"""Out to and in from other programs, one file a format."""
+"""Export to and import from other programs, one module per format."""

@@ -1,4 +1,4 @@
-"""Ames Stereo Pipeline: a .tsai file an image, with its distortion TSAI or FISHEYE, which are OpenCV's."""
+"""Ames Stereo Pipeline: a .tsai file per image, with the distortion models TSAI or FISHEYE, which are OpenCV's."""
 
 from pipeline.exchange.block import Block
 from pipeline.exchange.fitted_lens import BROWN
@@ -14,7 +14,7 @@ CONVENTION = Convention(
 
 
 def write(block: Block, options: ExportOptions) -> Written:
-    """NAME.tsai an image; c and principal point in mm, with the pitch in mm."""
+    """Write NAME.tsai for each image; c and principal point in mm, with the pitch in mm."""
     frames, left_out = pinhole_frames(block, options, (BROWN,), "asp")
     return pinholes_written(
         {f"{frame.frame.image}.tsai": _tsai(frame) for frame in frames},

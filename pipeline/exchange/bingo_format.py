@@ -1,4 +1,4 @@
-"""BINGO's image coordinates: mm, refined, that is free of film and lens."""
+"""BINGO's image coordinates in mm, corrected for film deformation and lens distortion."""
 
 import numpy as np
 
@@ -17,7 +17,7 @@ CONVENTION = Convention(
 
 
 def write(block: Block, options: ExportOptions) -> Written:
-    """bingo.txt with the refined coordinates of every point of every adjusted image."""
+    """Write bingo.txt with the corrected coordinates of every point of every adjusted image."""
     block.needs_orientation("bingo")
     unknown = (scan.image for scan in block.frames if scan.model is None)
     left_out = [f"{image}: it has no part in the adjustment, so its film is not known." for image in unknown]
@@ -42,7 +42,7 @@ def write(block: Block, options: ExportOptions) -> Written:
 
 
 def _origin(block: Block, frame: Frame) -> Array:
-    """The middle of the fiducial frame; of a digital camera, which has none, the principal point."""
+    """Centre of the fiducial frame; for a digital camera, which has none, the principal point."""
     if block.camera_file(frame.camera).fiducials or frame.lens is None:
         return np.zeros(2)
     return frame.lens.interior[1:]
@@ -54,7 +54,7 @@ def _interior(camera: str, lens: Lens, origin: Array) -> str:
 
 
 def _image(frame: WholeFrame, origin: Array) -> tuple[str, list[str]]:
-    """The lines of an image, and the points whose lens could not be taken out."""
+    """Lines of an image, and the points whose distortion cannot be removed."""
     assert frame.model is not None
     marks = frame.observed(fiducials=False)
     refined, found = frame.model.lens.ideal_from_observed(frame.camera_mm(marks))
@@ -70,5 +70,5 @@ def _image(frame: WholeFrame, origin: Array) -> tuple[str, list[str]]:
 
 
 def _word(name: str) -> str:
-    """A name without blanks, which part the words of a line."""
+    """The name without blanks, which separate the words of a line."""
     return "_".join(name.split())

@@ -1,4 +1,4 @@
-"""What goes out: the observed marks of every image, and what an adjustment says of it."""
+"""Data for the export: the observed marks of every image and the results of the adjustment."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -24,14 +24,20 @@ from pipeline.results.comparator_file import ComparatorPoint, pixel_from_compara
 from pipeline.results.covariance_file import Covariance, read_own_covariance
 from pipeline.types import Array
 
-NO_PITCH = (1000.0, 1000.0)  # where pixels are not asked for
+NO_PITCH = (1000.0, 1000.0)  # µm, where pixel coordinates are not needed
 
 
 @dataclass(frozen=True)
 class OutFrame:
-    """One image. marks: those that are observations; scan, pitch_um: None where nothing tells them; model, lens:
-    as they were adjusted, None without a part in an adjustment; is_oriented: whether its exterior
-    orientation was adjusted, too."""
+    """One image to be exported.
+
+    Attributes
+    ----------
+    marks : the marks that are observations.
+    scan, pitch_um : path and pixel pitch; None if unknown.
+    model, lens : adjusted; None for images without a part in the adjustment.
+    is_oriented : whether the exterior orientation was adjusted, too.
+    """
 
     image: str
     camera: str
@@ -43,25 +49,25 @@ class OutFrame:
     is_oriented: bool
 
     def observed(self, fiducials: bool) -> tuple[ComparatorPoint, ...]:
-        """Its fiducials, or its points."""
+        """Its fiducials, or its object points."""
         return tuple(mark for mark in self.marks if mark.kind != "join" and (mark.kind == "fiducial") == fiducials)
 
     def pixels(self, marks: tuple[ComparatorPoint, ...]) -> Array:
-        """Column and row (n, 2) of marks in the scan. Raises InputError where the pitch is not known."""
+        """Column and row (n, 2) of marks in the scan. Raises InputError where the pitch is unknown."""
         return pixel_from_comparator(_places_mm(marks), self.known_pitch_um)
 
     def camera_mm(self, marks: tuple[ComparatorPoint, ...]) -> Array:
-        """Observed places (n, 2) of its marks in the camera's frame."""
-        assert self.model is not None  # of frames that have a part in the adjustment alone
+        """Observed places (n, 2) of marks in the camera's frame, mm."""
+        assert self.model is not None  # only called for frames with a part in the adjustment
         return self.model.camera_from_comparator(_places_mm(marks))
 
     def frame_mm(self, marks: tuple[ComparatorPoint, ...], with_lens: bool) -> Array:
-        """The same in the resampled frame, whose lens may have been taken out."""
+        """Observed places (n, 2) in the resampled frame, mm. with_lens: its distortion is removed."""
         return self.chain(with_lens).frame_from_scan(self.pixels(marks))[0]
 
     @property
     def known_pitch_um(self) -> tuple[float, float]:
-        """Raises InputError where it is not known."""
+        """The pixel pitch. Raises InputError where it is unknown."""
         if self.pitch_um is None:
             raise InputError(
                 f"the pitch of image {self.image!r} is not known, and this format counts in pixels. Give pitch_um in "
@@ -71,13 +77,13 @@ class OutFrame:
 
     @property
     def is_mirrored(self) -> bool:
-        """Whether its scan shows the camera's frame as in a mirror."""
+        """Whether the scan is mirrored with respect to the camera's frame."""
         if self.model is None:
             return False
         return bool(np.linalg.det(self.model.camera_by_comparator(self.model.film.center_mm[None])[0]) < 0.0)
 
     def chain(self, with_lens: bool) -> FrameChain:
-        """From its scan to its camera's frame."""
+        """Transformations from the scan to the camera's frame."""
         model = self.model
         assert model is not None
         lens = self.lens if with_lens else None
@@ -85,13 +91,13 @@ class OutFrame:
 
     @property
     def file_name(self) -> str:
-        """Of its scan; its name where there is none."""
+        """File name of the scan; the image's name with .tif where there is none."""
         return self.scan.name if self.scan else f"{self.image}.tif"
 
 
 @dataclass(frozen=True)
 class WholeFrame:
-    """A frame as it was exposed, by its name: of one scan, or of several that show a part of it each."""
+    """An exposed frame, by its name: one scan, or several partial scans."""
 
     image: str
     scans: tuple[OutFrame, ...]
@@ -102,7 +108,7 @@ class WholeFrame:
 
     @property
     def model(self) -> ImageModel | None:
-        """Of its first scan; all have one exterior orientation."""
+        """Model of the first scan; all scans share one exterior orientation."""
         return self.scans[0].model
 
     @property
@@ -111,22 +117,22 @@ class WholeFrame:
 
     @property
     def known_pitch_um(self) -> tuple[float, float]:
-        """Of its first scan. Raises InputError where it is not known."""
+        """Pixel pitch of the first scan. Raises InputError where it is unknown."""
         return self.scans[0].known_pitch_um
 
     def observed(self, fiducials: bool) -> tuple[ComparatorPoint, ...]:
-        """Its fiducials, or its points; of what several of its scans show, the most precise mark."""
+        """Its fiducials, or its object points; the most precise mark of those observed in several scans."""
         best: dict[str, ComparatorPoint] = {}
         for mark in (mark for scan in self.scans for mark in scan.observed(fiducials)):
             best[mark.point] = min(best.get(mark.point, mark), mark, key=_variance)
         return tuple(best.values())
 
     def camera_mm(self, marks: tuple[ComparatorPoint, ...]) -> Array:
-        """Observed places (n, 2) of its marks in the camera's frame."""
+        """Observed places (n, 2) of marks in the camera's frame, mm."""
         return self._collect(marks, OutFrame.camera_mm)
 
     def frame_mm(self, marks: tuple[ComparatorPoint, ...], with_lens: bool) -> Array:
-        """The same in the resampled frame, whose lens may have been taken out."""
+        """Observed places (n, 2) in the resampled frame, mm. with_lens: its distortion is removed."""
         return self._collect(marks, lambda scan, own: scan.frame_mm(own, with_lens))
 
     def _collect(
@@ -143,7 +149,7 @@ Frame = OutFrame | WholeFrame
 
 @dataclass(frozen=True)
 class Block:
-    """A project's images in the order of their names; adjustment: None where there is none that holds."""
+    """The images of a project, sorted by name. adjustment: None where none is valid."""
 
     project: Project
     frames: tuple[OutFrame, ...]
@@ -155,28 +161,29 @@ class Block:
 
     @cached_property
     def points(self) -> dict[str, Array]:
-        """Adjusted coordinates (3,) of the object points, in the user's unit."""
+        """Adjusted coordinates (3,) of the object points, in the project's unit."""
         return {id: point.xyz for id, point in self.adjustment.points.items()} if self.adjustment else {}
 
     @cached_property
     def lens_reach(self) -> dict[str, str]:
-        """By camera a sentence on how far out its lens is known: what lies beyond goes out extrapolated."""
+        """By camera, a sentence on the radius up to which its lens is known: beyond it, the exported lens is
+        extrapolated."""
         lenses = self.adjustment.estimated_lenses() if self.adjustment else ()
         return {name: known.sentence(name) for name, known in lenses if known.share < 1.0}
 
     def camera_file(self, name: str) -> CameraFile:
-        """The file of a camera, by the camera's name."""
+        """Camera file by the camera's name."""
         return next(camera for camera in self.project.cameras.values() if camera.name == name)
 
     def fiducials_mm(self, camera: str) -> dict[str, tuple[float, float]]:
-        """A camera's fiducial marks as adjusted; as given, where nothing is adjusted."""
+        """Fiducial coordinates of a camera: adjusted, or as given where there is no adjustment."""
         adjusted = self.adjustment.cameras.get(camera) if self.adjustment else None
         if adjusted is not None:
             return {id: mark.xy_mm for id, mark in adjusted.fiducials.items()}
         return {fiducial.id: fiducial.xy_mm for fiducial in self.camera_file(camera).fiducials}
 
     def size_px(self, frame: OutFrame) -> tuple[int, int]:
-        """Width and height of an image's scan. Raises InputError where there is none."""
+        """Width and height of an image's scan. Raises InputError where there is no scan."""
         if frame.scan is None:
             raise InputError(
                 f"the scan of image {frame.image!r} is not known, and this format needs its size. Name the scans in "
@@ -189,20 +196,20 @@ class Block:
         return (frame for frame in self.frames if frame.is_oriented)
 
     def whole(self, scans: Iterable[OutFrame]) -> list[WholeFrame]:
-        """The frames that scans show: those of one frame (column part_of) together."""
+        """Group scans into exposed frames (column part_of)."""
         parts: dict[str, list[OutFrame]] = {}
         for scan in scans:
             parts.setdefault(self.project.scanned_frame(scan.image) or scan.image, []).append(scan)
         return [WholeFrame(name, tuple(own)) for name, own in parts.items()]
 
     def unoriented_note(self) -> tuple[str, ...]:
-        """A sentence an image that has no exterior orientation."""
+        """One sentence per image without exterior orientation."""
         return tuple(
             f"{frame.image}: it has no adjusted orientation." for frame in self.frames if not frame.is_oriented
         )
 
     def needs_orientation(self, format: str) -> None:
-        """Raises InputError where no image is oriented."""
+        """Raise InputError where no image is oriented."""
         if not any(self.oriented()):
             raise InputError(
                 f"{format} is for oriented images, and {self.project.adjustment_path} has none. Run `reseau adjust` "
@@ -211,9 +218,11 @@ class Block:
 
 
 def read_block(project: Project) -> Block:
-    """What a project has measured and adjusted.
+    """Read the measurements and the adjustment of a project.
 
-    Raises InputError where nothing was measured, or where the adjustment is not of what there is now.
+    Raises
+    ------
+    InputError : nothing was measured, or the adjustment is stale.
     """
     if not project.comparator.exists():
         raise InputError(f"{project.comparator}: there is no such file. Run `reseau measure` first.")
@@ -232,7 +241,7 @@ def read_block(project: Project) -> Block:
 
 
 def current_adjustment(project: Project, marks: tuple[ComparatorPoint, ...]) -> AdjustmentRecord | None:
-    """The adjustment, None where none converged. Raises InputError for one of other inputs than there are now."""
+    """Read the adjustment; None where none converged. Raises InputError for a stale one, made from other inputs."""
     path = project.adjustment_path
     if not path.exists():
         return None

@@ -1,22 +1,22 @@
-"""A calibration certificate: its table of radial distortion fitted, and its two principal distances told apart.
+"""Calibration certificates: fit of the table of radial distortion, and conversion between its two principal distances.
 
-A lens images a ray at the angle t from its axis at the radius r. The distortion that a table gives is r - c tan t, and
-so belongs to the c that it was made with: the equivalent principal distance, to which the lens tends near its axis, or
-the calibrated one, which makes the largest positive and negative distortions equal (Manual of Photogrammetry). With
-the model of this program, whose correction k3 r^3 + k5 r^5 + k7 r^7 has no linear term, c is the equivalent one:
+A lens images a ray at the angle t from its axis at the radius r. The distortion in a table is r - c tan t. It therefore
+depends on the c it was computed with: the equivalent principal distance, which the lens approaches near its axis, or
+the calibrated one, which makes the largest positive and negative distortions equal (Manual of Photogrammetry). In the
+model of this program, the correction k3 r^3 + k5 r^5 + k7 r^7 has no linear term, so that c is the equivalent one:
 
-    r - C tan t = (c - C) tan t + k3 r^3 + k5 r^5 + k7 r^7        C: what the table refers to
+    r - C tan t = (c - C) tan t + k3 r^3 + k5 r^5 + k7 r^7        C: principal distance of the table
 
-which is linear in c - C, k3, k5, k7.
+This is linear in c - C, k3, k5, k7.
 
-A certificate may give two principal points: that of autocollimation, PPA, where the axis meets the picture, and that
-of best symmetry, PPS, which its distortion counts from. The model has one, the PPA. With d = PPS - PPA the distortion
-k_n r^(n-1) x about the PPS is about the PPA, to the first order in d,
+A certificate may give two principal points: that of autocollimation, PPA, where the axis meets the image, and that of
+best symmetry, PPS, the origin of its distortion. The model has one, the PPA. With d = PPS - PPA, the distortion
+k_n r^(n-1) x relative to the PPS becomes, relative to the PPA and to the first order in d,
 
     k_n r^(n-1) x - k_n r^(n-1) (d + (n - 1) x (x.d) / r^2)
 
-whose second part is for n = 3 a decentering distortion with P = -k_3 d, and for larger n is fitted by one over the disk
-of radius R that the table covers: P = -k_n d R^(n-3) 6 (3 n + 1) / (10 (n + 3)).
+For n = 3 the second part is a decentring distortion with P = -k_3 d. For larger n a decentring distortion is fitted to
+it over the disk of radius R that the table covers: P = -k_n d R^(n-3) 6 (3 n + 1) / (10 (n + 3)).
 """
 
 import math
@@ -43,15 +43,25 @@ CONVENTION = Convention(
     "U.S. Geological Survey, Report of Calibration of Aerial Mapping Camera (OSL): Lens Distortion by field angle",
 )
 POWERS = (3, 5, 7)
-_ROUNDED_UM = 1.0 / np.sqrt(12.0)  # the standard deviation of what was rounded to whole um
-_CURVE = 400  # places on the curve whose extremes are balanced
+_ROUNDED_UM = 1.0 / np.sqrt(12.0)  # standard deviation of values rounded to 1 µm
+_CURVE = 400  # samples of the curve whose extremes are balanced
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """As it is printed. radius_mm (n,), tangent (n,) of the angle from the axis, radial_um (n,); sigma_um of one value;
-    principal_distance_mm: that which the table refers to. principal_point_mm: that of autocollimation; symmetry_mm:
-    that of best symmetry, where it is given apart. fiducials, distances: coordinates and distances of the marks."""
+    """Certificate as printed.
+
+    Attributes
+    ----------
+    principal_distance_mm : the one that the table refers to.
+    principal_point_mm : of autocollimation.
+    symmetry_mm : principal point of best symmetry, if given separately.
+    fiducials, distances : coordinates of the marks and distances between them.
+    radius_mm : (n,).
+    tangent : (n,) of the angle from the axis.
+    radial_um : (n,) radial distortion.
+    sigma_um : standard deviation of one value.
+    """
 
     name: str
     principal_distance_mm: float
@@ -67,8 +77,15 @@ class Certificate:
 
 @dataclass(frozen=True)
 class FittedTable:
-    """equivalent_mm and calibrated_mm: both principal distances; coefficients (3,) of r^3, r^5, r^7; their standard
-    deviations together with that of the equivalent one (4,); residuals_um (n,): the table's values less the curve's."""
+    """Fit of the distortion table.
+
+    Attributes
+    ----------
+    equivalent_mm, calibrated_mm : principal distances.
+    coefficients : (3,) of r^3, r^5, r^7.
+    sigmas : (4,) standard deviations of equivalent_mm and the coefficients.
+    residuals_um : (n,) values of the table less the curve.
+    """
 
     equivalent_mm: float
     calibrated_mm: float
@@ -78,7 +95,8 @@ class FittedTable:
 
 
 def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
-    """Certificates as TOML files, each a camera file with the equivalent principal distance, and a table of the fit."""
+    """Read certificates from TOML files, as camera files with the equivalent principal distance and tables of the
+    residuals."""
     certificates = [read_certificate(path) for path in paths]
     fits = [fit(certificate) for certificate in certificates]
     pairs = list(zip(certificates, fits, strict=True))
@@ -88,7 +106,8 @@ def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
 
 
 def read_certificate(path: Path) -> Certificate:
-    """Raises InputError naming the key: no distance, both kinds of places or none, lists of unlike length."""
+    """Read a certificate. Raises InputError, with the key, for a missing principal distance, for both or none of angles
+    and radii, and for lists of different lengths."""
     table = read_toml(path)
     both = ("calibrated_principal_distance_mm", "equivalent_principal_distance_mm")
     refers = table.text("refers_to", "calibrated", ("calibrated", "equivalent"))
@@ -126,7 +145,8 @@ def read_certificate(path: Path) -> Certificate:
 
 
 def _principal_points(table: Table) -> tuple[Point | None, Point | None]:
-    """That of autocollimation and that of best symmetry; the latter None where the two are not told apart."""
+    """Principal points of autocollimation and of best symmetry; the latter None where the certificate gives one
+    point."""
     keys = ("principal_point_mm", "autocollimation_mm", "symmetry_mm")
     one, autocollimation, symmetry = (table.pair(key) if key in table else None for key in keys)
     if one is not None and (autocollimation is not None or symmetry is not None):
@@ -141,7 +161,7 @@ def _principal_points(table: Table) -> tuple[Point | None, Point | None]:
 
 
 def _fiducials(table: Table) -> tuple[tuple[GivenFiducial, ...], tuple[FiducialDistance, ...]]:
-    """[[fiducial]] with id and xy_mm, [[fiducial_distance]] between these."""
+    """Read [[fiducial]] with id and xy_mm, and the [[fiducial_distance]] between them."""
     fiducials = []
     for entry in table.tables("fiducial") if "fiducial" in table else ():
         sigma_mm = entry.sigma_pair("sigma_mm", (DEFAULT_SIGMA_MM, DEFAULT_SIGMA_MM))
@@ -152,8 +172,10 @@ def _fiducials(table: Table) -> tuple[tuple[GivenFiducial, ...], tuple[FiducialD
 
 
 def fit(certificate: Certificate) -> FittedTable:
-    """By least squares, with as many of the three powers as leave one value over. The standard deviations are those of
-    the values' own, enlarged where the residuals are larger."""
+    """Fit the distortion curve by least squares, with as many of the three powers as leave one redundant value.
+
+    The standard deviations are based on sigma_um, or on the residuals where these are larger.
+    """
     radius, tangent = certificate.radius_mm, certificate.tangent
     count = max(min(len(POWERS), len(radius) - 2), 0)
     design = np.column_stack([tangent, *(radius**power for power in POWERS[:count])])
@@ -176,7 +198,7 @@ def fit(certificate: Certificate) -> FittedTable:
 
 
 def balanced_mm(equivalent_mm: float, coefficients: Array, largest_radius_mm: float) -> float:
-    """The calibrated principal distance: out to a radius its largest and its least distortion are of one size."""
+    """Calibrated principal distance: the largest and smallest distortion up to a radius have the same magnitude."""
     radius = np.linspace(0.0, largest_radius_mm, _CURVE)
     tangent = (radius - _curve(coefficients, radius)) / equivalent_mm
 
@@ -189,12 +211,12 @@ def balanced_mm(equivalent_mm: float, coefficients: Array, largest_radius_mm: fl
 
 
 def _curve(coefficients: Array, radius_mm: Array) -> Array:
-    """The distortion (n,) in mm against the equivalent principal distance."""
+    """Distortion (n,) in mm relative to the equivalent principal distance."""
     return np.asarray(sum(k * radius_mm**power for k, power in zip(coefficients, POWERS, strict=True)))
 
 
 def decentering(certificate: Certificate, fitted: FittedTable) -> Array:
-    """P1 and P2 (2,) by which the distortion about the point of symmetry is one about that of autocollimation."""
+    """P1 and P2 (2,) that move the origin of the distortion from the point of symmetry to that of autocollimation."""
     if certificate.symmetry_mm is None or certificate.principal_point_mm is None:
         return np.zeros(2)
     off_mm = np.subtract(certificate.symmetry_mm, certificate.principal_point_mm)
@@ -249,7 +271,7 @@ def _notes(certificate: Certificate, fitted: FittedTable) -> list[str]:
 
 
 def _residuals(certificate: Certificate, fitted: FittedTable) -> str:
-    """The table as printed, and what the curve leaves of it."""
+    """CSV table of the certificate's values with the residuals of the fit."""
     lines = [
         f"# radial distortion of {certificate.name}, against c = {certificate.principal_distance_mm!r} mm",
         "angle_deg,radius_mm,radial_um,fitted_um,residual_um",

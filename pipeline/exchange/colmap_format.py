@@ -1,4 +1,4 @@
-"""COLMAP: cameras, poses, points and their tracks as a reconstruction of resampled frames."""
+"""COLMAP: cameras, orientations, points and their tracks as a reconstruction of resampled frames."""
 
 import tempfile
 from collections import defaultdict
@@ -35,7 +35,7 @@ _MODELS: dict[str, tuple[int, tuple[str, ...]]] = {  # focal lengths, and the di
 
 
 def write(block: Block, options: ExportOptions) -> Written:
-    """sparse/*.bin; a camera an image, for every resampled frame has its own first pixel."""
+    """Write sparse/*.bin with one camera per image, since every resampled frame has its own origin."""
     pycolmap = import_pycolmap("the format colmap")
     frames, left_out = pinhole_frames(block, options, (BROWN, RATIONAL), "colmap")
     with tempfile.TemporaryDirectory() as folder:
@@ -45,7 +45,7 @@ def write(block: Block, options: ExportOptions) -> Written:
 
 
 def import_pycolmap(user: str) -> Any:
-    """pycolmap. Raises InputError, which names its user, where it is not installed."""
+    """Import pycolmap. Raises InputError, with the name of its user, where it is not installed."""
     try:
         import pycolmap
     except ImportError:
@@ -54,7 +54,7 @@ def import_pycolmap(user: str) -> Any:
 
 
 def _reconstruction(pycolmap: Any, block: Block, frames: list[PinholeFrame]) -> Any:
-    """The frames with the marks of adjusted points, and these points with their tracks."""
+    """Reconstruction of the frames with the marks of adjusted points, and of these points with their tracks."""
     made, tracks = pycolmap.Reconstruction(), defaultdict(list)
     for number, frame in enumerate(frames, 1):
         camera = _colmap_camera(pycolmap, frame, number)
@@ -75,7 +75,7 @@ def _reconstruction(pycolmap: Any, block: Block, frames: list[PinholeFrame]) -> 
 
 
 def _colmap_camera(pycolmap: Any, frame: PinholeFrame, number: int) -> Any:
-    """OPENCV, or FULL_OPENCV where the lens has a third radial term; OPENCV_FISHEYE of a fisheye."""
+    """Camera of the model OPENCV, FULL_OPENCV if the lens has a third radial term, or OPENCV_FISHEYE."""
     interior = frame.interior_px(CONVENTION)
     rest = frame.lens.named(_FULL)
     model = "FULL_OPENCV" if rest.any() else "OPENCV"
@@ -88,14 +88,15 @@ def _colmap_camera(pycolmap: Any, frame: PinholeFrame, number: int) -> Any:
 
 
 def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
-    """Folders of reconstructions (.bin or .txt): poses as approximations, and cameras of the models that OpenCV has."""
+    """Read folders of reconstructions (.bin or .txt): orientations as approximations, and cameras of the models that
+    OpenCV has."""
     pycolmap = import_pycolmap("the format colmap")
     cameras, poses, notes = [], [], []
     for path in paths:
         folder = path if path.is_dir() else path.parent
         try:
             made = pycolmap.Reconstruction(str(folder))
-        except Exception as error:  # whatever pycolmap raises at a broken or missing file
+        except Exception as error:  # pycolmap raises various types for a broken or missing file
             message = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
             raise InputError(
                 f"{folder}: is no reconstruction of COLMAP ({message}). Name its folder, as sparse/0."
@@ -120,7 +121,7 @@ def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
 
 
 def _parameters(camera: Any) -> tuple[list[float], dict[str, float]] | None:
-    """fx, fy, cx, cy in px and the distortion by OpenCV's names."""
+    """fx, fy, cx, cy in px and the distortion by OpenCV's names; None for other camera models."""
     values = [float(value) for value in camera.params]
     if camera.model_name not in _MODELS:
         return None

@@ -1,4 +1,4 @@
-"""`reseau convert`: a camera's lens in the words of another distortion family, with its covariance."""
+"""`reseau convert`: convert a camera's lens, with its covariance, to another family of distortion models."""
 
 import io
 import math
@@ -36,7 +36,8 @@ from pipeline.types import Array
 
 @dataclass(frozen=True)
 class ConvertOptions:
-    """parameters: those of the other family that are fitted, () for the usual ones; camera: which, of several."""
+    """Options of the conversion. parameters: to be fitted in the target family, () for its default ones; camera: name,
+    if there are several."""
 
     family: str
     r0_mm: float = 0.0
@@ -46,8 +47,15 @@ class ConvertOptions:
 
 @dataclass(frozen=True)
 class Conversion:
-    """sigmas (3 + k,): of c, x0', y0' and the parameters; inf free. sentences: the lines of the README; files: the
-    names of what was written."""
+    """Result of a conversion.
+
+    Attributes
+    ----------
+    lens : the converted lens.
+    sigmas : (3 + k,) of c, x0', y0' and the parameters; inf: free.
+    sentences : lines of the README.
+    files : names of the written files.
+    """
 
     lens: ConvertedLens
     sigmas: Array
@@ -56,7 +64,7 @@ class Conversion:
 
     @property
     def misfit_um(self) -> float:
-        """The largest over the frame."""
+        """Largest difference over the frame, µm."""
         return 1e3 * self.lens.largest_mm
 
     @property
@@ -66,7 +74,7 @@ class Conversion:
         return dict(zip(names, pairs, strict=True))
 
     def as_json(self) -> dict[str, object]:
-        """As `--json` prints it."""
+        """Content of `--json`."""
         return {
             **plain_json(DistortionRecord.from_distortion(self.lens.lens.distortion, {})),
             "same": self.lens.is_same,
@@ -79,7 +87,7 @@ class Conversion:
         }
 
     def lines(self) -> Sequence[str]:
-        """As it is printed: what holds, and the parameters."""
+        """Lines to be printed: the sentences and the parameters."""
         numbers = [
             f"  {name:6s} {value:>16.9g}  {format(sigma, '.2g') if math.isfinite(sigma) else 'free'}"
             for name, (value, sigma) in self.values.items()
@@ -89,10 +97,11 @@ class Conversion:
 
 
 def run_convert(path: Path, folder: Path, options: ConvertOptions) -> Conversion:
-    """Write the camera of a camera file, or of adjustment.json with its covariance, with another family.
+    """Convert the camera of a camera file, or of adjustment.json with its covariance, and write it into a folder.
 
-    Raises InputError for a family or a parameter that there is not, for a camera whose lens or frame is not known, and
-    for a folder that holds anything else.
+    Raises
+    ------
+    InputError : unknown family or parameter, a camera without lens or frame, or a folder with other files.
     """
     try:
         target = family(options.family)
@@ -117,7 +126,7 @@ Converted = tuple[ConvertedLens, Array, tuple[str, ...], dict[str, str | bytes]]
 def _convert(
     lens: Lens, sigmas: Array, corners_mm: Array, options: ConvertOptions
 ) -> tuple[ConvertedLens, tuple[str, ...]]:
-    """The lens, and what is to be said of it; sigmas (k,): of its parameters."""
+    """Convert a lens. Returns it with sentences on the result. sigmas (k,): of its parameters."""
     uncertain = [name for name, sigma in zip(lens.quantities[3:], sigmas, strict=True) if sigma > 0.0]
     half = np.abs(corners_mm).max(axis=0) if family(options.family).needs == "half_mm" else np.zeros(2)
     into = Distortion(options.family, r0_mm=options.r0_mm, half_mm=(float(half[0]), float(half[1])))
@@ -134,7 +143,7 @@ def _convert(
 
 
 def _converted_adjustment(path: Path, folder: Path, options: ConvertOptions) -> Converted:
-    """The whole adjustment.json and adjustment.npz, with one camera's lens converted."""
+    """Convert one camera's lens within the whole adjustment.json and adjustment.npz."""
     content, covariance = read_adjustment(path), read_own_covariance(path)
     name, given = calibrated_lens(path, content, options.camera)
     known = np.sqrt(np.diag(covariance.select(_parameters(name, given)[3:])))
@@ -166,7 +175,8 @@ def _parameters(camera: str, lens: Lens) -> tuple[Parameter, ...]:
 
 
 def _moved_covariance(covariance: Covariance, camera: str, source: Lens, lens: ConvertedLens) -> Covariance:
-    """That of all quantities, the camera's own in the other family: with all others, too."""
+    """Covariance of all parameters after the conversion of one camera, by propagation with the derivatives of its
+    lens."""
     old, new = _parameters(camera, source), _parameters(camera, lens.lens)
     others = tuple(each for each in covariance.parameters if each not in old)
     by_old = np.zeros((len(new) + len(others), len(old) + len(others)))
@@ -196,7 +206,7 @@ def _camera_entry(camera: CameraRecord, source: Distortion, lens: ConvertedLens,
 
 
 def _converted_camera(path: Path, folder: Path, options: ConvertOptions) -> Converted:
-    """camera.toml with the values and standard deviations of its lens converted."""
+    """Convert the values and standard deviations of a camera file's lens."""
     camera = read_camera(path)
     distance, point = camera.principal_distance_mm, camera.principal_point_mm
     if distance is None or point is None or camera.frame_mm is None:
@@ -241,7 +251,8 @@ def _converted_camera(path: Path, folder: Path, options: ConvertOptions) -> Conv
 
 
 def _sigmas(given: Array, source: Lens, found: ConvertedLens) -> Array:
-    """Standard deviations (3 + k,) of those of the source, taken as uncorrelated; what hangs on a free one is free."""
+    """Standard deviations (3 + k,) from those of the source, taken as uncorrelated; parameters that depend on a free
+    one are free."""
     free, lens = np.isinf(given), found.lens
     sigmas = np.sqrt(np.maximum(np.diag(lens.covariance), 0.0))
     is_free = np.zeros(len(sigmas), dtype=bool)

@@ -1,4 +1,5 @@
-"""`reseau export`: a project's marks, camera and poses as the files of another program, all of them or none."""
+"""`reseau export`: write a project's marks, cameras and orientations as files of another program, all of them or
+none."""
 
 import os
 import re
@@ -22,7 +23,7 @@ _HEAD = "Written by reseau"
 
 @dataclass(frozen=True)
 class Exchanged:
-    """The names of the files that were written, and the text of their README. written: of an export."""
+    """Names of the written files and the text of their README. written: what was written, and what was lost."""
 
     files: tuple[str, ...]
     readme_text: str
@@ -30,10 +31,10 @@ class Exchanged:
 
 
 def run_export(project: Project, format: str, folder: Path, options: ExportOptions) -> Exchanged:
-    """Write a format's files into a folder, in the place of an earlier export.
+    """Write a format's files into a folder, replacing an earlier export.
 
-    Raises InputError for a format that there is not, a folder that holds anything else, and whatever the format itself
-    cannot take.
+    Raises InputError for an unknown format, a folder that holds anything else, and whatever the format cannot
+    represent.
     """
     write, convention = format_writer(format)
     check_folder(folder)
@@ -55,7 +56,7 @@ def _convention_lines(convention: Convention) -> list[str]:
 
 
 def readme(what: str, head: Sequence[str], parts: Mapping[str, Sequence[str]]) -> str:
-    """What stands beside the files: a head, and lists by their titles."""
+    """Text of the README: a head, and lists by their titles."""
     lines = [f"{_HEAD} {version('reseau')}: {what}", "", *head]
     for title, sentences in parts.items():
         lines += ["", f"{title}:", *(f"- {sentence}" for sentence in sentences or ("nothing",))]
@@ -63,7 +64,7 @@ def readme(what: str, head: Sequence[str], parts: Mapping[str, Sequence[str]]) -
 
 
 def check_folder(folder: Path) -> None:
-    """Raises InputError for a folder that holds something that is no earlier export: nothing of it is overwritten."""
+    """Raise InputError for a folder with anything other than an earlier export, which would be overwritten."""
     if folder.exists() and (not folder.is_dir() or (any(folder.iterdir()) and not _is_own(folder / README))):
         raise InputError(
             f"{folder}: holds something that is no export of reseau. Name another folder, or an empty one."
@@ -75,8 +76,10 @@ def _is_own(path: Path) -> bool:
 
 
 def publish(folder: Path, files: Mapping[str, str | bytes], readme_text: str) -> None:
-    """All files into a folder of their own, which then takes the place of the earlier one. Raises InputError for the
-    name of a file that would lead out of it."""
+    """Write all files into a new folder that then replaces the earlier one.
+
+    Raises InputError for file names that lead out of the folder.
+    """
     new = folder.with_name(f".{folder.name}.{os.getpid()}.part")
     old = folder.with_name(f".{folder.name}.{os.getpid()}.old")
     try:
@@ -98,7 +101,8 @@ def publish(folder: Path, files: Mapping[str, str | bytes], readme_text: str) ->
 
 
 def _check_names(block: Block) -> None:
-    """Files of other programs are named after the scans' own files, without their folders."""
+    """Raise InputError for images with equal file names in different folders: other programs know images by the name
+    only."""
     images: dict[str, str] = {}
     for frame in block.frames:
         other = images.setdefault(frame.file_name, frame.image)

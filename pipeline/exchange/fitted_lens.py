@@ -1,4 +1,4 @@
-"""A camera's lens in the terms of another program: the very same, or the nearest one over the frame."""
+"""A camera's lens in the distortion model of another program: identical, or fitted over the frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,14 +18,19 @@ BROWN = ("k1", "k2", "p1", "p2", "k3")
 RATIONAL = (*BROWN, "k4", "k5", "k6")
 PRISMS = (*BROWN, "s1", "s2", "s3", "s4")
 _AFFINE = ("b1", "b2")
-_ONE_SCALE = ("none", "torlegard")  # families that stretch x and y alike, and have no shear
+_ONE_SCALE = ("none", "torlegard")  # families without affinity and shear
 
 
 @dataclass(frozen=True)
 class FittedLens:
-    """OpenCV's parameters (18,) as `opencv_model` has them, in mm with y up. largest_mm: how far they put a point of
-    the frame beside its place. fisheye: k1 to k4 of OpenCV's fisheye, in the place of the distortion; empty otherwise.
-    shear: b2 as `opencv` has it, of programs that know one.
+    """A lens in OpenCV's model.
+
+    Attributes
+    ----------
+    values : (18,) OpenCV's parameters as in `opencv_model`, in mm with y up.
+    largest_mm : largest error of a point in the frame.
+    fisheye : k1 to k4 of OpenCV's fisheye, instead of the distortion; otherwise empty.
+    shear : b2 as in the family `opencv`, for programs that have it.
     """
 
     values: Array
@@ -38,8 +43,11 @@ class FittedLens:
 
 
 def nearest_lens(block: Block, frame: Frame, models: Sequence[Sequence[str]], options: ExportOptions) -> FittedLens:
-    """The lens of an image's camera, in the first of the models (names of OpenCV's parameters) that says the very same,
-    else in the first one that is near enough, else in the last one. With the lens taken out, that of an ideal frame."""
+    """Fit the lens of an image's camera in one of several models, each given by names of OpenCV's parameters.
+
+    The first model that is identical is taken; else the first that is close enough; else the last. If the frames are
+    resampled with the lens, the result is that of an ideal camera.
+    """
     lens = frame.lens
     assert lens is not None
     if options.with_lens or lens.distortion.family == "none":
@@ -55,7 +63,8 @@ def nearest_lens(block: Block, frame: Frame, models: Sequence[Sequence[str]], op
 
 
 def fisheye_lens(block: Block, frame: Frame, options: ExportOptions) -> FittedLens | None:
-    """The lens of an image's camera where it is OpenCV's fisheye; a skew, which programs leave out, is its misfit."""
+    """The lens of an image's camera if it is OpenCV's fisheye. Its shear, which programs leave out, becomes the
+    misfit."""
     lens = frame.lens
     assert lens is not None
     if lens.distortion.family != FISHEYE or options.with_lens:
@@ -69,8 +78,12 @@ def fisheye_lens(block: Block, frame: Frame, options: ExportOptions) -> FittedLe
 
 
 def sheared_lens(block: Block, frame: Frame, at_ideal: bool) -> FittedLens:
-    """The lens of an image's camera by k1, k2, k3, p1, p2, affinity and shear. at_ideal: these two are of the ideal
-    point, as MicMac has them, and not of the distorted one, as Metashape has them."""
+    """The lens of an image's camera with k1, k2, k3, p1, p2, affinity and shear.
+
+    Parameters
+    ----------
+    at_ideal : affinity and shear apply to the ideal point, as in MicMac, and not to the distorted one, as in Metashape.
+    """
     lens = frame.lens
     assert lens is not None
     family = lens.distortion.family
@@ -86,7 +99,8 @@ def sheared_lens(block: Block, frame: Frame, at_ideal: bool) -> FittedLens:
 
 
 def frame_corners_mm(block: Block, frame: Frame) -> Array:
-    """(2, 2) two opposite corners of what a camera exposes, camera mm: as its file says, or what was observed of it."""
+    """(2, 2) opposite corners of the exposed frame, camera mm: from the camera file, or the extent of the
+    observations."""
     camera = block.camera_file(frame.camera)
     if camera.fiducials and camera.frame_mm is not None:
         half = np.array(camera.frame_mm) / 2.0
@@ -108,7 +122,7 @@ def _pinhole(lens: Lens) -> Array:
 
 
 def _has_only(lens: Lens, names: Sequence[str]) -> bool:
-    """Whether a lens is of OpenCV's family, and has no parameters but these."""
+    """Whether a lens is of OpenCV's family and has no other parameters than these."""
     family = lens.distortion.family
     known = zip(parameter_names(family), lens.parameters, strict=True)
     return family == "opencv" and not any(value for name, value in known if name not in names)
@@ -123,7 +137,7 @@ def _opencv(lens: Lens) -> FittedLens:
 
 
 def _over_frame(block: Block, frame: Frame) -> tuple[Array, Array]:
-    """Rays (n, 2) over the frame, y up, and where the lens images them (n, 2), mm."""
+    """Rays (n, 2) over the frame, y up, and their images (n, 2), mm."""
     lens = frame.lens
     assert lens is not None
     grid_mm = frame_grid_mm(frame_corners_mm(block, frame))
@@ -132,7 +146,7 @@ def _over_frame(block: Block, frame: Frame) -> tuple[Array, Array]:
 
 
 def _fit_opencv(block: Block, frame: Frame, names: Sequence[str]) -> FittedLens:
-    """The nearest lens by parameters of these names."""
+    """Fit parameters of these names in OpenCV's model."""
     lens = frame.lens
     assert lens is not None
     family = lens.distortion.family
@@ -142,14 +156,16 @@ def _fit_opencv(block: Block, frame: Frame, names: Sequence[str]) -> FittedLens:
     corners_mm = frame_corners_mm(block, frame)
     try:
         found = convert_lens(lens, into, corners_mm, estimated)
-    except AdjustmentError:  # as bad as a model that is nowhere near
+    except AdjustmentError:  # treat it as a model that does not fit
         return FittedLens(_pinhole(lens), np.inf)
     return FittedLens(opencv_values(found.lens)[0], found.largest_mm, shear=float(found.lens.parameters[-1]))
 
 
 def _sheared_step(rays: Array, observed_mm: Array) -> tuple[Array, float]:
-    """Parameters (18,) and shear, with affinity of the ideal point, by one linear fit: what is observed is linear in c,
-    in c times each of the others, and in the principal point."""
+    """Parameters (18,) and shear, with affinity and shear of the ideal point, by one linear least-squares fit.
+
+    The observations are linear in c, in c times each of the other parameters, and in the principal point.
+    """
     a, b = (rays * (1.0, -1.0)).T  # OpenCV's axes
     r2, none, one = a * a + b * b, np.zeros_like(a), np.ones_like(a)
     across = [a, a * r2, a * r2**2, 2 * a * b, r2 + 2 * a * a, a * r2**3, a, b, one, none]
@@ -164,7 +180,7 @@ def _sheared_step(rays: Array, observed_mm: Array) -> tuple[Array, float]:
 
 
 def _sheared(values: Array, shear: float, rays: Array) -> Array:
-    """Camera coordinates (n, 2) in mm of rays."""
+    """Camera coordinates (n, 2) in mm of rays (n, 2)."""
     fx, fy = values[:2]
     unit = Lens(Distortion("opencv"), np.array([1.0, 0.0, 0.0]), np.array([*values[4:], 0.0, 0.0]))
     bent, _ = unit.camera_from_ray(rays)

@@ -1,4 +1,4 @@
-"""The table of formats: what writes and what reads each, where it counts from, and what goes out."""
+"""Table of the exchange formats: writer, reader, and coordinate conventions of each."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -8,12 +8,13 @@ from typing import Any
 from pipeline.errors import InputError
 from pipeline.text.wording import did_you_mean
 
-LARGEST_MISFIT_PX = 0.05  # of a lens in another program's model: a third of a good mark's own standard deviation
+LARGEST_MISFIT_PX = 0.05  # of a lens in another program's model: a third of the standard deviation of a good mark
 
 
 @dataclass(frozen=True)
 class Format:
-    """module: of this folder, imported where the format is asked for; writer, reader: its functions, "" without."""
+    """An exchange format. module: in this folder, imported on demand; writer, reader: names of its functions, ""
+    without."""
 
     module: str
     writer: str = ""
@@ -39,8 +40,8 @@ IMPORTED = tuple(name for name, each in TABLE.items() if each.reader)
 
 @dataclass(frozen=True)
 class Convention:
-    """Where a format counts from. first_pixel_px: the coordinates that it gives to the centre of the first pixel;
-    axes: of picture and camera; source: the public text that says so."""
+    """Coordinate convention of a format. first_pixel_px: coordinates of the first pixel's centre; axes: of image and
+    camera; source: public text that documents them."""
 
     first_pixel_px: tuple[float, float]
     axes: str
@@ -49,8 +50,14 @@ class Convention:
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """pitch_um: of resampled frames, None that of each scan; with_lens: frames are resampled with their lens taken
-    out; largest_misfit_px: a lens that another program's model cannot take better is not handed on."""
+    """Options of the export.
+
+    Attributes
+    ----------
+    pitch_um : pixel pitch of the resampled frames; None: that of each scan.
+    with_lens : the frames are resampled with their distortion removed.
+    largest_misfit_px : a lens with a larger misfit in another program's model is not exported.
+    """
 
     pitch_um: float | None = None
     with_lens: bool = False
@@ -59,8 +66,14 @@ class ExportOptions:
 
 @dataclass(frozen=True)
 class Written:
-    """A format's files by their places below the folder. lost: what it has no place for; notes: what to know of it;
-    left_out: images, or parts of them, that did not go out, each with the reason."""
+    """Files of a format by their paths below the folder.
+
+    Attributes
+    ----------
+    lost : data that the format cannot hold.
+    notes : remarks for the user.
+    left_out : images, or parts of them, that were not exported, with the reasons.
+    """
 
     files: Mapping[str, str | bytes]
     lost: tuple[str, ...] = ()
@@ -69,13 +82,13 @@ class Written:
 
 
 def format_writer(name: str) -> tuple[Callable[..., Written], Convention]:
-    """What writes a format, and its convention. Raises InputError for a format that is not written."""
+    """Writer of a format, and its convention. Raises InputError for a format that cannot be written."""
     module, known = _module(name, FORMATS, "")
     return getattr(module, known.writer), module.CONVENTION
 
 
 def format_reader(name: str) -> Callable[..., Any]:
-    """What reads a format. Raises InputError for a format that is not read."""
+    """Reader of a format. Raises InputError for a format that cannot be read."""
     module, known = _module(name, IMPORTED, " to import")
     reader: Callable[..., Any] = getattr(module, known.reader)
     return reader

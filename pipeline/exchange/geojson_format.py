@@ -1,4 +1,4 @@
-"""GeoJSON: what ground every image shows, as a polygon in longitude and latitude."""
+"""GeoJSON: ground footprints of the images as polygons in longitude and latitude."""
 
 import json
 from itertools import pairwise
@@ -17,11 +17,12 @@ CONVENTION = Convention(
     "no pixels: longitude and latitude in degrees, WGS 84, counter-clockwise",
     "RFC 7946, sections 3.1.6 and 4",
 )
-_SIDE_POINTS = 8  # a side, for a side of the frame is no straight line on a map
+_SIDE_POINTS = 8  # points per side, since a side of the frame is not a straight line on a map
 
 
 def write(block: Block, options: ExportOptions) -> Written:
-    """footprints.geojson: the frame's outline by its adjusted lens and pose on the mean height of its points."""
+    """Write footprints.geojson: outlines of the frames, projected by the adjusted lens and orientation to the mean
+    height of their points."""
     crs = block.project.crs
     if not crs:
         raise InputError(
@@ -43,7 +44,7 @@ def write(block: Block, options: ExportOptions) -> Written:
 
 
 def footprint(block: Block, frame: WholeFrame) -> Array | str:
-    """The outline (n, 3) in object coordinates of what a frame shows of level ground, or why there is none."""
+    """Outline (n, 3) in object coordinates of a frame on level ground, or the reason why there is none."""
     model = frame.model
     assert model is not None
     heights = [block.points[mark.point][2] for mark in frame.observed(False) if mark.point in block.points]
@@ -61,7 +62,7 @@ def footprint(block: Block, frame: WholeFrame) -> Array | str:
 
 
 def _outline(corners_mm: Array) -> Array:
-    """Points around a rectangle between two opposite corners, counter-clockwise from the lower left one."""
+    """Points along a rectangle between two opposite corners, counter-clockwise from the lower left one."""
     (left, bottom), (right, top) = corners_mm
     turns = np.array([(left, bottom), (right, bottom), (right, top), (left, top), (left, bottom)])
     share = np.arange(_SIDE_POINTS)[:, None] / _SIDE_POINTS
@@ -69,7 +70,7 @@ def _outline(corners_mm: Array) -> Array:
 
 
 def _feature(frame: WholeFrame, outline: Array, height: float) -> dict[str, object]:
-    ring = outline if _area(outline) > 0.0 else outline[::-1]  # from the other side of a plane it runs clockwise
+    ring = outline if _area(outline) > 0.0 else outline[::-1]  # clockwise for a mirrored image
     closed = [*ring.tolist(), ring[0].tolist()]
     return {
         "type": "Feature",

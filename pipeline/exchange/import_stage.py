@@ -1,4 +1,5 @@
-"""`reseau import`: marks, cameras and poses of other programs, and certificates, as files of this one."""
+"""`reseau import`: convert marks, cameras and orientations of other programs, and certificates, to files of this
+one."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -23,9 +24,9 @@ from pipeline.text.names import file_word
 
 
 def run_import(format: str, paths: Sequence[Path], folder: Path, options: ImportOptions) -> Exchanged:
-    """Write what another program's files hold into a folder, in the place of an earlier import.
+    """Convert another program's files and write the result into a folder, replacing an earlier import.
 
-    Raises InputError for a format that there is not, and for files that are not of it.
+    Raises InputError for an unknown format and for files that do not have it.
     """
     read = format_reader(format)
     check_folder(folder)
@@ -46,7 +47,7 @@ def run_import(format: str, paths: Sequence[Path], folder: Path, options: Import
 
 
 def _unknown_notes(cameras: Sequence[CameraFile]) -> Iterator[str]:
-    """What a camera file says that the other program's files do not."""
+    """Notes on what the camera files assume because the other program's files do not contain it."""
     for camera in cameras:
         if camera.principal_distance_sigma_mm == 0.0:
             yield (
@@ -91,7 +92,7 @@ def _mark(mark: ForeignMark, options: ImportOptions, pitch_um: tuple[float, floa
 
 
 def _images(poses: Sequence[ForeignPose]) -> str:
-    """Without standard deviations: approximations."""
+    """images.csv without standard deviations: approximate orientations."""
     lines = ["# orientations of another program, as approximations", ",".join(("image", *ELEMENTS))]
     for pose in poses:
         angles = np.degrees(angles_from_rotation(pose.rotation))
@@ -100,7 +101,7 @@ def _images(poses: Sequence[ForeignPose]) -> str:
 
 
 def _cameras(cameras: Sequence[CameraFile]) -> dict[str, str]:
-    """camera.toml, or files by name where there are several; equal ones once."""
+    """camera.toml, or one file per name where there are several cameras; equal ones once."""
     files: dict[str, str] = {}
     for camera in cameras:
         name = "camera.toml" if len(cameras) == 1 else f"{file_word(camera.name or 'camera')}.toml"

@@ -1,4 +1,4 @@
-"""What comes in from other programs, before it is written as this one's."""
+"""Imported data of other programs, before it is written as files of this one."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ from pipeline.types import Array
 
 @dataclass(frozen=True)
 class ForeignMark:
-    """A mark of another program. place (2,): column and row, the first pixel's centre (0, 0). covariance_px2
+    """A mark of another program. place (2,): column and row, with the first pixel's centre at (0, 0); covariance_px2
     (2, 2): None where the other program has none."""
 
     image: str
@@ -31,7 +31,8 @@ class ForeignMark:
 
 @dataclass(frozen=True)
 class ForeignPose:
-    """An image's orientation: rotation (3, 3) from the object to axes x right, y up, looking along -z; station (3,)."""
+    """Exterior orientation of an image: rotation (3, 3) from the object to axes x right, y up, looking along -z;
+    station (3,)."""
 
     image: str
     rotation: Array
@@ -40,8 +41,15 @@ class ForeignPose:
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """pitch_um: of the pixels of the other program's pictures; sigma_px: of marks that have none of their own;
-    from_middle: the principal point counts from the picture's middle, as of a film camera; fiducials: the marks are."""
+    """Options of the import.
+
+    Attributes
+    ----------
+    pitch_um : pixel pitch of the other program's images.
+    sigma_px : standard deviation of marks that have none.
+    from_middle : the principal point refers to the centre of the image, as for a film camera.
+    fiducials : the marks are fiducials.
+    """
 
     pitch_um: float | None = None
     sigma_px: float | None = None
@@ -51,7 +59,7 @@ class ImportOptions:
 
 @dataclass(frozen=True)
 class Incoming:
-    """What files of another program hold. notes: what to know of it; tables: files that are written as they are."""
+    """Content of another program's files. notes: remarks for the user; tables: files that are written as they are."""
 
     marks: tuple[ForeignMark, ...] = ()
     cameras: tuple[CameraFile, ...] = ()
@@ -70,10 +78,17 @@ def opencv_camera(
     convention: Convention,
     family: str = "opencv",
 ) -> CameraFile:
-    """A camera in OpenCV's model, or its fisheye's, everything fixed; fx, fy, cx, cy (4,) in px of a convention.
+    """Camera in OpenCV's model, or its fisheye model, with all parameters fixed.
 
-    Its principal point is in comparator coordinates of the picture, or from the picture's middle. Raises InputError
-    where the pitch, or the size that the middle needs, is not known.
+    The principal point is in comparator coordinates of the image, or relative to the image's centre.
+
+    Parameters
+    ----------
+    interior_px : fx, fy, cx, cy (4,) in px of the convention.
+
+    Raises
+    ------
+    InputError : the pitch, or the size that is needed for the centre, is unknown.
     """
     if options.pitch_um is None:
         raise InputError(f"{path}: counts in pixels: give the pixel size in µm with --pitch-um.")
@@ -102,8 +117,10 @@ def opencv_camera(
 
 
 def fiducial_camera(name: str, places: Mapping[str, Array]) -> CameraFile:
-    """A camera of which only fiducial marks are known, mm: they may count from a frame's corner, so the principal point
-    is sought from the middle of the marks."""
+    """Camera of which only fiducial marks are known, mm.
+
+    They may be counted from a corner of the frame, so the principal point starts at the centre of the marks.
+    """
     xy = np.array(list(places.values()))
     middle = (xy.min(axis=0) + xy.max(axis=0)) / 2
     sigma = (DEFAULT_SIGMA_MM, DEFAULT_SIGMA_MM)
@@ -122,5 +139,5 @@ def fiducial_camera(name: str, places: Mapping[str, Array]) -> CameraFile:
 
 
 def foreign_pose(image: str, rotation: Array, translation: Array) -> ForeignPose:
-    """From axes x right, y down, z forward: `camera = rotation X + translation`."""
+    """Convert an orientation with axes x right, y down, z forward: `camera = rotation X + translation`."""
     return ForeignPose(image, np.asarray(Y_DOWN_Z_FORWARD @ rotation), np.asarray(-rotation.T @ translation))

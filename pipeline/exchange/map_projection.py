@@ -1,4 +1,4 @@
-"""From map coordinates to longitude and latitude: of UTM zones, and of what is longitude and latitude already."""
+"""Map coordinates to longitude and latitude: UTM zones, and coordinates that are longitude and latitude already."""
 
 import re
 
@@ -14,7 +14,7 @@ _DEGREES = ("EPSG:4326", "EPSG:4258")
 
 
 def check_crs(crs: str) -> None:
-    """Raises InputError for a system that is not known here."""
+    """Raise InputError for an unknown coordinate reference system."""
     if crs.upper() not in _DEGREES and _zone(crs) is None:
         raise InputError(
             f"crs {crs!r} is not known here. Known are UTM zones (EPSG:32601 to 32660, 32701 to 32760 of WGS 84, 25828 "
@@ -24,14 +24,15 @@ def check_crs(crs: str) -> None:
 
 
 def lon_lat(xy: Array, crs: str) -> Array:
-    """Longitude and latitude (n, 2) in degrees of easting and northing (n, 2) in m, or of longitude and latitude."""
+    """Longitude and latitude (n, 2) in degrees from easting and northing (n, 2) in m, or from longitude and
+    latitude."""
     check_crs(crs)
     zone = _zone(crs)
     return _from_utm(xy, *zone) if zone else xy
 
 
 def _zone(crs: str) -> tuple[int, bool] | None:
-    """The number of a UTM zone, and whether it is southern."""
+    """Number of a UTM zone, and whether it is southern; None for other systems."""
     found = re.fullmatch(r"EPSG:(326|327|258)(\d\d)", crs.upper())
     if found is None:
         return None
@@ -41,7 +42,8 @@ def _zone(crs: str) -> tuple[int, bool] | None:
 
 
 def _from_utm(xy: Array, zone: int, southern: bool) -> Array:
-    """Krueger's series in the third flattening, to n^4: exact to some micrometres within a zone.
+    """Longitude and latitude from UTM by Krueger's series in the third flattening, to n^4: exact to some micrometres
+    within a zone.
 
     L. Krueger, Konforme Abbildung des Erdellipsoids in der Ebene (1912); C. F. F. Karney, Transverse Mercator with an
     accuracy of a few nanometers, J. Geodesy 85 (2011), equations 11, 14, 36.

@@ -1,4 +1,4 @@
-"""Metashape: a script for its console that makes film cameras with their fiducials, and calibrations in its XML."""
+"""Metashape: a script for its console that creates film cameras with fiducials, and calibrations in its XML."""
 
 import json
 from collections.abc import Sequence
@@ -23,12 +23,12 @@ CONVENTION = Convention(
     "y'f, x' = x(...) + P1 (r2 + 2x2) + 2 P2 xy; Python reference: Sensor.film_camera, pixel_size, "
     "calibrateFiducials(resolution in mm), Marker.Type.Fiducial",
 )
-_MOST_REASONS = 3  # in a message
+_MOST_REASONS = 3  # largest number in a message
 NAMES = ("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "b1", "b2")
 
 
 def write(block: Block, options: ExportOptions) -> Written:
-    """reseau_to_metashape.py with its data, and CAMERA.xml where there is an adjustment."""
+    """Write reseau_to_metashape.py with its data, and CAMERA.xml where there is an adjustment."""
     reasons = {frame.image: _hindrance(frame) for frame in block.frames}
     frames = [frame for frame in block.frames if not reasons[frame.image]]
     left_out = tuple(f"{image}: {reason}" for image, reason in reasons.items() if reason)
@@ -58,7 +58,7 @@ def write(block: Block, options: ExportOptions) -> Written:
 
 
 def _hindrance(frame: OutFrame) -> str:
-    """Why an image cannot go out as a film camera's; "" where it can."""
+    """Reason why an image cannot be exported as one of a film camera; "" where it can."""
     if frame.is_mirrored:
         return (
             "its scan is mirrored, and Metashape is not known to take that. Resample it (reseau resample) and use the "
@@ -100,8 +100,8 @@ def _image(frame: OutFrame) -> dict[str, object]:
 
 
 def _calibration(lens: FittedLens, box: Canvas) -> str:
-    """Of the camera's frame: width and height of the exposed frame, cx and cy from its middle. Metashape's p1 stands
-    where OpenCV's p2 does."""
+    """Calibration of the exposed frame, with its width and height; cx and cy from its centre. Metashape's p1 is
+    OpenCV's p2."""
     fx, fy, x0, y0 = lens.values[:4]
     k1, k2, p1, p2, k3 = lens.named(BROWN)
     middle = box.x_mm + box.width_px * box.pitch_mm / 2.0, box.y_mm - box.height_px * box.pitch_mm / 2.0
@@ -119,12 +119,13 @@ def _calibration(lens: FittedLens, box: Canvas) -> str:
 
 
 def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
-    """Calibrations in Agisoft's XML as camera files."""
+    """Read calibrations in Agisoft's XML as camera files."""
     return Incoming(cameras=tuple(_read_camera(path, options) for path in paths))
 
 
 def _read_camera(path: Path, options: ImportOptions) -> CameraFile:
-    """Raises InputError for a file of another kind, and for what no family of distortion here has."""
+    """Read one calibration. Raises InputError for other files, and for parameters that no distortion family here
+    has."""
     root = read_xml(path)
     if root.tag != "calibration":
         raise InputError(f"{path}: its root is <{root.tag}>, not <calibration>. Save it as Agisoft XML.")

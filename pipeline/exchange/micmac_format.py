@@ -1,4 +1,4 @@
-"""MicMac: marks of unresampled scans for its ReSampFid, and camera and poses for the frames that this makes."""
+"""MicMac: fiducials of unresampled scans for its ReSampFid; camera and orientations for the frames that it creates."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from math import ceil, floor
@@ -28,14 +28,17 @@ CONVENTION = Convention(
 )
 _Y_DOWN = np.array([1.0, -1.0])
 _KNOWN = {"KnownConv": "eConvApero_DistM2C"}
-_REECH = "OIS-Reech_"  # before the name of what ReSampFid writes
+_REECH = "OIS-Reech_"  # prefix of the files that ReSampFid writes
 _DIGITS = 12
-_FEWEST = 3  # marks that an affine transformation needs
+_FEWEST = 3  # marks needed for an affine transformation
 
 
 def write(block: Block, options: ExportOptions) -> Written:
-    """Ori-InterneScan with the fiducials; where there is an adjustment, Ori-Reseau with camera and poses, too. Several
-    cameras have a folder each, for MicMac knows one MeasuresCamera.xml a folder."""
+    """Write Ori-InterneScan with the fiducials and, where there is an adjustment, Ori-Reseau with camera and
+    orientations.
+
+    With several cameras each has its own folder, since MicMac reads one MeasuresCamera.xml per folder.
+    """
     cameras = dict.fromkeys(frame.camera for frame in block.frames)
     parts = {
         f"{file_word(camera)}/" if len(cameras) > 1 else "": _camera_files(block, camera, options) for camera in cameras
@@ -92,7 +95,7 @@ def _camera_files(block: Block, camera: str, options: ExportOptions) -> Written:
 
 
 def film_box(block: Block, frame: OutFrame, options: ExportOptions) -> Canvas:
-    """The frame that ReSampFid is to make: the exposed frame, at whole multiples of the pitch, never the marks' box."""
+    """Canvas for ReSampFid: the exposed frame, at whole multiples of the pitch, never the bounding box of the marks."""
     pitch = options.pitch_um or float(np.sqrt(np.prod(frame.known_pitch_um)))
     corners = frame_corners_mm(block, frame) / (pitch / 1000.0)
     left, top = floor(corners[0, 0]), ceil(corners[1, 1])
@@ -101,7 +104,7 @@ def film_box(block: Block, frame: OutFrame, options: ExportOptions) -> Canvas:
 
 
 def _picture_box(block: Block, frame: OutFrame) -> Canvas:
-    """A digital camera's picture, which is not resampled. Raises InputError where its pixels are no squares."""
+    """Canvas of a digital camera's image, which is not resampled. Raises InputError where its pixels are not square."""
     x_um, y_um = frame.known_pitch_um
     if x_um != y_um:
         raise InputError(
@@ -125,13 +128,13 @@ def _marks(
 
 
 def _sigmas_px(marks: Sequence[ComparatorPoint], pitch_mm: float) -> dict[str, float]:
-    """MicMac has one number a mark: the root mean square of both directions."""
+    """One standard deviation per mark, px, as MicMac needs it: the root mean square of both directions."""
     known = {mark.point: mark.sigma_mm for mark in marks if mark.sigma_mm is not None}
     return {point: float(np.sqrt((sigma**2).mean())) / pitch_mm for point, sigma in known.items()}
 
 
 def _calibration(lens: FittedLens, box: Canvas) -> str:
-    """A central perspective with ModPhgrStd, in px of the resampled frame. MicMac's P1 is OpenCV's p2."""
+    """Central perspective with ModPhgrStd, in px of the resampled frame. MicMac's P1 is OpenCV's p2."""
     fx, fy, x0, y0 = lens.values[:4]
     k1, k2, p1, p2, k3 = lens.named(BROWN)
     focal = float(fy / box.pitch_mm)
@@ -152,7 +155,7 @@ def _calibration(lens: FittedLens, box: Canvas) -> str:
 
 def _orientation(frame: OutFrame, calibration: str) -> str:
     assert frame.model is not None
-    rows = (Y_DOWN_Z_FORWARD @ frame.model.rotation).T  # camera to world
+    rows = (Y_DOWN_Z_FORWARD @ frame.model.rotation).T  # rotation from camera to world
     matrix = {f"L{i}": row for i, row in enumerate(rows, 1)}
     content: Content = {
         "TypeProj": "eProjStenope",
@@ -166,7 +169,7 @@ def _orientation(frame: OutFrame, calibration: str) -> str:
 
 
 def _measures(block: Block, frames: Sequence[OutFrame], box: Canvas, reech: str) -> str:
-    """The points' marks in the frames that ReSampFid makes, or in a digital camera's pictures."""
+    """The object points' marks in the frames created by ReSampFid, or in a digital camera's images."""
     images = []
     for frame in frames:
         marks = frame.observed(fiducials=False)
@@ -203,8 +206,8 @@ def _affine_note(frames: Sequence[OutFrame], fiducials: Mapping[str, Array], box
 
 
 def _affine_misfit_px(frame: OutFrame, fiducials: Mapping[str, Array], box: Canvas) -> float:
-    """How far an affine transformation through an image's fiducials, all weighted alike, lies beside the adjusted one
-    at them, px of the frame."""
+    """Largest difference at an image's fiducials between an affine transformation with equal weights and the adjusted
+    one, px of the frame."""
     marks = tuple(mark for mark in frame.observed(fiducials=True) if mark.point in fiducials)
     if len(marks) < _FEWEST:
         return 0.0
@@ -214,8 +217,7 @@ def _affine_misfit_px(frame: OutFrame, fiducials: Mapping[str, Array], box: Canv
 
 
 def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
-    """Files MeasuresIm-*.xml (fiducials), MeasuresCamera.xml (a camera's, which makes a camera file) and sets of marks
-    (points)."""
+    """Read MeasuresIm-*.xml (fiducials), MeasuresCamera.xml (gives a camera file) and sets of marks (object points)."""
     marks: list[ForeignMark] = []
     cameras = []
     for path in paths:
@@ -242,7 +244,7 @@ def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
 
 
 def _points(image: Element, path: Path) -> Iterator[tuple[str, Array, float | None]]:
-    """Name, place and standard deviation, if there is one, of an image's marks."""
+    """Name, place and standard deviation (or None) of an image's marks."""
     for mark in image.findall("OneMesureAF1I"):
         sigma_px = child_numbers(mark, "PrecPointe", 1, path)[0] if mark.find("PrecPointe") is not None else None
         yield child_text(mark, "NamePt", path), np.array(child_numbers(mark, "PtIm", 2, path)), sigma_px

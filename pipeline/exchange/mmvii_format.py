@@ -1,4 +1,4 @@
-"""MMVII: the marks of unresampled scans with their whole covariances, which it alone of these programs takes."""
+"""MMVII: marks of unresampled scans with their full covariances, which no other of these formats supports."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -22,7 +22,7 @@ _FOLDERS = {True: "Fiducials", False: "Targets"}
 
 
 def write(block: Block, options: ExportOptions) -> Written:
-    """MMVII-PhgrProj/PointsMeasure/{Fiducials, Targets}/MesIm-IMAGE.xml."""
+    """Write MMVII-PhgrProj/PointsMeasure/{Fiducials, Targets}/MesIm-IMAGE.xml."""
     kinds = [(frame, folder, frame.observed(is_f)) for frame in block.frames for is_f, folder in _FOLDERS.items()]
     files = {
         f"MMVII-PhgrProj/PointsMeasure/{folder}/MesIm-{frame.file_name}.xml": _measures(frame, marks)
@@ -46,7 +46,7 @@ def _measures(frame: OutFrame, marks: tuple[ComparatorPoint, ...]) -> str:
 
 
 def _sigma2(mark: ComparatorPoint, pitch_um: tuple[float, float]) -> tuple[float, float, float]:
-    """In px, rows downward: what x and y have in common changes its sign."""
+    """Covariance xx, xy, yy in px. The rows point down, so xy changes its sign."""
     if mark.sigma_mm is None:
         return 1.0, 0.0, 1.0
     sx, sy = (float(sigma) for sigma in mark.sigma_mm / (np.array(pitch_um) / 1000.0))
@@ -54,7 +54,7 @@ def _sigma2(mark: ComparatorPoint, pitch_um: tuple[float, float]) -> tuple[float
 
 
 def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
-    """Files MesIm-*.xml: marks with their covariances. Those in a folder Fiducials are fiducials."""
+    """Read MesIm-*.xml: marks with their covariances. Those in a folder Fiducials are fiducials."""
     return Incoming(tuple(mark for path in paths for mark in _marks(path, options)))
 
 

@@ -1,4 +1,4 @@
-"""OpenCV's YAML: camera matrix, distortion and pose of every image, of its resampled frame."""
+"""OpenCV's YAML: camera matrix, distortion and orientation of every resampled frame."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,14 +24,14 @@ CONVENTION = Convention(
 
 
 def write(block: Block, options: ExportOptions) -> Written:
-    """NAME.yml an image, for cv2.FileStorage."""
+    """Write NAME.yml for each image, for cv2.FileStorage."""
     frames, left_out = pinhole_frames(block, options, (BROWN, PRISMS, NAMES[4:]), "opencv")
     files = {f"{frame.frame.image}.yml": _yaml(frame, block.lens_reach.get(frame.frame.camera)) for frame in frames}
     return pinholes_written(files, frames, left_out, lost="the marks")
 
 
 def _yaml(frame: PinholeFrame, lens_reach: str | None) -> str:
-    """lens_reach: a comment on how far out the lens is known."""
+    """YAML text of one image. lens_reach: comment on the radius up to which the lens is known."""
     fx, fy, cx, cy = frame.interior_px(CONVENTION)
     used = np.flatnonzero(frame.lens.values[4:])
     count = next(size for size in (5, 8, 12, 14) if size > (used.max() if used.size else 0))
@@ -54,7 +54,8 @@ def _yaml(frame: PinholeFrame, lens_reach: str | None) -> str:
 
 
 def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
-    """Files of cv2.FileStorage: matrix, distortion and size as camera files; R and t, where there are, as poses."""
+    """Read files of cv2.FileStorage: matrix, distortion and size as camera files; R and t, if given, as
+    orientations."""
     found = [_camera_and_pose(path, options) for path in paths]
     poses = tuple(pose for _, pose in found if pose is not None)
     return Incoming(cameras=tuple(camera for camera, _ in found), poses=poses)

@@ -1,4 +1,5 @@
-"""A resampled frame as programs know cameras that have no film: a pinhole with OpenCV's distortion, and a pose."""
+"""Resampled frames as images of cameras without film: a pinhole with OpenCV's distortion, and an exterior
+orientation."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,13 +17,16 @@ from pipeline.resampling.canvas import Canvas, outline_canvas
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.types import Array
 
-Y_DOWN_Z_FORWARD = np.diag([1.0, -1.0, -1.0])  # from the camera's axes (y up, looking along -z) to these programs'
+Y_DOWN_Z_FORWARD = np.diag([1.0, -1.0, -1.0])  # from the camera's axes (y up, looking along -z) to these programs' axes
 
 
 @dataclass(frozen=True)
 class PinholeFrame:
-    """One image in its resampled frame: pixel (0, 0) is the centre of the first one, the camera's axes are x right, y
-    down, z forward. misfit_px: the largest in its frame."""
+    """One image in its resampled frame.
+
+    Pixel (0, 0) is the centre of the first pixel; the camera's axes are x right, y down, z forward. misfit_px: largest
+    error of a point in the frame.
+    """
 
     frame: WholeFrame
     canvas: Canvas
@@ -32,18 +36,18 @@ class PinholeFrame:
 
     @property
     def picture(self) -> str:
-        """The file that `reseau resample` writes."""
+        """Name of the file that `reseau resample` writes."""
         return f"{self.frame.image}.tif"
 
     def interior_px(self, convention: Convention) -> Array:
-        """fx, fy, cx, cy (4,)."""
+        """fx, fy, cx, cy (4,) in px."""
         interior = self.lens.named(INTERIOR)
         point = self.canvas.pixel_from_camera(interior[2:]) + convention.first_pixel_px
         return np.concatenate([interior[:2] / self.canvas.pitch_mm, point])
 
     @property
     def rotation(self) -> Array:
-        """(3, 3) from the object to the camera's axes."""
+        """Rotation (3, 3) from the object's to the camera's axes."""
         assert self.frame.model is not None
         return np.asarray(Y_DOWN_Z_FORWARD @ self.frame.model.rotation)
 
@@ -54,7 +58,7 @@ class PinholeFrame:
 
     @property
     def translation(self) -> Array:
-        """(3,) of `camera = rotation X + translation`."""
+        """Translation (3,) of `camera = rotation X + translation`."""
         return np.asarray(-self.rotation @ self.station)
 
     def pixels(self, marks: tuple[ComparatorPoint, ...]) -> Array:
@@ -65,10 +69,19 @@ class PinholeFrame:
 def pinhole_frames(
     block: Block, options: ExportOptions, models: Sequence[Sequence[str]], format: str
 ) -> tuple[list[PinholeFrame], list[str]]:
-    """Every oriented image with its lens in the first of the models, each given by its parameters' names, that is near
-    enough, or as OpenCV's fisheye; and why the other images are not among them.
+    """Pinhole frames of every oriented image.
 
-    Raises InputError where no image is oriented, or where the last model, too, is off by more than the options allow.
+    Parameters
+    ----------
+    models : each given by its parameters' names; the first that is close enough is used, or OpenCV's fisheye.
+
+    Returns
+    -------
+    The frames, and the reasons why other images are left out.
+
+    Raises
+    ------
+    InputError : no image is oriented, or even the last model has a larger misfit than the options allow.
     """
     block.needs_orientation(format)
     lenses: dict[str, FittedLens] = {}
@@ -87,14 +100,15 @@ def pinhole_frames(
 def checked_misfits(
     block: Block, frames: Sequence[Frame], lens: FittedLens, box: Canvas, options: ExportOptions, format: str
 ) -> float:
-    """The largest misfit, px, of a camera's images by a lens. Raises InputError as `pinhole_frames` does."""
+    """Largest misfit, px, of a lens over a camera's images. Raises InputError where it is larger than the options
+    allow."""
     misfits = {each.image: (lens.largest_mm + sight_misfit_mm(block, each)) / box.pitch_mm for each in frames}
     _check_misfit(misfits, options, format)
     return max(misfits.values())
 
 
 def _check_misfit(misfit_px: dict[str, float], options: ExportOptions, format: str) -> None:
-    """Raises InputError where the worst image is off by more than the options allow."""
+    """Raise InputError where the misfit of the worst image is larger than the options allow."""
     worst = max(misfit_px, key=lambda image: misfit_px[image], default=None)
     if worst is not None and not misfit_px[worst] <= options.largest_misfit_px:
         raise InputError(
@@ -105,7 +119,7 @@ def _check_misfit(misfit_px: dict[str, float], options: ExportOptions, format: s
 
 
 def sight_misfit_mm(block: Block, frame: Frame) -> float:
-    """How far refraction and the earth's curvature, which other programs do not know, move an image's points."""
+    """Largest shift of an image's points by refraction and earth curvature, which other programs do not model."""
     model = frame.model
     assert model is not None
     points = [block.points[mark.point] for mark in frame.observed(fiducials=False) if mark.point in block.points]
@@ -118,7 +132,7 @@ def sight_misfit_mm(block: Block, frame: Frame) -> float:
 
 
 def _pinhole(block: Block, frame: WholeFrame, lens: FittedLens, options: ExportOptions) -> PinholeFrame:
-    """Raises MeasurementError where the lens folds within the scan."""
+    """Pinhole of one frame. Raises MeasurementError where the lens folds within the scan."""
     pitch_um = options.pitch_um or float(np.sqrt(np.prod(frame.known_pitch_um)))
     scans = [(scan.chain(options.with_lens), *block.size_px(scan)) for scan in frame.scans]
     canvas = outline_canvas(scans, pitch_um / 1000.0)
@@ -129,7 +143,7 @@ def _pinhole(block: Block, frame: WholeFrame, lens: FittedLens, options: ExportO
 def pinholes_written(
     files: Mapping[str, str | bytes], frames: Sequence[PinholeFrame], left_out: Sequence[str], *notes: str, lost: str
 ) -> Written:
-    """What a format of pinholes has written, with how well the cameras could be handed on. lost: of the marks."""
+    """Summary of an export of pinholes, with the misfit of the cameras. lost: what is lost of the marks."""
     worst = max((frame.misfit_px for frame in frames), default=-1.0)
     if worst == 0.0:
         notes = ("The camera's model is the very same: nothing was fitted.", *notes)

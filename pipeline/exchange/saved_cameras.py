@@ -1,9 +1,9 @@
-"""`reseau cameras --save`: calibrated cameras as camera files, each beside its calibration with covariance, for later
-projects to take as prior knowledge.
+"""`reseau cameras --save`: write calibrated cameras as camera files, each with its calibration and covariance, as prior
+knowledge for later projects.
 
-Several projects (archives) of one camera are joined by their covariances. What they differ by more than these explain
-is their spread, a variance component between archives by the method of moments (DerSimonian and Laird, 1986, for each
-quantity by itself), which is added to the joint variances.
+Calibrations of one camera from several projects (archives) are combined by their covariances. Differences beyond these
+are described by a variance component between archives, estimated for each quantity separately by the method of moments
+(DerSimonian and Laird, 1986). It is added to the combined variances.
 """
 
 import math
@@ -32,14 +32,14 @@ from pipeline.text.atomic import atomic_path, write_atomically
 from pipeline.text.wording import counted, listed
 from pipeline.types import Array
 
-_ONE_CAMERA = ("interior", "fiducial")  # kinds of quantities of a camera
+_ONE_CAMERA = ("interior", "fiducial")  # kinds of parameters that belong to a camera
 Changed = Callable[[Parameter, Quantity], Quantity]
 _HEAD = "# Adjusted camera, saved by reseau"
 
 
 @dataclass(frozen=True, eq=False)
 class _Calibration:
-    """A camera as one project's adjustment has it: its quantities with values (n,) and covariance (n, n)."""
+    """A camera as adjusted in one project: its parameters with values (n,) and covariance (n, n)."""
 
     project: Project
     camera: CameraFile
@@ -53,22 +53,24 @@ class _Calibration:
 
 @dataclass(frozen=True)
 class SavedCamera:
-    """A camera file that was written, and what stands behind it."""
+    """A camera file that was written, and its source."""
 
     name: str
     path: Path
     source: Source
 
     def sentence(self) -> str:
-        """What was saved."""
+        """Sentence that describes what was saved."""
         return f"{self.name}: {self.path}, {self.source.text}"
 
 
 def save_cameras(projects: Sequence[Project], folder: Path) -> list[SavedCamera]:
-    """Write every calibrated camera of adjusted projects into a folder; cameras of one name are one camera.
+    """Write every calibrated camera of adjusted projects into a folder. Cameras of the same name are one camera.
 
-    Raises InputError where nothing is adjusted or is of other inputs than there are now, where no camera is calibrated,
-    where calibrations of one camera are of different lens models, and for a file of that name that was not saved so.
+    Raises
+    ------
+    InputError : nothing is adjusted, an adjustment is stale, no camera is calibrated, the calibrations of one camera
+        have different lens models, or a file of that name exists and was not saved by this command.
     """
     found: dict[str, list[_Calibration]] = {}
     for project in projects:
@@ -123,13 +125,18 @@ def _save(calibrations: Sequence[_Calibration], path: Path) -> SavedCamera:
     camera = _adjusted_camera(first, record.cameras[first.camera.name], earlier, path, source)
     body = camera_text(camera, picture_writer(path.parent, f"{path.stem}-"))
     write_atomically(path, f"{_HEAD}: values, and in {earlier.name} their covariance.\n{body}")
-    read_camera(path)  # raises for what later projects could not read
+    read_camera(path)  # raises if later projects could not read it
     return SavedCamera(first.camera.name, path, source)
 
 
 def _combine(calibrations: Sequence[_Calibration]) -> tuple[Array, Array, Mapping[Parameter, float]]:
-    """Values and covariance of the first one's quantities by all calibrations, and the standard deviation between
-    archives of each that is estimated."""
+    """Weighted mean of several calibrations.
+
+    Returns
+    -------
+    Values and covariance of the first calibration's parameters; by free parameter, the standard deviation between
+    archives.
+    """
     first = calibrations[0]
     if len(calibrations) == 1:
         return first.values, first.covariance, {}
@@ -151,8 +158,12 @@ def _combine(calibrations: Sequence[_Calibration]) -> tuple[Array, Array, Mappin
 
 
 def _archive_variances(values: Array, variances: Array) -> Array:
-    """(n,) variance between archives of quantities (archives, n) with their own variances, by the method of moments; 0
-    where their differences are no larger than these explain."""
+    """Variances (n,) between archives, by the method of moments (DerSimonian and Laird).
+
+    Parameters
+    ----------
+    values, variances : (archives, n). The result is 0 where the variances explain the differences.
+    """
     weights = 1.0 / variances
     total = weights.sum(axis=0)
     mean = (weights * values).sum(axis=0) / total
@@ -161,7 +172,8 @@ def _archive_variances(values: Array, variances: Array) -> Array:
 
 
 def _order(first: _Calibration, other: _Calibration) -> Array:
-    """Where the quantities of one calibration stand in another of the same camera."""
+    """Indices of the parameters of one calibration in another of the same camera. Raises InputError where they
+    differ."""
     name = first.camera.name
     ours, theirs = first.record.cameras[name].distortion, other.record.cameras[name].distortion
     where = {one: at for at, one in enumerate(other.parameters)}
@@ -182,7 +194,7 @@ def _order(first: _Calibration, other: _Calibration) -> Array:
 
 
 def _replace_quantities(one: _Calibration, values: Mapping[Parameter, float], covariance: Array) -> AdjustmentRecord:
-    """The adjustment with these quantities of the one camera, and without images, points and residuals."""
+    """The adjustment record with these values and covariances for its camera, without images, points and residuals."""
     name, record = one.camera.name, one.record
     sigmas = dict(zip(one.parameters, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
 
@@ -234,8 +246,8 @@ def _write_calibration(
 
 
 def _adjusted_camera(one: _Calibration, record: CameraRecord, earlier: Path, path: Path, source: Source) -> CameraFile:
-    """The project's camera with adjusted values; the calibration takes the place of the standard deviations of all that
-    it holds."""
+    """The project's camera file with adjusted values. The calibration replaces the standard deviations of its
+    parameters."""
     camera, point = one.camera, record.principal_point_mm
     parameters = {
         name: Prior(record.distortion.parameters[name].value, prior.sigma)

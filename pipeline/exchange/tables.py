@@ -1,4 +1,4 @@
-"""Everything that goes out, as tables in this program's own conventions, in CSV and Parquet."""
+"""Export of all results as tables in this program's own conventions, in CSV and Parquet."""
 
 import io
 import math
@@ -24,17 +24,18 @@ Table = dict[str, list[Cell]]
 
 
 def write_csv(block: Block, options: ExportOptions) -> Written:
-    """A file a table; numbers with all their digits."""
+    """Write one CSV file per table; numbers with all their digits."""
     return Written({f"{name}.csv": _csv_text(table) for name, table in tables(block).items()})
 
 
 def write_parquet(block: Block, options: ExportOptions) -> Written:
-    """A file a table. Raises InputError where pyarrow is not installed."""
+    """Write one Parquet file per table. Raises InputError where pyarrow is not installed."""
     return Written({f"{name}.parquet": _parquet_bytes(table) for name, table in tables(block).items()})
 
 
 def tables(block: Block) -> Mapping[str, Table]:
-    """By name; a cell that has no value is None. Angles in degrees, their covariances in rad as in adjustment.npz."""
+    """Tables by name; cells without a value are None. Angles in degrees, their covariances in rad as in
+    adjustment.npz."""
     rows: dict[str, Iterable[Row]] = {"marks": (_mark(frame, mark) for frame in block.frames for mark in frame.marks)}
     if adjustment := block.adjustment:
         rows |= {
@@ -88,7 +89,8 @@ def _transformations(adjustment: AdjustmentRecord, block: Block) -> Iterable[Row
 
 
 def _covariances(block: Block) -> Iterable[Row]:
-    """Of each image's orientation and film transformation: the lower triangle, mm, object units and rad."""
+    """Covariances of each image's exterior orientation and film transformation: lower triangle; mm, object units and
+    rad."""
     of_image: dict[str, list[Parameter]] = {}
     for each in block.covariance.parameters:
         if each.kind in ("exterior", "film"):

@@ -1,4 +1,4 @@
-"""XML of other programs: read by a parser that expands no entities, written with two blanks a level."""
+"""XML of other programs: a parser that does not expand entities, and a writer that indents by two blanks per level."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -16,12 +16,12 @@ from pipeline.types import Array
 Element = ElementTree.Element
 Content: TypeAlias = "str | float | Array | Mapping[str, Content] | Sequence[tuple[str, Content]]"
 
-DEEPEST = 100  # elements within one another: no format here has ten
+DEEPEST = 100  # largest nesting depth of elements: no format here has ten
 
 
 def read_xml(path: Path) -> Element:
-    """The root element of a file. Raises InputError for a missing file, broken XML, and any document type, for with it
-    come entities."""
+    """Read the root element of a file. Raises InputError for a missing file, broken XML, and any document type, since
+    it may define entities."""
     builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
     depth = 0
 
@@ -58,7 +58,7 @@ def read_xml(path: Path) -> Element:
 
 
 def child_text(element: Element, name: str, path: Path) -> str:
-    """The text of a child element. Raises InputError where there is none."""
+    """Text of a child element. Raises InputError where there is none."""
     found = element.find(name)
     if found is None or found.text is None:
         raise InputError(f"{path}: <{element.tag}> has no <{name}>. Is it a file of this format?")
@@ -66,7 +66,7 @@ def child_text(element: Element, name: str, path: Path) -> str:
 
 
 def child_numbers(element: Element, name: str, count: int, path: Path) -> list[float]:
-    """So many numbers in the text of a child element. Raises InputError where there are others."""
+    """The given count of numbers in the text of a child element. Raises InputError for any other text."""
     text = child_text(element, name, path)
     try:
         values = [float(part) for part in text.split()]
@@ -78,7 +78,7 @@ def child_numbers(element: Element, name: str, count: int, path: Path) -> list[f
 
 
 def xml_text(name: str, content: Content) -> str:
-    """A document of one element: with text, numbers, or elements by their names (pairs, where a name recurs)."""
+    """Document with one root element: text, numbers, or elements by their names (pairs, where a name recurs)."""
     root = _element(name, content)
     ElementTree.indent(root)
     text = ElementTree.tostring(root, encoding="unicode", short_empty_elements=False)
