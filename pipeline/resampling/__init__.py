@@ -1,1 +1,2 @@
-"""A scan into its camera's frame: one chain of named transformations, inverted, and the picture sampled through it."""
+"""Resampling of scans into the camera's frame: a chain of named transformations is inverted, and the scan
+interpolated."""

@@ -1,4 +1,4 @@
-"""The way from a place in the camera's frame to a pixel of the scan, and the lattice that a scan is resampled to."""
+"""Transformation from camera coordinates to pixels of the scan, and the pixel grid of the resampled frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -18,16 +18,18 @@ from pipeline.results.comparator_file import comparator_from_pixel, pixel_from_c
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.types import Array, Mask
 
-_WIDEST = 2.0  # half of a fisheye's ideal picture, in principal distances
-_EDGE_POINTS = 65  # of the scan's outline, a side
-_NODES_PX = 16  # between the places at which the chain is asked; between them it is interpolated cubically
-_BEYOND = 3  # nodes on either side of a tile, for the interpolation
+_WIDEST = 2.0  # half width of a fisheye's ideal image, in principal distances
+_EDGE_POINTS = 65  # points per side of the scan's outline
+_NODES_PX = 16  # px between the nodes at which the chain is evaluated; cubic interpolation between them
+_BEYOND = 3  # nodes beyond each side of a tile, for the interpolation
 
 
 @dataclass(frozen=True)
 class FrameChain:
-    """What takes a scan to its camera's frame and back; lens None: to the observed points of the frame, distortion
-    left in. Its transformations, in the order from the scan: pitch, bend of the scanner, film, lens."""
+    """Transformations from the scan to the camera's frame, in this order: pitch, scanner bend, film, lens.
+
+    lens None: the frame keeps the lens distortion.
+    """
 
     pitch_um: tuple[float, float]
     film: Film
@@ -36,7 +38,7 @@ class FrameChain:
     lens: Lens | None = None
 
     def scan_from_frame(self, xy_mm: Array) -> tuple[Array, Mask]:
-        """Pixels (n, 2), column and row, of camera coordinates (n, 2) in mm; which of them the scan can have."""
+        """Pixels (n, 2), column and row, of camera coordinates (n, 2) in mm; mask of the places that have an image."""
         observed, is_imaged = xy_mm, np.ones(len(xy_mm), dtype=bool)
         if self.lens is not None:
             ray = (xy_mm - self.lens.interior[1:]) / self.lens.interior[0]
@@ -46,7 +48,7 @@ class FrameChain:
         return pixel_from_comparator(place, self.pitch_um), is_imaged & on_film & on_glass
 
     def frame_from_scan(self, col_row: Array) -> tuple[Array, Mask]:
-        """Camera coordinates (n, 2) in mm of pixels (n, 2); which of them the camera can have."""
+        """Camera coordinates (n, 2) in mm of pixels (n, 2); mask of the pixels for which the lens can be inverted."""
         comparator = self.bend.apply(self.bend_parameters, comparator_from_pixel(col_row, self.pitch_um))
         observed = self.film.camera_from_comparator(comparator)
         if self.lens is None:
@@ -55,14 +57,15 @@ class FrameChain:
 
 
 def adjusted_chain(measured: MeasuredScan, adjustment: AdjustmentRecord, with_lens: bool) -> FrameChain:
-    """The chain of an image of adjustment.json, with the film transformation and the scanner that were adjusted."""
+    """Chain of a scan from adjustment.json, with the adjusted film transformation and scanner bend."""
     return image_chain(measured.frame.image, adjustment, measured.pitch_um, _middle_mm(measured), with_lens)
 
 
 def image_chain(
     name: str, adjustment: AdjustmentRecord, pitch_um: tuple[float, float], middle_mm: Array, with_lens: bool
 ) -> FrameChain:
-    """The same. middle_mm (2,): a place about in the middle of the image, in the comparator."""
+    """Chain of an image from an adjustment record. middle_mm (2,): a place near the centre of the image, in the
+    comparator."""
     image = adjustment.images[name]
     scanner = adjustment.scanners.get(image.scanner)
     bend = (NO_BEND, np.empty(0)) if scanner is None else scanner.bend()
@@ -71,8 +74,12 @@ def image_chain(
 
 
 def measured_chain(measured: MeasuredScan, taking_lens: Lens | None = None) -> FrameChain | None:
-    """The chain by the fiducials of a scan alone, None where too few were found. taking_lens: of the camera that
-    photographed the film."""
+    """Chain from the fiducials of a scan alone; None where too few were found.
+
+    Parameters
+    ----------
+    taking_lens : of the camera that photographed the film.
+    """
     matrix = measured.frame.pixel_from_camera
     if matrix is None:
         return None
@@ -92,8 +99,11 @@ def _middle_mm(measured: MeasuredScan) -> Array:
 
 @dataclass(frozen=True)
 class Canvas:
-    """x_mm, y_mm: camera coordinates of the centre of the first pixel; col = (x' - x_mm) / pitch_mm, row =
-    (y_mm - y') / pitch_mm."""
+    """Pixel grid of a resampled frame.
+
+    x_mm, y_mm: camera coordinates of the centre of the first pixel; col = (x' - x_mm) / pitch_mm, row = (y_mm - y') /
+    pitch_mm.
+    """
 
     x_mm: float
     y_mm: float
@@ -110,16 +120,17 @@ class Canvas:
         return np.asarray((places_mm - np.array([self.x_mm, self.y_mm])) / (self.pitch_mm, -self.pitch_mm))
 
     def camera_mm(self, col: Array, row: Array) -> Array:
-        """(rows, cols, 2) of columns (cols,) and rows (rows,)."""
+        """Camera coordinates (rows, cols, 2) of columns (cols,) and rows (rows,)."""
         x, y = np.meshgrid(self.x_mm + self.pitch_mm * col, self.y_mm - self.pitch_mm * row)
         return np.stack([x, y], axis=-1)
 
 
 def outline_canvas(scans: Sequence[tuple[FrameChain, int, int]], pitch_mm: float) -> Canvas:
-    """The canvas that holds the whole outlines of scans, each with its width and height, its pixels at whole multiples
-    of the pitch.
+    """Canvas that contains the outlines of scans, each with its width and height. Pixels lie at whole multiples of the
+    pitch.
 
-    A fisheye's ideal picture has no end: it is cut off where it would be stretched five times over (63 degrees).
+    The ideal image of a fisheye is unbounded: it is cut off where it would be stretched by a factor of five (63
+    degrees).
 
     Raises MeasurementError where the lens or the film folds within the scan.
     """
@@ -130,7 +141,7 @@ def outline_canvas(scans: Sequence[tuple[FrameChain, int, int]], pitch_mm: float
 
 
 def _outline_mm(chain: FrameChain, width_px: int, height_px: int) -> Array:
-    """(n, 2) places along a scan's edge in the camera frame."""
+    """(n, 2) places along a scan's edge in the camera frame, mm."""
     across, down = np.linspace(-0.5, width_px - 0.5, _EDGE_POINTS), np.linspace(-0.5, height_px - 0.5, _EDGE_POINTS)
     sides = [(across, np.full_like(across, row)) for row in (down[0], down[-1])]
     sides += [(np.full_like(down, col), down) for col in (across[0], across[-1])]
@@ -144,16 +155,16 @@ def _outline_mm(chain: FrameChain, width_px: int, height_px: int) -> Array:
 
 
 def scan_places(chain: FrameChain, canvas: Canvas, col0: int, row0: int, side: int) -> tuple[Array, Array]:
-    """Columns and rows of the scan, (side, side) each, at the pixels of a tile of the canvas; NaN where it has none.
+    """Columns and rows of the scan, (side, side) each, at the pixels of a tile of the canvas; NaN where there is none.
 
-    The chain is smooth: between nodes 16 px apart cubic splines are within 1e-4 px of it.
+    The chain is smooth: cubic splines through nodes 16 px apart are within 1e-4 px of it.
     """
     nodes = _nodes(side)
     places_mm = canvas.camera_mm(col0 + nodes, row0 + nodes)
     pixels, found = chain.scan_from_frame(places_mm.reshape(-1, 2))
     pixels = pixels.reshape(len(nodes), len(nodes), 2)
     at = np.arange(side, dtype=float)
-    if not found.all():  # where a lens folds nothing is smooth: the tile is asked pixel by pixel
+    if not found.all():  # where a lens folds the chain is not smooth: evaluate it at each pixel
         exact, known = chain.scan_from_frame(canvas.camera_mm(col0 + at, row0 + at).reshape(-1, 2))
         exact[~known] = np.nan
         return exact[:, 0].reshape(side, side), exact[:, 1].reshape(side, side)
@@ -167,6 +178,6 @@ def _nodes(side: int) -> Array:
 
 @cache
 def _cubic_from_nodes(side: int) -> Array:
-    """(side, nodes) what cubic splines through values at the nodes are at the pixels of a tile."""
+    """(side, nodes) matrix that evaluates cubic splines through values at the nodes at the pixels of a tile."""
     nodes = _nodes(side)
     return np.asarray(make_interp_spline(nodes, np.eye(len(nodes)))(np.arange(side)))

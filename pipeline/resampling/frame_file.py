@@ -1,4 +1,4 @@
-"""A resampled frame as a TIFF file: tiles, reduced pages, a mask, and a description of where its pixels lie."""
+"""TIFF file of a resampled frame: tiles, reduced pages, a mask, and a description of the position of its pixels."""
 
 import json
 from collections.abc import Callable, Iterator, Sequence
@@ -17,17 +17,24 @@ from pipeline.text.atomic import atomic_path
 from pipeline.types import Mask, Samples
 
 TILE_PX = 512
-_REDUCTION = 4  # between a page and the next smaller one
+_REDUCTION = 4  # factor between a page and the next smaller one
 _SMALLEST_PX = 512
-_LARGEST_REDUCED_BYTES = 32 << 20  # of the first reduced page, which is held in memory
-_CLASSIC_BYTES = 3_900_000_000  # TIFF counts bytes in 32 bits
+_LARGEST_REDUCED_BYTES = 32 << 20  # largest size of the first reduced page, which is held in memory
+_CLASSIC_BYTES = 3_900_000_000  # above it BigTIFF is written: classic TIFF has 32-bit offsets
 _REDUCED, _MASK = 1, 4  # TIFF 6.0, NewSubfileType
 
 
 @dataclass(frozen=True)
 class Description:
-    """What the file says of itself; `pose` and `lens` are those taken out. parts: the scans that it was put together
-    of, seams_mm: the lines in the camera frame where it passes from one to another; both empty of one scan alone."""
+    """Description stored in the file.
+
+    Attributes
+    ----------
+    pose : scan orientation that was removed.
+    lens : whether the lens distortion was removed.
+    parts : scans of which the frame is composed; empty for a single scan.
+    seams_mm : seams between them, polylines in the camera frame; empty for a single scan.
+    """
 
     image: str
     camera: str
@@ -39,7 +46,7 @@ class Description:
     seams_mm: Sequence[Sequence[tuple[float, float]]] = ()
 
     def text(self) -> str:
-        """One JSON object: x_mm, y_mm are camera coordinates of the centre of the first pixel."""
+        """JSON text; x_mm, y_mm are camera coordinates of the centre of the first pixel."""
         content = {
             "reseau": version("reseau"),
             "image": self.image,
@@ -56,7 +63,7 @@ class Description:
 
 
 def read_description(path: Path) -> dict[str, Any] | None:
-    """The description of a resampled frame; None for any other file, and for one that is not there."""
+    """Read the description of a resampled frame; None for any other or missing file."""
     try:
         with TiffFile(path) as file:
             content = json.loads(file.pages.first.description)
@@ -68,14 +75,25 @@ def read_description(path: Path) -> dict[str, Any] | None:
 def write_frame(
     path: Path, described: Description, channels: int, dtype: type, make_tile: Callable[[int, int], Tile]
 ) -> int:
-    """Write the frame, tile by tile as `make_tile(col0, row0)` gives them; how many samples were clamped.
+    """Write the frame, tile by tile.
 
-    Memory holds a tile, the first reduced page, and the mask of tiles at the scan's edge. Raises InputError where the
-    file cannot be written.
+    Memory holds one tile, the first reduced page, and the masks of tiles at the scan's edge.
+
+    Parameters
+    ----------
+    make_tile : returns the tile at (col0, row0).
+
+    Returns
+    -------
+    The number of clamped samples.
+
+    Raises
+    ------
+    InputError : the file cannot be written.
     """
     canvas = described.canvas
     reduced = _Reduced(canvas, channels, dtype)
-    masks: dict[tuple[int, int], NDArray[np.uint8] | bool] = {}  # most tiles are inside or outside as wholes
+    masks: dict[tuple[int, int], NDArray[np.uint8] | bool] = {}  # most tiles are entirely inside or outside
     clamped = 0
 
     def tiles() -> Iterator[Samples]:
@@ -121,7 +139,7 @@ def write_frame(
 
 
 class _Reduced:
-    """The reduced pages, area-averaged: the first one filled from the tiles, the others from the one before them."""
+    """Reduced pages by area averaging: the first one from the tiles, each other one from the page before it."""
 
     def __init__(self, canvas: Canvas, channels: int, dtype: type) -> None:
         self.factor = _REDUCTION
@@ -155,5 +173,5 @@ def _averaged(samples: Samples, factor: int) -> Samples:
 
 
 def _filled(part: Mask, side: int) -> Mask:
-    """A tile at the frame's end, filled up."""
+    """Pad a tile at the frame's edge to its full size."""
     return np.pad(part, ((0, side - part.shape[0]), (0, side - part.shape[1])))

@@ -1,4 +1,4 @@
-"""The pixels of a scan by windows, however it lies, and tiles interpolated from them by splines."""
+"""Windows of a scan, whatever the layout of its file, and tiles interpolated from them by splines."""
 
 import os
 import tempfile
@@ -15,15 +15,15 @@ import compiled
 from measure.scans.scan import Scan
 from pipeline.types import Array, Mask, Samples
 
-_BAND_PX = 256  # rows that are decoded at a time into the scratch file
+_BAND_PX = 256  # rows decoded at a time into the scratch file
 Degree = Literal[3, 5]
 
 
-MARGIN_PX = 16  # about a tile: there the prefilter's pole 0.43 of a spline of degree 5 has died to 1e-6
+MARGIN_PX = 16  # around a tile: there the prefilter of a spline of degree 5, with pole 0.43, has decayed to 1e-6
 
 
 class Source(Protocol):
-    """What is interpolated: its size, and windows (height, width, channels) whose outside repeats its edge."""
+    """Source of the interpolation: its size, and windows (height, width, channels) that repeat its edge outside."""
 
     width_px: int
     height_px: int
@@ -36,7 +36,7 @@ class Source(Protocol):
 
 
 class _ByWindows:
-    """A scan whose file gives windows without reading the rest."""
+    """A scan whose file allows windows to be read without decoding the rest."""
 
     def __init__(self, scan: Scan) -> None:
         self.scan = scan
@@ -51,7 +51,7 @@ class _ByWindows:
 
 
 class _Decoded(_ByWindows):
-    """A scan decoded into a file without compression, whose rows are read by place: mapped memory would count."""
+    """A scan decoded into an uncompressed file that is read row by row; mapping the file would count as used memory."""
 
     def __init__(self, scan: Scan, file: int) -> None:
         super().__init__(scan)
@@ -84,7 +84,14 @@ def _inside_mask(source: _ByWindows, col0: int, row0: int, width: int, height: i
 
 @contextmanager
 def open_source(scan: Scan, rows_at_a_time: int, scratch: Path) -> Iterator[Source]:
-    """The scan, of which a row of tiles needs `rows_at_a_time` rows. scratch: a folder for what is decoded."""
+    """Open a scan as a source. Where a row of tiles needs more rows than stay decoded, the scan is decoded to a file
+    first.
+
+    Parameters
+    ----------
+    rows_at_a_time : rows of the scan that a row of tiles needs.
+    scratch : folder of the decoded file.
+    """
     wide = scan.segment_px[1] >= scan.width_px
     if not wide or rows_at_a_time <= scan.rows_kept:
         yield _ByWindows(scan)
@@ -94,8 +101,14 @@ def open_source(scan: Scan, rows_at_a_time: int, scratch: Path) -> Iterator[Sour
 
 
 class Tile(NamedTuple):
-    """samples (side, side, channels) as the scan stores them; is_inside (side, side): which the scan has; clamped: how
-    many samples a spline had thrown beyond what can be stored."""
+    """Interpolated tile.
+
+    Attributes
+    ----------
+    samples : (side, side, channels), with the type of the scan.
+    is_inside : (side, side) mask of the pixels within the scan.
+    clamped : number of samples that the spline put beyond the range of the type.
+    """
 
     samples: NDArray[np.uint8 | np.uint16]
     is_inside: Mask
@@ -103,7 +116,7 @@ class Tile(NamedTuple):
 
 
 def interpolated(source: Source, columns: Array, rows: Array, degree: Degree) -> Tile:
-    """The scan at places (side, side), by splines of the degree; 0 where it has no pixel."""
+    """Interpolate the scan at places (side, side) by splines of the degree; 0 outside of the scan."""
     shape = columns.shape
     inside = (columns >= -0.5) & (columns <= source.width_px - 0.5) & (rows >= -0.5) & (rows <= source.height_px - 0.5)
     samples = np.zeros((*shape, source.channels), source.dtype)
@@ -113,7 +126,7 @@ def interpolated(source: Source, columns: Array, rows: Array, degree: Degree) ->
     right, bottom = (int(np.ceil(places[inside].max())) + MARGIN_PX for places in (columns, rows))
     window = source.window(left, top, right - left + 1, bottom - top + 1)
     known = source.valid_mask(left, top, right - left + 1, bottom - top + 1)
-    if not known.all():  # what a spline touches of lost pixels is lost
+    if not known.all():  # a sample is lost if its spline involves a lost pixel
         lost = maximum_filter(~known, size=degree + 2)
         at = np.rint([rows[inside] - top, columns[inside] - left]).astype(int)
         inside[inside] = ~lost[tuple(at)]
@@ -130,8 +143,12 @@ def interpolated(source: Source, columns: Array, rows: Array, degree: Degree) ->
 def spline_samples(
     picture: Samples, places: Array, degree: Degree, dtype: type[np.uint8] | type[np.uint16]
 ) -> tuple[Samples, int]:
-    """Samples (n,) of a spline through a picture (rows, columns), mirrored at its edges, at places (2, n), row and
-    column; how many of them were clamped to what can be stored."""
+    """Evaluate a spline through an image (rows, columns), mirrored at its edges, at places (2, n), row and column.
+
+    Returns
+    -------
+    The samples (n,), and how many were clamped to the range of the type.
+    """
     coefficients = spline_filter(picture, degree, mode="mirror")
     if compiled.kernels is not None:
         samples: Samples = np.empty(places.shape[1], dtype)

@@ -1,4 +1,5 @@
-"""`reseau resample`: every scan of a project in its camera's frame, as files that say where their pixels lie."""
+"""`reseau resample`: resample every scan of a project into its camera's frame, as files that hold the position of their
+pixels."""
 
 import hashlib
 import json
@@ -37,7 +38,7 @@ FAST: Degree = 3
 
 @dataclass(frozen=True)
 class OtherScan:
-    """A further scan of the same frame, for that was scanned in parts."""
+    """A further partial scan of the same frame."""
 
     image: str
     scan: Path
@@ -46,8 +47,14 @@ class OtherScan:
 
 @dataclass(frozen=True)
 class ResampleTask:
-    """All that the resampling of one frame depends on. pitch_mm: of the result; max_pixels: as `open_scan` takes it;
-    part, others: of a frame that was scanned in parts the name of this scan, and the other ones."""
+    """All that the resampling of one frame depends on.
+
+    Attributes
+    ----------
+    pitch_mm : of the result.
+    max_pixels : limit for `open_scan`.
+    part, others : name of this scan and the other scans, for a frame scanned in parts.
+    """
 
     image: str
     camera: str
@@ -63,7 +70,8 @@ class ResampleTask:
 
     @property
     def fingerprint(self) -> str:
-        """Of the scans' files and everything that the result depends on: what has it need not be made again."""
+        """Fingerprint of the scans' files and everything else that the result depends on; a frame with an equal one is
+        up to date."""
         own = self._scan_fingerprint(self.scan, self.chain)
         others = [self._scan_fingerprint(other.scan, other.chain) for other in self.others]
         return hashlib.sha256("".join([own, *others]).encode()).hexdigest() if others else own
@@ -83,8 +91,14 @@ class ResampleTask:
 
 @dataclass(frozen=True)
 class Resampled:
-    """What became of one scan. clamped: samples that had to be brought back to what can be stored; problem: why there
-    is no frame, empty where there is one; kept: it was there already."""
+    """Result of one scan.
+
+    Attributes
+    ----------
+    clamped : number of samples clamped to the range of the type.
+    kept : whether an existing file was up to date.
+    problem : reason why there is no frame; otherwise empty.
+    """
 
     image: str
     path: Path | None
@@ -98,11 +112,17 @@ class Resampled:
 def resample(
     project: Project, folder: Path, pitch_um: float | None, with_lens: bool, fast: bool, reporter: Reporter
 ) -> tuple[Resampled, ...]:
-    """Resample every scan of the project that was measured, in the order of the names; one that fails is a result.
+    """Resample every measured scan of the project, in the order of the names; a failure is a result, too.
 
-    pitch_um: of the result; None: that of each scan, the mean of both directions. A frame in the folder that was made
-    of the same scan in the same way is kept. Raises InputError where nothing was measured, or for a lens that nobody
-    has adjusted.
+    A frame in the folder that was made from the same scan in the same way is kept.
+
+    Parameters
+    ----------
+    pitch_um : of the result; None: that of each scan, the mean of both directions.
+
+    Raises
+    ------
+    InputError : nothing was measured, or the lens was not adjusted.
     """
     check_writable(folder)
     tasks, results = resample_tasks(project, folder, pitch_um, with_lens, BEST if not fast else FAST)
@@ -117,7 +137,7 @@ def resample(
 def resample_tasks(
     project: Project, folder: Path, pitch_um: float | None, with_lens: bool, degree: Degree
 ) -> tuple[list[ResampleTask], list[Resampled]]:
-    """What is to be done, and what cannot be."""
+    """Tasks of a project, and the failures of scans that cannot be resampled."""
     adjustment = read_adjustment(project.adjustment_path) if project.adjustment_path.exists() else None
     if with_lens and (adjustment is None or not adjustment.converged):
         raise InputError("--lens needs an adjusted lens. Run `reseau adjust` first, or resample without it.")
@@ -158,7 +178,7 @@ def _chain(
     is_part: bool,
     taking_lens: Lens | None = None,
 ) -> FrameChain | str:
-    """The adjusted chain of an image, or that of its fiducials; else why there is none."""
+    """Adjusted chain of an image, or the chain from its fiducials, or the reason why there is none."""
     if adjustment is not None and adjustment.converged and measured.frame.image in adjustment.images:
         return adjusted_chain(measured, adjustment, with_lens)
     if with_lens:
@@ -173,7 +193,7 @@ def _chain(
 
 
 def resampled(task: ResampleTask) -> Resampled:
-    """One scan resampled into its file, or why not."""
+    """Resample one scan into its file; a failure is a result, too."""
     try:
         return _resampled(task)
     except (MeasurementError, InputError, OSError) as error:
@@ -210,12 +230,12 @@ def _resampled(task: ResampleTask) -> Resampled:
 
 
 def _rows_at_a_time(chain: FrameChain, pitch_mm: float, width_px: int) -> int:
-    """How many rows of a scan a row of tiles runs through."""
+    """Number of rows of a scan that a row of tiles covers."""
     ends = np.array([(0.0, 0.0), (width_px, 0.0), (0.0, -TILE_PX), (width_px, -TILE_PX)]) * pitch_mm
     pixels, _ = chain.scan_from_frame(ends)
     return int(np.ptp(pixels[:, 1])) + 2 * MARGIN_PX
 
 
 def resampled_json(results: Sequence[Resampled]) -> list[dict[str, object]]:
-    """The results for a script."""
+    """The results for `--json`."""
     return [asdict(result) | {"path": result.path and str(result.path)} for result in results]

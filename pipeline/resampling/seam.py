@@ -1,4 +1,5 @@
-"""A frame put together of several scans: each pixel from the one whose edges within the others are farthest from it."""
+"""Mosaic of a frame from several partial scans: each pixel comes from the scan whose inner edges are farthest from
+it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,13 +12,13 @@ from pipeline.resampling.canvas import Canvas, FrameChain, scan_places
 from pipeline.resampling.interpolation import Degree, Source, Tile, interpolated
 from pipeline.types import Array
 
-_NODES = 129  # along the longer side of the frame, between which the seam is straight
-_SHOWN = 33  # places of a seam that are told
+_NODES = 129  # along the longer side of the frame; the seam is straight between them
+_SHOWN = 33  # points of a seam in the description
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """One of the scans, opened, with its way to the frame. inner: which of its edges (left, right, top, bottom) lie in
+    """An open partial scan, with its chain to the frame. inner: which of its edges (left, right, top, bottom) lie in
     another scan."""
 
     source: Source
@@ -26,7 +27,7 @@ class Part:
 
 
 def find_inner_edges(parts: Sequence[Part]) -> list[Part]:
-    """The scans, knowing of their inner edges. Raises MeasurementError for scans whose pixels are not stored alike."""
+    """Determine the inner edges of the scans. Raises MeasurementError for scans with different pixel types."""
     kinds = {(part.source.channels, np.dtype(part.source.dtype).name) for part in parts}
     if len(kinds) > 1:
         kinds_text = " and ".join(
@@ -37,7 +38,7 @@ def find_inner_edges(parts: Sequence[Part]) -> list[Part]:
 
 
 def _inner_edges(part: Part, others: Sequence[Part]) -> tuple[bool, ...]:
-    """Those whose middle lies in another scan."""
+    """The edges whose centre lies in another scan."""
     right, bottom = part.source.width_px - 1.0, part.source.height_px - 1.0
     middles = np.array([[0.0, bottom / 2], [right, bottom / 2], [right / 2, 0.0], [right / 2, bottom]])
     places_mm, _ = part.chain.frame_from_scan(middles)
@@ -50,7 +51,7 @@ def _inner_edges(part: Part, others: Sequence[Part]) -> tuple[bool, ...]:
 
 
 def joined_tile(parts: Sequence[Part], canvas: Canvas, col0: int, row0: int, side: int, degree: Degree) -> Tile:
-    """A tile of the frame. A pixel that the deepest scan has lost is another one's, if that has it."""
+    """Tile of the frame. A pixel that is lost in the preferred scan comes from another one that has it."""
     places = [scan_places(part.chain, canvas, col0, row0, side) for part in parts]
     if len(parts) == 1:
         return interpolated(parts[0].source, *places[0], degree)
@@ -62,7 +63,7 @@ def joined_tile(parts: Sequence[Part], canvas: Canvas, col0: int, row0: int, sid
         columns, rows = (np.where(wanted, axis, np.nan) for axis in places[k])
         tile = interpolated(parts[k].source, columns, rows, degree)
         result = tile if result is None else _over(result, tile)
-    assert result is not None  # a frame has a scan
+    assert result is not None  # a frame has at least one scan
     return result
 
 
@@ -72,7 +73,7 @@ def _over(below: Tile, above: Tile) -> Tile:
 
 
 def _depth(part: Part, columns: Array, rows: Array) -> Array:
-    """How far, px, places lie from the scan's inner edges; -inf where they have no place in it."""
+    """Distance in px of places from the scan's inner edges; -inf outside of the scan."""
     right, bottom = part.source.width_px - 0.5, part.source.height_px - 0.5
     from_edges = np.stack([columns + 0.5, right - columns, rows + 0.5, bottom - rows])
     inner = np.array(part.inner)
@@ -82,7 +83,7 @@ def _depth(part: Part, columns: Array, rows: Array) -> Array:
 
 
 def seams_mm(parts: Sequence[Part], canvas: Canvas) -> list[list[tuple[float, float]]]:
-    """Where the frame passes from one scan to another: lines of places in mm of the camera frame."""
+    """Seams between the scans: polylines in mm of the camera frame."""
     step = max(canvas.width_px, canvas.height_px) / (_NODES - 1)
     col, row = (np.arange(0.0, size, step) for size in (canvas.width_px, canvas.height_px))
     nodes = canvas.camera_mm(col, row)
