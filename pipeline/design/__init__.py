@@ -1,1 +1,1 @@
-"""What a planned network of photographs would give: `reseau design`."""
+"""Network design: the expected precision and reliability of planned photographs, `reseau design`."""

@@ -1,4 +1,4 @@
-"""What would help: the same plan with one more photograph, another kappa, more points, better control or measuring."""
+"""Improvements of a design: one more photograph, another kappa, more points, better control or measurements."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -17,14 +17,14 @@ from synthetic_images.scene import SceneImage
 Array = NDArray[np.float64]
 
 QUARTER = math.pi / 2
-FOUND = 100.0  # the gain where only the changed plan determines a quantity
+FOUND = 100.0  # percent: gain where only the changed plan determines a quantity
 
 
 @dataclass(frozen=True)
 class Alternative:
-    """One change of the setup, and what it would make of the camera's standard deviations.
+    """One change of the setup, and the resulting standard deviations of the camera.
 
-    gain_percent: by how much each shrinks; nan where neither plan determines it, 100 where only the changed one does.
+    gain_percent: reduction of each; nan where neither plan determines it, 100 where only the changed one does.
     """
 
     change: str
@@ -33,7 +33,7 @@ class Alternative:
 
     @property
     def usefulness(self) -> float:
-        """The mean gain over all quantities."""
+        """Mean gain over all quantities."""
         gains = [gain for gain in self.gain_percent.values() if not math.isnan(gain)]
         return sum(gains) / len(gains) if gains else 0.0
 
@@ -42,7 +42,8 @@ Progress = Callable[[str, int, int], None]
 
 
 def alternatives(basis: Expected, progress: Progress | None = None) -> tuple[Alternative, ...]:
-    """Every kind of change once; of photographs that could be taken anew or turned, the most useful of each kind."""
+    """Try all kinds of changes, each once. Of the photographs that could be added or rolled, the most useful of each
+    kind is kept."""
     setup = basis.setup
     kinds = [list(kind) for kind in (*_photos(setup), _turned(setup), *([one] for one in _better(setup)))]
     total = sum(len(kind) for kind in kinds)
@@ -61,7 +62,7 @@ def alternatives(basis: Expected, progress: Progress | None = None) -> tuple[Alt
 
 
 def gains(before: Mapping[str, float], after: Mapping[str, float]) -> dict[str, float]:
-    """By how many percent standard deviations shrink."""
+    """Reduction of standard deviations in percent."""
     return {name: _gain(sigma, after.get(name, 0.0)) for name, sigma in before.items()}
 
 
@@ -81,7 +82,7 @@ Exterior = tuple[float, float, float, float, float, float]
 
 
 def _photos(setup: Setup) -> Iterator[Iterable[Change]]:
-    """One more photograph: each that the settings name; one as there is, but turned or carried round the field."""
+    """One more photograph: each named in the settings; and existing ones, rolled or moved around the field."""
     for photo in setup.settings.photo:
         omega, phi, kappa = (math.radians(angle) for angle in photo.angles_deg)
         image = SceneImage(photo.name, (*photo.position, omega, phi, kappa))
@@ -110,7 +111,7 @@ def _turned(setup: Setup) -> Iterator[Change]:
 
 
 def _better(setup: Setup) -> Iterator[Change]:
-    """More or better measurements; only those that there are."""
+    """More or better measurements, of the kinds that the setup has."""
     yield "twice as many points, spread alike", replace(setup, points=(*setup.points, *map(_double, setup.points)))
     if any(0.0 < point.sigma_height < math.inf for point in setup.points):
         points = (replace(point, sigma_height=point.sigma_height / 2) for point in setup.points)
@@ -130,7 +131,7 @@ def _better(setup: Setup) -> Iterator[Change]:
 
 
 def _double(point: PlannedPoint) -> PlannedPoint:
-    """A second point in the same place stands for one more of the same distribution."""
+    """A second point at the same place, which represents one more of the same distribution."""
     return replace(point, id=f"{point.id} again")
 
 
@@ -143,7 +144,7 @@ def _rolled(exterior: Exterior) -> Exterior:
 
 
 def _field_axis(points: Iterable[PlannedPoint]) -> tuple[Array, Array]:
-    """The middle of the field and the mean direction in which its targets face."""
+    """Centre of the field, and mean direction in which its targets face."""
     listed = list(points)
     center = np.mean([point.xyz for point in listed], axis=0)
     axis = np.mean([point.normal for point in listed], axis=0)
@@ -152,14 +153,14 @@ def _field_axis(points: Iterable[PlannedPoint]) -> tuple[Array, Array]:
 
 
 def _rotation(axis: Array, turn_rad: float) -> Array:
-    """The rotation matrix (Rodrigues)."""
+    """Rotation matrix by Rodrigues' formula."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.asarray(np.eye(3) + math.sin(turn_rad) * cross + (1 - math.cos(turn_rad)) * cross @ cross)
 
 
 def _carried(exterior: Exterior, center: Array, rotation: Array) -> Exterior:
-    """Station and camera together."""
+    """Rotate the station around the centre, together with the camera."""
     station = center + rotation @ (np.array(exterior[:3]) - center)
     angles = angles_from_rotation(rotation_from_angles(np.array(exterior[3:])) @ rotation.T)
     x, y, z, omega, phi, kappa = (float(value) for value in (*station, *angles))

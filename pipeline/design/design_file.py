@@ -1,4 +1,4 @@
-"""design.json: what is expected, what would help, and how it follows the quantities that were varied."""
+"""design.json: expected precision and reliability, improvements, and sweeps."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -22,8 +22,13 @@ Content = dict[str, object]
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """A plan that was carried out. alone: the standard deviations without given fiducials and interior orientation;
-    files: what was written, by a word for it: design.json first, then the picture of every sweep."""
+    """Result of a plan.
+
+    Attributes
+    ----------
+    alone : standard deviations without given fiducials and interior orientation.
+    files : written files by a description: design.json first, then the plot of every sweep.
+    """
 
     scene: Path
     expected: Expected
@@ -35,11 +40,11 @@ class Design:
 
     @property
     def has_findings(self) -> bool:
-        """Whether something is not determined, or hardly."""
+        """Whether some parameter is not estimable, or weakly determined."""
         return bool(self.expected.plan.singular or self.expected.plan.adjustment.warnings)
 
     def content(self) -> Content:
-        """That of design.json; a standard deviation of null: the observations do not determine the quantity."""
+        """Content of design.json. A standard deviation of null: the observations do not determine the parameter."""
         expected, plan = self.expected, self.expected.plan
         network, adjustment = expected.network, plan.adjustment
         kinds, pictures = network.observations.kind, list(self.files.values())[1:]
@@ -118,7 +123,7 @@ def _image(expected: Expected, image: Image) -> Content:
 
 
 def _degree_quantities(expected: Expected, parameters: Mapping[str, Parameter]) -> Content:
-    """Angles in degrees, by names that say so."""
+    """Quantities by name; angles in degrees, with names that say so."""
     return {
         f"{name}_deg" if name in ANGLES else name: _quantity(expected, each, DEG_PER_RAD if name in ANGLES else 1.0)
         for name, each in parameters.items()
@@ -135,7 +140,8 @@ def _points(expected: Expected) -> Iterator[tuple[str, Content]]:
 
 
 def _axis_summary(sigmas: np.ndarray) -> Content:
-    """Over the points whose coordinate is not fixed and is determined; how many are not determined."""
+    """Summary of a coordinate's standard deviations over the points where it is estimated, and the number where it is
+    not determined."""
     estimated = sigmas[(sigmas > 0.0) & np.isfinite(sigmas)]
     return {
         "rms": rms(estimated),
@@ -146,7 +152,8 @@ def _axis_summary(sigmas: np.ndarray) -> Content:
 
 
 def _reliability(expected: Expected) -> Content:
-    """null for a smallest error: nothing checks any of the group."""
+    """Reliability by groups and of the camera; null for a smallest error: nothing checks any observation of the
+    group."""
     groups = {
         one.group: {
             "coordinates": one.coordinates,

@@ -1,4 +1,4 @@
-"""The expected precision and reliability of a setup: of the camera, along the radius, of the points."""
+"""Expected precision and reliability of a setup: of the camera, the distortion along the radius, and the points."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -26,15 +26,19 @@ DIRECTIONS = 36
 QUARTERS = 4
 ROUNDING_UM = 1e-9
 INTERIOR = ("c", "x0", "y0")
-ROUNDING = 1e-9  # part of the largest motion that is none
+ROUNDING = 1e-9  # relative to the largest component of the null directions: below it, a component is 0
 
 
 @dataclass(frozen=True)
 class GroupReliability:
-    """One kind of observation or given quantity.
+    """Reliability of one group of observations or given quantities.
 
-    redundancy: the mean redundancy number of a coordinate. median, largest: of the smallest gross errors that are
-    found, um for what is measured in mm, else object units or rad, without those that nothing checks, `unchecked`.
+    Attributes
+    ----------
+    redundancy : mean redundancy number of a coordinate.
+    median, largest : of the smallest detectable gross errors; µm for groups measured in mm, else object units or rad;
+        without the unchecked ones.
+    unchecked : number of coordinates that nothing checks.
     """
 
     group: str
@@ -47,14 +51,14 @@ class GroupReliability:
 
 @dataclass(frozen=True)
 class PlannedReliability:
-    """Inner reliability by groups, outer reliability by camera parameters (Baarda)."""
+    """Inner reliability by groups and outer reliability by camera parameters (Baarda)."""
 
     groups: tuple[GroupReliability, ...]
     camera: tuple[OuterEffect, ...]
 
 
 def planned_reliability(plan: Plan) -> PlannedReliability:
-    """The reliability of a plan at its sigma0; empty where there is no redundancy."""
+    """Reliability of a plan for its sigma0; empty without redundancy."""
     found = plan.adjustment.reliability
     if found is None:
         return PlannedReliability((), ())
@@ -69,7 +73,7 @@ def planned_reliability(plan: Plan) -> PlannedReliability:
 
 
 def error_unit(group: str) -> str:
-    """The unit of a group's gross errors."""
+    """Unit of a group's gross errors."""
     if group in IN_MM:
         return "um"
     return "object unit" if group in ("control", "distance") else "mixed"
@@ -90,9 +94,9 @@ def _group(name: str, rows: list[tuple[float, float]]) -> GroupReliability:
 
 @dataclass(frozen=True)
 class AtRadius:
-    """Expected standard deviations in um at a radius: rms over all directions, one axis each.
+    """Expected standard deviations at a radius, µm: rms over all directions, per axis.
 
-    radial, tangential: of the distortion; ray: of where a ray of known direction is imaged in the camera frame, by the
+    radial, tangential: of the distortion; ray: of the image of a ray with known direction in the camera frame, from the
     whole interior orientation.
     """
 
@@ -104,7 +108,7 @@ class AtRadius:
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """A setup, its network and what is expected of it."""
+    """A setup, its network and its plan."""
 
     setup: Setup
     network: Network
@@ -116,7 +120,7 @@ class Expected:
 
     @property
     def family_parameters(self) -> tuple[str, ...]:
-        """The distortion parameters that are not fixed."""
+        """Distortion parameters that are not fixed."""
         distortion = self.network.cameras[0].distortion
         given, names = distortion.parameters, parameter_names(distortion.family)
         return tuple(name for name in names if name in given and given[name].sigma > 0.0)
@@ -127,10 +131,10 @@ class Expected:
 
     @cached_property
     def camera_sigmas(self) -> Mapping[str, float]:
-        """The standard deviations of what is to be found of the camera, by name; nothing that is fixed.
+        """Standard deviations of the camera's parameters that are not fixed, by name.
 
-        c, x0, y0, fiducials (rms of all coordinates) and scanner (rms of the terms of its bend) in um, distortion
-        parameters in their own units, `ray`: where a ray is imaged at the largest radius, um.
+        c, x0, y0, fiducials (rms of all coordinates) and scanner (rms of the terms of its bend) in µm; distortion
+        parameters in their own units; `ray`: of the image of a ray at the largest radius, µm.
         """
         found = self.plan.sigmas(self._interior, np.eye(len(self._interior))).tolist()
         by_name = dict(zip((each.quantity for each in self._interior), found, strict=True))
@@ -143,14 +147,14 @@ class Expected:
 
     @cached_property
     def scanner_sigmas(self) -> Mapping[Parameter, float]:
-        """Of the terms of the scanner's bend, mm; empty where none is to be found."""
+        """Standard deviations of the terms of the scanner's bend, mm; empty where none is estimated."""
         scanners = self.network.scanners
         terms = [Parameter.scanner(scanner.name, term) for scanner in scanners for term in scanner.terms]
         return {term: self.plan.sigma(term) for term in terms}
 
     @cached_property
     def curve(self) -> tuple[AtRadius, ...]:
-        """The distortion's precision at the radii that the settings ask for."""
+        """Precision of the distortion at the radii of the settings."""
         radii = self.setup.settings.radii_mm
         if not radii:
             corner = float(np.hypot(*self.setup.lens.frame_mm)) / 2
@@ -169,18 +173,19 @@ class Expected:
 
     @cached_property
     def point_sigmas(self) -> Array:
-        """(n, 3) of the network's points, object units."""
+        """(n, 3) standard deviations of the network's points, object units."""
         coordinates = [Parameter.point(point.id, axis) for point in self.network.points for axis in "XYZ"]
         return np.array([self.plan.sigma(each) for each in coordinates]).reshape(-1, 3)
 
     @property
     def _interior(self) -> list[Parameter]:
-        """The interior orientation and all parameters of the distortion."""
+        """Parameters of the interior orientation and the distortion."""
         names = (*INTERIOR, *parameter_names(self.network.cameras[0].distortion.family))
         return [Parameter.interior(self.camera, name) for name in names]
 
     def _functions(self, radius_mm: float) -> Array:
-        """Rows (4 DIRECTIONS, k) in um: the radial and the tangential distortion at a radius, the image of a ray."""
+        """Rows (4 DIRECTIONS, k) in µm: derivatives of the radial and the tangential distortion at a radius, and of the
+        image of a ray."""
         angles = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
         outward = np.stack([np.cos(angles), np.sin(angles)], axis=1)
         across = np.stack([-outward[:, 1], outward[:, 0]], axis=1)
@@ -194,7 +199,8 @@ class Expected:
 
 
 def _ray_by_unknowns(lens: Lens, from_principal_point_mm: Array) -> Array:
-    """How the image of a ray moves with c, x0', y0' and the parameters (n, 2, 3 + k): F = 0 with the ray held."""
+    """Derivatives (n, 2, 3 + k) of the image of a ray with respect to c, x0', y0' and the parameters: from F = 0 with a
+    fixed ray."""
     xy_mm = lens.interior[1:] + from_principal_point_mm
     ray, _ = lens.ray_from_observed(xy_mm)
     at = lens.equations(xy_mm, ray)
@@ -203,27 +209,28 @@ def _ray_by_unknowns(lens: Lens, from_principal_point_mm: Array) -> Array:
 
 
 def expect(setup: Setup) -> Expected:
-    """Plan a setup. Raises InputError or AdjustmentError where an image shows too little."""
+    """Plan a setup. Raises InputError or AdjustmentError where an image shows too few points."""
     network, values = planned_network(setup)
     return Expected(setup, network, plan(network, values, Options(setup.settings.datum), setup.settings.sigma0))
 
 
 def rms(values: list[float] | Array) -> float:
-    """Root of the mean square; 0 of nothing."""
+    """Root mean square; 0 for no values."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else 0.0
 
 
-# What the photographs alone would tell of a camera, where nothing is given of its fiducials and interior orientation.
+# Calibration from the photographs alone, without given fiducials and interior orientation.
 #
-# Then the camera frame itself can shift, turn and grow (Torlegård's singular cases), and what remains is how the
-# fiducials lie among themselves, and the rest of the camera in their frame.
+# The camera frame is then free in shift, rotation and scale (Torlegård's singular cases). Estimable are the relative
+# positions of the fiducials, and the rest of the camera in their frame.
 
 
 def alone(expected: Expected) -> Mapping[Parameter, float]:
-    """Standard deviations of the camera's quantities, with F5 to F9 dropped.
+    """Standard deviations of the camera's parameters without the pseudo-observations F5 to F9.
 
-    mm, and the parameters' own units; inf: not determined. With N how everything moves in the null directions, and N_f
-    its rows of the fiducials: those of d - N N_f^+ d_f (Baarda's S-transformation to inner constraints over the marks).
+    mm, and the parameters' own units; inf: not determined. With N the null directions and N_f its rows of the
+    fiducials: standard deviations of d - N N_f^+ d_f (Baarda's S-transformation to inner constraints over the
+    fiducials).
     """
     network = expected.network
     camera = network.cameras[0]
@@ -243,7 +250,7 @@ def _fiducial_unknowns(camera: Camera) -> list[Parameter]:
 
 
 def _freed_camera(camera: Camera) -> Camera:
-    """What is not fixed is free."""
+    """The camera with all parameters free that are not fixed."""
     fiducials = {id: Fiducial(_freed(mark.x_mm), _freed(mark.y_mm)) for id, mark in camera.fiducials.items()}
     interior = (camera.principal_distance_mm, camera.x0_mm, camera.y0_mm)
     c, x0, y0 = (prior and _freed(prior) for prior in interior)

@@ -1,4 +1,4 @@
-"""`reseau design`: from a scene file to what its photographs would give, without any picture."""
+"""`reseau design`: predict the precision of a scene's photographs, without any image."""
 
 from pathlib import Path
 
@@ -13,9 +13,15 @@ from pipeline.text.atomic import check_writable
 
 
 def run_design(scene_path: Path, out_dir: Path | None, reporter: Reporter) -> Design:
-    """Plan a scene, vary it, and write design.json and the pictures of its sweeps.
+    """Plan a scene, vary it, and write design.json and the plots of its sweeps.
 
-    out_dir None: a folder beside the scene, of its name with "-design". Raises InputError or AdjustmentError.
+    Parameters
+    ----------
+    out_dir : None: a folder next to the scene file, with its name and "-design".
+
+    Raises
+    ------
+    InputError, AdjustmentError : the scene cannot be planned.
     """
     folder = out_dir or scene_path.with_name(f"{scene_path.stem}-design")
     scene = Variations.read(scene_path)

@@ -1,4 +1,4 @@
-"""A planned set of photographs, and the network that measuring them would give."""
+"""Setup of a planned set of photographs, and the network that its measurement would give."""
 
 import math
 from collections import Counter
@@ -32,9 +32,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class PlannedPoint:
-    """A target: where it is and faces (3,), and the standard deviations of its given X and Y, and of its given Z.
+    """A target.
 
-    0: known exactly, inf: unknown; in object units.
+    Attributes
+    ----------
+    xyz, normal : (3,) coordinates and facing direction.
+    sigma_planimetry, sigma_height : standard deviations of the given X and Y, and of the given Z, in object units; 0:
+        exact, inf: unknown.
     """
 
     id: str
@@ -46,7 +50,7 @@ class PlannedPoint:
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """Everything that decides a plan. lens: the camera as it projects; camera: the same with its priors."""
+    """All input of a plan. lens: the camera for the projection; camera: the camera with its priors."""
 
     lens: SceneCamera
     camera: CameraFile
@@ -57,11 +61,11 @@ class Setup:
 
     @property
     def bends(self) -> bool:
-        """Whether the bend of the scanner is to be found."""
+        """Whether the bend of the scanner is estimated."""
         return self.settings.scanner != "none" and self.transformation != "none"
 
     def visible_points(self, image: SceneImage) -> list[int]:
-        """The points that lie within an image's frame and face its camera; that one hides another is not looked for."""
+        """Points that lie within an image's frame and face its camera. Occlusion by other points is not considered."""
         xyz = np.array([point.xyz for point in self.points])
         normals = np.array([point.normal for point in self.points])
         xy_mm = camera_from_object(self.lens, image.exterior, xyz)
@@ -72,8 +76,8 @@ class Setup:
 
 
 def scene_setup(scene_file: SceneFile) -> Setup:
-    """The plan of a scene. Raises InputError where it names control points that the field does not have, or has no
-    targets at all."""
+    """Setup of a scene. Raises InputError where it names control points that the field does not have, or has no
+    targets."""
     settings = scene_file.design
     targets = field_targets(scene_file.scene.field)
     if not targets:
@@ -107,13 +111,13 @@ def scene_setup(scene_file: SceneFile) -> Setup:
 
 
 def _frames(images: Sequence[SceneImage]) -> tuple[SceneImage, ...]:
-    """The frames: those that are to be scanned in parts are planned as wholes, under their own names."""
+    """The exposed frames: those to be scanned in parts are planned as a whole, under their own names."""
     frames = {image.frame: image for image in reversed(images)}
     return tuple(replace(image, name=frame, part_of="", part=(0.0, 1.0)) for frame, image in reversed(frames.items()))
 
 
 def _check_named(scene_file: SceneFile, targets: set[str], images: set[str]) -> None:
-    """Raises InputError where [design] names an end of a distance, or an image, that the scene does not have."""
+    """Raise InputError where [design] names an end of a distance, or an image, that the scene does not have."""
     known = targets | images
     for distance in scene_file.design.distance:
         for end in (distance.start, distance.end):
@@ -131,11 +135,11 @@ def _check_named(scene_file: SceneFile, targets: set[str], images: set[str]) -> 
 
 
 def planned_network(setup: Setup) -> tuple[Network, Approximations]:
-    """The network that measuring a setup gives, with the setup itself as the values of its unknowns.
+    """Network of a setup, with approximate values that are the setup itself.
 
-    The film lies straight in the comparator, or, where a scanner's bend is to be found, as its pose says, and every
-    visible mark is measured. A point of which nothing is known and
-    that fewer than two images show has no part in it. Raises InputError where an image shows too few targets.
+    The film lies without rotation in the comparator or, where a scanner's bend is estimated, according to its scan
+    orientation. Every visible mark is measured. A point without given coordinates that fewer than two images show is
+    left out. Raises InputError where an image shows too few targets.
     """
     visible = {image.name: setup.visible_points(image) for image in setup.images}
     for name, rows in visible.items():
@@ -171,7 +175,7 @@ def _image(setup: Setup, camera: str, image: SceneImage) -> network.Image:
 
 
 def _distances(setup: Setup, points: Mapping[str, Array]) -> tuple[Distance, ...]:
-    """Those whose ends take part."""
+    """Planned distances between points and stations of the network."""
     places = {image.name: np.array(image.exterior[:3]) for image in setup.images} | dict(points)
     return tuple(
         Distance(each.start, each.end, float(np.linalg.norm(places[each.end] - places[each.start])), each.sigma)
@@ -181,7 +185,7 @@ def _distances(setup: Setup, points: Mapping[str, Array]) -> tuple[Distance, ...
 
 
 def _scanners(setup: Setup) -> tuple[network.Scanner, ...]:
-    """The scanner, where its bend is to be found: over the frame, which lies about the comparator's origin."""
+    """The scanner, where its bend is estimated: over the frame, which is centred on the comparator's origin."""
     if not setup.bends:
         return ()
     settings, half_mm = setup.settings, max(setup.lens.frame_mm) / 2.0
@@ -195,7 +199,7 @@ def _sigmas(point: PlannedPoint) -> tuple[float, float]:
 
 
 def _camera(setup: Setup) -> Camera:
-    """The camera with its priors; fiducials only where images are transformed by them."""
+    """The camera with its priors; fiducials only where the film transformation is estimated from them."""
     point = setup.camera.principal_point_mm or (0.0, 0.0)
     fiducials = setup.camera.fiducials if setup.transformation != "none" else ()
     return replace(setup.camera, principal_point_mm=point, fiducials=fiducials).camera()
@@ -208,7 +212,7 @@ def _object_point(point: PlannedPoint) -> network.ObjectPoint:
 
 
 def _observations(setup: Setup, visible: dict[str, list[int]], used: set[int]) -> Observations:
-    """One row a visible mark; the coordinates are computed when the network is planned."""
+    """One row per visible mark; the coordinates are computed when the network is planned."""
     film_um = setup.settings.film_sigma_um
     rows: list[tuple[str, str, ObservationKind, float]] = []
     for image in setup.images:
@@ -241,7 +245,7 @@ def _values(setup: Setup, planned: Network, points: list[PlannedPoint]) -> Appro
 
 
 def _laid(setup: Setup, image: SceneImage) -> Array:
-    """How an image's frame lies in its scan (2, 2), comparator from camera."""
+    """(2, 2) rotation, or rotation with reflection, from the camera frame to the comparator."""
     if not setup.bends:
         return np.eye(2)
     pose_rad = math.radians(int(image.pose.rstrip("m")))

@@ -1,4 +1,4 @@
-"""What reseau design prints and draws: the expected precision, what would help, the sweeps."""
+"""Printed tables and plots of reseau design: expected precision, improvements, sweeps."""
 
 import math
 from itertools import pairwise
@@ -17,11 +17,19 @@ from pipeline.design.sweeps import Swept
 from pipeline.drawing import svg
 from pipeline.report.numbers import NONE, fixed, significant, value_and_sigma
 
-WIDE_RANGE = 2.0  # ratio of the largest to the smallest value from which on the axis is logarithmic
-COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555")  # told apart by the color-blind
+WIDE_RANGE = 2.0  # ratio of the largest to the smallest value, from which the axis is logarithmic
+COLORS = (
+    "#0072b2",
+    "#d55e00",
+    "#009e73",
+    "#cc79a7",
+    "#e69f00",
+    "#56b4e9",
+    "#555555",
+)  # distinguishable by the colour-blind
 DASHES = ("none", "7 3", "2 3", "7 3 2 3")
 WIDTH_PX, HEIGHT_PX, KEY_PX = 760.0, 460.0, 160.0
-ROW_PX = 17.0  # of a name beside the chart
+ROW_PX = 17.0  # px, height of a name in the legend
 UNDETERMINED = "not determined"
 UM_PER_MM = 1000.0
 KINDS = {
@@ -37,9 +45,9 @@ IN_UM = ("c", "x0", "y0", "fiducials", "ray", "scanner")
 
 
 def plot_sweep(swept: Swept, path: Path) -> None:
-    """Write an SVG: every standard deviation as a share of that at the first value where it has one.
+    """Plot a sweep as SVG: every standard deviation relative to its first finite value.
 
-    Only so do quantities of different units go on one axis. Raises InputError where the file cannot be written.
+    Quantities of different units thus share one axis. Raises InputError where the file cannot be written.
     """
     values = [step.value for step in swept.steps]
     places = [float(value) for value in values] if swept.numeric else [float(i) for i in range(len(values))]
@@ -53,7 +61,7 @@ def plot_sweep(swept: Swept, path: Path) -> None:
 
 
 def _axes(swept: Swept, places: list[float], shares: dict[str, list[float]]) -> svg.Axes:
-    """The chart's plane, with room for the names at its right."""
+    """Axes of the chart, with space for the legend at the right."""
     drawn = [share for each in shares.values() for share in each if math.isfinite(share)] or [1.0]
     is_log = swept.numeric and min(places) > 0.0 and max(places) >= WIDE_RANGE * min(places)
     width = max(places) - min(places)
@@ -76,7 +84,7 @@ def _axes(swept: Swept, places: list[float], shares: dict[str, list[float]]) -> 
 
 
 def _curve(axes: svg.Axes, number: int, places: list[float], shares: list[float]) -> Markup:
-    """A line through the values that there are, interrupted where there is none, and a dot at each."""
+    """A line through the finite values, interrupted where there is none, and a dot at each."""
     pixels = [
         (float(axes.x(place)), float(axes.y(share))) if math.isfinite(share) else None
         for place, share in zip(places, shares, strict=True)
@@ -98,7 +106,7 @@ def _stroke(number: int, path: str) -> Markup:
 
 
 def _relative(sigmas: list[float]) -> list[float]:
-    """Shares of the first that is finite; nan where there is none."""
+    """Ratios to the first finite value; nan where there is none."""
     first = next((sigma for sigma in sigmas if 0.0 < sigma < math.inf), math.nan)
     return [sigma / first if math.isfinite(sigma) else math.nan for sigma in sigmas]
 
@@ -130,7 +138,8 @@ def _table(title: str, *columns: str) -> Table:
 
 
 def _camera_table(design: Design) -> Table:
-    """With fiducials also what the photographs alone tell, in the frame that the fiducials make."""
+    """Expected precision of the camera; with fiducials also from the photographs alone, in the frame of the
+    fiducials."""
     expected, layouts = design.expected, design.layouts
     several = layouts.count > 1
     columns = ["quantity", "value", "sigma", *(["photographs alone"] if expected.fiducials else [])]
@@ -196,7 +205,7 @@ def _reliability_table(expected: Expected) -> Table:
 
 
 def _outer_table(expected: Expected) -> Table:
-    """Of the fiducials the worst alone."""
+    """Outer reliability of the camera; of the fiducials only the worst is shown."""
     table = _table("What errors that are not found may do to the camera", "parameter", "in its sigmas", "error in")
     effects = expected.reliability.camera
     marks = [one for one in effects if one.parameter.kind == "fiducial"]
@@ -234,14 +243,14 @@ def _sweep_table(swept: Swept) -> Table:
 
 
 def _sigma(sigma: float) -> str:
-    """To two digits."""
+    """Two digits."""
     if sigma == 0.0:
         return "0"
     return UNDETERMINED if math.isinf(sigma) else value_and_sigma(sigma, sigma)[1]
 
 
 def _gain(percent: float) -> str:
-    """Of a standard deviation; found: what was not determined is, lost: the reverse."""
+    """Gain of a standard deviation; "found": only the changed plan determines it, "lost": only the original one."""
     if math.isnan(percent):
         return NONE
     if percent == FOUND:

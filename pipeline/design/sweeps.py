@@ -1,4 +1,4 @@
-"""A scene with one of its quantities changed, and how the camera's precision follows."""
+"""Sweeps: a scene with one quantity varied, and the resulting precision of the camera."""
 
 import copy
 import math
@@ -27,18 +27,18 @@ EXTERIOR = {
     "phi_deg": ("angles_deg", 1),
     "kappa_deg": ("angles_deg", 2),
 }
-PLANNING_PITCH_UM = 20.0  # a scene that is only planned need not say how it is scanned
+PLANNING_PITCH_UM = 20.0  # default: a scene that is only planned needs no pitch
 Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
 class Variations:
-    """A scene file's values, and the setups that it gives with some of them changed.
+    """Values of a scene file, and setups with some of them changed.
 
     A quantity is a key of the scene file by its dotted name: `design.sigma_height`, `camera.principal_distance_mm`,
-    `field.grid.1.relief` (the first of several), `image.NAME.position.3` (the third number). Beyond these:
+    `field.grid.1.relief` (the first of several), `image.NAME.position.3` (the third number). In addition:
     `exterior.IMAGE.X0` .. `kappa_deg`; `field.points`, the number of targets over the same area; `images` and
-    `camera.fiducials`, how many are kept of them.
+    `camera.fiducials`, the number of them that is kept.
     """
 
     path: Path
@@ -46,18 +46,18 @@ class Variations:
 
     @staticmethod
     def read(path: Path) -> "Variations":
-        """The scene at a path. Raises InputError."""
+        """Read a scene file. Raises InputError."""
         values = copy.deepcopy(dict(read_toml(path).values))
         values.setdefault("scan", {}).setdefault("pitch_um", PLANNING_PITCH_UM)
         return Variations(path, values)
 
     def setup(self, layout: int = 0) -> Setup:
-        """The setup, with the random layout of its field of that number."""
+        """The setup, with the random layout of its field of this number."""
         values = self.values | {"seed": self.values.get("seed", 1) + layout} if layout else self.values
         return scene_setup(parse_scene(Table(values, self.path, "")))
 
     def varied(self, number: int, sweep: Sweep, value: float | str) -> "Variations":
-        """The scene with the quantity of a sweep at a value. Raises InputError for a quantity that there is not."""
+        """The scene with the quantity of a sweep set to a value. Raises InputError for an unknown quantity."""
         try:
             values = self._changed_values(sweep.quantity, value)
             varied = Variations(self.path, values)
@@ -90,7 +90,7 @@ class Variations:
 
 
 def _camera_values(path: Path) -> Values:
-    """A camera file's values without the drawings of its marks, which nothing here needs."""
+    """Values of a camera file without the drawings of its marks, which are not needed here."""
     values = copy.deepcopy(dict(read_toml(path).values))
     values.pop("mark", None)
     for fiducial in values.get("fiducial", []):
@@ -105,7 +105,7 @@ def _count(quantity: str, value: float | str) -> int:
 
 
 def _spread(field: Values, points: int) -> None:
-    """As many targets, or as near as whole rows and columns allow, over the same area."""
+    """Change the number of targets over the same area, as closely as whole rows and columns allow."""
     if field.get("kind", "disks") != "disks":
         raise InputError("field.points varies fields of disks; a board has columns and rows.")
     scatters, grids = field.get("scatter", []), field.get("grid", [])
@@ -121,7 +121,7 @@ def _spread(field: Values, points: int) -> None:
             grid[step] = [length * grid[count] / new for length in grid[step]]
             grid[count] = new
     first = 1
-    for part in (*grids, *scatters):  # numbers that the larger parts would share otherwise
+    for part in (*grids, *scatters):  # renumber: the enlarged parts would overlap in their numbers
         part["first"] = first
         first += part["points"] if "points" in part else part["columns"] * part["rows"]
 
@@ -143,7 +143,7 @@ def _assign(values: Values, parts: list[str], value: float | str) -> None:
 
 
 def _member(entries: list[Any], name: str, what: str) -> Any:
-    """One of an array of tables, by its name, its id or its number from 1."""
+    """Entry of an array of tables, by its name, its id or its number from 1."""
     names = {str(entry.get("name", entry.get("id", ""))): entry for entry in entries if isinstance(entry, dict)}
     if name in names:
         return names[name]
@@ -161,9 +161,9 @@ def _known_word(word: str, known: Mapping[str, object], sentence: str) -> str:
 
 @dataclass(frozen=True)
 class Layouts:
-    """Standard deviations of the camera over random layouts of the test field: mean and spread of each, by name.
+    """Mean and spread of the camera's standard deviations over random layouts of the test field, by name.
 
-    spread: the standard deviation over the layouts; 0 of a single one.
+    spread: standard deviation over the layouts; 0 for a single one.
     """
 
     count: int
@@ -173,7 +173,7 @@ class Layouts:
 
 @dataclass(frozen=True)
 class Step:
-    """A value of the quantity and what it gives: redundancy and null directions are those of the first layout."""
+    """One value of the quantity and its results; redundancy and null directions are those of the first layout."""
 
     value: float | str
     points: int
@@ -184,14 +184,14 @@ class Step:
 
 @dataclass(frozen=True)
 class Swept:
-    """A sweep that was carried out."""
+    """Result of a sweep."""
 
     quantity: str
     steps: tuple[Step, ...]
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Everything that some step has a standard deviation of."""
+        """Names of all standard deviations that occur in some step."""
         return tuple(dict.fromkeys(name for step in self.steps for name in step.sigmas.mean))
 
     @property
@@ -199,7 +199,7 @@ class Swept:
         return all(not isinstance(step.value, str) for step in self.steps)
 
     def slope(self, name: str) -> float:
-        """That of the logarithm of sigma over the logarithm of the value; nan where one of these does not exist."""
+        """Slope of the logarithm of sigma over the logarithm of the value; nan where one of these does not exist."""
         values = [step.value for step in self.steps]
         sigmas = [step.sigmas.mean.get(name, math.nan) for step in self.steps]
         if not all(isinstance(value, int | float) and value > 0.0 for value in values):
@@ -211,7 +211,7 @@ class Swept:
 
 
 def sweep(scene: Variations, number: int, planned: Sweep, progress: Progress | None = None) -> Swept:
-    """Carry out a sweep, the one of that number in the scene. Raises InputError for a quantity that there is not."""
+    """Carry out a sweep. number: of the sweep in the scene, for messages. Raises InputError for an unknown quantity."""
     varied = [scene.varied(number, planned, value) for value in planned.values]
     steps = []
     for i, variation in enumerate(varied):
@@ -226,7 +226,8 @@ def sweep(scene: Variations, number: int, planned: Sweep, progress: Progress | N
 
 
 def over_layouts(scene: Variations, first: Expected) -> Layouts:
-    """The camera's standard deviations over as many layouts as the scene asks for, the first of which is done."""
+    """Standard deviations of the camera over as many layouts as the scene asks for. first: result of the first
+    layout."""
     count = first.setup.settings.layouts
     found = [first.camera_sigmas, *(expect(scene.setup(layout)).camera_sigmas for layout in range(1, count))]
     mean = {name: float(np.mean([sigmas[name] for sigmas in found])) for name in first.camera_sigmas}
