@@ -1,1 +1,1 @@
-"""From comparator coordinates to the adjustment and its files."""
+"""Adjustment of comparator coordinates, and its result files."""

@@ -1,4 +1,4 @@
-"""Comparator coordinates to the adjustment, with scanners' bends, disks corrected for their eccentricity on the way."""
+"""Adjust comparator coordinates, with scanner terms and the eccentricity correction of disks."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -25,18 +25,32 @@ from pipeline.types import Array
 
 UM_PER_MM = 1000.0
 
-_ROUNDS = 4  # the correction changes by its own relative error, so the second round is already below the noise
-_SETTLED_SIGMAS = 0.01
-_NOTICEABLE_SIGMAS = 0.2  # of the coordinate: an eccentricity that is not corrected and as large deserves a word
+_ROUNDS = (  # largest number of corrections: their relative error shrinks each time, after two rounds below the noise
+    4  # largest number of corrections: each round is off by its own relative error, so the second is below the noise
+)
+_SETTLED_SIGMAS = 0.01  # change of the correction that ends the iteration, standard deviations of an observation
+_NOTICEABLE_SIGMAS = (  # standard deviations: a larger possible eccentricity that is not corrected is reported
+    0.2  # standard deviations of a coordinate: a possible uncorrected eccentricity beyond it is reported
+)
 
 
 def add_scanner_bends(
     project: Project, network: Network, adjusted: Callable[[Network], Adjustment]
 ) -> tuple[Network, tuple[str, ...]]:
-    """The network with its scanners' bends, and what is to be said of terms that cannot be told.
+    """Add scanner terms to the network, as the project demands.
 
-    adjusted: how a network is adjusted, for tests to choose by. Raises InputError where a term is asked for that the
-    film transformations take.
+    Parameters
+    ----------
+    adjusted : function that adjusts a network, for the tests that select terms.
+
+    Returns
+    -------
+    The network, and remarks on terms that are not estimable.
+
+    Raises
+    ------
+    InputError
+        A requested term is part of the film deformation model, or no image has one.
     """
     settings = project.adjust
     if settings.scanner == "none":
@@ -64,7 +78,7 @@ def add_scanner_bends(
 
 
 def name_scanners(project: Project, network: Network) -> Network:
-    """The network whose images say which scanner they come from, whether its bend is to be estimated or not."""
+    """Network whose images name their scanners, whether scanner terms are estimated or not."""
     images = tuple(
         image if image.transformation == "none" else replace(image, scanner=project.image_scanner(image.name))
         for image in network.images
@@ -77,9 +91,9 @@ def _spelt(settings: AdjustSettings) -> str:
 
 
 def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustment:
-    """Adjust what was measured; what the user should look at stands in the result's warnings.
+    """Adjust measured marks. Warnings and notes are part of the result.
 
-    Raises InputError or AdjustmentError where an adjustment cannot even begin.
+    Raises InputError or AdjustmentError where no adjustment is possible.
     """
     network, left_out = build_network(project, marks)
     options = adjustment_options(project)
@@ -87,7 +101,7 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
     network, untold = add_scanner_bends(project, network, adjusted)
     first = adjust_unmodelled(network, adjusted) if project.adjust.unmodelled == "estimate" else adjusted(network)
     adjustment = first
-    network = adjustment.network  # without images that are left out
+    network = adjustment.network  # without images that were left out
     uncorrected = np.zeros_like(network.observations.xy_mm)
     if project.disk_radius > 0.0:
         adjustment, uncorrected = _correct_eccentricity(project, network, adjustment, options)
@@ -117,7 +131,11 @@ def adjustment_options(project: Project) -> Options:
 def _correct_eccentricity(
     project: Project, network: Network, adjustment: Adjustment, options: Options
 ) -> tuple[Adjustment, Array]:
-    """The adjustment of disks taken to the images of their centres, and the eccentricities (n, 2) not known."""
+    """Iterate adjustment and eccentricity correction of disks.
+
+    Returns the adjustment and the largest possible eccentricities (n, 2), mm, of observations that could not be
+    corrected.
+    """
     applied = uncorrected = np.zeros_like(network.observations.xy_mm)
     for _ in range(_ROUNDS):
         if not adjustment.converged:
@@ -132,7 +150,8 @@ def _correct_eccentricity(
 
 
 def _eccentricities(project: Project, adjustment: Adjustment) -> tuple[Array, Array]:
-    """What is to be taken off every observation, and what cannot be for want of a normal: the most it could be."""
+    """(n, 2) eccentricities to be subtracted from the observations, mm; and (n, 2) largest possible ones of disks with
+    unknown normals."""
     network = adjustment.network
     observations = network.observations
     ids = [point.id for point in network.points]
@@ -161,7 +180,7 @@ def _eccentricities(project: Project, adjustment: Adjustment) -> tuple[Array, Ar
 
 
 def _slanted(normals: Array, coordinates: Array, station: Array) -> Array:
-    """Normals turned 45 degrees away from the line of sight, where the eccentricity is largest."""
+    """Normals at 45° to the line of sight, where the eccentricity is largest."""
     sight = (station - coordinates) / np.linalg.norm(station - coordinates, axis=1, keepdims=True)
     slanted: Array = (sight + across(sight)[0]) / np.sqrt(2.0)
     return slanted
@@ -173,13 +192,13 @@ def _shifted(network: Network, shift_mm: Array) -> Network:
 
 
 def _largest_sigmas(network: Network, change_mm: Array) -> float:
-    """The largest change of an observation, in its standard deviations."""
+    """Largest change of an observation, in its standard deviations."""
     sigmas = np.sqrt(np.diagonal(network.observations.covariance_mm2, axis1=1, axis2=2))
     return float(np.max(np.abs(change_mm) / sigmas, initial=0.0))
 
 
 def _assumed_pitch(project: Project) -> Iterator[str]:
-    """A note where a list of pixels was taken to mm by a size of a pixel that nobody gave."""
+    """Yield a note where pixels were converted to mm by an assumed pixel pitch."""
     path = project.comparator
     if project.pitch_um is None and not project.scans and path.exists() and has_pixels_alone(path):
         yield (
@@ -189,7 +208,7 @@ def _assumed_pitch(project: Project) -> Iterator[str]:
 
 
 def _misnamed(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[str, ...]:
-    """Where some images have no line in images.csv and some lines no image, a name is probably misspelt."""
+    """Warning of a probably misspelt name: some images have no line in images.csv, and some lines no image."""
     if project.given_images is None:
         return ()
     images, given = {mark.image for mark in marks}, set(project.given_images.exterior)
@@ -203,7 +222,8 @@ def _misnamed(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[str, 
 
 
 def _unmeasured(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[str, ...]:
-    """A note on given points that no image shows: large patterns have many, and a wrong point number makes one."""
+    """Note on given points that no image shows: common for large patterns, but also the effect of a wrong point
+    number."""
     observed = {mark.point for mark in marks if mark.status.is_observation and mark.kind not in ON_FILM}
     lost = [id for id in project.object_points if id not in observed]
     if project.given_points is None or not lost:

@@ -1,4 +1,5 @@
-"""`reseau choose`: which transformation and distortion the observations of a project ask for, to choose.json."""
+"""`reseau choose`: select film deformation and distortion model from the observations of a project; writes
+choose.json."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,10 +21,10 @@ from pipeline.results.record_json import write_record
 
 
 def run_choose(project: Project, reporter: Reporter) -> tuple[Choice, ChoiceRecord]:
-    """Compare models on the observations that the project's own adjustment uses, disks corrected; write and hand back
-    the result.
+    """Compare models on the observations of the project's own adjustment, with disks corrected for eccentricity; write
+    and return the result.
 
-    Raises InputError or AdjustmentError where the project cannot be adjusted at all.
+    Raises InputError or AdjustmentError where the project cannot be adjusted.
     """
     with unpublished(project) as new:
         with reporter.stage("comparing") as count:
@@ -43,7 +44,7 @@ def run_choose(project: Project, reporter: Reporter) -> tuple[Choice, ChoiceReco
 
 
 def print_choice(choice: Choice, console: Console, path: Path) -> None:
-    """The candidates as a table, then the verdict and a reason a line."""
+    """Print a table of the candidates, the verdict and the reasons."""
     columns = ("model", "unknowns", "redundancy", "sigma0", "v'Pv", "AIC", "AICc", "left out, µm", "correlated")
     table = Table(*columns, title="Candidates", title_justify="left")
     for each in choice.candidates:

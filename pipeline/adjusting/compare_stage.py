@@ -1,4 +1,5 @@
-"""`reseau compare`: the calibrations of a camera in several adjustment.json, compared as a field over the frame."""
+"""`reseau compare`: compare calibrations of a camera from several adjustment.json, as a field of differences over the
+frame."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -25,7 +26,7 @@ from pipeline.text.atomic import check_writable
 from pipeline.text.wording import did_you_mean, listed
 from pipeline.types import Array
 
-_LONGEST = 0.11  # of the frame's width: an arrow, or half the longest axis of an ellipse
+_LONGEST = 0.11  # length of the longest arrow or semi-axis, fraction of the frame's width
 _PANEL_PX = 520.0
 _MARGIN_PX = 74.0
 
@@ -33,10 +34,21 @@ _MARGIN_PX = 74.0
 def run_compare(
     paths: Sequence[Path], camera: str | None, times: Sequence[float] | None, use: Use, level: float, out: Path | None
 ) -> tuple[Comparison, ComparisonRecord]:
-    """The comparison of the camera in all files, and the record of it; compare.json and compare.svg into `out`, if any.
+    """Compare the calibrations of a camera; write compare.json and compare.svg to `out` if it is given.
 
-    Raises InputError or AdjustmentError for a file that holds no calibration of the camera, or for what cannot be
-    compared.
+    Parameters
+    ----------
+    paths : files adjustment.json.
+    camera : its name; None if each file has only one.
+    times : of the calibrations, for a linear trend.
+    use : "space" or "flat": whether the differences are adjusted for the attitude, or for attitude and station over
+        flat ground.
+    level : significance level of the verdict.
+
+    Raises
+    ------
+    InputError, AdjustmentError
+        A file has no calibration of the camera, or the calibrations are not comparable.
     """
     labels = _labels(paths)
     contents = [read_adjustment(path) for path in paths]
@@ -54,7 +66,8 @@ def run_compare(
 
 
 def _labels(paths: Sequence[Path]) -> list[str]:
-    """Names of the files: of what differs in their paths as many last parts as tell them apart."""
+    """Shortest distinct names of the files: as many last parts of their paths as distinguish them, after removal of a
+    common ending."""
     parts = [path.resolve().with_suffix("").parts for path in paths]
     twice = next((path for k, path in enumerate(paths) if parts[k] in parts[:k]), None)
     if twice is not None:
@@ -66,9 +79,9 @@ def _labels(paths: Sequence[Path]) -> list[str]:
 
 
 def calibrated_lens(path: Path, content: AdjustmentRecord, name: str | None) -> tuple[str, Lens]:
-    """A camera of an adjustment.json, by its name or because it is the only one, and its lens.
+    """Name and lens of a camera of an adjustment.json. name: None for its only camera.
 
-    Raises InputError where there is no such camera, or none that is calibrated.
+    Raises InputError where there is no such camera, or it is not calibrated.
     """
     if not content.converged:
         raise InputError(f"{path}: holds no calibration: its adjustment did not converge.")
@@ -94,7 +107,7 @@ def _calibration(path: Path, content: AdjustmentRecord, name: str, lens: Lens, l
 
 
 def _half_mm(path: Path, content: AdjustmentRecord, name: str) -> tuple[float, float]:
-    """As far as the camera was calibrated: where its images have observations."""
+    """Half width and height of the calibrated area, mm: extent of the observations from the origin."""
     x, y = np.abs(observed_mm(path, content, name)).max(axis=0)
     return float(x), float(y)
 
@@ -121,7 +134,7 @@ def _remarks(paths: Sequence[Path], contents: Sequence[AdjustmentRecord], names:
 
 
 def print_comparison(comparison: Comparison, record: ComparisonRecord, console: Console) -> None:
-    """The verdict first, then a table for each calibration after the first, then remarks."""
+    """Print the verdict, a table for each calibration after the first, and remarks."""
     console.print(Text(record.verdict, style="bold red" if record.verdict == DRIFT else "bold green"))
     console.print(Text(_why(comparison, record.level)))
     for k, rows in enumerate(record.differences):
@@ -189,10 +202,10 @@ def _largest(differences_um: Array, covariance_um2: Array) -> str:
 
 
 def draw_comparison(comparison: Comparison, path: Path) -> None:
-    """Write an SVG: an arrow a place, from where the first calibration sees it, and an ellipse of 95 % about its tip;
-    of a series the steady change besides.
+    """Write an SVG with one panel per calibration, and one for the linear trend of a series.
 
-    Raises InputError where the file cannot be written.
+    An arrow shows the difference from the first calibration at a place of the frame, the ellipse at its tip the 95 %
+    confidence region. Raises InputError where the file cannot be written.
     """
     width_mm, height_mm = np.ptp(comparison.places_mm, axis=0)
     px_per_mm = (_PANEL_PX - 2.0 * _MARGIN_PX) / float(width_mm)
@@ -214,7 +227,7 @@ def draw_comparison(comparison: Comparison, path: Path) -> None:
 
 
 def _panel(title: str, field_um: Array, covariance_um2: Array, starts: Array, px_per_um: float) -> tuple[Markup, ...]:
-    """A field as arrows; starts (m, 2) in px of the panel."""
+    """Field of differences as arrows with error ellipses. starts: (m, 2), px of the panel."""
     ends = starts + px_per_um * field_um * (1.0, -1.0)
     radii_um, angles = svg.ellipse_axes(covariance_um2)
     (left, top), (right, bottom) = starts.min(axis=0) - 24.0, starts.max(axis=0) + 24.0

@@ -1,4 +1,4 @@
-"""From the user's files and the comparator coordinates to the network that is adjusted, with checks of both."""
+"""Build the network of a project from the user's files and the comparator coordinates, with checks of both."""
 
 import math
 from collections import Counter
@@ -25,15 +25,15 @@ from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.text.wording import did_you_mean, listed
 from pipeline.types import Array
 
-OTHER_UNIT = 5.0  # film and paper keep their size to some percent; the nearest other unit, cm, is ten times as large
+OTHER_UNIT = 5.0  # ratio of lengths: film and paper deform by some percent; the nearest other unit (cm) is 10
 
 
 BOARD = "board"
-FEWEST_TARGETS = 3  # in an image whose exterior orientation nobody has observed
+FEWEST_TARGETS = 3  # in an image without observed exterior orientation
 
 
 def check_fiducials(project: Project, marks: Sequence[ComparatorPoint]) -> None:
-    """Raises InputError for a fiducial that the camera does not have, and for given coordinates that are no mm."""
+    """Raise InputError for fiducials that the camera lacks, and for coordinates that are not in mm."""
     shown: dict[str, list[ComparatorPoint]] = {}
     for mark in marks:
         if mark.kind == "fiducial":
@@ -56,7 +56,8 @@ def _check_fiducial_names(project: Project, image: str, marks: Sequence[Comparat
 
 
 def _check_fiducial_unit(project: Project, image: str, marks: Sequence[ComparatorPoint]) -> None:
-    """In um, inches or pixels they stand farther apart than the camera's, or closer, than film could make them."""
+    """Check the unit: in µm, inches or pixels, the extent of the fiducials differs from the camera's by more than film
+    deformation."""
     camera = project.image_camera(image)
     given = {one.id: one.xy_mm for one in camera.fiducials if max(one.sigma_mm) < math.inf}
     known = [(mark.xy_mm, given[mark.point]) for mark in marks if mark.xy_mm is not None and mark.point in given]
@@ -70,14 +71,21 @@ def _check_fiducial_unit(project: Project, image: str, marks: Sequence[Comparato
 
 
 def _extent(xy: NDArray[np.float64]) -> float:
-    """Diagonal of the rectangle about points (n, 2)."""
+    """Diagonal of the bounding rectangle of points (n, 2)."""
     return float(np.hypot(*np.ptp(xy, axis=0)))
 
 
 def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[Network, tuple[str, ...]]:
-    """The network of a project: the images, points and observations that `marks` really hold; and what is left out.
+    """Build the network from the images, points and observations in `marks`.
 
-    Raises InputError where a mark names a point, a fiducial or an image that the project does not have.
+    Returns
+    -------
+    The network, and a sentence on everything that is left out.
+
+    Raises
+    ------
+    InputError
+        A mark names a point or fiducial that the project lacks, or there is nothing to adjust.
     """
     used = rotate_to_sensor(project, [mark for mark in marks if mark.status.is_observation])
     if not used:
@@ -114,7 +122,7 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
 
 
 def _taking_cameras(project: Project, images: Sequence[Image]) -> tuple[Scanner, ...]:
-    """The digital cameras that photographed the film, with their lens; none where a scanner scanned it."""
+    """Digital cameras that photographed the film, with their lens; empty for film that was scanned."""
     if project.lens is None:
         return ()
     names = dict.fromkeys(image.scanner for image in images if image.scanner)
@@ -122,7 +130,7 @@ def _taking_cameras(project: Project, images: Sequence[Image]) -> tuple[Scanner,
 
 
 def anything_to_adjust(project: Project, marks: Sequence[ComparatorPoint]) -> bool:
-    """Whether an adjustment is asked for: of object points, or at least of the film where fiducials suffice for it."""
+    """Whether there is anything to adjust: object points, or film deformations where fiducials suffice."""
     observed = (mark for mark in marks if mark.kind == "fiducial" and mark.status.is_observation)
     fiducials = {(_frame(project, mark.image), mark.point): mark.image for mark in observed}
     counts = Counter(frame for frame, _ in fiducials)
@@ -133,18 +141,18 @@ def anything_to_adjust(project: Project, marks: Sequence[ComparatorPoint]) -> bo
 
 
 def check_transformation(project: Project) -> None:
-    """Raises InputError where the film transformation that is asked for needs fiducials that a camera does not have."""
+    """Raise InputError where the film deformation model needs fiducials that a camera lacks."""
     for camera in project.cameras.values():
         _transformation(project, camera)
 
 
 def _frame(project: Project, image: str) -> str:
-    """The name of the frame that an image is a scan of."""
+    """Name of the frame that an image is a scan of."""
     return project.scanned_frame(image) or image
 
 
 def _drop_single_joins(project: Project, marks: Sequence[ComparatorPoint]) -> list[ComparatorPoint]:
-    """The marks without the joins that only one scan of their frame shows."""
+    """Drop joins that only one scan of their frame shows."""
     shown = Counter((_frame(project, mark.image), mark.point) for mark in marks if mark.kind == "join")
     for mark in marks:
         if mark.kind == "join" and not project.scanned_frame(mark.image):
@@ -156,7 +164,7 @@ def _drop_single_joins(project: Project, marks: Sequence[ComparatorPoint]) -> li
 
 
 def _locatable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[ComparatorPoint], tuple[str, ...]]:
-    """The marks of the points that can be located: of which something is given, or which two images show."""
+    """Drop marks of points that cannot be located: without coordinates, and in one image only."""
     given = {id for id, point in project.object_points.items() if any((point.X, point.Y, point.Z))}
     shown_points = {(mark.point, _frame(project, mark.image)) for mark in marks if mark.kind not in ON_FILM}
     images = Counter(point for point, _ in shown_points)
@@ -172,11 +180,13 @@ def _locatable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list
 
 
 def _orientable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[ComparatorPoint], tuple[str, ...]]:
-    """The marks that have a part, and a sentence on every image that cannot be oriented.
+    """Drop marks of images that cannot be oriented, with a sentence on each.
 
-    Of an image with too few targets the fiducials remain, where they suffice for its film transformation.
+    Of an image with too few targets the fiducials remain if they suffice for its film deformation model.
     """
-    shown = {(_frame(project, mark.image), mark.kind, mark.point) for mark in marks}  # in several parts once
+    shown = {
+        (_frame(project, mark.image), mark.kind, mark.point) for mark in marks
+    }  # points in several parts of a frame count once
     targets = Counter(frame for frame, kind, _ in shown if kind not in ON_FILM)
     fiducials = Counter(frame for frame, kind, _ in shown if kind == "fiducial")
     first = {_frame(project, mark.image): mark.image for mark in reversed(marks)}
@@ -204,9 +214,9 @@ def _orientable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[lis
 
 
 def _joinable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[ComparatorPoint], tuple[str, ...]]:
-    """The marks of scans that hang together with the other parts of their frames, and a sentence on every other one.
+    """Drop marks of scans that are not connected with the other parts of their frames, with a sentence on each.
 
-    Of a frame in pieces the one that shows most fiducials remains.
+    Of a frame with several connected components, the one with the most fiducials remains.
     """
     shown_points: dict[str, dict[str, set[tuple[str, str]]]] = {}
     for mark in marks:
@@ -234,7 +244,7 @@ def _joinable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[
 def _few_fiducials(
     project: Project, frame: str, parts: Mapping[str, set[tuple[str, str]]], lost: Mapping[str, str]
 ) -> str:
-    """Why the scans of a frame that hang together have no part either; empty where they have."""
+    """Why the connected scans of a frame cannot take part either; "" if they can."""
     left = [part for part in parts if part not in lost]
     transformation = _transformation(project, project.image_camera(left[0]))
     shown = {point for part in left for kind, point in parts[part] if kind == "fiducial"}
@@ -247,7 +257,7 @@ def _few_fiducials(
 
 
 def _pieces(parts: Mapping[str, set[tuple[str, str]]]) -> list[set[str]]:
-    """Which scans of a frame hang together."""
+    """Connected components of the scans of a frame."""
     pieces: list[set[str]] = []
     for part in sorted(parts):
         own = [piece for piece in pieces if any(len(parts[part] & parts[other]) >= FEWEST_COMMON for other in piece)]
@@ -256,7 +266,7 @@ def _pieces(parts: Mapping[str, set[tuple[str, str]]]) -> list[set[str]]:
 
 
 def _expects_targets(project: Project) -> bool:
-    """Whether a project has object points to be seen; without them, film transformations are all it can ask for."""
+    """Whether a project has object points. Without any, only film deformations can be adjusted."""
     return any(part is not None for part in (project.targets, project.ties, project.given_points))
 
 
@@ -289,7 +299,7 @@ def _image(project: Project, name: str) -> Image:
 
 
 def _transformation(project: Project, camera: CameraFile) -> Transformation:
-    """As the project says; where it is silent, affine with fiducials and none without."""
+    """Film deformation model of the project; default: affine for cameras with fiducials, else none."""
     given = project.adjust.transformation
     if given is None:
         return "affine" if camera.fiducials else "none"
@@ -302,7 +312,8 @@ def _transformation(project: Project, camera: CameraFile) -> Transformation:
 
 
 def _check_points(project: Project, marks: Sequence[ComparatorPoint]) -> None:
-    """A target is one of the given points, where any are given; a tie point need not be."""
+    """Raise InputError for a target that is not among the given points, if there are any. Tie points need not be
+    given."""
     given = project.object_points
     for mark in marks:
         if mark.kind == "target" and given and mark.point not in given:
@@ -316,7 +327,7 @@ def _check_points(project: Project, marks: Sequence[ComparatorPoint]) -> None:
 def _cameras(
     project: Project, images: Sequence[Image], marks: Sequence[ComparatorPoint]
 ) -> tuple[tuple[Camera, ...], tuple[Calibration, ...]]:
-    """The cameras that images are of, and the earlier calibrations that take the place of priors."""
+    """Cameras of the images, and the earlier calibrations that replace their priors."""
     cameras, calibrations = [], []
     for file in project.cameras.values():
         names = {image.name for image in images if image.camera == file.name}
@@ -332,7 +343,7 @@ def _cameras(
 
 
 def _points(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[ObjectPoint, ...]:
-    """Every object point that an image shows: as given, of the board, or unknown where nothing gives it."""
+    """Object points that are observed: as given, of the board, or unknown."""
     given = project.object_points
     points = {}
     for mark in marks:
@@ -343,7 +354,8 @@ def _points(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[ObjectP
 
 
 def _boards(project: Project) -> tuple[Board, ...]:
-    """All given points as one board, where its bend is to be found. Raises InputError where they are none."""
+    """All given points as one board, where its bend is to be estimated. Raises InputError where they do not form
+    one."""
     sigma = project.board_bend_sigma
     if sigma == 0.0:
         return ()
@@ -361,14 +373,14 @@ def _boards(project: Project) -> tuple[Board, ...]:
 
 
 def _unnamed(project: Project, mark: ComparatorPoint) -> ObjectPoint:
-    """A point that nothing gives; of natural points the ground's height may be known."""
+    """Unknown object point; the height of a natural point may be known."""
     if mark.kind == "tie" and project.ties is not None:
         return project.ties.point(mark.point)
     return ObjectPoint(mark.point, None, None, None)
 
 
 def _distances(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[tuple[Distance, ...], tuple[str, ...]]:
-    """The distances between points and stations that take part, and a sentence on the others."""
+    """Distances whose ends are both observed, and a sentence on the others."""
     taking_part = {mark.point for mark in marks if mark.kind not in ON_FILM} | {mark.image for mark in marks}
     known = taking_part | set(project.object_points) | set(project.given_images.camera if project.given_images else ())
     known |= set(project.scans)
@@ -402,7 +414,7 @@ def _observations(settings: AdjustSettings, marks: Sequence[ComparatorPoint]) ->
 
 
 def _covariance(settings: AdjustSettings, mark: ComparatorPoint) -> Array:
-    """The mark's own covariance, or the a-priori one, and that of film and scanner, which no picture shows."""
+    """Covariance of a mark, or the a-priori one, plus the variance of film and scanner, mm²."""
     if mark.sigma_mm is None:
         sigma_um = settings.sigma_fiducial_um if mark.kind == "fiducial" else settings.sigma_target_um
         covariance = np.eye(2) * (sigma_um / 1000.0) ** 2

@@ -1,4 +1,4 @@
-"""The second visit to the scans: targets that were missed, sought where the adjustment says they are."""
+"""Second pass over the scans: missed targets are sought where the adjustment predicts them."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
@@ -23,12 +23,21 @@ from pipeline.progress import Reporter
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.workers import iterate_results
 
-_SEARCH_PX = 2.0  # an adjusted orientation predicts to far less than that
+_SEARCH_PX = 2.0  # search radius: predictions of an adjusted orientation are far more precise
 
 
 @dataclass(frozen=True, eq=False)
 class Visit:
-    """A scan to be looked at again: the path or the address of its file, and what is sought in it."""
+    """Scan to be searched again.
+
+    Attributes
+    ----------
+    image : name of the image.
+    scan : path or address of its file.
+    sought : predictions of the missed targets.
+    settings : description of the targets.
+    max_pixels : limit for the scan.
+    """
 
     image: str
     scan: str
@@ -44,10 +53,10 @@ def measure_again(
     reporter: Reporter,
     executor: Callable[[], AbstractContextManager[Executor]],
 ) -> tuple[MeasuredScan, ...] | None:
-    """The scans with what was found on the second visit; None where there is nothing new.
+    """Measure missed targets in a second pass; return the scans with new marks, or None where nothing is new.
 
-    Only targets that no mark was given to before are sought: what has been measured is not measured anew. executor:
-    what the scans are shared among, asked for where any is to be looked at.
+    Targets that were measured before are not measured again. executor: function that returns an executor, called only
+    if there is a scan to search.
     """
     settings = project.targets
     if settings is None or settings.board is not None or not adjustment.converged:
@@ -71,7 +80,8 @@ def measure_again(
 
 
 def looked_again(visit: Visit) -> tuple[MarkMeasurement, ...] | str:
-    """What is seen there of what is sought, or why the scan cannot be looked at: this raises nothing but interrupts."""
+    """Measure the predicted targets of a scan; return those found, or why the scan cannot be searched. Raises nothing
+    but interrupts."""
     try:
         with open_scan(scan_path(visit.scan), visit.max_pixels) as opened:
             grey = opened if visit.settings.code is None else opened.green_channel()
@@ -82,7 +92,7 @@ def looked_again(visit: Visit) -> tuple[MarkMeasurement, ...] | str:
 
 
 def _adjusted_field(field: Field, adjustment: Adjustment) -> Field:
-    """The field at its adjusted coordinates."""
+    """Target field at its adjusted coordinates."""
     xyz = field.xyz.copy()
     known = [row for row, id in enumerate(field.ids) if id in adjustment.network.point_by_id]
     xyz[known] = adjusted_places(adjustment, [field.ids[row] for row in known])
@@ -92,7 +102,7 @@ def _adjusted_field(field: Field, adjustment: Adjustment) -> Field:
 def _missed(
     field: Field, scan: MeasuredScan, adjustment: Adjustment, settings: TargetSettings
 ) -> tuple[TargetPrediction, ...]:
-    """The targets that are to be sought once more in a scan, where they should be."""
+    """Predictions of the targets that were missed in a scan."""
     network, image = adjustment.network, scan.frame.image
     if image not in network.image_by_name or image in network.unoriented:
         return ()
@@ -107,8 +117,10 @@ def _missed(
 def _visited(
     scan: MeasuredScan, seen: Sequence[MarkMeasurement] | str, field: Field, adjustment: Adjustment
 ) -> MeasuredScan:
-    """The scan with what was seen of it, the same object where that is nothing. What the first visit gave stays where a
-    second one was not possible any more, and the frame says so."""
+    """Scan with the targets found in the second pass; the same object if there are none.
+
+    If the second pass failed, the first one's marks stay and the frame gets a problem.
+    """
     if isinstance(seen, str):
         problem = Reason(f"The second pass failed: {seen}", Code.UNREACHABLE)
         return replace(scan, frame=replace(scan.frame, problems=(*scan.frame.problems, problem)))
@@ -124,8 +136,8 @@ def _visited(
 
 
 def _is_missed(mark: MarkMeasurement | None, settings: TargetSettings) -> bool:
-    """A coded target that was rejected has another one's ring at its place, and stays rejected; and so does what a
-    person decided."""
+    """Whether a target is to be sought again. A rejected coded target is not, since another one's ring is at its place;
+    nor is one that a person decided about."""
     if mark is None:
         return True
     if Code.DECIDED in mark.reason.codes:
@@ -138,5 +150,5 @@ def _is_inside(scan: MeasuredScan, center_px: np.ndarray) -> bool:
 
 
 def _is_free(mark: MarkMeasurement, taken_px: np.ndarray) -> bool:
-    """Whether no other target has been measured at that very place."""
+    """Whether no other target has been measured at the place of a mark."""
     return mark.center_px is not None and not bool((np.hypot(*(taken_px - mark.center_px).T) < _SEARCH_PX).any())

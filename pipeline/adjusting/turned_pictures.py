@@ -1,4 +1,4 @@
-"""Digital pictures that were turned by quarters: their marks in the frame of the sensor, which is one for all."""
+"""Rotate marks of digital images that were rotated by quarter turns back into the common system of the sensor."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,17 +12,17 @@ from pipeline.types import Array
 
 
 def rotate_to_sensor(project: Project, marks: Sequence[ComparatorPoint]) -> list[ComparatorPoint]:
-    """The marks as they would be in pictures that nobody turned, by the column turned_deg of images.csv.
+    """Marks in sensor coordinates, by the column turned_deg of images.csv.
 
-    Raises InputError where the size of the picture, which this needs, is not known.
+    Raises InputError where the size of a rotated image is unknown.
     """
     return [_turned_back(project, mark) if project.turned_deg(mark.image) else mark for mark in marks]
 
 
 def turned_back(xy_mm: Array, turned_deg: int, last_mm: tuple[float, float]) -> Array:
-    """(..., 2) comparator coordinates of a picture that was turned counter-clockwise, in the picture as it was before.
+    """(..., 2) comparator coordinates before a counter-clockwise rotation of the image.
 
-    last_mm: from the first pixel to the last one of a row and of a column of the picture before, mm.
+    last_mm: distances from the first to the last pixel of a row and of a column before the rotation, mm.
     """
     x, y = np.moveaxis(np.asarray(xy_mm, float), -1, 0)
     width, height = last_mm
@@ -31,7 +31,8 @@ def turned_back(xy_mm: Array, turned_deg: int, last_mm: tuple[float, float]) -> 
 
 
 def sensor_size_mm(project: Project, image: str) -> tuple[float, float]:
-    """From the first pixel to the last one of a row and of a column of the sensor. Raises InputError."""
+    """Distances from the first to the last pixel of a row and of a column of the sensor, mm. Raises InputError where
+    they are unknown."""
     camera, pitch_um = project.image_camera(image), project.pitch_um
     if camera.frame_mm is None or pitch_um is None:
         raise InputError(
