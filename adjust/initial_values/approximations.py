@@ -77,8 +77,7 @@ def _initial_values(network: Network) -> Approximations:
 
 
 def _joined_values(network: Network) -> Approximations:
-    """Initial values of a network with frames scanned in parts: of the whole frames, with the placement of the
-    parts."""
+    """Initial values of a network with frames scanned in parts: whole frames first, then their parts."""
     films, joins = dict[str, Film](), dict[tuple[str, str], Array]()
     for frame in joined_frames(network):
         films |= frame.films

@@ -1,1 +1,1 @@
-"""Linear algebra of large networks: small matrices, fronts, factors. It knows numbers only."""
+"""Linear algebra of large networks: small matrices, fronts, factors. Independent of photogrammetry."""

@@ -1,12 +1,12 @@
-"""Least squares with bordered blocks: every block's own unknowns are eliminated onto those that blocks share.
+"""Block elimination in bordered least-squares problems: each block's own unknowns are reduced onto the shared ones.
 
-The rows of an image, or of a point, touch its own unknowns and some shared ones. An orthogonal (Householder)
-factorisation of these rows alone leaves a triangle for its own unknowns and fewer rows in the shared ones; all these
-are factorised together. The cost is linear in the number of blocks, and the condition is that of the rows, not its
-square as with normal equations (Golub and Van Loan, Matrix Computations, section 5.3; Triggs et al., Bundle
-adjustment: a modern synthesis). Blocks of equal shape are factorised together.
+The observations of an image, or of a point, depend on its own unknowns and on some shared ones. An orthogonal
+(Householder) factorisation of these rows gives a triangle for the own unknowns and fewer rows in the shared ones; the
+remaining rows of all blocks are factorised together. The cost is linear in the number of blocks, and the condition
+number is that of the design matrix, not its square as with normal equations (Golub and Van Loan, Matrix Computations,
+section 5.3; Triggs et al., Bundle adjustment: a modern synthesis). Blocks of equal shape are factorised together.
 
-Rows that connect what no single block owns are blocks without own unknowns: what they touch must be shared.
+Observations that no single block contains form blocks without own unknowns: all their unknowns must be shared.
 """
 
 from collections.abc import Iterable
@@ -20,10 +20,10 @@ from adjust.linear_algebra.multifrontal import factorise_normal_equations, qr_tr
 from adjust.linear_algebra.schur_complement import SharedEquations, SparseRows, eliminated
 from adjust.linear_algebra.sparse_factor import TEN_DIGITS
 
-CHEAP = 1e7  # rows times columns squared in the shared unknowns up to which these rows are always reflected
-REFLECTED = 1e9  # the same, up to which they are wherever their normal equations would cost digits
-SAFE = 1e-6  # reciprocal condition of the shared triangle down to which normal equations will do beyond that
-STEADY = 1e3  # norm of the inverse of triangles up to which no singular value of the rows can be near 0
+CHEAP = 1e7  # rows times columns squared of the shared unknowns, up to which Householder QR is always used
+REFLECTED = 1e9  # the same, up to which it is used where normal equations would lose digits
+SAFE = 1e-6  # reciprocal condition of the shared triangle down to which normal equations suffice beyond that
+STEADY = 1e3  # norm of the triangles' inverses up to which no singular value of the design matrix is near 0
 
 
 def eliminate(
@@ -36,18 +36,25 @@ def eliminate(
     sharp: bool = True,
     fronts: Fronts | None = None,
 ) -> Factor:
-    """Factorise the blocks and one row an unknown for its prior.
+    """Factorise the observation equations of all blocks together with the priors.
 
-    The prior's row (count,) is prior_root_weight times unknown = prior_right. The shared unknowns are those that no
-    block owns, and stand first. A damping holds every scaled unknown where it is (Levenberg and Marquardt).
+    Parameters
+    ----------
+    blocks : observation equations; the unknowns that no block owns are shared, and are numbered first.
+    count : number of unknowns n.
+    prior_root_weight, prior_right : (n,) pseudo-observations: prior_root_weight times unknown = prior_right.
+    damping : added to the normal equations of the scaled unknowns (Levenberg and Marquardt).
+    sparse : the same equations in sparse form.
+    sharp : False: singular values below 1e-6 need not be distinguished from 1e-6.
+    fronts : fronts of the shared unknowns, which are numbered in elimination order; default a single front.
 
-    Where the same rows are given as `sparse` ones and reflections would take long, their own unknowns are eliminated by
-    orthonormal columns, and of what is left in the shared unknowns the normal equations are factorised (Cholesky). That
-    squares the condition: of variances the relative error is at most some 1e-16 times the squared condition, 1e-10
-    where the condition is 1e3. Where it is worse, all rows are reflected, but for so many that it would take too long:
-    there 1e6 will do. Not sharp: singular values below 1e-6 need not be told from that.
-
-    fronts: of the shared unknowns, which stand in their order; a single one if they are not told.
+    Notes
+    -----
+    Large problems with `sparse` equations avoid Householder QR. Their own unknowns are eliminated by Gram-Schmidt
+    orthonormalisation, and the reduced normal equations of the shared unknowns are factorised (Cholesky). This squares
+    the condition number: the relative error of variances is at most about 1e-16 times the squared condition, 1e-10 for
+    a condition of 1e3. Worse conditioned problems are factorised by Householder QR; those too large for that are
+    accepted up to a condition of 1e6.
     """
     cost = reflections_cost(fronts, *sparse.pattern.left_over) if sparse is not None and fronts is not None else 0.0
     is_large = sparse is not None and cost > (CHEAP if sharp else REFLECTED)
@@ -59,7 +66,7 @@ def eliminate(
         squares = _column_squares(blocks, count)
     squares += prior_root_weight**2
     scale = np.where(squares > 0.0, np.sqrt(squares), 1.0)
-    # One row an unknown holds its prior's and its damping's together: its coefficient and its right side.
+    # Combine prior and damping of each unknown in one row: coefficient and right side.
     together = np.hypot(prior_root_weight / scale, np.sqrt(damping))
     priors = together, prior_root_weight / scale * prior_right / np.where(together > 0.0, together, 1.0)
     if sparse is not None and equations is not None:
@@ -71,7 +78,7 @@ def eliminate(
 
 
 def _column_squares(blocks: Iterable[Blocks], count: int) -> Array:
-    """The sums (n,) of the squares in every column."""
+    """Sums of squares (n,) of the columns."""
     squares = np.zeros(count)
     for block in blocks:
         of_block = np.einsum("bmk,bmk->bk", block.matrix, block.matrix)
@@ -92,7 +99,7 @@ def _reflect_all(blocks: Iterable[Blocks], scale: Array, priors: tuple[Array, Ar
 
 
 def _eliminate_blocks(blocks: Blocks, scale: Array, priors: tuple[Array, Array]) -> tuple[BlockFactors, Array]:
-    """The blocks' triangles, and their remaining rows (b, k, s + 1) in the shared unknowns, right side behind."""
+    """Triangles of blocks, and their remaining rows (b, k, s + 1) in the shared unknowns, the right side last."""
     (count, height, width), own_count = blocks.matrix.shape, blocks.own.shape[1]
     rows = np.zeros((count, height + own_count, width + 1))
     np.divide(blocks.matrix, column_values(scale, blocks)[:, None, :], out=rows[:, :height, :-1])
@@ -108,7 +115,10 @@ def _eliminate_blocks(blocks: Blocks, scale: Array, priors: tuple[Array, Array])
 def _eliminate_normally(
     rows: SparseRows, scale: Array, priors: tuple[Array, Array], equations: SharedEquations, lift: float
 ) -> Factor | None:
-    """None where the normal equations of the shared unknowns are not positive definite."""
+    """Factorise with reduced normal equations of the shared unknowns; None if these are not positive definite.
+
+    lift: its square is added to the diagonal of the scaled normal equations.
+    """
     fronts, squares = equations.fronts, equations.squares
     root_weight, prior_right = (prior[: fronts.count] for prior in priors)
     blocks = eliminated(rows, *priors, scale, equations)

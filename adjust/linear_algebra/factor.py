@@ -1,4 +1,4 @@
-"""The square root of normal equations of bordered blocks, and what follows from it: solution, variances, cofactors."""
+"""Square root of the normal equations of bordered blocks: solution, variances, cofactors."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -18,10 +18,14 @@ Number = TypeVar("Number", bound=np.generic)
 
 @dataclass(frozen=True)
 class Blocks:
-    """The rows of b blocks of equal shape: matrix (b, m, o + s) times the unknowns = right (b, m), of unit weight.
+    """Observation equations of unit weight of b blocks of equal shape.
 
-    own (b, o): numbers of every block's own unknowns among all; shared (b, s): numbers of the others that it touches,
-    among the shared ones.
+    Attributes
+    ----------
+    own : (b, o) numbers of each block's own unknowns.
+    shared : (b, s) numbers of the shared unknowns that it involves.
+    matrix : (b, m, o + s) design matrices.
+    right : (b, m) right sides.
     """
 
     own: Indices
@@ -32,7 +36,7 @@ class Blocks:
 
 @dataclass(frozen=True)
 class BlockFactors:
-    """Their triangles (b, o, o): triangle own + border (b, o, s) shared = right (b, o)."""
+    """Eliminated blocks: triangle (b, o, o) own + border (b, o, s) shared = right (b, o)."""
 
     own: Indices
     shared: Indices
@@ -42,28 +46,29 @@ class BlockFactors:
 
 
 class Eliminated(Protocol):
-    """All blocks, their own unknowns eliminated."""
+    """All blocks after elimination of their own unknowns."""
 
     @property
     def blocks(self) -> tuple[BlockFactors, ...]:
-        """In the order of the blocks, those of equal shape together."""
+        """Factors in the order of the blocks, those of equal shape together."""
 
     def substitute(self, solution: Array) -> None:
-        """Put own unknowns into a solution (n,), scaled, whose shared ones are found."""
+        """Compute the own unknowns by back substitution in a scaled solution (n,) with the shared ones solved."""
 
     def square_sum(self) -> float:
-        """Of the right sides."""
+        """Sum of the squared right sides."""
 
     def own_cofactors(self, triangle: Triangle) -> Iterator[tuple[Indices, Array]]:
-        """Own unknowns (b, o), -1 for none, and their cofactor matrices (b, o, o), scaled; triangle: of what is shared.
+        """Own unknowns (b, o), -1 for none, and their scaled cofactor matrices (b, o, o).
 
-        For shared unknowns held fixed, and what these add.
+        The sum of those with the shared unknowns fixed and of the contribution of the shared unknowns, whose factor is
+        triangle.
         """
 
 
 @dataclass(frozen=True)
 class DenseBlocks:
-    """Blocks that were eliminated as they stand here."""
+    """Eliminated blocks in dense form."""
 
     blocks: tuple[BlockFactors, ...]
 
@@ -84,8 +89,10 @@ class DenseBlocks:
 
 @dataclass(frozen=True)
 class ReducedRows:
-    """Rows of b blocks as own (b, m, o) times quantities of unit covariance plus through (b, m, s) times the scaled
-    shared unknowns (b, s); these quantities are not correlated with each other nor with the shared unknowns.
+    """Rows of b blocks in terms of uncorrelated quantities.
+
+    Each is own (b, m, o) times quantities of unit covariance, which are not correlated with the shared unknowns, plus
+    through (b, m, s) times the scaled shared unknowns, with numbers shared (b, s).
     """
 
     own: Array
@@ -95,11 +102,14 @@ class ReducedRows:
 
 @dataclass(frozen=True)
 class Factor:
-    """The square root of the normal equations: the blocks' triangles, and that of the s shared unknowns.
+    """Square root of the normal equations: the triangles of the blocks, and that of the s shared unknowns.
 
-    All columns are scaled: the unknowns are those of the rows times `scale` (n,), which makes every column's norm 1.
-    The shared unknowns are the first s. steady: the inverses of its triangles are known to be so small that no singular
-    value of the rows is near 0.
+    Attributes
+    ----------
+    eliminated : blocks, with their own unknowns eliminated.
+    triangle, right : factor and right side (s,) of the shared unknowns, which are the first s.
+    scale : (n,) norms of the columns, priors included; the scaled unknowns are the unknowns times scale.
+    steady : the inverses of the triangles are small, so that no singular value of the design matrix is near 0.
     """
 
     eliminated: Eliminated
@@ -118,18 +128,18 @@ class Factor:
 
     @cached_property
     def solution(self) -> Array:
-        """The unknowns (n,). Raises numpy.linalg.LinAlgError where a triangle is singular."""
+        """Solution (n,). Raises numpy.linalg.LinAlgError if a triangle is singular."""
         solution = np.empty(len(self.scale))
         solution[: self.shared_count] = self.triangle.solve(self.right)
         self.eliminated.substitute(solution)
         return solution / self.scale
 
     def length(self) -> float:
-        """Of the solution, in standard deviations: what that function of the unknowns moves which moves most."""
+        """Length of the solution in standard deviations: the largest change of any function of the unknowns."""
         return float(np.sqrt((self.right**2).sum() + self.eliminated.square_sum()))
 
     def variances(self) -> Array:
-        """The diagonal (n,) of the cofactor matrix."""
+        """Diagonal (n,) of the cofactor matrix."""
         variances = np.empty(len(self.scale) + 1)
         for own, cofactors in self._own_cofactors:
             variances[own] = np.einsum("bii->bi", cofactors)
@@ -137,7 +147,7 @@ class Factor:
         return variances[:-1] / self.scale**2
 
     def cofactors(self, groups: Indices) -> Array:
-        """The cofactor matrices (g, k, k) of groups of unknowns (g, k), each of one block's own or of shared ones."""
+        """Cofactor matrices (g, k, k) of groups (g, k) of unknowns, each all own of one block or all shared."""
         cofactors = np.empty((*groups.shape, groups.shape[1]))
         shared = groups[:, 0] < self.shared_count
         cofactors[shared] = self.triangle.group_cofactors(groups[shared])
@@ -154,7 +164,7 @@ class Factor:
         return cofactors / (scale[:, :, None] * scale[:, None, :])
 
     def function_cofactor(self, functions: csr_array) -> Array:
-        """The cofactor matrix (k, k) of linear functions (k, n) of the unknowns."""
+        """Cofactor matrix (k, k) of linear functions (k, n) of the unknowns."""
         columns = (functions / self.scale).tocsc()
         shared = np.asarray(columns[:, : self.shared_count].toarray(), dtype=np.float64)
         used = np.diff(columns.indptr) > 0
@@ -170,7 +180,7 @@ class Factor:
         return np.asarray(cofactor + through.T @ through)
 
     def cofactor_times(self, columns: Array) -> Array:
-        """The cofactor matrix times columns (n, d)."""
+        """Product of the cofactor matrix with columns (n, d)."""
         scaled = columns / self.scale[:, None]
         shared = scaled[: self.shared_count].copy()
         own = []
@@ -185,7 +195,7 @@ class Factor:
         return result / self.scale[:, None]
 
     def reduced_rows(self, blocks: Iterable[Blocks]) -> Iterator["ReducedRows"]:
-        """The adjusted rows of blocks that own and share what those factorised do, one after the other."""
+        """Reduce rows of blocks with the same own and shared unknowns as the factorised blocks, in the same order."""
         for rows, block in zip(blocks, self.blocks, strict=True):
             count = block.own.shape[1]
             matrix = rows.matrix / column_values(self.scale, rows)[:, None, :]
@@ -198,5 +208,5 @@ class Factor:
 
 
 def column_values(values: NDArray[Number], blocks: Blocks) -> NDArray[Number]:
-    """The values (b, o + s), one an unknown, of what the blocks' columns stand for."""
+    """Values (b, o + s) of the unknowns in the blocks' columns."""
     return np.concatenate([values[blocks.own], values[blocks.shared]], axis=1)

@@ -1,10 +1,10 @@
-"""An order in which the unknowns of a network are eliminated, and the fronts in which that is done.
+"""Elimination order of the unknowns of a network, and its division into fronts.
 
-The images of a strip or of a block share points with their neighbours alone, and all of them share the camera: their
-reduced equations are a band with a border. Groups of unknowns, one an image, are put into the order of Cuthill and
-McKee, which makes the band narrow, and the border behind. A front is a run of neighbours that are eliminated together
-as one dense matrix; what it leaves goes to the front that owns the first unknown that it touches (Duff and Reid 1983,
-The multifrontal solution of indefinite sparse symmetric linear equations). A small network is a single front.
+The images of a strip or block share points only with their neighbours, and all share the camera: their reduced normal
+equations are banded and bordered. The Cuthill-McKee order of the groups of unknowns, one group per image, makes the
+band narrow; the border is eliminated last. A front is a run of neighbouring groups that are eliminated together as one
+dense matrix. Its Schur complement is passed to the front that owns the first remaining unknown (Duff and Reid 1983, The
+multifrontal solution of indefinite sparse symmetric linear equations). A small network is a single front.
 """
 
 from collections.abc import Iterator
@@ -17,12 +17,12 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from adjust.array_types import Indices
 
-FRONT_COST = 1e6  # of handling a front, in unknowns times columns squared: what dense algebra does in that time
+FRONT_COST = 1e6  # overhead of a front, in unknowns times columns squared of dense algebra in the same time
 
 
 @dataclass(frozen=True)
 class Front:
-    """Unknowns first to stop (excluded), which are eliminated together, and the later ones (a,) that these meet."""
+    """Front: unknowns first to stop (excluded), eliminated together, and the later ones (a,) connected with them."""
 
     first: int
     stop: int
@@ -38,16 +38,16 @@ class Front:
 
     @property
     def width(self) -> int:
-        """How many unknowns it touches."""
+        """Number of unknowns of the front, own and later ones."""
         return self.count + len(self.after)
 
     @property
     def columns(self) -> Indices:
-        """The unknowns (k + a,) that it touches."""
+        """Unknowns (k + a,) of the front, own ones first."""
         return np.concatenate([np.arange(self.first, self.stop), self.after])
 
     def places(self, unknowns: Indices) -> Indices:
-        """Where some of the unknowns that it touches stand among them."""
+        """Positions of unknowns within the front."""
         behind = self.count + np.searchsorted(self.after, unknowns)
         return np.where(unknowns < self.stop, unknowns - self.first, behind)
 
@@ -60,7 +60,7 @@ class Fronts:
 
     @staticmethod
     def single(count: int) -> "Fronts":
-        """All unknowns eliminated together."""
+        """A single front of all unknowns."""
         return Fronts((Front(0, count, np.empty(0, dtype=np.intp)),))
 
     def __len__(self) -> int:
@@ -74,24 +74,24 @@ class Fronts:
 
     @property
     def count(self) -> int:
-        """The unknowns of all."""
+        """Number of unknowns of all fronts."""
         return self.members[-1].stop
 
     def home(self, unknowns: Indices) -> Indices:
-        """The front (...,) that holds unknowns (..., s) together: which owns the first of them."""
+        """Front (...,) that holds unknowns (..., s) together: the owner of the first of them."""
         return np.asarray(np.searchsorted(self._starts, unknowns.min(axis=-1), side="right") - 1)
 
     @cached_property
     def table(self) -> Indices:
-        """(f, 5) of every front: its first unknown, how many it owns, where its square begins if all stand one behind
-        the other, where those that it meets later begin in `later_unknowns`, and how many these are."""
+        """(f, 5) of each front: first unknown, number of own unknowns, offset of its square in an array of all squares,
+        offset of its later unknowns in `later_unknowns`, and their number."""
         count, later = np.array([(front.count, len(front.after)) for front in self], dtype=np.intp).T
         sizes = (count + later) ** 2
         return np.column_stack([self._starts, count, np.cumsum(sizes) - sizes, np.cumsum(later) - later, later])
 
     @cached_property
     def later_unknowns(self) -> Indices:
-        """Those that the fronts meet later, one front behind the other."""
+        """Later unknowns of all fronts, one front after the other."""
         return np.concatenate([front.after for front in self])
 
     @cached_property
@@ -100,9 +100,9 @@ class Fronts:
 
 
 def band_order(meeting: csr_array) -> Indices:
-    """Groups (g,) in an order in which those that some block meets together are near each other.
+    """Order groups (g,) of unknowns by the reverse Cuthill-McKee algorithm, so that connected groups are close.
 
-    meeting (g, g): an entry for every two groups that some block of observations meets both of.
+    meeting (g, g): adjacency matrix, with an entry for any two groups that occur in the same block of observations.
     """
     if meeting.shape[0] == 0:
         return np.empty(0, dtype=np.intp)
@@ -110,10 +110,18 @@ def band_order(meeting: csr_array) -> Indices:
 
 
 def make_fronts(meeting: csr_array, sizes: Indices, border: int) -> Fronts:
-    """The fronts of groups of some unknowns each (g,), in their order, and of a border of unknowns that all may meet.
+    """Divide ordered groups of unknowns and a border into fronts.
 
-    meeting as in `band_order`. Neighbours are put together as long as that makes the elimination of an unknown cheaper.
-    What a run of them leaves is handed on, all of it, to the first group that it meets later.
+    Parameters
+    ----------
+    meeting : (g, g) adjacency matrix of the groups, as in `band_order`, in elimination order.
+    sizes : (g,) numbers of unknowns of the groups.
+    border : number of unknowns that may be connected with all groups.
+
+    Notes
+    -----
+    Neighbouring groups are merged as long as this lowers the cost per eliminated unknown. The later unknowns of a run
+    are passed on, all of them, to its first later group.
     """
     size, count = np.append(sizes, border), len(sizes)
     handed_on: list[set[int]] = [set() for _ in range(count + 1)]
@@ -146,14 +154,14 @@ def make_fronts(meeting: csr_array, sizes: Indices, border: int) -> Fronts:
 
 @dataclass(frozen=True)
 class _Run:
-    """Groups first to stop (excluded), and the later ones that these meet."""
+    """Groups first to stop (excluded), and the later ones connected with them."""
 
     first: int
     stop: int
     later: set[int]
 
     def cost(self, size: Indices) -> float:
-        """Of the elimination of an unknown; size (g + 1,): the unknowns of every group."""
+        """Cost per eliminated unknown; size (g + 1,): numbers of unknowns of the groups."""
         own = int(size[self.first : self.stop].sum())
         width = own + int(size[list(self.later)].sum())
         return width**2 + FRONT_COST / max(own, 1)

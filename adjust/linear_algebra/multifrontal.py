@@ -1,7 +1,7 @@
-"""Triangles of large sparse equations, front by front: by reflections of their rows, or by Cholesky.
+"""Multifrontal factorisation of large sparse equations: Householder QR of rows, or Cholesky of normal equations.
 
-A front's rows are factorised: a triangle for the unknowns that it owns, a border in those that it meets later, and rows
-that are handed on to the front that owns the first of these. Or normal equations are, and squares are handed on.
+QR of the rows of a front gives a triangle for its own unknowns, a border in the later ones, and remaining rows, which
+are passed to the front that owns the first of these. With normal equations, the Schur complement is passed on.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -13,18 +13,18 @@ from adjust.array_types import Array, Indices
 from adjust.linear_algebra.fronts import Fronts
 from adjust.linear_algebra.sparse_factor import Triangle
 
-Rows = tuple[Indices, Array]  # unknowns (b, s) and rows (b, k, s + 1) in them, the right side behind
+Rows = tuple[Indices, Array]  # unknowns (b, s) and rows (b, k, s + 1) in them, the right side last
 
-ROWS_PER_COLUMN = 4  # rows are condensed when there are more of them than this
-CONDENSED_ROWS = 2000  # and more than this
+ROWS_PER_COLUMN = 4  # pending rows are factorised when they exceed this number per column
+CONDENSED_ROWS = 2000  # and this number in all
 
 
 def reflected(
     fronts: Fronts, rows: Iterable[Rows], prior_root_weight: Array, prior_right: Array
 ) -> tuple[Triangle, Array]:
-    """The triangle and right side (s,) of rows, and of a row an unknown for its prior, by reflections.
+    """Factorise rows, and one prior row per unknown, by Householder QR; returns the triangle and right side (s,).
 
-    The unknowns of a row are in one front: that which owns the first of them.
+    All unknowns of a row must be in the front that owns the first of them.
     """
     of_front: list[list[Rows]] = [[] for _ in fronts]
     for i, some in _distributed(fronts, rows):
@@ -50,7 +50,7 @@ def reflected(
 
 
 def append_rows(triangle: Triangle, rows: Iterable[tuple[Indices, Array]]) -> Triangle:
-    """The triangle of further rows (k, s') in some unknowns (s',) each, besides its own rows."""
+    """Update a triangle with further rows (k, s') in unknowns (s',)."""
     itself = [(front.columns, np.hstack(parts)) for front, *parts in triangle.parts]
     all_rows = [(unknowns[None], np.pad(each, ((0, 0), (0, 1)))[None]) for unknowns, each in (*itself, *rows)]
     nothing = np.zeros(len(triangle))
@@ -58,10 +58,21 @@ def append_rows(triangle: Triangle, rows: Iterable[tuple[Indices, Array]]) -> Tr
 
 
 def factorise_normal_equations(fronts: Fronts, squares: list[Array], right: Array) -> tuple[Triangle, Array]:
-    """The triangle and right side (s,) of normal equations, by Cholesky.
+    """Factorise normal equations by Cholesky.
 
-    squares: of every front those (k + a, k + a) of the rows that belong to it, whose lower triangle is read and which
-    are used up; right (s,). Raises numpy.linalg.LinAlgError where they are not positive definite.
+    Parameters
+    ----------
+    squares : normal matrices (k + a, k + a) of the fronts' own rows; only lower triangles are read. Destroyed.
+    right : (s,) right side.
+
+    Returns
+    -------
+    Triangle and right side (s,).
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the normal equations are not positive definite.
     """
     own, borders = [], []
     right = right.copy()
@@ -82,14 +93,17 @@ def factorise_normal_equations(fronts: Fronts, squares: list[Array], right: Arra
 
 
 def reflections_cost(fronts: Fronts, first: Indices, heights: Indices) -> float:
-    """Rows times columns squared, of all fronts; heights (b,): the rows of blocks whose first unknown is that."""
+    """Cost of Householder QR: rows times columns squared, summed over the fronts.
+
+    first, heights (b,): first unknown and number of rows of each block.
+    """
     home = fronts.home(first[heights > 0, None])
     of_front = np.bincount(home, heights[heights > 0], len(fronts))
     return float((of_front * np.array([front.width for front in fronts]) ** 2).sum())
 
 
 def _distributed(fronts: Fronts, rows: Iterable[Rows]) -> Iterator[tuple[int, Rows]]:
-    """The rows by the front to which they belong."""
+    """Assign rows to the fronts that own their first unknowns."""
     for unknowns, each in rows:
         if unknowns.shape[1] == 0:
             continue
@@ -103,7 +117,7 @@ def _distributed(fronts: Fronts, rows: Iterable[Rows]) -> Iterator[tuple[int, Ro
 
 
 def _condensed(rows: Sequence[Rows], priors: Array) -> Array:
-    """The triangle (up to w + 1, w + 1) of prior rows (p, w + 1) and of rows in some of the w unknowns."""
+    """Triangle (up to w + 1, w + 1) of prior rows (p, w + 1) and of rows in some of the w unknowns."""
     width = priors.shape[1] - 1
     together = max(CONDENSED_ROWS, ROWS_PER_COLUMN * (width + 1))
     triangle, pending, height = priors, list[Array](), 0
@@ -119,7 +133,7 @@ def _condensed(rows: Sequence[Rows], priors: Array) -> Array:
 
 
 def _spread(unknowns: Indices, rows: Array, width: int) -> Array:
-    """Rows (b, k, s + 1) in some unknowns (b, s) as rows (b k, w + 1) in all."""
+    """Expand rows (b, k, s + 1) in some unknowns (b, s) to rows (b k, w + 1) in all."""
     spread = np.zeros((*rows.shape[:2], width + 1))
     columns = np.concatenate([unknowns, np.full((len(unknowns), 1), width)], axis=1)
     np.put_along_axis(spread, np.broadcast_to(columns[:, None, :], rows.shape), rows, axis=2)
@@ -127,5 +141,5 @@ def _spread(unknowns: Indices, rows: Array, width: int) -> Array:
 
 
 def qr_triangle(rows: Array) -> Array:
-    """The factors R (..., k, n) of Householder factorisations of rows (..., m, n), k the smaller of m and n."""
+    """Factors R (..., k, n) of Householder QR of rows (..., m, n), k = min(m, n)."""
     return np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)

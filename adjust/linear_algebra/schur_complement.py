@@ -1,9 +1,9 @@
-"""Least squares with many small blocks, of points say, each row of which touches few of the unknowns that they share.
+"""Schur complement for many small blocks, for example points, whose rows involve few of the shared unknowns.
 
-Own unknowns are eliminated for all blocks at once: their columns are made orthonormal by Gram and Schmidt's method,
-twice, which is as good as reflections (Giraud, Langou and Rozloznik 2005, The loss of orthogonality in the Gram-Schmidt
-orthogonalization process). Nothing is laid out in dense blocks. What they leave in the shared unknowns is a difference
-of squares, the rows' and the borders': products of sparse matrices of dense parts.
+The own unknowns of all blocks are eliminated at once: their columns are orthonormalised by the Gram-Schmidt method,
+twice, which is as accurate as Householder reflections (Giraud, Langou and Rozloznik 2005, The loss of orthogonality in
+the Gram-Schmidt orthogonalization process). No dense blocks are formed. The reduced normal equations of the shared
+unknowns are N = A'A - B'B, with the rows A and the borders B: products of block-sparse matrices.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -19,18 +19,21 @@ from adjust.linear_algebra.factor import BlockFactors, Blocks
 from adjust.linear_algebra.fronts import Fronts
 from adjust.linear_algebra.sparse_factor import Triangle
 
-Arranged = Callable[[], Iterable[tuple[Indices, Blocks]]]  # pairs of rows (b, m) of blocks of equal shape, laid out
-COMPILED_OWN = 3  # own unknowns of a block that kernels.c holds
-ROWS_AT_ONCE = 20_000  # pairs of rows that are handled together, so that they stay in the processor's cache
+Arranged = Callable[[], Iterable[tuple[Indices, Blocks]]]  # pairs of rows (b, m), and their dense blocks of equal shape
+COMPILED_OWN = 3  # largest number of own unknowns per block in kernels.c
+ROWS_AT_ONCE = 20_000  # pairs of rows in one batch, which then fits the processor's cache
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """What n pairs of rows touch: own unknowns of one of b blocks, those of one of g groups, and single ones.
+    """Sparsity pattern of n pairs of rows: unknowns of one of b blocks, of one of g groups, and single ones.
 
-    columns (own (o,), group (w,), single (c,)): which of the derivatives are by these. block (n,), group (n,): whose, b
-    and g for none. own (b + 1, o), members (g + 1, w), single (n, c): the unknowns' numbers, -1 for none. Those of
-    groups and single ones, `count` in all, are shared.
+    Attributes
+    ----------
+    columns : own (o,), group (w,), single (c,) columns of the derivatives with respect to these unknowns.
+    block, group : (n,) block and group of each pair; b and g for none.
+    own, members, single : (b + 1, o), (g + 1, w), (n, c) numbers of the unknowns, -1 for none.
+    count : number of shared unknowns: those of the groups, and the single ones.
     """
 
     columns: tuple[Indices, Indices, Indices]
@@ -43,7 +46,7 @@ class Pattern:
 
     @cached_property
     def singles(self) -> Indices:
-        """(t,) the numbers of the single unknowns that rows with own unknowns touch."""
+        """(t,) numbers of the single unknowns in rows with own unknowns."""
         touched = np.zeros(self.count + 1, dtype=bool)  # the last stands for none
         for numbers in self.single.T:
             touched[numbers[self.block < len(self.own) - 1]] = True
@@ -51,30 +54,34 @@ class Pattern:
 
     @cached_property
     def order(self) -> Indices:
-        """(m,) the pairs of rows that touch own unknowns, block by block, and group by group as they are eliminated."""
+        """(m,) pairs of rows with own unknowns, block by block, and within a block in elimination order of the
+        groups."""
         order = np.lexsort((self._lowest[self.group], self.block))
         return order[: np.count_nonzero(self.block < len(self.own) - 1)]
 
     @cached_property
     def groups(self) -> Indices:
-        """(m,) their groups."""
+        """(m,) groups of the pairs in `order`."""
         return self.group[self.order]
 
     @cached_property
     def block_numbers(self) -> Indices:
-        """(m,) their blocks."""
+        """(m,) blocks of the pairs in `order`."""
         return self.block[self.order]
 
     @cached_property
     def first(self) -> Indices:
-        """(b + 1,) where each block's begin among them, and where they end."""
+        """(b + 1,) index in `order` of each block's first pair; the last is m."""
         return np.searchsorted(self.block_numbers, np.arange(len(self.own)))
 
     @cached_property
     def cells(self) -> tuple[Indices, Indices, Indices]:
-        """What touches the same shared unknowns: order (n,) by cell, first (p + 1,) of each, unknowns (p, w + c)."""
+        """Cells: pairs of rows with the same shared unknowns.
+
+        Returns the order (n,) of the pairs by cell, the first (p + 1,) of each cell, and its unknowns (p, w + c).
+        """
         touched = np.column_stack([self.group, self.single])
-        begins = np.append(True, (touched[1:] != touched[:-1]).any(axis=1))  # most do as the one before
+        begins = np.append(True, (touched[1:] != touched[:-1]).any(axis=1))  # most pairs equal the one before
         kinds, kind = np.unique(touched[begins], axis=0, return_inverse=True)
         cell = kind[np.cumsum(begins) - 1]
         order = np.argsort(cell, kind="stable")
@@ -83,7 +90,7 @@ class Pattern:
 
     @cached_property
     def place_in_border(self) -> Indices:
-        """(o, c, m) where the products of own and single columns are summed up in borders (b, o, t + 1)."""
+        """(o, c, m) flat index in borders (b, o, t + 1) to which products of own and single columns are added."""
         place = np.full(self.count + 1, len(self.singles), dtype=np.intp)
         place[self.singles] = np.arange(len(self.singles))
         rows = self.block_numbers * self.own.shape[1] + np.arange(self.own.shape[1])[:, None]
@@ -91,12 +98,12 @@ class Pattern:
 
     @cached_property
     def _lowest(self) -> Indices:
-        """(g + 1,) the first member of every group."""
+        """(g + 1,) smallest number of a member of each group."""
         return np.asarray(np.where(self.members >= 0, self.members, self.count).min(axis=1, initial=self.count))
 
     @cached_property
     def left_over(self) -> tuple[Indices, Indices]:
-        """(b + 1,) the first shared unknown of every block, and the rows it leaves in these; at last those of none."""
+        """(b + 1,) first shared unknown of each block, and the number of its reduced rows; last, rows without block."""
         first = np.full(len(self.own), self.count)
         np.minimum.at(first, self.block, self._lowest[self.group])
         first = np.where(first < self.count, first, self.singles.min(initial=self.count))
@@ -106,26 +113,26 @@ class Pattern:
 
 @dataclass(frozen=True)
 class Border:
-    """Rows (r,) in the shared unknowns: as parts in the groups, and dense (r, t) in the single ones."""
+    """Border of r rows in the shared unknowns: block-sparse in the groups, and dense (r, t) in the single ones."""
 
     pattern: Pattern
     parts: bsr_array
     alone: Array
 
     def times(self, shared: Array) -> Array:
-        """Their products (r,) with shared unknowns (s,)."""
+        """Product (r,) with shared unknowns (s,)."""
         of_groups = np.append(shared, 0.0)[self.pattern.members.ravel()]
         return np.asarray(self.parts @ of_groups + self.alone @ shared[self.pattern.singles])
 
     def transposed_times(self, rows: Array) -> Array:
-        """(s,) of rows (r,)."""
+        """Product (s,) of the transpose with a vector (r,)."""
         result = np.zeros(self.pattern.count + 1)
         np.add.at(result, self.pattern.members.ravel(), self.parts.T @ rows)
         result[self.pattern.singles] += self.alone.T @ rows
         return result[:-1]
 
     def square(self) -> csr_array:
-        """(s, s)."""
+        """B'B (s, s)."""
         groups, singles, transposed = self.pattern.members.ravel(), self.pattern.singles, self.parts.T
         within = bsr_array(transposed @ self.parts).tocoo()
         across = coo_array(transposed @ self.alone)
@@ -140,9 +147,14 @@ class Border:
 
 @dataclass(frozen=True)
 class SparseRows:
-    """Pairs of rows of unit weight: matrix (n, 2, k) times the unknowns that a pattern tells = right (n, 2).
+    """Observation equations in pairs of rows of unit weight, with a sparsity pattern.
 
-    further: rows in shared unknowns alone, besides. arranged: all of these as dense blocks, for what is asked for once.
+    Attributes
+    ----------
+    matrix : (n, 2, k) derivatives with respect to the unknowns in the pattern.
+    right : (n, 2) right sides.
+    further : additional rows in shared unknowns only.
+    arranged : returns all rows as dense blocks, for rare uses.
     """
 
     pattern: Pattern
@@ -152,7 +164,7 @@ class SparseRows:
     arranged: Arranged
 
     def equations(self, fronts: Fronts) -> "SharedEquations":
-        """The normal equations of all rows in the shared unknowns, as if there were no own ones."""
+        """Normal equations of all rows in the shared unknowns, before the own ones are eliminated."""
         pattern, equations = self.pattern, SharedEquations.zeros(fronts)
         order, first, unknowns = pattern.cells
         home = fronts.home(np.where(unknowns >= 0, unknowns, pattern.count))
@@ -175,7 +187,7 @@ class SparseRows:
         return equations
 
     def column_squares(self, count: int, equations: "SharedEquations") -> Array:
-        """(n,) the sums of the squares in the columns of all unknowns."""
+        """(n,) sums of squares of the columns of all unknowns."""
         squares = np.zeros(count + 1)
         by_own = self.matrix[..., self.pattern.columns[0]]
         for of_rows, unknowns in zip((by_own**2).sum(axis=1).T, self.pattern.own.T, strict=True):
@@ -184,7 +196,7 @@ class SparseRows:
         return squares[:-1]
 
     def _cell_squares(self) -> Array:
-        """Of each cell the square (p, w + c + 1, w + c + 1) of its rows, with their right side behind."""
+        """Normal matrices (p, w + c + 1, w + c + 1) of the cells' rows, the right side as the last column."""
         pattern, (order, first, unknowns) = self.pattern, self.pattern.cells
         width = unknowns.shape[1]
         squares = np.empty((len(unknowns), width + 1, width + 1))
@@ -202,8 +214,13 @@ class SparseRows:
 
 @dataclass(frozen=True)
 class SharedEquations:
-    """Normal equations of the shared unknowns: of every front the lower triangle of the square (k + a, k + a) of the
-    rows that belong to it, all of them in values, and the right side (s,)."""
+    """Normal equations of the shared unknowns.
+
+    Attributes
+    ----------
+    values : normal matrices (k + a, k + a) of all fronts, one after the other; the lower triangles count.
+    right : (s,) right side.
+    """
 
     fronts: Fronts
     values: Array
@@ -215,7 +232,7 @@ class SharedEquations:
 
     @property
     def squares(self) -> list[Array]:
-        """(k + a, k + a) of every front, in the memory of the values."""
+        """Normal matrices (k + a, k + a) of the fronts, as views of the values."""
         begins = self.fronts.table[:, 2].tolist()
         shapes = ((front.width, front.width) for front in self.fronts)
         return [
@@ -225,14 +242,14 @@ class SharedEquations:
 
     @property
     def diagonal(self) -> Array:
-        """(s,)"""
+        """(s,) diagonal of the normal matrix."""
         diagonal = np.zeros(self.fronts.count)
         for front, square in zip(self.fronts, self.squares, strict=True):
             diagonal[front.columns] += np.diag(square)
         return diagonal
 
     def add_squares(self, unknowns: Indices, home: Indices, squares: Array) -> None:
-        """Add squares (b, s, s) of some unknowns (b, s) each, -1 for none, to those of their fronts (b,)."""
+        """Add normal matrices (b, s, s) of unknowns (b, s), -1 for none, to those of their fronts home (b,)."""
         of_fronts = self.squares
         for i in np.unique(home):
             of_front = spread_squares(unknowns[home == i], squares[home == i], self.fronts.count).tocoo()
@@ -241,7 +258,7 @@ class SharedEquations:
 
 
 def _batches(first: Indices) -> Iterator[slice]:
-    """Runs of sets of rows, the i-th from first[i] up to the next, as many as the processor's cache holds."""
+    """Batches of consecutive sets of rows, the i-th from first[i] to first[i + 1], that fit the processor's cache."""
     start = 0
     while start < len(first) - 1:
         stop = max(start + 1, int(np.searchsorted(first, first[start] + ROWS_AT_ONCE, side="right")) - 1)
@@ -250,7 +267,7 @@ def _batches(first: Indices) -> Iterator[slice]:
 
 
 def _take_columns(matrix: Array, columns: Indices, order: Indices) -> Array:
-    """Some columns (c, 2, m) of pairs of rows (n, 2, k), these in some order (m,)."""
+    """Columns (c, 2, m) of pairs of rows (n, 2, k), taken in an order (m,)."""
     taken = np.empty((len(columns), 2, len(order)))
     for into, i in zip(taken, columns, strict=True):
         for axis in range(2):
@@ -259,7 +276,7 @@ def _take_columns(matrix: Array, columns: Indices, order: Indices) -> Array:
 
 
 def spread_squares(unknowns: Indices, squares: Array, count: int) -> csr_array:
-    """The sum (n, n) of squares (b, s, s) of some unknowns (b, s) each, -1 for none."""
+    """Sum (n, n) of matrices (b, s, s) of unknowns (b, s), -1 for none."""
     rows, columns = (np.broadcast_to(at, squares.shape) for at in (unknowns[:, :, None], unknowns[:, None, :]))
     there = (rows >= 0) & (columns >= 0)
     return csr_array(coo_array((squares[there], (rows[there], columns[there])), shape=(count, count)))
@@ -268,10 +285,13 @@ def spread_squares(unknowns: Indices, squares: Array, count: int) -> csr_array:
 def eliminated(
     rows: SparseRows, root_weight: Array, prior_right: Array, scale: Array, equations: SharedEquations
 ) -> "SparseBlocks":
-    """Eliminate all own unknowns; scale (n,) as in `Factor`.
+    """Eliminate all own unknowns.
 
-    A row an unknown (n,), scaled, holds its prior: root_weight times the unknown = prior_right. equations: of the
-    shared unknowns, from which the squares of the borders are subtracted.
+    Parameters
+    ----------
+    root_weight, prior_right : (n,) priors of the scaled unknowns: root_weight times unknown = prior_right.
+    scale : (n,) as in `Factor`.
+    equations : normal equations of the shared unknowns, reduced in place by B'B of the borders B.
     """
     pattern, own, fronts = rows.pattern, rows.pattern.own[:-1], equations.fronts
     blocks = SparseBlocks(
@@ -306,7 +326,7 @@ def eliminated(
 
 
 def _eliminate(blocks: "SparseBlocks", weight: Array, prior: Array) -> None:
-    """Fill the blocks; weight (b, o) and prior (b, o): a row for each own unknown."""
+    """Fill the blocks; weight, prior (b, o): coefficients and right sides of the own unknowns' priors."""
     rows, pattern, own = blocks.rows, blocks.rows.pattern, blocks.own
     alone = np.empty((*own.shape, len(pattern.singles) + 1))
     for members in _batches(pattern.first):
@@ -336,9 +356,9 @@ def _eliminate(blocks: "SparseBlocks", weight: Array, prior: Array) -> None:
 
 
 def _orthonormal(by_block: csr_array, of: Indices, columns: Array, by_prior: Array) -> Array:
-    """Make columns (o, 2, m) with rows (o, b, o) of priors below orthonormal, where they are; the triangles (b, o, o).
+    """Orthonormalise columns (o, 2, m), with rows (o, b, o) of priors below, in place by modified Gram-Schmidt.
 
-    by_block (b, m): the sums over every block; of (m,): their blocks.
+    by_block (b, m): sums over the blocks; of (m,): block of each pair. Returns the triangles (b, o, o).
     """
     count = len(columns)
     triangle = np.zeros((by_prior.shape[1], count, count))
@@ -358,10 +378,16 @@ def _orthonormal(by_block: csr_array, of: Indices, columns: Array, by_prior: Arr
 
 @dataclass(frozen=True)
 class SparseBlocks:
-    """Blocks eliminated: triangle (b, o, o) own + border shared = right (b, o), of the unknowns as they are.
+    """Blocks after elimination: triangle own + border shared = right, for the unscaled unknowns.
 
-    The border as parts (m, o, w) in the groups of the pairs of rows `Pattern.order`, and alone (b, o, t) in the single
-    ones. orthonormal (o, 2, m): the own unknowns' columns made orthonormal. scale (n,) as in `Factor`.
+    Attributes
+    ----------
+    triangle : (b, o, o).
+    parts : (m, o, w) border in the groups, for the pairs of rows `Pattern.order`.
+    alone : (b, o, t) border in the single unknowns.
+    right : (b, o).
+    orthonormal : (o, 2, m) orthonormalised columns of the own unknowns.
+    scale : (n,) as in `Factor`.
     """
 
     rows: SparseRows
@@ -374,7 +400,7 @@ class SparseBlocks:
 
     @property
     def own(self) -> Indices:
-        """(b, o) numbers, -1 for none."""
+        """(b, o) numbers of the own unknowns, -1 for none."""
         return self.rows.pattern.own[:-1]
 
     @cached_property
@@ -385,7 +411,7 @@ class SparseBlocks:
         return Border(pattern, sparse, self.alone.reshape(self.right.size, len(pattern.singles)))
 
     def substitute(self, solution: Array) -> None:
-        """Put the blocks' own unknowns into a solution (n,), scaled, whose shared ones are found."""
+        """Compute the own unknowns by back substitution in a scaled solution (n,) with the shared ones solved."""
         count, diagonal = self.rows.pattern.count, np.einsum("bii->bi", self.triangle)
         if not diagonal.all():
             raise np.linalg.LinAlgError("a block is singular")
@@ -397,12 +423,12 @@ class SparseBlocks:
         solution[self.own[there]] = own[there] * self.scale[self.own[there]]
 
     def square_sum(self) -> float:
-        """Of the right sides."""
+        """Sum of the squared right sides."""
         return float((self.right**2).sum())
 
     @cached_property
     def _inverse(self) -> Array:
-        """Of the triangles (b, o, o), scaled."""
+        """Inverses (b, o, o) of the scaled triangles."""
         scaled = self.triangle / np.where(self.own >= 0, self.scale[self.own], 1.0)[:, None, :]
         inverse = np.zeros_like(scaled)
         for i in reversed(range(scaled.shape[1])):
@@ -412,7 +438,7 @@ class SparseBlocks:
         return inverse
 
     def norm_of_inverse(self) -> float:
-        """The largest of the triangles, scaled, by Frobenius; inf where one is singular."""
+        """Largest Frobenius norm of the scaled triangles' inverses; inf if one is singular."""
         if not np.einsum("bii->bi", self.triangle).all():
             return np.inf
         return float(np.sqrt((self._inverse**2).sum(axis=(1, 2)).max(initial=0.0)))
@@ -438,7 +464,7 @@ class SparseBlocks:
         yield self.own, self._inverse @ inner @ self._inverse.swapaxes(1, 2)
 
     def _own_cofactors_by_shape(self, triangle: Triangle) -> Iterator[tuple[Indices, Array]]:
-        """Those of blocks of equal shape together, by roots where the condition asks for them."""
+        """Own cofactors without kernels, for blocks of equal shape together; by roots where the condition requires."""
         pattern = self.rows.pattern
         counts, group, count = np.diff(pattern.first), pattern.groups, pattern.count
         shared_scale, inverse = np.append(self.scale[:count], 1.0), self._inverse
@@ -458,7 +484,7 @@ class SparseBlocks:
 
     @cached_property
     def blocks(self) -> tuple[BlockFactors, ...]:
-        """The same as dense blocks of equal shape, scaled."""
+        """The eliminated blocks in dense form, scaled, grouped by shape."""
         pattern = self.rows.pattern
         place = np.zeros(len(pattern.block), dtype=np.intp)
         place[pattern.order] = np.arange(len(pattern.order))

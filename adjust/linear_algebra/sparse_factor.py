@@ -1,8 +1,8 @@
-"""Upper triangles of many unknowns, most of them zero, in fronts: solved, and inverted where they are not zero.
+"""Sparse upper triangular factors, stored in fronts: solution of systems, and selected inversion.
 
-Of the inverse only that is computed which lies in the fronts, from the last to the first (Erisman and Tinney 1975, On
-computing certain elements of the inverse of a sparse matrix), and as a root of the cofactor matrix, so that the
-condition is not squared.
+Selected inversion computes only the elements of the cofactor matrix that lie in the fronts, from the last front to the
+first (Erisman and Tinney 1975, On computing certain elements of the inverse of a sparse matrix). It computes a root of
+the cofactor matrix, so that the condition number is not squared.
 """
 
 from collections.abc import Callable, Iterator
@@ -16,16 +16,16 @@ from scipy.linalg.lapack import dtrcon, dtrtrs
 from adjust.array_types import Array, Indices
 from adjust.linear_algebra.fronts import Front, Fronts
 
-WIDE = 500  # unknowns of a front up to which roots of cofactors run over all of them
-SAFE = 1e-6  # reciprocal condition of a root down to which its square will do in a large network
-TEN_DIGITS = 1e-3  # and in a small one: variances keep them
-ELEMENTS_AT_ONCE = 2_000_000  # of roots that are handled together
-POWERS = 20  # steps of power iterations
+WIDE = 500  # unknowns of a single front up to which roots of cofactor matrices keep all its columns
+SAFE = 1e-6  # reciprocal condition of a root down to which its square is accurate enough in a large network
+TEN_DIGITS = 1e-3  # and in a small one: variances keep ten digits
+ELEMENTS_AT_ONCE = 2_000_000  # elements of the roots in one batch
+POWERS = 20  # steps of the power iteration
 
 
 @dataclass(frozen=True)
 class Triangle:
-    """An upper triangle (s, s) in fronts: of each its triangle (k, k) and its border (k, a)."""
+    """Sparse upper triangular factor R (s, s): of each front the triangle (k, k) and the border (k, a)."""
 
     fronts: Fronts
     own: tuple[Array, ...]
@@ -46,14 +46,14 @@ class Triangle:
         return result
 
     def solve(self, right: Array) -> Array:
-        """The inverse times right sides (s,) or (s, d). Raises numpy.linalg.LinAlgError where it is singular."""
+        """Solve R x = b for right sides b (s,) or (s, d). Raises numpy.linalg.LinAlgError if R is singular."""
         result = np.array(right, dtype=np.float64)
         for front, own, border in reversed(list(self.parts)):
             result[front.own] = _solved(own, result[front.own] - border @ result[front.after])
         return result
 
     def solve_transposed(self, right: Array) -> Array:
-        """The inverse of the transpose times right sides (s,) or (s, d)."""
+        """Solve R' x = b for right sides b (s,) or (s, d)."""
         result = np.array(right, dtype=np.float64)
         for front, own, border in self.parts:
             result[front.own] = _solved(own, result[front.own], transposed=True)
@@ -61,7 +61,7 @@ class Triangle:
         return result
 
     def times(self, vectors: Array) -> Array:
-        """Its product with vectors (s,) or (s, d)."""
+        """Product R x with vectors x (s,) or (s, d)."""
         result = np.empty_like(vectors)
         for front, own, border in self.parts:
             result[front.own] = own @ vectors[front.own] + border @ vectors[front.after]
@@ -75,28 +75,28 @@ class Triangle:
         return result
 
     def cofactor_times(self, vectors: Array) -> Array:
-        """The cofactor matrix, the inverse of its square R'R, times vectors (s, d)."""
+        """Product of the cofactor matrix, the inverse of R'R, with vectors (s, d)."""
         return self.solve(self.solve_transposed(vectors))
 
     def lifted(self, least: float) -> "Triangle":
-        """With no diagonal element nearer to 0 than that: no singular value changes by more."""
+        """Raise diagonal elements to at least `least` in absolute value; singular values change by no more."""
         return replace(self, own=tuple(_lifted(own, least) for own in self.own))
 
     @cached_property
     def largest_singular(self) -> float:
-        """By power iteration, to a few percent."""
+        """Largest singular value by power iteration, accurate to a few percent."""
         return self._singular(lambda vector: self.transposed_times(self.times(vector)))
 
     @cached_property
     def reciprocal_condition(self) -> float:
-        """The smallest singular value over the largest, to some tens of percent; 0 where it is singular."""
+        """Smallest over largest singular value, accurate to some tens of percent; 0 if R is singular."""
         if not all(np.diag(own).all() for own in self.own):
             return 0.0
         smallest = self._singular(self.cofactor_times)
         return smallest / self.largest_singular if smallest > 0.0 else 1.0
 
     def _singular(self, multiplied: Callable[[Array], Array]) -> float:
-        """The singular value whose vector grows most where its square, or that of the inverse, is multiplied with."""
+        """Singular value by power iteration; multiplied: the product with R'R (largest) or its inverse (smallest)."""
         vector = np.random.default_rng(0).normal(size=len(self))
         for _ in range(POWERS):
             vector = multiplied(vector)
@@ -105,7 +105,7 @@ class Triangle:
 
     @cached_property
     def roots(self) -> tuple[Array, ...]:
-        """Of every front the upper root G (k + a, k + a): G G' is the cofactor matrix of what it touches."""
+        """Upper roots G (k + a, k + a) of the fronts: G G' is the cofactor matrix of the unknowns of the front."""
         roots: list[Array] = [np.empty((0, 0))] * len(self.fronts)
         for i in reversed(range(len(self.fronts))):
             front = self.fronts[i]
@@ -123,17 +123,17 @@ class Triangle:
 
     @cached_property
     def squares(self) -> tuple[Array, ...]:
-        """Of every front the cofactor matrix (k + a, k + a) of what it touches."""
+        """Cofactor matrices (k + a, k + a) of the unknowns of each front."""
         return tuple(root @ root.T for root in self.roots)
 
     @property
     def variances(self) -> Array:
-        """The diagonal (s,) of the cofactor matrix."""
+        """Diagonal (s,) of the cofactor matrix."""
         of_fronts = [(root[: f.count] ** 2).sum(axis=1) for f, root in zip(self.fronts, self.roots, strict=True)]
         return np.concatenate([np.empty(0), *of_fronts])
 
     def group_cofactors(self, groups: Indices) -> Array:
-        """The cofactor matrices (b, s', s') of groups (b, s') of unknowns that some front touches."""
+        """Cofactor matrices (b, s', s') of groups (b, s') of unknowns, each group within one front."""
         result = np.empty((*groups.shape, groups.shape[1]))
         home = self.fronts.home(groups)
         for i in np.unique(home):
@@ -141,7 +141,10 @@ class Triangle:
         return result
 
     def through(self, rows: Array, groups: Indices) -> Array:
-        """The cofactor matrices (b, r, r) of rows (b, r, s') of functions of groups (b, s') of unknowns."""
+        """Cofactor matrices (b, r, r) of linear functions (b, r, s') of groups (b, s') of unknowns.
+
+        By the cofactor matrix of the front where the condition allows, otherwise by its roots.
+        """
         result = np.zeros((*rows.shape[:2], rows.shape[1]))
         home = self.fronts.home(groups) if groups.size else np.empty(0, dtype=np.intp)
         for i in np.unique(home):
@@ -158,7 +161,7 @@ class Triangle:
 
     @property
     def is_safely_squared(self) -> bool:
-        """Whether the condition of the fronts' roots allows for products with their squares."""
+        """Whether the roots are well enough conditioned to be replaced by their squares, the cofactor matrices."""
         return min(self._conditions, default=1.0) > self._least_condition
 
     @property
@@ -171,11 +174,11 @@ class Triangle:
 
     @cached_property
     def _conditions(self) -> list[float]:
-        """The reciprocal conditions of the fronts' roots."""
+        """Reciprocal condition numbers of the fronts' roots."""
         return [float(dtrcon(root)[0]) for root in self.roots]
 
     def group_roots(self, groups: Indices) -> Array:
-        """Roots (b, s', k) of the cofactor matrices of groups (b, s') of unknowns that some front touches."""
+        """Roots (b, s', k) of the cofactor matrices of groups (b, s') of unknowns, each group within one front."""
         if self._is_narrow:
             return self.roots[0][groups]
         different, which = np.unique(groups, axis=0, return_inverse=True)
@@ -187,23 +190,23 @@ class Triangle:
         return np.asarray(result[which.reshape(-1)])
 
     def _local_roots(self, i: int, places: Indices) -> Array:
-        """Roots (b, s', s') of the cofactor matrices of some of what a front touches, by their places (b, s') in it."""
+        """Roots (b, s', s') of the cofactor matrices of unknowns of front i, given by their places (b, s') in it."""
         if self._conditions[i] > SAFE:
             try:
                 return np.asarray(np.linalg.cholesky(self._local_cofactors(i, places)), dtype=np.float64)
-            except np.linalg.LinAlgError:  # the condition of the cofactor matrix is the square of that of its root
+            except np.linalg.LinAlgError:  # the condition number of the cofactor matrix is that of its root, squared
                 pass
         rows = self.roots[i][places].swapaxes(1, 2)
         return np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64).swapaxes(1, 2)
 
     def _local_cofactors(self, i: int, places: Indices) -> Array:
-        """The cofactor matrices (b, s', s') themselves."""
+        """Cofactor matrices (b, s', s') of unknowns of front i, given by their places (b, s') in it."""
         width = self.fronts[i].width
         return self.squares[i].take(places[:, :, None] * width + places[:, None, :])
 
 
 def _solved(triangle: Array, right: Array, transposed: bool = False) -> Array:
-    """An upper triangle's inverse, or that of its transpose, times right sides, without what SciPy checks besides."""
+    """Solve an upper triangular system, or its transpose, without SciPy's further checks."""
     if not len(triangle):
         return right
     solved, singular = dtrtrs(triangle, right, trans=transposed)
