@@ -1,1 +1,1 @@
-"""The adjustment as a whole: its options, its runs, slips in what was given, and what the result is worth."""
+"""Adjustment as a whole: options, runs, blunder hypotheses, explanations and the result."""

@@ -1,4 +1,4 @@
-"""The simultaneous adjustment of cameras, fiducial marks, images and object points (Torlegård's F1 to F9)."""
+"""Simultaneous adjustment of cameras, fiducial marks, images and object points (Torlegård's F1 to F9)."""
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
@@ -37,27 +37,45 @@ from adjust.validation import validate
 __all__ = ["Datum", "Method", "Options", "adjust", "adjust_problem", "settle_datum"]
 
 
-GUESSED = 0.1  # standard deviation of a principal distance, over it, from which on it is a guess
-TRIAL_STEPS = 6  # of an adjustment that only has to show whether the observations agree: v'Pv falls with every one
+GUESSED = 0.1  # relative standard deviation of a principal distance above which the value is a guess
+TRIAL_STEPS = 6  # iterations of a trial adjustment, enough to test v'Pv, which decreases with each
 
 
 def adjust(
     network: Network, approximations: Approximations | None = None, options: Options | None = None
 ) -> Adjustment:
-    """Adjust a network by least squares, all unknowns together.
+    """Adjust a network by least squares, all unknowns simultaneously.
 
-    The combined model A v + B dx = w is relinearised at the adjusted observations and unknowns until both stand still
-    (Torlegård, equations F1 to F9); object coordinates count from the middle of the field. The cofactor matrix is that
-    of all unknowns, nothing held fixed but what a standard deviation of 0 fixes. A singular network is a result with
-    its null directions, not an error: its values are the approximations, its cofactor matrix is zero and means nothing.
-    Where no approximations are given, or the iteration does not come to rest from them, it begins with those found from
-    the network itself. Given points that are far off are named where the observations do not agree for them; robust
-    estimation and data snooping begin without them. Images for which no orientation is found are left out, and tried
-    again once the lens is known (`Adjustment.left_out`); so are those in which some point has no image to begin with.
+    The combined model A v + B dx = w is relinearised at the adjusted observations and unknowns until convergence
+    (Torlegård, equations F1 to F9). Object coordinates are reduced to the centre of the field. The cofactor matrix
+    covers all unknowns; only quantities with a standard deviation of 0 are held fixed. A singular network gives a
+    result with its null directions, not an error: its values are the approximations, its cofactor matrix is zero and
+    has no meaning.
 
-    Raises AdjustmentError where the network is empty or contradictory, where the approximations put a point where it
-    has no image, where the chosen datum does not hold the object space, or where a slip that concerns the whole network
-    explains what else contradicts itself everywhere (see `blunder_sentence`).
+    Parameters
+    ----------
+    network : Network
+        Cameras, images, object points and observations with their priors.
+    approximations : Approximations, optional
+        Initial values. By default, and where the iteration does not converge from those given, they are computed from
+        the network itself.
+    options : Options, optional
+        Datum, weighting, method and tests.
+
+    Returns
+    -------
+    Adjustment
+        The result. Images without an orientation are left out, and so are those in which some point has no image at the
+        start; both are tried again once the lens is known (`Adjustment.left_out`). Given points with coordinate
+        blunders are named where the observations do not agree because of them; robust estimation and data snooping
+        start without these points.
+
+    Raises
+    ------
+    AdjustmentError
+        If the network is empty or contradictory, the approximations put a point where it has no image, the chosen datum
+        does not determine the object space, or a blunder of the whole network explains contradictions everywhere (see
+        `blunder_sentence`).
     """
     keep_freed_memory()
     with pause_cycle_search():
@@ -73,7 +91,7 @@ def adjust(
 
 @dataclass(frozen=True)
 class _Solver:
-    """Adjusts networks with some options."""
+    """Adjust networks with given options."""
 
     options: Options
 
@@ -89,15 +107,17 @@ class _Solver:
         return initial_values(held_as_known(network, self.options.datum_coordinates))
 
     def own_start(self, network: Network) -> Approximations | None:
-        """A network's own approximations; None where it has none."""
+        """Compute a network's own approximations; None where this fails."""
         try:
             return self.initial_values(network)
         except AdjustmentError:
             return None
 
     def orientable(self, network: Network) -> tuple[Network, Approximations | None, dict[str, str]]:
-        """The network without the images for which no orientation is found, its own approximations, and why these are
-        left out. The whole network without approximations where too little would be left, or something else is wrong.
+        """Leave out the images for which no orientation is found.
+
+        Returns the remaining network, its own approximations and the reasons by frame. Returns the whole network
+        without approximations where too little would remain or something else is wrong.
         """
         try:
             return network, self.initial_values(network), {}
@@ -111,8 +131,10 @@ class _Solver:
     def leave_out_blind(
         self, part: Network, start: Approximations | None, left_out: dict[str, str]
     ) -> tuple[Adjustment, dict[str, str]]:
-        """The adjustment of a network without those images, too, in which some point has no image to begin with, and
-        why images are left out. Raises NoImageError where too little would be left."""
+        """Adjust a network without the images in which some point has no image at the start; also return the reasons.
+
+        Raises NoImageError where too little would remain.
+        """
         try:
             return self.check_whole(part, None, start), left_out
         except NoImageError as error:
@@ -124,7 +146,7 @@ class _Solver:
         return self.leave_out_blind(rest, begun, left_out | reasons)
 
     def try_again(self, network: Network, rest: Adjustment, left_out: dict[str, str]) -> Adjustment:
-        """The adjustment with those images that were left out and that fit once the lens is known."""
+        """Adjust with those left-out images that fit once the lens is known."""
         found = rest
         if rest.converged:
             _, start, reasons = self.orientable(adopt_lens(network, rest))
@@ -148,16 +170,18 @@ class _Solver:
     def check_whole(
         self, network: Network, approximations: Approximations | None, own: Approximations | None
     ) -> Adjustment:
-        """The adjustment of a network that is free of slips of the whole; own: its own approximations, where these are
-        known already. Raises AdjustmentError where such a slip explains what the network as it is given does not.
+        """Adjust a network after a check for blunders of the whole network.
+
+        own: the network's own approximations, where already computed. Raises AdjustmentError where such a blunder
+        explains contradictions that the network as given does not.
         """
         weighs_anew = self.options.plain != self.options
-        if weighs_anew:  # what is wrong with all would be weighed away here and there
+        if weighs_anew:  # reweighting would hide a blunder of the whole network in single observations
             own = own or self.own_start(network)
             self._refuse_blunder(network, self.solve_plainly(network, own))
         try:
             result = self.check_points(network, approximations or own or self.initial_values(network))
-        except DatumError:  # whatever the observations say
+        except DatumError:  # independent of the observations
             raise
         except AdjustmentError:
             if not weighs_anew:
@@ -175,7 +199,7 @@ class _Solver:
             raise AdjustmentError(slip)
 
     def check_points(self, network: Network, start: Approximations) -> Adjustment:
-        """The adjustment, and what is to be said of single given points."""
+        """Adjust a network and report given points with coordinate blunders."""
         try:
             result = self._start_robustly(network, start) or self.solve(network, start)
         except NoImageError as error:
@@ -193,8 +217,9 @@ class _Solver:
     def solve(
         self, network: Network, start: Approximations, doubted_points: Iterable[str] = (), plain: bool = False
     ) -> Adjustment:
-        """A network adjusted about its centroid, in its own coordinates; without the given places of some points to
-        begin with.
+        """Adjust a network in coordinates reduced to its centroid; the result is in its own coordinates.
+
+        doubted_points: points whose given coordinates are left out at first. plain: with the weights as given.
         """
         reduction = Reduction.to_centroid(network)
         problem = self._numbered(reduction.network(network), reduction.approximations(start))
@@ -204,7 +229,7 @@ class _Solver:
         return replace(result, network=network, values=reduction.unreduced_values(unknowns, result.values, network))
 
     def solve_plainly(self, network: Network, start: Approximations | None) -> Adjustment | None:
-        """A network adjusted in a few steps with the weights as they are given; None where it cannot begin."""
+        """Adjust a network in a few steps with the weights as given; None where the adjustment cannot start."""
         if start is None:
             return None
         limit = min(self.options.iteration_limit, TRIAL_STEPS)
@@ -217,15 +242,15 @@ class _Solver:
         return number(network, start, self.options.method == "elements")
 
     def _agrees(self, result: Adjustment) -> bool:
-        """Whether chance alone explains v'Pv."""
+        """Whether v'Pv agrees with the redundancy (chi-square test)."""
         chance = result.redundancy < 1 or chdtrc(result.redundancy, result.vpv) > self.family
         return result.converged and bool(chance)
 
     def _start_robustly(self, network: Network, start: Approximations) -> Adjustment | None:
-        """Robust estimation or data snooping that begins without the given points that are slips; None without any, or
-        where it comes to no end.
+        """Start robust estimation or data snooping without the given points that are blunders.
 
-        From an adjustment with a slip in it neither finds back: its linear equations say nothing of errors so large.
+        Returns None without such points or without convergence. From an adjustment that includes a blunder neither
+        method recovers: the linearised equations do not hold for errors so large.
         """
         slips = self._slips(network, start) if self.options.robust or self.options.snooping else []
         if not slips:
@@ -238,7 +263,7 @@ class _Solver:
         return result if result.converged else None
 
     def _slips(self, network: Network, start: Approximations) -> list[Slip]:
-        """The given points that contradict, beyond chance, an adjustment that knows nothing of their coordinates."""
+        """Find given points that contradict an adjustment without their coordinates significantly."""
         far = far_points(self._numbered(network, start), self.family)
         if not far:
             return []
@@ -246,12 +271,15 @@ class _Solver:
             return coordinate_slips(
                 network, far, self.solve(*free_points(network, start, far), plain=True), self.options
             )
-        except AdjustmentError:  # without these points it cannot even begin
+        except AdjustmentError:  # the adjustment cannot start without these points
             return []
 
     def _begin_anew(self, network: Network, start: Approximations, stopped: Adjustment) -> Adjustment:
-        """The adjustment from the network's own approximations, without principal distances of which so little is known
-        that images of known points tell more, then with them; what is there already where these are no better."""
+        """Adjust again from the network's own approximations; return `stopped` where these are no better.
+
+        The first attempt ignores poorly known principal distances, since images of known points determine them better;
+        the second one uses them.
+        """
         cameras = tuple(
             replace(camera, principal_distance_mm=None)
             if (c := camera.principal_distance_mm) is not None and c.sigma > GUESSED * abs(c.value)
@@ -278,8 +306,10 @@ class _Solver:
 def adjust_problem(
     problem: Problem, options: Options, held: Iterable[int] = (), doubted: Collection[int] = ()
 ) -> Adjustment:
-    """The same with a network whose quantities are numbered; those at the positions `held` stay where they start, the
-    given values of those `doubted` are left out to begin with (see `run`).
+    """Adjust a network whose quantities are numbered.
+
+    held: positions of quantities that stay at their start. doubted: positions of quantities whose given values are left
+    out at first (see `run`).
     """
     members = chosen_points(problem, options.datum_points)
     solved = settle_datum(problem, options)
@@ -291,7 +321,7 @@ def adjust_problem(
 
 
 def settle_datum(problem: Problem, options: Options) -> Problem:
-    """The problem that is solved: with a minimal datum held fixed, unless what is given is to be the datum."""
+    """Fix a minimal datum in a problem, unless the given values are to define the datum."""
     unknowns = problem.unknowns
     if options.datum_coordinates:
         unknowns = unknowns.fixed_as_given(chosen_coordinates(problem, options.datum_coordinates))
@@ -301,7 +331,7 @@ def settle_datum(problem: Problem, options: Options) -> Problem:
 
 
 def _straighten_sight(problem: Problem) -> Problem:
-    """Straight lines of sight where the datum is lacking: bent ones would hold it, but by next to nothing."""
+    """Use straight lines of sight where there is a datum defect: bent ones would determine the datum, but hardly."""
     bent = not problem.network.line_of_sight.is_straight
     if bent and object_datum(problem, problem.start()).free.shape[1] > 0:
         return replace(problem, network=replace(problem.network, line_of_sight=STRAIGHT))
@@ -309,10 +339,10 @@ def _straighten_sight(problem: Problem) -> Problem:
 
 
 def _center_datum(problem: Problem, last: Run, members: Indices, options: Options) -> Run:
-    """A run with minimal datum, brought to inner constraints over some coordinates; as it is where nothing was fixed.
+    """Transform a run with minimal datum to inner constraints over some coordinates; unchanged where nothing was fixed.
 
-    Where priors leave only some of the similarity transformations free, these are so to the first order alone: after
-    each the network is adjusted again.
+    Where priors leave only some of the similarity transformations free, these are free to first order only: the network
+    is adjusted again after each transformation.
     """
     if not is_fixed(problem, last):
         return last

@@ -1,6 +1,6 @@
-"""Whether a slip of the whole network explains what its observations contradict.
+"""Test whether a blunder of the whole network explains its contradictions.
 
-What is wrong with everything leaves residuals everywhere, and the tests of single observations blame innocent ones.
+Such a blunder leaves residuals everywhere, and tests of single observations would reject good ones.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,23 +14,22 @@ from adjust.problem.parameter import Parameter
 from adjust.solution.network_hypotheses import AXES, FACTORS, NetworkHypothesis, Trials, network_hypotheses, unit_words
 from adjust.solution.result import Adjustment
 
-CLEARLY = 3.0  # times smaller than as it is given a network's sigma0 is with what explains it
-NEAR = 0.3  # of its distance from the field's middle that a station may lie off where it is given
-PITCHES = (10.0, 25.4, 100.0, 1000.0, 2.0)  # of one principal distance in another unit, or with another pixel pitch
-ROUND = 0.05  # that a found ratio may be off one of these
-FLAT = 1e-3  # thickness of a field, in its extents, whose mirror image is that of the stations
+CLEARLY = 3.0  # factor by which an explanation must reduce sigma0
+NEAR = 0.3  # fraction of its distance from the field's centre that a station may lie off its given place
+PITCHES = (10.0, 25.4, 100.0, 1000.0, 2.0)  # ratios of principal distances by another unit or pixel pitch
+ROUND = 0.05  # relative tolerance of these ratios
+FLAT = 1e-3  # relative thickness of a flat field, which is mirrored by mirroring the stations
 MIRRORED = "the points are mirrored: the sign of X, Y or Z of all of them is wrong, or two axes are exchanged"
 
 
 def blunder_sentence(network: Network, given: Adjustment | None, trials: Trials) -> str:
-    """The slip of a whole network without which all observations agree, and with which they do not; empty where there
-    is none.
+    """Describe the blunder of a whole network without which all observations agree; empty where there is none.
 
-    given: the network adjusted as it is, None where that cannot begin. An adjustment explains all where v'Pv is within
-    chance (`Trials.explains`); its sigma0 must be CLEARLY smaller, too. Hypotheses that leave the same residuals are
-    tried once, without what is given of orientations, by which they are then told apart.
+    given: adjustment of the network as given, None where it cannot start. A hypothesis explains the contradictions
+    where v'Pv without the blunder is not significant (`Trials.explains`) and sigma0 is CLEARLY smaller. Hypotheses with
+    identical residuals are tried once, without the given orientations, which then distinguish them.
     """
-    if given is None:  # the approximations that were given may be all that is wrong
+    if given is None:  # perhaps only the given approximations are wrong
         given = trials.adjust(network)
     if trials.explains(given):
         return ""
@@ -49,7 +48,7 @@ def blunder_sentence(network: Network, given: Adjustment | None, trials: Trials)
 
 def _sentence(slips: Sequence[NetworkHypothesis], found: Adjustment, given: Adjustment | None, family: float) -> str:
     words = [each.words for each in slips]
-    if len(words) >= len(AXES):  # nothing tells which of the mirrors it is
+    if len(words) >= len(AXES):  # the mirrored axis cannot be identified
         words = [MIRRORED, *words[len(AXES) :]]
     what = "; or ".join(words) + _found_distance(*slips[0].distance, found)
     if given is None:
@@ -65,7 +64,7 @@ def _sentence(slips: Sequence[NetworkHypothesis], found: Adjustment, given: Adju
 
 
 def _found_distance(camera: str, given_mm: float, found: Adjustment) -> str:
-    """What a principal distance is found to be, and whether it is the given one in another unit or pixel pitch."""
+    """Describe the estimated principal distance, and whether it is the given one in another unit or pixel pitch."""
     if not camera:
         return ""
     c = found.value(Parameter.interior(camera, "c"))
@@ -79,7 +78,7 @@ def _found_distance(camera: str, given_mm: float, found: Adjustment) -> str:
 def _as_stations_are_given(
     network: Network, alike: Sequence[NetworkHypothesis], found: Adjustment
 ) -> Sequence[NetworkHypothesis]:
-    """Of hypotheses with the same residuals those whose stations come near the given ones; all where none does."""
+    """Keep the hypotheses with identical residuals whose stations lie near the given ones; all if none does."""
     given = _given_stations(network)
     if len(alike) == 1 or not given:
         return alike
@@ -99,7 +98,7 @@ def _given_stations(network: Network) -> dict[str, Array]:
 
 
 def _stations(result: Adjustment, images: dict[str, Array]) -> tuple[Array, Array]:
-    """Adjusted stations (n, 3) of some images, and their distances (n,) from the middle of the points."""
+    """Adjusted stations (n, 3) of some images, and their distances (n,) from the centre of the points."""
     frames = [result.network.image_by_name[name].frame for name in images]
     exterior = (Parameter.exterior(frame, element) for frame in frames for element in EXTERIOR_NAMES[:3])
     stations = result.values_of(exterior).reshape(-1, 3)
@@ -116,8 +115,9 @@ def _near(stations: Array, given: Array, depths: Array) -> Mask:
 
 
 def stations_elsewhere(network: Network, result: Adjustment) -> str:
-    """What would bring stations that the points alone give near those that the network gives, where they are not:
-    another unit, exchanged frames, or mirrored points of a flat field; empty where nothing does.
+    """Explain stations that lie far from where they are given; empty where nothing does.
+
+    Possible causes: another unit, exchanged frames, or mirrored points of a flat field.
     """
     given = _given_stations(network)
     if result.termination == "singular" or len(given) < 2 or not network.observed_points:
@@ -143,7 +143,7 @@ def stations_elsewhere(network: Network, result: Adjustment) -> str:
 
 
 def _moved_stations(result: Adjustment, stations: Array) -> Iterator[tuple[str, Array, float]]:
-    """Slips in words, the stations without them, and the scale of these."""
+    """Generate blunders in words, with the stations without them and the scale."""
     for factor in FACTORS:
         yield unit_words(factor), factor * stations, factor
     points = _points(result)

@@ -1,4 +1,4 @@
-"""Blunders in the given coordinates of points: too large for an adjustment that takes them for observations."""
+"""Coordinate blunders of given points, too large for an adjustment that treats the coordinates as observations."""
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -19,17 +19,22 @@ from adjust.problem.problem import Problem
 from adjust.solution.options import Options
 from adjust.solution.result import Adjustment
 
-MOST_FAR = 0.25  # part of the given points: where more lie far off, who is to say which are right
-FEWEST_IMAGES = 2  # whose rays meet at a place
-ENOUGH = 5  # points from which on a resection without a wrong one has a check of its own, and tells which one it is
+MOST_FAR = 0.25  # fraction of the given points: if more are far off, the correct ones cannot be identified
+FEWEST_IMAGES = 2  # images needed for an intersection
+ENOUGH = 5  # points needed to identify a wrong one: the resection without it is still redundant
 
 
 @dataclass(frozen=True)
 class FarPoint:
-    """A given point that its images see elsewhere.
+    """Given point whose rays meet elsewhere.
 
-    place (3,): where its rays meet, in object units; miss_mm: from its marks to the images of the given coordinates,
-    the median of its images, inf behind them; others_mm: the same of the other given points, at most.
+    Attributes
+    ----------
+    name : id of the point.
+    images : number of images that show it.
+    place : (3,) intersection of its rays, in object units.
+    miss_mm : median distance in the images of its marks from the projected given coordinates; inf behind the cameras.
+    others_mm : largest such distance of the other given points.
     """
 
     name: str
@@ -40,14 +45,14 @@ class FarPoint:
 
 
 def far_points(problem: Problem, family: float) -> list[FarPoint]:
-    """The given points whose coordinates miss their marks as no other one comes near, the farthest first.
+    """Find given points that miss their marks by far more than all others, farthest first.
 
-    By the orientations from which the adjustment starts: resections, which lack the distortion that is not known yet,
-    so that nothing is said of the distribution of what good points miss by but that its variance is finite. The largest
-    of many is then more than family^(-1/2) times as large as the next (10 times with 0.01) with the probability
-    `family` at most, for that is so where its tail falls with the square of the distance (the spacings of Pareto's
-    distribution: B. C. Arnold, Pareto Distributions, 1983). All before the last such gap are far, if their rays meet.
-    Empty where more than MOST_FAR are.
+    The orientations at the start of the adjustment are used: resections without the distortion, which is not known yet.
+    Therefore only a finite variance of the misses of good points is assumed. The largest of many is then more than
+    family^(-1/2) times as large as the next (10 times with 0.01) with the probability `family` at most, as holds for a
+    tail that falls with the square of the distance (the spacings of Pareto's distribution: B. C. Arnold, Pareto
+    Distributions, 1983). All points before the last such gap are far, if their rays meet. Empty where more than
+    MOST_FAR of the points are far.
     """
     sights = _sights(problem)
     rays = _rays_of_given(problem, sights)
@@ -56,7 +61,7 @@ def far_points(problem: Problem, family: float) -> list[FarPoint]:
     miss = {name: float(np.median([ray.distance_mm for ray in own])) for name, own in rays.items()}
     noise = float(np.median([sight.sigma_mm for sight in sights.values()]))
     falling = sorted(miss, key=lambda name: (-miss[name], name))
-    limits = [max(miss[name], noise) / np.sqrt(family) for name in falling]  # for those before each
+    limits = [max(miss[name], noise) / np.sqrt(family) for name in falling]  # for the points before each
     gaps = [k for k in range(1, int(MOST_FAR * len(falling)) + 1) if miss[falling[k - 1]] > limits[k]]
     if not gaps:
         return []
@@ -77,8 +82,10 @@ def far_points(problem: Problem, family: float) -> list[FarPoint]:
 
 @dataclass(frozen=True)
 class _Ray:
-    """Of an image to a given point: its station (3,), its direction (3,), the principal distance, and how far from its
-    mark the point would appear.
+    """Ray from an image to a given point.
+
+    center (3,): station; direction (3,); c_mm: principal distance; distance_mm: distance of the projected point from
+    its mark.
     """
 
     center: Array
@@ -87,14 +94,14 @@ class _Ray:
     distance_mm: float
 
     def missed_by_mm(self, place: Array) -> float:
-        """How far from the mark a place (3,) would appear, across the ray; inf where it is nowhere in front of it."""
+        """Distance in the image of a place (3,) from the mark, measured across the ray; inf behind the camera."""
         offset, along = place - self.center, self.direction / np.linalg.norm(self.direction)
         depth = float(offset @ along)
         return self.c_mm * float(np.linalg.norm(offset - depth * along)) / depth if depth > 0.0 else np.inf
 
 
 def _rays_of_given(problem: Problem, sights: Mapping[str, Sight]) -> dict[str, list[_Ray]]:
-    """The rays of every point that is given in X, Y and Z and seen in some images."""
+    """Rays of every point given in X, Y and Z, by id, if at least two images show it."""
     unknowns, start = problem.unknowns, problem.start()
     given = {id_: unknowns.given[at] for id_, at in unknowns.point.items() if np.isfinite(unknowns.sigma[at]).all()}
     rays = defaultdict(list)
@@ -112,7 +119,7 @@ def _rays_of_given(problem: Problem, sights: Mapping[str, Sight]) -> dict[str, l
 
 
 def _sights(problem: Problem) -> dict[str, Sight]:
-    """By image name, of those that show object points: freed of the distortion as far as it is known beforehand."""
+    """Image points by image name, for images with object points, corrected for the distortion known beforehand."""
     network, unknowns = problem.network, problem.unknowns
     transformation = {name: unknowns.start[at] for name, at in unknowns.transformation.items()}
     frames, sights = camera_frames(network, transformation, problem.mirrored), dict[str, Sight]()
@@ -124,10 +131,15 @@ def _sights(problem: Problem) -> dict[str, Sight]:
 
 @dataclass(frozen=True)
 class Slip:
-    """A given point that contradicts all that is known without its coordinates, beyond chance.
+    """Given point that contradicts all other information significantly.
 
-    place (3,): where it then is; sigma: its largest standard deviation; off (3,): given less that; explained: the slip
-    that would do it, in words, or empty.
+    Attributes
+    ----------
+    far : the point.
+    place : (3,) its place in an adjustment without its given coordinates.
+    sigma : largest standard deviation of that place.
+    off : (3,) given coordinates minus place.
+    explained : sentence on the clerical error that would explain it; may be empty.
     """
 
     far: FarPoint
@@ -153,7 +165,7 @@ class Slip:
 
 
 def free_points(network: Network, start: Approximations, far: Sequence[FarPoint]) -> tuple[Network, Approximations]:
-    """The network with nothing known of the far points' coordinates, and its start with them where their rays meet."""
+    """Remove the priors of far points from a network; start them where their rays meet."""
     places = {each.name: each.place for each in far}
 
     def freed(point: ObjectPoint) -> ObjectPoint:
@@ -164,11 +176,11 @@ def free_points(network: Network, start: Approximations, far: Sequence[FarPoint]
 
 
 def coordinate_slips(network: Network, far: Sequence[FarPoint], without: Adjustment, options: Options) -> list[Slip]:
-    """Which of the far points are slips, by an adjustment `without` their coordinates; none where that has no solution.
+    """Test far points by an adjustment `without` their coordinates; empty where that has no solution.
 
-    The difference of given and adjusted coordinates over its covariance is chi-square with 3 degrees of freedom. What
-    any of all given points exceeds with the probability `family` is beyond chance; where the observations are worse
-    than given the limit rises with sigma0².
+    The quadratic form of the difference between given and adjusted coordinates is chi-square with 3 degrees of freedom.
+    The critical value holds for the maximum over all given points at the level `family`, and is multiplied by sigma0²
+    where that is larger than 1.
     """
     if not without.converged:
         return []
@@ -191,7 +203,7 @@ def coordinate_slips(network: Network, far: Sequence[FarPoint], without: Adjustm
 
 
 def few_points(network: Network) -> list[str]:
-    """What is to be said of an adjustment without a solution where too few points are given to check one another."""
+    """Remark on an adjustment without a solution where too few points are given to check each other."""
     named = sorted(name for name in network.known_places if name in network.observed_points)
     if len(named) != ENOUGH - 1:
         return []
@@ -202,7 +214,7 @@ def few_points(network: Network) -> list[str]:
 
 
 def _explanation(name: str, given: Mapping[str, Array], passes: Callable[[Array], bool]) -> str:
-    """The slip of the pen after which the coordinates would be the given ones, where there is one such."""
+    """Find the clerical error that explains the coordinates; empty unless there is exactly one."""
     own = given[name]
     readings = [
         (own[[j if k == i else i if k == j else k for k in range(3)]], f"{'XYZ'[i]} and {'XYZ'[j]} look exchanged.")

@@ -1,15 +1,15 @@
-"""Why residuals are larger than the standard deviations given: the models, and the noise, that explain them.
+"""Explain residuals larger than the given standard deviations by errors of the model or of the noise.
 
-A hypothesis adds k unknowns to the model. One linearised step from the end of the adjustment without them tells by how
-much v'Pv falls to the first order; what that makes likely is adjusted and tested by the fall itself,
+A hypothesis adds k unknowns to the model. One linearised step from the end of the adjustment without them gives the
+decrease of v'Pv to first order. Likely hypotheses are adjusted and tested by the actual decrease,
 
-    F = fall / (k s²),   s² = max(1, v'Pv / r of the larger model),
+    F = decrease / (k s²),   s² = max(1, v'Pv / r of the larger model),
 
-chi-square over k where s² = 1. The groups of a partition that was chosen for it are tested by the smaller of two
-bounds: Scheffé's, with the unknowns of all contrasts, and Bonferroni's, over all partitions. All hypotheses of a round
-share the probability LEVEL. Hypotheses are compared with each other, and with gross errors of single observations, by
-v'Pv plus twice the unknowns and the logarithm of the choices (Akaike); what comes within TOLD_APART is named with the
-best. Nothing is named unless all that is named takes more than half of what v'Pv has beyond its redundancy.
+chi-square over k where s² = 1. Groups of a partition selected from the data are tested by the smaller of two bounds:
+Scheffé's, with the unknowns of all contrasts, and Bonferroni's, over all partitions. All hypotheses of a round share
+the level LEVEL. Hypotheses are compared with each other, and with gross errors of single observations, by v'Pv plus
+twice the unknowns and the logarithm of the choices (Akaike); those within TOLD_APART of the best are reported with it.
+Nothing is reported unless all that is reported removes more than half of the excess of v'Pv over its redundancy.
 """
 
 from dataclasses import dataclass, replace
@@ -29,21 +29,26 @@ from adjust.solution.model_hypotheses import GROUPS, ModelHypothesis, model_hypo
 from adjust.solution.noise_hypothesis import added_noise
 from adjust.solution.reweighting import again
 
-LEVEL = 0.001  # probability of naming anything where the model is right
-CHECKED = 10  # redundancy from which on an explanation is one
-ROUNDS = 3  # of explanations, each on top of those before
-MOST_ADJUSTED = 4  # hypotheses of a round
-LEFT = 0.5  # of what v'Pv has beyond its redundancy that may remain of what is explained
-WORTH = 0.3  # of the largest fall, to the first order, from which on a hypothesis is adjusted
+LEVEL = 0.001  # probability of reporting anything where the model is correct
+CHECKED = 10  # smallest redundancy for an explanation
+ROUNDS = 3  # rounds of explanations, each in addition to those before
+MOST_ADJUSTED = 4  # hypotheses adjusted per round
+LEFT = 0.5  # fraction of the excess of v'Pv over its redundancy that may remain
+WORTH = 0.3  # fraction of the largest first-order decrease above which a hypothesis is adjusted
 STEPS = 20
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """What makes residuals larger than the standard deviations given, beyond chance.
+    """Significant cause of residuals larger than the given standard deviations.
 
-    cause: in words with figures; remedy: what to do. kind: "radial", "decentering", "pixels", "groups", "board" or
-    "noise". p: probability of so much by chance; sigma0: without and with it in the model.
+    Attributes
+    ----------
+    kind : "radial", "decentering", "pixels", "groups", "board" or "noise".
+    cause : cause in words with figures.
+    remedy : what to do.
+    p : p-value.
+    sigma0 : sigma0 without and with the cause in the model.
     """
 
     kind: str
@@ -55,16 +60,16 @@ class Explanation:
 
 @dataclass(frozen=True)
 class Explained:
-    """What explains the residuals, the most first, and the adjustment with it: as it was where nothing does."""
+    """Explanations, largest first, and the adjustment that includes them; the original one where there are none."""
 
     explanations: tuple[Explanation, ...]
     run: Run
 
 
 def explain(run: Run, redundancy: int, probabilities: Probabilities) -> Explained:
-    """What explains residuals that are larger than the standard deviations given, if anything does.
+    """Search for explanations of residuals larger than the given standard deviations.
 
-    Nothing is sought where sigma0 is at most 1, or the adjustment has no solution.
+    There are none where sigma0 is at most 1 or the adjustment has no solution.
     """
     if not run.converged or not run.is_tested or redundancy < CHECKED or run.end.vpv <= redundancy:
         return Explained((), run)
@@ -91,10 +96,10 @@ def explain(run: Run, redundancy: int, probabilities: Probabilities) -> Explaine
 
 @dataclass(frozen=True)
 class _Model:
-    """An adjustment, and how well it agrees with its observations, with and without the worst of them.
+    """An adjustment, and its agreement with the observations, with and without gross errors.
 
-    has_suspects: whether gross errors are looked for; where the simpler model has none, they are not. hypothesis: what
-    it has more than the simpler one, p: the probability of so large a fall of v'Pv by chance.
+    has_suspects: whether to search for gross errors; not done where the simpler model has none. hypothesis: addition to
+    the simpler model; p: p-value of the decrease of v'Pv.
     """
 
     run: Run
@@ -113,7 +118,7 @@ class _Model:
         return self.vpv / self.redundancy
 
     def exceeds(self, level: float) -> bool:
-        """Whether v'Pv is larger than chance makes it with a probability."""
+        """Whether v'Pv is significant at a level (chi-square test)."""
         return bool(chdtrc(self.redundancy, self.vpv) < level)
 
     @cached_property
@@ -126,12 +131,12 @@ class _Model:
 
     @cached_property
     def rest(self) -> tuple[float, float]:
-        """v'Pv and redundancy without what contradicts the others."""
+        """v'Pv and redundancy without the gross errors."""
         units = [each.unit for each in self.gross_errors]
         return self._snooping.rest(units) if units else (self.vpv, float(self.redundancy))
 
     def criterion(self, variance: float) -> float:
-        """v'Pv over a variance without gross errors, and what these and their choice cost."""
+        """v'Pv over a variance without gross errors, plus the cost of removing and choosing these."""
         if not self.gross_errors:
             return self.vpv / variance
         chosen_from = len(self.gross_errors) * float(np.log(len(self._snooping.critical)))
@@ -139,11 +144,11 @@ class _Model:
 
     @property
     def costs(self) -> float:
-        """Of the unknowns and the choice of the hypothesis."""
+        """Cost of the unknowns and the choice of the hypothesis."""
         return 2.0 * (len(self.hypothesis.added) + self.hypothesis.choices) if self.hypothesis else 0.0
 
     def probability(self, hypothesis: ModelHypothesis, fall: float) -> float:
-        """Of such a fall of v'Pv by a hypothesis, or a larger one, by chance."""
+        """p-value of a decrease of v'Pv by a hypothesis."""
         single = self._fall_probability(fall, len(hypothesis.added))
         if not hypothesis.contrasts:
             return single
@@ -159,8 +164,10 @@ class _Model:
 
 
 def _best(model: _Model) -> tuple[list[_Model], bool]:
-    """The models with the best hypotheses that explain what chance does not, several where they do so alike; and
-    whether gross errors of single observations explain the residuals as well."""
+    """Models with the best significant hypotheses, several where these are not distinguished.
+
+    Also returns whether gross errors of single observations explain the residuals as well.
+    """
     falls = [(_first_order_fall(model.run, each), each) for each in model_hypotheses(model.run)]
     level = LEVEL / max(len(falls), 1)
     worth = WORTH * max((fall for fall, _ in falls), default=0.0)
@@ -180,7 +187,7 @@ def _best(model: _Model) -> tuple[list[_Model], bool]:
 
 
 def _first_order_fall(run: Run, hypothesis: ModelHypothesis) -> float:
-    """By how much v'Pv falls with the added unknowns, to the first order; 0 where they are not determined."""
+    """First-order decrease of v'Pv by the added unknowns; 0 where they are not determined."""
     weighted, covariance = run.weighting.applied(hypothesis.problem)
     numbering = Numbering(weighted)
     at = linearise(numbering, covariance, weighted.start())
@@ -190,7 +197,7 @@ def _first_order_fall(run: Run, hypothesis: ModelHypothesis) -> float:
 
 
 def _larger_model(model: _Model, hypothesis: ModelHypothesis) -> _Model | None:
-    """The hypothesis adjusted; None where that has no solution."""
+    """Adjust a hypothesis; None without a solution."""
     run = _refit(model.run, hypothesis.problem)
     if run is None:
         return None
@@ -200,8 +207,7 @@ def _larger_model(model: _Model, hypothesis: ModelHypothesis) -> _Model | None:
 
 
 def _following(model: _Model) -> _Model | None:
-    """The adjustment in which more is sought: groups of images with all of their lens apart; None where that has no
-    solution."""
+    """Return the adjustment for the next round: groups of images get separate lenses; None without a solution."""
     if model.hypothesis is None or model.hypothesis.kind != GROUPS:
         return model
     problem = separate_lenses(model.run)
@@ -213,7 +219,7 @@ def _following(model: _Model) -> _Model | None:
 
 
 def _refit(run: Run, problem: Problem) -> Run | None:
-    """A larger problem adjusted from where it starts, with the same weights; None where that has no solution."""
+    """Adjust a larger problem from its start with the same weights; None without a solution."""
     larger = again(replace(run, problem=problem), run.weighting, STEPS, problem.start())
     return larger if larger.converged and larger.is_tested else None
 

@@ -1,8 +1,8 @@
-"""Which images of a camera look as if taken with another interior orientation than the rest.
+"""Split the images of a camera into two groups with different interior orientations.
 
-With the rows of one image, its orientation and film eliminated, the shift (c, x0', y0') of that image alone has normal
-equations N d = g; two groups with shifts of their own lower v'Pv by the sum of g' N⁻¹ g of both. The best partition is
-that of weighted two-means, from the best thresholds of shifts in some directions.
+With orientation and film of one image eliminated from its rows, the shift (c, x0', y0') of that image alone has normal
+equations N d = g. Two groups with separate shifts lower v'Pv by the sum of g' N⁻¹ g of both. The best partition is
+found by weighted two-means, started from the best thresholds of the shifts in some directions.
 """
 
 from dataclasses import dataclass, replace
@@ -14,14 +14,18 @@ from adjust.least_squares.iteration import linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.quality.run import Run
 
-MOST_TURNS = 20  # of two-means
-FLAT = 1e-9  # part of the largest eigenvalue below which an image says nothing of a direction
-DIRECTIONS = 4  # in which groups are sought: c, x0', y0', the scale of the whole image
+MOST_TURNS = 20  # iterations of two-means
+FLAT = 1e-9  # fraction of the largest eigenvalue below which a direction is undetermined
+DIRECTIONS = 4  # directions in which groups are searched: c, x0', y0', scale of the whole image
 
 
 @dataclass(frozen=True)
 class ImageGroups:
-    """images: the smaller group, by name; count: all images; choices: natural logarithm of the partitions there are."""
+    """Partition of images.
+
+    images: names in the smaller group; count: number of all images; choices: natural logarithm of the number of
+    partitions.
+    """
 
     images: tuple[str, ...]
     count: int
@@ -29,7 +33,7 @@ class ImageGroups:
 
 
 def two_groups(run: Run, camera: str) -> ImageGroups | None:
-    """The partition of a camera's images that explains most; None where there are fewer than three images."""
+    """Find the partition of a camera's images that lowers v'Pv most; None with fewer than three images."""
     names, normal, right = _shifts(run, camera)
     if len(names) < 3:
         return None
@@ -39,7 +43,7 @@ def two_groups(run: Run, camera: str) -> ImageGroups | None:
     starts = [_threshold(normal, right, shift) for shift in np.hstack([_solved(normal, right), single]).T]
 
     def gain(mask: Mask) -> float:
-        """By how much v'Pv falls with shifts of two groups."""
+        """Decrease of v'Pv with separate shifts of two groups."""
         return float(sum(_quadratic(normal[some].sum(axis=0), right[some].sum(axis=0)) for some in (mask, ~mask)))
 
     mask = max((_two_means(normal, right, start) for start in starts), key=gain)
@@ -50,7 +54,7 @@ def two_groups(run: Run, camera: str) -> ImageGroups | None:
 
 
 def _shifts(run: Run, camera: str) -> tuple[list[str], Array, Array]:
-    """The images of a camera, and of each the normal equations (m, 3, 3), (m, 3) of its own c, x0' and y0'."""
+    """Names of a camera's images, and normal equations (m, 3, 3), (m, 3) of c, x0' and y0' of each image alone."""
     problem, covariance = run.weighting.applied(run.problem)
     sigma = problem.unknowns.sigma.copy()
     sigma[problem.unknowns.camera[camera][:3]] = np.inf
@@ -76,7 +80,7 @@ def _shifts(run: Run, camera: str) -> tuple[list[str], Array, Array]:
 
 
 def _basis(columns: Array) -> Array:
-    """Orthonormal columns that span some."""
+    """Orthonormal basis of the column space."""
     if not columns.shape[1]:
         return columns
     left, size, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
@@ -84,7 +88,7 @@ def _basis(columns: Array) -> Array:
 
 
 def _threshold(normal: Array, right: Array, shift: Array) -> Mask:
-    """The images whose shift (m,) is above the best of all thresholds."""
+    """Mask of images whose shift (m,) lies above the best threshold."""
     order = np.argsort(shift, kind="stable")
     below = np.cumsum(normal[order], axis=0)[:-1], np.cumsum(right[order], axis=0)[:-1]
     above = normal.sum(axis=0) - below[0], right.sum(axis=0) - below[1]
@@ -105,10 +109,10 @@ def _two_means(normal: Array, right: Array, mask: Mask) -> Mask:
 
 
 def _quadratic(normal: Array, right: Array) -> Array:
-    """g' N⁻¹ g of one (k, k), (k,) or many."""
+    """g' N⁻¹ g of one system (k, k), (k,) or of many."""
     return np.asarray((right * _solved(normal, right)).sum(axis=-1))
 
 
 def _solved(normal: Array, right: Array) -> Array:
-    """N⁻¹ g of one (k, k), (k,) or many."""
+    """N⁻¹ g of one system (k, k), (k,) or of many."""
     return np.asarray((np.linalg.pinv(normal, rcond=FLAT, hermitian=True) @ right[..., None])[..., 0])

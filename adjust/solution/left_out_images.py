@@ -1,4 +1,4 @@
-"""Images for which no orientation is found: left out, so that they do not end the rest, and tried again afterwards."""
+"""Images without an orientation: leave them out of the adjustment and try them again afterwards."""
 
 from collections import defaultdict
 from collections.abc import Collection
@@ -13,12 +13,12 @@ from adjust.problem.network import Network
 from adjust.problem.parameter import Parameter
 from adjust.solution.result import Adjustment
 
-FITTING = 3.0  # times sigma0 of the others, up to which the standardised residuals of an image agree with them
-FEWEST_RAYS = 2  # of a point that is not adopted
+FITTING = 3.0  # in sigma0 of the others: largest rms standardised residual of an image that agrees with them
+FEWEST_RAYS = 2  # rays needed for a point without priors
 
 
 def leave_out(network: Network, frames: Collection[str]) -> Network | None:
-    """The network without some frames and what they alone show; None where no more than half of it would be left."""
+    """Remove some frames and what only they show from a network; None where no more than half of it would remain."""
     left = {image.frame for image in network.images if image.frame not in frames}
     if len(left) <= len(frames):
         return None
@@ -53,7 +53,7 @@ def leave_out(network: Network, frames: Collection[str]) -> Network | None:
 
 
 def adopt_lens(network: Network, result: Adjustment) -> Network:
-    """The network with its cameras as an adjustment of a part of it found them."""
+    """Replace the cameras of a network by those adjusted from a part of it."""
     used = {image.camera for image in result.network.images} - result.network.idle_cameras
     return replace(
         network,
@@ -62,7 +62,7 @@ def adopt_lens(network: Network, result: Adjustment) -> Network:
 
 
 def fitting(result: Adjustment, frames: Collection[str], sigma0: float) -> set[str]:
-    """Those of some frames whose residuals are as large as those of the others, of sigma0."""
+    """Select the frames whose residuals agree with sigma0 of the others."""
     squares, weights = defaultdict[str, float](float), defaultdict[str, float](float)
     network = result.network
     of_rows = zip(network.observations.image, result.residuals.w, result.weights, strict=True)

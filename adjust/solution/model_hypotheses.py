@@ -1,7 +1,7 @@
-"""What a network's model may lack, each as the same problem with more unknowns: lens terms, square pixels, one interior
-orientation for all images, a flat board.
+"""Hypotheses on errors of a network's model, each as the same problem with additional unknowns.
 
-Every one starts where the adjustment without its unknowns ended, so that one linearised step tells what it explains.
+Lens terms, non-square pixels, different interior orientations of images, a bent board. Each problem starts where the
+adjustment without its unknowns ended, so that one linearised step estimates the fall of v'Pv.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -23,23 +23,28 @@ from adjust.quality.run import Run
 from adjust.solution.image_groups import ImageGroups, two_groups
 
 FREE = Prior(0.0, np.inf)
-TERMS_TOGETHER = 2  # radial terms that are tested as one
-OTHERS = " (other images)"  # behind a camera's name: the part of its images that may have another interior orientation
+TERMS_TOGETHER = 2  # radial terms tested jointly
+OTHERS = " (other images)"  # suffix of a camera's name for the images with a different interior orientation
 SCANNER, BOARD, GROUPS = "scanner", "board", "groups"
-NAMED = 5  # images
-ALIKE = 7.0  # difference of chi-square plus twice the unknowns within which two readings explain alike
+NAMED = 5  # images named in a message
+ALIKE = 7.0  # difference of chi-square plus twice the unknowns below which two readings are not distinguished
 
-# Of the adjustment with the unknowns at these positions, and the rms in µm of what they take of residuals.
+# Arguments: the adjustment with the added unknowns, their positions, and the rms in µm that they explain of residuals.
 Words = Callable[[Run, Indices, float], tuple[str, str]]
 
 
 @dataclass(frozen=True)
 class ModelHypothesis:
-    """A model with added unknowns.
+    """Model with additional unknowns.
 
-    kind: "radial", "decentering", "pixels", "groups" or "board". words: its cause with figures, and the remedy.
-    problem: it starts where the simpler model ended. added (k,): positions of the added unknowns. choices: natural
-    logarithm of how many such models it was chosen from; contrasts: the unknowns that all of these together would have.
+    Attributes
+    ----------
+    kind : "radial", "decentering", "pixels", "groups" or "board".
+    words : returns cause (with figures) and remedy.
+    problem : problem that starts where the simpler model ended.
+    added : (k,) positions of the additional unknowns.
+    choices : natural logarithm of the number of models it was selected from.
+    contrasts : number of unknowns that all of these models would have together.
     """
 
     kind: str
@@ -51,7 +56,7 @@ class ModelHypothesis:
 
 
 def model_hypotheses(run: Run) -> Iterator[ModelHypothesis]:
-    """All that the model of an adjustment may lack."""
+    """Generate all hypotheses on what the model of an adjustment may lack."""
     network = run.problem.network
     used = run.problem.unknowns.camera.keys() - network.idle_cameras
     cameras = [camera for camera in network.cameras if camera.name in used]
@@ -66,7 +71,7 @@ def model_hypotheses(run: Run) -> Iterator[ModelHypothesis]:
 
 
 def _radial_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
-    """The next radial terms that the camera's own do not have."""
+    """The next radial terms that the camera lacks."""
     free = _free_terms(camera)
     count = sum(name in free for name in (*_own_terms(camera, "radial"), *RADIAL))
     first = min(count, len(RADIAL) - TERMS_TOGETHER)
@@ -77,7 +82,7 @@ def _radial_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
 
 
 def _decentering_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
-    """Decentering, or the next terms of it."""
+    """Decentering distortion, or its next terms."""
     free = _free_terms(camera)
     if not free.intersection(DECENTERING[1]):
         has_decentering = any(name in free for name in (*_own_terms(camera, "decentering"), *DECENTERING[0]))
@@ -94,7 +99,7 @@ def _digital_pixels(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
 
 
 def _scanner_pixels(run: Run) -> Iterator[ModelHypothesis]:
-    """A scanner that stretches one axis where film transformations do not take that."""
+    """A scanner that stretches one axis, where film transformations do not absorb that."""
     network = run.problem.network
     films = [image for image in network.images if image.transformation != "none"]
     if not films or network.scanners or not all(is_left(image.transformation, "stretch") for image in films):
@@ -110,7 +115,7 @@ def _scanner_pixels(run: Run) -> Iterator[ModelHypothesis]:
 
 
 def _second_interior_orientation(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
-    """Some of the camera's images with another principal distance and principal point."""
+    """A different principal distance and principal point for some of the camera's images."""
     network, groups = run.problem.network, two_groups(run, camera.name)
     if groups is None:
         return
@@ -124,7 +129,7 @@ def _second_interior_orientation(run: Run, camera: Camera) -> Iterator[ModelHypo
 
 
 def _bent_board(run: Run) -> Iterator[ModelHypothesis]:
-    """All given points as a board that is bent, where they are a flat one."""
+    """A bent board of all given points, where they form a flat one."""
     network = run.problem.network
     places = network.known_places
     if network.boards or not places or len(places) < len(network.observed_points):
@@ -142,12 +147,12 @@ def _free_terms(camera: Camera) -> set[str]:
 
 
 def _own_terms(camera: Camera, group: str) -> tuple[str, ...]:
-    """The terms of a group of the camera's own family."""
+    """Terms of a group in the camera's own family."""
     return tuple(dict(family(camera.distortion.family.removesuffix(EXTENDED)).groups).get(group, ()))
 
 
 def _lens_half_mm(network: Network, camera: Camera) -> tuple[float, float]:
-    """Half the frame, by the marks of the camera's images where it is not given."""
+    """Half the frame in mm; from the extent of the camera's marks where it is not given."""
     if min(camera.distortion.half_mm) > 0.0:
         return camera.distortion.half_mm
     own = [image for image in network.images if image.camera == camera.name]
@@ -167,7 +172,7 @@ def _extended_lens(run: Run, camera: Camera, terms: Sequence[str], kind: str, wo
 
 
 def separate_lenses(run: Run) -> Problem | None:
-    """The problem of an adjustment with two groups of images, whose lenses share nothing; None where marks do."""
+    """Give the two groups of images entirely separate lenses; None where cameras have fiducial marks."""
     network = run.problem.network
     if any(camera.fiducials for camera in network.cameras):
         return None
@@ -180,10 +185,9 @@ def separate_lenses(run: Run) -> Problem | None:
 
 
 def _continued(run: Run, network: Network, like: dict[str, str] | None = None) -> Problem:
-    """A network with more unknowns as a problem that starts where an adjustment ended, in the datum of that.
+    """Number a network with additional unknowns; start where an adjustment ended, in its datum.
 
-    like: cameras that share the distortion and the fiducial marks of another one, and start with its interior
-    orientation.
+    like: cameras that share distortion and fiducial marks with another one and start with its interior orientation.
     """
     old, values, like, count = run.problem.unknowns, run.end.state.values, like or {}, len(INTERIOR_NAMES)
     interior = {name: values[at[:count]] for name, at in old.camera.items()}
@@ -228,7 +232,7 @@ def _lens_words(camera: Camera, group: str, what: str, run: Run, added: Indices,
 
 
 def _pixel_words(camera: str, per_mm: float, run: Run, added: Indices, _: float) -> tuple[str, str]:
-    """Of pixels that are not square; per_mm: change of the ratio by the added unknown."""
+    """Describe non-square pixels; per_mm: change of the aspect ratio per mm of the added unknown."""
     value, covariance = _estimate(run, added)
     ratio = 1.0 - per_mm * float(value[0])
     cause = (
@@ -253,7 +257,7 @@ def _board_words(run: Run, added: Indices, _: float) -> tuple[str, str]:
 
 
 def _group_words(camera: str, groups: ImageGroups, run: Run, added: Indices, _: float) -> tuple[str, str]:
-    """Of two groups of images with an interior orientation each, in the readings that fit their difference."""
+    """Describe two groups of images by the simplest differences of interior orientation that fit."""
     values, covariance = _estimate(run, np.concatenate([added, run.problem.unknowns.camera[camera][:3]]))
     base, difference = values[3:], values[:3] - values[3:]
     by_both = np.hstack([np.eye(3), -np.eye(3)])
@@ -288,7 +292,7 @@ def _group_words(camera: str, groups: ImageGroups, run: Run, added: Indices, _: 
 
 
 def _misfit(difference: Array, covariance: Array, along: Array) -> float:
-    """Chi-square of a difference (3,) that is held to some directions."""
+    """Chi-square of a difference (3,) constrained to given directions."""
     weight = np.linalg.pinv(covariance, hermitian=True)
     normal = along.T @ weight @ along
     rest = difference - along @ np.linalg.pinv(normal, hermitian=True) @ (along.T @ weight @ difference)
@@ -296,6 +300,6 @@ def _misfit(difference: Array, covariance: Array, along: Array) -> float:
 
 
 def _estimate(run: Run, positions: Indices) -> tuple[Array, Array]:
-    """Values (k,) of some unknowns and their covariance (k, k), of unit weight or the larger one that was found."""
+    """Values (k,) of unknowns and their cofactor matrix (k, k)."""
     cofactor = free_cofactor(run.numbering, run.end.state, run.factor)
     return run.end.state.values[positions], cofactor.part(positions)

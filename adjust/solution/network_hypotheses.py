@@ -1,5 +1,8 @@
-"""What may be wrong with a whole network, each as the network without it: mirrored points or exchanged axes, another
-unit, y that points down, exchanged frames, mirrored images, another principal distance."""
+"""Hypotheses on blunders of a whole network, each as the network without the blunder.
+
+Mirrored points or exchanged axes, another unit, y pointing down, exchanged frames, mirrored images, a wrong principal
+distance.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -16,15 +19,15 @@ from adjust.problem.parameter import Parameter
 from adjust.solution.left_out_images import leave_out
 from adjust.solution.result import Adjustment
 
-TOLERATED = 2.0  # times the standard deviations that were given, and residuals still need no other explanation
-CHECKED = 10  # redundancy from which on an explanation is one
-FEWEST_IMAGES = 3  # of which one that is mirrored is told from the others
-MOST_MIRRORED = 6  # images that are left out in turn, the worst first
-MOST_PAIRS = 15  # of frames that are tried exchanged, the worst first
-UNITS = (1000.0, 100.0, 10.0, 0.3048)  # of one length in another: m, dm, cm, mm, feet
+TOLERATED = 2.0  # factor on the given standard deviations up to which residuals need no explanation
+CHECKED = 10  # smallest redundancy for an explanation
+FEWEST_IMAGES = 3  # images needed to identify a mirrored one
+MOST_MIRRORED = 6  # images left out in turn, largest residuals first
+MOST_PAIRS = 15  # pairs of frames tried as exchanged, largest residuals first
+UNITS = (1000.0, 100.0, 10.0, 0.3048)  # ratios of length units: m, dm, cm, mm, feet
 FACTORS = (*UNITS, *(1.0 / each for each in UNITS))
 
-AXES = {  # the slips that mirror the points, and what takes them back
+AXES = {  # blunders that mirror the points, and the matrices that correct them
     **{f"the sign of {'XYZ'[i]} of all points is wrong": np.diag(1.0 - 2.0 * np.eye(3)[i]) for i in range(3)},
     **{
         f"{axes} of all points are exchanged": np.eye(3)[order]
@@ -35,16 +38,16 @@ AXES = {  # the slips that mirror the points, and what takes them back
 
 @dataclass(frozen=True)
 class Trials:
-    """Adjusts other networks (None where one cannot begin), and judges whether an adjustment needs no explanation.
+    """Adjusts trial networks (None where one cannot start) and tests the results.
 
-    family: the probability of chance.
+    family: significance level.
     """
 
     adjust: Callable[[Network], Adjustment | None]
     family: float
 
     def explains(self, result: Adjustment | None) -> bool:
-        """Whether v'Pv is within chance for standard deviations TOLERATED times as large, and checked at all."""
+        """Whether v'Pv is not significant for standard deviations TOLERATED times as large, with enough redundancy."""
         if result is None or result.termination == "singular" or result.redundancy < CHECKED:
             return False
         return bool(chdtrc(result.redundancy, result.vpv / TOLERATED**2) > self.family)
@@ -52,10 +55,10 @@ class Trials:
 
 @dataclass(frozen=True)
 class NetworkHypothesis:
-    """A slip in words, what to do about it, and the network without it.
+    """Blunder in words, remedy, and the network without the blunder.
 
-    moved (3, 3): what takes the points as they are given to where they are without it. distance: the camera
-    whose principal distance is not what is given, and that in mm.
+    moved (3, 3): transformation from the given points to the corrected ones. distance: camera with a wrong principal
+    distance, and the given value in mm.
     """
 
     words: str
@@ -68,13 +71,13 @@ class NetworkHypothesis:
 def network_hypotheses(
     network: Network, bare: Network, given: Adjustment | None, trials: Trials
 ) -> Iterator[list[NetworkHypothesis]]:
-    """Those that leave the same residuals together.
+    """Generate blunder hypotheses; those with identical residuals form one list.
 
     Parameters
     ----------
-    network, bare : with what is given of orientations, and without
-    given : the network adjusted as it is, None where that cannot begin
-    trials : adjusts other networks
+    network, bare : network with and without the given orientations
+    given : adjustment of the network as given, None where it cannot start
+    trials : adjusts trial networks
     """
     mirrored = (NetworkHypothesis(words, "Correct it.", _move_points(bare, by), by) for words, by in AXES.items())
     yield [*mirrored, *_y_down(bare, given)]
@@ -89,14 +92,14 @@ def network_hypotheses(
 
 
 def unit_words(factor: float) -> str:
-    """Of points in another unit, which a factor takes back."""
+    """Describe points in another unit; factor: multiplies them to correct it."""
     how = "large" if factor < 1.0 else "small"
     times = max(factor, 1.0 / factor)
     return f"the coordinates of the points are {times:.4g} times too {how} for the stations or distances: another unit"
 
 
 def _move_points(network: Network, by: Array) -> Network:
-    """With all points moved by a matrix that has one entry a row."""
+    """Transform all points by a matrix with one entry per row."""
     axes = np.abs(by).argmax(axis=1)
     factors = [float(row[axis]) for row, axis in zip(by, axes, strict=True)]
 
@@ -109,7 +112,7 @@ def _move_points(network: Network, by: Array) -> Network:
 
 
 def _y_down(network: Network, given: Adjustment | None) -> Iterator[NetworkHypothesis]:
-    """y' of the cameras, where films that are all mirrored speak for it, and y of comparators without fiducials."""
+    """Hypothesis: y points down, in the camera frame if all films are mirrored, or in comparators of digital images."""
     films = [image for image in network.images if image.transformation != "none"]
     if films and given is not None and any(image.name not in given.mirrored for image in films):
         return
@@ -122,7 +125,7 @@ def _y_down(network: Network, given: Adjustment | None) -> Iterator[NetworkHypot
 
 
 def _turn_camera(camera: Camera) -> Camera:
-    """With y' pointing the other way."""
+    """Reverse y' of a camera."""
     marks = {id_: Fiducial(mark.x_mm, _opposite(mark.y_mm)) for id_, mark in camera.fiducials.items()}
     y0_mm = camera.y0_mm and _opposite(camera.y0_mm)
     return replace(camera, y0_mm=y0_mm, fiducials=marks, center_mm=(camera.center_mm[0], -camera.center_mm[1]))
@@ -133,8 +136,7 @@ def _opposite(prior: Prior) -> Prior:
 
 
 def y_downward(network: Network) -> Network | None:
-    """A network of images without fiducials with y of its comparator coordinates pointing the other way; None where
-    there are films."""
+    """Reverse y of the comparator coordinates of a network without films; None where there are films."""
     if any(image.transformation != "none" for image in network.images):
         return None
     cameras = tuple(each if each.y0_mm else _turn_camera(each) for each in network.cameras)
@@ -143,7 +145,7 @@ def y_downward(network: Network) -> Network | None:
 
 
 def _mirrored_images(network: Network, given: Adjustment | None, trials: Trials) -> Iterator[NetworkHypothesis]:
-    """Single images of a digital camera, the worst first, without which all others agree."""
+    """Hypothesis: one image of a digital camera is mirrored, if all others agree without it; worst images first."""
     worst = list(_worst_images(network, given, films=False))
     for name in worst[:MOST_MIRRORED] if len(worst) >= FEWEST_IMAGES else ():
         others = leave_out(network, [network.image_by_name[name].frame])
@@ -155,8 +157,9 @@ def _mirrored_images(network: Network, given: Adjustment | None, trials: Trials)
 
 
 def _mirrored_image(network: Network, name: str, rest: Adjustment) -> Network:
-    """A network with one image mirrored; where the picture's middle is not known, with a principal point of its own and
-    the lens that the rest of the images have.
+    """Mirror one image of a network.
+
+    Where the image centre is unknown, the image gets its own principal point, with the lens of the other images.
     """
     turned = mirrored_images(network, [name])
     camera = network.camera_by_name[network.image_by_name[name].camera]
@@ -178,8 +181,10 @@ def _mirrored_image(network: Network, name: str, rest: Adjustment) -> Network:
 
 
 def mirrored_images(network: Network, names: Sequence[str]) -> Network:
-    """A network with the comparator coordinates of some images mirrored left to right: about the middle of the picture,
-    where its size is known, or of all marks of its camera."""
+    """Mirror the comparator coordinates of some images left to right.
+
+    The axis is the centre of the image where its size is known, else that of all marks of the camera.
+    """
     middle = {camera.name: _middle_mm(network, camera) for camera in network.cameras}
     turned = np.array([image.name in names and image.transformation == "none" for image in network.images])
     centers = np.array([middle[image.camera] for image in network.images])[network.image_numbers]
@@ -190,7 +195,7 @@ def mirrored_images(network: Network, names: Sequence[str]) -> Network:
 
 
 def _middle_mm(network: Network, camera: Camera) -> float:
-    """The middle of the camera's pictures in x."""
+    """Centre of the camera's images in x, mm."""
     own = np.array([image.camera == camera.name for image in network.images])[network.image_numbers]
     x_mm = network.observations.xy_mm[own, 0]
     if not len(x_mm):
@@ -203,7 +208,7 @@ def _middle_mm(network: Network, camera: Camera) -> float:
 
 
 def _distances(network: Network) -> Iterator[NetworkHypothesis]:
-    """Another principal distance of each camera that has one without a calibration."""
+    """Hypothesis: the principal distance of a camera without an earlier calibration is wrong."""
     calibrated = {parameter for each in network.calibrations for parameter in each.parameters}
     for camera in network.cameras:
         given = camera.principal_distance_mm
@@ -218,7 +223,7 @@ def _distances(network: Network) -> Iterator[NetworkHypothesis]:
 
 
 def _exchanged_frames(network: Network, given: Adjustment | None) -> Iterator[NetworkHypothesis]:
-    """Targets of one frame under the name of another of the same camera, those with the largest residuals first."""
+    """Hypothesis: the targets of two frames of a camera are exchanged; largest residuals first."""
     observations, worst = network.observations, _worst_images(network, given, films=True)
     camera = {image.name: image.camera for image in network.images}
     pairs = [pair for pair in combinations(worst, 2) if camera[pair[0]] == camera[pair[1]]]
@@ -234,8 +239,10 @@ def _exchanged_frames(network: Network, given: Adjustment | None) -> Iterator[Ne
 
 
 def _worst_images(network: Network, given: Adjustment | None, films: bool) -> dict[str, float]:
-    """The sums of squared residuals of films, or of digital images, that show object points, the largest first; 0
-    without an adjustment."""
+    """Sums of squared residuals by image, largest first, of films or of digital images with object points.
+
+    The sums are 0 without an adjustment.
+    """
     v_mm = np.zeros((len(network.image_numbers), 2)) if given is None else given.residuals.v_mm
     sums = np.bincount(network.image_numbers, (v_mm**2).sum(axis=1), len(network.images))
     images = [

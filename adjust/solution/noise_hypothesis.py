@@ -1,6 +1,6 @@
-"""Whether the standard deviations given to the marks are too small everywhere, and nothing else is wrong.
+"""Test whether the standard deviations of the marks are too small everywhere and nothing else is wrong.
 
-The residuals are then those of a larger noise: normally distributed, alike in all images, and independent of their
+The residuals are then pure noise: normally distributed, of equal variance in all images, and independent of their
 neighbours. With a standard deviation added to that of all marks, of targets alone or of fiducials alone, every group of
 observations agrees.
 """
@@ -18,10 +18,10 @@ from adjust.quality.residuals import residuals
 from adjust.quality.run import Run
 from adjust.solution.reweighting import again
 
-FEWEST = 30  # coordinates from which on residuals tell what they are distributed like
-CHANCE = 0.001  # of each test below which residuals are no mere noise
-NEIGHBOURS = 8  # that are looked at, the nearest first
-UNCHECKED = 0.05  # redundancy number below which a residual tells nothing
+FEWEST = 30  # coordinates needed to test the distribution of residuals
+CHANCE = 0.001  # significance level of each test of the noise hypothesis
+NEIGHBOURS = 8  # nearest neighbours searched for one in the same, or in another, image
+UNCHECKED = 0.05  # redundancy number below which a residual is not tested
 KINDS = (("marks", ("target", "tie", "fiducial")), ("targets", ("target", "tie")), ("fiducials", ("fiducial",)))
 STEPS = 20
 UM_PER_MM = 1000.0
@@ -29,7 +29,15 @@ UM_PER_MM = 1000.0
 
 @dataclass(frozen=True)
 class AddedNoise:
-    """The marks that it is added to, its standard deviation in mm, and the adjustment with it."""
+    """Noise added to marks.
+
+    Attributes
+    ----------
+    marks : "marks", "targets" or "fiducials".
+    sigma_mm : added standard deviation.
+    covariance_mm2 : (n, 2, 2) given covariances of the marks.
+    run : adjustment with the added noise.
+    """
 
     marks: str
     sigma_mm: float
@@ -38,7 +46,7 @@ class AddedNoise:
 
     @property
     def words(self) -> tuple[str, str]:
-        """The cause and the remedy; `covariance_mm2` is that given of the marks."""
+        """Cause and remedy."""
         given_um = UM_PER_MM * float(np.sqrt(np.median(np.trace(self.covariance_mm2, axis1=1, axis2=2) / 2.0)))
         added_um = UM_PER_MM * self.sigma_mm
         key = "sigma_fiducial_um" if self.marks == "fiducials" else "sigma_target_um"
@@ -52,7 +60,7 @@ class AddedNoise:
 
 
 def added_noise(run: Run, redundancy: int) -> AddedNoise | None:
-    """The standard deviation that, added to those of marks, explains all residuals; None where it does not."""
+    """Estimate the standard deviation that, added to those of marks, explains all residuals; None where none does."""
     if not _is_noise(run):
         return None
     network = run.problem.network
@@ -74,7 +82,7 @@ def added_noise(run: Run, redundancy: int) -> AddedNoise | None:
 
 
 def _is_noise(run: Run) -> bool:
-    """Whether standardised residuals are normally distributed, alike in all images and independent of neighbours."""
+    """Whether standardised residuals are normal, homogeneous over images and independent of neighbours."""
     v = residuals(run)
     checked = (v.redundancy > UNCHECKED).all(axis=1)
     if 2 * checked.sum() < FEWEST:
@@ -93,14 +101,14 @@ def _is_noise(run: Run) -> bool:
 
 
 def _is_normal(w: Array) -> bool:
-    """By the kurtosis of all coordinates, with its standard deviation √(24 / n)."""
+    """Test the kurtosis of all coordinates, with its standard deviation √(24 / n)."""
     w = w.ravel()
     kurtosis = np.mean(w**4) / np.mean(w**2) ** 2 - 3.0
     return bool(ndtr(-abs(kurtosis) / np.sqrt(24.0 / len(w))) > 0.5 * CHANCE)
 
 
 def _is_alike(w: Array, redundancy: Array, images: Indices) -> bool:
-    """Whether the mean square of every image is that of all, by chi-square of their differences."""
+    """Test by chi-square whether all images have the same mean square."""
     shares = np.bincount(images, (w**2 * redundancy).sum(axis=1))
     freedom = np.bincount(images, redundancy.sum(axis=1))
     present = freedom > 1.0
@@ -112,8 +120,8 @@ def _is_alike(w: Array, redundancy: Array, images: Indices) -> bool:
 
 
 def _is_shared(w: Array, places: Array, images: Indices, same_image: bool) -> bool:
-    """Whether nearest neighbours, in the same image or in another, have residuals alike."""
-    if same_image:  # far apart in a third coordinate, images keep to themselves
+    """Whether the residuals of nearest neighbours, in the same image or in others, are positively correlated."""
+    if same_image:  # a third coordinate separates the images in the tree
         apart = 10.0 * float(np.ptp(places, axis=0).max())
         places = np.column_stack([places, apart * images])
     near = np.asarray(KDTree(places).query(places, min(NEIGHBOURS, len(places)))[1])
@@ -125,7 +133,7 @@ def _is_shared(w: Array, places: Array, images: Indices, same_image: bool) -> bo
 
 
 def _is_shared_by_point(in_object: Array, points: NDArray[np.str_], images: Indices) -> bool:
-    """Whether a point's residuals, turned into the axes of the object, are alike in one image and the next."""
+    """Whether a point's residuals, rotated into object axes, are positively correlated between images."""
     order = np.lexsort((images, points))
     follows = points[order][1:] == points[order][:-1]
     products = (in_object[order][1:] * in_object[order][:-1]).sum(axis=1)[follows]
@@ -133,13 +141,13 @@ def _is_shared_by_point(in_object: Array, points: NDArray[np.str_], images: Indi
 
 
 def _is_positive(products: Array) -> bool:
-    """Whether products of residuals, which are 0 on the average where these are independent, are positive."""
-    z = products.sum() / np.sqrt(2.0 * (products**2).sum())  # most neighbours count twice
+    """Whether the sum of products of residuals, of expectation 0 if independent, is significantly positive."""
+    z = products.sum() / np.sqrt(2.0 * (products**2).sum())  # factor 2: most pairs of neighbours occur twice
     return bool(ndtr(-z) < 0.5 * CHANCE)
 
 
 def _added_sigma(run: Run, members: Mask, redundancy: int) -> float | None:
-    """The standard deviation in mm with which v'Pv, for the same residuals, is the redundancy."""
+    """Standard deviation in mm with which v'Pv of the same residuals equals the redundancy."""
     given = run.problem.network.observations.covariance_mm2 / run.weighting.weights[: len(members), None, None]
     v = run.end.v_mm
     rest = run.end.vpv - float(np.einsum("ni,nij,nj->n", v, np.linalg.inv(given), v)[members].sum())
@@ -155,7 +163,7 @@ def _added_sigma(run: Run, members: Mask, redundancy: int) -> float | None:
 
 
 def _groups_agree(run: Run) -> bool:
-    """Whether every group of observations agrees with its standard deviations, neither too small nor too large."""
+    """Whether every group of observations agrees with its standard deviations in a two-sided test."""
     for name in np.unique(run.units.groups):
         vpv, freedom = run.group_sums((run.units.groups == name) & run.weighting.used)
         if freedom > 1.0 and min(chdtr(freedom, vpv), chdtrc(freedom, vpv)) < CHANCE:

@@ -1,4 +1,4 @@
-"""How to adjust."""
+"""Options of an adjustment."""
 
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
@@ -15,20 +15,25 @@ MEASURED_KINDS = ("target", "tie", "fiducial", "join")
 
 @dataclass(frozen=True)
 class Options:
-    """How to adjust.
+    """Options of an adjustment.
 
-    datum: "control", what is given of points and stations and nothing else; "minimal", as many coordinates fixed as
-    these leave free; "free", inner constraints over points of which nothing is given.
-    datum_coordinates: those that "minimal" fixes, at their given values: "12.X" and so on; none: chosen automatically.
-    datum_points: the points that carry the inner constraints of "free"; none: all.
-    robust: what contradicts the others loses weight, "huber" (or True) some and "igg3" at last all; see
-    `robust_weights`. snooping: what contradicts the others beyond chance is taken out; see `adjust.quality.snooping`.
-    variance_components: the variances of groups are each multiplied by what their residuals say: True for targets, tie
-    points, fiducials and joins in the images, or names of groups (see `Group`).
-    probabilities: of the tests.
-    method: "combined", the strict combined model (Gauss-Helmert); "elements", Torlegård's adjustment by elements, which
-    takes the distortion at the observed point: the same as long as distortion changes little over a residual, and what
-    programs do that correct the measured points first.
+    Attributes
+    ----------
+    datum : "control": the priors of points and stations define the datum. "minimal": as many coordinates are fixed as
+        the priors leave free. "free": inner constraints over points without priors.
+    datum_coordinates : coordinates that "minimal" fixes at their given values: "12.X" and so on; default: chosen
+        automatically.
+    datum_points : points with the inner constraints of "free"; default: all.
+    robust : robust estimation. "huber" (or True) reduces the weights of outliers; "igg3" finally gives them no weight;
+        see `robust_weights`.
+    snooping : remove outliers by data snooping; see `adjust.quality.snooping`.
+    variance_components : estimate variance factors of groups. True: targets, tie points, fiducials and joins in the
+        images; or names of groups (see `Group`).
+    iteration_limit : largest number of iterations.
+    method : "combined": the strict combined model (Gauss-Helmert). "elements": Torlegård's adjustment by elements, with
+        the distortion at the observed point. Both agree as long as distortion changes little over a residual; programs
+        that correct the measured points first use the latter.
+    probabilities : probabilities of the tests.
     """
 
     datum: Datum = "control"
@@ -66,19 +71,19 @@ class Options:
 
     @property
     def plain(self) -> "Options":
-        """The same with all weights as they are given."""
+        """Copy of the options with all weights as given."""
         return replace(self, robust=False, snooping=False, variance_components=False)
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """The groups whose variance components are to be estimated."""
+        """Groups whose variance components are estimated."""
         if isinstance(self.variance_components, bool):
             return MEASURED_KINDS if self.variance_components else ()
         return self.variance_components
 
     @property
     def weight_functions(self) -> tuple[WeightFunction, ...]:
-        """Of robust estimation, one after the other: the redescending one begins where the convex one ends."""
+        """Weight functions of robust estimation in order; the redescending one starts where the convex one ends."""
         if not self.robust:
             return ()
         return ("huber", "igg3") if self.robust == "igg3" else ("huber",)

@@ -1,4 +1,4 @@
-"""What a network that nobody has measured yet would give: its adjustment at computed observations."""
+"""Network planning: adjustment with computed observations of a network not yet measured."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,17 +24,21 @@ from adjust.solution.adjustment import Options, adjust_problem, settle_datum
 from adjust.solution.result import Adjustment
 from adjust.validation import validate_plan
 
-STILL = 1e-6  # part of a null direction's motion that is rounding: what moves less is determined
+STILL = 1e-6  # fraction of a null direction's motion that is rounding: quantities that move less are determined
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The expected precision of a network.
+    """Expected precision of a network.
 
-    adjustment: that of observations without errors; its cofactor matrix, its redundancy numbers and sigma0, which was
-    given, are those to be expected. singular: what the observations would not see. null (n, d): how all unknowns move
-    in these directions; the adjustment is then that with d unknowns held, and what does not move is the same whichever
-    they are.
+    Attributes
+    ----------
+    adjustment : adjustment of error-free observations. Its cofactor matrix, redundancy numbers and the given sigma0 are
+        the expected ones.
+    sigma0 : given factor on the a-priori standard deviations.
+    singular : null directions.
+    null : (n, d) motion of all unknowns in these directions. The adjustment then holds d unknowns; quantities that do
+        not move are the same whichever are held.
     """
 
     adjustment: Adjustment
@@ -43,12 +47,12 @@ class Plan:
     null: Array
 
     def sigma(self, parameter: Parameter | str) -> float:
-        """The expected standard deviation of an unknown: 0 where it is fixed, inf where it is not determined."""
+        """Expected standard deviation of an unknown: 0 where fixed, inf where undetermined."""
         i = self.adjustment.index(parameter)
         return np.inf if self.null[i].any() else self.sigma0 * float(np.sqrt(self.adjustment.cofactor.variances[i]))
 
     def sigmas(self, parameters: Sequence[Parameter | str], functions: Array) -> Array:
-        """The expected standard deviations (m,) of linear functions (m, k) of k unknowns; inf where not determined."""
+        """Expected standard deviations (m,) of linear functions (m, k) of k unknowns; inf where undetermined."""
         rows = [self.adjustment.index(each) for each in parameters]
         variances = ((functions @ self.adjustment.cofactor_of(parameters)) * functions).sum(axis=1)
         moved = np.abs(functions @ self.null[rows])
@@ -58,11 +62,10 @@ class Plan:
 
 
 def plan(network: Network, values: Approximations, options: Options | None = None, sigma0: float = 1.0) -> Plan:
-    """The precision to be expected of a network whose unknowns have certain values.
+    """Compute the expected precision of a network whose unknowns have given values.
 
-    The observations' coordinates are not used but computed, and what is given of the unknowns is taken to be true, so
-    that nothing has to be iterated. sigma0: by how much the a-priori standard deviations are too small, as far as one
-    knows from earlier adjustments.
+    The coordinates of the observations are computed and priors are taken as true, so that no iteration is needed.
+    sigma0: expected factor on the a-priori standard deviations, known from earlier adjustments.
 
     Raises AdjustmentError where the network is empty or contradictory, or where a point has no image.
     """
@@ -97,7 +100,7 @@ def _computed_problem(problem: Problem) -> Problem:
 def _regularised(problem: Problem) -> tuple[list[int], Array]:
     """Positions of unknowns that make a singular problem regular when held, and its null vectors (n, d).
 
-    Held are the pivots of the null vectors, one for each: minimal constraints for whatever is free.
+    The pivots of the null vectors are held, one for each: minimal constraints of the free unknowns.
     """
     held: list[int] = []
     null = np.zeros((len(problem.unknowns), 0))

@@ -1,8 +1,9 @@
-"""What no photograph shows, whatever the residuals say: marks outside the picture, stations on both sides of an opaque
-board, a principal point outside the picture or far from where it is given.
+"""Checks against the geometry of photographs, independent of the residuals.
 
-On a flat board a mirrored image leaves the residuals of a true one, with its station on the other side; y that points
-down mirrors all images. The mirrored network is adjusted, and told with its sigma0 where it explains all observations.
+Implausible are marks outside the image, stations on both sides of an opaque board, and a principal point outside the
+image or far from its given place. On a flat board a mirrored image has the same residuals as a correct one, with its
+station on the other side; y pointing down mirrors all images. The mirrored network is adjusted, and its sigma0 is
+reported where it explains all observations.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,15 +20,15 @@ from adjust.problem.parameter import Parameter
 from adjust.solution.network_hypotheses import Trials, mirrored_images, y_downward
 from adjust.solution.result import Adjustment
 
-MARGIN = 0.01  # of the frame by which a mark may lie outside: the outermost pixel's edge, a frame's rounded size
-NEARLY_ALL = 0.9  # of the marks outside the picture, from which on the axes are wrong and not the marks
-FLAT = 1e-2  # relief of given points over their extent: a board, or ground without relief
-AROUND = 0.25  # of the extent of all marks that a picture of unknown size may reach beyond them
+MARGIN = 0.01  # fraction of the frame that a mark may lie outside: edge of the outermost pixel, rounded frame size
+NEARLY_ALL = 0.9  # fraction of marks outside the image above which the axes are wrong, not the marks
+FLAT = 1e-2  # relief of given points over their extent below which they are flat
+AROUND = 0.25  # fraction of the extent of all marks by which an image of unknown size may extend beyond them
 NAMED = 5
 
 
 def check_plausibility(result: Adjustment, trials: Trials) -> Adjustment:
-    """A result with sentences on what contradicts the geometry of photographs."""
+    """Add remarks on contradictions with the geometry of photographs to a result."""
     if result.termination == "singular" or not result.network.observed_points:
         return result
     views = _views(result.network, result)
@@ -41,21 +42,24 @@ def check_plausibility(result: Adjustment, trials: Trials) -> Adjustment:
 
 @dataclass(frozen=True)
 class _Picture:
-    """The picture of a camera in mm: two opposite corners."""
+    """Image area of a camera in mm, by two opposite corners."""
 
     low: Array
     high: Array
 
     def outside(self, xy_mm: Array) -> Mask:
-        """Which points (n, 2) lie outside of it."""
+        """Mask of points (n, 2) outside the image."""
         margin = MARGIN * float((self.high - self.low).max())
         return np.asarray((xy_mm < self.low - margin).any(axis=1) | (xy_mm > self.high + margin).any(axis=1))
 
 
 @dataclass(frozen=True)
 class _View:
-    """What a camera shows of object points: the rows of the observations, their camera coordinates (n, 2), and where
-    the picture lies, None where its size is not known."""
+    """Object points in the images of one camera.
+
+    rows: rows of the observations; xy_mm (n, 2): camera coordinates; digital: whether its images have no film
+    transformation.
+    """
 
     camera: Camera
     digital: bool
@@ -64,8 +68,11 @@ class _View:
 
     @property
     def picture(self) -> _Picture | None:
-        """Of a digital camera it counts from the first pixel, as the comparator does, of a film camera it lies about
-        the middle of the fiducial marks; about the origin if nearly all observed marks lie in it then, and more.
+        """Image area, None where its size is unknown.
+
+        That of a digital camera starts at the first pixel, like the comparator coordinates. That of a film camera is
+        centred on the fiducial marks. It is centred on the origin where nearly all marks lie inside then, and more than
+        otherwise.
         """
         size = np.array(self.camera.frame_mm)
         if not size.all():
@@ -79,15 +86,17 @@ class _View:
 
     @property
     def outside(self) -> list[int]:
-        """The rows outside the picture; all of a digital camera's that lie above and right of its first pixel, where
-        its size is not known."""
+        """Rows of the marks outside the image area.
+
+        For a digital camera of unknown size these are all rows, if all marks lie above and right of the first pixel.
+        """
         if self.picture is not None:
             return [int(row) for row in self.rows[self.picture.outside(self.xy_mm)]]
         return self.rows.tolist() if self.digital and (self.xy_mm > 0.0).all() else []
 
 
 def _views(network: Network, result: Adjustment) -> list[_View]:
-    """Of the cameras that show object points."""
+    """Views of the cameras whose images show object points."""
     numbers, views = network.image_numbers, []
     for camera in network.cameras:
         own = np.array([image.camera == camera.name for image in network.images])
@@ -135,9 +144,9 @@ def _marks_outside(result: Adjustment, rows: Sequence[int], trials: Trials) -> I
 
 
 def _both_sides(result: Adjustment, trials: Trials) -> Iterator[str]:
-    """Images whose stations lie on the other side of an opaque board than most."""
+    """Report images whose stations lie on the other side of an opaque board than most."""
     network, sides = result.network, _sides(result)
-    balance = sum(sides.values()) or -1.0  # as many here as there
+    balance = sum(sides.values()) or -1.0  # equally many on both sides
     fewer = [name for name, side in sides.items() if side * balance < 0.0]
     if network.transparent or not fewer:
         return
@@ -164,7 +173,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _sides(result: Adjustment) -> dict[str, float]:
-    """On which side of the plane of the given points, 1 or -1, the station of every image lies; empty without one."""
+    """Side (1 or -1) of the plane of the given points on which each station lies, by image; empty without a plane."""
     network = result.network
     places = [place for id_, place in network.known_places.items() if id_ in network.observed_points]
     if len(places) < max(4, len(network.observed_points)):
@@ -202,7 +211,7 @@ def _principal_point(view: _View, result: Adjustment, family: float) -> Iterator
 
 
 def _far_from_given(camera: Camera, found: Array, cofactor: Array, sigma0: float, family: float) -> str:
-    """Where the principal point is given, if the images contradict it beyond chance; empty where they do not."""
+    """Describe a significant contradiction between estimated and given principal point; empty where there is none."""
     priors = [prior for prior in (camera.x0_mm, camera.y0_mm) if prior is not None and 0.0 < prior.sigma < np.inf]
     if len(priors) < len(found):
         return ""

@@ -1,4 +1,4 @@
-"""The result of an adjustment: estimates, residuals and their tests, messages; each computed where it is asked for."""
+"""Result of an adjustment: estimates, residuals, tests and messages, each computed on demand."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -38,17 +38,25 @@ from adjust.solution.warnings import run_warnings
 
 @dataclass(frozen=True, repr=False)
 class Adjustment(Estimates, PlottedResult):
-    """An adjusted network and what its observations say of it.
+    """Adjusted network with residuals, tests and messages.
 
-    run: the last adjustment, in reduced coordinates; scaled: the same with the priors that the cofactor matrix has.
-    weights (n,): the factors that robust estimation left on the weights of the observations, 1 without it.
-    variance_factors: the factors found for the variances of groups, where asked for.
-    remarks: on how the adjustment came about, the first of the warnings.
-    slips: sentences on given points so far off that the observations do not agree, or have no solution, for them.
-    left_out: by name, the images for which no orientation was found, and why; the network is that of the others.
-    misread: sentences on images that are mirrored; what else there seems to be is theirs.
-    unused: notes on what was given and has no part, the first of the notes.
-    unmodelled_mm: by camera, the standard deviation of what is not modelled, where it was estimated.
+    Attributes
+    ----------
+    run : the last adjustment, in reduced coordinates.
+    scaled : the same with the priors used for the cofactor matrix.
+    probabilities : of the tests.
+    iterations, conditions, unknowns, redundancy : counts.
+    vpv : v'Pv.
+    singular : null directions of a singular network.
+    history : the iterations.
+    weights : (n,) factors of robust estimation on the weights of the observations; 1 without it.
+    variance_factors : estimated variance factors by group.
+    remarks : remarks on how the result was obtained; listed first among the warnings.
+    slips : sentences on coordinate blunders of given points that prevent agreement or a solution.
+    left_out : reasons by name of the images without an orientation; `network` has the others.
+    misread : sentences on mirrored images; other contradictions are then consequences of these.
+    unused : notes on input that is not used; listed first among the notes.
+    unmodelled_mm : by camera, the estimated standard deviation of unmodelled errors.
     """
 
     run: Run
@@ -76,47 +84,47 @@ class Adjustment(Estimates, PlottedResult):
 
     @cached_property
     def groups(self) -> Mapping[str, Group]:
-        """The kinds of observations, with their share of v'Pv."""
+        """Groups of observations with their share of v'Pv."""
         return groups(self.run, self.further)
 
     @cached_property
     def further(self) -> tuple[FurtherResidual, ...]:
-        """The residuals of distances and the like."""
+        """Residuals of distances, calibrations and antennas."""
         return tuple(further_residuals(self.run, self.probabilities.noncentrality(1)))
 
     @cached_property
     def contradictions(self) -> tuple[CalibrationTest, ...]:
-        """What the images say against earlier calibrations as wholes."""
+        """Compatibility tests of the images against earlier calibrations."""
         if not self.run.has_solution:
             return ()
         return tuple(calibration_tests(self.run, self.variance.sigma0, self.variance.redundancy))
 
     @cached_property
     def variance_sigmas(self) -> Mapping[str, float]:
-        """The standard deviations of the variance factors."""
+        """Standard deviations of the variance factors."""
         has_factors = self._is_tested and self.run.weighting.factors
         return factor_sigmas(self.run) if has_factors else {}
 
     @cached_property
     def reliability(self) -> Reliability | None:
-        """Baarda's inner and outer reliability; None where there is no solution."""
+        """Baarda's internal and external reliability; None without a solution."""
         return _reliability(self.run, self.variance, self.probabilities) if self._is_tested else None
 
     @cached_property
     def correlations(self) -> tuple[Correlation, ...]:
-        """High correlations of cameras' parameters, the highest first."""
+        """High correlations of cameras' parameters, highest first."""
         return correlations(self)
 
     @cached_property
     def significance(self) -> Mapping[tuple[str, str], tuple[SignificanceTest, ...]]:
-        """Tests by kind ("interior", "scanner", "board") and owner, of single parameters, then of groups."""
+        """Significance tests by kind ("interior", "scanner", "board") and owner: single parameters, then groups."""
         return significance_tests(self)
 
     def cluster_covariance_of(self, parameters: Sequence[Parameter]) -> Array | None:
-        """The covariance (k, k) of quantities of cameras or boards, by leaving out one image at a time.
+        """Estimate the covariance (k, k) of quantities of cameras or boards by leaving out one image at a time.
 
-        It holds where errors within an image are correlated; what is fixed has zeros. None without a solution and where
-        images are too few (`adjust.quality.image_clusters`).
+        It remains valid where errors within an image are correlated. Fixed quantities have zeros. None without a
+        solution or with too few images (`adjust.quality.image_clusters`).
         """
         run, at = self.scaled, shared_positions(self.scaled.numbering)
         if not self.converged or len(at) > MOST_SHARED:
@@ -129,20 +137,23 @@ class Adjustment(Estimates, PlottedResult):
         return np.pad(found, (0, 1))[np.ix_(numbers, numbers)]
 
     def prediction_errors(self, folds: int) -> Array | None:
-        """The mean square (m,) of the lengths of each image's residuals, over their standard deviations, where every so
-        many images are left out in turn (`adjust.quality.image_clusters`); None without a solution."""
+        """Cross-validate the images in `folds` groups.
+
+        Returns the (m,) mean squared standardised length of each image's residuals, each group of images predicted from
+        the others (`adjust.quality.image_clusters`); None without a solution.
+        """
         run, at = self.scaled, shared_positions(self.scaled.numbering)
         if not self.converged or len(at) > MOST_SHARED:
             return None
         return prediction_errors(run.numbering, run.end, self.cofactor.part(at), folds)
 
     def lens_reach(self, camera: Camera, frame_mm: tuple[float, float] | None = None) -> LensReach | None:
-        """How far out the lens of a camera is known; None without a solution or without targets.
+        """Determine how far out the lens of a camera is known; None without a solution or without targets.
 
         Parameters
         ----------
-        camera : of the network
-        frame_mm : width and height of the picture in mm, None where they are not known
+        camera : camera of the network
+        frame_mm : width and height of the image in mm, None where unknown
         """
         has_lens = self.converged and camera.name not in self.network.idle_cameras
         return lens_reach(self, camera, frame_mm) if has_lens else None
@@ -150,38 +161,38 @@ class Adjustment(Estimates, PlottedResult):
     def projection_uncertainty(
         self, camera: str = "", distance: float = np.inf, places_mm: Array | None = None
     ) -> ProjectionUncertainty:
-        """Standard deviations of the images of points that stand fixed in the scene.
+        """Compute standard deviations of the images of points fixed in the scene.
 
         Parameters
         ----------
-        camera : its name; may be left out where there is one
-        distance : of the points from the camera, in object units; by default they are infinitely far
-        places_mm : (..., 2) where they are seen, in the camera frame; by default a grid over the picture
+        camera : name; optional where there is one camera
+        distance : distance of the points from the camera in object units; default infinite
+        places_mm : (..., 2) image places in the camera frame; default a grid over the image
 
         Returns
         -------
         ProjectionUncertainty
-            See docs/method/reliability.md for what is taken out of it.
+            See docs/method/reliability.md for the effects that are removed.
 
         Raises
         ------
         AdjustmentError
-            Without a solution, for a camera that there is not, or one that shows no target.
+            Without a solution, for an unknown camera or for one without targets.
         """
         return projection_uncertainty(self, self.cluster_covariance_of, camera, distance, places_mm)
 
     def plots(self, camera: str = "", pixel_mm: float | None = None) -> CameraPlots:
-        """What the plots of a camera show.
+        """Collect the data for the plots of a camera.
 
         Parameters
         ----------
-        camera : its name; may be left out where there is one
+        camera : name; optional where there is one camera
         pixel_mm : side of a pixel of a digital camera; plots are then in px
 
         Raises
         ------
         AdjustmentError
-            Without a solution, or for a camera that there is not.
+            Without a solution, or for an unknown camera.
         """
         shown = only_camera(self, camera)
 
@@ -192,12 +203,12 @@ class Adjustment(Estimates, PlottedResult):
         return adjusted_camera_plots(self, shown, self.residuals.v_mm, uncertainty, pixel_mm)
 
     def to_pandas(self, table: Literal["parameters", "residuals"] = "parameters") -> Any:
-        """A table as pandas.DataFrame: one row a quantity, or one row an observation.
+        """Return a table as pandas.DataFrame: one row per quantity or per observation.
 
         Raises
         ------
         ImportError
-            Where pandas is not installed.
+            If pandas is not installed.
         """
         if table == "residuals":
             return data_frame(residual_columns(self.network.observations, self.residuals))
@@ -205,7 +216,7 @@ class Adjustment(Estimates, PlottedResult):
 
     @cached_property
     def suspects(self) -> tuple[Suspect, ...]:
-        """What contradicts the others, the worst first: beside what explains the residuals of all."""
+        """Suspected gross errors, worst first, after accounting for the explanations of all residuals."""
         if self.misread or not self._is_tested:
             return ()
         run, variance, tested = self._explanation_run.run, self.variance, self.reliability
@@ -216,19 +227,22 @@ class Adjustment(Estimates, PlottedResult):
 
     @cached_property
     def explanations(self) -> tuple[Explanation, ...]:
-        """Of a sigma0 that is too large; suspects are then those of an adjustment with them in the model."""
+        """Explanations of a large sigma0. The suspects are those of an adjustment that includes them in the model."""
         return () if self.misread else self._explanation_run.explanations
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
-        """What the user should look at; where slips kept it from a solution, all else there seems to be is theirs."""
+        """Warnings to the user.
+
+        Where coordinate blunders prevent a solution, the warnings on the run are dropped as consequences of these.
+        """
         left_out = (f"Left out of the adjustment: {reason}" for reason in self.left_out.values())
         own = () if self.slips and not self.converged else run_warnings(self.scaled, self.cofactor, self.residuals)
         return (*self.misread, *self.slips, *left_out, *self.remarks, *own)
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """What is worth knowing and needs no action."""
+        """Notes that need no action."""
         run = self.run
         found = inseparable(run.problem, run.end.state, self.cofactor.variances) if run.converged else ()
         return (*self.unused, *found)
@@ -248,7 +262,7 @@ class Adjustment(Estimates, PlottedResult):
         )
 
     def _repr_html_(self) -> str:
-        """The cameras' parameters, as a notebook shows them."""
+        """Table of the cameras' parameters for notebooks."""
         rows = "".join(
             f"<tr><td>{escape(each.label)}</td><td>{self.value(each):.7g}</td><td>{self.sigma(each):.2g}</td></tr>"
             for each in self.parameters
@@ -264,7 +278,7 @@ def is_fixed(problem: Problem, last: Run) -> bool:
 
 
 def _cofactor(problem: Problem, last: Run, members: Indices | None) -> Cofactor:
-    """The cofactor matrix in the datum of a run, or over the coordinates that carry inner constraints."""
+    """Compute the cofactor matrix in the datum of a run, or with inner constraints over the coordinates `members`."""
     state, factor = last.end.state, last.solution.factor
     if factor is None:
         return NoCofactor(len(problem.unknowns))
@@ -274,14 +288,14 @@ def _cofactor(problem: Problem, last: Run, members: Indices | None) -> Cofactor:
 
 
 def run_result(given: Problem, last: Run, members: Indices | None, probabilities: Probabilities) -> Adjustment:
-    """The result of the last run.
+    """Make the result of the last run.
 
     Parameters
     ----------
-    given : the problem before its datum was settled
-    last : the run, in that datum
-    members : positions of the coordinates that carry inner constraints, None without a free datum
-    probabilities : of the tests
+    given : problem before its datum was settled
+    last : run in that datum
+    members : positions of the coordinates with inner constraints, None without a free datum
+    probabilities : probabilities of the tests
     """
     problem = last.problem
     plain = _cofactor(given, last, members)
@@ -312,8 +326,10 @@ def run_result(given: Problem, last: Run, members: Indices | None, probabilities
 
 
 def _scaled_run(last: Run, variance: VarianceFactor) -> Run:
-    """The run with such standard deviations of the given values that sigma0 leaves out that sigma0 times the cofactors
-    leaves them as they were given."""
+    """Divide the standard deviations of the given values excluded from sigma0 by sigma0.
+
+    sigma0 times their cofactors then gives their standard deviations as given.
+    """
     if not len(variance.positions):
         return last
     unknowns = last.numbering.problem.unknowns
@@ -325,7 +341,7 @@ def _scaled_run(last: Run, variance: VarianceFactor) -> Run:
 
 
 def _meaningless(problem: Problem) -> Mask:
-    """The quantities (n,) that nothing is given of and that nothing tells, for no object point is seen."""
+    """(n,) mask of quantities without a given value that no observation determines, since no object point is seen."""
     network, unknowns = problem.network, problem.unknowns
     meaningless = np.zeros(len(unknowns), dtype=bool)
     for name in network.unoriented:
@@ -338,8 +354,7 @@ def _meaningless(problem: Problem) -> Mask:
 
 
 def _redundancy(run: Run, cofactor: Cofactor) -> int:
-    """Equations, without what the adjustment does without and with what pseudo-observations determine, less
-    unknowns."""
+    """Equations minus unknowns, without equations removed and with rank defects held by pseudo-observations."""
     problem = run.problem
     further = sum(len(each.observed) for each in problem.further)
     held = held_directions(problem, cofactor.variances) if problem.pseudo_observed else 0

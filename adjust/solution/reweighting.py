@@ -1,4 +1,4 @@
-"""Adjustments one after the other, until the residuals ask for no other weights."""
+"""Iterative reweighting: adjust repeatedly until the weights no longer change."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
@@ -22,15 +22,15 @@ from adjust.rank_defect.diagnosis import singular_directions
 from adjust.rank_defect.flat_valleys import REACHES, edge_motions, is_contradicted, unresolved
 from adjust.solution.options import Options
 
-ROUNDS = 30  # of robust estimation, of variance components or of data snooping at most
-ITERATIONS_A_ROUND = 8  # of the adjustments whose weights robust estimation is to change anyway
+ROUNDS = 30  # largest number of rounds of robust estimation, variance components or data snooping
+ITERATIONS_A_ROUND = 8  # iterations per round of robust estimation, whose weights will change anyway
 
 
 def run(problem: Problem, options: Options, doubted: Collection[int] = ()) -> Run:
-    """Adjust a problem, whose datum is settled, from where it starts.
+    """Adjust a problem, whose datum is settled, from its start.
 
-    doubted: quantities whose given values robust estimation and data snooping begin without; where these agree with
-    the rest they come back. Raises NoImageError where a point has no image there.
+    doubted: positions of quantities whose given values robust estimation and data snooping leave out at first; they
+    return where they agree with the rest. Raises NoImageError where a point has no image at the start.
     """
     units = TestedUnits(problem)
     alone = np.isin(units.positions[:, 0], list(doubted))
@@ -42,7 +42,7 @@ def run(problem: Problem, options: Options, doubted: Collection[int] = ()) -> Ru
     last = _run(problem, begun, problem.start(), options.iteration_limit)
     if not options.snooping:
         return _settle(last, options, doubted_units)
-    # Variance components come second: those of contaminated groups would hide what contaminates them.
+    # Variance components come second: those of contaminated groups would mask the outliers.
     if doubted_units and last.is_tested:
         tests = last.statistics
         removed = (GrossError(unit, float(tests.statistic[unit]), 0.0, tests.error[unit]) for unit in doubted_units)
@@ -54,10 +54,10 @@ def run(problem: Problem, options: Options, doubted: Collection[int] = ()) -> Ru
 
 
 def _settle(last: Run, options: Options, doubted: Sequence[int] = ()) -> Run:
-    """Adjust until the weights that robust estimation and variance components ask for are those that were used.
+    """Adjust until robust estimation and variance components no longer change the weights.
 
-    doubted: units that the redescending function is the first to weigh: the little that Huber's leaves an error of
-    many thousand sigma is enough to bend the network.
+    doubted: units that start with no weight until the redescending function takes over: the small weight that Huber's
+    function gives to an error of many thousand sigma would still distort the network.
     """
     limit = min(options.iteration_limit, ITERATIONS_A_ROUND) if options.robust else options.iteration_limit
     for function in options.weight_functions or (None,):
@@ -76,7 +76,7 @@ def _settle(last: Run, options: Options, doubted: Sequence[int] = ()) -> Run:
 
 
 def _reweight(last: Run, function: WeightFunction | None) -> Weighting:
-    """The weights that the residuals of a run ask for; its own where there is nothing to ask, or not to be trusted."""
+    """Compute the weights from the residuals of a run; unchanged where these are not usable."""
     if not (function or (last.weighting.factors and last.converged)) or not last.is_tested:
         return last.weighting
     weighting = refined_factors(last)
@@ -87,12 +87,12 @@ def _reweight(last: Run, function: WeightFunction | None) -> Weighting:
 
 
 def again(last: Run, weighting: Weighting, limit: int, state: State | None = None) -> Run:
-    """Adjust again with other weights, from where the last run ended or from another state."""
+    """Adjust again with other weights, from the end of the last run or from another state."""
     return replace(_run(last.problem, weighting, state or last.end.state, limit), removed=last.removed)
 
 
 def _snoop_rounds(last: Run, options: Options) -> Run:
-    """Adjust without what contradicts the others, until nothing does and what was taken out would do so again."""
+    """Remove outliers and adjust until none remains and every removed one would be rejected again."""
     earlier: set[frozenset[int]] = set()
     for _ in range(ROUNDS):
         if not last.is_tested:
@@ -115,8 +115,10 @@ def _snoop_rounds(last: Run, options: Options) -> Run:
 
 
 def _run(problem: Problem, weighting: Weighting, state: State, limit: int) -> Run:
-    """The run from a state; where the network is singular there and nowhere else, from where it ends with some of its
-    cameras' parameters held. As it is from the state where that, too, ends where the network is singular.
+    """Iterate from a state.
+
+    Where the network is singular at this state and only there, some parameters of the cameras are held first and then
+    released. The original run is returned where that ends singular, too.
     """
     last = _iterate(problem, weighting, state, limit)
     alike = [at for positions in _alike_at_zero(problem, state).values() for at in positions]
@@ -130,8 +132,9 @@ def _run(problem: Problem, weighting: Weighting, state: State, limit: int) -> Ru
 
 
 def _release_cameras(problem: Problem, weighting: Weighting, begun: Run, limit: int) -> Run:
-    """The run with all parameters free, from where one ended that held some; where the observations do not separate
-    distortion parameters, with pseudo-observations of these, as weak as they have to be.
+    """Release all parameters, starting from the end of a run that held some.
+
+    Where the observations do not separate distortion parameters, these get pseudo-observations, as weak as possible.
     """
     state, start = begun.end.state, _apart(problem, begun.end.state)
     at = _linearise(problem, weighting, state)
@@ -158,7 +161,7 @@ def _linearise(problem: Problem, weighting: Weighting, state: State) -> Linearis
 
 
 def _alike_at_zero(problem: Problem, state: State) -> dict[str, list[int]]:
-    """By camera, the free parameters of its distortion that are 0, where they do the same as others of the family."""
+    """Free distortion parameters by camera that are 0 and then have the derivatives of other parameters."""
     unknowns, found = problem.unknowns, {}
     for camera, positions in unknowns.camera.items():
         of = family(problem.network.camera_by_name[camera].distortion.family)
@@ -168,7 +171,7 @@ def _alike_at_zero(problem: Problem, state: State) -> dict[str, list[int]]:
 
 
 def _apart(problem: Problem, state: State) -> State:
-    """A state of nearly the same images in which no free parameters of a distortion do the same."""
+    """Return a state of nearly the same images in which the derivatives of the free distortion parameters differ."""
     values, unknowns = state.values.copy(), problem.unknowns
     for camera in (name for name, alike in _alike_at_zero(problem, state).items() if alike):
         at = unknowns.camera[camera][3:]
@@ -180,8 +183,8 @@ def _apart(problem: Problem, state: State) -> State:
 def _free_of_cameras(problem: Problem) -> list[int]:
     """All free parameters of cameras.
 
-    Approximations without known planimetry look straight down: from parallel axes heights never tell a principal
-    distance, but from those of tilted images they do.
+    Approximations without known planimetry look straight down: with parallel axes, heights never determine a principal
+    distance, but with the axes of tilted images they do.
     """
     unknowns = problem.unknowns
     return [int(at) for positions in unknowns.camera.values() for at in positions if np.isinf(unknowns.sigma[at])]

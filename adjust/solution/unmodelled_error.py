@@ -1,4 +1,4 @@
-"""What the model lacks, as a variance component: one standard deviation a camera, added to those of its marks."""
+"""Variance component of unmodelled errors: one standard deviation per camera, added to those of its marks."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -10,28 +10,30 @@ from adjust.array_types import Array
 from adjust.problem.network import Network
 from adjust.solution.result import Adjustment
 
-ROUNDS = 6  # residuals hardly change with weights that are nearly alike: two or three do
-FIRST = 1e-3  # of the frame's diagonal, to begin with: more than any lens leaves, less than a blunder does
-PLAUSIBLE = 3e-4  # of the frame's diagonal, up to which it may be lens, board and processing: 1.5 px of 5000 px
-SETTLED = 0.01  # relative change of a standard deviation that changes no weight noticeably
+ROUNDS = 6  # two or three suffice: nearly equal weights hardly change the residuals
+FIRST = 1e-3  # initial value, fraction of the frame's diagonal: above any lens misfit, below a blunder
+PLAUSIBLE = 3e-4  # fraction of the frame's diagonal that lens, board and processing may cause: 1.5 px of 5000 px
+SETTLED = 0.01  # relative change of a standard deviation that means convergence
 
 
 def adjust_unmodelled(network: Network, adjusted: Callable[[Network], Adjustment]) -> Adjustment:
-    """Adjust with the standard deviation of what is not modelled, estimated for each camera.
+    """Adjust with a standard deviation of unmodelled errors, estimated for each camera.
 
     It is added in quadrature to those of the camera's targets and tie points, such that their v'Pv equals their
     redundancy (Förstner's condition for a variance component, here an additive one). It is 0 where the given standard
-    deviations explain the residuals. The first adjustment allows FIRST of the frame, so that blunders of the whole
-    network are refused before any error is taken for unmodelled. An implausibly large one is a warning.
+    deviations explain the residuals. The first adjustment allows FIRST of the frame's diagonal, so that blunders of the
+    whole network are refused before an error is attributed to unmodelled effects. An implausibly large one is a
+    warning.
 
     Parameters
     ----------
-    network : marks with the standard deviations that the pictures say
+    network : marks with their standard deviations from image measurement
     adjusted : adjusts a network
 
     Returns
     -------
-    The adjustment with the added standard deviations, which stand in its `unmodelled_mm`.
+    Adjustment
+        The adjustment with the added standard deviations, stored in `unmodelled_mm`.
 
     Raises
     ------
@@ -61,21 +63,21 @@ def adjust_unmodelled(network: Network, adjusted: Callable[[Network], Adjustment
 
 
 def add_unmodelled(network: Network, sigma_mm: Mapping[str, float]) -> Network:
-    """The network whose targets and tie points have a standard deviation more, by their cameras."""
+    """Add a standard deviation by camera to the targets and tie points of a network."""
     added = np.array([sigma_mm.get(camera, 0.0) for camera in _cameras(network)]) ** 2
     covariance_mm2 = network.observations.covariance_mm2 + added[:, None, None] * np.eye(2)
     return replace(network, observations=replace(network.observations, covariance_mm2=covariance_mm2))
 
 
 def _cameras(network: Network) -> list[str]:
-    """The camera of every mark that shows the object; "" for marks of the camera itself."""
+    """Camera of every target and tie point; "" for other marks."""
     camera, observations = {image.name: image.camera for image in network.images}, network.observations
     shown = zip(observations.image, observations.kind, strict=True)
     return [camera[image] if kind in ("target", "tie") else "" for image, kind in shown]
 
 
 def _component_mm(result: Adjustment, before_mm: Mapping[str, float], camera: str) -> float:
-    """The standard deviation that makes v'Pv of a camera's marks their redundancy, as the residuals are."""
+    """Standard deviation with which v'Pv of a camera's marks equals their redundancy, for the current residuals."""
     rows = np.array(_cameras(result.network)) == camera
     if not rows.any():
         return 0.0
@@ -93,5 +95,5 @@ def _component_mm(result: Adjustment, before_mm: Mapping[str, float], camera: st
 
 
 def _upper(square: Array, redundancy: float) -> float:
-    """A variance with which v'Pv is below the redundancy."""
+    """Upper bound: a variance with which v'Pv is below the redundancy."""
     return 2.0 * float(square.sum()) / redundancy

@@ -1,4 +1,4 @@
-"""Warnings about a result: what its user should look at, and what to do."""
+"""Warnings about a result, each with its remedy."""
 
 from collections.abc import Iterator
 from itertools import combinations
@@ -19,13 +19,13 @@ from adjust.rank_defect.diagnosis import undetermined, weak_directions
 from adjust.rank_defect.scanner_directions import weak_term_sentences
 from adjust.solution.reweighting import ROUNDS
 
-GROSS = 20.0  # a-priori standard deviations from which on a residual can be that of another mark
-NEARER = 0.5  # of the distance of two marks that each may lie from where the other is expected
-UNCHECKED = 1e-6  # redundancy of all targets of an image that is none
+GROSS = 20.0  # in a-priori standard deviations: a larger residual may come from a confused mark
+NEARER = 0.5  # fraction of the distance of two marks: largest offset of one from the other's expected place
+UNCHECKED = 1e-6  # redundancy of all targets of an image below which its orientation is unchecked
 
 
 def run_warnings(run: Run, cofactor: Cofactor, residuals: Residuals) -> list[str]:
-    """Sentences on an adjustment: how it ended, what is weak, swapped numbers, images without a check."""
+    """Collect warnings on an adjustment: termination, weak parameters, swapped numbers, unchecked images."""
     problem, observations = run.problem, run.problem.network.observations
     unchecked = _unchecked_orientations(observations, residuals) if run.converged else []
     return [
@@ -79,7 +79,7 @@ def _weak_parameters(run: Run, cofactor: Cofactor) -> Iterator[str]:
 
 
 def _points_without_image(problem: Problem) -> list[str]:
-    """What is given and that no image shows."""
+    """Warn of given points without an image."""
     points = [point.id for point in problem.network.points if point.id not in problem.unknowns.point]
     if not points:
         return []
@@ -88,7 +88,7 @@ def _points_without_image(problem: Problem) -> list[str]:
 
 
 def _films_by_targets(problem: Problem) -> list[str]:
-    """Images whose film transformation takes more than their fiducial marks."""
+    """Warn of images with too few fiducial marks for their film transformation."""
     images = problem.network.images
     shown = np.bincount(problem.image_numbers[problem.is_fiducial], minlength=len(images))
     few = [i for i, image in enumerate(images) if shown[i] < marks_needed(image.transformation)]
@@ -103,16 +103,16 @@ def _films_by_targets(problem: Problem) -> list[str]:
 
 
 def _is_gross(observations: Observations, v_mm: Array) -> Mask:
-    """(n,) Whether residuals (n, 2) can be those of other marks."""
+    """(n,) mask of residuals (n, 2) large enough to come from confused marks."""
     sigma = np.sqrt(np.trace(observations.covariance_mm2, axis1=1, axis2=2) / 2)
     return np.asarray(np.linalg.norm(v_mm, axis=1) > GROSS * sigma)
 
 
 def _swapped_numbers(run: Run, residuals: Residuals) -> list[str]:
-    """Sentences on marks of which each lies where the other is expected, most others of the image not.
+    """Find pairs of marks that each lie where the other is expected, unless most marks of the image do.
 
-    By the residuals where the adjustment starts, whose orientations come of what most marks say: at its end it has bent
-    to fit the wrong ones too.
+    The residuals at the start of the adjustment are used, since those orientations follow the majority of the marks. At
+    the end the adjustment has been distorted to fit the wrong ones.
     """
     problem, observations = run.problem, run.problem.network.observations
     if run.converged and not _is_gross(observations, residuals.v_mm).any():
@@ -135,7 +135,7 @@ def _swapped_numbers(run: Run, residuals: Residuals) -> list[str]:
 
 
 def _unchecked_orientations(observations: Observations, residuals: Residuals) -> list[str]:
-    """Sentences on images whose orientation no redundant target checks."""
+    """Warn of images whose orientation no redundant target checks."""
     found = []
     for name, rows in _rows_by_image(observations).items():
         targets = rows[~observations.is_fiducial[rows]]
@@ -148,7 +148,7 @@ def _unchecked_orientations(observations: Observations, residuals: Residuals) ->
 
 
 def _rows_by_image(observations: Observations) -> dict[str, Indices]:
-    """The rows of every image, in their order; images in the order in which they come."""
+    """Group the rows by image, in order of first appearance."""
     number = {name: i for i, name in enumerate(dict.fromkeys(observations.image))}
     of = np.array([number[name] for name in observations.image], dtype=np.intp)
     rows = np.split(np.argsort(of, kind="stable"), np.cumsum(np.bincount(of))[:-1])
