@@ -1,1 +1,1 @@
-"""A folder of overlapping frames without any orientation, oriented by COLMAP and adjusted here."""
+"""Blocks of overlapping frames without known orientation: oriented by COLMAP and adjusted here."""

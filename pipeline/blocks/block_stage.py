@@ -1,8 +1,8 @@
-"""`reseau block`: a folder of overlapping frames without any orientation to an oriented, calibrated block.
+"""`reseau block`: orient and calibrate a block from a folder of overlapping frames without known orientation.
 
-Scans are resampled into their camera's frame; COLMAP finds features, matches and poses with the given camera; its poses
-come back as approximations and its tracks as observations in the scans; one adjustment takes them with the films, the
-fiducials, the lens and the control.
+Scans are resampled into the fiducial system of their camera. COLMAP extracts and matches features and estimates poses
+with the given camera. Its poses serve as initial values, its tracks as observations in the scans. One adjustment
+combines them with film deformations, fiducials, lens and control.
 """
 
 import time
@@ -29,13 +29,22 @@ from pipeline.text.csv_table import csv_line
 from pipeline.text.wording import counted
 from pipeline.types import Array
 
-MOST_PX = 3000  # along a frame's side, unless the user says a pitch
+MOST_PX = 3000  # pixels along the longer side of a frame, unless the user gives a pitch
 
 
 @dataclass(frozen=True)
 class OrientedBlock:
-    """project: with the block's own comparator.csv, images.csv and output; seconds: of every step; left_out: images
-    that COLMAP did not orient; ties, tracks: how many tie marks of how many points."""
+    """Result of the orientation of a block.
+
+    Attributes
+    ----------
+    project : project with the block's own comparator.csv, images.csv and output.
+    mapped : result of COLMAP.
+    pictures : images that COLMAP used.
+    seconds : duration of each step.
+    left_out : images that COLMAP did not orient.
+    ties, tracks : number of tie marks and of tie points.
+    """
 
     project: Project
     mapped: Mapped
@@ -47,12 +56,12 @@ class OrientedBlock:
 
 
 def run_block(project: Project, folder: Path, pitch_um: float | None, reporter: Reporter) -> OrientedBlock:
-    """All up to the adjustment, which is then run as of any project.
+    """Orient a block by COLMAP; its adjustment is then run as for any project.
 
-    Raises InputError where COLMAP is not installed, fiducials were not measured yet, COLMAP orients nothing, or control
-    is missing.
+    pitch_um: of the resampled frames; None: chosen. Raises InputError where COLMAP is not installed, fiducials are not
+    measured, COLMAP orients nothing, or control is missing.
     """
-    quiet_colmap()  # before the resampling, which takes far longer
+    quiet_colmap()  # fails before the resampling, which takes far longer
     if not project.comparator.exists():
         raise InputError(f"{project.comparator}: there is no such file. Run `reseau measure` first: films come by it.")
     marks = read_comparator(project.comparator, project.list_pitch_um)
@@ -80,8 +89,8 @@ def run_block(project: Project, folder: Path, pitch_um: float | None, reporter: 
 
 
 def coarse_pitch_um(project: Project) -> float | None:
-    """A pitch by which the frames have so many pixels that features come in minutes; None where that of the scans is
-    as coarse."""
+    """Pixel pitch that reduces the frames to MOST_PX, so that feature extraction takes minutes; None where the scans
+    are already that coarse."""
     pitches = read_pitches(project.comparator)
     sides = [max(camera.frame_mm) for camera in project.cameras.values() if camera.frame_mm is not None]
     enough = 1000.0 * max(sides, default=0.0) / MOST_PX
@@ -90,7 +99,7 @@ def coarse_pitch_um(project: Project) -> float | None:
 
 
 def block_lines(block: OrientedBlock) -> list[str]:
-    """What a user is told of it."""
+    """Lines for the user about a block."""
     lines = [
         f"COLMAP oriented {counted(len(block.mapped.poses), 'image')}; {counted(block.ties, 'tie mark')} of "
         f"{counted(block.tracks, 'point')} are observations now."
@@ -105,7 +114,7 @@ def written_block(
     marks: Sequence[ComparatorPoint],
     poses: dict[str, tuple[Array, Array]],
 ) -> Project:
-    """comparator.csv and images.csv of the block, and the project that is made of them."""
+    """Write comparator.csv and images.csv of a block, and return the project that uses them."""
     pitches, given = read_pitches(project.comparator), project.given_images or GivenImages({}, {})
     frames = {mark.image: project.scanned_frame(mark.image) or mark.image for mark in marks}
     kept = [mark for mark in marks if mark.kind != "target" or frames[mark.image] in poses]
@@ -145,7 +154,7 @@ def _problems(results: Sequence[Resampled]) -> str:
 
 
 class _Clock:
-    """The seconds of every step."""
+    """Duration of each step, s."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}

@@ -1,4 +1,4 @@
-"""COLMAP's own part: features, matches and incremental mapping of a block's pictures, with the given cameras."""
+"""Interface to COLMAP: features, matches and incremental mapping of a block's images, with the given cameras."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,16 +14,23 @@ from pipeline.files.camera_file import CameraFile
 from pipeline.resampling.canvas import Canvas
 from pipeline.types import Array
 
-FEATURES = 2000  # an image: a block needs hundreds of them in common
+FEATURES = 2000  # per image; a block needs hundreds of them in common
 SEED = 0
 _EXHAUSTIVE = 60  # images up to which every pair is matched
-_NEIGHBOURS = 12
+_NEIGHBOURS = 12  # neighbours in the sequence with which an image is matched in larger blocks
 
 
 @dataclass(frozen=True)
 class Sight:
-    """A point in an image: column and row of its feature, the first pixel's centre being (0, 0); size_px: that of the
-    feature, the standard deviation of the Gaussian that found it; off_px: how far the point's own projection lies."""
+    """Observation of a track in an image.
+
+    Attributes
+    ----------
+    image : name of the image.
+    col, row : of the feature; (0, 0) is the centre of the first pixel.
+    size_px : size of the feature: standard deviation of the Gaussian that detected it.
+    off_px : length of the reprojection error.
+    """
 
     image: str
     col: float
@@ -34,8 +41,14 @@ class Sight:
 
 @dataclass(frozen=True)
 class Mapped:
-    """What COLMAP found, in coordinates of its own: by image the rotation (3, 3) and translation (3,) to axes x right,
-    y down, z forward; by point its coordinates (3,) and its sights."""
+    """Result of COLMAP, in a coordinate system of its own.
+
+    Attributes
+    ----------
+    poses : by image, rotation (3, 3) and translation (3,) to axes x right, y down, z forward.
+    points : by point, coordinates (3,).
+    tracks : by point, its observations.
+    """
 
     poses: dict[str, tuple[Array, Array]]
     points: dict[int, Array]
@@ -43,7 +56,8 @@ class Mapped:
 
 
 def mapped(pictures: Sequence[BlockPicture], cameras: dict[str, CameraFile], folder: Path) -> Mapped:
-    """The largest part of the block that COLMAP orients. Raises InputError where it orients nothing."""
+    """Run COLMAP and return the largest part of the block that it orients. Raises InputError where it orients
+    nothing."""
     pycolmap = quiet_colmap()
     database = folder / "colmap.db"
     for left in folder.glob("colmap.db*"):
@@ -56,14 +70,14 @@ def mapped(pictures: Sequence[BlockPicture], cameras: dict[str, CameraFile], fol
 
 
 def quiet_colmap() -> Any:
-    """pycolmap, which then tells of errors only."""
+    """pycolmap, with only errors logged."""
     pycolmap = import_pycolmap("reseau block")
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     return pycolmap
 
 
 def _run_mapping(pictures: Sequence[BlockPicture], folder: Path) -> Mapped:
-    """From the matches in the database to poses and points, the cameras held."""
+    """Estimate poses and points from the matches in the database, with fixed cameras."""
     pycolmap = quiet_colmap()
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = SEED
@@ -81,7 +95,7 @@ def _run_mapping(pictures: Sequence[BlockPicture], folder: Path) -> Mapped:
 
 
 def read_model(model: Any, database: Any, pictures: Sequence[BlockPicture]) -> Mapped:
-    """What a reconstruction says, by the images' names here; the features' sizes stand in its database."""
+    """Content of a reconstruction, by the names of the images here; feature sizes are read from its database."""
     names = {picture.name: picture.image for picture in pictures}
     images = {number: model.images[number] for number in model.reg_image_ids()}
     poses = {}
@@ -104,7 +118,7 @@ def read_model(model: Any, database: Any, pictures: Sequence[BlockPicture]) -> M
 
 
 def _sizes_px(keypoints: Array) -> Array:
-    """(n,) of COLMAP's features (n, 6): x, y and the (2, 2) shape of each."""
+    """(n,) sizes of COLMAP's features (n, 6): x, y and the (2, 2) shape matrix of each."""
     return np.asarray(np.sqrt(np.abs(np.linalg.det(keypoints[:, 2:6].reshape(-1, 2, 2)))))
 
 
@@ -117,7 +131,7 @@ def _extract(pycolmap: Any, database: Path, folder: Path, pictures: Sequence[Blo
     reader.mask_path = str(folder / "masks")
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.sift.max_num_features = FEATURES
-    extraction.sift.first_octave = 0  # a scan is blurred: a picture of twice its size costs four times and adds nothing
+    extraction.sift.first_octave = 0  # scans are blurred: doubling the image takes four times as long and adds nothing
     pycolmap.extract_features(
         str(database),
         str(folder / "pictures"),
@@ -130,7 +144,7 @@ def _extract(pycolmap: Any, database: Path, folder: Path, pictures: Sequence[Blo
 
 
 def camera_params(camera: CameraFile, lattice: Canvas) -> list[float]:
-    """fx, fy, cx, cy, k1, k2, p1, p2 of COLMAP's OPENCV: the given principal distance and point, no distortion."""
+    """fx, fy, cx, cy, k1, k2, p1, p2 of COLMAP's OPENCV model: given principal distance and point, no distortion."""
     interior = given_interior(camera)
     focal = float(interior[0]) / lattice.pitch_mm
     center = lattice.pixel_from_camera(interior[1:]) + CONVENTION.first_pixel_px
@@ -138,7 +152,7 @@ def camera_params(camera: CameraFile, lattice: Canvas) -> list[float]:
 
 
 def given_interior(camera: CameraFile) -> Array:
-    """c, x0', y0' (3,) in mm. Raises InputError where the file does not give c."""
+    """c, x0', y0' (3,), mm. Raises InputError where the camera file does not give c."""
     if camera.principal_distance_mm is None:
         raise InputError(f"{camera.path}: principal_distance_mm is missing: COLMAP needs about the right one. Give it.")
     return np.array([camera.principal_distance_mm, *(camera.principal_point_mm or (0.0, 0.0))])

@@ -1,4 +1,4 @@
-"""The pictures that COLMAP matches: resampled frames of one lattice a camera, and masks of what moves with it."""
+"""Images for COLMAP: resampled frames on one pixel grid per camera, and masks of what is fixed to the camera."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -20,14 +20,14 @@ from pipeline.types import Array, Mask
 
 Picture = NDArray[np.uint8]
 
-_BORDER = 0.02  # of the frame's side: vignetting, the frame's edge
-_MARK = 0.03  # about a fiducial: it stands still in the camera, and would be matched with itself in every frame
-_DARKEST, _LIGHTEST = 0.5, 99.5  # percentiles that become black and white
+_BORDER = 0.02  # fraction of the frame's side: vignetting, edge of the frame
+_MARK = 0.03  # masked around fiducials, which would match themselves in every frame; fraction of the frame's side
+_DARKEST, _LIGHTEST = 0.5, 99.5  # percentiles that are mapped to black and white
 
 
 @dataclass(frozen=True)
 class BlockScan:
-    """A scan of a frame: its image's name, the way from the frame to it, and its size."""
+    """Scan of a frame: name of its image, transformation from the frame, and size."""
 
     image: str
     chain: FrameChain
@@ -35,7 +35,7 @@ class BlockScan:
     height_px: int
 
     def depths_px(self, pixels: Array) -> Array:
-        """How far (n,) pixels (n, 2) lie within its edges."""
+        """(n,) distances of pixels (n, 2) from the nearest edge of the scan, px; negative outside."""
         col, row = pixels.T
         edges = [col + 0.5, self.width_px - 0.5 - col, row + 0.5, self.height_px - 0.5 - row]
         return np.asarray(np.min(edges, axis=0))
@@ -43,8 +43,15 @@ class BlockScan:
 
 @dataclass(frozen=True)
 class BlockPicture:
-    """One frame: its file's name, in its camera's folder; lattice: the pixels of its camera's pictures; its scan, or
-    several that show parts."""
+    """Image of one frame.
+
+    Attributes
+    ----------
+    image, camera : names.
+    name : file, in its camera's folder.
+    lattice : pixel grid of its camera's images.
+    scans : scan of the frame, or several of its parts.
+    """
 
     image: str
     camera: str
@@ -53,15 +60,16 @@ class BlockPicture:
     scans: tuple[BlockScan, ...]
 
     def scan_place(self, camera_mm: Array) -> tuple[BlockScan, Array] | None:
-        """The scan that shows a place (2,) of the camera frame farthest from its edges, and the pixel (2,) there; None
-        where none can have it."""
+        """Scan in which a place (2,) of the camera frame is farthest from the edges, and its pixel (2,); None where no
+        transformation succeeds."""
         candidates = [(scan, scan.chain.scan_from_frame(camera_mm[None])) for scan in self.scans]
         places = [(scan, pixels[0]) for scan, (pixels, found) in candidates if found[0]]
         return max(places, key=lambda place: place[0].depths_px(place[1][None])[0], default=None)
 
 
 def camera_lattice(camera: CameraFile, pitch_mm: float) -> Canvas:
-    """The exposed frame at whole multiples of the pitch. Raises InputError where its size is not known."""
+    """Pixel grid of the exposed frame, at integer multiples of the pitch. Raises InputError where the frame's size is
+    unknown."""
     if camera.frame_mm is None or not camera.fiducials:
         raise InputError(
             f"{camera.path}: frame_mm and fiducials are needed to make pictures of one lattice. Give them."
@@ -73,7 +81,7 @@ def camera_lattice(camera: CameraFile, pitch_mm: float) -> Canvas:
 def write_pictures(
     tasks: Sequence[ResampleTask], cameras: Mapping[str, CameraFile], folder: Path
 ) -> tuple[BlockPicture, ...]:
-    """The frames of the tasks as pictures of 8 bits below folder/pictures, their masks below folder/masks."""
+    """Write frames as 8-bit images below folder/pictures, and their masks below folder/masks."""
     made = []
     for task in tasks:
         camera = cameras[task.camera]
@@ -101,7 +109,7 @@ def _scans(task: ResampleTask) -> tuple[BlockScan, ...]:
 
 
 def _cut(path: Path, lattice: Canvas) -> tuple[Array, Mask]:
-    """A resampled frame's part within the lattice in grey, and which of it the scan has."""
+    """Grey values of a resampled frame on the grid, and the mask of valid pixels."""
     with tifffile.TiffFile(path) as file:
         description = json.loads(file.pages.first.description)
         pixels, inside = file.pages[0].asarray(), file.pages[1].asarray().astype(bool)
@@ -118,7 +126,7 @@ def _cut(path: Path, lattice: Canvas) -> tuple[Array, Mask]:
 
 
 def _usable(camera: CameraFile, lattice: Canvas) -> Mask:
-    """The frame within its border, its fiducials left out."""
+    """Mask of the frame without its border and the fiducials."""
     assert camera.frame_mm is not None
     x = lattice.x_mm + lattice.pitch_mm * np.arange(lattice.width_px)
     y = lattice.y_mm - lattice.pitch_mm * np.arange(lattice.height_px)

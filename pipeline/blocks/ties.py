@@ -1,4 +1,4 @@
-"""COLMAP's tracks as tie marks of the scans, and its poses in the frame of the control."""
+"""Convert COLMAP's tracks to tie marks in the scans, and its poses to the control system."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -16,17 +16,18 @@ from pipeline.exchange.pinhole import Y_DOWN_Z_FORWARD
 from pipeline.results.comparator_file import ComparatorPoint, comparator_from_pixel
 from pipeline.types import Array
 
-CELLS = 8  # a side of an image: ties are spread over these
-A_CELL = 3  # ties that are taken of one, the longest tracks first
+CELLS = 8  # per side of an image, over which ties are spread
+A_CELL = 3  # ties taken per cell, the longest tracks first
 FEWEST_CONTROL = 3
-_CONSISTENT = 3.0  # standard deviations that the sights of a track may lie off, rms
+_CONSISTENT = 3.0  # largest rms reprojection error of a track, in standard deviations
 _FEWEST_SIGHTS = 3
 _ROUNDS = 5
 
 
 @dataclass(frozen=True)
 class FeaturePrecision:
-    """The variance of a feature's coordinate is grain^2 + (share * size)^2: a large one is found less exactly."""
+    """Precision of a feature's coordinate: variance grain² + (share · size)², since larger features are less
+    precise."""
 
     grain_px: float
     share: float
@@ -40,8 +41,7 @@ class FeaturePrecision:
 
 
 def tie_marks(mapped: Mapped, pictures: Sequence[BlockPicture]) -> tuple[ComparatorPoint, ...]:
-    """The tracks that are taken, back in the scans that they were seen in, with the standard deviations that features
-    of their sizes show among themselves."""
+    """Tie marks of the selected tracks in the scans, with standard deviations estimated by feature size."""
     by_image = {picture.image: picture for picture in pictures}
     precision = feature_precision(mapped)
     marks = []
@@ -59,11 +59,11 @@ def tie_marks(mapped: Mapped, pictures: Sequence[BlockPicture]) -> tuple[Compara
 
 
 def feature_precision(mapped: Mapped) -> FeaturePrecision:
-    """How exactly features are found, from how far the sights of tracks that are seen thrice or more lie off: of 2 n
-    coordinates three degrees of freedom went into the point.
+    """Estimate the precision of features from the reprojection errors of tracks with three or more observations.
 
-    It begins with the median of all, which of chi-square with two degrees of freedom is 2 ln 2; then the squares of
-    consistent tracks are fitted, each weighted by its expectation. Raises InputError where no track is seen thrice.
+    Of the 2n coordinates of a track, three degrees of freedom determine the point. The initial value is the median of
+    all squares (that of chi-square with two degrees of freedom is 2 ln 2). Then the squares of consistent tracks are
+    fitted, each weighted by its expectation. Raises InputError where no track has three observations.
     """
     tracks = [track for track in mapped.tracks.values() if len(track) >= _FEWEST_SIGHTS]
     if not tracks:
@@ -83,15 +83,15 @@ def feature_precision(mapped: Mapped) -> FeaturePrecision:
 
 
 def _squares_px2(track: Sequence[Sight]) -> Array:
-    """(n,) by how far its sights lie off, the mean square of a coordinate."""
+    """(n,) mean squared reprojection error of a coordinate, px²."""
     return np.array([sight.off_px**2 / 2.0 for sight in track])
 
 
 def _design(track: Sequence[Sight]) -> Array:
-    """(n, 2) what these are expected to be, as parts of grain^2 and share^2.
+    """(n, 2) design matrix: coefficients of grain² and share² in the expectation of these squares.
 
-    With a share f of the coordinates' freedom left, a residual's variance is f^2 of the sight's own and f (1 - f) of
-    the mean of all, as of a projection in any direction: which one it is the sights' geometry alone would say.
+    With the redundancy f of a coordinate, the variance of a residual is f² times the observation's own plus f (1 - f)
+    times the mean of all, as for a projection in a random direction: the actual one depends on the geometry.
     """
     free = (2 * len(track) - 3) / (2 * len(track))
     squares = np.array([sight.size_px**2 for sight in track])
@@ -99,7 +99,7 @@ def _design(track: Sequence[Sight]) -> Array:
 
 
 def chosen_tracks(mapped: Mapped, pictures: Mapping[str, BlockPicture], precision: FeaturePrecision) -> list[int]:
-    """Of every part of every image the longest tracks, the most precise first, as far as they agree with themselves."""
+    """Select consistent tracks for each cell of each image: the longest ones, among these the most precise."""
     usable = [
         number
         for number, track in mapped.tracks.items()
@@ -130,10 +130,21 @@ def oriented_by_control(
     points: Mapping[str, ObjectPoint],
     camera_rays: Mapping[str, Array],
 ) -> dict[str, tuple[Array, Array]]:
-    """By image: rotation (3, 3) to axes x right, y up, looking along -z, and station (3,), in the frame of the control.
+    """Transform COLMAP's poses into the control system.
 
-    camera_rays: by image the principal distance and point (3,) by which COLMAP saw it, mm. Raises InputError where
-    fewer than three control points are seen by two oriented images each.
+    Parameters
+    ----------
+    marks, points : marks in the scans, and the object points.
+    camera_rays : by image, the principal distance and point (3,) that COLMAP used, mm.
+
+    Returns
+    -------
+    By image, rotation (3, 3) to axes x right, y up, looking along -z, and projection centre (3,).
+
+    Raises
+    ------
+    InputError
+        Fewer than three control points are observed in two oriented images each.
     """
     places: dict[str, dict[str, Array]] = defaultdict(dict)
     scans = {scan.image: (picture.image, scan) for picture in pictures for scan in picture.scans}
@@ -163,14 +174,14 @@ def oriented_by_control(
 
 
 def _camera_mm(mark: ComparatorPoint, scan: BlockScan) -> Array:
-    """Where a mark (2,) is in the camera's frame."""
+    """(2,) place of a mark in the camera frame, mm."""
     assert mark.xy_mm is not None
     straight = scan.chain.bend.apply(scan.chain.bend_parameters, mark.xy_mm[None])
     return np.asarray(scan.chain.film.camera_from_comparator(straight)[0])
 
 
 def _intersection(mapped: Mapped, places: Mapping[str, Array], camera_rays: Mapping[str, Array]) -> Array:
-    """The point (3,) nearest to the rays of its places in the camera, by image, in COLMAP's coordinates."""
+    """Intersect the rays of a point observed in several images: the nearest point (3,), in COLMAP's coordinates."""
     normal, right = np.zeros((3, 3)), np.zeros(3)
     for image, place in places.items():
         c, x0, y0 = camera_rays[image]
@@ -184,9 +195,10 @@ def _intersection(mapped: Mapped, places: Mapping[str, Array], camera_rays: Mapp
 
 
 def similarity(start: Array, end: Array) -> tuple[float, Array, Array]:
-    """Scale, rotation (3, 3) and shift (3,) from points (n, 3) to points (n, 3), by least squares.
+    """Scale, rotation (3, 3) and shift (3,) of the least-squares similarity between points (n, 3).
 
-    S. Umeyama, Least-squares estimation of transformation parameters between two point patterns, PAMI 13 (1991).
+    Source: S. Umeyama, Least-squares estimation of transformation parameters between two point patterns, PAMI 13
+    (1991).
     """
     a, b = start - start.mean(axis=0), end - end.mean(axis=0)
     u, d, vt = np.linalg.svd(b.T @ a)

@@ -1,1 +1,1 @@
-"""From what each result was made, and how the results of a command take the places of earlier ones together."""
+"""Provenance of results, and joint replacement of earlier results by those of a command."""

@@ -1,4 +1,4 @@
-"""What a result was made from, as fingerprints by name: a later stage compares them with what there is now."""
+"""Provenance of results: fingerprints of their inputs by name, which a later stage compares with the present inputs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -13,13 +13,13 @@ from pipeline.results.comparator_file import ComparatorPoint
 
 MadeFrom = dict[str, str]
 
-# The names of the parts are words of messages: "is of other ... than there are now".
+# The names are used in messages: "is of other ... than there are now".
 CAMERAS, SETTINGS, SCAN, CAMERA = "cameras", "settings", "scan ", "camera "
 MARKS, POINTS, IMAGES, DISTANCES = "marks", "points", "images", "distances"
 DECISIONS = "decisions"
 PLACES = "points, orientations or lenses"
 
-# Of a project; all else of it is a setting, and so is what may be added.
+# Fields of a project that are not settings; all others, including future ones, are.
 _FILES = {
     "path",
     "cameras",
@@ -34,7 +34,7 @@ _FILES = {
     "decisions_cut_short",
 }
 _NO_MATTER = {"max_pixels", "crs"}
-# Of a camera: what tells where its targets are, but not what its marks are.
+# Fields of a camera that determine where its targets are expected, not what its marks look like.
 _LENS = {
     "principal_distance_mm", "principal_point_mm", "principal_distance_sigma_mm", "principal_point_sigma_mm",
     "distortion", "calibration",
@@ -43,8 +43,8 @@ _ORIGIN = {"path", "source"}
 
 
 def measured_from(project: Project) -> MadeFrom:
-    """Of a measurement: every scan, what is sought in it, and what tells where to look. The last changes no mark that
-    was measured, but which are found, and what they are named."""
+    """Inputs of a measurement: every scan, what is sought in it, and the approximate values used to predict targets.
+    The latter do not change a measured mark, but determine which ones are found and how they are named."""
     known, files = known_identities(project.measurement_path), FileStates(project.path.resolve().parent)
     coordinates = {id: [prior and prior.value for prior in (p.X, p.Y, p.Z)] for id, p in project.object_points.items()}
     places = [
@@ -70,7 +70,7 @@ def measured_from(project: Project) -> MadeFrom:
 
 
 def adjusted_from(project: Project, marks: Sequence[ComparatorPoint]) -> MadeFrom:
-    """Of an adjustment: the marks that are observations, all that is given with them, and the settings."""
+    """Inputs of an adjustment: the marks that are observations, the given values, and the settings."""
     observations = sorted(
         (mark.image, mark.kind, mark.point, *_numbers(mark)) for mark in marks if mark.status.is_observation
     )
@@ -86,8 +86,8 @@ def adjusted_from(project: Project, marks: Sequence[ComparatorPoint]) -> MadeFro
 
 
 def _parts(path: Path, project: Project, known: Mapping[str, Identity], files: FileStates) -> tuple[int, str]:
-    """Of a scan's file its size and what its telling parts hold: read only where it is not as the store knows it. A
-    file that was touched, or stands elsewhere, is the same."""
+    """Size of a scan's file and hash of its parts. The file is read only where its state differs from that in the
+    store; touching or moving it changes nothing."""
     state = files.get(path)
     found = known.get(state.uri)
     is_known = found is not None and found.state == state
@@ -95,12 +95,12 @@ def _parts(path: Path, project: Project, known: Mapping[str, Identity], files: F
 
 
 def differing(made: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
-    """The names of the parts that are not the same in both, or only in one of them."""
+    """Names of the inputs that differ, or exist only in one of the two."""
     return sorted(name for name in made.keys() | now.keys() if made.get(name) != now.get(name))
 
 
 def _numbers(mark: ComparatorPoint) -> tuple[Any, ...]:
-    assert mark.xy_mm is not None  # an observation has a place
+    assert mark.xy_mm is not None  # an observation has coordinates
     return (*mark.xy_mm.tolist(), *(() if mark.sigma_mm is None else mark.sigma_mm.tolist()), mark.rho)
 
 

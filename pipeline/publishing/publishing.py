@@ -1,4 +1,4 @@
-"""Results of one command that take the places of earlier ones together, when all are complete, or not at all."""
+"""Publish the results of a command together: they replace earlier ones when all are complete, or not at all."""
 
 import os
 import re
@@ -30,7 +30,7 @@ _COMPARATOR = rb'(\xef\xbb\xbf)?"?# comparator coordinates, reseau'
 
 
 class Unpublished:
-    """Files of a command that are not yet where they belong: in a folder of their own beside the earlier results."""
+    """Results of a command that are not yet published, in a temporary folder beside the earlier results."""
 
     def __init__(self, project: Project) -> None:
         self._project = project
@@ -38,22 +38,23 @@ class Unpublished:
         self._removed: list[Path] = []
 
     def place(self, path: Path) -> Path:
-        """Where a result is to be written that belongs to `path`."""
+        """Temporary path of the result that will be published at `path`."""
         if path == self._project.comparator:
             return path.with_name(f".{path.stem}{self.folder.name}{path.suffix}")
         return self.folder / path.relative_to(self._project.output)
 
     def current_path(self, path: Path) -> Path:
-        """Where the result of `path` stands now, if there is one: not yet published, or an earlier one."""
+        """Present path of the result of `path`: the unpublished one, if there is one, else the earlier one."""
         place = self.place(path)
         return place if place.exists() or path in self._removed else path
 
     def remove(self, path: Path) -> None:
-        """An earlier result of which nothing is true any more."""
+        """Mark an earlier result that is no longer valid, to be deleted on publication."""
         self._removed.append(path)
 
     def publish(self) -> None:
-        """Every file to where it belongs. Raises WriteError where that cannot be, before anything was changed."""
+        """Move all files to their final places. Raises WriteError; checks that fail do so before anything is
+        changed."""
         comparator = self._project.comparator
         files = {self.place(comparator): comparator} if self.place(comparator).exists() else {}
         for file in sorted(self.folder.rglob("*")):
@@ -76,12 +77,12 @@ class Unpublished:
                 raise WriteError(f"{error} New are: {', '.join(done) or 'none'}. Run it again.") from error
 
     def spoken(self, text: str) -> str:
-        """A message with the places where results are to stand, in place of those where they stand before."""
+        """Message with final instead of temporary paths."""
         comparator = self._project.comparator
         return text.replace(str(self.place(comparator)), str(comparator)).replace(f"{self.folder.name}{os.sep}", "")
 
     def discard(self) -> None:
-        """What was not published, and what processes left that were ended before they could."""
+        """Delete everything that was not published."""
         shutil.rmtree(self.folder, ignore_errors=True)
         with suppress(OSError):
             self.place(self._project.comparator).unlink(missing_ok=True)
@@ -89,9 +90,9 @@ class Unpublished:
 
 @contextmanager
 def unpublished(project: Project) -> Iterator[Unpublished]:
-    """For the results of one command. What is not published when the block ends is gone.
+    """Context for the results of one command; results that are not published when the block ends are deleted.
 
-    Raises InputError where they could not be written, before any work is done for them.
+    Raises InputError where they could not be written, before any work is done.
     """
     for path in project.results:
         check_replaceable(project, path)
@@ -113,7 +114,7 @@ def unpublished(project: Project) -> Iterator[Unpublished]:
 
 @contextmanager
 def _undisturbed() -> Iterator[None]:
-    """An interrupt waits until the block ends: it is short, and half of it would be worse than either end."""
+    """Defer interrupts until the short block ends, so that results are not published by halves."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -132,7 +133,7 @@ def _undisturbed() -> Iterator[None]:
 
 
 def check_replaceable(project: Project, path: Path) -> None:
-    """Raises InputError for a path where something stands that is no result of this kind: a device, somebody's file."""
+    """Raise InputError for a path where something exists that is not a result of this kind: a device, a user's file."""
     if path.is_dir() or (path.exists() and not path.is_file()):
         raise InputError(f"{path}: a result is to be written there, but it is no regular file. Name another place.")
     if not path.exists():
@@ -148,7 +149,7 @@ def check_replaceable(project: Project, path: Path) -> None:
 
 
 def outside_note(project: Project) -> str:
-    """Which folders outside that of the project are written to; "" where none is."""
+    """Note on folders outside the project's that are written to; "" where there are none."""
     home = project.path.resolve().parent
     folders = {project.output.resolve(), *({project.comparator.resolve().parent} if project.scans else ())}
     outside = sorted(str(folder) for folder in folders if not folder.is_relative_to(home))
@@ -156,7 +157,7 @@ def outside_note(project: Project) -> str:
 
 
 def _clear(project: Project) -> None:
-    """Away with what a process left that was ended before it could do that itself."""
+    """Delete temporary results of processes that ended before they could do so."""
     pattern = re.compile(rf".*\.unfinished\.{re.escape(socket.gethostname())}\.(\d+)(\..*)?")
     for folder in {project.output, project.comparator.parent}:
         for path in folder.glob(".*unfinished.*") if folder.is_dir() else ():
@@ -170,7 +171,7 @@ def _clear(project: Project) -> None:
 
 
 def _is_alive(pid: int) -> bool:
-    if os.name != "posix":  # elsewhere signal 0 does not ask, it ends
+    if os.name != "posix":  # on other systems signal 0 would end the process
         return True
     try:
         os.kill(pid, 0)
