@@ -1,7 +1,7 @@
-"""A folder of scans in, everything out: the only package that knows the other three.
+"""From a folder of scans to all results: the only package that depends on the other three.
 
-The names below read and write the files that docs/how-to/python.md works with. They are loaded when first used.
-docs/code.md lists the modules stage by stage.
+The names below read and write the files described in docs/how-to/python.md. They are loaded on first use. docs/code.md
+lists the modules stage by stage.
 """
 
 import lazy_loader

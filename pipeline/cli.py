@@ -1,4 +1,4 @@
-"""The command line: arguments in, exit codes and one clear message out."""
+"""Command line: parses arguments, returns exit codes, prints one clear message."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor
@@ -16,8 +16,8 @@ from pipeline.terminal import plain, spell_out_missing_letters
 
 __all__ = ["DONE", "INTERNAL_ERROR", "INTERRUPTED", "LOOK", "WRONG_INPUT", "app", "run"]
 
-LONGEST_LINE = 2000  # of a message: what a file has of any length may stand in it
-GROUPS: dict[str, dict[str, Callable[..., int]]] = {  # by what they are for, as the help lists them
+LONGEST_LINE = 2000  # characters of a message, which may contain text of any length from a file
+GROUPS: dict[str, dict[str, Callable[..., int]]] = {  # by purpose, as listed in the help
     "Measure": {
         "run": measuring.run,
         "measure": measuring.measure,
@@ -45,7 +45,7 @@ GROUPS: dict[str, dict[str, Callable[..., int]]] = {  # by what they are for, as
 
 
 class GroupedCommands(TyperGroup):
-    """Lists the commands of the help by what they are for."""
+    """Lists the commands in the help by purpose."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         for title, commands in GROUPS.items():
@@ -65,15 +65,15 @@ for group in GROUPS.values():
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit code: 0 done, 1 look at something, 2 wrong input, 3 a fault of ours,
-    130 interrupted, as shells count it.
+    """Run one command and return its exit code.
 
-    arguments: what follows the program's name; by default what it was called with.
+    0: done; 1: something needs a look; 2: wrong input; 3: internal error; 130: interrupted (as in shells). arguments:
+    default those of the process, without the program's name.
     """
     spell_out_missing_letters()
     try:
         code = app(args=arguments, standalone_mode=False)
-        if code == INTERRUPTED:  # what typer makes of it
+        if code == INTERRUPTED:  # typer's code for an interrupt
             message = "interrupted; files that were complete stay as they are, and scans that were measured are kept"
             return _message(message, INTERRUPTED)
         return code if isinstance(code, int) else DONE

@@ -1,4 +1,4 @@
-"""The demonstration: a small scan folder rendered with its truth, and the whole chain run on it."""
+"""Demonstration: render a small folder of scans with known truth, and run all stages on it."""
 
 from importlib import resources
 from pathlib import Path
@@ -14,7 +14,8 @@ SCENE = ("scenes", "demo.toml")
 
 
 def run_demo(folder: Path, reporter: Reporter) -> Summary:
-    """Render and run. Raises InputError for a folder that holds something else: nothing of it is overwritten."""
+    """Render the demonstration into a folder and run it. Raises InputError for a folder with other content, which is
+    never overwritten."""
     if folder.exists() and (not folder.is_dir() or (any(folder.iterdir()) and not (folder / TRUTH).exists())):
         raise InputError(f"{folder}: holds something that is no demonstration. Name another folder: reseau demo DIR")
     scene = resources.as_file(resources.files("synthetic_images").joinpath(*SCENE))

@@ -1,4 +1,4 @@
-"""What the user's files and arguments can get wrong, and what helps where the machine refuses."""
+"""Errors in the user's files and arguments, and remedies for errors of the operating system."""
 
 import errno
 import sqlite3
@@ -19,25 +19,25 @@ _OF_STORE = {
 
 
 class InputError(Exception):
-    """A file or an argument is not as it should be: the message says what, where, what would be right, what to do."""
+    """Error in a file or an argument; the message states what is wrong, where, and the remedy."""
 
 
 class WriteError(InputError):
-    """A file cannot be written: what stood there is as it was."""
+    """A file cannot be written; its earlier content is unchanged."""
 
 
 def missing_extra(user: str, packages: str, extra: str) -> InputError:
-    """What a command or option answers where the packages that it needs are not installed."""
+    """Error for a command or option whose packages are not installed."""
     return InputError(
         f"{user} needs {packages}, which this installation lacks. Install: pip install 'reseau[{extra}]'."
     )
 
 
 def what_to_do(error: OSError) -> str:
-    """The next step after what the operating system refused."""
+    """Remedy for an error of the operating system."""
     return _ADVICE.get(error.errno or 0, "Check the path, and that the drive is there.")
 
 
 def what_to_do_about_store(error: BaseException) -> str:
-    """The next step after what the operating system refused to SQLite; empty where it was something else."""
+    """Remedy for an operating-system error within SQLite; "" for other errors."""
     return _OF_STORE.get(getattr(error, "sqlite_errorcode", 0) & 0xFF, "")

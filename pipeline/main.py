@@ -1,4 +1,4 @@
-"""The command `reseau`."""
+"""Entry point of the command `reseau`."""
 
 import gc
 import importlib
@@ -7,20 +7,22 @@ import signal
 import sys
 
 _INTERRUPTED = 130
-_OBJECTS = 10_000  # made between searches for cycles: most of an archive's live to the end, and each search sees them
+_OBJECTS = (  # allocations per garbage collection: each one rescans an archive's many long-lived objects
+    10_000  # allocations between garbage collections, which rescan an archive's many long-lived objects each time
+)
 
 
 def main() -> None:
-    """Run the command line. One BLAS thread: two on two cores made the adjustment several times slower.
+    """Run the command line with one BLAS thread: two threads on two cores slowed the adjustment several times.
 
-    The variables must be set before numpy is imported, and so before the command line is.
+    The variables must be set before numpy is imported, hence before the command line is.
     """
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     gc.set_threshold(_OBJECTS)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as an interrupt does, worker processes with it
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as on an interrupt, so that worker processes end, too
     try:
         importlib.import_module("pipeline.terminal").outlive_readers()
         sys.exit(importlib.import_module("pipeline.cli").run())
-    except KeyboardInterrupt:  # while the modules are imported: later the command line answers for it
+    except KeyboardInterrupt:  # during the import of modules; later the command line handles it
         sys.exit(_INTERRUPTED)

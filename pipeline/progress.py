@@ -1,4 +1,4 @@
-"""How long work shows itself: one line with a bar on a terminal, a plain line now and then elsewhere, on stderr."""
+"""Progress display on stderr: a line with a bar on a terminal, occasional plain lines elsewhere."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -10,22 +10,22 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 from pipeline.terminal import PlainConsole
 
-_EVERY_S = 20.0  # between two plain lines of a stage
+_EVERY_S = 20.0  # between plain lines of a stage
 _HOUR_S, _MINUTE_S = 3600.0, 60.0
 
 
-Count = Callable[[str, int, int], None]  # of the thing in hand, the steps done and their total
+Count = Callable[[str, int, int], None]  # current item, steps done, total
 
 
 class TimedCount(Protocol):
-    """A `Count` that may be told how long the rest takes."""
+    """`Count` with an optional remaining time."""
 
     def __call__(self, what: str, done: int, total: int, /, left_s: float | None = None) -> None:
-        """left_s: what the rest takes; None: at the pace so far."""
+        """left_s: remaining time, s; None: extrapolated from the time so far."""
 
 
 def time_left(seconds: float) -> str:
-    """In minutes."""
+    """Remaining time in words."""
     minutes = round(seconds / _MINUTE_S)
     if seconds >= 2 * _HOUR_S:
         return f"about {seconds / _HOUR_S:.1f} hours left"
@@ -33,14 +33,14 @@ def time_left(seconds: float) -> str:
 
 
 class Reporter:
-    """Where the stages say how far they are. quiet: nowhere."""
+    """Progress display of the stages. quiet: none."""
 
     def __init__(self, console: Console | None = None, quiet: bool = False) -> None:
         self._console = console or PlainConsole(stderr=True, soft_wrap=True, quiet=quiet)
 
     @contextmanager
     def stage(self, title: str) -> Iterator[TimedCount]:
-        """A stage, which calls what it yields."""
+        """Begin a stage; the yielded function reports its progress."""
         started_s = time.monotonic()
 
         def line(what: str, done: int, total: int, left_s: float | None) -> str:
@@ -64,11 +64,11 @@ class Reporter:
             yield self._lines(line)
 
     def say(self, text: str) -> None:
-        """A line that stays, above the bar where there is one."""
+        """Print a permanent line, above the bar if there is one."""
         self._console.print(text, markup=False, highlight=False)
 
     def _lines(self, line: Callable[[str, int, int, float | None], str]) -> TimedCount:
-        """The first line, the last one, and those between at intervals."""
+        """Report the first and the last step, and others at intervals."""
         shown_s = -_EVERY_S
 
         def show(what: str, done: int, total: int, /, left_s: float | None = None) -> None:

@@ -1,4 +1,4 @@
-"""Provenance: fingerprints of values, files and scans, the states of files, and the keys of results."""
+"""Provenance: fingerprints of values, files and scans, states of files, and keys of results."""
 
 import hashlib
 import json
@@ -19,9 +19,9 @@ from measure.scans.remote import Address, tiff_file, whole_file
 from measure.scans.scan import Scan
 from pipeline.text.text_file import read_bytes
 
-_PLAIN = {str, int, bool, type(None)}  # most values by far
-NO_FINGERPRINT = {"fingerprint": False}  # metadata of a field that tells nothing of a value
-_PIECES, _PIECE = 8, 32768  # of a scan, spread evenly from its first byte to its last
+_PLAIN = {str, int, bool, type(None)}  # types of most values, tested first
+NO_FINGERPRINT = {"fingerprint": False}  # metadata of a field that is not part of a value's fingerprint
+_PIECES, _PIECE = 8, 32768  # number and bytes of pieces of a file, spread evenly from its first byte to its last
 _HEAD_BYTES = 1 << 16
 _MIDDLE_PX = 256
 _PIECE_BYTES = 1 << 20
@@ -33,27 +33,27 @@ def fingerprint(value: object) -> str:
 
 
 def canonical_json(value: object) -> str:
-    """Such a value as JSON: equal values give equal text, and any other value gives another.
+    """Canonical JSON of such a value: equal values give equal text, different values different text.
 
-    The order of a mapping does not count, nor where a file stands: a project may be moved, and its files rewritten. Nor
-    do fields of dataclasses that are NO_FINGERPRINT by their metadata.
-    Arrays are told by their form and the SHA-256 of their numbers, numbers that are not finite by their names.
+    Ignored are the order of mappings, the folders of files (a project may be moved, its files rewritten), and fields of
+    dataclasses with NO_FINGERPRINT in their metadata. Arrays are represented by type, shape and the SHA-256 of their
+    numbers, numbers that are not finite by name.
     """
     return json.dumps(_json(value), ensure_ascii=False, allow_nan=False, sort_keys=True, separators=(",", ":"))
 
 
 def hash_content(data: bytes) -> str:
-    """SHA-256 of the content of a file."""
+    """SHA-256 of a file's content."""
     return hashlib.sha256(data).hexdigest()
 
 
 def hash_file(path: Path) -> str:
-    """The same, the file read here."""
+    """SHA-256 of a file."""
     return hash_content(read_bytes(path))
 
 
 def scan_fingerprint(path: Path) -> str:
-    """Its size, and SHA-256 of pieces of its file. "" where it cannot be read."""
+    """Hash of a file's size and of the SHA-256 of pieces of it; "" where it cannot be read."""
     try:
         size = path.stat().st_size
         with path.open("rb") as file:
@@ -98,11 +98,15 @@ def _json(value: Any) -> Any:
     raise TypeError(f"no fingerprint is known of {type(value).__name__}")
 
 
-class FileState(NamedTuple):  # archives have many
+class FileState(NamedTuple):  # a tuple, since archives have many
     """What is known of a scan's file without reading it.
 
-    uri: its path relative to the project's folder with `/`, or its address. bytes: its size, -1 where it is not there.
-    mtime_ns: when it was last changed, local files; etag: the same of objects.
+    Attributes
+    ----------
+    uri : path relative to the project's folder, with `/`, or address.
+    bytes : size; -1 where it does not exist.
+    mtime_ns : time of the last change, for local files.
+    etag : state of an object's content in its store.
     """
 
     uri: str
@@ -113,22 +117,22 @@ class FileState(NamedTuple):  # archives have many
 
 @dataclass(frozen=True)
 class Identity:
-    """state: of the file. parts_hash: SHA-256 of its telling parts."""
+    """State of a file, and SHA-256 of parts of its content (`parts_hash`)."""
 
     state: FileState
     parts_hash: str
 
 
 class FileStates:
-    """The states of the files of a project; where a folder stands is asked once for all files in it."""
+    """States of the files of a project; each folder's relative path is computed once."""
 
     def __init__(self, folder: Path) -> None:
         """folder: that of the project, which may be moved as a whole."""
         self._folder = os.path.abspath(folder)
-        self._below: dict[str, str] = {}  # by folder, what stands before the names of its files
+        self._below: dict[str, str] = {}  # by folder, prefix of its files' URIs
 
     def get(self, path: str | Path) -> FileState:
-        """Of a file or an object; one that does not answer is as one that is not there."""
+        """State of a file or an object; one that does not respond counts as missing."""
         try:
             if isinstance(path, Address):
                 stat = path.stat()
@@ -139,7 +143,7 @@ class FileStates:
         return FileState(self.uri(path), stat.st_size, stat.st_mtime_ns)
 
     def uri(self, path: str | Path) -> str:
-        """Relative to the folder, where that is possible, with `/`; an address as it is."""
+        """Path relative to the project's folder if possible, with `/`; addresses are unchanged."""
         if isinstance(path, Address):
             return str(path)
         parent, sign, name = str(path).rpartition(os.sep)
@@ -157,17 +161,17 @@ class FileStates:
 
 
 def file_state(path: Path, folder: Path) -> FileState:
-    """The state of one file or object. folder: that of the project."""
+    """State of one file or object. folder: that of the project."""
     return FileStates(folder).get(path)
 
 
 def parts_hash(path: Path, max_pixels: int | None = None) -> str:
-    """SHA-256 (hexadecimal) of the first 64 KiB, of the tables of tile offsets and byte counts, of the 256 x 256 px in
-    the middle, and of pieces spread over the file. Head and tables alone would not do: uncompressed scans of one
-    scanner share them.
+    """SHA-256 (hexadecimal) of parts of a scan's file.
 
-    A file that cannot be opened as a scan has a hash of its first bytes; "" where not even these can be read. Of an
-    object, what its store calls its content stands for all this: nothing of it is read.
+    The parts are the first 64 KiB, the tables of tile offsets and byte counts, the central 256 x 256 px, and pieces
+    spread over the file. Head and tables are not sufficient, since uncompressed scans of one scanner share them. For a
+    file that cannot be opened as a scan only its first bytes and the pieces count; "" where they cannot be read. For an
+    object the store's own hash of its content is used, and nothing is read.
     """
     try:
         if isinstance(path, Address) and path.etag:
@@ -188,8 +192,10 @@ def parts_hash(path: Path, max_pixels: int | None = None) -> str:
 
 
 def content_hash(path: Path) -> str:
-    """SHA-256 (hexadecimal) of the whole file; "" where it cannot be read. It takes 0.6 s of CPU a GB, so it is made
-    where it decides, and not of every scan."""
+    """SHA-256 (hexadecimal) of the whole file; "" where it cannot be read.
+
+    It takes 0.6 s of CPU per GB, so it is computed only where needed.
+    """
     digest = hashlib.sha256()
     try:
         with path.open("rb") as file:
@@ -201,7 +207,7 @@ def content_hash(path: Path) -> str:
 
 
 def _tables(path: Path) -> bytes:
-    """Where the tiles or strips of all its pictures stand in a TIFF file; empty for other files, which have none."""
+    """Offsets and byte counts of the tiles or strips of all pages of a TIFF file; empty for other files."""
     if not _is_tiff(path):
         return b""
     with tiff_file(path) as file:
@@ -222,7 +228,7 @@ def _middle(scan: Scan) -> bytes:
 
 def result_key(identity: Identity, options_hash: str, revision: int = MEASURE_REVISION) -> str:
     """SHA-256 (hexadecimal) of a scan's identity, the hash of its options, and the revision of `measure`. It is the
-    same on every machine, so results of several may be joined."""
+    same on every machine, so results can be merged."""
     state = identity.state
     values = [state.uri, state.bytes, state.mtime_ns, state.etag, identity.parts_hash, options_hash, revision]
     return hashlib.sha256(json.dumps(values).encode()).hexdigest()
@@ -234,5 +240,6 @@ def options_hash(options_json: str) -> str:
 
 
 def shard_number(name: str, shards: int) -> int:
-    """Which of so many shards, 1 to N, an image is of: by its name, the same on every machine and in every run."""
+    """Number of the shard, 1 to N, that an image belongs to, from its name: the same on every machine and in every
+    run."""
     return int.from_bytes(hashlib.sha256(name.encode("utf-8", "surrogateescape")).digest()[:8]) % shards + 1

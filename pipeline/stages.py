@@ -1,6 +1,7 @@
-"""The stages of the chain, each from files to files, so that any of them can be run alone and looked at.
+"""Stages of the processing chain, each from files to files, so that any one can be run and inspected separately.
 
-What only one stage needs is imported by it: adjusting takes no pictures, and measuring no other program's adjustment.
+Imports that a single stage needs are local to it: adjusting needs no image processing, measuring no other program's
+adjustment.
 """
 
 from collections.abc import Iterable, Sequence
@@ -64,12 +65,15 @@ if TYPE_CHECKING:
     from pipeline.archive.thumbnails import Thumbnails
     from pipeline.opencv_check.opencv_corners import BoardPictures
 
-_ONE_BY_ONE = 2000  # scans: of more the summary tells totals and what needs a look, from the store
+_ONE_BY_ONE = 2000  # scans; for more, the summary is read from the store: totals and what needs a look
 
 
 def run_all(project: Project, reporter: Reporter, work: WorkOptions | None = None) -> Summary:
-    """Measure (where there are scans), adjust, visit the scans again, check, report. The results take the places of
-    earlier ones together, at the end; where no adjustment is possible, the marks do. Of a shard nothing is adjusted."""
+    """Measure (if there are scans), adjust, run the second pass, check, report.
+
+    All results replace earlier ones together, at the end. Where no adjustment is possible, the marks are still
+    published. A shard is only measured.
+    """
     if work is not None and work.shard is not None:
         return run_measure(project, reporter, work)
     check_transformation(project)
@@ -87,7 +91,7 @@ def run_all(project: Project, reporter: Reporter, work: WorkOptions | None = Non
         except WriteError:
             raise
         except Exception:
-            _publish(project, new)  # hours of measuring are not lost for a wrong point number
+            _publish(project, new)  # keep hours of measuring in spite of, for example, a wrong point number
             raise
         _publish(project, new)
         _fill_images(project, scans)
@@ -95,7 +99,7 @@ def run_all(project: Project, reporter: Reporter, work: WorkOptions | None = Non
 
 
 def run_measure(project: Project, reporter: Reporter, work: WorkOptions | None = None) -> Summary:
-    """Scans to comparator.csv. Of a shard to its store alone: `reseau merge` joins these."""
+    """Measure scans into comparator.csv; a shard only into its own store, for `reseau merge`."""
     if work is not None and work.shard is not None:
         return _measured_shard(project, reporter, work, work.shard)
     with unpublished(project) as new:
@@ -109,7 +113,8 @@ def run_measure(project: Project, reporter: Reporter, work: WorkOptions | None =
 
 
 def run_merge(project: Project, stores: Sequence[Path], reporter: Reporter) -> tuple[list[Merged], Summary]:
-    """The stores of shards into that of the project; and, where they hold all its scans, the marks of all together."""
+    """Merge the stores of shards into that of the project; if they hold all its scans, run the cross-scan checks and
+    write comparator.csv."""
     with Store(project.measurement_path) as store, ThumbnailStore.open(store.path) as thumbnails:
         taken = merge(store, stores)
         thumbnails.take(stores)
@@ -120,15 +125,15 @@ def run_merge(project: Project, stores: Sequence[Path], reporter: Reporter) -> t
 
 
 def run_adjust(project: Project, reporter: Reporter) -> Summary:
-    """comparator.csv to adjustment.json."""
+    """Adjust comparator.csv; write adjustment.json."""
     with unpublished(project) as new:
         with reporter.stage("adjusting") as count:
             count(project.comparator.name, 0, 1)
-            # Not kept: what is written takes as much memory, and is read again for the summary.
+            # The result is not kept: it takes as much memory as the file that the summary reads.
             _write_adjustment(project, adjust_marks(project, _given_marks(project, new)), new)
         earlier = project.adjustment_path
         if earlier.exists() and hash_file(earlier) != hash_file(new.current_path(earlier)):
-            new.remove(project.check_path)  # it belongs to the earlier one
+            new.remove(project.check_path)  # it belongs to the earlier adjustment
         data = adjusted_data(project, new.current_path)
         new.publish()
     covariance = covariance_path(project.adjustment_path)
@@ -136,8 +141,10 @@ def run_adjust(project: Project, reporter: Reporter) -> Summary:
 
 
 def run_check(project: Project, reporter: Reporter) -> Summary:
-    """The adjustment, made anew from comparator.csv, against OpenCV's calibration. Raises InputError where what is
-    made so is not what adjustment.json holds: that one is never written here."""
+    """Repeat the adjustment of comparator.csv and compare it with OpenCV's calibration.
+
+    Raises InputError where adjustment.json has other inputs; it is never written here.
+    """
     with unpublished(project) as new:
         with reporter.stage("checking") as count:
             count(project.comparator.name, 0, 1)
@@ -150,7 +157,7 @@ def run_check(project: Project, reporter: Reporter) -> Summary:
 
 
 def run_report(project: Project, reporter: Reporter) -> Summary:
-    """What the earlier stages left, in report.html."""
+    """Write report.html from the results of the earlier stages."""
     with unpublished(project) as new:
         _comparator(project, new)
         with reporter.stage("reporting") as count:
@@ -161,7 +168,7 @@ def run_report(project: Project, reporter: Reporter) -> Summary:
 
 
 def run_plots(project: Project, folder: Path, reporter: Reporter) -> list[Path]:
-    """The plots of all calibrated cameras, in files of a folder. Raises InputError where there is none."""
+    """Write the plots of all calibrated cameras to a folder. Raises InputError where there is none."""
     from pipeline.report.plots import write_plots
 
     with reporter.stage("plotting") as count:
@@ -170,8 +177,7 @@ def run_plots(project: Project, folder: Path, reporter: Reporter) -> list[Path]:
 
 
 def run_frame_pages(project: Project, images: Sequence[str], reporter: Reporter) -> dict[str, Path]:
-    """Everything about some images, each in a page of its own; where these stand, by image. Raises InputError for an
-    image that there is not."""
+    """Write a page on each of some images; return {image: page}. Raises InputError for an unknown image."""
     with unpublished(project) as new, reporter.stage("reporting") as count:
         _comparator(project, new)
         data = frame_data(project, new.current_path, frozenset(images))
@@ -200,7 +206,7 @@ def _measured_marks(
 
 
 def _measure(project: Project, new: Unpublished, reporter: Reporter, work: WorkOptions | None) -> str:
-    """Measure what is missing, write the marks of all scans, and give the digest of their judging."""
+    """Measure the missing scans, write the marks of all scans, and return the digest of their judging."""
     from pipeline.archive.measure_archive import measure_archive
 
     with Store(project.measurement_path) as store:
@@ -215,7 +221,7 @@ def _measure(project: Project, new: Unpublished, reporter: Reporter, work: WorkO
 
         try:
             return measured_and_written(work)
-        except DamagedError as error:  # of a mark, which is noticed where it is read
+        except DamagedError as error:  # of a mark: detected only when it is read
             if work is not None and work.only_kept:
                 raise
             reporter.say(str(error))
@@ -226,7 +232,7 @@ def _measure(project: Project, new: Unpublished, reporter: Reporter, work: WorkO
 def _adjusted_marks(
     project: Project, scans: Sequence[MeasuredScan], new: Unpublished, reporter: Reporter, work: WorkOptions | None
 ) -> Adjustment | None:
-    """The adjustment, after a second visit to the scans where that found more; None where nothing is to be adjusted."""
+    """Adjustment, repeated after a second pass that found more targets; None where there is nothing to adjust."""
     marks = _given_marks(project, new)
     if scans and not anything_to_adjust(project, marks):
         return None
@@ -244,12 +250,13 @@ def _adjusted_marks(
 
 
 def _given_marks(project: Project, new: Unpublished) -> tuple[ComparatorPoint, ...]:
-    """The marks that this command, an earlier one or the user has left. Raises InputError where there are none."""
+    """Marks of comparator.csv, from this command, an earlier one or the user. Raises InputError where there are
+    none."""
     return read_comparator(_comparator(project, new), project.list_pitch_um)
 
 
 def _comparator(project: Project, new: Unpublished) -> Path:
-    """The file that these stand in."""
+    """Path of comparator.csv. Raises InputError where it does not exist."""
     path = new.current_path(project.comparator)
     if not path.exists():
         raise InputError(
@@ -259,7 +266,7 @@ def _comparator(project: Project, new: Unpublished) -> Path:
 
 
 def _write_again(project: Project, scans: Sequence[MeasuredScan], new: Unpublished) -> None:
-    """What a second visit found, in the place of what was judged before it."""
+    """Store and write the marks after a second pass, in place of those before it."""
     with Store(project.measurement_path) as store:
         before = find_judging(store, read_measurement_hash(new.current_path(project.comparator)))
         assert before is not None
@@ -272,7 +279,7 @@ def _write_marks(project: Project, store: Store, digest: str, new: Unpublished) 
     assert judging is not None
     decisions = count_decisions(store, digest)
     for camera in project.cameras.values():
-        if camera.clicks is not None and camera.clicks.who:  # one decision more: how its marks look
+        if camera.clicks is not None and camera.clicks.who:  # the clicks count as one more decision
             who = camera.path.name, camera.clicks.who
             decisions[who] = decisions.get(who, 0) + 1
     marks = checked_marks(store, judging)
@@ -282,7 +289,7 @@ def _write_marks(project: Project, store: Store, digest: str, new: Unpublished) 
 
 
 def _publish(project: Project, new: Unpublished) -> None:
-    """Every result to its place; then nobody names the judgings any more that were before."""
+    """Publish all results, then delete earlier judgings, which no file names any more."""
     new.publish()
     if not (project.scans and project.measurement_path.exists() and project.comparator.exists()):
         return
@@ -294,7 +301,7 @@ def _publish(project: Project, new: Unpublished) -> None:
 
 
 def _fill_images(project: Project, scans: Iterable[MeasuredScan]) -> None:
-    """What was read on the film, where the user's own list has empty columns for it."""
+    """Fill empty columns of the user's images.csv with the writing read on the film."""
     if project.images_path is not None:
         fill_images(project.images_path, for_images(scans, WRITTEN))
 
@@ -305,7 +312,7 @@ def _write_adjustment(project: Project, adjustment: Adjustment, new: Unpublished
 
 
 def _frames_mm(project: Project, new: Unpublished) -> dict[str, tuple[float, float]]:
-    """By camera the size of its frame: of a camera without fiducials that of its pictures where its file has none."""
+    """{camera: size of its frame, mm}; for a camera without fiducials and frame size, that of its largest image."""
     sizes = picture_sizes_mm(project.measurement_path, read_measurement_hash(new.current_path(project.comparator)))
     largest: dict[str, tuple[float, float]] = {}
     for image, size in sizes.items():
@@ -316,7 +323,7 @@ def _frames_mm(project: Project, new: Unpublished) -> dict[str, tuple[float, flo
 
 
 def _check_adjusted(project: Project, marks: Sequence[ComparatorPoint]) -> None:
-    """Raises InputError where there is no adjustment of these marks and of the project as it is."""
+    """Raise InputError where adjustment.json was made from other inputs."""
     path = project.adjustment_path
     made_from = read_adjustment(path).made_from
     if others := differing(made_from, adjusted_from(project, marks)):
@@ -332,7 +339,7 @@ def _write_check(project: Project, adjustment: Adjustment, new: Unpublished) -> 
 
 
 def _board_pictures(project: Project, new: Unpublished) -> "BoardPictures | None":
-    """Those of the board; None where there is no scan of it, or OpenCV finds no such board."""
+    """Images of the board for OpenCV; None where there is no scan, or OpenCV has no detector for it."""
     from pipeline.opencv_check.opencv_corners import BoardPictures, detector_name
 
     board = project.targets.board if project.targets else None
@@ -356,7 +363,7 @@ def _reported(project: Project, new: Unpublished) -> Summary:
 
 
 def _thumbnails(project: Project, data: ReportData) -> "Thumbnails":
-    """The pictures of the marks that data shows."""
+    """Thumbnails of the marks in the data."""
     from pipeline.archive.thumbnails import Thumbnails
 
     scans, path = data.measurement or {}, project.measurement_path

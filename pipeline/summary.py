@@ -1,4 +1,4 @@
-"""What a command says when it is done: the verdict, the problems, the main numbers, where the files are."""
+"""Summary of a command: verdict, problems, main numbers, and where the files are."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -33,17 +33,28 @@ from pipeline.results.measured_record import pose_record
 from pipeline.text.wording import counted
 
 STYLES = {"good": "bold green", "look": "bold yellow", "failed": "bold red"}
-FRAME_ROWS = 8  # of frames in a table in the terminal: the report has all
-WHOLE_PROBLEMS = 6  # of more the terminal has the first sentence
-NOTES = 3  # that are printed: the report has all
+FRAME_ROWS = 8  # rows of the table of frames in the terminal; the report has all
+WHOLE_PROBLEMS = 6  # problems printed in full; if there are more, only the first sentence of each
+NOTES = 3  # that are printed; the report has all
 
 
 @dataclass(frozen=True)
 class Summary:
-    """The end of a command. poses: of the scans, each with its evidence, as measurement.db has them. files: what was
-    written, by a word for it. corrections: to the fiducials of cameras of which nothing else was adjusted, in words,
-    and distances between them; values: of the calibrated cameras; unit: of lengths in images. verdicts: numbers of
-    scans. parts: in how many the scans are measured, where these are those of one."""
+    """Summary of a command.
+
+    Attributes
+    ----------
+    verdict : verdict with problems and notes.
+    frames : numbers of marks by frame and status.
+    poses : scan orientations with their evidence, as in measurement.db.
+    adjustment, check : results of these stages.
+    files : files that were written, by a word for each.
+    corrections : corrections to the fiducials of cameras without calibration, in words, and distances between them.
+    values : of the calibrated cameras.
+    unit : of lengths in images.
+    verdicts : number of scans by verdict.
+    parts : number of shards of the scans, if these are the scans of one.
+    """
 
     verdict: ReportVerdict
     frames: Mapping[str, Mapping[str, int]]
@@ -73,7 +84,7 @@ class Summary:
 
 
 def summarise(data: ReportData, files: Mapping[str, Path]) -> Summary:
-    """Judge the data as the report does, and add where everything stands."""
+    """Summarise the data with the verdict of the report."""
     frames: dict[str, dict[str, int]] = {}
     for mark in data.comparator if not data.totals else ():
         counts = frames.setdefault(mark.image, {str(status): 0 for status in Status})
@@ -114,7 +125,7 @@ def _corrections(data: ReportData) -> dict[str, tuple[str, Sequence[Distance]]]:
 
 
 def print_summary(summary: Summary, console: Console) -> None:
-    """The summary for a person, in the report's order; file paths are never folded."""
+    """Print the summary in the report's order; file paths are not wrapped."""
     console.print(Text(summary.verdict.sentence, style=STYLES[summary.verdict.level]))
     if summary.adjustment and summary.values and summary.adjustment.converged:
         console.print(_camera_table(summary.adjustment, summary.values))
@@ -143,7 +154,7 @@ def print_summary(summary: Summary, console: Console) -> None:
     if len(notes) > NOTES:
         console.print(Text(f"{counted(len(notes) - NOTES, 'more note')}: in the report.", style="dim"))
     for word, path in summary.files.items():
-        if word == "report":  # is the next step
+        if word == "report":  # mentioned as the next step
             continue
         console.print(f"{word}: {path}", soft_wrap=True, markup=False, highlight=False)
 
@@ -155,7 +166,7 @@ def _main_numbers(adjustment: AdjustmentRecord) -> dict[str, object]:
 
 
 def _frame_table(summary: Summary) -> Table:
-    """Marks and residuals by frame, the worst first; columns without anything are left out."""
+    """Table of marks and residuals by frame, the worst first, without empty columns."""
     frames, poses, rms = summary.frames, summary.poses, _rms_um(summary.adjustment)
     lost = {name: sum(counts.values()) - counts[Status.MEASURED] for name, counts in frames.items()}
     worst = sorted(frames, key=lambda name: (rms.get(name, 0.0), lost[name]), reverse=True)
@@ -176,7 +187,7 @@ def _frame_table(summary: Summary) -> Table:
 
 
 def _rms_um(adjustment: AdjustmentRecord | None) -> dict[str, float]:
-    """Of the residuals of each frame, per axis."""
+    """{frame: rms of the residuals per axis, µm}."""
     squares: dict[str, list[float]] = defaultdict(list)
     for row in adjustment.residuals if adjustment else ():
         squares[row.image] += [row.vx_um**2, row.vy_um**2]
@@ -184,7 +195,7 @@ def _rms_um(adjustment: AdjustmentRecord | None) -> dict[str, float]:
 
 
 def _camera_table(adjustment: AdjustmentRecord, values: Mapping[str, Sequence[CameraValue]]) -> Table:
-    """The values to cite, in mm or px, with sigma0 and the redundancy that it comes from."""
+    """Table of the values to cite, in mm or px, with sigma0 and its redundancy."""
     quality = _quality(adjustment)
     columns = ("parameter", "value", "standard deviation", "unit")
     table = Table(*(("camera", *columns) if len(values) > 1 else columns), title_justify="left")
@@ -198,19 +209,19 @@ def _camera_table(adjustment: AdjustmentRecord, values: Mapping[str, Sequence[Ca
 
 
 def _quality(adjustment: AdjustmentRecord) -> str:
-    """sigma0 with the redundancy of what it comes from; without any, what standard deviations are."""
+    """sigma0 with its redundancy; without any, that the standard deviations are a priori."""
     if not adjustment.has_sigma0:
         return "standard deviations a priori"
     return f"sigma0 {adjustment.sigma0:.3f}, redundancy {adjustment.variance_factor.redundancy:.0f}"
 
 
 def archive_summary(project: Project, files: Mapping[str, Path]) -> Summary:
-    """What `measure` says of many scans."""
+    """Summary of a measurement of many scans."""
     return _scan_summary(archive_status(project), files)
 
 
 def shard_summary(project: Project, path: Path, shard: tuple[int, int]) -> Summary:
-    """What `measure --shard` says: of the scans of that part."""
+    """Summary of a measured shard."""
     status = archive_status(project, path)
     own = tuple(scan for scan in status.scans if scan.verdict not in (Verdict.WAITING, Verdict.OLD))
     summary = _scan_summary(ArchiveStatus(own), {f"part {shard[0]} of {shard[1]}": path})

@@ -1,4 +1,4 @@
-"""What a terminal is given: no control characters from names in files, and letters that it lacks spelled out."""
+"""Safe output to a terminal: without control characters from file names, with replacements for missing letters."""
 
 import codecs
 import io
@@ -22,13 +22,13 @@ _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2
 
 
 def plain(text: str) -> str:
-    """The text with control characters as their codes: a name could recolour a terminal, or rewrite what it shows. And
-    without the credentials and signatures of addresses."""
+    """Text with control characters escaped, since names could recolour or rewrite the terminal, and without credentials
+    and signatures in addresses."""
     return _CONTROL.sub(lambda found: ascii(found[0])[1:-1], public_text(text))
 
 
 class PlainConsole(Console):
-    """A console whose own colours and bars work, and in which no name does anything but be read."""
+    """Console that escapes control characters in text, but keeps its own colours and bars."""
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
         for segment in super().render(renderable, options):
@@ -36,11 +36,11 @@ class PlainConsole(Console):
 
 
 def outlive_readers() -> None:
-    """From now on the streams of this process drop what nobody reads any more: `reseau status | head` ends with the
-    code that the command has without `head`."""
+    """Make the standard streams ignore a closed pipe, so that `reseau status | head` returns the exit code that it has
+    without `head`."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
-        if not isinstance(stream, io.TextIOWrapper):  # there is none, or it is a test's
+        if not isinstance(stream, io.TextIOWrapper):  # no stream, or a test's
             continue
         raw = _Patient(stream.fileno(), "wb", closefd=False)
         buffered = io.BufferedWriter(raw)
@@ -49,7 +49,7 @@ def outlive_readers() -> None:
 
 
 class _Patient(io.FileIO):
-    """A file that takes everything once its pipe is closed."""
+    """File that discards everything once its pipe is closed."""
 
     def write(self, data: Any) -> int:
         try:
@@ -62,7 +62,7 @@ class _Patient(io.FileIO):
 
 
 def spell_out_missing_letters() -> None:
-    """From now on the streams of this process print what their encoding lacks (Latin-1, ASCII) in letters it has."""
+    """Make the standard streams replace characters that their encoding lacks (Latin-1, ASCII)."""
     codecs.register_error(_NAME, _spelled)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):

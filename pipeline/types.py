@@ -1,4 +1,4 @@
-"""Types of arrays that the modules share."""
+"""Array types shared by the modules."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""The processes that scans are shared among, on this machine: a pool that survives the death of any of them."""
+"""Local process pool for measuring scans, which survives the death of any process."""
 
 import multiprocessing
 import os
@@ -26,33 +26,33 @@ import cv2
 
 from adjust.least_squares.malloc_tuning import keep_freed_memory
 
-KILLS = 2  # of its process, after which a task is given up: once may be chance, or another program's doing
-STARTS = 6  # of processes that are killed before they stand, one after another: then none will
-CHECKED_AGAIN_S = 0.05  # whether a pool that is ended has come to rest
-TASKS_A_CORE = 4  # handed out ahead: enough that no process waits, few enough that little is lost
+KILLS = 2  # losses of its process after which a task is given up: one may be due to chance or another program
+STARTS = 6  # consecutive processes killed while starting, after which no more are started
+CHECKED_AGAIN_S = 0.05  # interval of the test whether a pool has stopped
+TASKS_A_CORE = 4  # submitted ahead: enough to keep every process busy, few enough that little is lost
 
 Task = TypeVar("Task")
 Made = TypeVar("Made")
 
 
 class WorkerKilled(BrokenExecutor):
-    """The process of a task was ended from outside, each time that it was tried."""
+    """The process of a task was killed on each attempt."""
 
     def __init__(self, what: str = "its process was ended, most likely because the memory was full") -> None:
         super().__init__(what)
 
 
 def processes(scans: int) -> int:
-    """How many scans are measured at a time: one a core."""
+    """Number of scans measured in parallel: one per core."""
     return min(scans, os.cpu_count() or 1)
 
 
 @contextmanager
 def worker_pool(scans: int, workers: int | None = None) -> Iterator[Executor]:
-    """A process a core, of one thread: a scan is measured alone, so the result does not depend on their number.
+    """Pool of single-threaded processes, one per core or `workers`.
 
-    Whatever ends the block early ends the processes too: nobody waits for scans whose results are not wanted any more.
-    workers: how many processes, if not one a core.
+    Each scan is measured by one process, so the result does not depend on their number. If the block ends early, the
+    processes are ended.
     """
     pool = LocalPool(min(max(scans, 1), workers) if workers else processes(max(scans, 1)))
     try:
@@ -65,8 +65,11 @@ def worker_pool(scans: int, workers: int | None = None) -> Iterator[Executor]:
 
 
 class LocalPool(ThreadPoolExecutor):
-    """Threads that hand their own process one task at a time, so that it is known whose process was killed: that task
-    alone is begun again, in a new process, and given up when it kills that too."""
+    """Threads with a process each, which get one task at a time.
+
+    It is therefore known which task a killed process had: only that one is repeated, in a new process, and given up
+    after KILLS losses.
+    """
 
     def __init__(self, workers: int) -> None:
         super().__init__(workers)
@@ -83,10 +86,10 @@ class LocalPool(ThreadPoolExecutor):
             process.shutdown(wait, cancel_futures=cancel_futures)
 
     def end(self) -> None:
-        """End the processes, whatever they have in hand."""
+        """End the processes, even with unfinished tasks."""
         self._ended = True
         super().shutdown(wait=False, cancel_futures=True)
-        while any(thread.is_alive() for thread in self._threads):  # one may just have begun to start its process
+        while any(thread.is_alive() for thread in self._threads):  # a thread may be starting its process
             for process in multiprocessing.active_children():
                 process.terminate()
             time.sleep(CHECKED_AGAIN_S)
@@ -99,7 +102,7 @@ class LocalPool(ThreadPoolExecutor):
         raise WorkerKilled
 
     def _process(self) -> ProcessPoolExecutor:
-        """This thread's process, once it stands: one that is killed on its way there says nothing of the task."""
+        """This thread's process, once it runs: one that is killed while starting does not count against the task."""
         for _ in range(STARTS if not self._ended else 0):
             process = getattr(self._own, "process", None) or self._start()
             with suppress(BrokenProcessPool):
@@ -116,21 +119,20 @@ class LocalPool(ThreadPoolExecutor):
 
 
 def prepare() -> None:
-    """An interrupt from the terminal reaches every process; the one that started this one answers it for all, and when
-    it ends, however that is, so does this one."""
+    """Prepare a process: ignore terminal interrupts, which the parent handles for all, and end when the parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     work_alone()
 
 
 def work_alone() -> None:
-    """One thread for a scan: as many are measured at a time as there are cores."""
+    """Use one thread per scan: the cores are shared among scans."""
     cv2.setNumThreads(1)
-    keep_freed_memory()  # one mark asks for arrays as large as the last one's: a twentieth of a scan's time
+    keep_freed_memory()  # each mark allocates arrays as large as the last one's: saves a twentieth of a scan's time
 
 
 def _end_with_parent() -> None:
-    """Wait until the process that started this one is no more; then nobody wants what is in hand here."""
+    """Exit when the parent process has ended: nobody needs the result then."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -138,10 +140,10 @@ def _end_with_parent() -> None:
 
 
 class Submits(Protocol):
-    """What shares work out: an executor of `concurrent.futures`, or one like it."""
+    """Executor of `concurrent.futures`, or one with the same `submit`."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> "Future[Any]":
-        """Have `fn` called with these, some time."""
+        """Schedule a call of `fn`."""
 
 
 def iterate_results(
@@ -150,7 +152,10 @@ def iterate_results(
     executor: Submits | None = None,
     in_flight: int | None = None,
 ) -> Iterator[tuple[Task, Made | Exception]]:
-    """Each task with what the function makes of it, or with why the executor has lost it. in_flight: as above."""
+    """Yield each task with its result, or with the exception of an executor that lost it, in order of completion.
+
+    in_flight: number of tasks submitted at a time; None: TASKS_A_CORE per core.
+    """
     if executor is None:
         yield from ((task, function(task)) for task in tasks)
         return
@@ -180,7 +185,7 @@ def _submitted(executor: Submits, function: Callable[[Task], Made], task: Task) 
 
 
 def _result(future: "Future[Made]") -> Made | Exception:
-    """What is measured raises nothing: what comes here is of the executor, whose process is gone or out of reach."""
+    """Result of a future. Tasks themselves raise nothing: an exception means that the executor lost its process."""
     try:
         return future.result()
     except Exception as error:
@@ -189,9 +194,17 @@ def _result(future: "Future[Made]") -> Made | Exception:
 
 @dataclass(frozen=True)
 class WorkOptions:
-    """How the work is shared. shard: (K, N), only the scans of the K-th of N parts. cluster: a scheduler's address, or
-    `local`. retry: measure again what failed. moved: keep results of files whose content is the same elsewhere.
-    workers: processes, if not one a core. only_kept: nothing is measured; what is missing stays so."""
+    """Options of the measurement.
+
+    Attributes
+    ----------
+    shard : (K, N): only the scans of the K-th of N parts.
+    cluster : address of a scheduler, or `local`.
+    retry : measure failed scans again.
+    moved : keep results of files with the same content elsewhere.
+    workers : number of processes; None: one per core.
+    only_kept : measure nothing; what is missing stays missing.
+    """
 
     shard: tuple[int, int] | None = None
     cluster: str | None = None
@@ -202,4 +215,4 @@ class WorkOptions:
 
 
 class NotMeasured(Exception):
-    """Something is missing, and nothing is to be measured now."""
+    """A result is missing, and nothing is to be measured."""

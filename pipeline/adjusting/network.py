@@ -184,9 +184,8 @@ def _orientable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[lis
 
     Of an image with too few targets the fiducials remain if they suffice for its film deformation model.
     """
-    shown = {
-        (_frame(project, mark.image), mark.kind, mark.point) for mark in marks
-    }  # points in several parts of a frame count once
+    # Marks in several parts of a frame count once.
+    shown = {(_frame(project, mark.image), mark.kind, mark.point) for mark in marks}
     targets = Counter(frame for frame, kind, _ in shown if kind not in ON_FILM)
     fiducials = Counter(frame for frame, kind, _ in shown if kind == "fiducial")
     first = {_frame(project, mark.image): mark.image for mark in reversed(marks)}
