@@ -1,1 +1,1 @@
-"""A digital camera from pictures of a board: `reseau calibrate`."""
+"""Calibration of digital cameras from images of a board: `reseau calibrate`."""

@@ -1,4 +1,4 @@
-"""`reseau calibrate` with its options as they are given, from the command line and from Python."""
+"""Entry point of `reseau calibrate`, with its options as given on the command line and in Python."""
 
 import os
 from collections.abc import Sequence
@@ -35,40 +35,38 @@ def calibrate(
     workers: int | None = None,
     reporter: Reporter | None = None,
 ) -> Calibration:
-    """Calibrate digital cameras from pictures of a board, as `reseau calibrate` does.
+    """Calibrate digital cameras from images of a board, as `reseau calibrate` does.
 
     Parameters
     ----------
-    pictures : a folder or a picture, or several of these
+    pictures : a folder or an image file, or several of these
     board : columns x rows, such as "9x6": inner corners of a chessboard, squares, markers or circles
     square : side of a square, or distance from one marker or circle to the next, with its unit, such as "25mm"
     kind : chessboard, charuco, aprilgrid, aruco, circle-grid or asymmetric-circle-grid
     marker : side of a marker or diameter of a circle, with its unit
     dictionary : of the markers, such as "4X4_50"
-    legacy : whether a ChArUco board has the older layout; both are tried without
+    legacy : whether a ChArUco board has the older layout; if not set, both are tried
     first_id : number of the first marker
     lens : opencv4, opencv5, opencv8, fisheye, or auto, by cross-validation
-    square_pixels : whether x and y have one focal length
+    square_pixels : whether x and y have the same focal length
     pitch_um : side of a pixel, for results in mm
     out : folder of the project, camera.yaml and the report
     ros : whether ROS's camera info is written as well
-    workers : processes that measure, None for one a core
-    reporter : of the progress, on stderr by default
+    workers : number of measuring processes; None: one per core
+    reporter : reports the progress, on stderr by default
 
     Returns
     -------
-    Calibration
-        Its cameras in px with standard deviations, `adjustments` by camera, plots and a table.
+    Calibration Its cameras in px with standard deviations, `adjustments` by camera, plots and a table.
 
     Raises
     ------
-    InputError
-        For a wrong option, and where no camera can be calibrated; the message says why.
+    InputError For a wrong option, and where no camera can be calibrated; the message gives the reason.
 
     Examples
     --------
-    >>> result = reseau.calibrate("pictures", board="9x6", square="25mm")  # doctest: +SKIP
-    >>> result.plot_uncertainty()  # doctest: +SKIP
+    >>> result = reseau.calibrate("pictures", board="9x6", square="25mm")  # doctest: +SKIP >>>
+    result.plot_uncertainty()  # doctest: +SKIP
     """
     if lens not in LENSES:
         raise InputError(f"--lens {lens}: possible are {', '.join(LENSES)}.{did_you_mean(lens, LENSES)}")

@@ -1,4 +1,4 @@
-"""The board of `reseau calibrate`, as the command line describes it and as project.toml has it."""
+"""Options of the board of `reseau calibrate`, from the command line to project.toml."""
 
 import math
 import re
@@ -9,17 +9,22 @@ from pipeline.errors import InputError
 from pipeline.text.wording import did_you_mean, quoted
 
 BoardKind = Literal["chessboard", "charuco", "aprilgrid", "aruco", "circle-grid", "asymmetric-circle-grid"]
-MOST = 500  # columns or rows, as `[targets]` takes them
-KALIBR_SPACING = 0.3  # of an AprilGrid's tags, where nobody says it
+MOST = 500  # largest number of columns or rows in `[targets]`
+KALIBR_SPACING = 0.3  # default gap between the tags of an AprilGrid, in sides of a tag
 MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 
 
 @dataclass(frozen=True)
 class BoardOptions:
-    """columns, rows: inner corners (chessboard), squares (charuco), markers (aprilgrid, aruco) or circles.
+    """Description of a board.
 
-    spacing_mm: side of a square, or from one marker or circle to the next; of an asymmetric grid from row to row, half
-    of what lies between two circles of a row. size_mm: of a marker or a circle. first_id: of the markers.
+    Attributes
+    ----------
+    columns, rows : inner corners (chessboard), squares (charuco), markers (aprilgrid, aruco) or circles.
+    spacing_mm : side of a square, or distance from one marker or circle to the next; of an asymmetric grid the distance
+        of its rows, which is half the distance between two circles of a row.
+    size_mm : of a marker or a circle.
+    first_id : number of the first marker.
     """
 
     kind: BoardKind
@@ -32,12 +37,12 @@ class BoardOptions:
     first_id: int = 0
 
     def __post_init__(self) -> None:
-        """Raises InputError where an option of its kind is missing: before anything is read."""
+        """Raise InputError where an option of its kind is missing, before anything is read."""
         assert self.table
 
     @property
     def table(self) -> str:
-        """The table [targets] of project.toml."""
+        """Text of the table [targets] in project.toml."""
         keys: dict[str, object] = {"kind": self.kind, "columns": self.columns, "rows": self.rows}
         match self.kind:
             case "chessboard":
@@ -88,7 +93,7 @@ def board_options(
     legacy: bool = False,
     first_id: int = 0,
 ) -> BoardOptions:
-    """The board that the options of the command line describe. Raises InputError naming the option that is wrong."""
+    """Build the board from command-line options. Raises InputError with the name of the wrong option."""
     kinds: dict[str, BoardKind] = {each: each for each in get_args(BoardKind)}
     if kind not in kinds:
         raise InputError(

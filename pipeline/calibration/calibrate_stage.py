@@ -1,4 +1,4 @@
-"""Pictures of a board to calibrated cameras: a project is written, measured, adjusted and checked."""
+"""Stages of `reseau calibrate`: a project is written, measured, adjusted and checked for each camera."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -37,17 +37,22 @@ from pipeline.text.atomic import write_atomically
 from pipeline.text.wording import counted, listed
 from pipeline.workers import WorkOptions
 
-GENEROUS = 2.0  # of the unmodelled standard deviation, for lens models that are poorer than the first
-FEWEST_CORNERS = 4  # of a picture whose space resection is over-determined
-FEWEST_PICTURES = 3  # of a flat board that determine a principal distance and point
+GENEROUS = 2.0  # factor on the unmodelled standard deviation, for lens models with larger misfit than the first
+FEWEST_CORNERS = 4  # corners for a space resection with redundancy
+FEWEST_PICTURES = 3  # images of a flat board needed for principal distance and principal point
 
 
 @dataclass(frozen=True, repr=False)
 class Calibration(PlottedResult):
-    """Calibrated cameras, and what is not calibrated.
+    """Calibrated cameras, and the reasons why others are not calibrated.
 
-    unreadable: by picture, why. not_calibrated: by camera, why. files: what was written, report and project last.
-    adjustments: by camera; in them a pixel is pixel_mm wide.
+    Attributes
+    ----------
+    unreadable : by image, the reason.
+    not_calibrated : by camera, the reason.
+    files : written files, report and project last.
+    adjustments : by camera.
+    pixel_mm : side of a pixel in the adjustments.
     """
 
     cameras: tuple[CameraIntrinsics, ...]
@@ -59,7 +64,7 @@ class Calibration(PlottedResult):
     pixel_mm: float
 
     def plots(self, camera: str = "") -> CameraPlots:
-        """What the plots of a camera show, in px. Raises InputError for a camera that there is not."""
+        """Plots of a camera, in px. Raises InputError for an unknown camera."""
         if not camera and len(self.adjustments) == 1:
             camera = next(iter(self.adjustments))
         if camera not in self.adjustments:
@@ -67,7 +72,7 @@ class Calibration(PlottedResult):
         return self.adjustments[camera].plots(camera, self.pixel_mm)
 
     def to_pandas(self) -> Any:
-        """One row a parameter of a camera, as pandas.DataFrame. Raises ImportError where pandas is not installed."""
+        """One row per parameter of a camera, as pandas.DataFrame. Raises ImportError where pandas is not installed."""
         rows = [
             {"camera": camera.pictures.name, "parameter": name, **each.as_json()}
             for camera in self.cameras
@@ -79,7 +84,7 @@ class Calibration(PlottedResult):
         return f"Calibration({'; '.join(map(repr, self.cameras))})"
 
     def _repr_html_(self) -> str:
-        """The cameras' parameters, as a notebook shows them."""
+        """HTML table of the cameras' parameters, for notebooks."""
         rows = "".join(
             f"<tr><td>{escape(camera.pictures.name)}</td><td>{name}</td><td>{each.value:.7g}</td><td>{each.sigma:.2g}</td></tr>"
             for camera in self.cameras
@@ -90,7 +95,7 @@ class Calibration(PlottedResult):
 
     @property
     def needs_look(self) -> bool:
-        """Whether pictures were left out, or the adjustment or its check has a problem."""
+        """Whether images were left out, or the adjustment or its check has a problem."""
         left_out = self.unreadable or self.not_calibrated or any(camera.left_out for camera in self.cameras)
         return bool(left_out) or self.summary.verdict.exit_code != 0
 
@@ -112,7 +117,7 @@ class Calibration(PlottedResult):
         }
 
     def print(self, console: Console) -> None:
-        """The cameras first, then what needs a look, then the files but the report."""
+        """Print the cameras, then the problems, then the files except the report."""
         for camera in self.cameras:
             camera.print(console)
         for line in self._lines():
@@ -132,20 +137,19 @@ class Calibration(PlottedResult):
 def calibrate_pictures(
     given: Sequence[Path], out: Path, options: CalibrationOptions, reporter: Reporter, workers: int | None = None
 ) -> Calibration:
-    """Calibrate the cameras that took some pictures of a board.
+    """Calibrate the cameras that took some images of a board.
 
-    Each camera is adjusted by itself, so that one without a solution costs no other.
+    Each camera is adjusted separately, so that a failure does not affect the others.
 
     Parameters
     ----------
-    given : picture files, and folders that are searched at any depth
+    given : image files, and folders that are searched at any depth
     out : folder of the project and the results
-    workers : processes that measure, None for one a core
+    workers : number of measuring processes; None: one per core
 
     Raises
     ------
-    InputError
-        Where there is no picture, or no camera can be calibrated; the message says why.
+    InputError Where there is no image, or no camera can be calibrated; the message gives the reason.
     """
     pictures = find_pictures(given, out)
     first: LensModel = "opencv4" if options.lens == "auto" else options.lens
@@ -201,7 +205,7 @@ def calibrate_pictures(
 
 
 def _left_out(pictures: BoardPictureFiles, marks: Sequence[ComparatorPoint]) -> dict[str, str]:
-    """Why pictures are left out: those without a board, or with hardly any of it."""
+    """Reasons why images are left out: no board, or too few of its corners."""
     corners = dict.fromkeys((name for camera in pictures.cameras for name in camera.images), 0)
     reasons = dict.fromkeys(corners, "the board was not found")
     for mark in marks:
@@ -222,7 +226,7 @@ def _chosen_lens(
     options: CalibrationOptions,
     left_out: Mapping[str, str],
 ) -> LensChoice | None:
-    """The lens by cross-validation; None where it is given. Raises InputError where too few pictures show the board."""
+    """Lens model by cross-validation; None where it is given. Raises InputError where too few images show the board."""
     used = set(camera.images) - left_out.keys()
     if len(used) < FEWEST_PICTURES:
         others = _most_common(left_out[name] for name in camera.images if name in left_out)
@@ -241,7 +245,7 @@ def _chosen_lens(
 
 
 def _alike(network: Network, unmodelled_mm: float) -> Network:
-    """The network with one standard deviation for all marks, generous enough for a model that lacks something."""
+    """The network with one standard deviation for all marks, large enough for lens models with systematic residuals."""
     observations = network.observations
     variance = float(np.median(np.trace(observations.covariance_mm2, axis1=1, axis2=2)) / 2.0)
     variance += (GENEROUS * unmodelled_mm) ** 2
@@ -250,7 +254,7 @@ def _alike(network: Network, unmodelled_mm: float) -> Network:
 
 
 def _adjust(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustment:
-    """The adjustment of one camera. Raises InputError or AdjustmentError where there is no solution."""
+    """Adjust one camera. Raises InputError or AdjustmentError where there is no solution."""
     adjustment = adjust_marks(project, marks)
     if not adjustment.converged:
         why = " ".join(adjustment.warnings[:1])
@@ -262,7 +266,7 @@ def _adjust(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustment:
 
 
 def _nothing(pictures: BoardPictureFiles, left_out: Mapping[str, str], not_calibrated: Mapping[str, str]) -> str:
-    """Why no camera is calibrated."""
+    """Reason why no camera is calibrated."""
     number = sum(len(camera.images) for camera in pictures.cameras)
     if len(left_out) == number:
         return (
@@ -276,5 +280,5 @@ def _nothing(pictures: BoardPictureFiles, left_out: Mapping[str, str], not_calib
 
 
 def _most_common(reasons: Iterable[str]) -> str:
-    """ "" without any."""
+    """The most frequent reason; "" without any."""
     return next((reason for reason, _ in Counter(reasons).most_common(1)), "")

@@ -1,4 +1,4 @@
-"""Intrinsics as other programs read them: OpenCV's camera.yaml and ROS's camera info."""
+"""Camera files for other programs: OpenCV's camera.yaml and ROS's camera info."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -9,11 +9,12 @@ from pipeline.results.pixel_intrinsics import CENTRE
 
 OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 FISHEYE_ORDER = ("k1", "k2", "k3", "k4")
-OPENCV_COUNTS = (4, 5, 8, 12, 14)  # coefficients that OpenCV takes
+OPENCV_COUNTS = (4, 5, 8, 12, 14)  # numbers of coefficients that OpenCV accepts
 
 
 def camera_files(cameras: Sequence[CameraIntrinsics], out: Path, ros: bool) -> Iterator[tuple[Path, str]]:
-    """The files of all cameras with their text: camera.yaml for one, else a file a camera, by its name."""
+    """Paths and texts of the files of all cameras: camera.yaml for a single one, else one file per camera, by its
+    name."""
     for camera in cameras:
         stem = "camera" if len(cameras) == 1 else camera.pictures.name
         yield out / f"{stem}.yaml", opencv_yaml(camera)
@@ -22,7 +23,7 @@ def camera_files(cameras: Sequence[CameraIntrinsics], out: Path, ros: bool) -> I
 
 
 def opencv_yaml(camera: CameraIntrinsics) -> str:
-    """The text that cv2.FileStorage reads."""
+    """Text for cv2.FileStorage."""
     distortion = _distortion(camera)
     lines = ["%YAML:1.0", "---"]
     lines += [f"image_width: {camera.pictures.width_px}", f"image_height: {camera.pictures.height_px}"]
@@ -37,7 +38,7 @@ def opencv_yaml(camera: CameraIntrinsics) -> str:
 
 
 def ros_yaml(camera: CameraIntrinsics) -> str:
-    """The text of camera info: plumb_bob, rational_polynomial or equidistant."""
+    """Text of ROS's camera info: plumb_bob, rational_polynomial or equidistant."""
     distortion, matrix = _distortion(camera), _camera_matrix(camera)
     model = "equidistant" if camera.is_fisheye else "rational_polynomial" if len(distortion) == 8 else "plumb_bob"
     if model == "plumb_bob":
@@ -56,7 +57,7 @@ def _camera_matrix(camera: CameraIntrinsics) -> list[float]:
 
 
 def _distortion(camera: CameraIntrinsics) -> list[float]:
-    """The coefficients in OpenCV's order, as many as OpenCV takes."""
+    """Coefficients in OpenCV's order, in a number that OpenCV accepts."""
     order = FISHEYE_ORDER if camera.is_fisheye else OPENCV_ORDER
     last = max((order.index(name) + 1 for name in camera.values if name in order), default=0)
     count = next(count for count in OPENCV_COUNTS if count >= last)

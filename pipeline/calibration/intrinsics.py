@@ -1,4 +1,4 @@
-"""A calibrated digital camera in pixels: intrinsics with standard deviations, and what they rest on."""
+"""Intrinsics of a calibrated digital camera in pixels, with standard deviations and the data they are based on."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,7 +23,8 @@ HIGHLY_CORRELATED = 0.9
 
 @dataclass(frozen=True)
 class Intrinsic:
-    """A value with the standard deviation of the model, and that by leaving out pictures; None with few pictures."""
+    """A value with its standard deviation from the adjustment, and by leaving out images (jackknife); None with too few
+    images."""
 
     value: float
     sigma_model: float
@@ -31,7 +32,7 @@ class Intrinsic:
 
     @property
     def sigma(self) -> float:
-        """The one to use: the larger."""
+        """The larger standard deviation, which should be used."""
         return max(self.sigma_model, self.sigma_clusters or 0.0)
 
     def as_json(self) -> dict[str, float | None]:
@@ -45,12 +46,18 @@ class Intrinsic:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class CameraIntrinsics:
-    """Intrinsics in px from the centre of the top left pixel, x right, y down, as OpenCV has them.
+    """Intrinsics in px from the centre of the top left pixel, x right, y down, as in OpenCV.
 
-    values: fx, fy, cx, cy, then the distortion's. covariance: of these, with the standard deviations to use.
-    correlations: pairs above HIGHLY_CORRELATED. left_out: of its
-    pictures, why. used: number of pictures. known_share: how far out the lens was observed, of the way to the corner.
-    lens: how its model was chosen; None where it was given. pitch_um: of a pixel, None if unknown.
+    Attributes
+    ----------
+    values : fx, fy, cx, cy, then the distortion parameters.
+    covariance : of these, scaled to the larger standard deviations.
+    correlations : pairs above HIGHLY_CORRELATED.
+    left_out : by image, the reason.
+    used : number of images.
+    known_share : radius up to which the lens was observed, as a fraction of the distance to the corner.
+    lens : selection of the lens model; None where it was given.
+    pitch_um : pixel pitch, None if unknown.
     """
 
     pictures: CameraPictures
@@ -74,7 +81,7 @@ class CameraIntrinsics:
         return self.family == "opencv_fisheye"
 
     def covariance_matrix(self, names: Sequence[str]) -> Array:
-        """(n, n) of some values; 0 of those that were not estimated."""
+        """(n, n) covariance of some values; 0 for those that were not estimated."""
         rows = [list(self.values).index(name) if name in self.values else -1 for name in names]
         known = np.pad(self.covariance, (0, 1))
         return np.asarray(known[np.ix_(rows, rows)])
@@ -108,7 +115,7 @@ class CameraIntrinsics:
         }
 
     def _opencv_json(self) -> dict[str, Any]:
-        """OpenCV's calibration of the same points, and of its own."""
+        """OpenCV's calibration of the same points, and of its own corners."""
         if self.check is None:
             return {"verdict": "not possible", "reason": "the camera was not checked"}
         shown: dict[str, Any] = {"verdict": self.check.verdict, "reason": self.check.reason}
@@ -118,7 +125,7 @@ class CameraIntrinsics:
         return shown
 
     def print(self, console: Console) -> None:
-        """The camera as a table, then what it rests on."""
+        """Print the camera as a table, then the data it is based on."""
         title = f"{self.pictures.name}, {self.pictures.width_px} x {self.pictures.height_px} px"
         table = Table(title=title, title_justify="left")
         for column in ("parameter", "value", "standard deviation"):
@@ -180,12 +187,12 @@ def camera_intrinsics(
     pitch_um: float | None,
     check: CameraCheck | None,
 ) -> CameraIntrinsics:
-    """The camera in px, from an adjustment of its pictures alone, in mm.
+    """Convert the adjustment of one camera from mm to px.
 
     Parameters
     ----------
-    pixel_mm : side of a pixel, as the adjustment took it
-    left_out, lens, pitch_um, check : as `CameraIntrinsics` has them
+    pixel_mm : side of a pixel in the adjustment
+    left_out, lens, pitch_um, check : see `CameraIntrinsics`
     """
     (camera,) = adjustment.network.cameras
     names = [name for name, prior in camera.distortion.parameters.items() if prior.sigma > 0.0]

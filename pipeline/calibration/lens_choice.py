@@ -1,4 +1,5 @@
-"""The lens model of a digital camera: the simplest that predicts pictures it was not fitted to as well as any."""
+"""Selection of a digital camera's lens model by cross-validation: the simplest with no significantly better
+alternative."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -22,15 +23,16 @@ PARAMETERS: dict[LensModel, tuple[str, ...]] = {
     "opencv5": ("k1", "k2", "p1", "p2", "k3"),
     "opencv8": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "fisheye": ("k1", "k2", "k3", "k4"),
-}  # from the simplest on, each but the last with all of the one before
+}  # from the simplest; each but the last extends the one before
 FOLDS = 5
-FEWEST_PICTURES = 6  # of fewer none is left out
-WIDE = 1.0  # half the picture's diagonal over the principal distance, from which on a fisheye is tried: 45 degrees
+FEWEST_PICTURES = 6  # images needed for the cross-validation
+WIDE = 1.0  # half the image's diagonal over the principal distance, above which a fisheye is tried: 45 degrees
 
 
 @dataclass(frozen=True)
 class LensScore:
-    """rms_px: a point, of pictures that were left out; None where the model has no solution."""
+    """Result of one lens model. rms_px: prediction error of a point in images left out; None where the model has no
+    solution."""
 
     model: LensModel
     rms_px: float | None
@@ -43,23 +45,24 @@ class LensChoice:
 
 
 def free_lens(model: LensModel, square_pixels: bool) -> Distortion:
-    """The distortion of a model, all parameters free; b1, by which fx and fy differ, unless pixels are square."""
+    """Distortion of a model with all parameters free, including b1 (fx differs from fy) unless the pixels are
+    square."""
     family = "opencv_fisheye" if model == "fisheye" else "opencv"
     names = PARAMETERS[model] if square_pixels else (*PARAMETERS[model], "b1")
     return Distortion(family, {name: Prior(0.0, np.inf) for name in names})
 
 
 def choose_lens(network: Network, square_pixels: bool, pixel_mm: float, adjusted: Adjust) -> LensChoice:
-    """Select the lens model of a camera by cross-validation over its pictures.
+    """Select the lens model of a camera by cross-validation over its images.
 
-    Fifths of the pictures are left out in turn; their points are predicted with the camera of the others, after a space
-    resection each, by the normal equations of all pictures. A richer model is taken where its predictions are better by
-    more than the standard error of the difference over the pictures.
+    One fifth of the images is left out in turn. Their points are predicted with the camera of the others, after a space
+    resection of each, using the normal equations of all images. A model with more parameters is taken where its
+    predictions are better by more than the standard error of the difference over the images.
 
     Parameters
     ----------
-    network : of one camera and its pictures, its marks alike in standard deviation
-    square_pixels : whether fx and fy are one
+    network : of one camera and its images, with equal standard deviations of all marks
+    square_pixels : whether fx and fy are equal
     pixel_mm : side of a pixel
     adjusted : adjusts a network
     """
@@ -92,7 +95,7 @@ def _is_better(squares: Array | None, than: Array | None) -> bool:
 
 
 def _try_adjustment(network: Network, adjusted: Adjust) -> Adjustment | None:
-    """The adjustment; None without a solution."""
+    """Adjust a network; None without a solution."""
     try:
         result = adjusted(network)
     except AdjustmentError:
@@ -101,7 +104,7 @@ def _try_adjustment(network: Network, adjusted: Adjust) -> Adjustment | None:
 
 
 def _is_wide(fitted: Adjustment) -> bool:
-    """Whether the field is so wide that a fisheye is likely."""
+    """Whether the field of view is so wide that a fisheye is likely."""
     (camera,) = fitted.network.cameras
     c_mm = fitted.value(Parameter.interior(camera.name, "c"))
     return float(np.hypot(*camera.frame_mm)) / 2.0 > WIDE * c_mm

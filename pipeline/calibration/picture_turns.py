@@ -1,4 +1,4 @@
-"""By which quarter turn a picture of a board was turned: by the one that fits the lens of the other pictures."""
+"""Quarter turns of board images: the turn that fits the lens of the other images."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,28 +18,28 @@ from pipeline.files.images_file import GivenImages
 from pipeline.files.project_file import Project
 from pipeline.results.comparator_file import ComparatorPoint
 
-PLAIN = 20.0  # twice the log of the odds, e to the 10
-FEWEST_PICTURES = 3  # that determine the lens by which the others are judged
+PLAIN = 20.0  # twice the log-likelihood ratio; odds of e to the 10
+FEWEST_PICTURES = 3  # images with known turns needed to determine the lens
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """Weighted squares of residuals, and how many redundant observations they come of."""
+    """Weighted sum of squared residuals, and its redundancy."""
 
     vpv: float
     redundancy: int
 
 
 def find_turns(project: Project, marks: Sequence[ComparatorPoint], camera: CameraPictures) -> CameraPictures:
-    """The camera's pictures with the turn of each; `unsure_turns`: those which both turns fit alike.
+    """Determine the quarter turn of each image; `unsure_turns`: those that fit equally with both turns.
 
-    The principal point and decentering distortion, which turn with the picture, tell one turn from the other: each
-    picture is resected with the lens of those whose turn is known, or, where these are too few, all are adjusted with
-    either turn. Raises AdjustmentError or InputError where the pictures of known turns have no solution.
+    The principal point and the decentring distortion, which turn with the image, distinguish the turns. Each image is
+    resected with the lens of those with known turns; where these are too few, all are adjusted with either turn. Raises
+    AdjustmentError or InputError where the images with known turns have no solution.
 
     Parameters
     ----------
-    marks : of the camera's pictures
+    marks : of the camera's images
     """
     open_turns = [name for name in camera.images if camera.turned_deg.get(name, 0) is None]
     known = {name: turn for name, turn in camera.turned_deg.items() if turn is not None}
@@ -60,7 +60,7 @@ def find_turns(project: Project, marks: Sequence[ComparatorPoint], camera: Camer
     if len(fixed) >= FEWEST_PICTURES:
         lens = adjusted(turned_network(fixed, known))
     else:
-        groups = [sought]  # all alike
+        groups = [sought]  # all with the same turn
     turns, unsure = dict[str, int](), list[str]()
     for group in groups:
         fits = dict[int, _Fit]()
@@ -85,7 +85,7 @@ def find_turns(project: Project, marks: Sequence[ComparatorPoint], camera: Camer
 
 
 def _is_plain(fits: Mapping[int, _Fit], best: int) -> bool:
-    """Whether one turn fits so much better than the other that chance does not explain it."""
+    """Whether one turn fits significantly better than the other."""
     if len(fits) < len(QUARTERS_DEG):
         return bool(fits)
     variance = max(fits[best].vpv / max(fits[best].redundancy, 1), 1.0)
@@ -93,7 +93,7 @@ def _is_plain(fits: Mapping[int, _Fit], best: int) -> bool:
 
 
 def _held_camera(camera: Camera, fitted: Adjustment) -> Camera:
-    """The camera as it was adjusted, held fixed."""
+    """The camera with its adjusted parameters held fixed."""
 
     def prior(name: str) -> Prior:
         return Prior(fitted.value(Parameter.interior(camera.name, name)), 0.0)

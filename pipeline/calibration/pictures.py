@@ -1,4 +1,4 @@
-"""The pictures of `reseau calibrate`, by the camera that took them."""
+"""Image files of `reseau calibrate`, grouped by camera."""
 
 import os
 from collections import defaultdict
@@ -17,15 +17,18 @@ from pipeline.text.names import SCAN_ENDINGS, names_below
 
 _Kind = tuple[int, int, float | None]  # width, height, focal length
 QUARTERS_DEG = (90, 270)
-TURNS_BY_TAG = {6: 90, 8: 270}  # of Exif's Orientation: viewers turn these back
+TURNS_BY_TAG = {6: 90, 8: 270}  # Exif's Orientation of images that viewers turn back
 
 
 @dataclass(frozen=True)
 class CameraPictures:
-    """Pictures of one size and one focal length (of their Exif tags, None without), some of them turned by a quarter.
+    """Images of one size and one focal length (from their Exif tags, None without), some of them turned by 90 or 270
+    degrees.
 
-    turned_deg: by how much those were turned counter-clockwise against the others, None where only their contents tell.
-    unsure_turns: those whose contents do not tell it either.
+    Attributes
+    ----------
+    turned_deg : by image, the counter-clockwise turn relative to the others; None where the tag does not give it.
+    unsure_turns : images whose contents do not determine it either.
     """
 
     name: str
@@ -39,21 +42,22 @@ class CameraPictures:
 
 @dataclass(frozen=True)
 class BoardPictureFiles:
-    """files: of every image by its name; cameras: that of most pictures first; unreadable: by image, why."""
+    """Image files. files: by the image's name; cameras: the one with the most images first; unreadable: by image, the
+    reason."""
 
     files: Mapping[str, Path]
     cameras: tuple[CameraPictures, ...]
     unreadable: Mapping[str, str]
 
     def replace_camera(self, camera: CameraPictures) -> "BoardPictureFiles":
-        """With this camera in the place of the one of its name."""
+        """Replace the camera of this name."""
         return replace(self, cameras=tuple(camera if each.name == camera.name else each for each in self.cameras))
 
 
 def find_pictures(given: Sequence[Path], out: Path) -> BoardPictureFiles:
-    """Find the pictures among files and below folders, and sort them by camera; what is below `out` is no picture.
+    """Find the images among files and below folders, and group them by camera. Files below `out` are ignored.
 
-    Raises InputError where there is none that can be read.
+    Raises InputError where no image can be read.
     """
     paths = list(dict.fromkeys(_files(given, out.resolve())))
     if not paths:
@@ -78,7 +82,7 @@ def find_pictures(given: Sequence[Path], out: Path) -> BoardPictureFiles:
         raise InputError(f"No picture can be read: {next(iter(unreadable.values())).rstrip('.')}.")
     by_count = sorted(groups.items(), key=lambda group: -len(group[1]))
     kinds = dict[_Kind, list[str]]()
-    for (width, height, focal), images in by_count:  # of a size and the size turned by a quarter the more frequent
+    for (width, height, focal), images in by_count:  # the more frequent of a size and the size with sides exchanged
         turned = (height, width, focal)
         kinds.setdefault(turned if turned in kinds else (width, height, focal), []).extend(images)
     cameras = [
@@ -105,7 +109,7 @@ def _files(given: Iterable[Path], out: Path) -> Iterator[Path]:
 
 
 def _exif(path: Path) -> Mapping[str, Any]:
-    """The Exif tags of a picture; none where it has none."""
+    """Exif tags of an image; empty where there are none."""
     try:
         return jpeg_colour_tags(path).exif
     except (*DECODING_ERRORS, OSError):
@@ -113,7 +117,7 @@ def _exif(path: Path) -> Mapping[str, Any]:
 
 
 def _names(cameras: Sequence[_Kind]) -> list[str]:
-    """ "camera" where there is one; else what tells them apart."""
+    """Names of the cameras: "camera" for a single one; else with the properties that distinguish them."""
     if len(cameras) == 1:
         return ["camera"]
     sizes = {(width, height) for width, height, _ in cameras}

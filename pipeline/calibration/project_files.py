@@ -1,4 +1,4 @@
-"""The project that `reseau calibrate` writes, which `reseau run` continues."""
+"""Project files of `reseau calibrate`, which `reseau run` can continue."""
 
 import os
 from collections.abc import Mapping
@@ -16,7 +16,8 @@ from pipeline.text.wording import quoted
 
 @dataclass(frozen=True)
 class CalibrationOptions:
-    """pitch_um: of a pixel, None where it is not known. ros: whether ROS's camera info is written, too."""
+    """Options of a calibration. pitch_um: pixel pitch, None if unknown; ros: whether ROS's camera info is written,
+    too."""
 
     board: BoardOptions
     lens: LensSetting = "auto"
@@ -26,14 +27,14 @@ class CalibrationOptions:
 
     @property
     def pixel_mm(self) -> float:
-        """Side of a pixel, as the project has it."""
+        """Side of a pixel in the project; assumed if unknown."""
         return (self.pitch_um or ASSUMED_PITCH_UM) / 1000.0
 
 
 def write_project(
     out: Path, pictures: BoardPictureFiles, options: CalibrationOptions, lenses: Mapping[str, LensModel]
 ) -> Project:
-    """Write project.toml, a camera file for each camera, and images.csv where pictures differ; read the project."""
+    """Write project.toml, a camera file for each camera, and images.csv where images differ; then read the project."""
     out.mkdir(parents=True, exist_ok=True)
     for camera in pictures.cameras:
         write_atomically(out / f"{camera.name}.toml", _camera_text(camera, options, lenses[camera.name]))

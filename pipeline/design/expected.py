@@ -26,7 +26,7 @@ DIRECTIONS = 36
 QUARTERS = 4
 ROUNDING_UM = 1e-9
 INTERIOR = ("c", "x0", "y0")
-ROUNDING = 1e-9  # relative to the largest component of the null directions: below it, a component is 0
+ROUNDING = 1e-9  # relative cut-off of singular values of the null directions
 
 
 @dataclass(frozen=True)

@@ -18,15 +18,7 @@ from pipeline.drawing import svg
 from pipeline.report.numbers import NONE, fixed, significant, value_and_sigma
 
 WIDE_RANGE = 2.0  # ratio of the largest to the smallest value, from which the axis is logarithmic
-COLORS = (
-    "#0072b2",
-    "#d55e00",
-    "#009e73",
-    "#cc79a7",
-    "#e69f00",
-    "#56b4e9",
-    "#555555",
-)  # distinguishable by the colour-blind
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555")  # colour-blind safe
 DASHES = ("none", "7 3", "2 3", "7 3 2 3")
 WIDTH_PX, HEIGHT_PX, KEY_PX = 760.0, 460.0, 160.0
 ROW_PX = 17.0  # px, height of a name in the legend
@@ -112,7 +104,7 @@ def _relative(sigmas: list[float]) -> list[float]:
 
 
 def print_design(design: Design, console: Console) -> None:
-    """For a person; file paths are never folded."""
+    """Print the tables of a design to the console; file paths are not wrapped."""
     expected, adjustment = design.expected, design.expected.plan.adjustment
     console.print(
         f"{len(expected.network.images)} photographs, {len(expected.network.points)} points, redundancy "
@@ -243,7 +235,7 @@ def _sweep_table(swept: Swept) -> Table:
 
 
 def _sigma(sigma: float) -> str:
-    """Two digits."""
+    """Format a standard deviation with two digits."""
     if sigma == 0.0:
         return "0"
     return UNDETERMINED if math.isinf(sigma) else value_and_sigma(sigma, sigma)[1]

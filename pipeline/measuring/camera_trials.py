@@ -55,7 +55,7 @@ _FEW = 3  # best results of the search without a pitch, to be refined at the pit
 _BY_CHANCE = 1.0  # expected false alarms: the constellation may be one
 _HOPELESS = 100.0  # expected false alarms: above it, the marks are not measured
 _ODDS = 1000.0  # ratio of the expected false alarms of two layouts: the rarer one is present, the other is not
-_AFFINE = 6  # parameters
+_AFFINE = 6  # parameters of an affine transformation
 
 
 @dataclass(frozen=True, eq=False)

@@ -178,7 +178,7 @@ def image_options(project: Project, said: Mapping[str, tuple[ToneInformation, ..
 def _targets(project: Project) -> "SoughtTargets | None":
     if project.targets is None:
         return None
-    from pipeline.measuring.target_stage import SoughtTargets  # and all that looks for them
+    from pipeline.measuring.target_stage import SoughtTargets  # late: it imports the detection of targets
 
     return SoughtTargets.from_project(project)
 
