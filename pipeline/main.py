@@ -13,7 +13,7 @@ _OBJECTS = (  # allocations per garbage collection: each one rescans an archive'
 
 
 def main() -> None:
-    """Run the command line with one BLAS thread: two threads on two cores slowed the adjustment several times.
+    """Run the command line with one BLAS thread: two threads on two cores made the adjustment several times slower.
 
     The variables must be set before numpy is imported, hence before the command line is.
     """

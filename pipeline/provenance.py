@@ -106,7 +106,7 @@ class FileState(NamedTuple):  # a tuple, since archives have many
     uri : path relative to the project's folder, with `/`, or address.
     bytes : size; -1 where it does not exist.
     mtime_ns : time of the last change, for local files.
-    etag : state of an object's content in its store.
+    etag : version tag of an object, in place of the time.
     """
 
     uri: str

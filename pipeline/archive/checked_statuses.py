@@ -73,7 +73,7 @@ class CheckedResult:
     ----------
     result : row of the raw result.
     scan : the scan with its checked statuses.
-    decisions : hash of the review decisions about the image that were applied.
+    decisions : hash of the review decisions about the image that were considered.
     """
 
     result: int

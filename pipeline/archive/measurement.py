@@ -30,7 +30,7 @@ from pipeline.results.measured_record import MeasuredScan
 _PLACE = "project folder"
 Array = NDArray[np.float64]
 
-_AT_A_TIME = 50_000  # rows
+_AT_A_TIME = 50_000  # rows fetched at once
 
 
 def read_measurement(path: Path, digest: str = "") -> tuple[MeasuredScan, ...]:
@@ -198,7 +198,7 @@ class StoredMarks:
     @cached_property
     def plain(self) -> tuple[StoredFrame, ...]:
         """Frames that are reported only in totals: good ones in which, if they have targets, at least one is
-        measured."""
+        observed."""
         with Store(self._path) as store:
             rows = store.connection.execute(_PLAIN, (self._judging.row, str(Verdict.GOOD)))
             return tuple(StoredFrame(*row) for row in rows)

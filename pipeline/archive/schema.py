@@ -113,7 +113,7 @@ alter table judged_frame add column lot integer not null default 0;
 # Hash of the project's request when it was last determined whether the scan's result is current.
 _ASKED = "alter table scan add column asked text"
 
-# BLAKE2b of rows, see `results_integrity`; decisions: hash of the applied decisions about the image.
+# BLAKE2b of rows, see `results_integrity`; decisions: hash of the decisions about the image that were considered.
 _DIGESTS = """
 alter table scan add column digest text;
 alter table result add column marks_digest text;

@@ -94,7 +94,8 @@ class Work:
         self.results: dict[str, int] = {}  # by image, row of the result of its last request
 
     def measure(self, tasks: Iterable[ScanTask]) -> Iterator[MeasuredScan]:
-        """Yield the scan of each task, measured or stored, with the decisions that precede the checks: a `Measure`."""
+        """Yield the scan of each task, measured or stored, with all decisions applied except acceptance
+        (`before_checks`): a `Measure`."""
         missing = []
         for task in map(self._reviewed_task, tasks):
             row = self._row(task)
@@ -120,7 +121,7 @@ class Work:
             self._complete(missing, len(tasks), reporter)
 
     def read(self, name: str) -> MeasuredScan:
-        """Scan of an image as last requested, with the decisions that precede the checks."""
+        """Scan of an image as last requested, with all decisions applied except acceptance (`before_checks`)."""
         scan = self._store.scan(self.results[name], name, self._folder)
         return before_checks(scan, self._counting.get(name, {}))
 

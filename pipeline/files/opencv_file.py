@@ -29,7 +29,7 @@ class PixelCamera:
     ----------
     interior_px : fx, fy, cx, cy.
     family : distortion model.
-    distortion : values by parameter, without trailing zeros.
+    distortion : values by parameter, as many as the file has, and b2 (skew) from the camera matrix.
     size_px : width and height of the images; None if unknown.
     covariance : of fx, fy, cx, cy and the first distortion coefficients; None if the file has none.
     """

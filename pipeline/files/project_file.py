@@ -50,7 +50,7 @@ class Project:
     comparator, output : comparator.csv and the folder of the results.
     pitch_um : pixel pitch of the scans; None: from the files.
     pose : scan orientation.
-    tone : tone curve of the scans: auto, one of TONES, or the exponent of the grey value that is proportional to light.
+    tone : tone curve of the scans: auto, one of TONES, or the exponent p of light ~ (grey value)^p.
     unit_mm : user's unit of object coordinates, mm.
     max_pixels : limit for a scan, if the user states one.
     writing : scans in which the writing about the frame is read, as in `FiducialOptions`.

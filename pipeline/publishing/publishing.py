@@ -53,8 +53,11 @@ class Unpublished:
         self._removed.append(path)
 
     def publish(self) -> None:
-        """Move all files to their final places. Raises WriteError; checks that fail do so before anything is
-        changed."""
+        """Move all files to their final places.
+
+        Raises InputError, before anything is changed, where an existing file may not be replaced, and WriteError where
+        a file cannot be moved.
+        """
         comparator = self._project.comparator
         files = {self.place(comparator): comparator} if self.place(comparator).exists() else {}
         for file in sorted(self.folder.rglob("*")):
