@@ -57,11 +57,13 @@ def calibrate(
 
     Returns
     -------
-    Calibration Its cameras in px with standard deviations, `adjustments` by camera, plots and a table.
+    Calibration
+        Its cameras in px with standard deviations, `adjustments` by camera, plots and a table.
 
     Raises
     ------
-    InputError For a wrong option, and where no camera can be calibrated; the message gives the reason.
+    InputError
+        For a wrong option, and where no camera can be calibrated; the message gives the reason.
 
     Examples
     --------

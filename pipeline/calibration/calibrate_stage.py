@@ -149,7 +149,8 @@ def calibrate_pictures(
 
     Raises
     ------
-    InputError Where there is no image, or no camera can be calibrated; the message gives the reason.
+    InputError
+        Where there is no image, or no camera can be calibrated; the message gives the reason.
     """
     pictures = find_pictures(given, out)
     first: LensModel = "opencv4" if options.lens == "auto" else options.lens

@@ -23,7 +23,7 @@ HIGHLY_CORRELATED = 0.9
 
 @dataclass(frozen=True)
 class Intrinsic:
-    """A value with its standard deviation from the adjustment, and by leaving out images (jackknife); None with too few
+    """A value with its standard deviation from the adjustment, and by leaving out images; None with too few
     images."""
 
     value: float

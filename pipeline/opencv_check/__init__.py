@@ -1,1 +1,1 @@
-"""The adjustment checked against OpenCV's calibration."""
+"""Check of the adjustment against OpenCV's calibration."""

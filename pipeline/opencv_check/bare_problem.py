@@ -1,4 +1,5 @@
-"""The part of an adjustment that OpenCV can solve: one camera, no film, no priors, known points, equal weights."""
+"""Bare problem: the part of an adjustment that OpenCV can solve. One camera, no film, no priors, known points, equal
+weights."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -18,9 +19,9 @@ from pipeline.opencv_check.opencv_calibration import ImagePoints, can_begin
 from pipeline.opencv_check.opencv_model import FISHEYE, NAMES, Freedom, fixed, opencv_values, to_opencv_model
 from pipeline.types import Array
 
-GROSS_WEIGHT = 0.5  # observations that robust estimation left less of their weight are no observations here
+GROSS_WEIGHT = 0.5  # observations with a lower robust weight are left out
 
-# A family's parameters beside those of OpenCV; what has no counterpart is held at its adjusted value.
+# OpenCV's counterparts of each family's parameters. Parameters without one are held at their adjusted values.
 COUNTERPARTS: Mapping[str, Mapping[str, str]] = {
     "none": {},
     "torlegard": {"k3": "k1", "k5": "k2", "k7": "k3", "p1": "p1", "p2": "p2"},
@@ -31,17 +32,21 @@ COUNTERPARTS: Mapping[str, Mapping[str, str]] = {
     FISHEYE: {name: name for name in parameter_names(FISHEYE) if name not in ("b1", "b2")}
     | {"b1": "fy", "b2": "alpha"},
 }
-# Its own parameters that OpenCV estimates together or not at all.
+# Parameters that OpenCV estimates only together.
 FREE_TOGETHER = (frozenset({"p1", "p2"}), frozenset({"s1", "s2", "s3", "s4"}), frozenset({"tau_x", "tau_y"}))
 
 
 @dataclass(frozen=True)
 class BareProblem:
-    """The problem for the adjustment (network, approximations), and the same for OpenCV (images, freedom).
+    """The bare problem for the adjustment (network, approximations) and for OpenCV (images, freedom).
 
-    sigma_mm: the one standard deviation of all image coordinates; sigma_spread: the largest over the smallest of the
-    observations' own; gross: observations that robust estimation set aside; uncertain_points: how many object points
-    are not held fixed by their priors; left_out: images with too few points for OpenCV.
+    Attributes
+    ----------
+    sigma_mm : common standard deviation of all image coordinates.
+    sigma_spread : ratio of the largest to the smallest standard deviation of the observations.
+    gross : number of observations with a low robust weight.
+    uncertain_points : number of object points that their priors do not fix.
+    left_out : images with too few points for OpenCV.
     """
 
     network: Network
@@ -56,7 +61,7 @@ class BareProblem:
 
 
 def bare_problem(adjustment: Adjustment, camera_name: str) -> BareProblem:
-    """All images of one camera that OpenCV can begin, at the values of the adjustment."""
+    """Bare problem of one camera with all images for which OpenCV can find initial values, at the adjusted values."""
     network = adjustment.network
     camera = network.camera_by_name[camera_name]
     names = [image.name for image in network.images if image.camera == camera_name]
@@ -100,7 +105,7 @@ def bare_problem(adjustment: Adjustment, camera_name: str) -> BareProblem:
 
 
 def opencv_problem(problem: BareProblem, parameters: Array) -> BareProblem:
-    """The same problem with OpenCV's own distortion, from parameters (18,) in the order of `opencv_model.NAMES`."""
+    """The bare problem with OpenCV's own distortion, from parameters (18,) in the order of `opencv_model.NAMES`."""
     values = dict(zip(NAMES, parameters.tolist(), strict=True))
     values |= {"b1": values["fx"] / values["fy"] - 1, "b2": 0.0}
     free = set(problem.freedom.names) - {"fy"} | ({"b1"} if "fy" in problem.freedom.names else set())
@@ -121,7 +126,7 @@ def opencv_problem(problem: BareProblem, parameters: Array) -> BareProblem:
 
 
 def free_parameters(camera: Camera) -> set[str]:
-    """c, x0, y0 and the distortion parameters that are estimated in the bare problem, priors or not."""
+    """c, x0, y0 and the distortion parameters that are estimated in the bare problem, with or without priors."""
     given = camera.distortion.parameters
     counterparts = COUNTERPARTS[camera.distortion.family]
     free = {name for name in counterparts if name in given and given[name].sigma > 0}
@@ -154,7 +159,8 @@ def _freed(camera: Camera, values: Mapping[str, float], free: set[str]) -> Camer
 
 
 def _image_points(adjustment: Adjustment, image: str) -> tuple[ImagePoints, Array, list[str]]:
-    """What an image shows in the camera frame, the standard deviation (n,) of each observation, and the points."""
+    """Observations of an image in the camera frame, the standard deviation (n,) of each, and the names of the
+    points."""
     observations = adjustment.network.observations
     weights = adjustment.weights if len(adjustment.weights) else np.ones(len(observations))
     rows = [
@@ -194,8 +200,14 @@ def _observations(shown: Mapping[str, tuple[ImagePoints, Array, list[str]]], sig
 
 @dataclass(frozen=True)
 class Converted:
-    """A solution in OpenCV's model: parameters (n,) and a-priori standard deviations (n,) in the order of
-    `opencv_model.model_names`; residual_mm: what is left between the two lenses over the image, rms a point."""
+    """A solution in OpenCV's model.
+
+    Attributes
+    ----------
+    parameters : (n,) in the order of `opencv_model.model_names`.
+    sigmas : (n,) a-priori standard deviations.
+    residual_mm : difference of the two lenses over the image, rms per point.
+    """
 
     parameters: Array
     sigmas: Array
@@ -203,7 +215,7 @@ class Converted:
 
 
 def converted(problem: BareProblem, solved: Adjustment) -> Converted:
-    """Raises AdjustmentError where the lens cannot be brought to OpenCV's model."""
+    """Convert a solution to OpenCV's model. Raises AdjustmentError where the fit fails."""
     camera = problem.network.cameras[0]
     family = camera.distortion.family
     lens = adjusted_lens(solved, camera.name)
@@ -211,7 +223,7 @@ def converted(problem: BareProblem, solved: Adjustment) -> Converted:
     observed = problem.network.observations.xy_mm
     corners_mm = np.array([observed.min(axis=0), observed.max(axis=0)])
     whole = to_opencv_model(lens, corners_mm, _whole(family))
-    # What OpenCV does not estimate it holds at these values, and so they are for its standard deviations.
+    # OpenCV holds the parameters that it does not estimate at these values. Its standard deviations assume them.
     held = dict(zip(whole.lens.quantities[3:], whole.lens.parameters.tolist(), strict=True))
     model = fixed(whole.lens.distortion.family, held)
     known = replace(lens, covariance=solved.cofactor_of(own))
@@ -223,7 +235,7 @@ def converted(problem: BareProblem, solved: Adjustment) -> Converted:
 
 
 def _whole(family: str) -> tuple[str, ...]:
-    """All parameters that a family can need in OpenCV's model."""
+    """Parameters of OpenCV's model that are fitted for a family."""
     if family in ("opencv", FISHEYE):
         return ("b1",)
     return ("k1", "k2", "p1", "p2", "k3", *(["b1"] if "fy" in COUNTERPARTS[family].values() else []))

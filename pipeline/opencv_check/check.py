@@ -1,10 +1,10 @@
-"""The adjustment against OpenCV: the same observations through its calibration of cameras or fisheyes, in sigmas.
+"""Check of the adjustment against OpenCV: the same observations in its calibration of cameras or fisheyes, in sigmas.
 
-OpenCV knows neither film, nor priors, nor weights, nor uncertain object points. So the comparison is of one problem
-that both programs can solve: the observations in the camera frame by the adjusted transformations, the object points
-at their adjusted coordinates, all observations of one weight, no prior. The adjustment solves it anew, its solution is
-converted to OpenCV's model by a refit over the image, and what the step from the full adjustment to this problem
-changes is told too.
+OpenCV has neither film transformations, nor priors, nor weights, nor uncertain object points. The comparison therefore
+uses a bare problem that both programs can solve: the observations in the camera frame by the adjusted transformations,
+the object points at their adjusted coordinates, equal weights, no priors. The adjustment solves this problem again. Its
+solution is converted to OpenCV's model by a fit over the image. The change from the full adjustment to the bare problem
+is reported, too.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,40 +33,42 @@ from pipeline.opencv_check.opencv_corners import BoardPictures, compare_corners
 from pipeline.opencv_check.opencv_model import FISHEYE, INTERIOR, NAMES, Freedom, model_names
 from pipeline.results.check_file import CameraCheck, Check, Estimate, Row, Verdict
 
-LARGEST_DIFFERENCE = 1.0  # sigmas; about 0.1 is usual, for the two models are not quite the same
-LARGEST_SIGMA_RATIO = 1.2  # of the standard deviations; 1.006 to 1.03 is usual
-SAME_MODEL_DIFFERENCE = 0.1  # sigmas, where both programs are given the very same model
+LARGEST_DIFFERENCE = 1.0  # sigmas; about 0.1 is usual, since the two models differ slightly
+LARGEST_SIGMA_RATIO = 1.2  # ratio of standard deviations; 1.006 to 1.03 is usual
+SAME_MODEL_DIFFERENCE = 0.1  # sigmas, where both programs use the identical model
 SAME_MODEL_SIGMA_RATIO = 1.02
-LARGEST_DEPARTURE = 3.0  # sigmas that priors, weights and the like may move a parameter by before it is a difference
+LARGEST_DEPARTURE = 3.0  # sigmas, largest accepted change of a parameter by priors, weights etc.
 NOTABLE_DEPARTURE = 0.1
-LARGEST_REFIT = 0.5  # of the standard deviation of an image coordinate: beyond it OpenCV's model cannot take the lens
-UNDETERMINED = 0.05  # relative sigma of the principal distance above which there is nothing to compare
+LARGEST_REFIT = 0.5  # fraction of an image coordinate's sigma: above it, OpenCV's model does not fit the lens
+UNDETERMINED = 0.05  # relative sigma of the principal distance above which no comparison is possible
 WORSE_RMS = 1.02
-ROUNDINGS = 20.0  # rms below which a solution consists of OpenCV's rounding, in that of one coordinate
+ROUNDINGS = 20.0  # rms, in units of OpenCV's rounding of one coordinate, below which rounding dominates the residuals
 NOTABLE_SPREAD = 1.5
-NOTABLE_ROUNDING = 0.01  # of the standard deviation of an image coordinate
+NOTABLE_ROUNDING = 0.01  # fraction of the standard deviation of an image coordinate
 
 
 def check_against_opencv(adjustment: Adjustment, pictures: BoardPictures | None = None) -> Check:
     """Compare every camera of an adjustment with OpenCV's calibration of the same observations.
 
-    pictures: of a board; in those of digital cameras OpenCV's own points are calibrated, too.
+    The verdicts are "agrees": no parameter differs by more than one sigma; or a strong distortion does not fit OpenCV's
+    model well enough for that, but the solutions agree once the adjustment uses OpenCV's model. "differs": a parameter
+    differs, or priors and weights moved one by more than three sigmas. "not possible": OpenCV, or any adjustment
+    without priors, cannot solve the problem. The reason gives the details.
 
-    "agrees": no parameter differs by more than one sigma, or a strong lens does not fit OpenCV's model well enough for
-    that and the same observations agree once the adjustment is given OpenCV's model; "differs": one does, or priors and
-    weights moved one by more than three; "not possible": OpenCV, or anyone without priors, cannot solve it. The reason
-    says which.
+    Parameters
+    ----------
+    pictures : images of a board; for digital cameras, OpenCV's own points in them are calibrated, too.
     """
     names = [camera.name for camera in adjustment.network.cameras]
     return Check.from_cameras({name: _check_camera(adjustment, name, pictures) for name in names})
 
 
 class _NotPossible(Exception):
-    """Why there is nothing to compare."""
+    """Reason why no comparison is possible."""
 
 
 def _check_camera(adjustment: Adjustment, name: str, pictures: BoardPictures | None) -> CameraCheck:
-    known: dict[str, Any] = {}  # of the check, as far as it came
+    known: dict[str, Any] = {}  # results of the check up to a failure
     try:
         verdict, reason = _compare(adjustment, name, pictures, known)
     except _NotPossible as hindrance:
@@ -75,7 +77,7 @@ def _check_camera(adjustment: Adjustment, name: str, pictures: BoardPictures | N
 
 
 def _hindrance(adjustment: Adjustment, name: str) -> str:
-    """Why OpenCV has no model for this camera; empty where it has."""
+    """Reason why OpenCV has no model for this camera; empty where it has one."""
     network, camera = adjustment.network, adjustment.network.camera_by_name[name]
     if not adjustment.converged:
         return f"The adjustment itself has no solution: {_stop_reason(adjustment)}."
@@ -95,7 +97,7 @@ def _hindrance(adjustment: Adjustment, name: str) -> str:
 
 
 def _solve_without_priors(problem: BareProblem) -> Adjustment:
-    """Raises _NotPossible where the observations without priors give no camera."""
+    """Solve the bare problem. Raises _NotPossible where the observations alone do not determine the camera."""
     try:
         solved = adjust(problem.network, problem.approximations)
     except AdjustmentError as error:
@@ -125,7 +127,7 @@ def _stop_reason(adjustment: Adjustment) -> str:
 def _compare(
     adjustment: Adjustment, name: str, pictures: BoardPictures | None, known: dict[str, Any]
 ) -> tuple[Verdict, str]:
-    """The verdict and its reason; known: takes what was found on the way. Raises _NotPossible."""
+    """Verdict and its reason; intermediate results are added to known. Raises _NotPossible."""
     if hindrance := _hindrance(adjustment, name):
         raise _NotPossible(hindrance)
     problem = bare_problem(adjustment, name)
@@ -179,7 +181,7 @@ def _compare(
 
 
 def _is_digital(adjustment: Adjustment, problem: BareProblem) -> bool:
-    """Whether the camera's frame is that of its pictures."""
+    """Whether the camera frame is that of the images, without film transformations."""
     network = adjustment.network
     camera = network.camera_by_name[problem.network.cameras[0].name]
     transformations = {network.image_by_name[image.image].transformation for image in problem.images}
@@ -187,7 +189,7 @@ def _is_digital(adjustment: Adjustment, problem: BareProblem) -> bool:
 
 
 def _rms_um(solved: Adjustment) -> float:
-    """Per point: the root of the mean squared length of the residuals."""
+    """RMS length of the residual of a point, µm."""
     return 1e3 * float(np.sqrt((solved.residuals.v_mm**2).sum(axis=1).mean()))
 
 
@@ -207,7 +209,8 @@ def _rows(
 
 
 def _agreement(rows: Sequence[Row], sigmas_tell: bool) -> tuple[Verdict, str]:
-    """sigmas_tell: whether the residuals, from which the sigmas come, are more than OpenCV's rounding."""
+    """Verdict from the parameters. sigmas_tell: whether the residuals are larger than OpenCV's rounding, so that sigmas
+    are meaningful."""
     worst = max(rows, key=lambda row: row.difference_sigmas)
     loosest = max(rows, key=_sigma_ratio)
     found = f"{worst.name} differs most from OpenCV's, by {worst.difference_sigmas:.2f} sigma"
@@ -225,7 +228,7 @@ def _sigma_ratio(row: Row) -> float:
 
 
 def _same_model_agrees(problem: BareProblem, conversion: Converted, opencv: OpenCvCalibration) -> bool:
-    """Whether the adjustment with OpenCV's own model comes to OpenCV's solution."""
+    """Whether the adjustment with OpenCV's own model gives OpenCV's solution."""
     if problem.network.cameras[0].distortion.family in ("opencv", FISHEYE):
         return False
     same = opencv_problem(problem, conversion.parameters)
@@ -239,7 +242,7 @@ def _same_model_agrees(problem: BareProblem, conversion: Converted, opencv: Open
 
 
 def _departures(adjustment: Adjustment, solved: Adjustment, camera: Camera) -> dict[str, float]:
-    """How far, in the sigmas of the bare problem, the adjustment's own values lie from the bare problem's."""
+    """Differences between the full adjustment and the bare problem, in sigmas of the bare problem, by parameter."""
     return {
         each.quantity: abs(adjustment.value(each) - solved.value(each)) / solved.sigma(each)
         for each in (Parameter.interior(camera.name, name) for name in sorted(free_parameters(camera)))
@@ -248,7 +251,7 @@ def _departures(adjustment: Adjustment, solved: Adjustment, camera: Camera) -> d
 
 
 def _judge_departure(reason: str, departures: Mapping[str, float]) -> tuple[Verdict, str]:
-    """The agreement on the bare problem, seen with what separates the adjustment from that problem."""
+    """Verdict from the agreement on the bare problem and the departures of the full adjustment from it."""
     farthest = max(departures, key=lambda name: departures[name])
     sigmas = departures[farthest]
     alone = f"On the observations alone, {reason[0].lower()}{reason[1:]}"
@@ -261,7 +264,7 @@ def _judge_departure(reason: str, departures: Mapping[str, float]) -> tuple[Verd
 
 
 def _notes(problem: BareProblem, opencv: OpenCvCalibration, sigmas_tell: bool) -> str:
-    """What OpenCV was told that is not quite so."""
+    """Notes on the simplifications of the bare problem."""
     notes = [
         "This checks the adjustment and not the marks: OpenCV is given the same observations. Both take film "
         "transformations and object points as known, so these sigmas hold for that case"

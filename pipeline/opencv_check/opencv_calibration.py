@@ -1,4 +1,4 @@
-"""cv2.calibrateCameraExtended, and cv2.fisheye.calibrate, on observations in the camera frame."""
+"""Calibration of observations in the camera frame by cv2.calibrateCameraExtended and cv2.fisheye.calibrate."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,13 +10,11 @@ from measure.scans.parallel import one_opencv_thread
 from pipeline.opencv_check.opencv_model import FISHEYE_NAMES, NAMES, Y_UP, Freedom, camera_matrix
 from pipeline.types import Array
 
-PICTURE_PX = 4000.0  # the frame's longer side, in the pixels in which OpenCV is given the observations
-OBJECT_EXTENT = (
-    100.0  # rms distance of object points from their mean: of a small one, or in metres, OpenCV loses digits
-)
+PICTURE_PX = 4000.0  # px, longer side of the frame in the observations for OpenCV
+OBJECT_EXTENT = 100.0  # rms distance of object points from their centroid: with smaller numbers OpenCV loses digits
 CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 300, 1e-15)
-FLAT = 1e-3  # OpenCV takes a field for a plane where its smallest extent is below this part of the middle one (squared)
-FEWEST_FLAT, FEWEST_DEEP = 4, 6  # points from which OpenCV begins an image
+FLAT = 1e-3  # squared ratio of the smallest to the middle extent, below which OpenCV treats a field as a plane
+FEWEST_FLAT, FEWEST_DEEP = 4, 6  # points that OpenCV needs for the initial orientation of an image
 RADIAL_FLAGS = {
     "k1": cv2.CALIB_FIX_K1,
     "k2": cv2.CALIB_FIX_K2,
@@ -29,7 +27,7 @@ RADIAL_FLAGS = {
 
 @dataclass(frozen=True)
 class ImagePoints:
-    """One image for OpenCV: object points (n, 3) and where they were observed in the camera frame (n, 2), mm, y up."""
+    """One image for OpenCV: object points (n, 3) and their observations in the camera frame (n, 2), mm, y up."""
 
     image: str
     xyz: Array
@@ -38,9 +36,14 @@ class ImagePoints:
 
 @dataclass(frozen=True)
 class OpenCvCalibration:
-    """Parameters (n,) and standard deviations (n,) in the order of `opencv_model.model_names`; rms a point in um.
+    """OpenCV's solution.
 
-    rounding_um: rms of what the rounding to single precision, which OpenCV demands, changes an image coordinate by.
+    Attributes
+    ----------
+    parameters : (n,) in the order of `opencv_model.model_names`.
+    sigmas : (n,) standard deviations.
+    rms_um : per point.
+    rounding_um : rms change of an image coordinate by the rounding to single precision, which OpenCV requires.
     """
 
     parameters: Array
@@ -50,7 +53,7 @@ class OpenCvCalibration:
 
 
 def can_begin(xyz: Array) -> bool:
-    """Whether OpenCV finds a start of its own for an image of these points (n, 3)."""
+    """Whether OpenCV can compute initial values for an image of these points (n, 3)."""
     if len(xyz) < FEWEST_FLAT:
         return False
     extents = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
@@ -60,18 +63,17 @@ def can_begin(xyz: Array) -> bool:
 
 
 def calibrate(images: Sequence[ImagePoints], freedom: Freedom, start: Array) -> OpenCvCalibration:
-    """OpenCV's least squares from `start` (18,); what `freedom` does not name is held at its start.
+    """OpenCV's least squares with initial values `start` (18,); parameters that are not in `freedom` are held.
 
-    Its points are single precision: object points are taken about their mean and of one size, and the frame about its
-    middle.
-    Raises cv2.error where OpenCV refuses.
+    OpenCV's points are single precision. Object points are therefore reduced to their centroid and scaled to a common
+    extent, and image points are reduced to the frame. Raises cv2.error where OpenCV fails.
     """
     pixels = _Pixels.from_images(images, start)
     rounded = [each.astype(np.float32) for each in pixels.places]
     objects = [each.astype(np.float32) for each in pixels.objects]
     tilted = "tau_x" in freedom.names or bool(start[-2:].any())
     lens = start[4:] if tilted else start[4:-2]
-    with one_opencv_thread():  # several add up the images in the order in which they end, which differs by the run
+    with one_opencv_thread():  # several threads sum the images in the order they finish, which is not reproducible
         rms_px, adjusted_matrix, distortion, _, _, sigmas, _, _ = cv2.calibrateCameraExtended(
             objects,
             rounded,
@@ -82,7 +84,7 @@ def calibrate(images: Sequence[ImagePoints], freedom: Freedom, start: Array) -> 
             criteria=CRITERIA,
         )
     values = np.zeros(len(NAMES) - 4)
-    values[: np.size(distortion)] = np.ravel(distortion)[: len(values)]  # without a tilt OpenCV gives none
+    values[: np.size(distortion)] = np.ravel(distortion)[: len(values)]  # OpenCV returns no tilt if it is not estimated
     rounding_px = np.concatenate([a - b for a, b in zip(pixels.places, rounded, strict=True)])
     return OpenCvCalibration(
         parameters=np.concatenate([pixels.interior_mm(np.asarray(adjusted_matrix, dtype=np.float64)), values]),
@@ -93,11 +95,12 @@ def calibrate(images: Sequence[ImagePoints], freedom: Freedom, start: Array) -> 
 
 
 def calibrate_fisheye(images: Sequence[ImagePoints], freedom: Freedom, start: Array) -> OpenCvCalibration:
-    """OpenCV's least squares of a fisheye from `start` (9,); what `freedom` does not name is held at its start.
+    """OpenCV's least squares of a fisheye with initial values `start` (9,); parameters that are not in `freedom` are
+    held.
 
-    It gives no standard deviations: these are from the derivatives that it gives, at where it ends. It takes double
-    precision; what may be told from its solution is what is left of a gradient that is not quite 0.
-    Raises cv2.error where OpenCV refuses.
+    OpenCV returns no standard deviations for a fisheye: they are computed from its derivatives at the solution. It uses
+    double precision; the accuracy of its solution is limited by a gradient that is not exactly 0. Raises cv2.error
+    where OpenCV fails.
     """
     pixels = _Pixels.from_images(images, start)
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_RECOMPUTE_EXTRINSIC
@@ -140,7 +143,8 @@ def calibrate_fisheye(images: Sequence[ImagePoints], freedom: Freedom, start: Ar
 
 
 def _fisheye_derivatives(xyz: Array, turn: Array, shift: Array, matrix: Array, lens: Array, alpha: float) -> Array:
-    """By the camera's parameters (2 n, 9), in their order, less what a change of the pose does as well."""
+    """Derivatives (2 n, 9) with respect to the camera's parameters, projected orthogonally to those of the exterior
+    orientation."""
     _, jacobian = cv2.fisheye.projectPoints(xyz[None], turn, shift, matrix, lens, alpha=alpha)
     pose = np.linalg.qr(jacobian[:, 8:14])[0]
     by_camera = jacobian[:, [*range(8), 14]]
@@ -149,8 +153,16 @@ def _fisheye_derivatives(xyz: Array, turn: Array, shift: Array, matrix: Array, l
 
 @dataclass(frozen=True)
 class _Pixels:
-    """The images as OpenCV is given them: places (n, 2) in pixels of mm, y down, object points about their mean and of
-    the extent OBJECT_EXTENT; offset (2,) of the top left corner, size of the frame."""
+    """Observations for OpenCV.
+
+    Attributes
+    ----------
+    objects : object points, reduced to their centroid and scaled to OBJECT_EXTENT.
+    places : (n, 2) image points in px, y down.
+    mm : size of a pixel.
+    offset : (2,) of the top left corner, px.
+    size : of the frame, px.
+    """
 
     objects: list[Array]
     places: list[Array]
@@ -176,14 +188,14 @@ class _Pixels:
         return np.concatenate(self.places)
 
     def matrix(self, values: Array) -> Array:
-        """OpenCV's camera matrix (3, 3) in pixels."""
+        """OpenCV's camera matrix (3, 3) in px."""
         matrix = camera_matrix(values) / self.mm
         matrix[2, 2] = 1.0
         matrix[:2, 2] -= self.offset
         return matrix
 
     def interior_mm(self, matrix: Array) -> Array:
-        """fx, fy, cx, cy (4,), y up, of such a matrix."""
+        """fx, fy, cx, cy (4,), y up, from a camera matrix in px."""
         return np.concatenate([np.diag(matrix)[:2], (matrix[:2, 2] + self.offset) * Y_UP]) * self.mm
 
 
@@ -203,7 +215,8 @@ def _flags(freedom: Freedom, tilted: bool) -> int:
 
 
 def _sigmas(sigmas: Array, freedom: Freedom, start: Array, pixel_mm: float) -> Array:
-    """In OpenCV's order, which is that of NAMES; with the ratio kept it gives the focal length's at fy alone."""
+    """Standard deviations in the order of NAMES. If the ratio of the focal lengths is held, OpenCV returns only that of
+    fy."""
     found = sigmas[: len(NAMES)] * np.where(np.arange(len(NAMES)) < 4, pixel_mm, 1.0)
     if "fy" not in freedom.names:
         found[0] = found[1] * start[0] / start[1]

@@ -1,4 +1,4 @@
-"""A board's points as OpenCV itself finds them in a digital picture, beside those that were measured here."""
+"""Points of a board found by OpenCV in digital images, compared with those that were measured."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,18 +21,23 @@ from pipeline.types import Array
 Bytes = NDArray[np.uint8]
 Calibrate = Callable[[Sequence[ImagePoints]], OpenCvCalibration]
 
-HALF_WINDOW_PX = 11  # of cornerSubPix, as OpenCV's own sample of a calibration has it
+HALF_WINDOW_PX = 11  # of cornerSubPix, as in OpenCV's calibration sample
 CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.0001)  # of the same sample
 FLAGS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_FAST_CHECK | cv2.CALIB_CB_NORMALIZE_IMAGE  # of the same sample
-NEAREST = 0.4  # of the distance to the next point, within which a point of OpenCV's is that of a name
+NEAREST = 0.4  # of the distance to the next point: largest distance between corresponding points
 FEWEST_PICTURES = 3
 
 
 @dataclass(frozen=True)
 class BoardPictures:
-    """The pictures of a board. open_scan: of an image, raises MeasurementError or KeyError where its scan is not at
-    hand; pitch_um: across and down, by image; turned: (quarters counter-clockwise in degrees, size of the sensor), of
-    the images that were turned."""
+    """Images of a board.
+
+    Attributes
+    ----------
+    open_scan : opens an image by its name; raises MeasurementError or KeyError where its scan is not available.
+    pitch_um : pixel pitch across and down, by image.
+    turned : (counter-clockwise turn in degrees, size of the sensor), by image, for images that were turned.
+    """
 
     board: BoardSpec
     open_scan: Callable[[str], Scan]
@@ -40,7 +45,7 @@ class BoardPictures:
     turned: Mapping[str, tuple[int, tuple[float, float]]] = field(default_factory=dict)
 
     def points_mm(self, image: str) -> Array:
-        """(n, 2) the points that OpenCV finds, in the frame of the sensor, mm; none where the scan is not at hand."""
+        """(n, 2) points that OpenCV finds, in the frame of the sensor, mm; empty where the scan is not available."""
         try:
             with self.open_scan(image) as scan:
                 grey = scan.window(0, 0, scan.width_px, scan.height_px) * (255.0 / scan.full_scale_dn)
@@ -53,7 +58,7 @@ class BoardPictures:
 
 
 def detector_name(board: BoardSpec) -> str:
-    """OpenCV's functions that find such a board; empty where it has none that is customary."""
+    """OpenCV's functions that detect such a board; empty where there is no customary one."""
     match board:
         case ChessboardSpec():
             return f"findChessboardCorners and cornerSubPix, half a window of {HALF_WINDOW_PX} px"
@@ -68,7 +73,7 @@ def detector_name(board: BoardSpec) -> str:
 
 
 def find_points(picture: Bytes, board: BoardSpec) -> Array:
-    """(n, 2) column and row of a board's points by OpenCV's own functions with their customary settings."""
+    """(n, 2) column and row of a board's points, by OpenCV's functions with their customary settings."""
     found: object = True
     points = None
     match board:
@@ -91,8 +96,10 @@ def find_points(picture: Bytes, board: BoardSpec) -> Array:
 def compare_corners(
     images: Sequence[ImagePoints], pictures: BoardPictures, calibrate: Calibrate
 ) -> CornersCheck | None:
-    """OpenCV's calibration of the points that were measured here, and of OpenCV's own in their place: of those that
-    both have. None where too few pictures are at hand, or OpenCV finds its board in too few."""
+    """Calibrate the measured points and OpenCV's own points with OpenCV, using the points that both have.
+
+    Returns None where too few images are available, or OpenCV finds the board in too few of them.
+    """
     both = [pair for image in images if (pair := _paired(image, pictures)) is not None]
     if len(both) < FEWEST_PICTURES:
         return None
@@ -113,7 +120,8 @@ def compare_corners(
 
 
 def _paired(image: ImagePoints, pictures: BoardPictures) -> tuple[ImagePoints, ImagePoints] | None:
-    """The points that both have, each named as the one measured here that is nearest; None where they are too few."""
+    """Corresponding points, each of OpenCV's with the name of the nearest measured one; None where there are too
+    few."""
     own_mm = pictures.points_mm(image.image)
     if len(own_mm) == 0 or len(image.xyz) < 2:
         return None

@@ -1,8 +1,8 @@
-"""OpenCV's camera models beside the adjustment's: their parameters, and lenses brought to them.
+"""OpenCV's camera models and the adjustment's: parameters, and conversion of lenses.
 
-Parameters are those of cv2.calibrateCamera, or of cv2.fisheye.calibrate, in the camera frame's unit: fx, fy, cx, cy in
-mm, cx and cy being the principal point x0', y0' (y up); k1 to s4 and the fisheye's alpha without unit and the sensor's
-tilt tau_x, tau_y in rad, in OpenCV's own signs.
+Parameters are those of cv2.calibrateCamera, or of cv2.fisheye.calibrate, in the unit of the camera frame: fx, fy, cx,
+cy in mm, where cx and cy are the principal point x0', y0' (y up); k1 to s4 and the fisheye's alpha without unit; the
+sensor's tilt tau_x, tau_y in rad, with OpenCV's signs.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,40 +19,45 @@ INTERIOR = ("fx", "fy", "cx", "cy")
 NAMES = (
     *INTERIOR, "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y",
 )  # fmt: skip
-FISHEYE = "opencv_fisheye"  # the adjustment's family of this model
+FISHEYE = "opencv_fisheye"  # name of this model's family in the adjustment
 FISHEYE_NAMES = (*INTERIOR, "k1", "k2", "k3", "k4", "alpha")
 Y_UP = np.array([1.0, -1.0])
 
 
 @dataclass(frozen=True)
 class Freedom:
-    """Which of a model's parameters are estimated. "fx" alone of the two: one focal length, the ratio fx/fy is kept."""
+    """Parameters of a model that are estimated. "fx" without "fy": one focal length, the ratio fx/fy is held."""
 
     names: tuple[str, ...]
 
     @property
     def held_interior(self) -> tuple[str, ...]:
-        """Which of c, x0 and y0 are not."""
+        """Those of c, x0 and y0 that are held."""
         return tuple(own for own, name in (("c", "fx"), ("x0", "cx"), ("y0", "cy")) if name not in self.names)
 
     @property
     def distortion(self) -> tuple[str, ...]:
-        """Which parameters of the adjustment's family of this model are."""
+        """Estimated distortion parameters, by the names of the adjustment's family."""
         affinity = [own for own, name in (("b1", "fy"), ("b2", "alpha")) if name in self.names]
         return (*(name for name in self.names if name not in (*INTERIOR, "alpha")), *affinity)
 
 
 def model_names(family: str) -> tuple[str, ...]:
-    """The parameters of OpenCV's model of a distortion family."""
+    """Parameters of OpenCV's model for a distortion family."""
     return FISHEYE_NAMES if family == FISHEYE else NAMES
 
 
 def to_opencv_model(lens: Lens, corners_mm: Array, estimated: Sequence[str]) -> ConvertedLens:
-    """A lens in the adjustment's family of OpenCV's model, over the rectangle between two corners (2, 2).
+    """Convert a lens to the adjustment's family of OpenCV's model, over the rectangle between two corners (2, 2).
 
-    estimated: the parameters that are fitted. Of a lens of such a family the others
-    keep their values, but for the skew b2, which cv2.calibrateCamera does not know.
-    Raises AdjustmentError where no fit stands still.
+    Parameters
+    ----------
+    estimated : parameters that are fitted. If the lens has such a family already, its other parameters keep their
+        values, except the shear b2, which cv2.calibrateCamera does not model.
+
+    Raises
+    ------
+    AdjustmentError : the fit does not converge.
     """
     family = lens.distortion.family
     own = dict(zip(parameter_names(family), lens.parameters.tolist(), strict=True))
@@ -68,8 +73,8 @@ def fixed(family: str, values: Mapping[str, float]) -> Distortion:
 
 
 def opencv_values(lens: Lens) -> tuple[Array, Array]:
-    """OpenCV's parameters (n,) of a lens in the family of its model, and their derivatives (n, 3 + k) by c, x0', y0'
-    and the family's parameters."""
+    """OpenCV's parameters (n,) of a lens in the family of its model, and their derivatives (n, 3 + k) with respect to
+    c, x0', y0' and the family's parameters."""
     (c, x0, y0), (*others, b1, b2) = lens.interior, lens.parameters
     values = [c * (1.0 + b1), c, x0, y0, *others]
     by_lens = np.zeros((len(values) + 1, 3 + len(lens.parameters)))
