@@ -1,1 +1,1 @@
-"""What a mark is, and how it looks in a scan."""
+"""Fiducial marks: drawings, templates, and their rendering."""

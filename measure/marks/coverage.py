@@ -1,8 +1,9 @@
-"""How much of each pixel a drawn mark covers: the ideal picture of a mark, before film and scanner blur it.
+"""Area coverage of pixels by a drawn mark: its ideal image without the blur of film and scanner.
 
-A pixel (col, row) is the unit square about its centre. An affine map takes the mark's millimetres (x right, y up) to
-pixels (col right, row down). Every part is an outline, a circle one of so many corners that it is as good; by Green's
-theorem the area of a part in each pixel follows from the piece of outline in it and in the pixels left of it.
+A pixel (col, row) is the unit square around its centre. An affine map transforms the mark's millimetres (x right, y up)
+to pixels (col right, row down). Every part is an outline; circles are approximated by polygons of sufficiently many
+corners. By Green's theorem, the area of a part in each pixel follows from the outline in it and in the pixels left of
+it.
 """
 
 from collections.abc import Iterator
@@ -17,22 +18,22 @@ from measure.marks.shapes import Bar, Disk, MarkShape, Part, Polygon, Ring
 
 Integers = NDArray[np.intp]
 
-CELLS = 4  # cells along a pixel's side: more than any blur of a scan tells apart
-_ROUND = 0.002  # cells: how far off its circle an outline may be
+CELLS = 4  # cells along a pixel's side, finer than the blur of any scan resolves
+_ROUND = 0.002  # cells, largest deviation of an outline from its circle
 
 
 def cell_coverage(shape: MarkShape, pixel_from_mark: Array, width: int, height: int, cells: int) -> Single:
-    """Draw a mark without blur.
+    """Render a mark without blur.
 
     Parameters
     ----------
     pixel_from_mark : (2, 3) affine matrix from (x_mm, y_mm, 1) to (col, row) in a window of width x height px.
-    cells : so many a pixel is divided into along either side.
+    cells : number of cells along a pixel's side.
 
     Returns
     -------
-    (height * cells, width * cells) shares, 0 to 1, of the cells' areas that the mark covers. A part's share is exact;
-    where parts overlap they count once, to about 0.001 of a pixel.
+    (height * cells, width * cells) fraction, 0 to 1, of each cell's area that the mark covers. It is exact for a single
+    part; the union of overlapping parts is exact to about 0.001 of a pixel.
     """
     cell_from_mark = np.array(pixel_from_mark, dtype=float)
     cell_from_mark[:, 2] += 0.5
@@ -44,7 +45,7 @@ def cell_coverage(shape: MarkShape, pixel_from_mark: Array, width: int, height: 
 
 
 def outline_mm(part: Part) -> Array:
-    """(n, 2) corners of a convex region that holds the part."""
+    """(n, 2) corners of a convex region that contains the part."""
     if isinstance(part, Polygon):
         return np.asarray(part.vertices_mm, dtype=float)
     if isinstance(part, Bar):
@@ -58,8 +59,8 @@ def outline_mm(part: Part) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Pieces:
-    """The outline of a part in pieces, each within one cell: (n,) the cells they lie in, how far down they go, and the
-    columns of their middles."""
+    """Outline of a part, cut into n pieces, each within one cell. row, col: (n,) of the cell; tall: (n,) height,
+    positive downwards; middle: (n,) column of the centre."""
 
     row: Integers
     col: Integers
@@ -68,7 +69,7 @@ class _Pieces:
 
 
 def _outline_pieces(shape: MarkShape, cell_from_mark: Array) -> Iterator[_Pieces]:
-    """The outlines of all parts are cut at once."""
+    """Cut the outlines of all parts at the cell borders, in one pass; yields the pieces of each part."""
     parts = shape.parts
     outlines = [_outlines(part, cell_from_mark) for part in parts]
     corners = np.concatenate([outline for own in outlines for outline in own])
@@ -90,7 +91,7 @@ def _outline_pieces(shape: MarkShape, cell_from_mark: Array) -> Iterator[_Pieces
 
 
 def _outlines(part: Part, cell_from_mark: Array) -> list[Array]:
-    """The part's outlines in mm, (n, 2) each; a hole's runs the other way round."""
+    """Outlines of a part in mm, (n, 2) each; the outline of a hole has the opposite sense."""
     if isinstance(part, Bar | Polygon):
         return [outline_mm(part)]
     if isinstance(part, Disk):
@@ -100,10 +101,10 @@ def _outlines(part: Part, cell_from_mark: Array) -> list[Array]:
 
 
 def _circle(part: Disk | Ring, radius_mm: float, cell_from_mark: Array) -> Array:
-    """Corners of a polygon of the circle's area; none where there is no circle."""
+    """Corners of a polygon of the same area as the circle; none for a radius of zero or less."""
     if radius_mm <= 0:
         return np.zeros((0, 2))
-    # A chord and its corners lie off the circle of the same area by no more than a third of radius * half angle².
+    # Deviation of the polygon from the circle of the same area: at most a third of radius * half angle².
     radius = radius_mm * float(np.linalg.norm(cell_from_mark[:, :2], 2))
     count = max(int(np.ceil(np.pi * np.sqrt(radius / (3 * _ROUND)))), 16)
     turn = 2 * np.pi / count
@@ -113,7 +114,8 @@ def _circle(part: Disk | Ring, radius_mm: float, cell_from_mark: Array) -> Array
 
 
 def _split(start: Array, end: Array, part_of: Integers, axis: int) -> tuple[Array, Array, Integers]:
-    """Lines (n, 2) cut where they cross whole numbers of a coordinate, in order, and the parts (n,) they are of."""
+    """Cut lines, start and end (n, 2), at integers of a coordinate. Returns start, end and part number of the pieces in
+    order."""
     first, last = np.floor(start[:, axis]), np.floor(end[:, axis])
     pieces = np.abs(last - first).astype(np.intp) + 1
     line = np.repeat(np.arange(len(start)), pieces)
@@ -126,7 +128,7 @@ def _split(start: Array, end: Array, part_of: Integers, axis: int) -> tuple[Arra
     cut[:, axis] = crossing
     is_first = number == 0
     cut[is_first] = start[is_first]
-    # A piece ends where the next one of its line begins, the last one at the line's end.
+    # A piece ends at the start of the next one of its line, the last one at the line's end.
     cut_end = np.roll(cut, -1, axis=0)
     is_last = np.roll(is_first, -1)
     cut_end[is_last] = (start + step)[is_last]
@@ -134,8 +136,8 @@ def _split(start: Array, end: Array, part_of: Integers, axis: int) -> tuple[Arra
 
 
 def _add(covered: Single, pieces: _Pieces) -> None:
-    """Add a part to what is covered already. Each piece of its outline adds its height to all cells right of it, and to
-    its own what lies right of it there. Only the cells about the part are looked at."""
+    """Add a part to the coverage, by Green's theorem. Each piece of its outline adds its height to all cells right of
+    it and, in its own cell, the area right of it. Only cells in the part's bounding box are processed."""
     height, width = covered.shape
     inside = (pieces.row >= 0) & (pieces.row < height) & (pieces.col < width)
     if not inside.any():
@@ -146,7 +148,7 @@ def _add(covered: Single, pieces: _Pieces) -> None:
     tall_cells, wide_cells = row.max() - row0 + 1, col1 - col0 + 1
     cell = (row - row0) * wide_cells + col - col0
     count = tall_cells * wide_cells
-    # In place where it can be: a large mark's cells are many.
+    # In place where possible: a large mark has many cells.
     areas = np.bincount(cell, own, count)
     areas += np.bincount(cell + 1, tall - own, count)
     areas = areas.reshape(tall_cells, wide_cells)

@@ -1,13 +1,13 @@
-"""What of a mark's drawing is known to be true, at the border of the exposed frame and along the lines of a réseau.
+"""Known part of a mark's drawing, at the border of the exposed frame and along the lines of a réseau.
 
-Solid marks at the border are wings and blocks that grow out of it, and notches that are cut into it.
+Solid marks at the border are wings and blocks that project from it, and notches cut into it.
 
-Nothing was exposed beyond the frame. A wing is no darker there than all else, and merges into the border; a notch is
-exposed as the frame is, and merges into that. So the drawing of a wing is true within the frame alone, and that of a
-notch beyond its edge. A dark mark beyond the edge stands in a pocket that was exposed, too: all of it is true.
+Nothing is exposed beyond the frame. A wing merges there into the unexposed border; a notch is exposed like the frame
+and merges into it. The drawing of a wing is therefore known within the frame only, that of a notch beyond its edge
+only. A dark mark beyond the edge lies in an exposed pocket: all of it is known.
 
-A réseau of continuous lines is drawn as crosses whose arms reach to the next ones. A crossing is told by the lines
-next to it; farther off they cost time, and meet stars.
+A réseau of continuous lines is drawn as crosses whose arms reach to the next ones. A crossing is determined by the
+lines close to it; farther parts take computing time and meet stars.
 """
 
 from dataclasses import replace
@@ -20,20 +20,22 @@ from measure.array_types import Array
 from measure.marks.coverage import outline_mm
 from measure.marks.shapes import Bar, FiducialLayout, FrameCorner, LayoutMark, Mark, MarkShape, Polygon
 
-_EDGE_MM = 0.1  # so near to the frame's edge a drawing ends on it
-_TO_NEXT = 0.45  # of the distance to the next mark: arms so long are lines that run on
-_LINE_WIDTHS = 5.0  # on either side of a crossing
+_EDGE_MM = 0.1  # mm, tolerance within which a drawing ends on the frame's edge
+_TO_NEXT = 0.45  # fraction of the distance to the next mark: longer arms are continuous lines
+_LINE_WIDTHS = 5.0  # in line widths, half side of the square used around a crossing
 
 
 def limit_to_frame(layout: FiducialLayout) -> FiducialLayout:
-    """The layout with the drawings of solid marks known where they are true: of those whose points lie in the frame,
-    and that reach its edge, within the frame; of those with a point on its edge or beyond, beyond the edge, unless they
-    are dark."""
+    """Limit the drawings of solid marks to their known part.
+
+    Marks whose point lies within the frame and that reach its edge are limited to the frame. Marks whose point lies on
+    the edge or beyond are limited to the area beyond the edge, unless they are dark.
+    """
     return replace(layout, marks=tuple(_limit_mark(mark, np.array(layout.frame_mm) / 2) for mark in layout.marks))
 
 
 def limit_to_crossings(layout: FiducialLayout) -> FiducialLayout:
-    """The layout with crosses whose arms reach half way to the next mark known a few line widths about their points."""
+    """Limit crosses whose arms reach halfway to the next mark to a few line widths around their points."""
     if len(layout.marks) < 2:
         return layout
     xy = np.array([mark.xy_mm for mark in layout.marks])
@@ -84,12 +86,12 @@ def _is_of_polygons(mark: Mark) -> TypeGuard[MarkShape]:
 
 
 def drawn_outline_mm(mark: MarkShape) -> Array:
-    """(n, 2) corners of a region that holds all that is drawn."""
+    """(n, 2) corners of a region that contains the whole drawing."""
     return mark.perspective_places(np.concatenate([outline_mm(part) for part in mark.parts]))
 
 
 def known_outline_mm(mark: MarkShape) -> Array:
-    """(n, 2) the same of what of it is known to be true."""
+    """(n, 2) corners of a region that contains the known part of the drawing."""
     drawn = drawn_outline_mm(mark)
     if mark.known_mm is None:
         return drawn
@@ -102,7 +104,7 @@ def known_outline_mm(mark: MarkShape) -> Array:
 
 
 def _below(polygon: Array, axis: int, sign: float, limit: float) -> Array:
-    """(n, 2) the part of a polygon whose coordinate, times the sign, is at most the limit (Sutherland and Hodgman)."""
+    """Clip a polygon (n, 2) to the half plane sign * coordinate <= limit (Sutherland and Hodgman)."""
     corners = []
     over = sign * polygon[:, axis] - limit
     for start, end, begins, ends in zip(polygon, np.roll(polygon, -1, axis=0), over, np.roll(over, -1), strict=True):

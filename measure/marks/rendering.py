@@ -1,5 +1,4 @@
-"""The picture of a mark as film and scanner show it: its coverage, or a chip cut from a scan, under a Gaussian blur,
-with the derivatives that least-squares matching needs."""
+"""Rendering of marks: area coverage of a drawing, or a chip, under a Gaussian blur, with derivatives for matching."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,15 +17,16 @@ from measure.marks.shapes import Mark, MarkShape, MarkTemplate
 
 Integers = NDArray[np.int_]
 
-_DRAWINGS = 16  # kept: more than a camera has kinds of marks
-ROUGH_CELLS = 2  # along a pixel's side: of pictures that are right to a hundredth
-_BLURRED = 2.0  # times the blur: so far an edge is seen
-_BLOCK = 4  # pixels that are averaged at once: of a matrix for more, too much would be empty
+_DRAWINGS = 16  # cached drawings, more than a camera has kinds of marks
+ROUGH_CELLS = 2  # cells along a pixel's side, for images exact to 0.01
+_BLURRED = 2.0  # in blurs, reach of an edge
+_BLOCK = 4  # pixels averaged by one matrix product; a matrix for more would be mostly zeros
 
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """A mark's picture and its first and second derivatives by column and row in px, each (height, width)."""
+    """Image of a mark and its first and second derivatives with respect to column and row in px, each (height,
+    width)."""
 
     value: Single
     by_col: Single
@@ -37,12 +37,14 @@ class Rendering:
 
     @property
     def laplacian(self) -> Single:
-        """Twice the derivative by the blur's variance."""
+        """Laplacian, twice the derivative with respect to the blur's variance."""
         return np.asarray(self.by_col_col + self.by_row_row)
 
     def bent(self, change: Array, center_px: Array, variance_px2: float) -> "Rendering":
-        """The picture of a mark whose linear part is (I + change) times this one's, by a series to the second order;
-        its second derivatives stay as they are. variance_px2: of blur and pixel, which do not bend with the mark."""
+        """Deform the image by a second-order Taylor series: the mark's linear part is multiplied by (I + change).
+
+        The second derivatives are kept. variance_px2: of blur and pixel, which are not deformed with the mark.
+        """
         (xx, xy), (yx, yy) = (np.eye(2) - np.linalg.inv(np.eye(2) + change)).astype(np.float32)
         height, width = self.value.shape
         col = np.arange(width, dtype=np.float32) - np.float32(center_px[0])
@@ -58,9 +60,9 @@ class Rendering:
 
 
 def render(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px: float) -> Rendering:
-    """The mark under a Gaussian of standard deviation blur_px, in a window of width x height px.
+    """Render a mark under a Gaussian of standard deviation blur_px in a window of width x height px, with derivatives.
 
-    A drawn mark is 1 inside and 0 outside; a chip, to whose blur this one is added, spans 0 to 1.
+    A drawn mark is 1 inside and 0 outside. A chip spans 0 to 1 and is blurred in addition to its own blur.
     pixel_from_mark: (2, 3), from (x_mm, y_mm, 1) to (col, row) of the window.
     """
     value, by_col, by_row, by_col_col, by_col_row, by_row_row = _blurred_derivatives(
@@ -70,30 +72,30 @@ def render(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px:
 
 
 def picture(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px: float, cells: int = CELLS) -> Array:
-    """(height, width): the mark as `render` makes it, without derivatives; cells: of its drawing along a pixel."""
+    """(height, width) image of the mark, like `render` without derivatives. cells: of the drawing along a pixel."""
     return _blurred_derivatives(mark, pixel_from_mark, (width, height), blur_px, ((0, 0),), cells)[0].astype(float)
 
 
 def known_picture(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px: float) -> Array:
-    """(height, width): a rough picture of the mark, nan where its drawing is not known to be true."""
+    """(height, width) approximate image of the mark; nan where its drawing is not known."""
     drawn = picture(mark, pixel_from_mark, width, height, blur_px, ROUGH_CELLS)
     return np.where(known_mask(mark, pixel_from_mark, width, height, _BLURRED * blur_px), drawn, np.nan)
 
 
 def extent_px(mark: Mark, pixel_from_mark: Array) -> tuple[Array, Array]:
-    """(2,) least and (2,) greatest column and row that the mark reaches."""
+    """Bounding box of the mark: (2,) smallest and (2,) largest column and row."""
     points = Affine(pixel_from_mark).apply(_outline_mm(mark))
     return points.min(axis=0), points.max(axis=0)
 
 
 def reach_px(mark: Mark, linear: Array) -> float:
-    """How far from its origin the mark reaches; linear (2, 2): px from mm."""
+    """Largest distance (px) of the mark from its origin. linear (2, 2): px from mm."""
     return float(np.hypot(*(linear @ _outline_mm(mark).T)).max())
 
 
 @lru_cache(maxsize=_DRAWINGS)
 def _outline_mm(mark: Mark) -> Array:
-    """(n, 2) corners of a region that holds the mark, as far as it is known."""
+    """(n, 2) corners of a region that contains the known part of the mark."""
     if not isinstance(mark, MarkTemplate):
         return known_outline_mm(mark)
     rows, cols = mark.image.shape
@@ -101,7 +103,7 @@ def _outline_mm(mark: Mark) -> Array:
 
 
 def true_mask(mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px: float) -> Mask:
-    """(height, width): in which pixels the mark's drawing is true, and in all within margin_px of them."""
+    """(height, width) mask of the pixels in which the mark's drawing is exact, reduced by margin_px."""
     shown = known_mask(mark, pixel_from_mark, width, height, margin_px)
     if isinstance(mark, MarkTemplate) or mark.true_mm is None:
         return shown
@@ -109,24 +111,25 @@ def true_mask(mark: Mark, pixel_from_mark: Array, width: int, height: int, margi
 
 
 def known_mask(mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px: float) -> Mask:
-    """(height, width): in which pixels anything is known of the mark, and in all within margin_px of them."""
+    """(height, width) mask of the pixels in which the mark's drawing is known, reduced by margin_px."""
     if isinstance(mark, MarkTemplate) or mark.known_mm is None:
         return np.ones((height, width), dtype=bool)
     return _rectangle_mask(mark.known_mm, pixel_from_mark, (width, height), margin_px)
 
 
 def frame_pixel_mask(mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px: float) -> Mask:
-    """(height, width): which pixels show the exposed frame beside a mark that is cut into its border, farther than
-    margin_px from the frame's edge; none beside other marks."""
+    """(height, width) mask of the exposed frame around a mark cut into its border, farther than margin_px from the
+    frame's edge; empty for other marks."""
     if isinstance(mark, MarkTemplate) or mark.known_mm is None or np.isfinite(mark.known_mm).all():
         return np.zeros((height, width), dtype=bool)
-    least, greatest = np.array(mark.known_mm)  # the frame lies beyond each of these that is finite
+    least, greatest = np.array(mark.known_mm)  # the frame lies beyond each finite limit
     beyond = np.where(np.isfinite(greatest), greatest, -np.inf), np.where(np.isfinite(least), least, np.inf)
     return _rectangle_mask(beyond, pixel_from_mark, (width, height), margin_px)
 
 
 def _rectangle_mask(corners: ArrayLike, pixel_from_mark: Array, size: tuple[int, int], margin_px: float) -> Mask:
-    """(height, width): which pixels lie in a rectangle of the mark's plane, mm, and margin_px from its sides."""
+    """(height, width) mask of the pixels inside a rectangle of the mark's plane (mm), at least margin_px from its
+    sides."""
     mark_from_pixel = Affine(np.asarray(pixel_from_mark, float)).inverse
     places = mark_from_pixel.apply(np.stack(np.meshgrid(*map(np.arange, size)), axis=-1))
     least, greatest = np.add(corners, np.array([[1.0], [-1.0]]) * margin_px * mark_from_pixel.scale)
@@ -134,7 +137,7 @@ def _rectangle_mask(corners: ArrayLike, pixel_from_mark: Array, size: tuple[int,
 
 
 def chip_mask(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int) -> Mask:
-    """(height, width): which pixels lie on the chip, where it is steady."""
+    """(height, width) mask of the pixels on the steady part of the chip."""
     col, row = _chip_positions(mark, pixel_from_mark, width, height, 1)
     rows, cols = mark.image.shape
     inside = (col >= 1) & (col <= cols - 2) & (row >= 1) & (row <= rows - 2)
@@ -144,7 +147,7 @@ def chip_mask(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: in
 
 
 def chip_steadiness(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int) -> Array:
-    """(height, width): the chip's steadiness, 1 where it is not known."""
+    """(height, width) steadiness of the chip; 1 where unknown."""
     if mark.steadiness is None:
         return np.ones((height, width))
     return _sampled(mark.steadiness, _chip_positions(mark, pixel_from_mark, width, height, 1), 1)
@@ -152,8 +155,8 @@ def chip_steadiness(mark: MarkTemplate, pixel_from_mark: Array, width: int, heig
 
 @dataclass(frozen=True, eq=False)
 class _Drawing:
-    """A mark without blur: sharp (rows, columns) in cells, so many along a pixel's side. first: pixel (col, row) of the
-    window that the first cells belong to, and shift_px (2,), how far right and down of it they still have to move."""
+    """Rendering without blur. sharp: (rows, columns) cells; cells: number along a pixel's side; first: pixel (col, row)
+    of the window that holds the first cell; shift_px: (2,) remaining shift to the right and down."""
 
     sharp: Single
     cells: int
@@ -169,7 +172,7 @@ def _blurred_derivatives(
     orders: Sequence[tuple[int, int]],
     cells: int = CELLS,
 ) -> list[Single]:
-    """The derivatives of the picture, each of an order by column and by row, in a window of a size (width, height)."""
+    """Derivatives of the image in a window of size (width, height), one for each pair of orders by column and row."""
     place = np.asarray(pixel_from_mark, dtype=float)
     if isinstance(mark, MarkTemplate):
         drawing = _chip_drawing(mark, place, size, blur_px)
@@ -177,7 +180,7 @@ def _blurred_derivatives(
         drawing = _drawing(mark, place, blur_px, cells)
     cells, most = drawing.cells, np.max(orders, axis=0)
     along = [_Average(blur_px, cells, shift, int(order)) for shift, order in zip(drawing.shift_px, most, strict=True)]
-    # Of the window only what the blurred mark reaches is computed: all else is empty.
+    # Compute only the part of the window that the blurred mark reaches; the rest is zero.
     spare = int(np.ceil(along[0].reach / cells)) + 1
     low = np.maximum(drawing.first - spare, 0)
     high = np.minimum(drawing.first + np.array(drawing.sharp.shape[::-1]) // cells + spare, size)
@@ -196,10 +199,10 @@ def _blurred_derivatives(
 
 
 def _drawing(mark: MarkShape, pixel_from_mark: Array, blur_px: float, cells: int) -> _Drawing:
-    cells = cells if blur_px < 1.5 else max(cells - 1, 2)  # blur hides what coarser cells get wrong
+    cells = cells if blur_px < 1.5 else max(cells - 1, 2)  # blur hides the error of coarser cells
     whole = np.floor(pixel_from_mark[:, 2])
     rest = pixel_from_mark[:, 2] - whole
-    # Sharp cells cannot be moved by a part of their own size.
+    # Without blur cells cannot be shifted by a fraction of their size: draw them at the exact place.
     drawing_origin = np.zeros(2) if blur_px * cells >= 1.0 else rest
     sharp, origin = _sharp_cells(mark, pixel_from_mark[:, :2].tobytes(), tuple(drawing_origin.tolist()), cells)
     return _Drawing(sharp, cells, whole.astype(int) - origin, rest - drawing_origin)
@@ -207,8 +210,8 @@ def _drawing(mark: MarkShape, pixel_from_mark: Array, blur_px: float, cells: int
 
 @lru_cache(maxsize=_DRAWINGS)
 def _sharp_cells(mark: MarkShape, linear: bytes, origin_px: tuple[float, float], cells: int) -> tuple[Single, Integers]:
-    """The mark's cells, its origin so far right and down of a pixel's centre; and which pixel (col, row) that is. Marks
-    of a camera that are drawn alike share them."""
+    """Draw the mark in cells with its origin at origin_px from a pixel's centre. Returns the cells and that pixel (col,
+    row). Marks of the same drawing share the cached result."""
     place = np.column_stack([np.frombuffer(linear).reshape(2, 2), origin_px])
     points = Affine(place).apply(drawn_outline_mm(mark))
     least, greatest = points.min(axis=0), points.max(axis=0)
@@ -222,14 +225,14 @@ def _chip_drawing(mark: MarkTemplate, pixel_from_mark: Array, size: tuple[int, i
     pad = int(np.ceil(4 * blur_px)) + 2
     shifted = pixel_from_mark.copy()
     shifted[:, 2] += pad
-    cells = max(1, round(1 / max(linear_scale(pixel_from_mark) * mark.pitch_um / 1000, 1e-3)))  # to a pixel of the chip
+    cells = max(1, round(1 / max(linear_scale(pixel_from_mark) * mark.pitch_um / 1000, 1e-3)))  # the chip's pixels
     sampled = _sampled(mark.image, _chip_positions(mark, shifted, size[0] + 2 * pad, size[1] + 2 * pad, cells), 3)
     sharp = (sampled - mark.image.min()) / max(np.ptp(mark.image), 1e-12)
     return _Drawing(sharp.astype(np.float32), cells, np.array([-pad, -pad]), np.zeros(2))
 
 
 class _Average:
-    """The mean over every pixel of blurred cells, and its derivatives in px up to an order, along one axis."""
+    """Operator along one axis: means of blurred cells over each pixel, and derivatives in px up to an order."""
 
     def __init__(self, blur_px: float, cells: int, shift_px: float, order: int) -> None:
         whole = round(shift_px * cells)
@@ -245,15 +248,16 @@ class _Average:
         self.first = -reach - whole
 
     def apply(self, sharp: Single, first: int, count: int) -> Single:
-        """(orders, count, columns) of the pixels from the first one on, of cells (rows, columns).
+        """(orders, count, columns) means and derivatives of count pixels from the first one on. sharp: cells (rows,
+        columns).
 
-        Pixels are taken in blocks: a matrix for all of them would be nearly empty.
+        Pixels are processed in blocks, since a matrix for all of them would be mostly zeros.
         """
         orders, taps = self.taps.shape
         blocks = -(-count // _BLOCK)
         span = (_BLOCK - 1) * self.cells + taps
         band = np.zeros((orders, _BLOCK * (span + self.cells)), np.float32)
-        # Each pixel's taps lie as many cells farther on than the last one's.
+        # The taps of each pixel are offset by self.cells from those of the previous one.
         as_strided(band, (orders, _BLOCK, taps), (band.strides[0], 4 * (span + self.cells), 4))[:] = self.taps[:, None]
         matrix = band[:, : _BLOCK * span].reshape(-1, span)
         begin, length = first * self.cells + self.first, (blocks - 1) * _BLOCK * self.cells + span
@@ -267,8 +271,8 @@ class _Average:
 
 
 def _kernels(sigma: float, shift: float) -> Array:
-    """A Gaussian sampled at whole numbers and so far off, and its first and second derivative, normalised so that
-    polynomials come out right."""
+    """Kernels of a Gaussian, sampled at integers plus shift, and of its first two derivatives, normalised to be exact
+    for polynomials."""
     reach = int(np.ceil(4 * sigma)) + 2
     place = np.arange(-reach, reach + 1) + shift
     kernels = np.zeros((3, len(place)))
@@ -276,7 +280,7 @@ def _kernels(sigma: float, shift: float) -> Array:
     smooth[:] = np.exp(-0.5 * (place / max(sigma, 1e-3)) ** 2)
     smooth /= smooth.sum()
     if sigma < 0.5:
-        # A chip's own detail is hardly coarser than its pixels: differences of the fourth order, over five of them.
+        # A chip's detail is hardly coarser than its pixels: central differences of fourth order over five pixels.
         slope[reach - 2 : reach + 3] = np.array([1.0, -8.0, 0.0, 8.0, -1.0]) / 12
         bend[reach - 2 : reach + 3] = np.array([-1.0, 16.0, -30.0, 16.0, -1.0]) / 12
         return kernels
@@ -290,20 +294,20 @@ def _kernels(sigma: float, shift: float) -> Array:
 
 
 def _sampled(image: Array, positions: Array, order: Literal[0, 1, 3]) -> Array:
-    """An image of a chip at positions (2, height, width) of its columns and rows, by splines of an order."""
+    """Interpolate a chip's image at columns and rows (2, height, width) by splines of an order."""
     from scipy import ndimage
 
     return np.asarray(ndimage.map_coordinates(image, positions[::-1], order=order, mode="nearest"))
 
 
 def _chip_positions(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int, cells: int) -> Array:
-    """(2, rows, columns) column and row in the chip of every cell's centre."""
+    """(2, rows, columns) column and row of each cell's centre in the chip."""
     place = [(np.arange(size * cells) + 0.5) / cells - 0.5 for size in (width, height)]
     chip_from_pixel = _chip_from_mark(mark).compose(Affine(pixel_from_mark).inverse)
     return np.moveaxis(chip_from_pixel.apply(np.stack(np.meshgrid(*place), axis=-1)), -1, 0)
 
 
 def _chip_from_mark(mark: MarkTemplate) -> Affine:
-    """From the mark's mm to the chip's column and row; a turned mark is turned back first."""
+    """Transformation from the mark's mm to the chip's column and row, including the mark's rotation."""
     c, s = np.cos(np.deg2rad(mark.turn_deg)), np.sin(np.deg2rad(mark.turn_deg))
     return Affine.from_linear(1000 / mark.pitch_um * np.array([[c, s], [s, -c]]), mark.origin_px)

@@ -1,6 +1,6 @@
-"""Fiducial marks as drawings: unions of simple shapes in mm about the point that is measured, x right and y up.
+"""Drawings of fiducial marks: unions of simple shapes in mm relative to the measured point, x right and y up.
 
-The kinds are shorthands that give parts; everything after them knows parts only.
+The kinds (cross, dot, ...) are shorthands that return parts; all other modules use parts only.
 """
 
 import math
@@ -16,10 +16,10 @@ Point = tuple[float, float]
 Polarity = Literal["light", "dark", "auto"]
 Side = Literal["left", "right", "top", "bottom"]
 
-LEARNED_ORIGIN = 0.25  # of a learned mark's size: standard deviation of its template's origin about the mark
-MOST_GIVEN_SIGMA_MM = 0.1  # of a given place: a datum's sigma may be a millimetre, and its place is better than that
-_CORNER_RAD = np.deg2rad(30.0)  # of an outline: an arc is drawn by vertices of less
-_SEARCHED = 0.3  # of a frame corner's reach: the square that it is searched by
+LEARNED_ORIGIN = 0.25  # fraction of a learned mark's size: standard deviation of its template's origin on the mark
+MOST_GIVEN_SIGMA_MM = 0.1  # mm, limit of a given place's sigma: a datum may state 1 mm although the place is better
+_CORNER_RAD = np.deg2rad(30.0)  # rad, smallest turn of a corner; the vertices of an arc turn by less
+_SEARCHED = 0.3  # fraction of a frame corner's reach: side of the square used as its template
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Disk:
 
 @dataclass(frozen=True)
 class Ring:
-    """A circle drawn with a line: radius_mm is the line's middle, line_mm its width."""
+    """A circle drawn as a line: radius_mm to the centre of the line, line_mm its width."""
 
     center_mm: Point
     radius_mm: float
@@ -60,11 +60,16 @@ Part = Disk | Ring | Bar | Polygon
 
 @dataclass(frozen=True)
 class MarkShape:
-    """A mark that is drawn. Overlapping parts count once.
+    """A drawn mark, the union of its parts.
 
-    perspective: of a plane seen obliquely, per mm: a point u of the parts is drawn at u / (1 + perspective u).
-    known_mm: the least and the greatest corner of the part of the plane in which anything is known of the mark; None:
-    all of it. true_mm: likewise of that in which the drawing is true to the last pixel, and that it is fitted by.
+    Attributes
+    ----------
+    parts : shapes in mm.
+    polarity : light or dark against the background, or "auto".
+    perspective : per mm, of a plane imaged obliquely: a point u of the parts is drawn at u / (1 + perspective u).
+    known_mm : smallest and largest corner of the rectangle in which the drawing is known; None: everywhere.
+    true_mm : smallest and largest corner of the rectangle in which the drawing is exact and is fitted; None: everywhere
+        it is known.
     """
 
     parts: tuple[Part, ...]
@@ -78,16 +83,16 @@ class MarkShape:
             raise ValueError("a mark needs at least one part")
 
     def perspective_places(self, places_mm: Array) -> Array:
-        """Where points (n, 2) of the parts are drawn."""
+        """Apply the perspective to points (n, 2) of the parts."""
         return np.asarray(places_mm / (1.0 + places_mm @ self.perspective)[:, None])
 
 
 @dataclass(frozen=True)
 class FrameCorner(MarkShape):
-    """Where two edges of the exposed frame meet; its parts, a square of the frame, serve the search alone.
+    """Intersection of two edges of the exposed frame. Its parts, a square of the frame, serve the search only.
 
-    toward: (±1, ±1), where from the corner the frame lies. reach_mm: how far along the edges they are measured, from
-    radius_mm on, that of a rounded corner.
+    toward: (±1, ±1) direction from the corner into the frame; reach_mm: length along which the edges are measured;
+    radius_mm: radius of a rounded corner, where the measured part begins.
     """
 
     toward: Point = (1.0, 1.0)
@@ -97,16 +102,25 @@ class FrameCorner(MarkShape):
 
 @dataclass(frozen=True, eq=False)
 class MarkTemplate:
-    """A mark that is a chip cut from a scan.
+    """A mark given as a template, a chip cut from a scan or averaged over several.
 
-    image: (rows, columns), any scale of grey values; origin_px: (column, row) of the measured point in it. detail_mm:
-    its finest detail, 0 where that is not known: then two of its pixels. noise_dn: of one pixel of the scans that it is
-    made of, by whose names shares says how much of the chip is each one's own picture. slope_noise_dn: standard
-    deviation of noise in the chip's own slopes, per pixel, as a fit sees them. steady: which of its pixels look alike
-    in all of them, None where all do. steadiness: (rows, columns), 1 where a picture differs from the chip by noise,
-    and less where it differs by more: the ratio of the standard deviations; None where that is not known.
-    learned_mm: the side of the square that was learned, 0 of a chip that somebody cut out. alike: the poses that take
-    the camera's learned marks, with their origins, to one another.
+    Attributes
+    ----------
+    image : (rows, columns) grey values on any scale.
+    pitch_um : pixel pitch of the template.
+    origin_px : (column, row) of the measured point.
+    turn_deg : rotation of the mark, counter-clockwise.
+    polarity : light or dark, or "auto".
+    detail_mm : width of the finest detail; 0 where unknown, then two pixels are assumed.
+    noise_dn : standard deviation of the noise of one pixel in the scans it is made of.
+    slope_noise_dn : standard deviation of the noise in the template's gradient, per pixel, after the smoothing of a
+        fit.
+    shares : by the name of the scan, its share of the template.
+    steady : (rows, columns) mask of the pixels that look alike in all scans; None: all.
+    steadiness : (rows, columns) standard deviation of the noise over that of the differences between scans and
+        template, at most 1; None where unknown.
+    learned_mm : side of the learned square; 0 for a chip supplied by the user.
+    alike : scan orientations that map the camera's learned marks, with their origins, onto one another.
     """
 
     image: Array
@@ -129,7 +143,7 @@ Mark = MarkShape | MarkTemplate
 
 @dataclass(frozen=True)
 class LearnedMark:
-    """A mark that nobody has drawn: a square of size_mm about it is averaged over the camera's scans, and that is its
+    """A mark without a drawing. A square of size_mm around it, averaged over the camera's scans, becomes its
     template."""
 
     size_mm: float
@@ -137,7 +151,7 @@ class LearnedMark:
 
 @dataclass(frozen=True)
 class LayoutMark:
-    """A fiducial as the camera file gives it: xy_mm (2,) with standard deviations sigma_mm (2,), inf where free."""
+    """A fiducial of the camera file: xy_mm (2,), standard deviations sigma_mm (2,), inf where free, and its mark."""
 
     id: str
     xy_mm: Point
@@ -147,9 +161,12 @@ class LayoutMark:
 
 @dataclass(frozen=True)
 class WrittenPlace:
-    """Where a camera writes on its film: beside which side of the frame, x' to the right and y' up. pose: how the
-    writing lies in the drawing, "90" where it reads upward; None where nobody says. plate: whether it is the camera's
-    own plate, with its type, number and principal distance, or titles."""
+    """Place of a camera's writing on its film.
+
+    side: side of the frame, with x' to the right and y' up; pose: orientation of the writing in the drawing, "90" if it
+    reads upwards, None if unknown; plate: True for the camera's data plate (type, number, principal distance), False
+    for titles.
+    """
 
     side: Side
     pose: str | None = None
@@ -158,8 +175,8 @@ class WrittenPlace:
 
 @dataclass(frozen=True)
 class FiducialLayout:
-    """The camera's marks, the size of its exposed frame (width, height), and where it writes on its film, as far as
-    anybody says."""
+    """Layout of a camera: its marks, the size of the exposed frame (width, height) in mm, and the places of writing, as
+    far as known."""
 
     marks: tuple[LayoutMark, ...]
     frame_mm: Point
@@ -167,7 +184,7 @@ class FiducialLayout:
 
 
 def cross(arm_mm: float, line_mm: float, gap_mm: float = 0.0, angle_deg: float = 0.0) -> tuple[Part, ...]:
-    """Four arms from gap_mm to arm_mm off the centre, each line_mm wide; two whole bars where there is no gap."""
+    """Four arms from gap_mm to arm_mm from the centre, each line_mm wide; two full bars if there is no gap."""
     if gap_mm == 0.0:
         bars: tuple[Part, ...] = (
             Bar((-arm_mm, 0.0), (arm_mm, 0.0), line_mm),
@@ -192,12 +209,12 @@ def ring_cross(
     gap_mm: float = 0.0,
     angle_deg: float = 0.0,
 ) -> tuple[Part, ...]:
-    """A ring of mean radius ring_mm about a cross."""
+    """A ring of mean radius ring_mm around a cross."""
     return (Ring((0.0, 0.0), ring_mm, ring_line_mm), *cross(arm_mm, line_mm, gap_mm, angle_deg))
 
 
 def ring_dot(ring_mm: float, ring_line_mm: float, radius_mm: float) -> tuple[Part, ...]:
-    """A ring of mean radius ring_mm about a dot."""
+    """A ring of mean radius ring_mm around a dot."""
     return (Ring((0.0, 0.0), ring_mm, ring_line_mm), *dot(radius_mm))
 
 
@@ -207,7 +224,7 @@ def polygon(vertices_mm: Sequence[Point]) -> tuple[Part, ...]:
 
 
 def frame_corner(xy_mm: Point, reach_mm: float, radius_mm: float = 0.0, polarity: Polarity = "auto") -> FrameCorner:
-    """The corner of the frame at a place in it, polarity that of the frame against the border."""
+    """The frame corner at xy_mm. polarity: of the frame against its border."""
     toward = (-1.0 if xy_mm[0] > 0 else 1.0, -1.0 if xy_mm[1] > 0 else 1.0)
     size = max(_SEARCHED * reach_mm, 2 * radius_mm)
     turn = np.linspace(0.0, np.pi / 2, 9)
@@ -219,7 +236,7 @@ def frame_corner(xy_mm: Point, reach_mm: float, radius_mm: float = 0.0, polarity
 
 
 def turned(mark: Mark, angle_deg: float) -> Mark:
-    """The mark turned counter-clockwise about its origin."""
+    """Rotate a mark counter-clockwise around its origin."""
     if isinstance(mark, MarkTemplate):
         return replace(mark, turn_deg=mark.turn_deg + angle_deg)
     parts = tuple(turned_part(part, angle_deg) for part in mark.parts)
@@ -228,7 +245,7 @@ def turned(mark: Mark, angle_deg: float) -> Mark:
 
 
 def turned_part(part: Part, angle_deg: float) -> Part:
-    """The part turned counter-clockwise about the mark's origin; quarter turns are exact."""
+    """Rotate a part counter-clockwise around the mark's origin; quarter turns are exact."""
 
     def turn(point: Point) -> Point:
         return _turned_point(point, angle_deg)
@@ -241,8 +258,8 @@ def turned_part(part: Part, angle_deg: float) -> Part:
 
 
 def _turned_rectangle(rectangle: tuple[Point, Point], angle_deg: float) -> tuple[Point, Point]:
-    """An upright rectangle, by its least and its greatest corner, after a turn: of its own shape after a quarter turn,
-    else as large as lies in the turned one."""
+    """Rotate an upright rectangle, given by its smallest and largest corner. After quarter turns the result is exact,
+    otherwise the largest upright rectangle of the same proportions inside the rotated one."""
     quarter = round(angle_deg / 90)
     rest = abs(math.radians(angle_deg - 90 * quarter))
     middle = _turned_point(tuple(np.mean(rectangle, axis=0).tolist()), angle_deg)
@@ -262,7 +279,7 @@ def _turned_point(point: Point, angle_deg: float) -> Point:
 
 
 def thinnest_mm(mark: Mark) -> float:
-    """The width of the mark's thinnest line, as far as its parts tell."""
+    """Width (mm) of the mark's thinnest line, estimated from its parts."""
     if isinstance(mark, MarkTemplate):
         return mark.detail_mm or mark.pitch_um / 1000 * 2
     widths = []
@@ -278,7 +295,7 @@ def thinnest_mm(mark: Mark) -> float:
 
 
 def finest_detail_mm(mark: Mark) -> float:
-    """The width of the mark's thinnest line, or the shortest straight edge from corner to corner of its outline."""
+    """Width of the mark's thinnest line, or length of the shortest straight edge between corners of its outline."""
     if isinstance(mark, MarkTemplate):
         return thinnest_mm(mark)
     outlines = (np.asarray(part.vertices_mm) for part in mark.parts if isinstance(part, Polygon))
@@ -286,9 +303,9 @@ def finest_detail_mm(mark: Mark) -> float:
 
 
 def _straight_edges_mm(outline: Array) -> list[float]:
-    """Lengths of the edges of a polygon (n, 2) that end in corners, and do not go on as an arc."""
+    """Lengths of the edges of a polygon (n, 2) between two corners, excluding the edges of arcs."""
     edges = np.roll(outline, -1, axis=0) - outline
     angles = np.angle(edges @ (1, 1j))
-    turns = np.abs(np.angle(np.exp(1j * (angles - np.roll(angles, 1)))))  # at the beginning of each edge
+    turns = np.abs(np.angle(np.exp(1j * (angles - np.roll(angles, 1)))))  # at the start of each edge
     is_corner = turns > _CORNER_RAD
     return [float(np.hypot(*edge)) for edge in edges[is_corner & np.roll(is_corner, -1)]]

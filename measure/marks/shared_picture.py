@@ -1,10 +1,9 @@
-"""The one sharp picture that all pictures of a mark are blurs of, by least squares.
+"""Least-squares estimation of the shared sharp image of a mark, of which all its images are blurred versions.
 
-Scans of one camera are not alike in sharpness. Under more blur the edges of a mark that is not symmetric seem to lie
-elsewhere, so that neither a mean of unlike pictures nor what is measured with it tells where the mark is. Each picture
-therefore is the shared one under a Gaussian blur of its own, moved, with gain and offset; the shared one is as sharp as
-the sharpest of them. It, the moves and the blurs are adjusted together: by itself the sharpest picture would be
-compared with little but itself, and stay where it is.
+Scans of one camera differ in sharpness. More blur displaces the edges of an asymmetric mark, so a mean of images of
+different blur gives a biased place. Each image is therefore modelled as the shared one under its own Gaussian blur,
+shift, gain and offset. The shared image is as sharp as the sharpest of them. It is adjusted simultaneously with the
+shifts and blurs: in an alternating adjustment the sharpest image would be compared mostly with itself, and not move.
 """
 
 from collections.abc import Sequence
@@ -18,30 +17,36 @@ from scipy.sparse.linalg import LinearOperator, lsmr
 from measure.array_types import Array, Mask
 from measure.noise.robust_estimation import robust_scale, tukey_weights
 
-_GAIN, _OFFSET, _COL, _ROW, _BLUR = range(5)  # what is estimated of each picture
-_REWEIGHTINGS = 5  # of the pixels by Tukey's function
-NOISE_FLOOR = 0.002  # of the picture's range: under a picture's noise, for clean pictures have none
-_LEAST_WEIGHT = 1e-6  # of a pixel that lies off in all pictures
-_LEAST_REDUNDANCY = 0.1  # of a picture: below it residuals do not tell its noise
-_ALIKE_PX = 0.7  # about a pixel, that tell whether pictures are alike there
-_LEAST_GAIN = 0.01  # of a picture that hardly shows the mark
-SMOOTHED_PX2 = 0.7**2  # variance of a blur of all that is compared: as sharp as pixels, edges are sampled falsely
-_CORRELATED = 4 * np.pi * SMOOTHED_PX2  # pixels that are one observation, after it
-_LONGEST_PX = 1.0  # of a move: beyond it the linearisation tells nothing
-_MOST_BLURRED = 2.0  # times the blur, likewise
-_SEEN_PX2 = 1.0  # variance of the blur of a sharp scan, the pixel's share and the smoothing included
-_SURELY = 3.0  # standard deviations: the shared picture is no sharper than one of them surely is
-_HELD = 0.1  # times one picture's weight: what no picture tells of the shared one stays as it was
-_ITERATIONS, _TOLERANCE = 12, 1e-3  # of one adjustment: the next round goes on
+_GAIN, _OFFSET, _COL, _ROW, _BLUR = range(5)  # unknowns of each image
+_REWEIGHTINGS = 5  # iterations of Tukey's reweighting
+NOISE_FLOOR = 0.002  # fraction of the image's range, floor of the noise, which is zero in clean images
+_LEAST_WEIGHT = 1e-6  # floor of Tukey's weight, for pixels that are outliers in all images
+_LEAST_REDUNDANCY = 0.1  # floor of 1 - share; with less redundancy residuals do not estimate an image's noise
+_ALIKE_PX = 0.7  # px, smoothing of the weights that decide whether a pixel is steady
+_LEAST_GAIN = 0.01  # floor of the gain, for an image that hardly shows the mark
+SMOOTHED_PX2 = 0.7**2  # px², smoothing of all compared images: edges as sharp as a pixel are undersampled
+_CORRELATED = 4 * np.pi * SMOOTHED_PX2  # pixels per independent observation after smoothing
+_LONGEST_PX = 1.0  # px, longest shift for which the linearisation holds
+_MOST_BLURRED = 2.0  # largest factor of the blur, likewise
+_SEEN_PX2 = 1.0  # px², variance of a sharp scan's total blur, pixel and smoothing included
+_SURELY = 3.0  # standard deviations: the shared image is only as sharp as the sharpest image certainly is
+_HELD = 0.1  # in weights of one image: regularises components of the shared image that no image determines
+_ITERATIONS, _TOLERANCE = 12, 1e-3  # of LSMR in one adjustment; the next round continues
 
 
 @dataclass(frozen=True, eq=False)
 class SharedPicture:
-    """image (side, side): what n pictures share. variances_px2 (n,): how much more blur than that each of them has.
+    """Shared image of n images.
 
-    Of the pictures that it was adjusted to: weights (n, side, side) of their pixels and residuals (n, side, side), in
-    the image's units; moves (n, 2) px by column and row, how far each shows the mark off its middle, their sum being
-    none; alike (side, side): where more of them are alike than not."""
+    Attributes
+    ----------
+    image : (side, side) shared image.
+    variances_px2 : (n,) variance of each image's additional blur.
+    weights : (n, side, side) weights of the images' pixels.
+    residuals : (n, side, side) residuals in units of the shared image.
+    moves : (n, 2) px, shifts of the images by column and row, with zero sum.
+    alike : (side, side) mask of the pixels in which most images agree.
+    """
 
     image: Array
     variances_px2: Array
@@ -52,7 +57,7 @@ class SharedPicture:
 
     @property
     def shares(self) -> Array:
-        """(n,) how much of the image is each picture's own, of as fine a detail as a fit sees."""
+        """(n,) share of each image in the shared one, averaged over the frequencies that a fit uses."""
         side = len(self.image)
         information = self.weights.mean(axis=(1, 2))[:, None, None] * _transfers(side, 2 * self.variances_px2)
         visible = _transfers(side, np.array([2 * SMOOTHED_PX2]))
@@ -60,15 +65,15 @@ class SharedPicture:
 
     @property
     def slope_noise(self) -> float:
-        """Standard deviation of noise in the image's slopes, per pixel, as a fit sees them: by those of the residuals,
-        in which a picture's own share is missing."""
+        """Standard deviation of the noise in the image's gradient, per pixel, after the smoothing of a fit. Estimated
+        from the residuals, corrected for each image's share."""
         shares = self.shares
         noise = np.array([robust_scale(np.diff(residuals)) for residuals in self.residuals])
         return float(np.sqrt(np.sum(shares**2 * noise**2 / np.maximum(1 - shares, _LEAST_REDUNDANCY))))
 
 
 def first_picture(stack: Array) -> SharedPicture:
-    """What pictures (n, side, side) share, as long as they are taken to be alike."""
+    """Initial shared image of images (n, side, side), under the assumption that they are alike."""
     levelled = [_line(picture, stack[0]) for picture in stack]
     return SharedPicture(
         np.median(levelled, axis=0),
@@ -81,7 +86,8 @@ def first_picture(stack: Array) -> SharedPicture:
 
 
 def adjust_picture(shared: SharedPicture, stack: Array, steady: Mask) -> SharedPicture:
-    """The shared picture adjusted once more to pictures (n, side, side), moves and blurs by the steady pixels."""
+    """Adjust the shared image once more to images (n, side, side). Shifts and blurs are estimated from the steady
+    pixels."""
     smoothed = _blur_images(stack, np.full(len(stack), SMOOTHED_PX2))
     designs = _designs(shared.image, shared.variances_px2, steady)
     fits = [_fit(*each) for each in zip(smoothed, designs, shared.weights, strict=True)]
@@ -101,18 +107,18 @@ def adjust_picture(shared: SharedPicture, stack: Array, steady: Mask) -> SharedP
 
 
 def _squares(side: int) -> Array:
-    """(side, side) the squared frequency of each cosine."""
+    """(side, side) squared frequencies of the cosine transform."""
     square = (np.pi * np.arange(side) / side) ** 2
     return np.asarray(square[:, None] + square)
 
 
 def _transfers(side: int, variances_px2: Array) -> Array:
-    """(n, side, side) what Gaussian blurs leave of each cosine."""
+    """(n, side, side) transfer functions of Gaussian blurs in the cosine transform."""
     return np.asarray(np.exp(-0.5 * variances_px2[:, None, None] * _squares(side)))
 
 
 def _blur_images(images: Array, variances_px2: Array) -> Array:
-    """(n, side, side) one image, or n, under blurs (n,); mirrored at its borders, so that a blur is its own adjoint."""
+    """(n, side, side) one image, or n, under blurs (n,); mirrored at the borders, so that the blur is self-adjoint."""
     cosines = _transfers(images.shape[-1], variances_px2) * _cosines(images)
     return np.asarray(idctn(cosines, axes=(1, 2), norm="ortho"))
 
@@ -122,8 +128,8 @@ def _cosines(images: Array) -> Array:
 
 
 def _designs(image: Array, variances_px2: Array, steady: Mask) -> Array:
-    """(n, 5, side, side) of each picture: the shared one as it shows it, one, and how that changes by column, row and
-    variance of the blur, where pixels are steady."""
+    """(n, 5, side, side) design matrices of the images: the blurred shared image, 1, and its derivatives by column, row
+    and variance of the blur, the latter in steady pixels only."""
     views = _blur_images(image, variances_px2 + SMOOTHED_PX2)
     by_row, by_col = np.gradient(views, axis=(1, 2))
     by_variance = idctn(-0.5 * _squares(len(image)) * _cosines(views), axes=(1, 2), norm="ortho")
@@ -132,9 +138,16 @@ def _designs(image: Array, variances_px2: Array, steady: Mask) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """One picture beside the shared one: levelled (side, side) to its grey values; residuals and alike (side, side), by
-    what each pixel differs, and what Tukey's function makes of that; scale: the residuals' standard deviation.
-    blur_px2: how much more its blur's variance is than was taken, and blur_sigma_px2, the standard deviation of that.
+    """Fit of one image to the shared one.
+
+    Attributes
+    ----------
+    levelled : (side, side) image in grey values of the shared one.
+    residuals : (side, side).
+    alike : (side, side) Tukey's weights.
+    scale : standard deviation of the residuals.
+    blur_px2 : correction of the blur's variance.
+    blur_sigma_px2 : its standard deviation.
     """
 
     levelled: Array
@@ -146,8 +159,8 @@ class _Fit:
 
 
 def _fit(picture: Array, design: Array, weights: Array) -> _Fit:
-    """Robust against dust and the landscape behind the mark. What a pixel changes by while the picture is moved and
-    blurred is no damage: the next round shows it."""
+    """Fit an image to the shared one, robustly against dust and background. Residuals as large as the changes by shift
+    and blur are not yet treated as damage; the next round decides."""
     columns, grey = design.reshape(len(design), -1), picture.ravel()
     floor = NOISE_FLOOR * float(np.ptp(design[_GAIN]))
     weights = weights.ravel()
@@ -172,33 +185,34 @@ def _fit(picture: Array, design: Array, weights: Array) -> _Fit:
 
 
 def _weights(fits: Sequence[_Fit], shares: Array) -> Array:
-    """(n, side, side) of the pixels. shares (n,): of the image that each picture was fitted to. What is mostly a
-    picture's own leaves little of its noise; and none counts by more than most of them do."""
+    """(n, side, side) weights of the pixels. shares (n,): of the images in the shared one, by which the residuals
+    underestimate the noise. The noise is at least the median, so that no image dominates."""
     noise = np.array([fit.scale for fit in fits]) / np.sqrt(np.maximum(1 - shares, _LEAST_REDUNDANCY))
     noise = np.maximum(noise, np.median(noise))
     return (np.array([fit.alike for fit in fits]) + _LEAST_WEIGHT) / noise[:, None, None] ** 2
 
 
 def _excess_variances(variances_px2: Array, fits: Sequence[_Fit]) -> Array:
-    """(n,) variances as fits have them, less that of the sharpest picture: 0 where pictures are as sharp as it, as far
-    as is known."""
+    """(n,) variances of the fits minus that of the sharpest image, plus its uncertainty; 0 for images not
+    significantly less sharp."""
     found = _bounded(variances_px2, np.array([fit.blur_px2 for fit in fits]))
     sharpest = float((found + _SURELY * np.array([fit.blur_sigma_px2 for fit in fits])).min())
     return np.maximum(found - sharpest, 0.0)
 
 
 def _bounded(variances_px2: Array, change_px2: Array) -> Array:
-    """Variances after a change that a linearisation allows."""
+    """Apply a change of variances, limited to the range of the linearisation."""
     total = variances_px2 + _SEEN_PX2
     return np.clip(total + change_px2, total / _MOST_BLURRED**2, total * _MOST_BLURRED**2) - _SEEN_PX2
 
 
 class _Together:
-    """The adjustment of the image and of all pictures' unknowns together, where they are linear.
+    """Linearised simultaneous adjustment of the shared image and the unknowns of all images, solved by LSMR.
 
-    The pictures that are as sharp as the image have no more blur: they say how sharp it is. Of the other unknowns all
-    pictures together have no sum, for a move of all of them would be one of the image. What no picture tells of the
-    image stays as it was. Unknowns and equations are scaled to a weight of about one."""
+    Datum: the blur of the sharpest images is held fixed, and the sums of the other unknowns are zero, since a common
+    shift would be one of the shared image. Components that no image determines are held by a weak prior. Unknowns and
+    equations are scaled to a weight of about one.
+    """
 
     def __init__(self, image: Array, variances_px2: Array, weights: Array, steady: Mask) -> None:
         self.image, self.roots = image, np.sqrt(weights)
@@ -213,7 +227,7 @@ class _Together:
         self.scale = 1 / np.sqrt(weights.sum(axis=0) + self.held**2)
 
     def solved(self, levelled: Array) -> tuple[Array, Array]:
-        """The image adjusted to pictures (n, side, side), and what is to be added (n, 5) to their unknowns."""
+        """Solve for the shared image and the corrections (n, 5) of the images' unknowns. levelled: (n, side, side)."""
         wanted = (self.roots * (levelled - self.designs[:, _GAIN])).ravel()
         rest = self.image.size + _BLUR
         shape = (wanted.size + rest, self.image.size + self.lengths.size)
@@ -227,7 +241,7 @@ class _Together:
         return unknowns[: self.image.size].reshape(self.image.shape), unknowns[self.image.size :].reshape(-1, _BLUR + 1)
 
     def _forward(self, unknowns: Array) -> Array:
-        """What changes of the unknowns change: in the pictures, in the image, and in the sums."""
+        """Product of the design matrix with the unknowns: images, prior of the shared image, and sums."""
         image, factors = self._parted(unknowns)
         change = self.scale * image
         pictures = idctn(self.transfers * _cosines(change), axes=(1, 2), norm="ortho")
@@ -235,7 +249,7 @@ class _Together:
         return np.concatenate([pictures.ravel(), self.held * change.ravel(), factors[:, :_BLUR].sum(axis=0)])
 
     def _adjoint(self, rows: Array) -> Array:
-        """The adjoint of it."""
+        """Product of the transposed design matrix with the equations."""
         pictures, change, sums = np.split(rows, [self.roots.size, self.roots.size + self.image.size])
         pictures = pictures.reshape(self.roots.shape)
         back = idctn((self.transfers * _cosines(self.roots * pictures)).sum(axis=0), norm="ortho")
@@ -246,7 +260,7 @@ class _Together:
 
 
 def _line(picture: Array, like: Array) -> Array:
-    """A picture with the gain and offset that make it most like another."""
+    """Fit an image to another one by gain and offset."""
     off = picture - picture.mean()
     gain = float((off * like).sum()) / max(float((off**2).sum()), 1e-12)
     return np.asarray(like.mean() + gain * off)

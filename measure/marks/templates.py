@@ -1,9 +1,9 @@
-"""Marks that nobody has drawn: pictures of the same mark in all frames of a camera, aligned, and what they share.
+"""Templates of marks without a drawing, learned from the images of the mark in all frames of a camera.
 
-All pictures are adjusted to the one that they share (shift, blur, gain and offset), this is made anew of them, and so
-on until nothing moves. It is as sharp as the sharpest of them, and the noise of its coarser detail falls with the
-square root of their number. Where its origin lies on the mark is a convention, the same one in every frame: a shift of
-the fiducial's coordinates.
+All images are fitted to their common template (shift, blur, gain and offset), which is then recomputed from them, until
+convergence. The template is as sharp as the sharpest image. The noise of its coarser detail falls with the square root
+of their number. The template's origin on the mark is a convention, common to all frames: a shift of the fiducial's
+coordinates.
 """
 
 from collections.abc import Collection, Sequence
@@ -20,23 +20,26 @@ from measure.marks.shared_picture import NOISE_FLOOR, SharedPicture, adjust_pict
 from measure.noise.robust_estimation import robust_scale
 from measure.scans.scan import Scan
 
-_PHASES = 2  # of rounds: what differs from frame to frame is known once the pictures are aligned
-_ROUNDS = 12  # of adjusting; five are enough where pictures are about as sharp as one another
-_SETTLED_PX, _SETTLED_PX2 = 0.005, 0.02  # no picture moves or is blurred further
-_ROOM_PX = 10  # about the chip, to move in
-_SPREAD_PX = 1.0  # over which it is averaged, for a few pictures alone hardly tell it, yet it changes at the edges
-GRAIN_PX = 1.0  # taken where one picture cannot tell how far its grain reaches
-_ALIKE = 0.8  # correlation of two pictures of one mark, with the landscape beside it
-_CORE = 0.15  # of the picture's side: by so much two origins may lie apart in each coordinate
-_SMOOTH_PX = 5  # of the pictures that are aligned: their noise
+_PHASES = 2  # unsteady pixels are known only after the images have been aligned once
+_ROUNDS = 12  # iterations per phase; five suffice for images of similar sharpness
+_SETTLED_PX, _SETTLED_PX2 = 0.005, 0.02  # px and px², convergence limits of shifts and blur variances
+_ROOM_PX = 10  # px around the chip, so that the mark can move
+_SPREAD_PX = 1.0  # px, smoothing of the steadiness: few images estimate it poorly, but it varies at the edges
+GRAIN_PX = 1.0  # px, correlation length of grain assumed where a single image does not determine it
+_ALIKE = 0.8  # smallest NCC of two images of one mark, including the background around it
+_CORE = 0.15  # fraction of the image's side: largest difference of two origins in each coordinate
+_SMOOTH_PX = 5  # px, smoothing of the images to be aligned, against noise
 _STEPS = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-5)
 _FLIP = np.diag([1.0, -1.0])  # from right and up to columns and rows
 
 
 @dataclass(frozen=True, eq=False)
 class Chip:
-    """A window of a scan about one mark: grey (rows, columns), its top-left pixel at origin_px (col, row) of the scan;
-    pixel_from_mark: (2, 3), mark's mm to the scan's pixels, its last column where the mark is taken to be."""
+    """Window of a scan around one mark.
+
+    scan: name of the scan; grey: (rows, columns) grey values; origin_px: (col, row) of the top-left pixel in the scan;
+    pixel_from_mark: (2, 3) from mm of the mark to pixels of the scan, the last column being the mark's assumed place.
+    """
 
     scan: str
     grey: Array
@@ -49,8 +52,8 @@ class Chip:
 
 
 def cut(scan: Scan, pixel_from_mark: Array, size_mm: float, weights: Sequence[float] | None = None) -> Chip:
-    """The window of a scan that holds a square of size_mm about the mark however it is turned, and room to move.
-    weights: of a colour scan's channels, those in which the mark is measured."""
+    """Cut out the window of a scan that holds a square of size_mm around the mark at any rotation, plus a margin.
+    weights: channel weights of a colour scan, as used for measuring the mark."""
     matrix = np.array(pixel_from_mark, dtype=float)
     reach = int(np.ceil(np.abs(matrix[:, :2]).sum(axis=1).max() * size_mm / 2)) + _ROOM_PX
     col0, row0 = (int(value) - reach for value in np.rint(matrix[:, 2]))
@@ -59,7 +62,7 @@ def cut(scan: Scan, pixel_from_mark: Array, size_mm: float, weights: Sequence[fl
 
 
 def learn_template(chips: Sequence[Chip], size_mm: float) -> MarkTemplate:
-    """The template that all pictures of one mark have in common. Raises ValueError without any picture."""
+    """Learn the common template of all images of one mark. Raises ValueError if there is no image."""
     if not chips:
         raise ValueError("a template needs a picture of its mark")
     pitch_um = float(np.median([chip.pitch_um for chip in chips]))
@@ -82,7 +85,7 @@ def learn_template(chips: Sequence[Chip], size_mm: float) -> MarkTemplate:
 
 
 def _align_chips(chips: Sequence[Chip], side: int, pitch_um: float) -> tuple[SharedPicture, Mask]:
-    """The picture (side, side) that chips share, and which of its pixels are steady."""
+    """Align chips. Returns their shared image (side, side) and the mask of its steady pixels."""
     places = [np.array(chip.pixel_from_mark) for chip in chips]
 
     def stack() -> Array:
@@ -102,7 +105,7 @@ def _align_chips(chips: Sequence[Chip], side: int, pitch_um: float) -> tuple[Sha
 
 
 def _resampled(chip: Chip, pixel_from_mark: Array, side: int, pitch_um: float) -> Array:
-    """The chip in the mark's own axes, x right and y up, its origin in the middle pixel."""
+    """Resample a chip to the mark's axes, x right and y up, with its origin in the centre pixel."""
     step = (np.arange(side) - side // 2) * (pitch_um / 1000)
     mark_mm = np.stack(np.meshgrid(step, -step))
     col, row = np.tensordot(pixel_from_mark[:, :2], mark_mm, axes=1) + (
@@ -112,8 +115,8 @@ def _resampled(chip: Chip, pixel_from_mark: Array, side: int, pitch_um: float) -
 
 
 def _steadiness(residuals: Array, image: Array, steady: Mask) -> Array:
-    """(side, side) standard deviation of noise, which is what most of the steady pixels have, over that of the
-    differences between the pictures (n, side, side) and their mean."""
+    """(side, side) standard deviation of the noise, estimated as the median over steady pixels, over that of the
+    residuals (n, side, side) of the images."""
     squares = (residuals**2).mean(axis=0)
     about = np.sqrt(cv2.GaussianBlur(squares, (0, 0), _SPREAD_PX))
     noise = max(float(np.median(about[steady])) if steady.any() else 0.0, NOISE_FLOOR * float(np.ptp(image)), 1e-9)
@@ -121,30 +124,40 @@ def _steadiness(residuals: Array, image: Array, steady: Mask) -> Array:
 
 
 def _noise_dn(grey: Array) -> float:
-    """Of one pixel: what is finer than grain gets; lines are finer too, but few."""
+    """Standard deviation of one pixel's noise, from high-pass filtered grey values; thin lines pass the filter, too,
+    but are few."""
     return robust_scale(grey - cv2.GaussianBlur(grey, (0, 0), 2 * GRAIN_PX))
 
 
 def _detail_px(image: Array) -> float:
-    """The finest detail: twice the blur that takes half of the picture's variance away, the width of a lone line."""
+    """Width (px) of the finest detail: twice the blur that halves the image's variance, the width of a single line."""
     blurs = np.arange(1.0, max(image.shape[0] / 4, 2.0), 0.5)
     left = [cv2.GaussianBlur(image, (0, 0), blur).var() / max(image.var(), 1e-12) for blur in blurs]
     return 2 * float(np.interp(-0.5, -np.array(left), blurs))
 
 
-# Learned marks that look like one another however their frame lies: then their origins are made one place of each.
+# Consistent origins of learned marks that look alike in several scan orientations.
 #
-# Where a learned mark's origin lies on it is a convention. In a frame that lies another way a mark may be taken for
-# another that looks like it there, and then the origin would lie elsewhere: unless every such pose takes the origins to
-# one another, as it takes the middles of crosses.
+# The origin of a learned mark is a convention. In another scan orientation a mark may be confused with one that looks
+# alike there, and its origin would be at a different place. This does no harm if every such orientation maps the
+# origins onto one another, as it does for the centres of crosses.
 
 
 def share_origins(
     templates: Sequence[MarkTemplate], places_mm: Array, poses: Collection[str]
 ) -> tuple[list[MarkTemplate], Array]:
-    """The templates of a camera's learned marks at places_mm (n, 2), each with those of the poses, which frames do not
-    tell apart, under which all of them look alike, and their origins such that these poses take them to one another;
-    and by how much these moved, mm (n, 2), in the camera's axes."""
+    """Make the origins of a camera's learned marks consistent under indistinguishable scan orientations.
+
+    Parameters
+    ----------
+    templates, places_mm : templates of the n marks and their coordinates (n, 2).
+    poses : scan orientations that the frames do not distinguish.
+
+    Returns
+    -------
+    The templates with the orientations under which all of them look alike, and with origins that these map onto one
+    another; the shifts of the origins, mm (n, 2), in the camera's axes.
+    """
     count, rows, shifts, alike = len(templates), list[Array](), list[Array](), list[str]()
     for pose in (pose for pose in POSES[1:] if pose in poses):
         turn = up_from_camera(pose)
@@ -168,15 +181,14 @@ def share_origins(
 
 
 def _partners(places_mm: Array, turn: Array, near_mm: float) -> list[int] | None:
-    """Which mark lies where a turn takes each; None where one has no such partner."""
+    """Index of the mark to whose place a turn takes each mark; None if any has no partner."""
     apart = np.hypot(*np.moveaxis((places_mm @ turn.T)[:, None] - places_mm[None], -1, 0))
     to = apart.argmin(axis=1)
     return to.tolist() if apart.min(axis=1).max() < near_mm and len(set(to.tolist())) == len(to) else None
 
 
 def _aligned_origin(one: MarkTemplate, other: MarkTemplate, turn: Array) -> Array | None:
-    """Where a mark's origin lies beside another's, mm (2,), once it is turned and laid where it is most like that; None
-    where it is not like it."""
+    """Shift (2,) mm from another mark's origin to that of a turned mark, aligned by ECC. None if they are not alike."""
     seen, shown = _centre_origin(other), turn_by_quarters(_centre_origin(one), _FLIP @ turn @ _FLIP)
     side = min(len(seen), len(shown))
     margin = int(np.ceil(_CORE * side))
@@ -189,14 +201,14 @@ def _aligned_origin(one: MarkTemplate, other: MarkTemplate, turn: Array) -> Arra
         likeness, moved = cv2.findTransformECC(
             core, within, warp, cv2.MOTION_TRANSLATION, _STEPS, everywhere, _SMOOTH_PX
         )
-    except cv2.error:  # it comes to no end: the two are not alike
+    except cv2.error:  # no convergence: the two are not alike
         return None
     shift_px = np.asarray(moved, float)[:, 2] - margin
     return np.asarray(_FLIP @ shift_px * other.pitch_um / 1000) if likeness >= _ALIKE else None
 
 
 def _centre_origin(template: MarkTemplate) -> Array:
-    """The largest square picture with the origin in its middle, to a part of a pixel."""
+    """Resample to the largest square image whose centre is exactly the origin."""
     size = np.array(template.image.shape[::-1])
     origin = np.array(template.origin_px)
     half = int(np.floor(min(np.min(origin), np.min(size - 1 - origin))))
