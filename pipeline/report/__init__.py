@@ -1,4 +1,4 @@
-"""report.html: the verdict, the problems, every mark, and what each number means."""
+"""report.html: the verdict, the problems, all marks, and explanations of the numbers."""
 
 from pipeline.report.data import Problem, ReportData
 from pipeline.report.page import render_report, write_report

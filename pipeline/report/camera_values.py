@@ -1,4 +1,4 @@
-"""The values of a camera that are to be cited: in mm of a film camera, in px of a digital one."""
+"""Calibration values of a camera to cite: in mm for a film camera, in px for a digital camera."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -24,12 +24,12 @@ INTERIOR_MEANING = {
     "cy": "principal point, row",
 }
 SYMBOLS = {"x0": "x₀′", "y0": "y₀′"}
-LARGER = 1.5  # times a standard deviation, which a dozen pictures hardly make by chance
+LARGER = 1.5  # ratio of standard deviations that a dozen images rarely exceed by chance
 
 
 @dataclass(frozen=True)
 class CameraValue:
-    """name: as adjustment.json or OpenCV has it; sigma: the one to use, 0 of a fixed value."""
+    """Calibration value. name: as in adjustment.json or OpenCV; sigma: standard deviation to use, 0 if fixed."""
 
     name: str
     value: float
@@ -42,7 +42,7 @@ class CameraValue:
 
     @property
     def meaning(self) -> str:
-        """In words; empty of the distortion."""
+        """Name in words; "" for distortion parameters."""
         return INTERIOR_MEANING.get(self.name, "")
 
     @property
@@ -51,9 +51,9 @@ class CameraValue:
 
 
 def camera_values(data: ReportData, name: str) -> list[CameraValue]:
-    """Interior orientation and distortion of a calibrated camera of the adjustment; without what is fixed at 0.
+    """Interior orientation and distortion of a calibrated camera, without distortion parameters fixed at 0.
 
-    A standard deviation is the larger one of the adjustment's and of that by leaving out images, where there is one.
+    The standard deviation is the larger of that of the adjustment and that by leaving out images, if computed.
     """
     assert data.adjustment is not None
     camera, unit = data.adjustment.cameras[name], data.unit_of_camera(name)
@@ -70,7 +70,7 @@ def camera_values(data: ReportData, name: str) -> list[CameraValue]:
 
 
 def _stated(camera: CameraRecord, known: Mapping[str, Quantity], unit: ImageUnit) -> tuple[dict[str, float], Array]:
-    """The values by their names in this unit, and their derivatives by those in mm."""
+    """Values by name in this unit, and their derivatives with respect to the values in mm."""
     mm = {key: each.value for key, each in known.items()}
     if unit.is_pixel and family_of(camera.distortion.family).y_down:
         return pixel_intrinsics(mm, 1.0 / unit.per_mm)
@@ -89,7 +89,7 @@ def _sigmas(by_mm: Array, covariance: Array) -> Array:
 
 
 def cluster_ratio(name: str, camera: CameraRecord, covariance: Covariance | None) -> float:
-    """How many times the adjustment's standard deviations those by leaving out images are, at most; 0 if not known."""
+    """Largest ratio of the standard deviations by leaving out images to those of the adjustment; 0 if unknown."""
     keys = [key for key, each in camera.interior.items() if each.sigma > 0.0]
     if covariance is None or covariance.clusters is None or not keys:
         return 0.0

@@ -1,4 +1,4 @@
-"""What the report shows of each camera: its values, distortion, residuals, maps over its frame, fiducials and check."""
+"""Cameras in the report: values, distortion, residuals, maps over the frame, fiducials and check."""
 
 import math
 from collections.abc import Iterator
@@ -25,13 +25,13 @@ from pipeline.results.image_unit import ImageUnit
 
 PLOT_PX = 400.0
 LONGEST_VECTOR_PX = 44.0
-MOST_VECTORS = 10_000  # in the picture of all frames
+MOST_VECTORS = 10_000  # in the plot of all images
 CURVE_TABLE_ROWS = 6
 
 
 @dataclass(frozen=True)
 class LensView:
-    """The distortion of a camera. rows: of the curves' table, by their positions; certificate: of film cameras."""
+    """Distortion of a camera. rows: indices of the curve points in the table; certificate: None for digital cameras."""
 
     curves: Curves
     plot: Markup
@@ -42,10 +42,18 @@ class LensView:
 
 @dataclass(frozen=True)
 class CameraView:
-    """A camera; None or empty where the files do not hold what is needed.
+    """Camera in the report; None or empty where the files lack the data.
 
-    values: those to cite; parameters: what was given of them, and what they say. maps: contours of the standard
-    deviation of projected points, with what each is of. observed: how many observations the coverage shows.
+    Attributes
+    ----------
+    images : number of images.
+    values : values to cite.
+    effect_where : place at which the effects of distortion parameters are stated.
+    parameters : table of parameters with their priors and significance.
+    vectors, coverage : plots of the residuals and of the number of observations over the frame.
+    observed : number of observations in the coverage.
+    maps : contour plots of the standard deviation of projected points, with their distance in words.
+    corrections, corrections_sentence, corrections_plot : fiducials against their given coordinates.
     """
 
     name: str
@@ -70,7 +78,7 @@ class CameraView:
 
 
 def camera_views(data: ReportData) -> list[CameraView]:
-    """All cameras of the adjustment; none where there is no adjustment."""
+    """Views of all cameras of the adjustment; empty without an adjustment."""
     stored = data.adjustment
     return [_view(data, stored, name, camera) for name, camera in stored.cameras.items()] if stored else []
 
@@ -79,7 +87,7 @@ def _view(data: ReportData, stored: AdjustmentRecord, name: str, camera: CameraR
     images, by_image = stored.camera_images(name), residuals_by_image(data)
     rows = [row for image in images for row in by_image.get(image, [])]
     known, unit = data.covariance if stored.converged else None, data.unit_of_camera(name)
-    # Where there is no solution, none of what is missing was left out.
+    # Without a solution all sigmas are NaN: they do not mean that the camera was left out of the calibration.
     is_calibrated = camera.is_calibrated or not stored.converged
     covariance = known if is_calibrated else None
     radius_mm, on = _observed_radius_mm(camera, rows), _plane(data, name, camera, rows, unit)
@@ -95,7 +103,7 @@ def _view(data: ReportData, stored: AdjustmentRecord, name: str, camera: CameraR
         unit=unit,
         values=camera_values(data, name) if is_calibrated else [],
         effect_where="in the frame" if is_defined_over_frame(camera.lens()) else f"at {radius} {unit.long_name}",
-        # Of a digital camera c, x0' and y0' in mm of the pixels' size would be second values of the same.
+        # For a digital camera the values above already state c, x0' and y0' in px.
         parameters=(parameters[3:] if unit.is_pixel else parameters) if is_calibrated else [],
         correlations=high_correlations(name, camera, covariance) if covariance else [],
         correlation_causes=_correlation_causes(name, stored),
@@ -114,7 +122,7 @@ def _view(data: ReportData, stored: AdjustmentRecord, name: str, camera: CameraR
 
 
 def _observed_radius_mm(camera: CameraRecord, rows: list[ResidualRecord]) -> float:
-    """From the principal point to the outermost target."""
+    """Distance from the principal point to the outermost target."""
     point = camera.principal_point_mm
     targets = ((row.camera_x_mm, row.camera_y_mm) for row in rows if row.kind not in ("fiducial", "join"))
     return max((float(np.hypot(x - point.x.value, y - point.y.value)) for x, y in targets), default=0.0)
@@ -123,7 +131,7 @@ def _observed_radius_mm(camera: CameraRecord, rows: list[ResidualRecord]) -> flo
 def _plane(
     data: ReportData, name: str, camera: CameraRecord, rows: list[ResidualRecord], unit: ImageUnit
 ) -> vectors.Plane | None:
-    """The camera's picture, or where its size is not known, what was observed of it; None without observations."""
+    """Plane of the camera's frame, or of its observations if the frame size is unknown; None without observations."""
     if not rows:
         return None
     if camera.lens_known is not None and camera.lens_known.frame_mm is not None:
@@ -132,13 +140,13 @@ def _plane(
 
 
 def _prior_scale(name: str, stored: AdjustmentRecord) -> float:
-    """What sigma0 multiplies the given standard deviations of an interior orientation by."""
+    """Factor by which sigma0 scales the given standard deviations of an interior orientation."""
     is_left_out = ("interior", name) in stored.variance_factor.left_out
     return stored.sigma0 if stored.sigma0 > 0.0 and not is_left_out else 1.0
 
 
 def _correlation_causes(name: str, stored: AdjustmentRecord) -> list[str]:
-    """What makes quantities of a camera highly correlated, in words."""
+    """Causes and remedies of high correlations of a camera's quantities, in words."""
     firsts = (parameter_from_text(each.parameters[0]) for each in stored.correlations)
     return [
         f"{each.cause} {each.remedy}"
@@ -150,8 +158,8 @@ def _correlation_causes(name: str, stored: AdjustmentRecord) -> list[str]:
 def _lens_view(
     name: str, camera: CameraRecord, covariance: Covariance, on: vectors.Plane | None, radius_mm: float, unit: ImageUnit
 ) -> LensView | None:
-    """Out to the frame's corner where its size is known, else to the outermost target. Of a family that is defined over
-    the frame: on circles that lie in it."""
+    """Distortion out to the corner of the frame if its size is known, otherwise of the observed area. A family defined
+    over the frame is shown on circles within it only."""
     reach = camera.lens_known
     corner_mm = reach.corner_mm if reach is not None and reach.corner_mm > 0.0 else 0.0
     if corner_mm == 0.0 and on is not None:
@@ -175,7 +183,7 @@ def _lens_view(
 
 def _vectors(rows: list[ResidualRecord], on: vectors.Plane) -> Markup:
     scale = vectors.VectorField.from_residuals(rows).scale(LONGEST_VECTOR_PX)
-    residuals = vectors.VectorField.from_residuals(rows[:: -(-len(rows) // MOST_VECTORS)])  # evenly over the frames
+    residuals = vectors.VectorField.from_residuals(rows[:: -(-len(rows) // MOST_VECTORS)])  # evenly from all images
     return vectors.all_images_plot(residuals, on, scale)
 
 

@@ -1,4 +1,4 @@
-"""What the report is made from: the files of the stages, any of which may be missing."""
+"""Input of the report: the result files of the stages, any of which may be missing."""
 
 import math
 import re
@@ -23,10 +23,9 @@ _SENTENCE = re.compile(r"(?<=[.:]) (?=[A-Z])")
 
 @dataclass(frozen=True)
 class Problem:
-    """Something that needs a look: what it is, and what to do about it.
+    """Problem that needs a look. what: description; next_step: remedy.
 
-    images: the frames that it is about; marks: those that it is about, the first of which the report shows; section: of
-    the report, that has more of it.
+    images, marks: those concerned, the report shows the first mark; section: of the report, with details.
     """
 
     what: str
@@ -37,22 +36,26 @@ class Problem:
 
     @property
     def cause(self) -> str:
-        """Its first sentence."""
+        """First sentence of the description."""
         return _SENTENCE.split(self.what, maxsplit=1)[0]
 
     @property
     def detail(self) -> str:
-        """What follows it."""
+        """Rest of the description."""
         return "".join(_SENTENCE.split(self.what, maxsplit=1)[1:])
 
 
 @dataclass(frozen=True)
 class FrameTotals:
-    """What a report says of more frames than it shows one by one.
+    """Totals of all frames, for a report that does not show all of them.
 
-    marks: their number by image and status; of_targets: of those that are no
-    fiducials, by kind and status. verdicts: number of frames by camera and kind of file, and then by verdict. problems:
-    what the frames have to say. places_px: of all marks observed, by axis; as `fractions.places_px` has them.
+    Attributes
+    ----------
+    marks : number of marks by image and status.
+    of_targets : number of marks other than fiducials, by kind and status.
+    verdicts : number of frames by (camera, kind of file) and verdict.
+    problems : of the frames.
+    places_px : distinct positions of the observed marks by axis, see `fractions.places_px`.
     """
 
     marks: Mapping[str, Mapping[str, int]]
@@ -64,15 +67,22 @@ class FrameTotals:
 
 @dataclass(frozen=True)
 class ReportData:
-    """Everything a report can show.
+    """Input of a report.
 
-    comparator: the rows of comparator.csv. measurement: the scans of measurement.db by image. adjustment, check: as
-    adjustment.json and check.json keep them; covariance: adjustment.npz. frame_mm: width and height of the exposed
-    frame by camera name. pitch_um: of the scans whose pixel positions are known, across and down. thumbnail: from
-    image, point and kind (a fiducial and a target may share a name) to the mark's picture. problems, notes: what the
-    caller has to say beyond the files. made_from: their fingerprints by name. unit: of the object coordinates.
-    given_by: by camera what its fiducials' given coordinates come from. totals: of all frames where they are many;
-    comparator and measurement are then of those that are shown.
+    Attributes
+    ----------
+    comparator : rows of comparator.csv.
+    measurement : scans of measurement.db by image.
+    adjustment, check : content of adjustment.json and check.json.
+    covariance : content of adjustment.npz.
+    frame_mm : width and height of the exposed frame by camera.
+    pitch_um : pixel pitch across and down, by scan with known pixel positions.
+    thumbnail : returns the thumbnail of a mark from image, point and kind (a fiducial and a target may share a name).
+    problems, notes : further ones of the caller.
+    made_from : fingerprints of the files by name.
+    unit : of the object coordinates.
+    given_by : source of the given fiducial coordinates by camera.
+    totals : of all frames if these are many; comparator and measurement then hold only the frames shown.
     """
 
     project: str
@@ -93,18 +103,18 @@ class ReportData:
 
     @property
     def is_film_alone(self) -> bool:
-        """Whether fiducial marks are all there was to adjust."""
+        """Whether only fiducial marks were adjusted and no camera is calibrated."""
         stored = self.adjustment
         return stored is not None and not any(camera.is_calibrated for camera in stored.cameras.values())
 
     @property
     def is_digital(self) -> bool:
-        """Whether all is stated in pixels."""
+        """Whether image lengths are stated in pixels."""
         return any(unit.is_pixel for unit in self.image_units.values())
 
     @cached_property
     def image_units(self) -> Mapping[str, ImageUnit]:
-        """By camera of the adjustment the unit of lengths in its images: all in px, or all in mm and µm."""
+        """Unit of image lengths by camera of the adjustment; empty if all are in mm and µm."""
         stored = self.adjustment
         if stored is None or any(camera.fiducials for camera in stored.cameras.values()):
             return {}
@@ -117,7 +127,7 @@ class ReportData:
         return {name: ImageUnit(min(each)) for name, each in sizes.items()}
 
     def given_by_of(self, camera: str) -> str:
-        """What the given coordinates of a camera's fiducials come from."""
+        """Source of the given fiducial coordinates of a camera."""
         return self.given_by.get(camera, "the given coordinates")
 
     def unit_of_camera(self, camera: str) -> ImageUnit:

@@ -1,4 +1,4 @@
-"""Fiducial marks, given against estimated, as a figure that is free of the datum in which the camera stands."""
+"""Corrections of the fiducial coordinates to the given ones, after removal of the datum."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,17 +18,17 @@ from pipeline.types import Array
 LONGEST_PX = 46.0
 WIDTH_PX = 400.0
 SIGNIFICANT = 3.0  # standard deviations of a coordinate
-DATUM_UM = 100.0  # given standard deviations from which on coordinates place the datum alone
-LEAST_UM = 0.1  # of a correction, below which no certificate has digits
+DATUM_UM = 100.0  # µm; coordinates with a larger given standard deviation only define the datum
+LEAST_UM = 0.1  # µm, resolution of certificates; smaller corrections are ignored
 MARGIN_PX = 58.0
-BETTER = 2.0  # how many times as well as coordinates distances must be known to tell the form
-_CALIBRATED = Film("similarity", np.array([0.0, 0.0, 1.0, 0.0]), np.zeros(2))  # the camera as it lies
-_MEASURED = Film("congruent", np.zeros(3), np.zeros(2))  # the same of fiducials between which distances were measured
+BETTER = 2.0  # ratio of the standard deviations of coordinates and distances above which distances define the figure
+_CALIBRATED = Film("similarity", np.array([0.0, 0.0, 1.0, 0.0]), np.zeros(2))  # datum of calibrated cameras
+_MEASURED = Film("congruent", np.zeros(3), np.zeros(2))  # datum of fiducials with measured distances
 
 
 @dataclass(frozen=True)
 class Distance:
-    """Between two marks: mm, less the given one in um, and its whole standard deviation, the datum's scale included."""
+    """Distance between two fiducials. change_um: estimated minus given; sigma_um includes the scale of the datum."""
 
     start: str
     end: str
@@ -39,11 +39,14 @@ class Distance:
 
 @dataclass(frozen=True)
 class Figure:
-    """The camera, laid over its given fiducials by what its datum leaves open, and fits them best.
+    """Estimated fiducials after a best-fit datum transformation to the given ones.
 
-    ids (n); given_mm (n, 2); change_um (n, 2): what is left of estimated less given; covariance_um2 (2n, 2n) of all
-    changes. distances: across, as estimated; none where films alone hold the figure and keep none. transformation: to
-    the given places, after which these changes are left.
+    Attributes
+    ----------
+    ids, given_mm : (n,) and (n, 2).
+    change_um, covariance_um2 : (n, 2) estimated minus given after the transformation, and (2n, 2n) their covariance.
+    distances : across the frame; empty if the film models, which alone define the datum, do not preserve distances.
+    transformation : kind of the datum transformation.
     """
 
     ids: tuple[str, ...]
@@ -55,19 +58,22 @@ class Figure:
 
     @property
     def mark_covariances_um2(self) -> Array:
-        """(n, 2, 2) of each mark's change."""
+        """(n, 2, 2) covariance of the change of each mark."""
         at = np.arange(len(self.ids))
         return self.covariance_um2.reshape(len(at), 2, len(at), 2)[at, :, at, :]
 
     @property
     def sigmas_um(self) -> Array:
-        """(n, 2) of the changes."""
+        """(n, 2) standard deviations of the changes."""
         return np.sqrt(np.maximum(np.diag(self.covariance_um2), 0.0)).reshape(-1, 2)
 
 
 def correction_sentence(form: Figure, fiducials: Mapping[str, FiducialRecord], given_by: str) -> str:
-    """What the corrections say of the given coordinates, in words: against the larger of their own standard deviations
-    and of those of the given coordinates, where these do more than place the datum. given_by: what these come from."""
+    """State the size of the corrections and which are significant.
+
+    The limit is based on the larger of the standard deviations of the correction and of the given coordinate, the
+    latter only if it does more than define the datum. given_by: source of the given coordinates.
+    """
     size = np.hypot(*form.change_um.T)
     worst, rms = int(size.argmax()), float(np.sqrt(np.mean(form.change_um**2)))
     pairs = [(fiducials[id].x_mm.given, fiducials[id].y_mm.given) for id in form.ids]
@@ -90,7 +96,7 @@ def correction_sentence(form: Figure, fiducials: Mapping[str, FiducialRecord], g
 
 
 def figure(name: str, stored: AdjustmentRecord, covariance: Covariance) -> Figure | None:
-    """A camera's fiducials free of its datum; None where its datum covers all that they tell."""
+    """Corrections of a camera's fiducials; None if the datum transformation absorbs all of them."""
     camera = stored.cameras[name]
     if _is_measured(name, stored):
         return figure_of_films(name, camera.fiducials, covariance, {}, _MEASURED)
@@ -99,7 +105,7 @@ def figure(name: str, stored: AdjustmentRecord, covariance: Covariance) -> Figur
 
 
 def _is_measured(name: str, stored: AdjustmentRecord) -> bool:
-    """Whether distances tell the form of a camera's fiducials, much better than given coordinates do."""
+    """Whether measured distances define the figure of a camera's fiducials much better than given coordinates do."""
     sigmas = [row.sigma_mm for row in stored.fiducial_distances if row.camera == name]
     given = [each.given for mark in stored.cameras[name].fiducials.values() for each in (mark.x_mm, mark.y_mm)]
     known = [each.sigma for each in given if each is not None and np.isfinite(each.sigma)]  # NaN: free
@@ -114,12 +120,17 @@ def figure_of_films(
     films: Mapping[str, Film],
     otherwise: Film = _CALIBRATED,
 ) -> Figure | None:
-    """The figure of fiducials that nothing but these films, by image, holds; where there are none, after the kind of
-    transformation that `otherwise` has.
+    """Corrections of fiducials whose datum only the film transformations define; None without given coordinates.
 
-    The datum that calibrated fiducials stand in is itself uncertain, by a shift, a rotation and a scale that they
-    share. The covariance is that after the S-transformation (Baarda 1973) to the marks. Of films the datum takes up all
-    that each of them can.
+    Parameters
+    ----------
+    films : film transformations by image. The datum transformation then absorbs all that each of them can.
+    otherwise : film transformation of the kind of the datum transformation if films is empty.
+
+    Notes
+    -----
+    The datum of calibrated fiducials is uncertain by a common shift, rotation and scale. The covariance is therefore
+    that after an S-transformation (Baarda 1973) to the marks.
     """
     known = {id: (mark.given_mm, mark.xy_mm) for id, mark in fiducials.items() if mark.given_mm is not None}
     given, estimated = np.array(list(known.values()), dtype=float).reshape(-1, 2, 2).swapaxes(0, 1)
@@ -140,7 +151,7 @@ def figure_of_films(
 
 
 def _distances(ids: tuple[str, ...], places_mm: Array, given_mm: Array, covariance_mm2: Array) -> tuple[Distance, ...]:
-    """From every mark to that which lies farthest from it; covariance_mm2 (2n, 2n): of the places, datum and all."""
+    """Distance from each mark to the farthest one. covariance_mm2: (2n, 2n) of the coordinates, datum included."""
     apart = np.linalg.norm(given_mm[:, None] - given_mm, axis=2)
     pairs = np.sort(np.stack([np.arange(len(apart)), apart.argmax(axis=1)], axis=1), axis=1)
     found = []
@@ -156,7 +167,7 @@ def _distances(ids: tuple[str, ...], places_mm: Array, given_mm: Array, covarian
 
 
 def figure_plot(change: Figure) -> Markup:
-    """The given places, the change of each mark as a stroke, and the 95 % ellipse about its end."""
+    """Plot the given places, the change of each mark as a vector, and the 95 % ellipse around its end."""
     radius, angles = svg.ellipse_axes(change.mark_covariances_um2)
     reach = np.hypot(*change.change_um.T) + radius.max(axis=1)
     px_per_um = svg.round_step(LONGEST_PX / float(reach.max())) if reach.max() > 0.0 else 1.0

@@ -1,4 +1,4 @@
-"""Fractional parts of measured pixel positions, and their histograms."""
+"""Test for pixel locking: histograms of the fractional parts of measured pixel positions."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -13,19 +13,22 @@ from pipeline.report.marks import Frame
 from pipeline.types import Array
 
 BINS = 10
-LEAST_MARKS = 50  # five a bin, below which the chi-square test means nothing
-LEAST_PROBABILITY = 1e-4  # grids of targets that lie nearly along the pixels are a little uneven by themselves
-LEAST_BIAS_PX = 0.01  # with very many marks even a bias that harms nobody is beyond chance
-SAME_PLACE_PX = 0.5  # marks that lie at random are seldom so near to another one's column or row
+LEAST_MARKS = 50  # five per bin; with fewer the chi-square test is invalid
+LEAST_PROBABILITY = 1e-4  # significance level; low, as target grids nearly parallel to the pixels are uneven
+LEAST_BIAS_PX = 0.01  # px; with very many marks even a negligible bias is significant
+SAME_PLACE_PX = 0.5  # px; randomly placed marks rarely share a column or row this closely
 
 
 @dataclass(frozen=True)
 class FractionTest:
-    """Counts (BINS,) of the fractional parts over [-0.5, 0.5) of a pixel, about its centre.
+    """Chi-square test for uniform fractional parts.
 
-    probability: how often chance alone gives counts as uneven as these; None where there are too few marks to say.
-    bias_px: the amplitude of the bias that would make them so. Positions f moved to f + b sin(2 pi f) have, to first
-    order, the density 1 - 2 pi b cos(2 pi f), so that b follows from the counts' first harmonic.
+    Attributes
+    ----------
+    counts : (BINS,) of the fractional parts over [-0.5, 0.5) px around the pixel centre.
+    probability : p-value; None if there are too few marks.
+    bias_px : amplitude of a sinusoidal bias that would cause the counts. Positions f shifted to f + b sin(2 pi f) have,
+        to first order, the density 1 - 2 pi b cos(2 pi f), so that b follows from the first harmonic.
     """
 
     counts: NDArray[np.int64]
@@ -34,31 +37,34 @@ class FractionTest:
 
     @property
     def is_locked(self) -> bool:
-        """Whether the positions prefer parts of a pixel, beyond chance and by an amount that matters."""
+        """Whether pixel locking is significant and not negligible."""
         return self.probability is not None and self.probability < LEAST_PROBABILITY and self.bias_px > LEAST_BIAS_PX
 
 
 def places_px(shots: Iterable[Frame]) -> dict[str, Array]:
-    """Columns and rows (n,) of all marks observed, each place along its axis once: a mark that recurs there in frame
-    after frame, and the line of a lattice that lies along the pixels, share one fractional part."""
+    """Distinct columns and rows (n,) of the observed marks.
+
+    Equal positions count once: a mark that recurs in every frame, or a grid line parallel to the pixels, has only one
+    independent fractional part.
+    """
     return places_apart([center for frame in shots for center in centers_px(frame)])
 
 
 def centers_px(frame: Frame) -> Iterator[Array]:
-    """Centres (2,) of the marks of a frame that are observations."""
+    """Yield the centres (2,) of the observed marks of a frame."""
     for mark in frame.marks:
         if mark.status.is_observation and mark.center_px is not None:
             yield mark.center_px
 
 
 def places_apart(centers: ArrayLike) -> dict[str, Array]:
-    """The same of centres (n, 2)."""
+    """Distinct columns and rows of centres (n, 2); see `places_px`."""
     columns, rows = np.asarray(centers, dtype=np.float64).reshape(-1, 2).T
     return {"column": _apart(columns), "row": _apart(rows)}
 
 
 def _apart(positions_px: Array) -> Array:
-    """Of positions (n,) those that lie apart from all that were kept before."""
+    """Positions, sorted, without those within SAME_PLACE_PX of the last one kept."""
     kept: list[float] = []
     for position in np.sort(positions_px).tolist():
         if not kept or position - kept[-1] > SAME_PLACE_PX:
@@ -67,7 +73,7 @@ def _apart(positions_px: Array) -> Array:
 
 
 def fraction_test(position_px: Array) -> FractionTest:
-    """Test one coordinate (n,) of measured positions: chi-square against equal counts."""
+    """Test one coordinate (n,) of measured positions for uniform fractional parts."""
     fractions = position_px - np.floor(position_px + 0.5)
     counts, _ = np.histogram(fractions, bins=BINS, range=(-0.5, 0.5))
     if len(position_px) < LEAST_MARKS:
@@ -78,7 +84,7 @@ def fraction_test(position_px: Array) -> FractionTest:
 
 
 def expected_range(total: int) -> tuple[float, float]:
-    """Where 99 % of all counts of a bin lie when the marks prefer no place."""
+    """99 % interval of the count of a bin without pixel locking (binomial distribution)."""
     if total == 0:
         return 0.0, 0.0
     low, high = np.ceil(bdtrik((0.005, 0.995), total, 1.0 / BINS))
@@ -86,7 +92,7 @@ def expected_range(total: int) -> tuple[float, float]:
 
 
 def fraction_plot(axis: str, test: FractionTest) -> Markup:
-    """Counts over the pixel, with the range in which chance leaves 99 of 100 of them."""
+    """Plot the histogram over the pixel with the 99 % interval of the counts."""
     total = int(test.counts.sum())
     low, high = expected_range(total)
     axes = svg.Axes((-0.5, 0.5), (0.0, 1.15 * max(float(test.counts.max()), high, 1.0)), width=330.0, height=220.0)

@@ -1,4 +1,4 @@
-"""Maps over a camera's frame: where it was observed, and contours of a standard deviation."""
+"""Maps over a camera's frame: coverage by observations, and contours of a standard deviation."""
 
 import numpy as np
 from markupsafe import Markup
@@ -9,12 +9,13 @@ from pipeline.report.vectors import Plane
 from pipeline.types import Array
 
 CELLS = 12  # along the longer side of the frame
-LEVELS = 7  # of contours, about
-LABEL_ROOM_PX = 46.0  # between the labels of a contour, and from one of another
+LEVELS = 7  # approximate number of contours
+LABEL_ROOM_PX = 46.0  # px, smallest distance between contour labels
 
 
 def coverage_counts(on: Plane, places_mm: Array) -> tuple[Array, Array, Array]:
-    """Numbers of places (n, 2) in square cells of the plane, by row from below and column, with the cells' edges."""
+    """Count places (n, 2) in square cells of the plane; returns counts (row from below, column) and the cell edges x
+    and y."""
     low, high = on.corners_mm
     counts = np.maximum(np.rint(CELLS * (high - low) / (high - low).max()), 1.0).astype(int)
     x, y = (np.linspace(first, last, count + 1) for first, last, count in zip(low, high, counts, strict=True))
@@ -22,7 +23,7 @@ def coverage_counts(on: Plane, places_mm: Array) -> tuple[Array, Array, Array]:
 
 
 def coverage_plot(on: Plane, places_mm: Array) -> Markup:
-    """The cells of a frame, the darker the more observations lie in them."""
+    """Plot the cells of a frame, the darker the more observations they contain."""
     counts, x, y = coverage_counts(on, places_mm)
     drawn = []
     for row, column in np.argwhere(counts > 0):
@@ -35,12 +36,12 @@ def coverage_plot(on: Plane, places_mm: Array) -> Markup:
 
 
 def contour_plot(on: Plane, x_mm: Array, y_mm: Array, sigma_um: Array, title: str) -> Markup | None:
-    """Contours of a standard deviation over a frame, labelled in the plane's unit; None where it is 0 everywhere.
+    """Plot contours of a standard deviation over a frame, labelled in the plane's unit; None if it is 0 everywhere.
 
     Parameters
     ----------
     x_mm, y_mm : (m,), (n,) the grid, ascending
-    sigma_um : (n, m) at its nodes, NaN where the camera makes no image
+    sigma_um : (n, m) at its nodes, NaN where the camera forms no image
     """
     sigma = on.unit.per_um * sigma_um
     high = float(np.nanmax(sigma, initial=0.0))
@@ -61,7 +62,7 @@ def contour_plot(on: Plane, x_mm: Array, y_mm: Array, sigma_um: Array, title: st
 
 
 def _levels(low: float, high: float) -> list[float]:
-    """Round ones: equally spaced, or 1, 2, 5 times powers of ten where the standard deviation grows manifold."""
+    """Round contour levels: equally spaced, or 1, 2, 5 times powers of ten if the range exceeds a factor of five."""
     if high > 5.0 * low:
         powers = 10.0 ** np.arange(np.floor(np.log10(max(low, 1e-3 * high))), np.ceil(np.log10(high)) + 1.0)
         return [float(f"{m * power:.3g}") for power in powers for m in (1.0, 2.0, 5.0) if low < m * power < high]

@@ -1,4 +1,4 @@
-"""What of the frames' measurement needs a look, before any adjustment."""
+"""Problems of the measurement of frames that need a look before any adjustment."""
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -18,22 +18,23 @@ _ONE_ANSWER = (
     'writing = ["left: reads upward"].'
 )
 
-Gathered = dict[tuple[str, str], tuple[Problem, list[str]]]  # by their words: the first, and the images of all
+Gathered = dict[tuple[str, str], tuple[Problem, list[str]]]  # by masked text: the first problem and the images of all
 
 
 def single_frame_problems(frame: Frame) -> Iterator[Problem]:
-    """What one frame has to say, of a pose that nothing decides first."""
+    """Yield the problems of one frame, an undetermined scan orientation (pose) first."""
     yield from _assumed_pose(frame)
     yield from _measurement_problems(frame)
 
 
 def masked_text(sentence: str) -> str:
-    """The same of sentences that differ by their numbers alone."""
+    """Mask the numbers of a sentence, to group sentences that differ only in numbers."""
     return _NUMBER.sub("#", sentence)
 
 
 def frame_problems(shots: list[Frame]) -> Iterator[Problem]:
-    """What the frames have to say, of their poses first; once where several say the same but for numbers."""
+    """Yield the problems of all frames, scan orientations (poses) first. Problems that differ only in numbers are
+    merged."""
     for evidence in (_assumed_pose, _measurement_problems):
         gathered: Gathered = {}
         for frame in shots:
@@ -42,21 +43,21 @@ def frame_problems(shots: list[Frame]) -> Iterator[Problem]:
 
 
 def gather(gathered: Gathered, image: str, problems: Iterable[Problem]) -> None:
-    """Add the problems of an image to those of others, which may say the same but for numbers."""
+    """Add the problems of an image, grouped with those that differ only in numbers."""
     for problem in problems:
         alike = masked_text(problem.what), problem.next_step
         gathered.setdefault(alike, (problem, []))[1].append(image)
 
 
 def named_problem(problem: Problem, images: list[str]) -> Problem:
-    """The problem of the first of some images, with the names of all."""
+    """Problem of the first image, with the names of all."""
     has_numbers = len(images) > 1 and masked_text(problem.what) != problem.what
     of_first = " The numbers are those of the first." if has_numbers else ""
     return replace(problem, what=f"{listed(images)}: {problem.what}{of_first}", images=tuple(images))
 
 
 def images_by_sentence(shots: list[Frame], evidence: Callable[[Frame], Iterable[str]]) -> dict[str, list[str]]:
-    """The frames' names by what they say."""
+    """Names of frames by the sentences of evidence."""
     images: dict[str, list[str]] = {}
     for frame in shots:
         for sentence in evidence(frame):
@@ -86,7 +87,7 @@ def _measurement_problems(frame: Frame) -> Iterator[Problem]:
             yield Problem(drop_file_name(problem, frame.scan.scan) if frame.scan else problem)
     lost = [mark for mark in frame.marks if mark.is_fiducial and mark.is_open]
     found = sum(mark.is_fiducial and mark.status.is_observation for mark in frame.marks)
-    if lost and (found or pose):  # a frame that was not found at all has said so
+    if lost and (found or pose):  # otherwise the frame was not found, which is a problem of its own
         yield Problem(
             f"{counted(len(lost), 'fiducial mark')} not measured, {found} measured. Reasons: {_reasons(lost)}.",
             "Settle them with `reseau review`."
@@ -103,8 +104,7 @@ def _measurement_problems(frame: Frame) -> Iterator[Problem]:
 
 
 def _reasons(lost: list[Mark]) -> str:
-    """What became of marks, said once where several of them say the same but for the numbers: then with those of the
-    first."""
+    """Statuses and reasons of marks; reasons that differ only in numbers are merged, with the numbers of the first."""
     alike: dict[str, list[Mark]] = {}
     for mark in lost:
         alike.setdefault(f"{mark.status}: {masked_text(mark.reason)}", []).append(mark)
@@ -118,7 +118,8 @@ def _lost_marks(marks: list[Mark]) -> str:
 
 
 def pixel_locking(places_px: Mapping[str, Array]) -> Iterator[Problem]:
-    """places_px: of the marks by axis, as `fractions.places_px` has them."""
+    """Yield problems of pixel locking. places_px: distinct positions of the marks by axis, see
+    `fractions.places_px`."""
     for axis, positions in places_px.items():
         test = fraction_test(positions)
         if test.is_locked:

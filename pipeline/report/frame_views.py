@@ -1,4 +1,4 @@
-"""What the report shows of each frame: a line of the summary, its marks, residuals, orientation and writing."""
+"""Frames in the report: a line of the summary, marks, residuals, orientation and writing."""
 
 from collections import defaultdict
 from collections.abc import Collection, Iterable
@@ -22,18 +22,18 @@ from pipeline.results.assessment_record import ResidualRecord
 from pipeline.results.image_unit import ImageUnit
 from pipeline.results.measured_record import MeasuredScan
 
-_WIDTH_PX = 1000.0  # plates of 20 mm on film of 230 are read
-_LEAST_PX = 7.0  # of letters
-LARGE_W = 3.0  # of a standardised residual that is shown
-MOST_CARDS = 60  # of marks that need a look
+_WIDTH_PX = 1000.0  # px; data plates 20 mm wide on film of 230 mm remain legible
+_LEAST_PX = 7.0  # px, smallest letters
+LARGE_W = 3.0  # standardised residual above which a mark needs a look
+MOST_CARDS = 60  # largest number of marks that need a look
 PLOT_PX = 330.0
 LONGEST_VECTOR_PX = 42.0
-_LEAST_PART_PX = 0.0005  # a thousandth of a pixel is the last digit that is printed
+_LEAST_PART_PX = 0.0005  # px, half of the last digit printed
 
 
 def writing_picture(scan: MeasuredScan | None) -> Markup | None:
-    """The scan's outline with its lines of writing in place; None where none was read. Those that the pose's evidence
-    quotes stand out."""
+    """Draw the scan's outline with its lines of writing in place; None if none was read. Lines quoted as evidence of
+    the scan orientation (pose) are highlighted."""
     if scan is None or not scan.frame.writing:
         return None
     zoom = _WIDTH_PX / max(scan.width_px, scan.height_px)
@@ -45,14 +45,14 @@ def writing_picture(scan: MeasuredScan | None) -> Markup | None:
 
 
 def _writing_line(line: Line, zoom: float, is_evidence: bool) -> Markup:
-    """The text over the rectangle in which it was read, turned and mirrored as it lies."""
+    """Draw a text over the rectangle in which it was read, rotated and mirrored as in the scan."""
     outline = [(col * zoom, row * zoom) for col, row in line.outline_px]
     cols, rows = zip(*outline, strict=True)
     center = (sum(cols) / len(cols), sum(rows) / len(rows))
     up = up_from_camera(line.pose)
     sides = max(cols) - min(cols), max(rows) - min(rows)
     size = max(0.8 * min(sides), _LEAST_PX)
-    # SVG counts rows downwards, and so do letters.
+    # SVG and the glyphs have y down, `up` has y up: hence the signs.
     matrix = (up[0, 0], -up[1, 0], -up[0, 1], up[1, 1], *center)
     text = svg.tag(
         "text",
@@ -70,8 +70,8 @@ def _writing_line(line: Line, zoom: float, is_evidence: bool) -> Markup:
 
 @dataclass(frozen=True)
 class Card:
-    """A mark of the report. picture: None where there is no scan to cut it from; causes: what its standard deviation in
-    the scan consists of, with sizes and meanings; empty where it has one cause."""
+    """Mark in the report. picture: None without a thumbnail; causes: contributions to its standard deviation in the
+    scan, as name, px and meaning; empty if there is only one."""
 
     mark: Mark
     picture: Markup | None
@@ -81,14 +81,23 @@ class Card:
 
     @property
     def needs_look(self) -> bool:
-        """Whether it is anything but measured, or fits badly."""
+        """Whether the mark is suspect, not plainly measured, or has a large residual."""
         return self.is_suspect or self.mark.status is not Status.MEASURED or abs(self.mark.w or 0.0) > LARGE_W
 
 
 @dataclass(frozen=True)
 class FrameView:
-    """A frame of the report. id: of its place in the page; rms: of its residuals along x and y, in its unit; stored:
-    what is adjusted of it; None without."""
+    """Frame in the report.
+
+    Attributes
+    ----------
+    id : HTML anchor.
+    fiducials, targets : numbers of observed marks, in words.
+    rms : of the residuals in x and y, in `unit`; None without an adjustment.
+    largest_w : largest absolute standardised residual.
+    plot, writing : drawings of the residuals and of the writing around the frame.
+    stored : record in adjustment.json, None if not adjusted.
+    """
 
     id: str
     frame: Frame
@@ -104,13 +113,14 @@ class FrameView:
 
     @property
     def badness(self) -> tuple[bool, float, int]:
-        """The key that sorts frames from good to bad: not found, then by the residuals, then by marks that are lost."""
+        """Sort key, larger is worse: no mark observed, then residuals, then number of open marks."""
         is_lost = not any(mark.status.is_observation for mark in self.frame.marks)
         return is_lost, sum(self.rms or (0.0,)), sum(mark.is_open for mark in self.frame.marks)
 
 
 def frame_views(data: ReportData, shots: list[Frame], every_mark: bool = False) -> list[FrameView]:
-    """All frames, the worst first, drawn to the same scales. every_mark: picture them all, however many."""
+    """Views of all frames, the worst first, drawn to common scales. every_mark: show all marks, whatever their
+    number."""
     shown = {frame.image: list(frame.marks) for frame in shots} if every_mark else mark_pictures.shown_marks(shots)
     px_per_um, most_px = thumbnail_scale(shots), mark_pictures.stored_px(shown)
     by_image = residuals_by_image(data)
@@ -142,13 +152,13 @@ def frame_views(data: ReportData, shots: list[Frame], every_mark: bool = False) 
 
 
 def cards_to_show(views: Iterable[FrameView]) -> tuple[list[Card], int]:
-    """Cards of marks that need a look, the worst frame's first, and how many more there are."""
+    """Cards of marks that need a look, those of the worst frame first, and the number of further ones."""
     cards = [card for view in views for card in view.cards if card.needs_look]
     return cards[:MOST_CARDS], len(cards[MOST_CARDS:])
 
 
 def thumbnail_scale(shots: list[Frame]) -> float:
-    """Page pixels to 1 um of the residual arrows on the marks' pictures."""
+    """Scale of the residual arrows on the thumbnails, page pixels per µm."""
     return mark_pictures.arrow_scale([mark for frame in shots for mark in frame.marks])
 
 
@@ -186,7 +196,7 @@ def _causes(covariance: Covariance | None) -> tuple[tuple[str, str, str], ...]:
 
 
 def _observed_share(marks: list[Mark]) -> str:
-    """ "8 of 8", with what became of the others."""
+    """Number of observed marks in words, such as "8 of 8", with the statuses of those not plainly measured."""
     if not marks:
         return "–"
     counts = {status: sum(mark.status is status for mark in marks) for status in Status}

@@ -1,5 +1,5 @@
-"""The distortion of a camera over the radius, as a certificate and over the frame, with standard deviations from the
-full covariance."""
+"""Distortion of a camera over the radius, as a certificate, and over the frame, with standard deviations from the full
+covariance."""
 
 from dataclasses import dataclass, replace
 
@@ -26,22 +26,22 @@ from pipeline.results.image_unit import FILM_UNIT, ImageUnit
 from pipeline.types import Array
 
 FRAME_GRID = 17
-BAND = 1.959964  # sigmas to a probability of 95 %
+BAND = 1.959964  # half width of a 95 % band, in sigmas
 
-# Of the U.S. Geological Survey's reports, as far as the frame reaches.
+# Field angles of the U.S. Geological Survey's calibration reports; those beyond the frame are left out.
 ANGLES_DEG = (7.5, 15.0, 22.7, 30.0, 35.0, 40.0)
-_FEWEST_ANGLES = 5  # from which the principal distance and three powers come back, with one value over
+_FEWEST_ANGLES = 5  # determine the principal distance and three powers, with one redundant value
 _CERTIFICATE_RADII = 240
-_NEAR_AXIS = 1e-3  # of the largest radius: there the distortion is linear in it
+_NEAR_AXIS = 1e-3  # fraction of the largest radius within which the distortion is linear in the radius
 
 MAP_GRID = 15  # vectors along the longer side
-LONGEST = 1.5  # of the grid's mesh
-ARCS = 180  # of the circle about what was observed
+LONGEST = 1.5  # longest vector, in grid spacings
+ARCS = 180  # line segments of the circle around the observed area
 
 
 @dataclass(frozen=True)
 class CertificateRow:
-    """The distortion at an angle from the axis, positive outwards, each value in um with its sigma."""
+    """Distortion at an angle from the axis, positive outwards; values in µm with their sigmas."""
 
     angle_deg: float
     radius_mm: float
@@ -51,8 +51,15 @@ class CertificateRow:
 
 @dataclass(frozen=True)
 class Certificate:
-    """calibrated: the principal distance that makes the largest and the least radial distortion equal, to which the
-    rows refer; equivalent: that near the axis; with their sigmas, mm. reach_mm: how far out it is balanced."""
+    """Distortion in the form of a calibration certificate.
+
+    Attributes
+    ----------
+    calibrated : principal distance that balances the largest and smallest radial distortion, and its sigma, mm; the
+        rows refer to it.
+    equivalent : principal distance near the axis, and its sigma, mm.
+    reach_mm : radius up to which the distortion is balanced.
+    """
 
     calibrated: tuple[float, float]
     equivalent: tuple[float, float]
@@ -62,8 +69,8 @@ class Certificate:
 
 @dataclass(frozen=True)
 class LensMap:
-    """The drawing, and the largest displacement in it with its sigma; extrapolated: whether some of it lies beyond the
-    outermost target."""
+    """Plot of distortion vectors. extrapolated: whether some lie beyond the outermost target; largest_um: longest
+    vector with its sigma."""
 
     plot: Markup
     extrapolated: bool
@@ -71,7 +78,7 @@ class LensMap:
 
 
 def lens(name: str, camera: CameraRecord, covariance: Covariance | None = None) -> Lens:
-    """The lens of a camera of adjustment.json, with its covariance where that is known."""
+    """Lens of a camera in adjustment.json, with its covariance if given."""
     known = camera.lens()
     if covariance is None:
         return known
@@ -79,9 +86,9 @@ def lens(name: str, camera: CameraRecord, covariance: Covariance | None = None) 
 
 
 def largest_effects_um(lens: Lens, radius_mm: float) -> dict[str, float]:
-    """By parameter: the largest displacement that a change of 1 of the parameter makes, at a radius.
+    """Largest displacement at a radius caused by a unit change of each distortion parameter.
 
-    Of a family that is defined over the frame: anywhere in it, for beyond it a polynomial means nothing.
+    For a family defined over the frame the maximum is over the frame, since its polynomials are invalid outside.
     """
     along = np.linspace(-1.0, 1.0, FRAME_GRID)
     in_frame = grid_mm(half * along for half in lens.distortion.half_mm)
@@ -91,11 +98,13 @@ def largest_effects_um(lens: Lens, radius_mm: float) -> dict[str, float]:
 
 
 def certificate(lens: Lens, largest_radius_mm: float) -> Certificate:
-    """The lens in the form of a calibration certificate, out to a radius.
+    """Convert a lens to the form of a calibration certificate, out to a radius.
 
-    A ray at the angle a is imaged at the radius r with tan a = t(r) = (r - d(r)) / c, d being the radial distortion.
-    Against another principal distance C it is r - C t; C makes its extremes, at h and l, of one size:
-    C = (h + l) / (t(h) + t(l)), and they are extremes still when h and l move a little.
+    Notes
+    -----
+    A ray at the angle a is imaged at the radius r with tan a = t(r) = (r - d(r)) / c, where d is the radial distortion.
+    With another principal distance C the distortion is r - C t. The calibrated C balances its extremes, at radii h and
+    l: C = (h + l) / (t(h) + t(l)). As these are extremes, the derivatives of C neglect changes of h and l.
     """
     radius = np.linspace(0.0, largest_radius_mm, _CERTIFICATE_RADII)[1:]
     radius = np.concatenate([[_NEAR_AXIS * largest_radius_mm], radius])
@@ -126,7 +135,7 @@ def certificate(lens: Lens, largest_radius_mm: float) -> Certificate:
 
 
 def _angles_deg(largest: float) -> list[float]:
-    """Those of the reports that the frame shows; of a narrower camera six steps, to the tenths that are printed."""
+    """ANGLES_DEG within the frame; for a narrower camera six equal steps, rounded down to tenths."""
     usual = [angle for angle in ANGLES_DEG if angle <= largest]
     if len(usual) >= _FEWEST_ANGLES:
         return usual
@@ -134,8 +143,11 @@ def _angles_deg(largest: float) -> list[float]:
 
 
 def _balanced(radius: Array, tangent: Array) -> tuple[float, int, int]:
-    """The principal distance by which the largest and the least distortion are of one size, and where these are: the
-    pair of radii is exchanged until they are the extremes; the axis, without distortion, may be one."""
+    """Principal distance that balances the largest and smallest distortion, and the indices of these extremes.
+
+    An exchange algorithm: the pair of radii is replaced by the current extremes until it no longer changes. The axis,
+    without distortion, may be one of them.
+    """
     distance, high, low = float(radius[-1] / tangent[-1]), 0, 0
     for _ in range(50):
         distortion = radius - distance * tangent
@@ -148,8 +160,8 @@ def _balanced(radius: Array, tangent: Array) -> tuple[float, int, int]:
 
 
 def lens_map(lens: Lens, on: Plane, observed_radius_mm: float = np.inf) -> LensMap:
-    """The displacement at a grid of observed points over a plane, from the ideal to the observed place; grey beyond the
-    outermost target, where it is extrapolated."""
+    """Plot distortion vectors from the ideal to the observed place on a grid over the plane; grey beyond the outermost
+    target, where they are extrapolated."""
     low, high = on.corners_mm
     mesh_mm = float((high - low).max()) / MAP_GRID
     counts = np.maximum(np.rint((high - low) / mesh_mm), 1.0).astype(int)
@@ -175,7 +187,7 @@ def lens_map(lens: Lens, on: Plane, observed_radius_mm: float = np.inf) -> LensM
 
 
 def _circle(center_mm: Array, radius_mm: float, on: Plane) -> Markup:
-    """What of a circle lies on the plane."""
+    """Draw the part of a circle that lies on the plane."""
     angles = np.linspace(0.0, 2.0 * np.pi, ARCS + 1)
     points = center_mm + radius_mm * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     low, high = on.corners_mm
@@ -185,7 +197,7 @@ def _circle(center_mm: Array, radius_mm: float, on: Plane) -> Markup:
 
 
 def curves_plot(drawn: Curves, observed_radius_mm: float, unit: ImageUnit = FILM_UNIT, width: float = 400.0) -> Markup:
-    """Both curves with their 95 % bands; grey beyond the outermost target, where nothing was observed."""
+    """Plot radial and asymmetric distortion with their 95 % bands; grey beyond the outermost target."""
     pairs = {"first": (drawn.radial_um, drawn.radial_sigma_um)}
     if np.any(drawn.asymmetric_um > 1e-6):
         pairs = {"second": (drawn.asymmetric_um, drawn.asymmetric_sigma_um), **pairs}

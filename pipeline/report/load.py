@@ -1,4 +1,4 @@
-"""What the stages left, as far as it is of what there is now: what was made from something else is named, not shown."""
+"""Load the stages' results for the report. Stale results are listed, not shown."""
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -46,10 +46,13 @@ At = Callable[[Path], Path]
 def measured_data(
     project: Project, at: At, most_frames: int | None = None, rows: Sequence[ComparatorPoint] | None = None
 ) -> ReportData:
-    """The marks, and what measurement.db says of them where it is theirs. at: where each result stands now.
+    """Load the marks, with the scans of measurement.db if these belong to them.
 
-    most_frames: of more than these the scans are not read; `unread_scans` gives them one by one. rows: some of the
-    marks, where not all are to be read; then no scans are.
+    Parameters
+    ----------
+    at : returns the current path of a result file.
+    most_frames : with more frames the scans are not loaded; `unread_scans` yields them one by one.
+    rows : marks to use instead of reading comparator.csv; no scans are loaded then.
     """
     comparator = at(project.comparator)
     marks = read_comparator(comparator, project.list_pitch_um) if rows is None else rows
@@ -97,26 +100,25 @@ def measured_data(
 
 
 def _given_by(camera: CameraFile) -> str:
-    """What the given coordinates of its fiducials come from, as far as its file says that."""
+    """Source of the given fiducial coordinates, from the camera file."""
     if camera.source is None:
         return "the certificate"
     return "the camera file" if camera.source.frames else "the library's typical coordinates"
 
 
 def frame_count(data: ReportData) -> int:
-    """How many images have marks."""
+    """Number of images with marks."""
     return len({row.image for row in data.comparator})
 
 
 def unread_scans(data: ReportData, project: Project, images: Collection[str] | None = None) -> Iterator[MeasuredScan]:
-    """The scans of data that have not been read, or those of some images, one after the other; none where the store is
-    of other marks."""
+    """Yield the scans of all or some images from measurement.db; none if it belongs to other marks."""
     digest = data.made_from.get(project.measurement_path.name)
     return iter(()) if digest is None else measured_scans(project.measurement_path, digest, images)
 
 
 def report_data(project: Project, at: At, most_frames: int = MOST_FRAMES) -> ReportData:
-    """All that a report shows: of more frames than these, totals and those that need a look."""
+    """Load all data of a report. With more than most_frames frames: totals, and the frames that need a look."""
     camera_of = partial(_camera_name, project)
     stored = _stored(project, at)
     if stored is not None and len(stored.names) > most_frames:
@@ -129,7 +131,7 @@ def report_data(project: Project, at: At, most_frames: int = MOST_FRAMES) -> Rep
 
 
 def frame_data(project: Project, at: At, images: Collection[str]) -> ReportData:
-    """All that is known of some images. Raises InputError for one that there is not."""
+    """Load all data of some images. Raises InputError for an unknown image."""
     stored = _stored(project, at)
     data = adjusted_data(project, at, 0) if stored is None else measured_data(project, at, rows=stored.rows(images))
     known = {row.image for row in data.comparator} if stored is None else stored.names
@@ -141,7 +143,8 @@ def frame_data(project: Project, at: At, images: Collection[str]) -> ReportData:
 
 
 def _stored(project: Project, at: At) -> StoredMarks | None:
-    """The marks where they need not be read all: comparator.csv is as it was written, and nothing is adjusted."""
+    """Open the stored marks if comparator.csv is unchanged and nothing is adjusted, so that not all need be read; else
+    None."""
     if not project.scans or at(project.adjustment_path).exists():
         return None
     return StoredMarks.open(project.measurement_path, at(project.comparator))
@@ -152,7 +155,7 @@ def _camera_name(project: Project, image: str) -> str:
 
 
 def adjusted_data(project: Project, at: At, most_frames: int | None = None) -> ReportData:
-    """The same with the adjustment, where it is of these marks, and its check, where it is of that adjustment."""
+    """Load as `measured_data` does, with the adjustment and its check unless they are stale."""
     data, path = measured_data(project, at, most_frames), at(project.adjustment_path)
     if not path.exists():
         return data
@@ -179,7 +182,7 @@ def adjusted_data(project: Project, at: At, most_frames: int | None = None) -> R
 
 
 def _unlike(made: Mapping[str, str], now: Mapping[str, str]) -> Iterator[Problem]:
-    """Where what was measured is not what the project has now."""
+    """Yield problems of measurements that do not match the current scans, decisions or settings."""
     others = differing(made, now)
     scans = [name.removeprefix(SCAN) for name in others if name.startswith(SCAN)]
     kinds = {

@@ -1,4 +1,4 @@
-"""What a report shows of more frames than it can show one by one: totals of all, and those that need a look."""
+"""Reports of many frames: totals of all, and the frames that need a look."""
 
 from array import array
 from collections import Counter, defaultdict
@@ -22,15 +22,15 @@ from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.wording import counted
 
-MOST_FRAMES = 200  # that a report shows with their marks
-_MOST_PROBLEMS = 50  # different ones that it lists
-_ROWS = 200  # cameras and kinds of file at most
+MOST_FRAMES = 200  # largest number of frames shown with their marks
+_MOST_PROBLEMS = 50  # largest number of different problems listed
+_ROWS = 200  # largest number of rows (camera and kind of file)
 _BEST_FIRST = (Verdict.GOOD, Verdict.DECIDED, Verdict.LOOK, Verdict.POOR, Verdict.FAILED)
 
 
 @dataclass
 class _Totals:
-    """Of the frames so far, for `FrameTotals`."""
+    """Accumulator of `FrameTotals`."""
 
     marks: dict[str, Counter[str]] = field(default_factory=dict)
     of_targets: Counter[tuple[str, str]] = field(default_factory=Counter)
@@ -47,7 +47,7 @@ class _Totals:
             self.centers_px.extend(center.tolist())
 
     def add_plain(self, plain: Sequence[StoredFrame], columns: MarkColumns, camera_of: Callable[[str], str]) -> None:
-        """Frames of which only totals are told."""
+        """Add frames without problems from stored columns."""
         for frame in plain:
             self.verdicts[camera_of(frame.image), _ending(frame.scan)][Verdict.GOOD] += 1
         counts = np.zeros((len(plain), len(columns.statuses)), dtype=np.int64)
@@ -80,10 +80,13 @@ def reduced(
     camera_of: Callable[[str], str],
     stored: StoredMarks | None = None,
 ) -> ReportData:
-    """The data with the totals of all frames, and of single frames only the worst of those that need a look.
+    """Reduce the data to the totals of all frames and the worst of the frames that need a look.
 
-    scans: of the images of data.comparator, read once, one after the other. stored: of whose plain frames only columns
-    are read, the images of data.comparator being all others.
+    Parameters
+    ----------
+    scans : of the images in data.comparator, iterated once.
+    stored : stored marks, of whose frames without problems only columns are read; data.comparator then holds all other
+        frames.
     """
     totals = _Totals()
     if stored is not None:
@@ -91,7 +94,7 @@ def reduced(
     suspect = {row.image for row in suspect_rows(data.adjustment)} if data.adjustment else set[str]()
 
     def frames_to_show() -> Iterator[tuple[tuple[float, float], ReportData]]:
-        """Those that need a look, with a key that puts the worst first; all are counted on the way."""
+        """Count all frames; yield those that need a look with a sort key, the worst first."""
         for one in _one_by_one(data, scans):
             (frame,) = frames(one)
             verdict, problems = _verdict(frame), list(single_frame_problems(frame))
@@ -115,7 +118,7 @@ def _ending(scan: str) -> str:
 
 
 def _one_by_one(data: ReportData, scans: Iterable[MeasuredScan]) -> Iterator[ReportData]:
-    """Of every frame by itself: its rows, its scan, its residuals."""
+    """Yield the data of each frame separately: its rows, scan and residuals."""
     rows: dict[str, list[ComparatorPoint]] = defaultdict(list)
     for row in data.comparator:
         rows[row.image].append(row)
@@ -131,7 +134,7 @@ def _one_by_one(data: ReportData, scans: Iterable[MeasuredScan]) -> Iterator[Rep
         )
 
     for scan in scans:
-        if scan.frame.image in rows or not scan.frame.marks:  # others were taken out of the comparator file
+        if scan.frame.image in rows or not scan.frame.marks:  # others were removed from comparator.csv
             shown.add(scan.frame.image)
             yield frame_data(scan.frame.image, scan)
     for image in sorted({*rows, *others} - shown):
@@ -139,7 +142,7 @@ def _one_by_one(data: ReportData, scans: Iterable[MeasuredScan]) -> Iterator[Rep
 
 
 def _verdict(frame: Frame) -> Verdict:
-    """As `reseau status` has it, of the marks as the comparator file has them now."""
+    """Verdict as in `reseau status`, for the marks currently in comparator.csv."""
     scan, marks = frame.scan, [(mark.kind, mark.status, mark.codes) for mark in frame.marks]
     if scan is None:
         return frame_verdict(marks, True, False, False)
@@ -149,7 +152,7 @@ def _verdict(frame: Frame) -> Verdict:
 
 
 def _listed(problems: Gathered) -> Iterator[Problem]:
-    """What most frames say first."""
+    """Yield problems, those of most frames first."""
     ordered = sorted(problems.values(), key=lambda each: -len(each[1]))
     yield from (named_problem(*each) for each in ordered[:_MOST_PROBLEMS])
     rest = sum(len(images) for _, images in ordered[_MOST_PROBLEMS:])
@@ -159,9 +162,17 @@ def _listed(problems: Gathered) -> Iterator[Problem]:
 
 @dataclass(frozen=True)
 class TotalsView:
-    """Numbers of frames. sentence: of all; verdicts: those that occur; rows: by camera and kind of file, with a number
-    for each verdict; left_out: further rows; all: of all frames; shown: those that the report shows, None where it
-    shows all."""
+    """Numbers of frames by verdict.
+
+    Attributes
+    ----------
+    sentence : summary of all frames.
+    shown : number of frames that the report shows, None if all.
+    verdicts : those that occur.
+    rows : camera, kind of file, and the number for each verdict.
+    left_out : number of further rows.
+    all : number of frames for each verdict.
+    """
 
     sentence: str
     shown: int | None
@@ -172,7 +183,7 @@ class TotalsView:
 
 
 def totals_view(data: ReportData, shots: Sequence[Frame]) -> TotalsView | None:
-    """Of more frames than are shown, and of an archive; else None."""
+    """Totals, if the report does not show all frames or only fiducials were adjusted; else None."""
     if data.totals is None and not data.is_film_alone:
         return None
     counts, total = _verdicts(data, shots), frame_counts(data, shots)
@@ -189,7 +200,7 @@ def totals_view(data: ReportData, shots: Sequence[Frame]) -> TotalsView | None:
 
 
 def frame_counts(data: ReportData, shots: Sequence[Frame]) -> Counter[Verdict]:
-    """Numbers of all frames by verdict: what report and terminal count by. shots: the frames that are shown."""
+    """Numbers of all frames by verdict, for the report and the terminal. shots: the frames shown."""
     total = Counter[Verdict]()
     for row in _verdicts(data, shots).values():
         total.update({Verdict(verdict): count for verdict, count in row.items()})
@@ -197,7 +208,7 @@ def frame_counts(data: ReportData, shots: Sequence[Frame]) -> Counter[Verdict]:
 
 
 def _verdicts(data: ReportData, shots: Sequence[Frame]) -> Mapping[tuple[str, str], Mapping[str, int]]:
-    """The same by camera and kind of file."""
+    """Numbers of frames by (camera, kind of file) and verdict."""
     if data.totals is not None:
         return data.totals.verdicts
     stored, counts = data.adjustment, defaultdict[tuple[str, str], Counter[str]](Counter)

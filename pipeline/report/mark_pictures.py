@@ -1,4 +1,4 @@
-"""Marks as they stand in the scan, with the measured centre and its residual drawn over them."""
+"""Pictures of marks in the scan, with the measured centre and its residual overlaid."""
 
 import base64
 
@@ -14,21 +14,21 @@ from pipeline.results.assessment_record import ResidualRecord
 from pipeline.results.thumbnail import Thumbnail
 
 SIZE_PX = 92.0  # a picture's width and height on the page
-TARGETS = 600  # pictures of targets in a report; with more of them, only the worst of each frame are shown
+TARGETS = 600  # largest number of target pictures; beyond it only the worst of each frame are shown
 LEAST_TARGETS = 4
-PICTURES = 1200  # of full size; with more of them they are stored half as fine, so that the file stays readable
-ARROW_PX = 34.0  # the longest arrow
+PICTURES = 1200  # largest number of pictures at full resolution; beyond it they are halved, to limit the file size
+ARROW_PX = 34.0  # px, longest arrow
 
 
 def shown_marks(shots: list[Frame]) -> dict[str, list[Mark]]:
-    """Which marks of each frame get a picture: all fiducials, and all targets or the worst of them."""
+    """Select the marks of each frame that get a picture: all fiducials, and all targets or the worst of them."""
     targets = sum(not mark.is_fiducial for frame in shots for mark in frame.marks)
     most = targets if targets <= TARGETS else max(LEAST_TARGETS, TARGETS // len(shots))
     return {frame.image: _worst(frame, most) for frame in shots}
 
 
 def stored_px(shown: dict[str, list[Mark]]) -> float:
-    """The greatest width of a picture as it is stored."""
+    """Largest stored width of a picture."""
     return SIZE_PX if sum(len(marks) for marks in shown.values()) <= PICTURES else 0.5 * SIZE_PX
 
 
@@ -39,7 +39,7 @@ def _worst(frame: Frame, most: int) -> list[Mark]:
 
 
 def _badness(mark: Mark) -> tuple[bool, bool, float]:
-    """Refused marks first, then unchecked weak ones, then by the standardised residual."""
+    """Sort key, larger is worse: rejected, then weak or predicted, then the standardised residual."""
     return (
         mark.status == "rejected",
         mark.status in ("weak", "predicted"),
@@ -48,27 +48,27 @@ def _badness(mark: Mark) -> tuple[bool, bool, float]:
 
 
 def arrow_scale(marks: list[Mark]) -> float:
-    """How many page pixels 1 um of a residual is drawn: a round number at which the longest arrow fits."""
+    """Scale of residual arrows, page pixels per µm: a round number at which the longest arrow fits."""
     lengths = [float(np.hypot(*mark.residual.v_um)) for mark in marks if mark.residual]
     return svg.round_step(ARROW_PX / max(*lengths, LEAST_UM)) if lengths else 1.0
 
 
 def mark_picture(mark: Mark, thumbnail: Thumbnail, px_per_um: float, most_px: float) -> Markup:
-    """The picture with its overlay: a crosshair where the centre was measured, the residual as an arrow from it."""
+    """Draw the picture with a crosshair at the measured centre and the residual as an arrow."""
     rows, cols = thumbnail.pixels.shape
     zoom = SIZE_PX / (max(rows, cols) * thumbnail.step_px)  # page pixels to a pixel of the scan
     width, height = cols * thumbnail.step_px * zoom, rows * thumbnail.step_px * zoom
     image = svg.tag("image", href=_png_uri(thumbnail.pixels, most_px), width=width, height=height, class_="chip")
     overlay = Markup("")
     if mark.center_px is not None:
-        # The centre of the top-left thumbnail pixel lies half a thumbnail pixel inside of the picture's edge.
+        # The centre of the top-left thumbnail pixel lies half a thumbnail pixel inside the picture's edge.
         x, y = (mark.center_px - thumbnail.origin_px + 0.5 * thumbnail.step_px) * zoom
         overlay = _crosshair(x, y, mark) + (_arrow(x, y, mark.residual, px_per_um) if mark.residual else Markup(""))
     return svg.picture(SIZE_PX, SIZE_PX, _description(mark), image, overlay, class_="thumb")
 
 
 def _png_uri(pixels: NDArray[np.generic], most_px: float) -> str:
-    """Grey values as a PNG of 8 bit in a data URI, stretched from their darkest to their lightest per mille."""
+    """Encode grey values as an 8-bit PNG data URI, stretched between the 0.1 and 99.9 percentiles."""
     grey = pixels.astype(np.float64)
     low, high = np.percentile(grey, [0.1, 99.9])
     stretched = np.clip((grey - low) / max(high - low, 1e-12), 0.0, 1.0) * 255.0
@@ -80,7 +80,7 @@ def _png_uri(pixels: NDArray[np.generic], most_px: float) -> str:
 
 
 def _crosshair(x: float, y: float, mark: Mark) -> Markup:
-    """Four ticks that leave the centre itself in view; dashed where the place is only predicted."""
+    """Draw four ticks that leave the centre visible; dashed if the mark is not an observation."""
     ends = np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])
     at = np.array([x, y])
     class_ = "hair" if mark.status.is_observation else "hair guess"
@@ -90,7 +90,7 @@ def _crosshair(x: float, y: float, mark: Mark) -> Markup:
 
 
 def _arrow(x: float, y: float, residual: ResidualRecord, px_per_um: float) -> Markup:
-    """The residual from the measured centre; y of the comparator points up, rows point down."""
+    """Draw the residual from the measured centre; comparator y points up, rows point down."""
     v = px_per_um * np.array([residual.vx_um, -residual.vy_um])
     length = float(np.hypot(*v))
     start = np.array([x, y])

@@ -1,4 +1,4 @@
-"""Every mark of every frame: what the scan, the comparator file and the adjustment say of it, joined by their names."""
+"""Marks of all frames: measurement, comparator file and adjustment, joined by name."""
 
 import re
 from collections import defaultdict
@@ -18,11 +18,14 @@ from pipeline.types import Array
 
 @dataclass(frozen=True)
 class Mark:
-    """One mark of one frame.
+    """Mark of a frame.
 
-    center_px (2,), its covariance in the scan, sigma_um (2,) along x and y: None where nothing was fitted.
-    residual: its row of adjustment.json; None where it was no observation of the adjustment. quality: the figures of
-    its fit by name.
+    Attributes
+    ----------
+    center_px, covariance : (2,) column and row, and covariance in the scan; None if nothing was fitted.
+    sigma_um : (2,) standard deviations in x and y; None if unknown.
+    residual : row of adjustment.json; None if the mark was not an observation of the adjustment.
+    quality : quality measures of the fit by name.
     """
 
     image: str
@@ -42,28 +45,28 @@ class Mark:
 
     @property
     def codes(self) -> tuple[Code, ...]:
-        """Of its reason, as it was measured."""
+        """Codes of its reason."""
         return self.reason.codes
 
     @property
     def is_open(self) -> bool:
-        """Whether it is no observation, and neither has somebody decided so nor has another scan of its frame it."""
+        """Whether it is not an observation, without a review decision and not measured in another part of the frame."""
         return not self.status.is_observation and not {Code.DECIDED, Code.OTHER_PART} & set(self.codes)
 
     @property
     def sigma_px(self) -> Array | None:
-        """(2,) along columns and rows of the scan."""
+        """(2,) standard deviations in column and row."""
         return None if self.covariance is None else np.sqrt(np.diag(self.covariance.px2))
 
     @property
     def w(self) -> float | None:
-        """The standardised residual; None where nothing checks the mark."""
+        """Standardised residual; None if the mark is unchecked."""
         return self.residual.w if self.residual and np.isfinite(self.residual.w) else None
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One image: its marks, fiducials first; scan: what measuring it gave, None where it was not measured."""
+    """Image with its marks, fiducials first. scan: its measurement, None if not measured."""
 
     image: str
     marks: tuple[Mark, ...]
@@ -74,7 +77,7 @@ class Frame:
 
 
 def frames(data: ReportData) -> list[Frame]:
-    """Every image that any of the files names, in the order of their names."""
+    """Frames of all images named in any of the files, sorted by name."""
     scans = current_scans(data)
     marks: dict[str, dict[tuple[bool, str], Mark]] = defaultdict(dict)
     for mark in _marks(data, scans):
@@ -87,13 +90,13 @@ def frames(data: ReportData) -> list[Frame]:
 
 
 def current_scans(data: ReportData) -> dict[str, MeasuredScan]:
-    """The scans that were measured by image name; those left out whose marks comparator.csv no longer has."""
+    """Measured scans by image, without those whose marks were removed from comparator.csv."""
     images, scans = {row.image for row in data.comparator}, data.measurement or {}
     return {name: scan for name, scan in scans.items() if name in images or not images or not scan.frame.marks}
 
 
 def natural(name: str) -> list[tuple[int, str]]:
-    """The key that sorts "f2" before "f10"."""
+    """Natural sort key: "f2" before "f10"."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
@@ -115,10 +118,10 @@ def _mark(
     row: ComparatorPoint | None,
     residual: ResidualRecord | None,
 ) -> Mark:
-    """Where the comparator file and the measurement differ, the file holds: the user may have changed it."""
+    """Join the sources of a mark. The comparator file takes precedence, since the user may have edited it."""
     image, _, point = key
     known = row or pixel
-    assert known is not None  # by one of both the key is known
+    assert known is not None  # the keys come from these two sources
     return Mark(
         image=image,
         point=point,
@@ -134,7 +137,7 @@ def _mark(
 
 
 def _sigma_um(residual: ResidualRecord | None, row: ComparatorPoint | None) -> Array | None:
-    """As the adjustment took it, the film's share included, or else as it was measured."""
+    """Standard deviation used in the adjustment, film included; without an adjustment as measured."""
     if residual:
         return np.array([residual.sx_um, residual.sy_um])
     return 1e3 * row.sigma_mm if row and row.sigma_mm is not None else None

@@ -1,4 +1,4 @@
-"""Numbers as a report prints them: true minus signs, and no digit that the standard deviation does not support."""
+"""Formatting of numbers in the report: true minus signs, and only digits that the standard deviation supports."""
 
 import math
 from collections.abc import Iterable
@@ -8,7 +8,7 @@ _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def fixed(value: float | None, decimals: int = 2, sign: bool = False) -> str:
-    """A number with so many decimals; a dash where there is none."""
+    """Format a number with fixed decimals; a dash for None or a non-finite number."""
     if value is None or not math.isfinite(value):
         return NONE
     rounded = round(value, decimals) + 0.0  # no minus sign before a zero
@@ -17,12 +17,12 @@ def fixed(value: float | None, decimals: int = 2, sign: bool = False) -> str:
 
 
 def fixed_list(values: Iterable[float] | None, decimals: int, separator: str = ", ", sign: bool = False) -> str:
-    """Numbers with so many decimals; a dash where there are none."""
+    """Format numbers with fixed decimals; a dash for None."""
     return NONE if values is None else separator.join(fixed(value, decimals, sign) for value in values)
 
 
 def value_and_sigma(value: float | None, sigma: float | None) -> tuple[str, str]:
-    """The value to the last digit that its sigma supports, and the sigma to two digits.
+    """Format the value to the last digit that its sigma supports, and the sigma to two digits.
 
     >>> value_and_sigma(153.66401, 0.00412)
     ('153.6640', '0.0041')
@@ -44,7 +44,7 @@ def value_and_sigma(value: float | None, sigma: float | None) -> tuple[str, str]
 
 
 def significant(value: float | None, digits: int = 3) -> str:
-    """A number to so many digits."""
+    """Format a number to significant digits; a dash for None or a non-finite number."""
     if value is None or not math.isfinite(value):
         return NONE
     power = _power(abs(value))
@@ -54,7 +54,7 @@ def significant(value: float | None, digits: int = 3) -> str:
 
 
 def _power(size: float) -> int:
-    """The power of ten to set apart: none for sizes that are read easily."""
+    """Power of ten to write separately; 0 for sizes that are legible without."""
     return 0 if size == 0.0 or 1e-3 <= size < 1e7 else math.floor(math.log10(size))
 
 

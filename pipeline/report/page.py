@@ -1,4 +1,4 @@
-"""report.html: one file, no network, readable without scripts and on paper."""
+"""Rendering of report.html: a single file, without network access, readable without scripts and in print."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -37,7 +37,7 @@ from pipeline.text.atomic import write_atomically
 from pipeline.types import Array
 
 LIST_LIMIT = 200  # rows of a long table
-LINKS = 3  # to frames of a problem
+LINKS = 3  # largest number of links from a problem to frames
 SECTIONS = {
     "frames": "Frames",
     "coverage": "Coverage",
@@ -49,17 +49,17 @@ SECTIONS = {
 
 
 def write_report(data: ReportData, path: Path) -> None:
-    """Write the report. Raises InputError where the file cannot be written; an earlier one then stays as it was."""
+    """Write the report. Raises InputError if the file cannot be written; an earlier one is then kept."""
     write_atomically(path, render_report(data))
 
 
 def write_frame_page(data: ReportData, image: str, path: Path) -> None:
-    """Write the page of one image, with all its marks. Raises InputError where the file cannot be written."""
+    """Write the page of one image with all its marks. Raises InputError if the file cannot be written."""
     write_atomically(path, render_frame_page(data, image))
 
 
 def render_frame_page(data: ReportData, image: str) -> str:
-    """All that data has of one image, as HTML."""
+    """Render the page of one image with all its marks as HTML."""
     shots = [frame for frame in frames(data) if frame.image == image]
     context = _common(data) | _frame_context(data, shots, every_mark=True)
     up = "../" * (image.count("/") + 1)
@@ -67,13 +67,13 @@ def render_frame_page(data: ReportData, image: str) -> str:
 
 
 def render_report(data: ReportData) -> str:
-    """The report as HTML."""
+    """Render the report as HTML."""
     return _environment().get_template("report.html.j2").render(_context(data))
 
 
 @cache
 def _environment() -> Environment:
-    """What compiles the templates, once for all reports of a process."""
+    """Template environment, shared by all reports of a process."""
     environment = Environment(
         loader=PackageLoader("pipeline.report"),
         autoescape=True,
@@ -158,7 +158,7 @@ def _frame_context(data: ReportData, shots: list[Frame], every_mark: bool = Fals
 
 @dataclass(frozen=True)
 class ProblemView:
-    """A problem as it is printed: its cause, what else there is to say, and what to do; links with their words."""
+    """Problem as printed: cause, details, remedy, and links (text, target)."""
 
     cause: str
     detail: str
@@ -168,7 +168,7 @@ class ProblemView:
 
 
 def _problem_view(problem: Problem, views: Sequence[FrameView]) -> ProblemView:
-    """A problem without a next step has its remedy in its last sentences."""
+    """View of a problem. Without a next step, its further sentences are the remedy."""
     detail, remedy = (problem.detail, problem.next_step) if problem.next_step else ("", problem.detail)
     known = {view.frame.image: view for view in views}
     images = dict.fromkeys((*problem.images, *(image for image, *_ in problem.marks)))
@@ -187,7 +187,7 @@ def _problem_view(problem: Problem, views: Sequence[FrameView]) -> ProblemView:
 
 
 def _points_word(shots: list[Frame]) -> str:
-    """What the marks are that are no fiducials."""
+    """Word for the marks other than fiducials."""
     kinds = {mark.kind for frame in shots for mark in frame.marks if not mark.is_fiducial}
     if "tie" not in kinds:
         return "targets"
@@ -195,7 +195,7 @@ def _points_word(shots: list[Frame]) -> str:
 
 
 def _fractions(places: Mapping[str, Array]) -> Iterator[tuple[str, FractionTest, Markup]]:
-    """By axis: the test of the fractional parts and its drawing; nothing where no pixel positions are known."""
+    """Yield axis, test of the fractional parts and its plot; nothing without pixel positions."""
     for axis, positions in places.items():
         if len(positions):
             test = fraction_test(positions)
@@ -203,13 +203,13 @@ def _fractions(places: Mapping[str, Array]) -> Iterator[tuple[str, FractionTest,
 
 
 def _arrow_bar(data: ReportData, shots: list[Frame]) -> tuple[float, float]:
-    """A round length for the legend of the marks' pictures, and its page pixels."""
+    """Round length for the legend of the residual arrows, and its page pixels."""
     px_per_unit = thumbnail_scale(shots) / next(iter(data.image_units.values()), FILM_UNIT).per_um
     length = svg.round_step(40.0 / px_per_unit)
     return length, length * px_per_unit
 
 
 def _points(adjustment: AdjustmentRecord) -> list[tuple[str, PointRecord]]:
-    """Object points that were estimated, the least certain first."""
+    """Estimated object points, the least precise first."""
     free = [(id, point) for id, point in adjustment.points.items() if any(each.sigma != 0.0 for each in point.axes)]
     return sorted(free, key=lambda item: -np.nan_to_num([each.sigma for each in item[1].axes]).max())

@@ -1,4 +1,4 @@
-"""The table of a camera's parameters: value, standard deviation, what was given, and what that says."""
+"""Table of a camera's parameters: value, standard deviation, prior, effect and significance."""
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -18,13 +18,14 @@ from pipeline.results.covariance_file import Covariance
 from pipeline.results.image_unit import FILM_UNIT, ImageUnit
 from pipeline.text.wording import capitalised
 
-MOSTLY_PRIOR = 0.9  # of the prior's sigma is left: the data have told little
+MOSTLY_PRIOR = 0.9  # fraction of the prior sigma above which the observations have contributed little
 HIGH_CORRELATION = 0.9
 
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """A quantity of the table, what was given of it, and what that says. effect: at the outermost target."""
+    """Row of the table. given: prior; effect: displacement at the outermost target; meaning: whether the parameter is
+    significant, or how far the observations determined it."""
 
     symbol: str
     unit: str
@@ -37,8 +38,13 @@ class ParameterRow:
 def parameter_rows(
     name: str, camera: CameraRecord, prior_scale: float, radius_mm: float, unit: ImageUnit = FILM_UNIT
 ) -> Iterator[ParameterRow]:
-    """Principal distance, principal point and distortion. radius_mm: where the distortion's effect is stated;
-    prior_scale: what the adjustment has multiplied given standard deviations by."""
+    """Yield rows of principal distance, principal point and distortion.
+
+    Parameters
+    ----------
+    prior_scale : factor by which the adjustment scaled the given standard deviations.
+    radius_mm : radius at which the effect of the distortion is stated.
+    """
     family, names = family_of(camera.distortion.family), parameter_names(camera.distortion.family)
     for parameter, in_mm in list(camera.interior.items())[:3]:
         quantity, symbol = _scaled(in_mm, unit.per_mm), SYMBOLS.get(parameter, parameter)
@@ -56,20 +62,20 @@ def parameter_rows(
 
 
 def term_rows(terms: Mapping[str, Quantity]) -> Iterator[ParameterRow]:
-    """The terms of a scanner's bend, in um."""
+    """Yield rows of the terms of a scanner's geometric error, µm."""
     for name, known in terms.items():
         in_um = _scaled(known, 1e3)
         yield ParameterRow(name, "µm", in_um, _given_text(in_um), "", _significance(known))
 
 
 def _scaled(known: Quantity, factor: float) -> Quantity:
-    """The same in another unit."""
+    """Convert a quantity to another unit."""
     given = known.given and GivenQuantity(factor * known.given.value, factor * known.given.sigma)
     return replace(known, value=factor * known.value, sigma=factor * known.sigma, given=given)
 
 
 def high_correlations(name: str, camera: CameraRecord, covariance: Covariance) -> list[tuple[str, str, float]]:
-    """Pairs of parameters that the observations hardly tell apart, the highest correlation first."""
+    """Pairs of highly correlated parameters, the highest correlation first."""
     parameters = ["c", "x0", "y0", *parameter_names(camera.distortion.family)]
     block = covariance.select(Parameter.interior(name, parameter) for parameter in parameters)
     sigma = np.sqrt(np.maximum(np.diag(block), 0.0))
@@ -84,7 +90,7 @@ def high_correlations(name: str, camera: CameraRecord, covariance: Covariance) -
 
 
 def group_sentences(tests: Sequence[GroupTestRecord]) -> list[str]:
-    """Which parameters the data need together, as sentences."""
+    """State the significance tests of groups of parameters."""
     return [
         f"{capitalised(test.group)} ({', '.join(test.parameters)}) together: "
         + _tested(f"F = {significant(test.F, 3)}", test.p)
@@ -93,7 +99,7 @@ def group_sentences(tests: Sequence[GroupTestRecord]) -> list[str]:
 
 
 def axes_sentence(camera: CameraRecord) -> str:
-    """Of a family with axes of its own, which they are; empty of the others."""
+    """State the axes of a distortion family that has its own; "" for others."""
     name, known = camera.distortion.family, camera.distortion.parameters
     shown = [each for each in family_of(name).y_down if each in known and known[each].value != 0.0]
     if not shown:
@@ -105,8 +111,8 @@ def axes_sentence(camera: CameraRecord) -> str:
 
 
 def spoken_name(text: str, cameras: Collection[str]) -> str:
-    """A quantity, by its text in adjustment.json, as this report calls it elsewhere: IO.RC 20.x0 is x₀′. With the
-    camera's name, where there are several."""
+    """Name of a quantity in the report from its text in adjustment.json: IO.RC 20.x0 is x₀′. The camera's name is added
+    if there are several."""
     parameter = parameter_from_text(text, cameras)
     whose = f", {parameter.owner}" if len(cameras) > 1 else ""
     if parameter.kind == "interior":
@@ -132,7 +138,7 @@ def _undetermined(sigma: float) -> str:
 
 
 def _origin(quantity: Quantity, prior_scale: float, unit: ImageUnit) -> str:
-    """How far the value moved from the given one, and whether data or prior determined it."""
+    """State the change from the given value, and whether observations or prior determined the value."""
     given, sigma = quantity.given, quantity.sigma
     if sentence := _undetermined(sigma):
         return sentence

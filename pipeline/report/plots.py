@@ -1,4 +1,4 @@
-"""The plots of `reseau report --plots`: of every camera what `plot_residuals` and the others draw, as PNG and PDF."""
+"""Plots of `reseau report --plots`: residuals, coverage, distortion and uncertainty of each camera, as PNG and PDF."""
 
 import math
 from collections.abc import Iterator
@@ -27,12 +27,12 @@ DPI = 150
 
 
 def write_plots(data: ReportData, folder: Path) -> list[Path]:
-    """Write the plots of all calibrated cameras; their files.
+    """Write the plots of all calibrated cameras; returns the files written.
 
     Raises
     ------
     InputError
-        Without Matplotlib, without a calibrated camera, and where a file cannot be written.
+        If Matplotlib is missing, no camera is calibrated, or a file cannot be written.
     """
     try:
         from matplotlib.figure import Figure
@@ -54,7 +54,7 @@ def write_plots(data: ReportData, folder: Path) -> list[Path]:
 
 
 def _draw(plots: CameraPlots, record: CameraRecord, figure: "Figure") -> Iterator[str]:
-    """Draw one plot after the other; its name in the files."""
+    """Draw the plots one after another; yield the name of each, used in its file name."""
     plots.plot_residuals(figure.subplots())
     yield "residuals"
     plots.plot_coverage(figure.subplots())
@@ -69,7 +69,7 @@ def _draw(plots: CameraPlots, record: CameraRecord, figure: "Figure") -> Iterato
 
 
 def calibrated_cameras(data: ReportData) -> Iterator[tuple[CameraPlots, CameraRecord]]:
-    """The plots of every calibrated camera that shows targets, from what is stored of it."""
+    """Yield the plots of each calibrated camera with observed targets, from the stored results."""
     stored, covariance = data.adjustment, data.covariance
     if stored is None or covariance is None or not stored.converged:
         return
@@ -101,7 +101,8 @@ def calibrated_cameras(data: ReportData) -> Iterator[tuple[CameraPlots, CameraRe
 
 
 def _stored_map(record: CameraRecord, distance: float) -> tuple[Array, Array]:
-    """Places (r, c, 2) and standard deviations (r, c) in mm. Raises AdjustmentError for a distance without a map."""
+    """Stored map: places (r, c, 2) and standard deviations (r, c), mm. Raises AdjustmentError for a distance without
+    one."""
     for known in record.projection:
         if known.distance == distance or (math.isnan(known.distance) and math.isinf(distance)):
             places = np.stack(np.meshgrid(known.x_mm, known.y_mm), axis=-1)

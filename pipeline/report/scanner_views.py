@@ -1,4 +1,4 @@
-"""What the report shows of each scanner: the terms of its bend, and what it does over the scan with a 95 % band."""
+"""Scanners in the report: terms of the geometric error, and the displacement over the scan with 95 % ellipses."""
 
 from dataclasses import dataclass
 
@@ -16,15 +16,15 @@ from pipeline.types import Array
 
 PLOT_PX = 560.0
 GRID = 9  # vectors along the longer side
-LONGEST = 0.8  # of the grid's mesh, the ellipse at its end included
-ROOM = 0.06  # beyond the extent, of its longer side
+LONGEST = 0.8  # longest vector with its ellipse, in grid spacings
+ROOM = 0.06  # margin around the extent, fraction of its longer side
 UM_PER_MM = 1000.0
 
 
 @dataclass(frozen=True)
 class ScannerView:
-    """A scanner; field None where it bends nothing or there is no solution. largest_um: of the field, with its
-    sigma."""
+    """Scanner in the report. field: plot of the displacements, None without terms or without a solution; largest_um:
+    largest displacement with its sigma."""
 
     name: str
     record: ScannerRecord
@@ -35,7 +35,7 @@ class ScannerView:
 
 
 def scanner_views(data: ReportData) -> list[ScannerView]:
-    """All scanners of the adjustment; none where there is no adjustment, or none is adjusted."""
+    """Views of all scanners of the adjustment; empty without an adjustment or without scanners."""
     stored = data.adjustment
     return [_view(stored, data.covariance, *each) for each in stored.scanners.items()] if stored else []
 
@@ -63,7 +63,7 @@ def _view(stored: AdjustmentRecord, covariance: Covariance | None, name: str, sc
 
 
 def bend_field(name: str, scanner: ScannerRecord, covariance: Covariance, xy_mm: Array) -> tuple[Array, Array]:
-    """How far the scanner puts points (n, 2) in mm off their places, (n, 2) in um, with the covariances (n, 2, 2)."""
+    """Displacements (n, 2), µm, by the scanner at points (n, 2), mm, and their covariances (n, 2, 2)."""
     bend, values = scanner.bend()
     at = bend.displacement(values, xy_mm)
     of_terms = covariance.select(Parameter.scanner(name, term) for term in scanner.terms)

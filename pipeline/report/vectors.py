@@ -1,4 +1,4 @@
-"""Vectors over the camera frame: residuals of one image and of all, joins of scans, what a lens or a scanner does."""
+"""Vector plots over the camera frame: residuals, differences between partial scans, distortion, scanner errors."""
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
@@ -15,14 +15,14 @@ from pipeline.types import Array, Mask
 
 MARGIN_PX = 26.0
 FOOT_PX = 30.0
-LEAST_UM = 0.01  # a residual drawn at full length: without redundancy they are rounding errors
+LEAST_UM = 0.01  # µm, smallest residual that sets the scale: without redundancy residuals are rounding errors
 JOINED_PLOT_PX = 420.0
 LONGEST_JOIN_PX = 40.0
 
 
 @dataclass(frozen=True)
 class Plane:
-    """The camera frame on the page: corners (2, 2) lower left and upper right in mm, y up; unit: of its scale bars."""
+    """Camera frame on the page. corners_mm: (2, 2) lower left and upper right, y up; unit: of the scale bars."""
 
     corners_mm: Array
     width_px: float
@@ -37,13 +37,12 @@ class Plane:
         return float(self.corners_mm[1, 1] - self.corners_mm[0, 1]) * self.px_per_mm + 2.0 * MARGIN_PX
 
     def page(self, xy_mm: Array) -> Array:
-        """(n, 2) camera mm to page pixels, y down."""
+        """Convert (n, 2) camera coordinates, mm, to page pixels, y down."""
         low_x, high_y = self.corners_mm[0, 0], self.corners_mm[1, 1]
         return MARGIN_PX + self.px_per_mm * np.stack([xy_mm[:, 0] - low_x, high_y - xy_mm[:, 1]], axis=1)
 
     def picture(self, title: str, px_per_um: float | None, *content: Markup) -> Markup:
-        """The frame's outline with what is in it, below a bar of a round length for vectors, if any, and one for the
-        frame."""
+        """Draw the frame's outline and content, with scale bars below for the vectors, if any, and for the frame."""
         (x0, y0), (x1, y1) = self.page(self.corners_mm)
         outline = svg.tag("rect", x=x0, y=y1, width=x1 - x0, height=y0 - y1, class_="frame")
         bars = [(self.px_per_mm / self.unit.per_mm, f"{self.unit.long_name} (frame)")]
@@ -60,7 +59,7 @@ class Plane:
 
 @dataclass(frozen=True)
 class VectorField:
-    """Vectors (n, 2) in um at places (n, 2) in mm of the camera frame; is_fiducial (n,): of fiducial marks."""
+    """Vectors (n, 2), µm, at places (n, 2), mm, in the camera frame; is_fiducial: (n,) mask of fiducial marks."""
 
     places_mm: Array
     vectors_um: Array
@@ -68,24 +67,24 @@ class VectorField:
 
     @classmethod
     def from_residuals(cls, rows: Sequence[ResidualRecord]) -> "VectorField":
-        """The residuals along the camera's axes."""
+        """Residuals in camera coordinates."""
         numbers = [(row.camera_x_mm, row.camera_y_mm, row.camera_vx_um, row.camera_vy_um) for row in rows]
         places, vectors = np.hsplit(np.array(numbers, dtype=float).reshape(-1, 4), 2)
         return cls(places, vectors, np.array([row.kind == "fiducial" for row in rows], dtype=bool))
 
     @classmethod
     def from_joins(cls, rows: Sequence[JoinRecord]) -> "VectorField":
-        """How far two scans of a frame differ."""
+        """Differences between two partial scans of a frame."""
         places, vectors = np.hsplit(np.array([(row.x_mm, row.y_mm, row.dx_um, row.dy_um) for row in rows]), 2)
         return cls(places, vectors, np.zeros(len(rows), dtype=bool))
 
     def scale(self, longest_px: float) -> float:
-        """Page pixels to 1 um, a round number: all but the largest per cent are shorter than `longest_px`."""
+        """Page pixels per µm, a round number: the 99th percentile of the lengths is drawn `longest_px` long at most."""
         length = float(np.percentile(np.hypot(*self.vectors_um.T), 99.0))
         return svg.round_step(longest_px / max(length, LEAST_UM))
 
     def ends(self, on: Plane, px_per_um: float) -> tuple[Array, Array]:
-        """Starts and ends (n, 2) on the page."""
+        """Starts and ends (n, 2) of the vectors on the page."""
         starts = on.page(self.places_mm)
         return starts, starts + px_per_um * self.vectors_um * (1.0, -1.0)
 
@@ -93,7 +92,8 @@ class VectorField:
 def plane(
     places_mm: Array, frame_mm: tuple[float, float] | None, width_px: float, unit: ImageUnit = FILM_UNIT
 ) -> Plane:
-    """The camera's frame, or where it is not known or not about the origin (a digital camera), what is observed."""
+    """Plane of the camera's frame; of the observations if its size is unknown or it does not enclose them (digital
+    cameras, whose origin is not the centre)."""
     low, high = places_mm.min(axis=0), places_mm.max(axis=0)
     half = 0.5 * np.array(frame_mm) if frame_mm is not None else np.zeros(2)
     if np.all(np.abs([low, high]) <= half):
@@ -102,19 +102,19 @@ def plane(
 
 
 def padded_plane(corners_mm: Array, width_px: float, share: float = 0.02, unit: ImageUnit = FILM_UNIT) -> Plane:
-    """The rectangle between two corners (2, 2), with a little room about it: a share of its longer side."""
-    # A single point, or points in a row, still need a plane to stand in.
+    """Plane between two corners (2, 2) with a margin: a share of its longer side."""
+    # The margin has a minimum, so that a single point or collinear points have a plane.
     room = share * max(float(np.ptp(corners_mm, axis=0).max()), 1.0)
     return Plane(corners_mm + np.array([[-room], [room]]), width_px, unit)
 
 
 def grid_mm(axes: Iterable[Array]) -> Array:
-    """(n, 2) the nodes of a grid, by its values along x and along y."""
+    """(n, 2) nodes of a grid from its x and y values."""
     return np.stack([each.ravel() for each in np.meshgrid(*axes)], axis=1)
 
 
 def longest_vector(vectors_um: Array, covariances_um2: Array) -> tuple[float, float]:
-    """The length of the longest of vectors (n, 2), and its standard deviation; covariances_um2 (n, 2, 2)."""
+    """Length of the longest of vectors (n, 2), and its standard deviation; covariances_um2: (n, 2, 2)."""
     size = np.hypot(*vectors_um.T)
     at = int(size.argmax())
     along = vectors_um[at] / max(float(size[at]), 1e-12)
@@ -124,7 +124,7 @@ def longest_vector(vectors_um: Array, covariances_um2: Array) -> tuple[float, fl
 def image_plot(
     image: str, rows: Sequence[ResidualRecord], on: Plane, px_per_um: float, suspects: Collection[ResidualRecord]
 ) -> Markup:
-    """The residuals of one image, each with its name and numbers to point at."""
+    """Plot the residuals of one image, each with its name and numbers as a tooltip."""
     residuals, unit = VectorField.from_residuals(rows), on.unit
     marks = []
     for start, end, row in zip(*residuals.ends(on, px_per_um), rows, strict=True):
@@ -136,7 +136,7 @@ def image_plot(
 
 
 def all_images_plot(residuals: VectorField, on: Plane, px_per_um: float) -> Markup:
-    """The residuals of all images in one frame: what they have in common is the camera's, not the film's."""
+    """Plot the residuals of all images in one frame: a common pattern is due to the camera, not to the film."""
     starts, ends = residuals.ends(on, px_per_um)
     kinds = (("target", ~residuals.is_fiducial), ("fiducial", residuals.is_fiducial))
     drawn = [strokes_and_dots(starts[rows], ends[rows], kind) for kind, rows in kinds]
@@ -144,15 +144,15 @@ def all_images_plot(residuals: VectorField, on: Plane, px_per_um: float) -> Mark
 
 
 def strokes_and_dots(starts: Array, ends: Array, kind: str, dots: Array | None = None) -> Markup:
-    """Vectors with a dot where each starts, or at other places."""
+    """Draw vectors with a dot at each start, or at the places `dots`."""
     at = starts if dots is None else dots
     return svg.strokes(starts, ends, f"vector {kind}") + svg.strokes(at, at, f"dot {kind}")
 
 
 @dataclass(frozen=True)
 class JoinedView:
-    """A frame that was scanned in parts. rms_um: of the differences of both scans of a join, in x' and y'; largest: of
-    them, with its name."""
+    """Frame scanned in parts. rms_um: RMS difference at tie points in x' and y'; largest: name and length of the
+    largest."""
 
     record: JoinedFrameRecord
     rms_um: tuple[float | None, float | None]
@@ -161,7 +161,7 @@ class JoinedView:
 
 
 def joined_view(frame: JoinedFrameRecord) -> JoinedView:
-    """The joins of a frame."""
+    """View of the tie points between the partial scans of a frame."""
     if not frame.joins:
         return JoinedView(frame, (None, None), "–", None)
     apart = VectorField.from_joins(frame.joins)

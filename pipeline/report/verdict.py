@@ -1,4 +1,4 @@
-"""The verdict on a calibration, and what needs a look."""
+"""Verdict on a calibration, and the problems that need a look."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -37,13 +37,13 @@ A_PRIORI = (
     "Standard deviations are a priori ones, as the given sigmas make them: the observations have no redundancy of "
     "their own that would tell σ₀. Given coordinates with a large sigma place the datum and check nothing."
 )
-CONTRADICTED = 0.01  # probability of so much against an earlier calibration, below which it is a problem
+CONTRADICTED = 0.01  # significance level of the test against an earlier calibration
 ON_FRAMES = ("target", "fiducial", "tie")  # groups of marks
-MOST_QUANTITIES = 3  # of it that are named
-LEAST_SHARE = 0.5  # of the corner's radius within which an estimated lens is known
-CONFIDENCE = 0.99  # of the global test, and that no good observation of the whole adjustment is called suspect
+MOST_QUANTITIES = 3  # largest number of contradicted quantities named
+LEAST_SHARE = 0.5  # fraction of the corner radius up to which a lens must be observed
+CONFIDENCE = 0.99  # of the global test, and family-wise confidence of the tests of residuals
 
-# Observations other than marks: how a list of them is headed, and what to do.
+# Observations other than marks: heading of their list, and remedy.
 DISTANCES = (
     "contradicted by the images (p < 0.01)",
     "Look for a wrong point or unit in the file of distances; two distances that contradict each other are both named.",
@@ -64,7 +64,7 @@ ANTENNAS = (
 
 @dataclass(frozen=True)
 class ReportVerdict:
-    """One sentence, and the problems behind it. good: exit code 0; look: 1; failed: 1, there is no usable result."""
+    """Verdict in one sentence, with its problems. Level good: exit code 0; look: 1; failed: 1, no usable result."""
 
     level: Level
     sentence: str
@@ -77,7 +77,7 @@ class ReportVerdict:
 
 
 def judge(data: ReportData) -> ReportVerdict:
-    """Judge what is there: the measurement, the adjustment, the check against OpenCV."""
+    """Judge the available results: measurement, adjustment and check against OpenCV."""
     shots = frames(data)
     problems = tuple(problem for found in NEEDS_A_LOOK.values() for problem in found(data, shots))
     is_fatal = data.adjustment is not None and any(_no_solution(data.adjustment))
@@ -86,18 +86,18 @@ def judge(data: ReportData) -> ReportVerdict:
 
 
 def sigma0_bounds(redundancy: float) -> tuple[float, float]:
-    """Where sigma0 lies, with a probability of 99 %, when the a-priori standard deviations are right."""
+    """99 % interval of sigma0 if the a-priori standard deviations are right (chi-square)."""
     low, high = (chdtri(redundancy, 0.5 * above) for above in (1.0 + CONFIDENCE, 1.0 - CONFIDENCE))
     return float(np.sqrt(low / redundancy)), float(np.sqrt(high / redundancy))
 
 
 def critical_w(tests: int) -> float:
-    """The standardised residual that one of so many good observations exceeds once in a hundred adjustments."""
+    """Critical standardised residual for a family-wise level of 1 % over all tests (Bonferroni)."""
     return -float(ndtri(0.5 * (1.0 - CONFIDENCE) / max(tests, 1)))
 
 
 def suspect_rows(adjustment: AdjustmentRecord) -> frozenset[ResidualRecord]:
-    """The residuals of image points that contradict the others beyond chance."""
+    """Residuals of image points suspected of gross errors."""
     names = {(row.group, row.owner, row.point) for row in adjustment.suspects}
     return frozenset(row for row in adjustment.residuals if (row.kind, row.image, row.point) in names)
 
@@ -148,7 +148,7 @@ def _suspects(adjustment: AdjustmentRecord) -> Iterator[Problem]:
 
 
 def _suspect_marks(rows: Sequence[SuspectRecord], removed: bool) -> tuple[MarkKey, ...]:
-    """Those that are marks of a frame."""
+    """Keys of the suspects that are marks of a frame."""
     marks = (row for row in rows if row.removed is removed and row.group in ON_FRAMES)
     return tuple((row.owner, row.group, row.point) for row in marks)
 
@@ -159,7 +159,7 @@ def _suspect(row: SuspectRecord) -> str:
 
 
 def _further_problems(adjustment: AdjustmentRecord) -> Iterator[Problem]:
-    """Distances, earlier calibrations and antennas that the images contradict."""
+    """Yield problems of distances, earlier calibrations and antennas that the images contradict."""
     heading, remedy = DISTANCES
     if bad := _outlying(adjustment, adjustment.distances):
         what = f"{counted(len(bad), 'distance')} {heading}: {_named(bad, [row.name for row in bad])}."
@@ -186,7 +186,7 @@ def _named(rows: Sequence[Observed], names: Sequence[str]) -> str:
 
 
 def contradiction(test: ContradictionRecord, cameras: Mapping[str, CameraRecord]) -> str:
-    """What the images say against an earlier calibration as a whole, and in which direction."""
+    """State the compatibility test of the images with an earlier calibration, and the quantities in contradiction."""
     known = [row for row in test.direction if math.isfinite(row.difference) and row.sigma > 0.0][:MOST_QUANTITIES]
     by = ", ".join(
         f"{spoken_name(row.name, cameras)} {row.difference:+.3g} (its sigma {row.sigma:.2g})" for row in known
@@ -203,7 +203,7 @@ def _outlying(adjustment: AdjustmentRecord, rows: Sequence[Observed]) -> list[Ob
 
 
 def _too_large(adjustment: AdjustmentRecord) -> Iterator[Problem]:
-    """A sigma0 beyond chance, with what explains it where something does."""
+    """Yield the problem of a significantly large sigma0, with explanations if there are any."""
     _, high = sigma0_bounds(adjustment.variance_factor.redundancy)
     explained = [Problem(each.cause, each.remedy) for each in adjustment.explanations]
     if adjustment.sigma0 <= high:
@@ -225,7 +225,7 @@ def _too_large(adjustment: AdjustmentRecord) -> Iterator[Problem]:
 
 
 def _too_small(adjustment: AdjustmentRecord) -> Iterator[str]:
-    """Better than promised is no harm: a note."""
+    """Yield a note for a significantly small sigma0, which is harmless."""
     low, _ = sigma0_bounds(adjustment.variance_factor.redundancy)
     if adjustment.sigma0 < low:
         yield (
@@ -240,14 +240,14 @@ def _group_sigmas(adjustment: AdjustmentRecord) -> str:
 
 
 def _sigma0_and(side: str, bound: float, sigma0: float) -> str:
-    """Both with as many digits as tell them apart."""
+    """State sigma0 and its bound with enough digits to distinguish them."""
     digits = next((count for count in (2, 3, 4) if f"{sigma0:.{count}f}" != f"{bound:.{count}f}"), 5)
     return f"σ₀ = {sigma0:.{digits}f} is {side} {bound:.{digits}f}"
 
 
 def _lens_problems(data: ReportData, shots: list[Frame]) -> Iterator[Problem]:
-    """Lenses that were estimated in less than half of the picture: from half the radius to the corner the seventh power
-    of k3 grows by 128, so that a hundredth of a pixel inside is more than a pixel there."""
+    """Yield problems of lenses observed out to less than half the corner radius. From there to the corner the term of
+    k3 grows by 2^7 = 128, so that a hundredth of a pixel inside becomes more than a pixel."""
     remedy = "Observe targets out to the corners of the picture, or use the lens within that radius only."
     for _, sentence, share in lens_sentences(data):
         if share < LEAST_SHARE:
@@ -255,7 +255,7 @@ def _lens_problems(data: ReportData, shots: list[Frame]) -> Iterator[Problem]:
 
 
 def lens_sentences(data: ReportData) -> Iterator[tuple[str, str, float]]:
-    """By camera how far out its lens is known, in words and as a share of the way to the corner."""
+    """Yield camera, extent of its lens in words, and the extent as a fraction of the corner radius."""
     if data.adjustment is not None and _is_solved(data):
         for name, known in data.adjustment.estimated_lenses():
             yield name, known.sentence(name, data.unit_of_camera(name)), known.share
@@ -271,7 +271,7 @@ def _check_problems(check: Check) -> Iterator[Problem]:
 
 
 def _corners_notes(check: Check) -> Iterator[str]:
-    """What OpenCV's own points of a board give in the place of those that were measured here."""
+    """Yield notes comparing OpenCV's calibrations from its own board corners and from those measured here."""
     for name, camera in check.cameras.items():
         corners = camera.corners_px
         if corners:
@@ -292,7 +292,7 @@ def _is_solved(data: ReportData) -> bool:
 
 
 def _solution_check(found: Callable[[AdjustmentRecord], Iterator[Problem]], checked: bool = False) -> Evidence:
-    """What an adjustment needs a look at where it has a solution, and redundancy if that is asked for."""
+    """Restrict a check to adjustments with a solution; checked: also with an estimated sigma0."""
 
     def problems(data: ReportData, _: list[Frame]) -> Iterator[Problem]:
         if data.adjustment is not None and _is_solved(data) and (not checked or data.adjustment.has_sigma0):
@@ -308,7 +308,7 @@ def _frame_check(data: ReportData, shots: list[Frame]) -> Iterator[Problem]:
     yield from frame_problems(shots)
 
 
-# All that makes exit code 1, with the names that docs/how-to/read-the-report.md tells them by.
+# Checks that lead to exit code 1, by their names in docs/how-to/read-the-report.md.
 NEEDS_A_LOOK: dict[str, Evidence] = {
     "solution": lambda data, _: _no_solution(data.adjustment) if data.adjustment else (),
     "made from": lambda data, _: data.problems,
@@ -325,7 +325,7 @@ NEEDS_A_LOOK: dict[str, Evidence] = {
 
 
 def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
-    """What is worth knowing and needs no action."""
+    """Yield remarks that need no action."""
     yield from data.notes
     if not data.comparator and not data.measurement and not data.totals:
         yield "No measurement was handed to this report."
@@ -366,7 +366,7 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
 
 
 def _unmodelled_notes(data: ReportData, adjustment: AdjustmentRecord) -> Iterator[str]:
-    """What was added for errors that the model lacks, and what errors that a picture's marks share make."""
+    """Yield notes on sigmas added for unmodelled errors, and on correlated errors within images."""
     for name, sigma_mm in adjustment.unmodelled_mm.items():
         unit, ratio = data.unit_of_camera(name), cluster_ratio(name, adjustment.cameras[name], data.covariance)
         if sigma_mm > 0.0:
@@ -382,7 +382,7 @@ def _unmodelled_notes(data: ReportData, adjustment: AdjustmentRecord) -> Iterato
 
 
 def _weight_notes(adjustment: AdjustmentRecord) -> Iterator[str]:
-    """What the adjustment itself has changed of the weights."""
+    """Yield notes on weights changed by robust estimation and variance components."""
     lowered = [row for row in adjustment.residuals if row.weight < 1.0]
     if lowered:
         least = min(lowered, key=lambda row: row.weight)
@@ -430,7 +430,7 @@ def _focal_lengths(data: ReportData, camera: str) -> str:
 
 
 def _observed(data: ReportData, shots: list[Frame]) -> int:
-    """How many marks are observations; those of the adjustment where the comparator file is not at hand."""
+    """Number of observed marks; from the adjustment if there is no comparator file."""
     if data.totals:
         return sum(count[status] for count in data.totals.marks.values() for status in (Status.MEASURED, Status.WEAK))
     marks = sum(frame.count(Status.MEASURED, Status.WEAK) for frame in shots)
