@@ -1,4 +1,4 @@
-"""A camera that a person draws in one scan: what the page sends of it, where its frame lies, and its file."""
+"""Camera drawn by a user in one scan: the drawing sent by the page, the placement of its frame, and its file."""
 
 import math
 import re
@@ -30,12 +30,12 @@ from pipeline.text.wording import listed, table_lines
 
 Array = NDArray[np.float64]
 
-MARK = "drawn"  # the name of the table [mark.NAME]
+MARK = "drawn"  # NAME of the table [mark.NAME]
 _DRAWN_BY = f"# Drawn on the review page by reseau {version('reseau')}"
 _FILE_NAME = re.compile(r"\w[\w .-]{0,99}")
-_CLICK_MM = 0.3  # how well a mark is clicked
-_ONE_SIDE = 0.5  # of half the marks' extent: what lies farther out is on one side of the frame
-_FLIP = np.diag([1.0, -1.0])  # from right and up to columns and rows
+_CLICK_MM = 0.3  # mm, standard deviation of a click
+_ONE_SIDE = 0.5  # fraction of half the marks' extent; marks farther out belong to one side of the frame
+_FLIP = np.diag([1.0, -1.0])  # (right, up) to (column, row)
 _NO_PITCH = (
     "what a pixel of the scan measures is not known. Give its size in µm, or the coordinates of two marks, or the "
     "frame's size and two of its opposite corners."
@@ -44,8 +44,16 @@ _NO_PITCH = (
 
 @checked_dataclass(frozen=True)
 class ClickedMark:
-    """A mark that was clicked. xy_mm: its coordinates, None where they are not known. turn_deg, blur_px: of its picture
-    against the drawing, clockwise in the scan, as far as it was fitted; unfitted: why the drawing did not fit there."""
+    """Clicked mark.
+
+    Attributes
+    ----------
+    px : column and row.
+    xy_mm : given camera coordinates, None if unknown.
+    turn_deg : fitted rotation of the image of the mark against the drawing, clockwise in the scan.
+    blur_px : fitted blur.
+    unfitted : why the drawing did not fit here; "" if it did.
+    """
 
     id: str
     px: tuple[float, float]
@@ -62,8 +70,17 @@ class ClickedMark:
 
 @checked_dataclass(frozen=True)
 class CameraDrawing:
-    """What the page sends. mark: a table [mark.NAME]; point: the mark that is looked at; corners_px: two opposite
-    corners of the exposed frame; sigma_mm: of the coordinates that are given. None: not known."""
+    """Drawing of a camera, as sent by the page. None: unknown.
+
+    Attributes
+    ----------
+    mark : content of the table [mark.NAME].
+    point : name of the mark shown; "" for none.
+    pose : scan orientation.
+    frame_mm : width and height of the exposed frame.
+    corners_px : two opposite corners of the exposed frame.
+    sigma_mm : standard deviation of the given coordinates.
+    """
 
     image: str
     mark: dict[str, Any]
@@ -84,26 +101,27 @@ class CameraDrawing:
 
     @property
     def is_picture(self) -> bool:
-        """Whether the mark is a square of the scan, and no drawing."""
+        """Whether the mark is an image patch of the scan instead of a drawing."""
         return self.mark.get("kind") in ("template", "learned")
 
 
 @dataclass(frozen=True, eq=False)
 class FramePlacement:
-    """Where a frame lies in a scan: pixel_from_camera (2, 3), the size of a pixel, and what says that."""
+    """Placement of a frame in a scan. pixel_from_camera: (2, 3) affine matrix; pitch_um: pixel pitch across and down;
+    pitch_source: its source, in words."""
 
     pixel_from_camera: Array
     pitch_um: Point
     pitch_source: str
 
     def camera_mm(self, px: Point) -> Point:
-        """A place of the scan in the camera's coordinates, to a micrometre."""
+        """Camera coordinates of a place in the scan, rounded to 1 µm."""
         x, y = Affine(self.pixel_from_camera).inverse.apply(np.array(px)).round(3).tolist()
         return x, y
 
 
 def parse_drawing(given: Any) -> CameraDrawing:
-    """The drawing of a request. Raises InputError for what is none."""
+    """Parse the drawing of a request. Raises InputError for invalid content."""
     try:
         drawing: CameraDrawing = TypeAdapter(CameraDrawing).validate_python(given)
     except ValidationError as error:
@@ -120,9 +138,20 @@ def parse_drawing(given: Any) -> CameraDrawing:
 def place_frame(
     drawing: CameraDrawing, size_px: tuple[int, int], known_um: Point | None, source: str
 ) -> FramePlacement:
-    """Where the frame lies: through the marks whose coordinates are given; else upright in the pose that is set, its
-    axes through the middles of marks on opposite sides. known_um: the pitch that the project or the file gives, and
-    source which of them. Raises InputError where nothing says what a pixel measures."""
+    """Place the frame in the scan.
+
+    With two or more given coordinates the frame is fitted to them. Otherwise it lies in the given scan orientation
+    (pose), with axes through the means of the marks on opposite sides.
+
+    Parameters
+    ----------
+    known_um, source : pixel pitch from the project or the file, and which of them.
+
+    Raises
+    ------
+    InputError
+        If the pixel pitch is unknown.
+    """
     known = [(one.px, one.given_mm) for one in drawing.marks if one.given_mm is not None]
     pitch_um, source = _pitch(drawing, known_um, source)
     if len(known) >= 2:
@@ -161,7 +190,8 @@ def _pitch(drawing: CameraDrawing, known_um: Point | None, source: str) -> tuple
 
 
 def _through_coordinates(up_mm: Array, given_mm: Array, pose: str) -> Array:
-    """(2, 3), camera to the scan's (right, up) in mm; mirrored where that fits better, or the pose says it."""
+    """(2, 3) matrix, camera to the scan's (right, up), mm; mirrored if that fits better, or, with too few points to
+    decide, if the pose is."""
     tells_mirror = len(given_mm) >= LEAST_CLICKS and not are_collinear(given_mm)
     mirrors = ("0", "0m") if tells_mirror else ("0m" if "m" in pose else "0",)
     fits = [fit_frame(given_mm, up_mm, np.full(len(up_mm), _CLICK_MM), up_from_camera(one)) for one in mirrors]
@@ -169,8 +199,8 @@ def _through_coordinates(up_mm: Array, given_mm: Array, pose: str) -> Array:
 
 
 def _skew_rad(places_mm: Array) -> float:
-    """By which turn the line through the middles of the left and the right marks becomes x', and that of the lower and
-    upper ones y': the mean of both."""
+    """Rotation of the marks against the axes: mean of the directions of the line through the means of the left and
+    right marks, and of that through the lower and upper ones."""
     if len(places_mm) < 2:
         return 0.0
     middle, half = (places_mm.max(axis=0) + places_mm.min(axis=0)) / 2, np.ptp(places_mm, axis=0) / 2
@@ -195,7 +225,7 @@ def _pair(values: Array) -> Point:
 
 
 def frame_size_mm(drawing: CameraDrawing, placement: FramePlacement) -> Point | None:
-    """As given, or between the corners that were clicked, to a tenth of a millimetre."""
+    """Frame size as given, or from the clicked corners, rounded to 0.1 mm; None if unknown."""
     if drawing.given_frame_mm or len(drawing.corners_px) != 2:
         return drawing.given_frame_mm
     first, second = (np.array(placement.camera_mm(px)) for px in drawing.corners_px)
@@ -203,7 +233,7 @@ def frame_size_mm(drawing: CameraDrawing, placement: FramePlacement) -> Point | 
 
 
 def camera_content(drawing: CameraDrawing, placement: FramePlacement) -> dict[str, Any]:
-    """The camera in the words of a camera file, but for the table of its mark."""
+    """Content of the camera file without the table of its mark."""
     frame_mm, content = frame_size_mm(drawing, placement), dict[str, Any]()
     if drawing.name:
         content["name"] = drawing.name
@@ -222,7 +252,7 @@ def _fiducial(drawing: CameraDrawing, placement: FramePlacement, one: ClickedMar
 
 
 def drawn_camera(drawing: CameraDrawing, placement: FramePlacement, path: Path) -> CameraFile:
-    """The camera as its file would be read; a mark that is a square of the scan is to be learned. Raises InputError."""
+    """Camera as read from its file; a mark that is an image patch is to be learned. Raises InputError if invalid."""
     content = camera_content(drawing, placement)
     content["mark"] = {MARK: {**drawing.mark, "kind": "learned"} if drawing.is_picture else drawing.mark}
     if drawing.is_picture and drawing.marks:
@@ -231,8 +261,8 @@ def drawn_camera(drawing: CameraDrawing, placement: FramePlacement, path: Path) 
 
 
 def camera_path(folder: Path, name: str) -> Path:
-    """Where a camera file of that name is to stand. Raises InputError for a name of a folder, and for a file that was
-    not drawn here."""
+    """Path of a camera file of that name. Raises InputError for an invalid name, and for an existing file that was not
+    drawn on the page."""
     name = name.strip().removesuffix(".toml")
     if not _FILE_NAME.fullmatch(name):
         raise InputError(f"{name!r} can be no file's name here. Give one such as camera.toml, without a folder.")
@@ -243,8 +273,8 @@ def camera_path(folder: Path, name: str) -> Path:
 
 
 def save_drawing(drawing: CameraDrawing, placement: FramePlacement, scan: Scan, path: Path) -> CameraFile:
-    """Write a camera that is drawn, or whose mark is one chip of the scan, and read it again. Raises InputError for
-    what would be no camera file."""
+    """Write a camera whose mark is drawn or one image patch of the scan, and read it again. Raises InputError if the
+    drawing is incomplete or invalid."""
     if not drawing.marks:
         raise InputError("click the marks first.")
     if not frame_size_mm(drawing, placement):
@@ -260,19 +290,19 @@ def save_drawing(drawing: CameraDrawing, placement: FramePlacement, scan: Scan, 
 
 
 def save_learned(camera: CameraFile, remarks: Sequence[str], path: Path) -> CameraFile:
-    """Write a camera whose marks one scan's pictures show, and read it again."""
+    """Write a camera with marks learned from one scan, and read it again."""
     text = camera_text(replace(camera, path=path, clicks=None), picture_writer(path.parent, f"{path.stem}-"))
     write_atomically(path, "\n".join([*remarks, "", text]))
     return read_camera(path)
 
 
 def learned_remarks(image: str) -> list[str]:
-    """What a camera file says of marks that were learned from one scan."""
+    """Comment lines of a camera file whose marks were learned from one scan."""
     return [f"{_DRAWN_BY}: its marks were learned from their places in {_join_lines(image)}."]
 
 
 def _chip_lines(drawing: CameraDrawing, placement: FramePlacement, scan: Scan, save: SavePicture) -> list[str]:
-    """The table of a mark that is a chip: cut about the mark that is looked at, or the first one."""
+    """Lines of the table of a mark that is an image patch, cut around the mark shown or the first one."""
     size_mm = float(drawing.mark["size_mm"])
     one = next((mark for mark in drawing.marks if mark.id == drawing.point), drawing.marks[0])
     place = np.column_stack([placement.pixel_from_camera[:, :2], one.px])
@@ -282,7 +312,7 @@ def _chip_lines(drawing: CameraDrawing, placement: FramePlacement, scan: Scan, s
 
 
 def _remarks(drawing: CameraDrawing, placement: FramePlacement) -> list[str]:
-    """Where the numbers of the file come from."""
+    """Comment lines on the sources of the values in the file."""
     pixel = " x ".join(f"{um:.4g}" for um in dict.fromkeys(np.round(placement.pitch_um, 6).tolist()))
     found = [one.id for one in drawing.marks if one.given_mm is None]
     lines = [f"{_DRAWN_BY} in {drawing.image}, a pixel of {pixel} µm ({placement.pitch_source})."]

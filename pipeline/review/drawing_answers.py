@@ -1,4 +1,4 @@
-"""What the page is answered about a camera that a person draws."""
+"""Answers to requests about a camera drawn by a user."""
 
 from dataclasses import replace
 from typing import Any
@@ -25,17 +25,17 @@ from pipeline.review.pictures import Pictures
 from pipeline.review.query import Query, parse_places
 from pipeline.review.session import Session
 
-_WIDEST_PX = 2000  # half the window about a mark
+_WIDEST_PX = 2000  # px, largest half width of the window around a mark
 
 
 class DrawingAnswers:
-    """Requests about drawings: the page holds the drawing, and sends it whole."""
+    """Answers to requests about drawings. Stateless: each request contains the whole drawing."""
 
     def __init__(self, session: Session, pictures: Pictures) -> None:
         self._session, self._pictures = session, pictures
 
     def draw(self, query: Query, body: Any) -> Any:
-        """The drawing after a step, and all that is shown of it."""
+        """Apply a step to the drawing; returns the drawing as shown."""
         drawing, placement = self._placed(_part(body, "drawing"))
         if step := body.get("step"):
             scan = self._session.scan_location(drawing.image)
@@ -44,7 +44,7 @@ class DrawingAnswers:
         return drawing_json(drawing, placement)
 
     def picture(self, query: Query) -> bytes:
-        """The rendered drawing, or what it leaves of the scan, about the mark that is looked at."""
+        """Rendered drawing or residual image around the mark shown."""
         drawing, placement = self._placed(query.table("drawing"))
         half, shown = query.whole("half", 8, _WIDEST_PX), drawn_mark(drawing, placement)
         if shown is None or not isinstance(shown.mark, MarkShape):
@@ -55,7 +55,7 @@ class DrawingAnswers:
         return self._pictures.residual(self._session.scan_location(drawing.image), shown.mark, matrix, blur_px, half)
 
     def save(self, query: Query, body: Any) -> Any:
-        """The camera file written, and what to do next."""
+        """Write the camera file; returns a message with the next step."""
         drawing, placement = self._placed(_part(body, "drawing"))
         project, path = self._session.project, camera_path(self._session.folder, str(body.get("file", "")))
         if drawing.mark.get("kind") == "learned" and drawing.marks:
@@ -69,9 +69,9 @@ class DrawingAnswers:
         return self._saved(self._pictures.compute(scan, lambda file: save_drawing(drawing, placement, file, path)))
 
     def save_learned(self, query: Query, body: Any) -> Any:
-        """A camera of the project written with its marks as one scan shows them at clicked places."""
+        """Write a camera of the project with marks learned at clicked places of one scan."""
         image, path = str(_part(body, "image")), camera_path(self._session.folder, str(body.get("file", "")))
-        self._session.scan_location(image)  # raises for one that is none
+        self._session.scan_location(image)  # raises KeyError for an unknown image
         px = parse_places(_part(body, "px"))
         project = self._session.project
         camera = project.image_camera(image)

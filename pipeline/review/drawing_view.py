@@ -1,4 +1,4 @@
-"""A camera drawing as the page shows it, what a drag, a click or a fit makes of it, and its pictures."""
+"""Camera drawing as shown on the page, and its changes by dragging, clicking and fitting."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -39,17 +39,25 @@ from pipeline.text.table_models import key_rows
 Array = NDArray[np.float64]
 Json = dict[str, Any]
 
-_START_PX = 20.0  # of a new drawing, to every side of its point
-_LEAST_PX, _SIZES = 30, 1.8  # of half the window about a mark: at least, and in the mark's own size
-_SEARCH_PX, _SEARCH_MM = 6.0, 0.3  # about a click, whichever is more
-_NO_FILE = Path("camera.toml")  # of a drawing that is not saved yet
+_START_PX = 20.0  # px, half size of a new drawing
+_LEAST_PX, _SIZES = 30, 1.8  # half width of the window around a mark: minimum, px, and in sizes of the mark
+_SEARCH_PX, _SEARCH_MM = 6.0, 0.3  # px and mm, search radius around a click; the larger one applies
+_NO_FILE = Path("camera.toml")  # placeholder for a drawing that is not saved yet
 _CHOICES = {"polarity": ("auto", "light", "dark"), "rotate": ("none", "radial")}
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnMark:
-    """The mark that is looked at. mark: None where its drawing is not complete, and problem says why; pixel_from_mark
-    (2, 3): through its place, the frame's rotation and scale, and its own turn as far as that was fitted."""
+    """Mark shown on the page.
+
+    Attributes
+    ----------
+    clicked, xy_mm : clicked mark and its camera coordinates.
+    mark : None if the drawing is incomplete.
+    pixel_from_mark : (2, 3) affine matrix from its position, the rotation and scale of the frame, and its fitted
+        rotation.
+    problem : why the drawing is incomplete.
+    """
 
     clicked: ClickedMark
     xy_mm: Point
@@ -59,12 +67,12 @@ class DrawnMark:
 
     @property
     def toward(self) -> Point:
-        """In which quadrant about it the frame lies."""
+        """Signs (x, y) of the quadrant around the mark in which the frame lies."""
         return -1.0 if self.xy_mm[0] > 0 else 1.0, -1.0 if self.xy_mm[1] > 0 else 1.0
 
 
 def drawn_mark(drawing: CameraDrawing, placement: FramePlacement) -> DrawnMark | None:
-    """None where no mark is looked at."""
+    """Mark shown, None if none is selected."""
     clicked = next((one for one in drawing.marks if one.id == drawing.point), None)
     if clicked is None:
         return None
@@ -86,7 +94,7 @@ def _pixel_from_mark(placement: FramePlacement, clicked: ClickedMark) -> Array:
 
 
 def drawing_json(drawing: CameraDrawing, placement: FramePlacement) -> Json:
-    """All that the page shows of a drawing beside its pictures."""
+    """JSON of a drawing as shown on the page, without images."""
     shown = drawn_mark(drawing, placement)
     frame_mm = frame_size_mm(drawing, placement)
     return {
@@ -113,7 +121,7 @@ def drawing_json(drawing: CameraDrawing, placement: FramePlacement) -> Json:
 
 
 def _form(mark: MarkJson) -> list[Json]:
-    """The keys of a mark that are one number or one word, as its table in a camera file has them."""
+    """Form of the scalar keys of a mark, as in its table in a camera file."""
     kind = mark["kind"]
     rows = list(key_rows(MARK_TABLES["learned" if kind == "template" else kind]))
     form = []
@@ -154,7 +162,8 @@ def _half_px(shown: DrawnMark, lines: Sequence[Any], place: Affine, own: Sequenc
 
 
 def _handle_affine(drawing: CameraDrawing, shown: DrawnMark) -> Affine:
-    """From the axes that a mark is drawn in, which a radial one has turned with its place, to the scan."""
+    """Affine from the axes in which a mark is drawn to the scan; those of a radial mark are rotated with its
+    position."""
     linear = shown.pixel_from_mark[:, :2]
     if drawing.mark.get("rotate") == "radial":
         x, y = np.array(shown.xy_mm) / (math.hypot(*shown.xy_mm) or 1.0)
@@ -163,8 +172,18 @@ def _handle_affine(drawing: CameraDrawing, shown: DrawnMark) -> Affine:
 
 
 def take_step(drawing: CameraDrawing, placement: FramePlacement, step: Mapping[str, Any], scan: Scan) -> CameraDrawing:
-    """The drawing after what a person did with it: {"kind": of mark}, {"part": shape}, {"click": px} in the picture of
-    the mark, {"drag": key of a handle, "px": to}, {"remove": key of a handle} or {"fit": True}."""
+    """Apply a step of the user to the drawing.
+
+    Parameters
+    ----------
+    step : {"kind": kind of mark}, {"part": shape}, {"click": px} in the image of the mark, {"drag": key of a handle,
+        "px": new place}, {"remove": key of a handle} or {"fit": True}.
+
+    Raises
+    ------
+    InputError
+        If the step is invalid.
+    """
     mark, shown = drawing.mark, drawn_mark(drawing, placement)
     size_mm = _START_PX / linear_scale(placement.pixel_from_camera)
     match step:
@@ -201,9 +220,11 @@ def _move_drawing(drawing: CameraDrawing, px: Point) -> CameraDrawing:
 
 
 def fit_drawing(drawing: CameraDrawing, placement: FramePlacement, scan: Scan) -> CameraDrawing:
-    """Every mark matched as `measure` matches it, at the frame's edge as far as its drawing is true there: its place
-    and blur; and all of them turned, and the drawing larger, by the median over the marks. Raises InputError where none
-    matches the drawing."""
+    """Fit the drawing to all marks by the method of `measure`.
+
+    Each mark gets its own position and blur. All get the median rotation, and the drawing is scaled by the median
+    scale. Marks at the frame's edge are limited to the frame. Raises InputError if the drawing fits no mark.
+    """
     if drawing.is_picture:
         raise InputError("a square of the scan is its own picture: there is nothing to fit.")
     camera = drawn_camera(drawing, placement, _NO_FILE)
@@ -232,7 +253,7 @@ def fit_drawing(drawing: CameraDrawing, placement: FramePlacement, scan: Scan) -
 
 
 def _match(scan: Scan, mark: Any, start: Array) -> Detection:
-    """The better one of both polarities, where the drawing leaves it open."""
+    """Detect a mark at a place; the better of both polarities if the drawing does not specify one."""
     search_px = max(_SEARCH_PX, _SEARCH_MM * linear_scale(start))
     polarities = {"light": (1,), "dark": (-1,)}.get(mark.polarity, (1, -1))
     found = [detect_mark(scan, MarkPrediction(mark, start, search_px, one), MatchOptions()) for one in polarities]

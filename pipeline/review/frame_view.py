@@ -1,4 +1,4 @@
-"""What a person sees of a frame: its result as JSON for the page, outlines of marks, trial measurements."""
+"""Frames on the review page: results as JSON, outlines of marks, trial measurements."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,17 +27,17 @@ from pipeline.results.measured_record import FailureCode, MeasuredScan
 
 Array = NDArray[np.float64]
 
-_STEPS = 48  # of a circle
+_STEPS = 48  # vertices of a circle
 Json = dict[str, Any]
 
-_NEAR = 100  # scans before and after it among which these are sought
-_OTHERS = 6  # frames beside which a mark is shown
-_LEAST_PX = 40  # of a window, so that the surroundings can be seen
-_REACH_SIZES = 2.5  # of a window, in the mark's own size
+_NEAR = 100  # scans before and after, among which frames for comparison are sought
+_OTHERS = 6  # largest number of frames for comparison
+_LEAST_PX = 40  # px, smallest half width of a window, to include the surroundings
+_REACH_SIZES = 2.5  # width of a window in sizes of the mark
 
 
 def outlines_px(mark: Mark, pixel_from_mark: Array) -> list[list[list[float]]]:
-    """Closed lines in pixels of the scan; none of a mark that is a picture."""
+    """Outlines of a mark as closed lines in pixels of the scan; empty for an image template."""
     if not isinstance(mark, MarkShape):
         return []
     lines = (line for part in mark.parts for line in _lines_mm(part))
@@ -67,7 +67,8 @@ def _circle(center_mm: tuple[float, float], radius_mm: float) -> Array:
 
 @dataclass(frozen=True)
 class LookedAt:
-    """A frame. verdict: of the judging; fingerprint: of its result; camera: with its marks as they were sought."""
+    """Frame with its result. verdict: of the cross-scan checks; fingerprint: of the result; camera: with the marks as
+    used in the search."""
 
     scan: MeasuredScan
     verdict: str
@@ -76,44 +77,44 @@ class LookedAt:
 
     @cached_property
     def layout_marks(self) -> Mapping[str, LayoutMark]:
-        """The marks of the camera that have a drawing or a picture, by name."""
+        """Marks of the camera with a drawing or template, by name."""
         return {mark.id: mark for mark in self.camera.layout().marks} if self.camera.layout_marks else {}
 
     def mark(self, point: str, kind: str) -> MarkMeasurement:
-        """Raises KeyError where the frame has no such mark."""
+        """Mark of that name and kind. Raises KeyError if there is none."""
         found = next((one for one in self.scan.frame.marks if (one.point, one.kind) == (point, kind)), None)
         if found is None:
             raise KeyError(point)
         return found
 
     def predicted_px(self, point: str, kind: str) -> Array | None:
-        """Where the frame puts a fiducial."""
+        """Place of a fiducial predicted by the interior orientation; None if unknown or for other marks."""
         matrix, drawn = self.scan.frame.pixel_from_camera, self.layout_marks.get(point)
         if matrix is None or drawn is None or kind != "fiducial":
             return None
         return np.asarray(matrix @ (*drawn.xy_mm, 1.0))
 
     def place_px(self, point: str, kind: str) -> Array:
-        """Where to look: at the mark, where it should be, or in the middle of the scan."""
+        """Centre of the window: measured place, else predicted place, else centre of the scan."""
         mark, predicted = self.mark(point, kind), self.predicted_px(point, kind)
         if mark.center_px is not None:
             return mark.center_px
         return predicted if predicted is not None else np.array([self.scan.width_px / 2, self.scan.height_px / 2])
 
     def pixel_from_mark(self, point: str, kind: str) -> Array | None:
-        """(2, 3), as the frame turns and scales a fiducial, at its place."""
+        """(2, 3) affine matrix of a fiducial: rotation and scale of the frame, at its place; None for other marks."""
         matrix, drawn = self.scan.frame.pixel_from_camera, self.layout_marks.get(point)
         if matrix is None or drawn is None or kind != "fiducial" or isinstance(drawn.mark, FrameCorner):
             return None
         return np.column_stack([matrix[:, :2], self.place_px(point, kind)])
 
     def window_px(self, point: str, kind: str) -> int:
-        """Half the width of the window about a mark."""
+        """Half the width of the window around a mark."""
         size = self.mark(point, kind).quality.get("size_px", 0.0)
         return int(max(_LEAST_PX, np.ceil(_REACH_SIZES * size / 2)))
 
     def detail_json(self, point: str, kind: str) -> Json:
-        """All that the page shows of a mark."""
+        """JSON of a mark with all details."""
         mark = self.mark(point, kind)
         drawn, linear = self.layout_marks.get(point), self.pixel_from_mark(point, kind)
         return {
@@ -136,7 +137,7 @@ class LookedAt:
         }
 
     def frame_json(self) -> Json:
-        """All that the page shows of a frame."""
+        """JSON of a frame with all marks except tie points."""
         frame, pose = self.scan.frame, self.scan.frame.pose
         marks = [
             {**mark_json(mark), "place": _pair(self._known_place(mark))} for mark in frame.marks if mark.kind != "tie"
@@ -163,10 +164,10 @@ class LookedAt:
 
 
 class Looking:
-    """Frames of the latest judging of a store, which somebody else may be writing meanwhile."""
+    """Access to the latest checked results in a results database, which another process may be writing."""
 
     def __init__(self, store: Path, folder: Path, camera_of: Any) -> None:
-        """folder: that paths of scans are relative to. camera_of: the camera of an image."""
+        """folder: to which paths of scans are relative; camera_of: returns the camera of an image."""
         self._store, self._folder, self._camera_of = store, folder, camera_of
 
     def judging(self) -> Judging | None:
@@ -176,7 +177,7 @@ class Looking:
             return latest(store)
 
     def view(self, image: str) -> LookedAt:
-        """Raises KeyError where no such image is judged."""
+        """Load a frame. Raises KeyError for an image without checked results, DamagedError for a damaged result."""
         with Store(self._store) as store:
             judging = latest(store)
             row = store.connection.execute(_ONE, (image, -1 if judging is None else judging.row)).fetchone()
@@ -188,7 +189,7 @@ class Looking:
         return LookedAt(scan, str(row[0]), str(row[1]), self._camera_of(image))
 
     def others(self, image: str, point: str, kind: str) -> Sequence[str]:
-        """Frames beside which the mark is shown: of the same camera, where it was measured."""
+        """Frames for comparison: nearby frames of the same camera in which the mark was measured."""
         with Store(self._store) as store:
             sql_parameters = (image, _NEAR, point, kind, _OTHERS)
             rows = store.connection.execute(_BESIDE, sql_parameters).fetchall()
@@ -214,7 +215,7 @@ order by abs(s.id - own.id) limit ?5
 
 
 def mark_json(mark: MarkMeasurement) -> Json:
-    """What is shown of any mark."""
+    """JSON common to all marks."""
     return {
         "point": mark.point,
         "kind": mark.kind,
@@ -230,7 +231,7 @@ def _pair(place: Array | None) -> list[float] | None:
 
 
 def _second(mark: MarkMeasurement) -> list[float] | None:
-    """Where the second method puts the mark."""
+    """Place of the mark by the second method; None without one."""
     if mark.center_px is None or "second_method_col_px" not in mark.quality:
         return None
     offset = (mark.quality["second_method_col_px"], mark.quality["second_method_row_px"])
@@ -238,15 +239,15 @@ def _second(mark: MarkMeasurement) -> list[float] | None:
 
 
 def _causes(mark: MarkMeasurement) -> list[Json]:
-    """What its sigma consists of, the largest part first."""
+    """Contributions to the standard deviation, the largest first."""
     parts = mark.covariance.parts.items() if mark.covariance else ()
     parts_px = [(str(c), CAUSE_MEANING[c], float(np.sqrt(max(np.trace(px2) / 2, 0.0)))) for c, px2 in parts]
     return [{"cause": c, "meaning": m, "sigma_px": s} for c, m, s in sorted(parts_px, key=lambda one: -one[2])]
 
 
 def measured_from_clicks(project: Project, image: str, clicks: Sequence[Click]) -> MeasuredScan:
-    """The scan's fiducials, as `reseau measure` would find them with these decisions. project: with what was learned of
-    its marks. Raises InputError for a mark that the camera does not have."""
+    """Measure the fiducials of a scan as `reseau measure` would with these clicks. project: with learned marks. Raises
+    InputError for a mark that the camera does not have."""
     known = {mark.id for mark in project.image_camera(image).layout_marks}
     unknown = [click.point for click in clicks if click.point not in known]
     if unknown:
@@ -257,8 +258,19 @@ def measured_from_clicks(project: Project, image: str, clicks: Sequence[Click]) 
 
 
 def measured_as_shown(project: Project, shown: str, px: Mapping[str, tuple[float, float]], image: str) -> MeasuredScan:
-    """A scan's fiducials, found by the pictures of marks that are to be learned at places of one scan, which may be
-    itself. shown: that scan; px: column and row of its camera's marks. Raises InputError for a mark that is missing."""
+    """Measure the fiducials of a scan with templates learned at clicked places of a scan, which may be the same one.
+
+    Parameters
+    ----------
+    shown : scan from which the templates are learned.
+    px : column and row by mark.
+    image : scan to measure.
+
+    Raises
+    ------
+    InputError
+        If a mark was not clicked.
+    """
     camera = project.image_camera(shown)
     missing = [one.id for one in camera.learned if one.id not in px]
     if missing:
@@ -269,7 +281,7 @@ def measured_as_shown(project: Project, shown: str, px: Mapping[str, tuple[float
 
 
 def camera_as_shown(project: Project, camera: CameraFile, clicks: Clicks) -> CameraFile:
-    """A camera, of the project or not, with the pictures of its marks at clicked places of one scan."""
+    """Camera with templates of its marks learned at clicked places of one scan; it need not belong to the project."""
     alone = replace(project, cameras=dict.fromkeys(project.cameras or ("",), camera))
     (task,) = scan_tasks(alone, [clicks.scan])
     return first_pictures(replace(camera, clicks=clicks), [task.fiducials_alone("linear")], None)

@@ -1,7 +1,7 @@
-"""Handles of a mark's drawing: the points that a person drags on the page, and what of the drawing each changes.
+"""Handles of a mark's drawing: points that the user drags on the page, each of which changes one value.
 
-A mark is a table [mark.NAME] of a camera file. The page knows no kind of mark: it shows handles and sends back
-where one was dragged.
+A mark is a table [mark.NAME] of a camera file. The page does not depend on the kind of mark: it shows handles and sends
+the place to which one was dragged.
 """
 
 import math
@@ -18,16 +18,17 @@ from pipeline.errors import InputError
 Array = NDArray[np.float64]
 MarkJson = Mapping[str, Any]
 
-_DECIMALS = 4  # of a size in mm that is dragged: a tenth of a micrometre
+_DECIMALS = 4  # of values in mm: 0.1 µm
 _LEAST_MM = 1e-3
-_RING_DEG, _LINE_DEG = 22.5, -22.5  # where on a ring its handles lie: beside upright and diagonal arms
-_LINE_AT = 0.7  # of an arm: where the handle of its width lies
-_QUARTER_DEG = 90.0  # after which a cross is itself again
+_RING_DEG, _LINE_DEG = 22.5, -22.5  # degrees, handles on a ring, clear of upright and diagonal arms
+_LINE_AT = 0.7  # fraction of an arm's length at which the handle of its width lies
+_QUARTER_DEG = 90.0  # degrees, rotational symmetry of a cross
 
 
 @dataclass(frozen=True)
 class Handle:
-    """key: what it changes; place_mm: where it lies in the mark's axes; dragged: the mark with it at another place."""
+    """Handle. key: value that it changes; place_mm: in the mark's axes; dragged: returns the mark with the handle at
+    another place."""
 
     key: str
     place_mm: Point
@@ -35,12 +36,12 @@ class Handle:
 
 
 def handles(mark: MarkJson, toward: Point = (1.0, 1.0)) -> list[Handle]:
-    """The handles of a mark. toward: of a frame corner, in which quadrant the frame lies."""
+    """Handles of a mark. toward: signs (x, y) of the quadrant in which the frame lies, used for a frame corner."""
     return list(_HANDLES[mark["kind"]](mark, toward))
 
 
 def first_drawing(kind: str, size_mm: float) -> MarkJson:
-    """A mark of a kind to start from, some size_mm to every side of its point."""
+    """Initial drawing of a kind of mark, with a half size of about size_mm."""
     arm, line, ring = size_mm, size_mm / 8, size_mm / 2
     cross = {"arm_mm": arm, "line_mm": line, "gap_mm": 0.0, "angle_deg": 0.0}
     rings = {"ring_mm": ring, "ring_line_mm": line}
@@ -61,7 +62,7 @@ def first_drawing(kind: str, size_mm: float) -> MarkJson:
 
 
 def first_part(shape: str, size_mm: float) -> MarkJson:
-    """A simple shape to start from."""
+    """Initial part of a shape."""
     corners = [[0.0, size_mm], [-size_mm, -size_mm], [size_mm, -size_mm]]
     parts: dict[str, MarkJson] = {
         "disk": {"center_mm": [0.0, 0.0], "radius_mm": size_mm},
@@ -75,7 +76,7 @@ def first_part(shape: str, size_mm: float) -> MarkJson:
 
 
 def scaled_mark(mark: MarkJson, factor: float) -> MarkJson:
-    """The mark with all its lengths times a factor."""
+    """Scale all lengths of a mark by a factor."""
 
     def scaled(key: str, value: Any) -> Any:
         if isinstance(value, Mapping):
@@ -88,7 +89,7 @@ def scaled_mark(mark: MarkJson, factor: float) -> MarkJson:
 
 
 def add_vertex(mark: MarkJson, place_mm: Array) -> MarkJson:
-    """A polygon with one more corner: in the nearest side of its outline, or at the end of one that is not closed."""
+    """Add a vertex to a polygon: in the side nearest to it, or at the end if there are fewer than three vertices."""
     vertices = [*mark["vertices_mm"]]
     at = len(vertices)
     if at >= 3:
@@ -101,7 +102,7 @@ def add_vertex(mark: MarkJson, place_mm: Array) -> MarkJson:
 
 
 def remove_part(mark: MarkJson, key: str) -> MarkJson:
-    """The mark without the corner, or without the part, that a handle's key names."""
+    """Remove the vertex or the part named by a handle's key."""
     name, *rest = key.split(".")
     if name not in ("vertices_mm", "part"):
         raise InputError("only corners of a polygon and parts can be taken out.")
@@ -140,7 +141,7 @@ def _point(place: Array) -> Point:
 def _length(
     mark: MarkJson, key: str, angle_deg: float, factor: float = 1.0, offset: float = 0.0, side: Array | None = None
 ) -> Handle:
-    """Of a size that grows as its handle goes in a direction, factor times as fast; 0 at offset from side."""
+    """Handle of a length: value = factor (distance from side in the direction of angle_deg - offset)."""
     along, start = _unit(angle_deg), np.zeros(2) if side is None else side
 
     def dragged(place: Array) -> MarkJson:

@@ -1,4 +1,4 @@
-"""Pictures of scans for the page: windows at the file's own pixels, what a fit leaves of them, whole frames reduced."""
+"""Images of scans for the page: windows at full resolution, residual images of fits, reduced whole frames."""
 
 import threading
 from collections import OrderedDict
@@ -18,19 +18,19 @@ from measure.scans.scan import Scan
 Array = NDArray[np.float64]
 Result = TypeVar("Result")
 
-_OPEN = 4  # scans that are kept open
-_KEPT_MB = 64  # of pictures, so that one that was shown is there at once
-_WINDOW_PX = 480  # a larger window is reduced to about this many pixels
-_FRAME_PX = 1400  # of the longer side of a whole scan
+_OPEN = 4  # scans kept open
+_KEPT_MB = 64  # MB, size of the image cache
+_WINDOW_PX = 480  # px, larger windows are reduced to about this width
+_FRAME_PX = 1400  # px, longer side of a whole scan
 _POSE_PX = 180
-_NOTHING = 128  # grey: beyond the scan
-_ROUNDS, _OUTLYING = 6, 5.0  # of a fit, and times the median residual: three and a half standard deviations
-_DRAWN_BGR, _COVERED = (61, 163, 22), 0.55  # a drawing over the scan: its colour, and how much of the scan it hides
-_SHARE = 0.1  # per cent of pixels that may be too dark or too light to be told apart
+_NOTHING = 128  # grey value outside the scan
+_ROUNDS, _OUTLYING = 6, 5.0  # iterations of the robust fit; outlier limit in median residuals, 3.5 standard deviations
+_DRAWN_BGR, _COVERED = (61, 163, 22), 0.55  # colour and opacity of a drawing over the scan
+_SHARE = 0.1  # per cent of the pixels clipped at each end of the grey values
 
 
 class Pictures:
-    """Windows of scans as PNG. Several threads may ask; the scans asked for last are kept open."""
+    """Windows of scans as PNG. Thread-safe; the scans used last are kept open."""
 
     def __init__(self, max_pixels: int | None = None) -> None:
         self._max_pixels = max_pixels
@@ -44,40 +44,39 @@ class Pictures:
                 self._open.popitem()[1].close()
 
     def size(self, scan: str) -> tuple[tuple[int, int], tuple[float, float] | None]:
-        """Width and height in px, and the pitch in um as far as its file tells it."""
+        """Width and height, px, and the pixel pitch from the file, µm, None if unknown."""
         return self.compute(scan, lambda file: ((file.width_px, file.height_px), file.pitch_um))
 
     def compute(self, scan: str, work: Callable[[Scan], Result]) -> Result:
-        """What some work on an open scan gives."""
+        """Run a function on an open scan."""
         with self._reading:
             return work(self._scan(scan))
 
     def window(self, scan: str, col0: int, row0: int, size: int) -> bytes:
-        """A square window; one of many pixels is reduced. Raises MeasurementError where the file cannot be read."""
+        """Square window; a large one is reduced. Raises MeasurementError if the file cannot be read."""
         return self._png(("window", scan, col0, row0, size), lambda: _window(self._scan(scan), col0, row0, size))
 
     def residual(self, scan: str, mark: Mark, pixel_from_mark: Array, blur_px: float, half: int) -> bytes:
-        """What is left of the picture about a mark when the mark as it was fitted, and a sloping ground, are taken
-        out."""
+        """Residual image around a mark, after subtraction of the fitted mark and a linear background."""
         key = ("residual", scan, hash(mark), *pixel_from_mark.ravel(), blur_px, half)
         return self._png(key, lambda: _residual(self._scan(scan), mark, pixel_from_mark, blur_px, half))
 
     def drawing(self, mark: Mark, pixel_from_mark: Array, blur_px: float, half: int) -> bytes:
-        """The mark as it is rendered for the fit, transparent where nothing is drawn, in the window of `residual`."""
+        """Mark as rendered for the fit, transparent outside, in the window of `residual`."""
         key = ("drawing", hash(mark), *pixel_from_mark.ravel(), blur_px, half)
         return self._png(key, lambda: _drawing(mark, pixel_from_mark, blur_px, half))
 
     def frame(self, scan: str) -> bytes:
-        """The whole scan, reduced."""
+        """Whole scan, reduced."""
         return self._png(("frame", scan), lambda: stretched(self._reduced(scan, _FRAME_PX)))
 
     def posed(self, scan: str, pose: str) -> bytes:
-        """The whole scan as it would have to be seen if it lay in that pose: upright, and not mirrored."""
+        """Whole scan rotated and mirrored back from a scan orientation (pose): upright if that pose is right."""
         return self._png(("pose", scan, pose), lambda: upright(stretched(self._reduced(scan, _POSE_PX)), pose))
 
     def _reduced(self, name: str, side_px: int) -> Array:
         scan = self._scan(name)
-        factor = max(1, -(-max(scan.width_px, scan.height_px) // _FRAME_PX))  # one for both: it is kept
+        factor = max(1, -(-max(scan.width_px, scan.height_px) // _FRAME_PX))  # cached, for both sizes
         grey = np.asarray(scan.reduced(factor), dtype=np.float64)
         smaller = side_px / max(grey.shape)
         return (
@@ -101,7 +100,7 @@ class Pictures:
         return png
 
     def _scan(self, name: str) -> Scan:
-        """Called while `_reading` is held."""
+        """Open a scan, or get it from the cache. The caller holds `_reading`."""
         if name not in self._open:
             self._open[name] = open_scan(name, self._max_pixels)
             while len(self._open) > _OPEN:
@@ -111,13 +110,13 @@ class Pictures:
 
 
 def stretched(grey: Array) -> NDArray[np.uint8]:
-    """8 bit, from the darkest to the lightest but for a few."""
+    """Stretch grey values to 8 bits between their extreme percentiles."""
     low, high = np.percentile(grey, [_SHARE, 100.0 - _SHARE])
     return np.asarray(np.rint(np.clip((grey - low) / max(high - low, 1e-12), 0.0, 1.0) * 255.0), dtype=np.uint8)
 
 
 def upright(grey: NDArray[np.uint8], pose: str) -> NDArray[np.uint8]:
-    """A scan of that pose turned back, and mirrored back."""
+    """Rotate and mirror back a scan in that orientation (pose)."""
     turned = np.rot90(grey, -int(pose.removesuffix("m")) // 90)
     return np.ascontiguousarray(turned[:, ::-1] if pose.endswith("m") else turned)
 
@@ -134,8 +133,8 @@ def _window(scan: Scan, col0: int, row0: int, size: int) -> NDArray[np.uint8]:
 
 
 def _reduced_window(scan: Scan, col0: int, row0: int, side: int, step: int) -> NDArray[np.uint8]:
-    """side x side pixels, each the mean of step x step of the scan. Only what the scan has is read, and only one row of
-    these pixels is held at a time."""
+    """(side, side) means over squares of step x step pixels. Only the part within the scan is read, one row of means at
+    a time."""
     shown = np.full((side, side), _NOTHING, np.uint8)
     cols, rows = (
         _overlapping_pixels(col0, scan.width_px, side, step),
@@ -148,30 +147,30 @@ def _reduced_window(scan: Scan, col0: int, row0: int, side: int, step: int) -> N
 
 
 def _overlapping_pixels(start_px: int, extent_px: int, side: int, step: int) -> range:
-    """Which of a row or column of reduced pixels show something of a scan."""
+    """Indices of the reduced pixels of a row or column that overlap the scan."""
     return range(max(0, -start_px // step), min(side, -((start_px - extent_px) // step)))
 
 
 def _means(scan: Scan, col0: int, row0: int, count: int, step: int) -> Array:
-    """(count,) reduced pixels side by side."""
+    """(count,) means of adjacent squares in one row."""
     grey = scan.window(col0, row0, count * step, step)
     return np.asarray(grey.reshape(step, count, step).mean(axis=(0, 2), dtype=np.float64))
 
 
 def window_start(pixel_from_mark: Array, half: int) -> tuple[int, int]:
-    """First column and row of the window, 2 half + 1 pixels wide, about a mark."""
+    """First column and row of the window around a mark, 2 half + 1 pixels wide."""
     col, row = np.rint(pixel_from_mark[:, 2]).astype(int).tolist()
     return col - half, row - half
 
 
 def _model(mark: Mark, pixel_from_mark: Array, blur_px: float, half: int) -> Array:
-    """The mark's rendered picture in the window about it."""
+    """Rendered image of the mark in the window around it."""
     local = np.column_stack([pixel_from_mark[:, :2], pixel_from_mark[:, 2] - window_start(pixel_from_mark, half)])
     return picture(mark, local, 2 * half + 1, 2 * half + 1, blur_px)
 
 
 def _drawing(mark: Mark, pixel_from_mark: Array, blur_px: float, half: int) -> NDArray[np.uint8]:
-    """(rows, columns, 4), blue, green, red and how much of the scan is covered."""
+    """(rows, columns, 4) blue, green, red and opacity."""
     shown = np.empty((2 * half + 1, 2 * half + 1, 4), np.uint8)
     shown[..., :3] = _DRAWN_BGR
     shown[..., 3] = np.rint(_COVERED * 255 * np.clip(_model(mark, pixel_from_mark, blur_px, half), 0.0, 1.0))
@@ -185,7 +184,7 @@ def _residual(scan: Scan, mark: Mark, pixel_from_mark: Array, blur_px: float, ha
     rows, cols = np.mgrid[-1 : 1 : width * 1j, -1 : 1 : width * 1j]
     design = np.stack([model, np.ones_like(model), rows, cols], axis=-1).reshape(-1, 4)
     left, is_fitted = grey.ravel(), np.ones(grey.size, dtype=bool)
-    for _ in range(_ROUNDS):  # what is damaged is to be seen, and not to spoil the rest
+    for _ in range(_ROUNDS):  # robust, so that damage stays visible and does not bias the fit
         values, *_ = np.linalg.lstsq(design[is_fitted], grey.ravel()[is_fitted], rcond=None)
         left = grey.ravel() - design @ values
         is_fitted = np.abs(left) <= _OUTLYING * np.median(np.abs(left))

@@ -1,4 +1,4 @@
-"""The values of a request's query."""
+"""Parsing of the values of a request."""
 
 import json
 from collections.abc import Mapping
@@ -6,11 +6,11 @@ from typing import Any
 
 from pipeline.errors import InputError
 
-_MOST_PX = 1e7  # of a place, far beyond any scan
+_MOST_PX = 1e7  # px, limit of coordinates, larger than any scan
 
 
 class Query:
-    """The values of a request's query."""
+    """Query parameters of a request."""
 
     def __init__(self, values: Mapping[str, str]) -> None:
         self._values = values
@@ -19,7 +19,7 @@ class Query:
         return self._values.get(name, "")
 
     def whole(self, name: str, least: int, most: int) -> int:
-        """Raises InputError for what is no such number."""
+        """Whole number between least and most. Raises InputError otherwise."""
         try:
             value = round(float(self._values.get(name, "0")))
         except (ValueError, OverflowError):
@@ -29,12 +29,12 @@ class Query:
         return value
 
     def table(self, name: str) -> Any:
-        """A value that is JSON. Raises InputError for what is none."""
+        """Value parsed as JSON. Raises InputError if it is not JSON."""
         return parse_json(self.text(name))
 
 
 def parse_json(text: str | bytes) -> Any:
-    """JSON with finite numbers alone. Raises InputError for what is none."""
+    """Parse JSON with finite numbers only. Raises InputError otherwise."""
     try:
         return json.loads(text, parse_constant=_refuse_constant)
     except (ValueError, RecursionError):
@@ -42,14 +42,14 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def parse_places(given: Any) -> dict[str, tuple[float, float]]:
-    """Columns and rows by fiducial. Raises InputError for what is none."""
+    """Parse columns and rows by fiducial. Raises InputError for invalid content."""
     if not isinstance(given, dict) or not all(isinstance(one, list) and len(one) == 2 for one in given.values()):
         raise InputError("px is column and row by fiducial.")
     return {str(point): (parse_pixels(col), parse_pixels(row)) for point, (col, row) in given.items()}
 
 
 def parse_pixels(given: Any) -> float:
-    """A column, a row or a size in px. Raises InputError for what is none."""
+    """Parse a column, row or size, px. Raises InputError for invalid content."""
     if isinstance(given, bool) or not isinstance(given, int | float) or not abs(given) < _MOST_PX:
         raise InputError(f"a column or row is a number of pixels, not {str(given)[:40]!r}.")
     return float(given)

@@ -1,9 +1,8 @@
-"""What of a project needs a person's eye, from the store: the worst first, each question once.
+"""Review queue: questions of a project for the user, from the results database.
 
-How a camera's marks look comes first, where nothing tells it, for without them nothing is found. Then a pose, for all
-names of its frame hang on it, and once where it is the same question for the frames of a roll; then frames in which
-nothing was found; then marks, those of frames with few others before those with many, for there a decision changes
-more.
+The order is: first cameras whose marks have no drawing or template, since nothing is found without them. Then scan
+orientations (poses), on which the names of all marks of a frame depend; asked once for all frames of a roll. Then
+frames without any mark found. Then marks, those of frames with few others first, since a decision changes more there.
 """
 
 import json
@@ -20,7 +19,7 @@ from pipeline.files.project_file import Project
 
 
 class Question(StrEnum):
-    """What is asked, in the order in which it is."""
+    """Kind of question, in the order of the queue."""
 
     CAMERA = "camera"
     POSE = "pose"
@@ -37,9 +36,16 @@ _WORST = (Status.REJECTED, Status.WEAK, Status.PREDICTED, Status.ABSENT)
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A question. images: of a camera all its scans, of a pose all frames that it is the same for, else one.
-    fingerprints: of the results that are looked at, in the order of the images; none of a camera. marks: how many were
-    found in the frame, or in one of the camera's. point, kind, status: of a mark; pose: in which it has that name.
+    """Question of the review queue.
+
+    Attributes
+    ----------
+    images : all scans of a camera, all frames with the same question about the pose, otherwise one frame.
+    fingerprints : of the results concerned, in the order of images; empty for a camera.
+    marks : number of marks found in the frame; for a camera, number of its frames with marks.
+    reason, code : why it is asked.
+    point, kind, status : of a mark.
+    pose : scan orientation in which the mark has that name.
     """
 
     question: Question
@@ -57,12 +63,12 @@ class Entry:
 
     @property
     def key(self) -> str:
-        """By which a page asks for it."""
+        """Identifier of the question in requests."""
         return json.dumps([self.question, self.images[0], self.point, self.kind], ensure_ascii=False)
 
     @property
     def is_left(self) -> bool:
-        """Whether it needs an answer. Marks that are found by what their scans have in common need not be shown."""
+        """Whether an answer is needed. It is optional for a camera whose marks were learned from its scans."""
         return self.question is not Question.CAMERA or self.marks == 0
 
     @property
@@ -71,7 +77,7 @@ class Entry:
 
 
 def build_queue(project: Project, db: sqlite3.Connection | None, judging: int) -> tuple[Entry, ...]:
-    """Every question of a judging, the worst first. db: None where nothing is judged yet."""
+    """Build the queue of one run of the cross-scan checks, the worst first. db: None before the first run."""
     if db:
         check_judging(db, judging, project.measurement_path)
     damaged = damaged_frames(db, judging) if db else {}
@@ -144,7 +150,7 @@ def _frames(db: sqlite3.Connection, judging: int) -> Iterator[_Frame]:
 
 
 def _cameras(project: Project, with_marks: Collection[str]) -> Iterator[Entry]:
-    """One for each camera whose marks are learned from its scans. with_marks: images in which some were found."""
+    """Yield a question for each camera whose marks are learned from its scans. with_marks: images with marks found."""
     for camera in project.cameras.values():
         images = (
             tuple(image for image in project.scans if project.image_camera(image) is camera)
@@ -157,7 +163,7 @@ def _cameras(project: Project, with_marks: Collection[str]) -> Iterator[Entry]:
 
 
 def _poses(frames: Sequence[_Frame]) -> Iterator[Entry]:
-    """One for each roll's question, and for each frame that is asked about by itself: those first that concern many."""
+    """Yield a question for each undetermined pose of a roll or frame, those that concern most frames first."""
     groups = defaultdict[tuple[str, str], list[_Frame]](list)
     for frame in sorted(frames, key=lambda frame: frame.image):
         if not frame.is_certain and frame.marks:
@@ -178,5 +184,5 @@ def _marks(db: sqlite3.Connection, judging: int, frames: dict[int, _Frame]) -> I
 
 
 def _badness(entry: Entry) -> tuple[int, bool, int, str]:
-    is_target = entry.kind != "fiducial"  # of which there are many, and of which few change anything
+    is_target = entry.kind != "fiducial"  # targets come last: they are many, and each matters little
     return (entry.marks if not is_target else 0, is_target, _WORST.index(Status(entry.status)), entry.images[0])

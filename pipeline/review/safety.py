@@ -1,7 +1,7 @@
-"""Who may ask: this machine's browser that was given the address, from the page itself, and nobody else.
+"""Access control of the review server: only the page itself, in the browser that was given the address.
 
-Any page that is open in the same browser can send requests to 127.0.0.1, and a name of its own can point there: so the
-Host, the Origin and a cookie that only this browser has are asked of every request.
+Any page open in the same browser can send requests to 127.0.0.1 (CSRF), and a foreign host name can resolve to it (DNS
+rebinding). Every request is therefore checked for its Host, its Origin and a cookie that only this browser has.
 """
 
 import hmac
@@ -28,7 +28,7 @@ _SPENT = "This page needs the address that `reseau review` printed, with what st
 
 
 class Guard:
-    """Lets only those requests through that may be answered. port: of the server."""
+    """ASGI middleware that refuses unauthorised requests. port: of the server."""
 
     def __init__(self, app: ASGIApp, port: int, token: str) -> None:
         self._app, self._token = app, token
@@ -43,7 +43,7 @@ class Guard:
         await (answer or self._app)(scope, receive, _add_headers(send))
 
     def _refusal(self, request: Request) -> Response | None:
-        """What is said to a request that is not let through; None to one that is."""
+        """Response to an unauthorised request, or the redirect that sets the cookie; None for an authorised request."""
         host, origin = request.headers.get("host", ""), request.headers.get("origin")
         if host not in self._hosts:
             return _refused(f"This server answers to {self._hosts[0]} only.\n")
@@ -56,7 +56,7 @@ class Guard:
         return None if hmac.compare_digest(own.encode(), self._secret.encode()) else _refused(_SPENT)
 
     def _welcome(self) -> Response:
-        """The token leaves the address, where others could read it, and a cookie stands for it."""
+        """Redirect that replaces the token in the address, where others could read it, by a cookie."""
         answer = RedirectResponse("/", status_code=303)
         answer.set_cookie(self._cookie, self._secret, httponly=True, samesite="strict")
         return answer

@@ -1,4 +1,4 @@
-"""The page on this machine: what it asks for, and what it is answered."""
+"""Local web server of the review page: routes and answers."""
 
 import getpass
 import secrets
@@ -43,15 +43,15 @@ _FILES = {
 }
 _LARGEST_BODY = 200_000  # bytes
 _WIDEST_PX = 60_000
-_OFFERED, _TRIED = 100, 4  # scans: to click a camera's marks in, and to try what was learned
-_HALF_PX = 40  # of a window about a mark whose size in pixels is not known
+_OFFERED, _TRIED = 100, 4  # scans offered for clicking a camera's marks, and scans for trying the learned templates
+_HALF_PX = 40  # px, half width of a window around a mark of unknown size
 
 
 class Server:
-    """A review as a web application on a port of this machine."""
+    """Review as a local web application."""
 
     def __init__(self, project: Project, port: int, who: str) -> None:
-        """port: 0 takes any that is free. Raises InputError where nothing is judged yet, or the port is taken."""
+        """port: 0 for any free port. Raises InputError if there are no checked results yet, or the port is in use."""
         self._session = Session(project, who)
         self._pictures = Pictures(project.max_pixels)
         self._socket = _bound(port)
@@ -61,7 +61,7 @@ class Server:
         self._app = Guard(_application(self._session, self._pictures), self.port, token)
 
     def run(self) -> None:
-        """Answer until it is interrupted."""
+        """Serve requests until interrupted."""
         config = uvicorn.Config(self._app, log_level="warning", access_log=False, server_header=False, lifespan="off")
         try:
             uvicorn.Server(config).run(sockets=[self._socket])
@@ -70,7 +70,7 @@ class Server:
 
 
 def serve(project: Project, port: int, who: str | None, opens_browser: bool, say: Callable[[str], None]) -> None:
-    """Print the address on a line of its own, and answer until Ctrl-C. who: decides; None: who is logged in."""
+    """Print the address on a line of its own, and serve until Ctrl-C. who: reviewer; None: the logged-in user."""
     server = Server(project, port, who or _login_name())
     say(server.address)
     sys.stdout.flush()
@@ -82,7 +82,7 @@ def serve(project: Project, port: int, who: str | None, opens_browser: bool, say
 def _login_name() -> str:
     try:
         return getpass.getuser()
-    except (OSError, KeyError):  # of a container whose user has no name
+    except (OSError, KeyError):  # in a container the user may have no name
         return "somebody"
 
 
@@ -91,7 +91,7 @@ def _bound(port: int) -> socket.socket:
     own.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         own.bind(("127.0.0.1", port))
-        own.listen()  # so that who has the address is answered, if a moment later
+        own.listen()  # requests sent before the server runs wait in the backlog
     except OSError as error:
         own.close()
         raise InputError(f"port {port}: {error.strerror or error}. Give another with --port, or 0 for any.") from None
@@ -126,7 +126,7 @@ def _application(session: Session, pictures: Pictures) -> Starlette:
 
 
 class _Answers:
-    """What each request is answered: from its query and its body, JSON or a picture."""
+    """Answers to requests, JSON or images, from query and body."""
 
     def __init__(self, session: Session, pictures: Pictures) -> None:
         self._session, self._pictures = session, pictures
@@ -172,7 +172,7 @@ class _Answers:
         return {**self._session.looking.view(image).frame_json(), "decided": self._session.image_decisions(image)}
 
     def camera(self, query: Query, body: Any) -> Any:
-        """Whose marks are to be learned: which they are, and scans to click them in."""
+        """Camera with marks to be learned: their names, and scans in which to click them."""
         entry = self._session.entry(query.text("key"))
         camera = self._session.project.image_camera(entry.images[0])
         return {
@@ -183,7 +183,7 @@ class _Answers:
         }
 
     def scan(self, query: Query, body: Any) -> Any:
-        """A scan that need not be measured yet."""
+        """Size of a scan, measured or not."""
         image = query.text("image")
         learned = self._session.project.image_camera(image).learned if self._session.project.cameras else ()
         size_px, pitch_um = self._pictures.size(self._session.scan_location(image))
@@ -225,7 +225,7 @@ class _Answers:
         if not isinstance(body, dict):
             raise InputError("clicks are missing.")
         image, clicks = str(body.get("image", "")), body.get("clicks")
-        self._session.looking.view(image)  # raises for one that is none
+        self._session.looking.view(image)  # raises KeyError for an unknown image
         if not isinstance(clicks, list) or len(clicks) < 3:
             raise InputError("three clicks on named marks or more are needed.")
         if not all(isinstance(one, dict) and {"point", "col_px", "row_px"} <= set(one) for one in clicks):
@@ -234,12 +234,12 @@ class _Answers:
         return _trial_json(measured_from_clicks(self._session.learned, image, given))
 
     def learn(self, query: Query, body: Any) -> Any:
-        """One scan measured with the marks as another one, or itself, shows them."""
+        """Measure a scan with templates learned from another scan or itself."""
         if not isinstance(body, dict) or not isinstance(body.get("px"), dict):
             raise InputError("clicks are missing.")
         shown, image = str(body.get("image", "")), str(body.get("of", ""))
         for name in (shown, image):
-            self._session.scan_location(name)  # raises for one that is none
+            self._session.scan_location(name)  # raises KeyError for an unknown image
         return _trial_json(measured_as_shown(self._session.project, shown, parse_places(body["px"]), image))
 
     def _scan(self, query: Query) -> str:
@@ -327,7 +327,7 @@ async def _body(request: Request) -> Any:
 
 
 def _refusal(error: Exception) -> Response:
-    """What went wrong in a sentence that the page shows; a fault of the program itself stays one."""
+    """Response with a message for the user; raises other errors, which are faults of the program."""
     match error:
         case KeyError():
             return PlainTextResponse(f"There is no {error.args[0]!r} here (any more).", 404)

@@ -1,4 +1,4 @@
-"""The state of a review: the queue as the results database and the decisions have it now, whoever changed them."""
+"""State of a review: the queue and its answers, kept up to date with the results database and the decisions file."""
 
 import threading
 from collections import Counter, defaultdict
@@ -27,23 +27,23 @@ from pipeline.measuring.learn_stage import add_learned_marks
 from pipeline.review.frame_view import Looking
 from pipeline.review.queue import Entry, Question, build_queue
 
-_COMPARED = 4096  # bytes before what is new, by which a file that goes on is told from another one
+_COMPARED = 4096  # bytes before the new part, compared to recognise a file that was only appended to
 Json = dict[str, Any]
 
-_NONE = -1  # no judging: nothing is measured yet
-PAGE = 100  # entries that a page gets at a time
+_NONE = -1  # no cross-scan checks yet
+PAGE = 100  # entries sent at a time
 
 
 class Ledger:
-    """The decisions that stand. Of a file that goes on only the new lines are read, however many there are."""
+    """Decisions in force. Only new lines are read from a decisions file that was appended to."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._seen: tuple[int, int, int] | None = None  # which file, its size, and when it was written
+        self._seen: tuple[int, int, int] | None = None  # inode, size and modification time
         self._forget()
 
     def update(self) -> frozenset[str] | None:
-        """The images about which there is something new; None where the whole file is another one."""
+        """Read new decisions. Returns the images concerned; None if the file was replaced and read again."""
         before, self._seen = self._seen, _state(self._path)
         if self._seen == before:
             return frozenset()
@@ -59,11 +59,11 @@ class Ledger:
         return stack[-1] if stack else None
 
     def image_decisions(self, image: str) -> Iterable[Decision]:
-        """Of its marks and its pose, in the order in which somebody first decided about each."""
+        """Decisions in force on the marks and the pose of an image, in the order of the first decision on each."""
         return (one for about in self._abouts.get(image, ()) if (one := self.get(about)) and about[2] != LEARNED)
 
     def learned(self, images: Collection[str]) -> Decision | None:
-        """From which the marks of a camera that has these images are learned."""
+        """Decision from which the marks of the camera of these images are learned."""
         return learned_from(self._learned, images)
 
     def _forget(self) -> None:
@@ -73,7 +73,7 @@ class Ledger:
         self._end, self._lines, self._tail = 0, 0, b""
 
     def _more(self) -> bytes | None:
-        """What stands behind all that was read; None where that is not there any more as it was."""
+        """Bytes appended to the file; None if the part already read has changed."""
         if not self._tail.endswith(b"\n"):
             return None
         data = decisions_bytes(self._path, self._end - len(self._tail))
@@ -100,7 +100,7 @@ def _state(path: Path) -> tuple[int, int, int] | None:
 
 @dataclass(frozen=True)
 class Filters:
-    """Which questions are shown; "" is all of them. search: a part of an image's name."""
+    """Filters of the questions shown; "" for all. search: part of an image's name."""
 
     question: str = ""
     verdict: str = ""
@@ -124,7 +124,7 @@ class Filters:
 
 @dataclass(frozen=True)
 class _Shown:
-    """The questions that filters let through, their keys, and those of them that need an answer."""
+    """Questions that pass the filters, their keys, and the keys of those that need an answer."""
 
     filters: Filters
     entries: tuple[Entry, ...]
@@ -140,10 +140,10 @@ class _Shown:
 
 
 class Session:
-    """A review of a project. Threads may call any of it."""
+    """Review of a project. Thread-safe."""
 
     def __init__(self, project: Project, who: str) -> None:
-        """Raises InputError where there is nothing to ask yet."""
+        """Raises InputError if there are no checked results and no scans."""
         self.project, self.who = project, who
         self.folder = project.path.resolve().parent
         self.looking = Looking(project.measurement_path, self.folder, lambda image: self.learned.image_camera(image))
@@ -159,7 +159,7 @@ class Session:
             )
 
     def refresh(self) -> None:
-        """Know what another process measured, or another window decided."""
+        """Update the queue and its answers from the results database and the decisions file."""
         with self._lock:
             judging = self.looking.judging()
             row = _NONE if judging is None else judging.row
@@ -178,8 +178,8 @@ class Session:
                     self._left[entry.question] += (before is not None) - (now is not None)
 
     def decide(self, decisions: Sequence[Decision], key: str = "") -> None:
-        """Write decisions down, all of them or none. key: of a question about several frames, for all of which they
-        are. Raises InputError for what cannot be decided, and KeyError for a question that is none any more."""
+        """Append decisions to the file, all or none. key: of a question about several frames; the decisions then apply
+        to all of them. Raises InputError for an invalid decision, and KeyError for an obsolete question."""
         when = datetime.now(UTC).isoformat(timespec="seconds")
         with self._lock:
             for one in decisions:
@@ -193,7 +193,7 @@ class Session:
             self.refresh()
 
     def page(self, filters: Filters, start: int = 0) -> Json:
-        """Counts of what is left, and some of the questions that filters let through, from one on."""
+        """Numbers of open questions, and PAGE of the questions that pass the filters, from start on."""
         self.refresh()
         with self._lock:
             if self._shown is None or self._shown.filters != filters:
@@ -216,7 +216,7 @@ class Session:
         return key in shown.open_keys and key not in self._answers
 
     def choices(self) -> Json:
-        """What filters can be set to."""
+        """Possible values of the filters."""
         return {
             "questions": [str(question) for question in Question],
             "verdicts": sorted({entry.verdict for entry in self._queue if entry.verdict}),
@@ -228,11 +228,11 @@ class Session:
 
     @property
     def camera_name(self) -> str:
-        """The file that a camera drawn here is to be written to: that which the project still lacks, or another one."""
+        """Default file name of a drawn camera: the camera file missing in the project, or another name."""
         return self.project.missing_camera or "drawn-camera.toml"
 
     def entry(self, key: str) -> Entry:
-        """Raises KeyError for a question that is none, or none any more."""
+        """Question by its key. Raises KeyError for an unknown or obsolete one."""
         return self._by_key[key]
 
     def entry_json(self, entry: Entry) -> Json:
@@ -257,12 +257,12 @@ class Session:
         }
 
     def scan_location(self, image: str) -> str:
-        """The path or the address of its file. Raises KeyError where no such image is known."""
+        """Path or address of an image's file. Raises KeyError for an unknown image."""
         given = self.project.scans.get(image)
         return self.looking.view(image).scan.scan if given is None else fetch_location(given)
 
     def image_decisions(self, image: str) -> list[Json]:
-        """All that stands decided in a frame."""
+        """JSON of the decisions in force on a frame."""
         with self._lock:
             return [_answer_json(one) for one in self._ledger.image_decisions(image)]
 
@@ -285,8 +285,11 @@ class Session:
         return {entry.key: entry for image in images for entry in self._of_image.get(image, ())}.values()
 
     def _find_answer(self, entry: Entry) -> Decision | None:
-        """What answers a question: about all of its frames; of one without marks, about any of its marks; of a mark in
-        a frame that lies otherwise, that it does."""
+        """Decision that answers a question; None if it is open.
+
+        A question about several frames needs decisions on all of them. Any decision on a frame answers the question
+        about a frame without marks. A changed pose answers the questions about marks, since it renames them.
+        """
         match entry.question:
             case Question.CAMERA:
                 return self._ledger.learned(frozenset(entry.images))
@@ -310,19 +313,19 @@ class Session:
         return first
 
     def _old_json(self, entry: Entry) -> Json | None:
-        """A decision about another result than the one that is there now."""
+        """JSON of a decision on an earlier result; None if there is none."""
         if entry.question in (Question.CAMERA, Question.FRAME):
             return None
         one = self._ledger.get((entry.images[0], entry.point, entry.kind))
         return None if one is None or _names_result(one, entry.fingerprints[0]) else _answer_json(one)
 
     def _add_fingerprint(self, one: Decision) -> Decision:
-        """Pictures are learned from the file as it is now, and from no other one of its name."""
+        """Add the fingerprint of the scan to a decision to learn marks, so that it applies to this file only."""
         is_learned = one.decision is Choice.LEARN
         return replace(one, fingerprint=digest(self.project.scans[one.image])) if is_learned else one
 
     def _check(self, one: Decision) -> None:
-        """Images and points are those of the project and its store, and never paths."""
+        """Check that image and mark exist and the decision is possible. Raises InputError otherwise."""
         if one.subject[2] == LEARNED:
             self._check_learned(one)
             return
@@ -347,7 +350,7 @@ class Session:
 
 
 def _names_result(one: Decision, fingerprint: str) -> bool:
-    """Whether a decision is about the result that is there now."""
+    """Whether a decision refers to the current result."""
     return one.fingerprint in ("", fingerprint)
 
 
