@@ -1,1 +1,1 @@
-"""The least-squares solution of blocks that share unknowns, and its covariance."""
+"""Least-squares solution of blocks with shared unknowns, and its covariance."""

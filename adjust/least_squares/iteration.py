@@ -1,4 +1,4 @@
-"""Relinearise and solve until unknowns and adjusted observations stand still."""
+"""Gauss-Newton iteration with damping: linearise and solve until the unknowns and adjusted observations converge."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,26 +17,30 @@ from adjust.problem.estimates import Termination
 from adjust.problem.further_observations import square_sum
 from adjust.problem.problem import State
 
-STANDSTILL_SIGMAS = 1e-8  # a step below this, in standard deviations, is none
-FORESEEN = 0.1  # of that: a next step that would be smaller if it shrank as the last two did need not be taken
-ROUNDING_SIGMAS = 1e-5  # steps below this that no longer shrink are rounding
-VPV_ROUNDING = 1e-9  # relative increase of v'Pv that is not an increase
+STANDSTILL_SIGMAS = 1e-8  # in standard deviations: largest step at convergence
+FORESEEN = 0.1  # fraction of that: a next step predicted to be smaller, from the last ones, need not be taken
+ROUNDING_SIGMAS = 1e-5  # in standard deviations: smaller steps that no longer shrink are rounding errors
+VPV_ROUNDING = 1e-9  # relative increase of v'Pv that may be rounding
 FIRST_DAMPING = 1e-4
 LEAST_DAMPING = 1e-9
 LARGEST_DAMPING = 1e8
-POOR_GAIN = 0.25  # of the promised decrease of v'Pv, below which the next step is damped
-LARGEST_EASING = 0.1  # of the damping after a good step
-PROBE = 0.1  # part of a step over which its curvature is taken
-LARGEST_TURN = 0.75  # of a step's length that its second-order part may have
-SLOW = 0.5  # of the step before, above which a step shrinks slowly
-LARGEST_STRETCH = 10.0  # times as long as a step that an accelerated one may be
+POOR_GAIN = 0.25  # fraction of the predicted decrease of v'Pv below which the next step is damped
+LARGEST_EASING = 0.1  # smallest factor of the damping after a good step
+PROBE = 0.1  # fraction of a step used for the difference quotient of its curvature
+LARGEST_TURN = 0.75  # largest second-order part, as a fraction of the step's length
+SLOW = 0.5  # ratio to the step before above which convergence is slow
+LARGEST_STRETCH = 10.0  # largest ratio of an accelerated step to the plain one
 
 
 class Iteration(NamedTuple):
-    """A step of the iteration: v'Pv after it, how far it moves what moves most, its damping, the attempts.
+    """Record of a step of the iteration.
 
-    A step that would have increased v'Pv, or after which some point would have had no image, was tried again with more
-    damping (0: an undamped Gauss-Newton step).
+    Attributes
+    ----------
+    vpv : v'Pv after the step.
+    largest_step_sigmas : length of the step: the largest change of any function of the unknowns, in its sigmas.
+    damping : 0 for an undamped Gauss-Newton step.
+    attempts : trials, each with more damping, until v'Pv did not increase and every point had an image.
     """
 
     vpv: float
@@ -47,9 +51,14 @@ class Iteration(NamedTuple):
 
 @dataclass(frozen=True)
 class Linearised:
-    """The equations at a state: computed observations and residuals (n, 2) in mm, whitened rows, v'Pv.
+    """Observation equations linearised at a state.
 
-    by_observation (n, 2, 2): A, the derivatives of the functions by the observations.
+    Attributes
+    ----------
+    computed_mm, v_mm : (n, 2) computed observations and residuals.
+    by_observation : (n, 2, 2) A, derivatives of the condition equations with respect to the observations.
+    rows : whitened rows.
+    vpv : v'Pv.
     """
 
     state: State
@@ -61,13 +70,13 @@ class Linearised:
 
     @cached_property
     def factor(self) -> Factor:
-        """The square root of the normal equations, undamped."""
+        """Square root of the undamped normal equations."""
         return factorise(self.rows.numbering, self)
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Where the iteration ended, and the factor there: None where the equations could not be solved."""
+    """Final state of the iteration, and the factor there; None if the equations could not be solved."""
 
     end: Linearised
     factor: Factor | None
@@ -76,7 +85,7 @@ class Solution:
 
 
 def linearise(numbering: Numbering, covariance_mm2: Array, state: State) -> Linearised | None:
-    """The equations at a state; None where some point has no image there."""
+    """Linearise the observation equations at a state; None if some point has no image there."""
     problem = numbering.problem
     computed = compute(problem, state)
     if computed is None:
@@ -92,28 +101,39 @@ def linearise(numbering: Numbering, covariance_mm2: Array, state: State) -> Line
 
 
 def factorise(numbering: Numbering, at: Linearised, damping: float = 0.0, camera_priors: bool = True) -> Factor:
-    """The square root of the normal equations, with or without the priors of the cameras (F5 to F9)."""
+    """Factorise the normal equations, with or without the priors of the cameras (F5 to F9)."""
     weights = prior_root_weights(numbering)
     if not camera_priors:
         weights = np.where(camera_mask(numbering), 0.0, weights)
     differences = prior_differences(numbering.problem, at.state)[numbering.free]
     system = len(numbering.free), weights, weights * differences
-    # Without these priors the factor tells what is weak: nothing is solved with it.
+    # Without these priors the factor only serves to find weak directions, so it need not be sharp.
     return eliminate(at.rows, *system, damping, at.rows.sparse, camera_priors, numbering.fronts)
 
 
 def iterate(
     numbering: Numbering, covariance_mm2: Array, state: State, limit: int, is_singular: Callable[[Linearised], bool]
 ) -> Solution | None:
-    """Gauss-Newton steps, damped where they fail (Levenberg and Marquardt), until nothing moves any more.
+    """Iterate Gauss-Newton steps, damped where they fail (Levenberg and Marquardt), until convergence.
 
-    A step is taken when it makes v'Pv smaller; if not, or where a point would have no image after it, the damping
-    grows. How much of the promised decrease came about, the gain, decides on the next damping (Nielsen 1999, Damping
-    parameter in Marquardt's method). Damped steps are bent along the curve on which the linear residuals stay
-    (`_bent`): that follows the valleys in which the principal distance changes with heights and scale. Undamped steps
-    that shrink slowly are accelerated (`_accelerated`).
+    Parameters
+    ----------
+    covariance_mm2 : (n, 2, 2) covariance matrices of the observations.
+    state : initial values.
+    limit : largest number of steps.
+    is_singular : decides at the initial values whether the equations are singular.
 
-    is_singular: whether the equations say so, asked at the state where it begins. None: some point has no image there.
+    Returns
+    -------
+    Solution; None if some point has no image at the initial values.
+
+    Notes
+    -----
+    A step is accepted if it decreases v'Pv. Otherwise, or if a point would have no image after it, the damping is
+    increased. The gain, the ratio of the actual to the predicted decrease, determines the next damping (Nielsen 1999,
+    Damping parameter in Marquardt's method). Damped steps are corrected to the second order (`_bent`), to follow curved
+    valleys in which the principal distance is correlated with heights and scale. Undamped steps that shrink slowly are
+    accelerated (`_accelerated`).
     """
     at = linearise(numbering, covariance_mm2, state)
     if at is None:
@@ -136,7 +156,7 @@ def iterate(
 
 
 def _stands_still(history: list[Iteration]) -> bool:
-    """Whether the last step was none, or rounding, or so much smaller than those before that the next will be none."""
+    """Whether the iteration converged: the last step was negligible or rounding, or the next one will be negligible."""
     steps = [each.largest_step_sigmas for each in history[-3:]]
     if steps[-1] < STANDSTILL_SIGMAS:
         return True
@@ -147,7 +167,7 @@ def _stands_still(history: list[Iteration]) -> bool:
 
 
 def _eased(damping: float, gain: float) -> float:
-    """The damping of the next step: less where the linear equations told the truth, more where they did not."""
+    """Damping of the next step: smaller if the linear prediction was good, larger if it was not (Nielsen 1999)."""
     if damping == 0.0:
         return 0.0 if gain > POOR_GAIN else FIRST_DAMPING
     eased = damping * max(LARGEST_EASING, 1.0 - (2.0 * gain - 1.0) ** 3)
@@ -156,9 +176,15 @@ def _eased(damping: float, gain: float) -> float:
 
 @dataclass(frozen=True)
 class _Moved:
-    """A step that was taken: where it leads, its length in standard deviations, and how it came about.
+    """Accepted step.
 
-    solution (n,): that of the linear equations; taken (n,): what was made of it.
+    Attributes
+    ----------
+    end : equations after the step.
+    sigmas : length of the step, in standard deviations.
+    damping, gain, attempts : damping, ratio of the actual to the predicted decrease of v'Pv, number of trials.
+    solution : (n,) solution of the linear equations.
+    taken : (n,) the step taken: this solution, or the corrected or accelerated one.
     """
 
     end: Linearised
@@ -173,9 +199,9 @@ class _Moved:
 def _step(
     numbering: Numbering, covariance_mm2: Array, at: Linearised, damping: float, lately: float, before: _Moved | None
 ) -> _Moved | None:
-    """The first step from a state that makes v'Pv smaller, with more and more damping; None: there is none.
+    """Take the first step that decreases v'Pv, with increasing damping; None if there is none.
 
-    lately: the damping that helped lately, to be tried where it takes some. before: the step before.
+    lately: damping of the last successful damped step, tried first where damping is needed. before: the step before.
     """
     problem = numbering.problem
     attempts = 0
@@ -193,11 +219,11 @@ def _step(
         step = np.zeros(len(problem.unknowns))
         step[numbering.free] = solution
         if np.isfinite(step).all():
-            # The damping's rows, which hold the scaled unknowns where they are, take their part of the decrease.
+            # Predicted decrease of v'Pv: factor.length() belongs to the damped equations, so add the damping term.
             promised = factor.length() ** 2 + damping * float(((factor.scale * solution) ** 2).sum())
             bent = step if damping == 0.0 else _bent(numbering, at, damping, step)
             moved = None if bent is None else linearise(numbering, covariance_mm2, problem.step_state(at.state, bent))
-            is_rounding = damping == 0.0 and factor.length() < ROUNDING_SIGMAS  # and so is what it does to v'Pv
+            is_rounding = damping == 0.0 and factor.length() < ROUNDING_SIGMAS  # and so is the change of v'Pv
             is_better = moved is not None and (is_rounding or moved.vpv <= at.vpv + VPV_ROUNDING * (1.0 + at.vpv))
             if bent is not None and moved is not None and is_better:
                 gain = (at.vpv - moved.vpv) / promised if promised > VPV_ROUNDING * (1.0 + at.vpv) else 1.0
@@ -207,11 +233,11 @@ def _step(
 
 
 def _accelerated(numbering: Numbering, covariance_mm2: Array, at: Linearised, before: _Moved) -> _Moved | None:
-    """An undamped step with what the one before tells of its error; None where that is no better.
+    """Accelerate an undamped step by the one before; None if that is not possible or no better.
 
-    Where observations hardly determine a direction, the second derivatives of large residuals make Gauss-Newton's steps
-    shrink slowly, or overshoot. The combination of the last two steps of least length takes their place (Anderson 1965,
-    Iterative procedures for nonlinear integral equations; of depth one).
+    In weakly determined directions, the second derivatives neglected with large residuals make Gauss-Newton steps
+    shrink slowly, or overshoot. The combination of the last two steps of least length replaces the step (Anderson 1965,
+    Iterative procedures for nonlinear integral equations; depth one).
     """
     problem, factor = numbering.problem, at.factor
     step = np.zeros(len(problem.unknowns))
@@ -232,10 +258,10 @@ def _accelerated(numbering: Numbering, covariance_mm2: Array, at: Linearised, be
 
 
 def _bent(numbering: Numbering, at: Linearised, damping: float, step: Array) -> Array | None:
-    """A damped step with its second-order part; None where that is too large to be trusted, or cannot be found.
+    """Add the second-order correction to a damped step; None if it is too large or cannot be computed.
 
-    The second derivative of the observations along the step, by a difference, takes the place of an observation:
-    geodesic acceleration (Transtrum and Sethna 2012, Improvements to the Levenberg-Marquardt algorithm).
+    Geodesic acceleration (Transtrum and Sethna 2012, Improvements to the Levenberg-Marquardt algorithm): the second
+    derivative of the observations along the step, by a difference quotient, is added to the discrepancies.
     """
     problem = numbering.problem
     ahead = computed_observations(problem, problem.step_state(at.state, PROBE * step))

@@ -1,4 +1,4 @@
-"""The free unknowns of a problem, numbered, and what the blocks of its observations touch of them."""
+"""Numbering of the free unknowns of a problem, and the unknowns involved in each block of observations."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,16 +12,19 @@ from adjust.linear_algebra.fronts import Fronts, band_order, make_fronts
 from adjust.linear_algebra.schur_complement import Pattern
 from adjust.problem.problem import ABSENT, Problem, side_by_side
 
-ELEMENTS_AT_ONCE = 2_000_000  # of the matrices of blocks that are handled together
+ELEMENTS_AT_ONCE = 2_000_000  # matrix elements of the blocks in one batch
 
 
 @dataclass(frozen=True)
 class Touched:
-    """What b blocks of equal shape touch: their own and shared free unknowns, and where every derivative goes.
+    """Unknowns of b blocks of equal shape, and the columns of their derivatives.
 
-    rows (b, m): the observations of every block; own (b, o), shared (b, s): numbers of unknowns. columns (b, m, k): the
-    column, own unknowns first, of every derivative; one column behind the last for what is fixed or absent. Where all
-    blocks or all observations agree, b or m is 1.
+    Attributes
+    ----------
+    rows : (b, m) observations of each block.
+    own, shared : (b, o), (b, s) numbers of the free unknowns.
+    columns : (b, m, k) column of each derivative, own unknowns first; the column after the last for fixed or absent
+        quantities. b or m is 1 where all blocks or all observations agree.
     """
 
     rows: Indices
@@ -32,12 +35,12 @@ class Touched:
 
 @dataclass(frozen=True)
 class Numbering:
-    """The free unknowns of a problem, numbered: those that blocks of observations share, then the blocks' own.
+    """Numbering of the free unknowns: those shared by blocks of observations first, then the blocks' own.
 
-    A block is a frame, with its orientation and the transformations and joins of its scans. Where object points have
-    more unknowns than frames have, a block is a point with its coordinates, and the frames' unknowns are shared:
-    whichever leaves less to share. What a frame shows besides, its fiducials and the known points, is then a block
-    without own unknowns. Points and frames that further observations tie to others have no unknowns of their own:
+    A block is a frame, which owns its exterior orientation and the film transformations and join points of its scans.
+    If the object points have more unknowns than the frames, a block is a point, which owns its coordinates, and the
+    unknowns of the frames are shared: so fewer unknowns are shared. The remaining observations of a frame, of fiducials
+    and known points, then form a block without own unknowns. Points and frames in further observations own no unknowns:
     theirs are shared.
     """
 
@@ -45,31 +48,32 @@ class Numbering:
 
     @cached_property
     def free(self) -> Indices:
-        """Positions of the free unknowns; the shared ones as they are eliminated."""
+        """Positions of the free unknowns, the shared ones in elimination order."""
         free = np.flatnonzero(self.problem.unknowns.sigma > 0.0)
         return np.concatenate([self._shared_order.positions, free[np.isin(free, self._blocks.owned)]])
 
     @property
     def fronts(self) -> Fronts:
-        """In which the shared unknowns are eliminated."""
+        """Fronts of the shared unknowns."""
         return self._shared_order.fronts
 
     @cached_property
     def touched(self) -> list[Touched]:
-        """What every block touches, blocks of equal shape together."""
+        """Unknowns of all blocks, blocks of equal shape together."""
         return list(_arranged(self.numbers[self.problem.columns], self._blocks, self.numbers))
 
     @cached_property
     def numbers(self) -> Indices:
-        """By position: the number of a free unknown, ABSENT for what is fixed, and at the end for ABSENT."""
+        """Number of each unknown by position; ABSENT for fixed ones, and as the last element, for ABSENT itself."""
         numbers = np.full(len(self.problem.unknowns) + 1, ABSENT, dtype=np.intp)
         numbers[self.free] = np.arange(len(self.free))
         return numbers
 
     @cached_property
     def pattern(self) -> Pattern | None:
-        """What every observation touches, without blocks being laid out; None where no images or points are shared, and
-        where the frames that own unknowns are parts put together.
+        """Sparsity pattern of the observations.
+
+        None if no images or points are shared, or if frames own unknowns and some are scanned in parts.
         """
         problem, unknowns = self.problem, self.problem.unknowns
         exterior, place, film, *_ = problem.parts
@@ -115,9 +119,9 @@ class Numbering:
 
     @cached_property
     def _shared_order(self) -> "_Shared":
-        """The shared unknowns: images, or points, that are neighbours one after the other, what is of none behind.
+        """Shared unknowns in elimination order: neighbouring images (or points) in sequence, the remaining ones last.
 
-        As they are numbered where all of them are one front.
+        In their original order if they form a single front.
         """
         free = np.flatnonzero(self.problem.unknowns.sigma > 0.0)
         shared = free[~np.isin(free, self._blocks.owned)]
@@ -136,12 +140,12 @@ class Numbering:
 
     @property
     def _grouped(self) -> Indices:
-        """Positions (g, k) of the unknowns of every frame, or of every point: those that blocks do not own."""
+        """Positions (g, k) of the unknowns of each frame, or of each point: of the kind that blocks do not own."""
         return self._frame_unknowns if self._points_own else self._point_unknowns
 
     @cached_property
     def _group(self) -> Indices:
-        """By position: of which image or point, of those that are grouped, it is, ABSENT for others and at the end."""
+        """Group (frame or point) of each unknown by position; ABSENT for others, and as the last element."""
         group = np.full(len(self.problem.unknowns) + 1, ABSENT, dtype=np.intp)
         group[self._grouped] = np.arange(len(self._grouped))[:, None]
         group[ABSENT] = ABSENT
@@ -149,7 +153,7 @@ class Numbering:
 
     @property
     def _group_meetings(self) -> csr_array:
-        """Which groups (b, g) every block of observations meets, and behind these every further observation."""
+        """Incidence matrix (b, g) of blocks and groups; further observations follow the blocks as more rows."""
         groups = [self._frame_of_rows if self._points_own else self._group[self.problem.places[:, 0]]]
         blocks = [self._blocks.of]
         for i, further in enumerate(self.problem.further):
@@ -171,7 +175,7 @@ class Numbering:
 
     @cached_property
     def _is_tied(self) -> Mask:
-        """By position: what further observations tie to other unknowns; the last stands for ABSENT."""
+        """Mask by position of the unknowns in further observations; the last element stands for ABSENT."""
         tied = np.zeros(len(self.problem.unknowns) + 1, dtype=bool)
         for further in self.problem.further:
             tied[further.positions] = True
@@ -179,7 +183,7 @@ class Numbering:
 
     @cached_property
     def _frame_unknowns(self) -> Indices:
-        """Positions (frames, k) of the unknowns of every frame, ABSENT behind those that have less."""
+        """Positions (frames, k) of the unknowns of each frame, padded with ABSENT."""
         unknowns = self.problem.unknowns
         own: dict[str, list[Indices]] = {}
         for image in self.problem.network.images:
@@ -190,12 +194,12 @@ class Numbering:
 
     @cached_property
     def _frame_of_rows(self) -> Indices:
-        """(n,) the frame of every observation, by its number."""
+        """(n,) number of the frame of each observation."""
         return self.problem.network.frame_numbers[self.problem.image_numbers]
 
     @cached_property
     def _point_unknowns(self) -> Indices:
-        """Positions (points, 3) of the unknowns of every point."""
+        """Positions (points, 3) of the unknowns of each point."""
         return np.array(list(self.problem.unknowns.point.values()), dtype=np.intp).reshape(-1, 3)
 
     @cached_property
@@ -219,7 +223,7 @@ class Numbering:
 
 @dataclass(frozen=True)
 class _Shared:
-    """positions (s,) of the shared unknowns as they are eliminated, and in which fronts."""
+    """Positions (s,) of the shared unknowns in elimination order, and their fronts."""
 
     positions: Indices
     fronts: Fronts
@@ -227,26 +231,27 @@ class _Shared:
 
 @dataclass(frozen=True)
 class _Blocks:
-    """owned (b, k): positions of the own unknowns of every block, ABSENT where it has less; of (n,): whose block every
-    observation is.
-    """
+    """Blocks. owned (b, k): positions of their own unknowns, padded with ABSENT; of (n,): block of each observation."""
 
     owned: Indices
     of: Indices
 
 
 def _arranged(derivatives: Indices, blocks: _Blocks, numbers: Indices) -> Iterator[Touched]:
-    """Blocks of equal shape together; derivatives (n, k): the numbers of their unknowns; numbers: by position."""
+    """Group blocks by shape.
+
+    derivatives (n, k): numbers of the unknowns of each derivative; numbers: number of each unknown by position.
+    """
     owned = numbers[blocks.owned]
     count, owns = int(numbers.max(initial=ABSENT)) + 1, owned != ABSENT
     first_own = count - int(owns.sum())
     rank = (np.arange(count + 1) - first_own) % max(count, 1)  # own unknowns first; the last stands for ABSENT
     order = np.argsort(blocks.of, kind="stable")
-    # Most observations of a block touch what the one before touched: such runs are looked at once.
+    # Most observations involve the same unknowns as the one before: process such runs once.
     of, unknown = blocks.of[order], derivatives[order]
     begins = np.append(True, (of[1:] != of[:-1]) | (unknown[1:] != unknown[:-1]).any(axis=1))[: len(of)]
     run, of, unknown = np.cumsum(begins) - 1, of[begins], unknown[begins].T
-    # Every pair of a block and an unknown that it touches or owns: block by block, its own unknowns first.
+    # All pairs of a block and an unknown that it involves or owns: block by block, own unknowns first.
     pair = np.where(unknown == ABSENT, ABSENT, of * count + rank[unknown])
     new = pair != ABSENT
     new[:, 1:] &= pair[:, 1:] != pair[:, :-1]
@@ -256,7 +261,7 @@ def _arranged(derivatives: Indices, blocks: _Blocks, numbers: Indices) -> Iterat
     widths = np.diff(first, append=len(pairs))
     own_counts = owns.sum(axis=1)
     touched = place[np.maximum(np.cumsum(new).reshape(new.shape) - 1, 0)]
-    columns = np.where(pair == ABSENT, widths[of], touched - first[of]).T  # behind the last for what is absent
+    columns = np.where(pair == ABSENT, widths[of], touched - first[of]).T  # after the last for absent ones
     unknown = (pairs % count + first_own) % count
 
     heights = np.bincount(blocks.of, minlength=len(owned))
@@ -275,7 +280,7 @@ def _arranged(derivatives: Indices, blocks: _Blocks, numbers: Indices) -> Iterat
 
 
 def _agreed(columns: Indices, run: Indices) -> Indices:
-    """The columns (b, m, k) of the runs (b, m) of observations, b or m 1 where all agree."""
+    """Columns (b, m, k) of the runs (b, m) of observations; b or m is 1 where all agree."""
     if (run == run[:, :1]).all():
         run = run[:, :1]
     of_rows = columns[run]

@@ -1,4 +1,4 @@
-"""The weighted rows of an adjustment: whitened pairs F1, F2 and F3, F4 in blocks, and the unknowns' priors."""
+"""Weighted rows of an adjustment: whitened condition equations F1, F2 and F3, F4 in blocks, and priors of unknowns."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -19,10 +19,14 @@ from adjust.problem.problem import ABSENT, Problem, State
 
 @dataclass(frozen=True)
 class WhitenedRows:
-    """Rows of unit weight; in turn the blocks of `Numbering.touched`, put together as asked for.
+    """Rows of unit weight; iterates over the blocks of `Numbering.touched`, formed on demand, and of `further`.
 
-    A block for each further observation follows. root (n, 2, 2): the factor L of A C A' = L L'; matrix (n, 2, k): by
-    the unknowns at `Problem.columns`; right (n, 2).
+    Attributes
+    ----------
+    root : (n, 2, 2) Cholesky factor L of A C A' = L L'.
+    matrix : (n, 2, k) derivatives with respect to the unknowns at `Problem.columns`.
+    right : (n, 2) right sides.
+    further : one block for each further observation.
     """
 
     numbering: Numbering
@@ -37,22 +41,22 @@ class WhitenedRows:
         yield from self.further
 
     def replace_discrepancies(self, by_observation: Array, v_mm: Array) -> "WhitenedRows":
-        """The same rows with other v (n, 2) on the right side; by_observation: A (n, 2, 2)."""
+        """Replace the right side by that of other discrepancies v (n, 2); by_observation: A (n, 2, 2)."""
         return replace(self, right=_whitened(self.root, applied(by_observation, v_mm)[..., None])[..., 0])
 
     def change_mm(self, by_observation: Array, step: Array) -> Array:
-        """How the computed observations (n, 2) change with a step of the unknowns, to the first order: -A^-1 B dx."""
+        """First-order change -A^-1 B dx of the computed observations (n, 2) by a step dx of the unknowns."""
         by_column = np.append(step, 0.0)[self.numbering.problem.columns]  # the last stands for ABSENT
         along = applied(self.root, np.einsum("nij,nj->ni", self.matrix, by_column))
         return -applied(inverse(by_observation), along)
 
     @cached_property
     def sparse(self) -> SparseRows | None:
-        """The same where blocks share more than a few unknowns."""
+        """Rows in sparse form; None without a `Numbering.pattern`."""
         pattern = self.numbering.pattern
         if pattern is None:
             return None
-        itself = replace(self)  # without what is kept here: no cycle, so that a step's memory is free for the next
+        itself = replace(self)  # a copy avoids a reference cycle, so that the memory is freed before the next step
         return SparseRows(pattern, self.matrix, self.right, self.further, itself._arranged)
 
     def _arranged(self) -> Iterator[tuple[Indices, Blocks]]:
@@ -64,10 +68,10 @@ class WhitenedRows:
 def whitened_rows(
     numbering: Numbering, values: Array, at: Derivatives, covariance_mm2: Array, v_mm: Array
 ) -> WhitenedRows:
-    """The rows B dx = w of all blocks, every pair multiplied by L^-1, where A C A' = L L'.
+    """Whiten the rows B dx = w of all blocks: multiply each pair by L^-1, where A C A' = L L'.
 
-    At computed observations F is 0, so that w = -A (l_obs - l_k) = A v, with v (n, 2) = computed less observed. The
-    derivatives B are divided where they are, and are not these any more.
+    F is 0 at the computed observations, so that w = -A (l_obs - l_k) = A v, with v (n, 2) = computed minus observed.
+    The derivatives B in `at` are overwritten.
     """
     a, matrix = at.by_observation, at.by_unknowns
     further = tuple(_further_block(numbering, each, values) for each in numbering.problem.further)
@@ -81,7 +85,7 @@ def whitened_rows(
 
 
 def _whitened(root: Array, rows: Array) -> Array:
-    """Rows (n, 2, k) divided by lower triangles (n, 2, 2), in their own memory: it is the largest array of a step."""
+    """Multiply rows (n, 2, k) by the inverses of lower triangles (n, 2, 2), in place to save memory."""
     rows[:, 0] /= root[:, 0, :1]
     rows[:, 1] -= root[:, 1, :1] * rows[:, 0]
     rows[:, 1] /= root[:, 1, 1:]
@@ -89,13 +93,13 @@ def _whitened(root: Array, rows: Array) -> Array:
 
 
 def _blocks(touched: Touched, matrix: Array, right: Array) -> Blocks:
-    """The rows of blocks of equal shape, of all (n, 2, k), with every derivative in its unknown's column."""
+    """Form dense rows of blocks of equal shape from all rows (n, 2, k), each derivative in its unknown's column."""
     (count, height), width = touched.rows.shape, touched.own.shape[1] + touched.shared.shape[1]
     of_blocks = _row_values(right, touched.rows).reshape(count, 2 * height)
     if touched.columns.shape[:2] == (1, 1) and np.array_equal(touched.columns[0, 0], np.arange(width)):
         as_they_are = _row_values(matrix, touched.rows).reshape(count, 2 * height, width)
         return Blocks(touched.own, touched.shared, as_they_are, of_blocks)
-    by_column = np.zeros((count, width + 1, height, 2))  # what an operation on a column takes stands together
+    by_column = np.zeros((count, width + 1, height, 2))  # contiguous by column, for column operations
     if touched.columns.shape[:2] == (1, 1):
         for k, column in enumerate(touched.columns[0, 0]):
             by_column[:, column] = _row_values(matrix[..., k], touched.rows)
@@ -110,7 +114,7 @@ def _blocks(touched: Touched, matrix: Array, right: Array) -> Blocks:
 
 
 def _row_values(values: Array, rows: Indices) -> Array:
-    """Values (b, m, ...), of all (n, ...), of some rows (b, m); without a copy where they stand in order."""
+    """Values (b, m, ...) of rows (b, m) from all values (n, ...); a view if the rows are consecutive."""
     first, count = int(rows[0, 0]) if rows.size else 0, rows.size
     if np.array_equal(rows.ravel(), np.arange(first, first + count)):
         return values[first : first + count].reshape(*rows.shape, *values.shape[1:])
@@ -118,7 +122,7 @@ def _row_values(values: Array, rows: Indices) -> Array:
 
 
 def _further_block(numbering: Numbering, further: FurtherObservation, values: Array) -> Blocks:
-    """The rows f'(x) dx = l - f(x) of a further observation; what it touches is shared."""
+    """Rows f'(x) dx = l - f(x) of a further observation, all of whose unknowns are shared."""
     numbers = numbering.numbers[further.positions]
     free = numbers != ABSENT
     root = np.linalg.cholesky(further.covariance)
@@ -128,20 +132,20 @@ def _further_block(numbering: Numbering, further: FurtherObservation, values: Ar
 
 
 def prior_root_weights(numbering: Numbering) -> Array:
-    """One over the standard deviation of every free unknown's prior or pseudo-observation (f,), 0 where it has none."""
+    """(f,) inverse prior standard deviations of the free unknowns, of pseudo-observations too; 0 without a prior."""
     return np.asarray(1.0 / numbering.problem.prior_sigma[numbering.free])
 
 
 def camera_mask(numbering: Numbering) -> Mask:
-    """Which free unknowns (f,) are those of cameras and scanners: fiducials, interior orientation, distortion (F5 to
-    F9), and the terms of bends."""
+    """Mask (f,) of the free unknowns of cameras (fiducials, interior orientation, distortion: F5 to F9) and
+    scanners."""
     unknowns = numbering.problem.unknowns
     positions = [*unknowns.camera.values(), *unknowns.fiducial.values(), *unknowns.scanner.values()]
     return np.isin(numbering.free, np.concatenate(positions))
 
 
 def prior_differences(problem: Problem, state: State) -> Array:
-    """Given less present values (n,) of all quantities, angles within half a turn; 0 where nothing is given."""
+    """(n,) given minus current values of all quantities, angles reduced to half a turn; 0 where nothing is given."""
     unknowns = problem.unknowns
     differences = np.where(np.isnan(unknowns.given), 0.0, unknowns.given - state.values)
     angles = problem.exterior[:, 3:]
