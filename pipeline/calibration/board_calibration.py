@@ -67,8 +67,8 @@ def calibrate(
 
     Examples
     --------
-    >>> result = reseau.calibrate("pictures", board="9x6", square="25mm")  # doctest: +SKIP >>>
-    result.plot_uncertainty()  # doctest: +SKIP
+    >>> result = reseau.calibrate("pictures", board="9x6", square="25mm")  # doctest: +SKIP
+    >>> result.plot_uncertainty()  # doctest: +SKIP
     """
     if lens not in LENSES:
         raise InputError(f"--lens {lens}: possible are {', '.join(LENSES)}.{did_you_mean(lens, LENSES)}")

@@ -1,1 +1,1 @@
-"""Rendered scenes as projects, and projects against their truth."""
+"""Projects from rendered scenes, and comparison of their results with the truth."""

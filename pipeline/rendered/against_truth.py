@@ -1,4 +1,5 @@
-"""A rendered project against its truth: names, errors over sigmas, and the adjusted camera and scanner in sigmas."""
+"""Comparison of a rendered project with its truth: identification, errors over sigmas, and adjusted camera and
+scanner."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -18,16 +19,22 @@ Array = NDArray[np.float64]
 Json = dict[str, Any]
 Quantity = tuple[float, float, float]  # value, sigma, truth
 
-_HIGHEST = 6  # degree along an axis of a scanner's terms
-WRONG_PX = 1.0  # farther from its own place than this, a mark is another one
+_HIGHEST = 6  # highest degree per axis of a scanner's terms
+WRONG_PX = 1.0  # px: a mark farther from its true place is a wrong one
 
 
 @dataclass(frozen=True)
 class FrameComparison:
-    """One frame: how many fiducials and targets could be seen and were observed, which are wrong, and the pose.
+    """Comparison of one frame.
 
-    errors_px (n, 2): measured less true places of the observed marks that are right; normalised (n, 2): the same in
-    units of their covariances, each component of variance 1 if these are right.
+    Attributes
+    ----------
+    visible, observed : numbers of visible and of observed marks, by kind.
+    wrong : points with wrong marks.
+    pose, true_pose : scan orientation.
+    errors_px : (n, 2) measured less true places of the correct marks.
+    normalised : (n, 2) the errors divided by the Cholesky factors of their covariances: components of variance 1 if
+        these are right.
     """
 
     image: str
@@ -42,8 +49,10 @@ class FrameComparison:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All frames, and every adjusted quantity of the camera and of the scanner's bend, by its name; of the bend every
-    product that is adjusted by itself, in mm."""
+    """Comparison of all frames, and of the adjusted parameters of camera and scanner bend, by name.
+
+    The bend is compared by its separately adjusted products, in mm.
+    """
 
     frames: tuple[FrameComparison, ...]
     camera: Mapping[str, Quantity]
@@ -67,7 +76,7 @@ def _worst(quantities: Mapping[str, Quantity]) -> float:
 
 
 def compare_with_truth(truth_path: Path, measurement_path: Path, adjustment_path: Path | None = None) -> Comparison:
-    """Compare what was measured, and adjusted if there is a file of it, with truth.json."""
+    """Compare measurements and, if given, an adjustment with truth.json."""
     truth: Json = json.loads(truth_path.read_text(encoding="utf-8"))
     frames = tuple(_frame(scan, truth["images"][scan.frame.image]) for scan in read_measurement(measurement_path))
     camera, scanner = dict[str, Quantity](), dict[str, Quantity]()
@@ -89,7 +98,7 @@ def _frame(scan: MeasuredScan, truth: Json) -> FrameComparison:
     for mark in scan.frame.marks:
         if not Status(mark.status).is_observation or mark.center_px is None or mark.covariance_px2 is None:
             continue
-        if mark.kind not in places:  # a join, whose place in the scene is nobody's
+        if mark.kind not in places:  # a join has no true place in the scene
             continue
         observed[mark.kind] += 1
         place = places[mark.kind].get(mark.point)
@@ -113,13 +122,16 @@ def _frame(scan: MeasuredScan, truth: Json) -> FrameComparison:
 
 
 def _visible_place(place: Json) -> Array:
-    """Where the centre of the figure lies that is seen: for a disk that of its ellipse."""
+    """True centre of the visible figure: for a disk that of its ellipse."""
     return np.array([place.get("ellipse_col_px", place["col_px"]), place.get("ellipse_row_px", place["row_px"])])
 
 
 def bend_quantities(adjusted: Json, truth: Json) -> Iterator[tuple[str, Quantity]]:
-    """Every adjusted product of a scanner's bend with its truth over the adjusted extent: the scene's bend has another
-    one. What the films take of the scene's bend is in no product that is adjusted."""
+    """Adjusted products of a scanner's bend and their true values over the adjusted extent, which differs from the
+    scene's.
+
+    Parts of the scene's bend that the film transformations absorb are in none of these products.
+    """
     along = np.linspace(-1.0, 1.0, 2 * _HIGHEST + 1)
     units = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
     places_mm = np.array(adjusted["center_mm"]) + units * adjusted["half_mm"]
@@ -140,7 +152,7 @@ def bend_quantities(adjusted: Json, truth: Json) -> Iterator[tuple[str, Quantity
 
 
 def _quantities(adjusted: Json, truth: Json, name: str = "") -> Iterator[tuple[str, Quantity]]:
-    """Every quantity that both hold, by the path of its names."""
+    """Quantities in both records, by the path of their names."""
     for key, given in truth.items():
         mine = adjusted.get(key) if isinstance(adjusted, dict) else None
         if not isinstance(given, dict) or not isinstance(mine, dict):

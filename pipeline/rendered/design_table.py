@@ -1,4 +1,4 @@
-"""The tables [design] of a scene: how well everything is to be measured, and what is to be varied."""
+"""The tables [design] of a scene: planned precision of the measurements, and quantities to be varied."""
 
 import math
 from collections.abc import Callable
@@ -63,7 +63,7 @@ def _radii(table: Table, key: str) -> tuple[float, ...]:
 
 @dataclass(frozen=True, config=TABLE)
 class Sweep:
-    """A quantity of the scene, by its dotted name, and the values it is to take."""
+    """A quantity of the scene, by its dotted name, and its values."""
 
     quantity: Annotated[str, Key("dotted name", _quantity)]
     values: Annotated[Values, Key("list of values", _values)]
@@ -71,7 +71,7 @@ class Sweep:
 
 @dataclass(frozen=True, config=TABLE)
 class Photo:
-    """A photograph that might be taken as well: X0, Y0, Z0 in object units, omega, phi, kappa in degrees."""
+    """A photograph that could be added: X0, Y0, Z0 in object units, omega, phi, kappa in degrees."""
 
     name: Annotated[str, TEXT]
     position: Annotated[Triple, TRIPLE]
@@ -80,8 +80,8 @@ class Photo:
 
 @dataclass(frozen=True, config=TABLE)
 class PlannedDistance:
-    """A distance that is to be measured, between two targets, two stations (by the images' names) or one of each; its
-    standard deviation in object units."""
+    """A planned distance between two targets, two stations (by the images' names) or one of each; its standard
+    deviation in object units."""
 
     start: str
     end: str
@@ -89,7 +89,7 @@ class PlannedDistance:
 
     @staticmethod
     def read(table: Table) -> "PlannedDistance":
-        """The keys `from`, `to` and `sigma`."""
+        """Read the keys `from`, `to` and `sigma`."""
         distance = PlannedDistance(table.text("from"), table.text("to"), table.number("sigma", above=0.0))
         table.done()
         if distance.start == distance.end:
@@ -99,8 +99,14 @@ class PlannedDistance:
 
 @dataclass(frozen=True, config=TABLE)
 class PlannedOrientation:
-    """How well exterior orientations are to be observed: the standard deviations of X0, Y0, Z0 in object units and of
-    omega, phi, kappa in degrees; inf: not at all. image: of which; "": of all that are not named."""
+    """Planned observations of exterior orientations.
+
+    Attributes
+    ----------
+    image : name; "": all images without an entry of their own.
+    position_sigma : standard deviations of X0, Y0, Z0 in object units; inf: not observed.
+    angles_sigma_deg : standard deviations of omega, phi, kappa in degrees; inf: not observed.
+    """
 
     image: Annotated[str, TEXT] = ""
     position_sigma: Annotated[Triple, Key("[sx, sy, sz]", _three_sigmas)] = UNOBSERVED
@@ -108,7 +114,7 @@ class PlannedOrientation:
 
     @staticmethod
     def read(table: Table) -> "PlannedOrientation":
-        """Raises InputError where nothing is observed."""
+        """Read a table. Raises InputError where nothing is observed."""
         orientation = read_model(table, PlannedOrientation)
         if all(math.isinf(sigma) for sigma in (*orientation.position_sigma, *orientation.angles_sigma_deg)):
             raise table.error("position_sigma", "or angles_sigma_deg must be given: else nothing is observed.")
@@ -131,7 +137,7 @@ def _tables(read: Callable[[Table], Any]) -> Key:
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
 class DesignSettings:
-    """What a plan needs beyond the scene, in the words of project.toml."""
+    """Settings of a design in addition to the scene, with the names of project.toml."""
 
     transformation: Annotated[Transformation | None, Key("text", lambda table, _: read_transformation(table))] = Field(
         default=None, description="Film deformation model; absent: the scene's, none for a camera without fiducials."
@@ -167,15 +173,17 @@ class DesignSettings:
     orientation: Annotated[tuple[PlannedOrientation, ...], Key("tables", _orientations)] = ()
 
     def planned_orientation(self, image: str) -> PlannedOrientation | None:
-        """How well that of an image is to be observed; None where it is not."""
+        """Planned observation of an image's exterior orientation; None where it is not observed."""
         named = {each.image: each for each in self.orientation}
         return named.get(image) or named.get("")
 
 
 def read_design(table: Table, sigma_planimetry: float, sigma_height: float) -> DesignSettings:
-    """The table [design]. Raises InputError.
+    """Read the table [design]. Raises InputError.
 
-    sigma_planimetry, sigma_height: what the table [given] says, where this one is silent.
+    Parameters
+    ----------
+    sigma_planimetry, sigma_height : defaults from the table [given].
     """
     settings = read_model(table, DesignSettings)
     return replace(

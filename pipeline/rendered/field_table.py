@@ -1,5 +1,5 @@
-"""The table [field] of a scene file: disks, crosses or ring-coded disks, on grids anywhere in space or one by one, or a
-planar board."""
+"""The table [field] of a scene: disks, crosses or ring-coded disks, on grids in space or one by one, or a planar
+board."""
 
 from dataclasses import dataclass, replace
 
@@ -17,8 +17,10 @@ KINDS = ("disks", "crosses", "coded-rings", "chessboard", "circle-grid", "natura
 
 
 def read_field(table: Table, unit: str, seed: int) -> DiskField | BoardField:
-    """The test field; of kind natural, without any target. Sizes of targets and boards are mm, all coordinates in the
-    unit. Raises InputError."""
+    """Read the test field; a field of kind natural has no targets.
+
+    Sizes of targets and boards are in mm, coordinates in the unit. Raises InputError.
+    """
     mm = 1.0 / UNITS_MM[unit]
     kind = table.text("kind", "disks", KINDS)
     if kind == "natural":
@@ -55,7 +57,7 @@ def _field(table: Table, seed: int, diameter: float, figure: CrossFigure | None 
 
 
 def _coded_field(table: Table, seed: int, diameter: float) -> DiskField:
-    """Every so many disks have rings, and the numbers of these for names."""
+    """Every n-th disk has a ring code, and its number as its name."""
     default = RingCode()
     code = RingCode(table.whole("bits", default.bits), table.pair("ring", default.ring))
     every = table.whole("every", 1, least=1)
@@ -71,7 +73,8 @@ def _coded_field(table: Table, seed: int, diameter: float) -> DiskField:
 
 
 def _grid_targets(table: Table, generator: np.random.Generator) -> list[DiskTarget]:
-    """Targets about a centre, row by row from the bottom, each moved at random within its cell and out of the plane."""
+    """Targets on a grid around a centre, row by row from the bottom, with random shifts within the cells and out of the
+    plane."""
     first = table.whole("first")
     columns, rows = table.whole("columns", least=1), table.whole("rows", least=1)
     plane = _Plane.read(table)
@@ -84,7 +87,7 @@ def _grid_targets(table: Table, generator: np.random.Generator) -> list[DiskTarg
 
 
 def _scattered_targets(table: Table, generator: np.random.Generator) -> list[DiskTarget]:
-    """Targets at random all over a parallelogram, and out of its plane; fewer of them are the first of more."""
+    """Random targets over a parallelogram, and out of its plane. A smaller number gives the first of a larger one."""
     first, count = table.whole("first"), table.whole("points", least=1)
     plane = _Plane.read(table)
     table.done()
@@ -94,7 +97,7 @@ def _scattered_targets(table: Table, generator: np.random.Generator) -> list[Dis
 
 @dataclass(frozen=True, eq=False)
 class _Plane:
-    """Where targets lie: about a centre, in steps right and up, out of the plane by up to the relief either way."""
+    """Plane of targets: a centre, steps right and up, and a relief: the largest distance from the plane."""
 
     center: Array
     right: Array
@@ -114,12 +117,12 @@ class _Plane:
         return plane
 
     def targets(self, first: int, across: Array, along: Array, height: Array) -> list[DiskTarget]:
-        """across, along (n,) in steps, height (n,) in reliefs."""
+        """Targets at across, along (n,) in steps and height (n,) in units of the relief."""
         normal = np.cross(self.right, self.up)
         normal /= np.linalg.norm(normal)
         out = self.relief * height[:, None] * normal
         places: Array = self.center + across[:, None] * self.right + along[:, None] * self.up + out
-        # Whole micro-units: a field that is surveyed has coordinates that can be written down.
+        # Rounded to 1e-6 units, so that written coordinates are exact.
         places = np.round(places, 6)
         return [DiskTarget(str(first + i), _triple(place), _triple(normal)) for i, place in enumerate(places)]
 

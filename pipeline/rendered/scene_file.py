@@ -1,4 +1,4 @@
-"""SCENE.toml: the scene that is to be rendered, and how well its camera, points and orientations are to be given."""
+"""SCENE.toml: the scene to be rendered, and the precision of its given camera, points and orientations."""
 
 import math
 from collections.abc import Callable
@@ -26,9 +26,11 @@ WRITTEN = ("project.toml", "camera.toml", "points.csv", "images.csv")
 
 
 def render_project(scene_path: Path, out_dir: Path, progress: Progress | None = None) -> None:
-    """`reseau render`: scans, truth.json and the project's files. Raises InputError.
+    """Render a scene: scans, truth.json and the project's files (`reseau render`). Raises InputError.
 
-    progress: called with the image's name, the steps done and the steps of the whole scene.
+    Parameters
+    ----------
+    progress : called with the image's name, the steps done and the steps of the whole scene.
     """
     scene_file = read_scene(scene_path)
     _check_free(out_dir)
@@ -42,7 +44,7 @@ def render_project(scene_path: Path, out_dir: Path, progress: Progress | None = 
 
 
 def _check_free(out_dir: Path) -> None:
-    """Refuse a folder with somebody's own project: one that was rendered has its truth beside it."""
+    """Raise InputError for a folder with a project that was not rendered: a rendered one holds truth.json."""
     own = [name for name in WRITTEN if (out_dir / name).exists()]
     if own and not (out_dir / TRUTH).exists():
         raise InputError(
@@ -52,12 +54,12 @@ def _check_free(out_dir: Path) -> None:
 
 
 def read_scene(path: Path) -> SceneFile:
-    """Read SCENE.toml. Raises InputError naming file, line and key."""
+    """Read SCENE.toml. Raises InputError with file, line and key."""
     return parse_scene(read_toml(path))
 
 
 def parse_scene(table: Table) -> SceneFile:
-    """The scene that stands in the root table of a file."""
+    """Build the scene from the root table of a file."""
     path = table.file
     seed = table.whole("seed", 1)
     camera = _camera(table)
@@ -98,7 +100,7 @@ def parse_scene(table: Table) -> SceneFile:
 
 
 def _build(path: Path, make: Callable[[], Made]) -> Made:
-    """A part of the scene; what it refuses is an error of the file."""
+    """Build a part of the scene; a ValueError becomes an InputError for the file."""
     try:
         return make()
     except ValueError as error:
@@ -106,7 +108,7 @@ def _build(path: Path, make: Callable[[], Made]) -> Made:
 
 
 def _camera(table: Table) -> CameraFile:
-    """The camera, written in the scene file or in a file of its own."""
+    """Read the camera from the scene file, or from the camera file it names."""
     if isinstance(table.values.get("camera"), str):
         camera = read_camera(camera_path(table.text("camera"), table.file.parent))
     else:
@@ -133,12 +135,12 @@ def _scene_camera(camera: CameraFile) -> scene.SceneCamera:
 
 
 def _painted(mark: shapes.Mark | shapes.LearnedMark | None) -> scene.DrawnMark | scene.ChipMark | None:
-    """Nothing is painted at a corner of the frame, which is there already, nor where nobody has drawn the mark."""
+    """Mark to be drawn; None for a corner of the frame, which is rendered anyway, and for a mark without a drawing."""
     return None if mark is None or isinstance(mark, shapes.LearnedMark | shapes.FrameCorner) else scene_mark(mark)
 
 
 def scene_mark(mark: shapes.Mark) -> scene.DrawnMark | scene.ChipMark:
-    """A mark of no polarity is light, as most are. In a scene polarities are those of the positive."""
+    """Mark of the scene. One without polarity is light, as most are. Polarities are those of the positive."""
     light = mark.polarity != "dark"
     if isinstance(mark, shapes.MarkShape):
         return scene.DrawnMark(tuple(_area(part) for part in mark.parts), light)
@@ -222,7 +224,7 @@ def _tones(table: Table) -> scene.Tones:
 
 @dataclass(frozen=True)
 class _Laws:
-    """The chance by which every frame gets its own film transformation and place on the scanner: sigmas."""
+    """Standard deviations of the random film transformation of each frame and its position on the scanner."""
 
     kind: scene.FilmKind
     scale_ppm: float
@@ -244,8 +246,8 @@ class _Laws:
 def _image(
     table: Table, laws: _Laws, generator: np.random.Generator, on_all: tuple[scene.Writing, ...]
 ) -> scene.SceneImage:
-    """One frame: what the file does not say of its film and its place on the scanner is left to chance. on_all: what is
-    written on all frames."""
+    """One frame. Film and position on the scanner are random where the file does not give them. on_all: text on all
+    frames."""
     scale = 1.0 + generator.normal(0.0, laws.scale_ppm * 1e-6, 2)
     shear = float(generator.normal(0.0, laws.shear_urad * 1e-6))
     if laws.kind == "similarity":

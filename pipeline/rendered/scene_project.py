@@ -1,4 +1,4 @@
-"""A rendered scene as a project: what somebody would have who got the scans, with errors as the scene says."""
+"""Project files of a rendered scene: given values with random errors, as specified in the scene."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -40,11 +40,16 @@ NEGATIVE: Mapping[shapes.Polarity, shapes.Polarity] = {"light": "dark", "dark": 
 
 @dataclass(frozen=True)
 class Given:
-    """How well things are known to whoever gets the scans: standard deviations of the errors of what is written.
+    """Standard deviations of the errors of the given values.
 
-    principal_distance_mm, principal_point_mm, fiducial_mm: of the given camera. point: of the given coordinates X, Y
-    and Z, object units. planimetry: whether X and Y are control; else they are approximations, of fixed_points exact.
-    position: of the given exterior orientations, as a share of the distance to the field; angle_deg: likewise.
+    Attributes
+    ----------
+    principal_distance_mm, principal_point_mm, fiducial_mm : of the given camera.
+    point : of the given coordinates X, Y and Z, object units.
+    planimetry : whether X and Y are control; else they are approximations, except those of fixed_points, which are
+        exact.
+    position : of the given exterior orientations, as a fraction of the distance to the field.
+    angle_deg : of the given exterior orientations, degrees.
     """
 
     principal_distance_mm: float
@@ -59,9 +64,13 @@ class Given:
 
 @dataclass(frozen=True)
 class SceneFile:
-    """A scene file as read. camera: the true camera, with the priors that the given one is to have.
+    """A scene file as read.
 
-    unit: of the object's coordinates. design: how the same photographs are planned.
+    Attributes
+    ----------
+    camera : the true camera, with the priors of the given one.
+    unit : of the object coordinates.
+    design : settings of the network design of these photographs.
     """
 
     path: Path
@@ -73,7 +82,7 @@ class SceneFile:
 
 
 def write_project(scene_file: SceneFile, out_dir: Path) -> None:
-    """Write camera.toml, points.csv, images.csv and project.toml. Raises InputError where that cannot be done."""
+    """Write camera.toml, points.csv, images.csv and project.toml. Raises InputError where that is not possible."""
     generator = np.random.default_rng([scene_file.scene.seed, 20])
     camera = replace(_given_camera(scene_file, generator), path=out_dir / "camera.toml")
     write_atomically(camera.path, camera_text(camera, picture_writer(out_dir)))
@@ -88,7 +97,7 @@ def write_project(scene_file: SceneFile, out_dir: Path) -> None:
 
 
 def taking_camera_yaml(scene: Scene, lens: TakingLens) -> str:
-    """The true lens that took the scans, for cv2.FileStorage."""
+    """The true lens of the camera that photographed the film, for cv2.FileStorage."""
     geometry = frame_geometry(scene, 0)
     size = geometry.width_px, geometry.height_px
     center = lens.center_px or ((size[0] - 1) / 2.0, (size[1] - 1) / 2.0)
@@ -102,14 +111,14 @@ def taking_camera_yaml(scene: Scene, lens: TakingLens) -> str:
 
 
 def _middle(scene: Scene, targets: tuple[Target, ...]) -> Array:
-    """Of the field; without targets, the ground below the photographs."""
+    """Centre of the field; without targets, the ground below the photographs."""
     if targets:
         return np.asarray(np.mean([target.center for target in targets], axis=0))
     return np.array([*np.mean([image.exterior[:2] for image in scene.images], axis=0), scene.ground])
 
 
 def _given_camera(scene_file: SceneFile, generator: np.random.Generator) -> CameraFile:
-    """The true camera with errors; a distortion that is to be found is given as none."""
+    """The true camera with errors. Free distortion parameters are given as 0."""
     camera, given = scene_file.camera, scene_file.given
     true = scene_file.scene.camera
     distance = true.principal_distance_mm + generator.normal(0.0, given.principal_distance_mm)
@@ -120,7 +129,7 @@ def _given_camera(scene_file: SceneFile, generator: np.random.Generator) -> Came
     return replace(
         camera,
         principal_distance_mm=round(float(distance), 4),
-        # Without fiducials the camera frame is the comparator's, and the principal point is left to the points.
+        # Without fiducials the camera frame is the comparator's, and the principal point is estimated from the points.
         principal_point_mm=_pair(point) if camera.fiducials else None,
         distortion=replace(camera.distortion, parameters=parameters),
         fiducials=tuple(_given_fiducial(one, scene_file, generator) for one in camera.fiducials),
@@ -137,13 +146,13 @@ def _given_fiducial(fiducial: GivenFiducial, scene_file: SceneFile, generator: n
     xy_mm = np.asarray(fiducial.xy_mm) + generator.normal(0.0, scene_file.given.fiducial_mm, 2)
     mark = fiducial.mark
     if isinstance(mark, shapes.Mark) and scene_file.scene.scanner.negative:
-        # The scene tells what the positive shows, the project what its scans show.
+        # The scene has the polarity of the positive, the project that of its scans.
         mark = replace(mark, polarity=NEGATIVE[mark.polarity])
     return replace(fiducial, xy_mm=_pair(xy_mm), mark=mark)
 
 
 def _pair(values: Array) -> tuple[float, float]:
-    """To a tenth of a micrometre, as calibration reports are typed."""
+    """Rounded to 0.1 µm, like the values of calibration reports."""
     return (round(float(values[0]), 4), round(float(values[1]), 4))
 
 
@@ -169,7 +178,7 @@ def _given_point(
 
 
 def _images_csv(scene_file: SceneFile, middle: Array, generator: np.random.Generator) -> str:
-    """Of a frame that was scanned in parts the orientation stands at the first of them."""
+    """images.csv; the orientation of a frame scanned in parts is given for the first part only."""
     columns = ["image", "X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg"]
     images = scene_file.scene.images
     has_parts = any(image.part_of for image in images)
@@ -214,7 +223,7 @@ transformation = "{film_transformation(scene_file)}"
 
 
 def _taking_camera_text(scene: Scene) -> str:
-    """Of a photograph, whose file does not tell how much of the film a pixel shows."""
+    """Pitch and lens for a photographed film, since the file of a photograph has no pitch."""
     if scene.scanner.lens is None:
         return ""
     return f'pitch_um = {scene.scanner.pitch_um[0]!r}\n\n[scanner]\nlens = "{TAKING_CAMERA}"\n'
@@ -225,7 +234,7 @@ def _scanner_text(scene_file: SceneFile) -> str:
 
 
 def _datum_text(scene_file: SceneFile) -> str:
-    """Natural points bring no planimetric control."""
+    """Minimum constraints for natural points, which give no planimetric control."""
     return "" if field_targets(scene_file.scene.field) else 'datum = "minimal"\n'
 
 
@@ -236,7 +245,7 @@ def _points_text(scene_file: SceneFile) -> str:
 def _targets_text(scene_file: SceneFile) -> str:
     field, mm = scene_file.scene.field, UNITS_MM[scene_file.unit]
     if not field_targets(field):
-        # The sigma of heights is that of the ground as given, and so of what its relief leaves unsaid.
+        # The sigma of heights includes that of the given ground and its relief.
         scene, sigma = scene_file.scene, scene_file.given.point[1]
         return f"[ties]\nheight = {scene.ground:.6g}\nheight_sigma = {np.hypot(sigma, scene.relief):.6g}\n"
     if isinstance(field, DiskField) and isinstance(field.figure, CrossFigure):
@@ -258,5 +267,5 @@ def _targets_text(scene_file: SceneFile) -> str:
 
 
 def film_transformation(scene_file: SceneFile) -> FilmKind | Literal["none"]:
-    """The transformation that the scene's film needs; none for a camera without fiducials."""
+    """Transformation of the scene's film; none for a camera without fiducials."""
     return scene_file.scene.film.kind if scene_file.camera.fiducials else "none"
