@@ -1,7 +1,6 @@
-"""Inner loops in C, where a compiler was there at the installation; elsewhere `kernels` is None, and the same is done
-by numpy and scipy, slower.
+"""Inner loops in C. Without a compiler at installation, `kernels` is None, and numpy and scipy do the same more slowly.
 
-Every kernel has one caller, which holds both ways. See docs/method/compiled.md.
+Every kernel has one caller, which contains both versions. See docs/method/compiled.md.
 """
 
 from importlib import import_module
@@ -14,104 +13,126 @@ Doubles = NDArray[np.float64]
 
 
 class Kernels(Protocol):
-    """What kernels.c gives. Arrays are of doubles, and of integers (intp) where they number something."""
+    """Functions of kernels.c. Arrays hold doubles; numbers and indices are integers (intp)."""
 
     def spline_samples(
         self, coefficients: Doubles, width: int, rows: Doubles, columns: Doubles, degree: int, samples: NDArray[Any]
     ) -> int:
-        """Fill samples (n,), of 8 or 16 bits, with a spline's values at places (n,), rounded and clamped.
+        """Evaluate a B-spline at places (n,) and store the values, rounded and clamped, in samples of 8 or 16 bits.
 
         Parameters
         ----------
-        coefficients : (height, width), as `scipy.ndimage.spline_filter` gives them, mirrored at the edges.
+        coefficients : (height, width) spline coefficients from `scipy.ndimage.spline_filter`, mirrored at the edges.
+        width : of the coefficients.
+        rows, columns : (n,) places.
         degree : 3 or 5.
+        samples : (n,), filled.
 
         Returns
         -------
-        How many were clamped to what can be stored.
+        Number of values that were clamped to the range of the samples.
         """
         ...
 
     def square_rows(self, *arrays: NDArray[Any]) -> None:
-        """Add the normal equations of pairs of rows, cell by cell: what touches the same unknowns.
+        """Accumulate the normal equations of pairs of rows, cell by cell: a cell holds rows with the same unknowns.
 
         Parameters
         ----------
-        matrix : (n, 2, k), right : (n, 2), pairs of rows; columns (w,) : those of the matrix that count.
-        order : (n,) the rows cell by cell; first (p + 1,) : where each begins; unknowns (p, w), -1 for none.
-        sequence, home : (p,) the cells by their fronts, and the front of each.
-        fronts : (f, 5) first unknown, how many are owned, where its square begins in `squares`, where those that it
-            meets later begin in `after`, and how many these are; after.
-        squares : lower triangles of all fronts, right sides (s,), to both of which is added.
+        matrix, right : (n, 2, k), (n, 2) pairs of rows.
+        columns : (w,) columns of the matrix used.
+        order : (n,) rows, cell by cell.
+        first : (p + 1,) index in `order` of each cell's first row.
+        unknowns : (p, w) numbers of the unknowns of each cell, -1 for none.
+        sequence, home : (p,) cells sorted by front, and the front of each cell.
+        fronts : (f, 5) first unknown, number of own unknowns, offset of the normal matrix in `squares`, offset of the
+            later unknowns in `after`, and their number.
+        after : later unknowns of all fronts.
+        squares : normal matrices of all fronts; the sums are added to the lower triangles.
+        right sides : (s,), added to.
         """
         ...
 
     def eliminate_blocks(self, *arrays: NDArray[Any]) -> None:
-        """Eliminate the own unknowns of many small blocks, and subtract the squares of their borders.
+        """Eliminate the own unknowns of many small blocks, and reduce the normal equations of the shared ones.
+
+        The reduction subtracts B'B of the borders B (Schur complement).
 
         Parameters
         ----------
         matrix, right : as in `square_rows`.
-        order, first, sequence, home : (m,), (b + 1,), (b,) and (b,) of blocks, as of cells there.
-        by_own, by_group, by_single : (o,), (w,), (c,) columns of the matrix.
-        own : (b, o), group (m,), members (g, w), single (n, c), numbers of unknowns, -1 for none.
-        singles : (t,) the single unknowns that blocks touch.
-        weight, prior : (b, o) of own unknowns.
-        fronts, after : as there.
-        triangle, reduced, orthonormal, parts, alone : (b, o, o), (b, o), (o, 2, m), (m, o, w), (b, o, t), to be filled
-            as in `adjust.linear_algebra.schur_complement.SparseBlocks`.
-        squares, right sides : as there.
+        order, first, sequence, home : (m,), (b + 1,), (b,), (b,) for blocks as for cells in `square_rows`.
+        by_own, by_group, by_single : (o,), (w,), (c,) columns of the matrix for these unknowns.
+        own : (b, o) numbers of the own unknowns, -1 for none.
+        group : (m,) group of each pair of rows.
+        members, single : (g, w), (n, c) numbers of the shared unknowns, -1 for none.
+        singles : (t,) single unknowns in rows with own unknowns.
+        weight, prior : (b, o) root weights and right sides of the own unknowns' priors.
+        fronts, after : as in `square_rows`.
+        triangle, reduced, orthonormal, parts, alone : (b, o, o), (b, o), (o, 2, m), (m, o, w), (b, o, t), filled; as in
+            `adjust.linear_algebra.schur_complement.SparseBlocks`.
+        squares, right sides : as in `square_rows`, reduced in place.
         """
         ...
 
     def border_cofactors(self, *arrays: NDArray[Any]) -> None:
-        """Fill cofactors (b, o, o) with B Q B' of the borders B of blocks, as `eliminate_blocks` gives them.
+        """Compute B Q B' of blocks with borders B from `eliminate_blocks`.
 
         Parameters
         ----------
-        first, sequence, home, group, members, singles, parts, alone, fronts, after : as there.
-        squares : the cofactor matrix Q of the shared unknowns, lower triangles of all fronts.
-        cofactors : to be filled.
+        first, sequence, home, group, members, singles, parts, alone, fronts, after : as in `eliminate_blocks`.
+        squares : cofactor matrix Q of the shared unknowns, lower triangles of all fronts.
+        cofactors : (b, o, o), filled.
         """
         ...
 
     def target_rays(self, *arrays: NDArray[Any]) -> None:
-        """Fill rays (m, 2), and points in the camera's axes (m, 3).
+        """Compute rays (m, 2), and the points in camera axes (m, 3).
 
         Parameters
         ----------
-        values : (u,); exterior (images, 6), place (m, 3) : positions in them; image (m,); rotation (images, 3, 3).
-        ray, in_camera : to be filled.
+        values : (u,) all quantities.
+        exterior, place : (images, 6), (m, 3) positions in `values` of exterior orientations and object points.
+        image : (m,) image of each observation.
+        rotation : (images, 3, 3).
+        ray, in_camera : (m, 2), (m, 3), filled.
         """
         ...
 
     def target_derivatives(self, *arrays: NDArray[Any]) -> None:
-        """Fill columns of derivatives (n, 2, k) at rows: by exterior orientations, by object points, by cameras.
+        """Compute derivatives with respect to exterior orientations, object points and cameras.
 
         Parameters
         ----------
-        rows, image : (m,) observations and their images; rotation, attitude (images, 3, 3).
-        ray : (m, 2), in_camera (m, 3), by_ray (m, 2, 2), of targets.
-        exterior, place : which of the six elements, and of the three coordinates, have one of the first columns.
-        camera : (c, 2, m) the derivatives by the camera, for columns from first (1,) on.
-        derivatives : to be filled.
+        rows, image : (m,) observations and their images.
+        rotation, attitude : (images, 3, 3).
+        ray, in_camera, by_ray : (m, 2), (m, 3), (m, 2, 2) of the targets.
+        exterior, place : which of the six elements, and of the three coordinates, occupy the first columns.
+        camera : (c, 2, m) derivatives with respect to the camera.
+        first : (1,) first column of the derivatives with respect to the camera.
+        derivatives : (n, 2, k), filled at `rows`.
         """
         ...
 
     def whiten_rows(self, *arrays: NDArray[Any]) -> None:
-        """Divide rows (n, 2, k) by L of A C A' = L L', and A v by it.
+        """Whiten pairs of rows: multiply them, and A v, by L^-1, where A C A' = L L'.
 
         Parameters
         ----------
-        by_observation, covariance : (n, 2, 2); differences v (n, 2).
-        root : (n, 2, 2) L, to be filled; rows, divided in place; right (n, 2), to be filled.
+        by_observation, covariance : (n, 2, 2) A and C.
+        differences : (n, 2) v.
+        root : (n, 2, 2) L, filled.
+        rows : (n, 2, k), whitened in place.
+        right : (n, 2) L^-1 A v, filled.
         """
         ...
 
 
 def _load() -> Kernels | None:
-    """None where nothing was compiled, or only what earlier sources had: all is compiled anew at the next
-    installation."""
+    """Import the compiled module; None if it is missing or compiled from older sources without all of these functions.
+
+    The next installation compiles it again.
+    """
     try:
         found = import_module("compiled.kernels")
     except ImportError:

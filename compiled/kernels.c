@@ -1,5 +1,5 @@
-/* Inner loops that numpy and scipy leave slow. Each is the compiled twin of a few lines of Python, which run where there
- * is no compiler, and is tested against them. The buffers are checked for their sizes; what they mean is the caller's.
+/* Inner loops that are slow in numpy and scipy. Each one duplicates a few lines of Python, which run where there is no
+ * compiler, and is tested against them. Only the sizes of buffers are checked, not the indices in them.
  */
 #define PY_SSIZE_T_CLEAN
 #define Py_LIMITED_API 0x030B0000
@@ -11,7 +11,7 @@
 
 #define MOST_TAPS 6
 
-/* The weights of a B-spline of degree 3 or 5 at a part t of a step behind the middle one of its first taps. */
+/* Weights of the taps of a B-spline of degree 3 or 5, at the fraction t after the tap degree / 2. */
 static void spline_weights(int degree, double t, double *weight)
 {
     double t2 = t * t, t3 = t2 * t, s = 1.0 - t;
@@ -31,7 +31,7 @@ static void spline_weights(int degree, double t, double *weight)
     weight[5] = t5 / 120.0;
 }
 
-/* An index mirrored at the first and the last one, once: places lie at most a few taps outside. */
+/* Mirror an index at the first or last one. Once suffices: places lie at most a few taps outside. */
 static Py_ssize_t mirrored(Py_ssize_t index, Py_ssize_t size)
 {
     if (index < 0)
@@ -72,8 +72,8 @@ static double spline_value(const double *coefficients, Py_ssize_t height, Py_ssi
 
 /* spline_samples(coefficients, width, rows, columns, degree, samples) -> clamped
  *
- * Samples, 8 or 16 bits by the buffer's items, of a spline with coefficients (height, width) at places (n,), rounded to
- * even and clamped; how many were.
+ * Evaluate a spline with coefficients (height, width) at places (n,). Values are rounded half to even and clamped to
+ * the range of the samples: 8 or 16 bits, by the item size of their buffer. Returns the number of clamped values.
  */
 static PyObject *spline_samples(PyObject *module, PyObject *args)
 {
@@ -121,14 +121,14 @@ static PyObject *spline_samples(PyObject *module, PyObject *args)
 
 #define MOST_OWN 3
 
-/* An array of eight-byte items in up to three dimensions: lengths, and steps in items. */
+/* Array of eight-byte items with up to three dimensions; steps are strides in items. */
 typedef struct {
     Py_buffer view;
     Py_ssize_t length[3], step[3];
 } Table;
 
-/* Open the tables of all arguments, those from `output` on to be written. Of each its dimensions: as a digit where it
- * lies in memory as C has it, as a letter, a for one and so on, where it may lie otherwise.
+/* Open the tables of all arguments, writable from number `output` on. dimensions: one character per argument, a digit
+ * for a C-contiguous array of so many dimensions, a letter (a for 1, b for 2, c for 3) for one with any strides.
  */
 static int open_tables(PyObject *args, const char *dimensions, int output, Table *tables)
 {
@@ -160,7 +160,7 @@ static int open_tables(PyObject *args, const char *dimensions, int output, Table
     return 0;
 }
 
-/* An element of a table of doubles that may lie in memory in any way. */
+/* Element of a table of doubles with any strides. */
 static inline double element(const Table *table, int64_t i, int64_t j, int64_t k)
 {
     return ((const double *)table->view.buf)[i * table->step[0] + j * table->step[1] + k * table->step[2]];
@@ -171,7 +171,7 @@ static inline double *place_of(const Table *table, int64_t i, int64_t j)
     return (double *)table->view.buf + i * table->step[0] + j * table->step[1];
 }
 
-/* The derivatives of a pair of rows of a matrix (n, 2, k) by one column. */
+/* One column of a pair of rows of a matrix (n, 2, k). */
 static inline void take_pair(const Table *matrix, int64_t row, int64_t column, double *x, double *y)
 {
     const double *at = (const double *)matrix->view.buf + row * matrix->step[0] + column * matrix->step[2];
@@ -185,7 +185,7 @@ static void close_tables(Table *tables, int count)
         PyBuffer_Release(&tables[i].view);
 }
 
-/* Columns of `height` elements, one behind the other, made orthonormal (Gram and Schmidt); their upper triangle. */
+/* Orthonormalise consecutive columns of `height` elements (modified Gram-Schmidt); fills the upper triangle R. */
 static void make_orthonormal(double *columns, int count, Py_ssize_t height, double triangle[MOST_OWN][MOST_OWN])
 {
     for (int i = 0; i < count; i++) {
@@ -207,7 +207,7 @@ static void make_orthonormal(double *columns, int count, Py_ssize_t height, doub
     }
 }
 
-/* The lower triangle of the square matrix of a front, and where the shared unknowns stand in it. */
+/* A front: its normal (or cofactor) matrix, with only the lower triangle used, and the place of each unknown in it. */
 typedef struct {
     double *square;
     int64_t width;
@@ -218,8 +218,8 @@ typedef struct {
 #define INTEGERS(table) ((const int64_t *)(table).view.buf)
 #define DOUBLES(table) ((double *)(table).view.buf)
 
-/* Move on to a front. Its row of the table of fronts: its first unknown, how many it owns, where its square begins, where
- * those that it meets later begin, and how many these are.
+/* Select a front. A row of the table of fronts: first unknown, number of own unknowns, offset of the matrix in squares,
+ * offset of the later unknowns in after, and their number.
  */
 static void open_front(Front *front, int64_t number, const Table *fronts, const Table *after, double *squares)
 {
@@ -297,8 +297,8 @@ static PyObject *square_rows(PyObject *module, PyObject *args)
     Py_RETURN_NONE;
 }
 
-/* The border of a block (o, s) in the shared unknowns that it touches, in the order of their places in a front, and
- * where runs of neighbouring places begin.
+/* The border (o, s) of a block, its shared unknowns sorted by their places in the front, and the first indices of the
+ * runs of consecutive places.
  */
 typedef struct {
     int64_t count, runs, *run;
@@ -307,7 +307,7 @@ typedef struct {
     double *row[MOST_OWN];
 } Border;
 
-/* What tells the borders of blocks, and room for the largest one. */
+/* Tables that define the borders of blocks, and memory for the largest border. */
 typedef struct {
     const Table *first, *numbers, *members, *singles, *parts, *alone;
     int64_t own, group, single_count;
@@ -363,7 +363,9 @@ static void insert(Borders *b, int64_t unknown, const double *value, int64_t ste
         border->row[k][at] = k < b->own ? value[k * step] : 0.0;
 }
 
-/* numbers (m,): the groups of the pairs of rows of the blocks. */
+/* Assemble the border of a block from the parts in its groups and in the single unknowns. numbers (m,): group of each
+ * pair of rows.
+ */
 static void lay_out_border(Borders *b, int64_t block)
 {
     b->border.count = 0;
@@ -389,16 +391,16 @@ enum {
     WEIGHT, PRIOR, FRONTS, AFTER, TRIANGLE, REDUCED, ORTHONORMAL, PARTS, ALONE, SQUARES, SHARED, TABLES
 };
 
-/* The tables of an elimination; by shared unknown, its rank among the single ones. */
+/* Tables and working memory of an elimination. rank: index of a shared unknown among the single ones. */
 typedef struct {
     Table t[TABLES];
     int64_t own, group, single, singles, m;
-    double *orthonormal, *unused; /* unused: for rows of a border beyond o */
+    double *orthonormal, *unused; /* unused: dummy target for rows of a border beyond o */
     int32_t *rank;
     Borders borders;
 } Elimination;
 
-/* The own unknowns of a block, their columns made orthonormal: its triangle, right side, and border. */
+/* Eliminate the own unknowns of a block by orthonormalising their columns: fills triangle, right side and border. */
 static void eliminate_block(Elimination *e, int64_t block)
 {
     int64_t begin = INTEGERS(e->t[FIRST])[block], rows = INTEGERS(e->t[FIRST])[block + 1] - begin;
@@ -417,7 +419,7 @@ static void eliminate_block(Elimination *e, int64_t block)
             column[2 * rows + j] = j == k ? DOUBLES(e->t[WEIGHT])[block * o + k] : 0.0;
     }
     make_orthonormal(q, (int)o, height, first);
-    make_orthonormal(q, (int)o, height, second); /* twice is enough */
+    make_orthonormal(q, (int)o, height, second); /* twice is enough (Giraud, Langou and Rozloznik 2005) */
     memset(alone, 0, (size_t)(o * e->singles) * sizeof(double));
     for (int64_t k = 0; k < o; k++) {
         reduced[k] = 0.0;
@@ -459,7 +461,7 @@ static void eliminate_block(Elimination *e, int64_t block)
     }
 }
 
-/* Less the square of a block's border. */
+/* Reduce the normal equations of the shared unknowns: subtract B'B, and B' times the reduced right side. */
 static void subtract_border(Elimination *e, int64_t block)
 {
     const Border *border = &e->borders.border;
@@ -477,7 +479,7 @@ static void subtract_border(Elimination *e, int64_t block)
             for (int64_t j = 0; j < stop - first; j++)
                 to[j] -= a0 * c0[j] + a1 * c1[j] + a2 * c2[j];
         }
-        for (int64_t j = i; j-- > 0 && border->place[j] == border->place[i];) /* two rows of one image: both ways */
+        for (int64_t j = i; j-- > 0 && border->place[j] == border->place[i];) /* twice the same unknown */
             into[border->place[j]] -= a0 * b0[j] + a1 * b1[j] + a2 * b2[j];
     }
 }
@@ -545,8 +547,8 @@ static PyObject *eliminate_blocks(PyObject *module, PyObject *args)
 
 /* border_cofactors(first, sequence, home, group, members, singles, parts, alone, fronts, after, squares, cofactors)
  *
- * What the cofactors of shared unknowns, lower triangles of the squares of fronts, add to those of own ones of unit
- * covariance: B Q B' for borders B, into cofactors (b, o, o).
+ * Contribution of the shared unknowns to the cofactor matrices of the own ones: B Q B' for borders B, into cofactors
+ * (b, o, o). Q: cofactor matrix of the shared unknowns, lower triangles of the fronts.
  */
 static PyObject *border_cofactors(PyObject *module, PyObject *args)
 {
@@ -603,8 +605,8 @@ static PyObject *border_cofactors(PyObject *module, PyObject *args)
 
 /* target_rays(values, exterior, place, image, rotation, ray, in_camera) -> None
  *
- * ray (m, 2), -U/W and -V/W, and in_camera (m, 3), of points place (m, 3) seen from the stations exterior (images, 3),
- * both positions in values.
+ * Fill ray (m, 2): -U/W and -V/W, and in_camera (m, 3): U, V, W of object points in camera axes. place (m, 3), exterior
+ * (images, 3 or more): positions in values of the object coordinates and the projection centres.
  */
 static PyObject *target_rays(PyObject *module, PyObject *args)
 {
@@ -641,9 +643,9 @@ static PyObject *target_rays(PyObject *module, PyObject *args)
 
 /* target_derivatives(rows, image, rotation, attitude, ray, in_camera, by_ray, exterior, place, camera, first, derivatives)
  *
- * Into derivatives (n, 2, k), at rows (m,): in the first columns those by the members of exterior orientation, the
- * vector from the station and the attitude, then by those of the point's coordinates; from column first (1,) on those
- * by the camera (c, 2, m). by_ray (m, 2, 2).
+ * Fill derivatives (n, 2, k) at rows (m,). The first columns are those with respect to the given elements of exterior
+ * orientation (projection centre, attitude), then to the given object coordinates. The derivatives with respect to the
+ * camera (c, 2, m) follow from column first (1,) on. by_ray (m, 2, 2).
  */
 static PyObject *target_derivatives(PyObject *module, PyObject *args)
 {
@@ -694,7 +696,8 @@ static PyObject *target_derivatives(PyObject *module, PyObject *args)
 
 /* whiten_rows(by_observation, covariance, differences, root, rows, right) -> None
  *
- * root (n, 2, 2): L of A C A' = L L'; rows (n, 2, k), divided by it in place; right (n, 2): A v divided by it.
+ * Whiten pairs of rows. Fills root (n, 2, 2): L of A C A' = L L', and right (n, 2): L^-1 A v; multiplies rows (n, 2, k)
+ * by L^-1 in place.
  */
 static PyObject *whiten_rows(PyObject *module, PyObject *args)
 {
