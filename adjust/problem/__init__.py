@@ -1,1 +1,1 @@
-"""What is adjusted: a network, its numbered quantities and their equations F1 to F4; and the form of the result."""
+"""Adjustment problem: network, numbered unknowns, condition equations F1 to F4, and the form of the result."""

@@ -1,4 +1,4 @@
-"""A camera as it is known before an adjustment: interior orientation, distortion, fiducial marks, each with its prior.
+"""Camera before an adjustment: interior orientation, distortion and fiducial marks, with their priors.
 
 Lengths in mm. A standard deviation of 0 fixes a quantity, inf frees it.
 """
@@ -13,7 +13,7 @@ Corners = tuple[tuple[float, float], tuple[float, float]]
 
 @dataclass(frozen=True)
 class Fiducial:
-    """A fiducial mark in the camera frame: the datum observations F5 and F6."""
+    """Fiducial mark in the camera frame: the datum observations F5 and F6."""
 
     x_mm: Prior
     y_mm: Prior
@@ -25,7 +25,7 @@ class Fiducial:
 
 @dataclass(frozen=True)
 class FiducialDistance:
-    """A measured distance between two fiducial marks, as certificates give it that know no coordinates."""
+    """Measured distance between two fiducial marks, from certificates without coordinates."""
 
     start: str
     end: str
@@ -41,9 +41,16 @@ class FiducialDistance:
 class Camera:
     """Interior orientation, distortion and fiducial marks (by id), with their priors F5 to F9.
 
-    principal_distance_mm None: unknown, an approximation is found from the points. The principal point likewise; it
-    then starts at the centre of the frame, `center_mm` in the camera frame. frame_mm: width and height of the picture,
-    0 where they are not known. distances: between fiducials, observed beside their coordinates or in place of them.
+    Attributes
+    ----------
+    name : name.
+    principal_distance_mm : prior; None: unknown, an approximation is computed from the points.
+    x0_mm, y0_mm : priors of the principal point; None: unknown, it starts at `center_mm`.
+    distortion : distortion family with priors.
+    fiducials : fiducial marks by id.
+    center_mm : centre of the frame in the camera frame.
+    frame_mm : width and height of the image, 0 where unknown.
+    distances : distances between fiducials, observed in addition to, or instead of, their coordinates.
     """
 
     name: str
@@ -57,10 +64,10 @@ class Camera:
     distances: tuple[FiducialDistance, ...] = ()
 
     def frame_corners(self, frame_mm: tuple[float, float] | None = None) -> Corners | None:
-        """The lower left and the upper right corner of the picture in the camera frame; None where its size is unknown.
+        """Lower left and upper right corner of the image in the camera frame; None where its size is unknown.
 
-        frame_mm: its size where it is not the camera's own. It lies about 0 with fiducial marks, else below and to the
-        right of the scan's first pixel.
+        frame_mm: size of the image, if not the camera's own. The image is centred on 0 with fiducial marks; otherwise
+        it extends right and down from the first pixel of the scan.
         """
         width, height = frame_mm or self.frame_mm
         if not width or not height:

@@ -1,10 +1,10 @@
-"""The functions F1 to F4 of all observations: the observations that satisfy them, and their derivatives there.
+"""Condition equations F1 to F4: the observations that satisfy them, and their derivatives there.
 
-A target obeys T(S(x, y)) = image of its ray, a fiducial T(S(x, y)) = its place in the camera frame, with S the bend of
-the scanner. The derivatives are taken at computed observations, those that satisfy the functions for the unknowns of
-the moment: after convergence these are the adjusted observations. By elements the distortion is taken at the observed
-camera point instead: then F = T(S(x, y)) - image of the ray - distortion there, which depends on the observations by T
-and S alone.
+A target satisfies T(S(x, y)) = image of its ray, a fiducial T(S(x, y)) = its place in the camera frame, with S the
+scanner deformation. The derivatives are evaluated at computed observations, which satisfy the equations for the current
+unknowns: after convergence these are the adjusted observations. In the adjustment by elements the distortion is
+evaluated at the observed camera point instead: then F = T(S(x, y)) - image of the ray - distortion there, which depends
+on the observations through T and S alone.
 """
 
 from collections.abc import Iterable, Sequence
@@ -22,12 +22,16 @@ from adjust.linear_algebra.small_matrices import applied, columns, cross, laid_o
 from adjust.problem.problem import Part, Problem, State
 
 Rows = Indices | slice
-ROWS_AT_ONCE = 20_000  # targets that are imaged together, so that they stay in the processor's cache
+ROWS_AT_ONCE = 20_000  # targets imaged together, chosen to fit into the processor's cache
 
 
 @dataclass(frozen=True)
 class Derivatives:
-    """A (n, 2, 2), by the observation, and B (n, 2, k), by the unknowns at `Problem.columns` (n, k)."""
+    """Design matrices of F1 to F4.
+
+    by_observation (n, 2, 2): A, with respect to the observations. by_unknowns (n, 2, k): B, with respect to the
+    unknowns at `Problem.columns`.
+    """
 
     by_observation: Array
     by_unknowns: Array
@@ -35,9 +39,15 @@ class Derivatives:
 
 @dataclass(frozen=True)
 class TargetImages:
-    """The targets of one camera as they appear for a state.
+    """Images of the targets of one camera for a state.
 
-    rows: their observations; ray (n, 2) and the image of it; in_camera (n, 3): the points in the camera's axes.
+    Attributes
+    ----------
+    camera : name.
+    rows : rows of the observations.
+    ray : (n, 2) rays.
+    in_camera : (n, 3) vectors to the points in the camera frame.
+    imaged : images of the rays.
     """
 
     camera: str
@@ -49,20 +59,20 @@ class TargetImages:
 
 @dataclass(frozen=True)
 class Computed:
-    """Observations (n, 2) in mm that satisfy F1 to F4, in the comparator, and what they were computed from."""
+    """Observations (n, 2) in mm that satisfy F1 to F4, in the comparator, and the images of the targets."""
 
     xy_mm: Array
     targets: tuple[TargetImages, ...]
 
 
 def computed_observations(problem: Problem, state: State) -> Array | None:
-    """The comparator coordinates (n, 2) in mm that satisfy F1 to F4; None where some point has no image."""
+    """Compute the comparator coordinates (n, 2) in mm that satisfy F1 to F4; None where some point has no image."""
     computed = compute(problem, state)
     return None if computed is None else computed.xy_mm
 
 
 def compute(problem: Problem, state: State) -> Computed | None:
-    """The observations that satisfy F1 to F4, as derivatives are taken at; None where some point has no image."""
+    """Compute the observations that satisfy F1 to F4, for the derivatives; None where some point has no image."""
     targets = tuple(
         _image_targets(problem, state, name, rows[first : first + ROWS_AT_ONCE])
         for name, rows in problem.targets_by_camera.items()
@@ -76,7 +86,7 @@ def compute(problem: Problem, state: State) -> Computed | None:
 
 
 def _computed_in_camera(problem: Problem, state: State, targets: Iterable[TargetImages]) -> Array | None:
-    """The camera coordinates (n, 2) of all marks; None where some point has no image."""
+    """Camera coordinates (n, 2) of all marks; None where some point has no image."""
     camera_xy = state.values[problem.places.T[:2]].T  # fiducials stay, targets follow
     observed = observed_in_camera(problem, state) if problem.by_elements else camera_xy
     for shown in targets:
@@ -95,7 +105,7 @@ def _computed_in_camera(problem: Problem, state: State, targets: Iterable[Target
 
 
 def _image_targets(problem: Problem, state: State, camera: str, targets: Indices) -> TargetImages:
-    """Some targets as they appear from their stations."""
+    """Image some targets from their stations."""
     rows = _as_slice(targets)
     images, network = problem.image_numbers[rows], problem.network
     if compiled.kernels is not None and network.line_of_sight.is_straight and not network.boards:
@@ -109,11 +119,11 @@ def _image_targets(problem: Problem, state: State, camera: str, targets: Indices
 
 
 def _sight(problem: Problem, state: State, rows: Rows) -> SightVectors:
-    """From the stations to the points of some targets."""
+    """Vectors from the stations to the points of some targets."""
     stations = state.values[problem.exterior[:, :3].T[:, problem.image_numbers[rows]]].T
     points = state.values[problem.places.T[:, rows]].T
     if problem.network.boards:
-        bends = state.values[problem.board_positions[rows]]  # of a point on none any values, which lift it by 0
+        bends = state.values[problem.board_positions[rows]]  # arbitrary for points on no board: their lift is 0
         points = points + (bends[:, :, None] * problem.lift_directions[rows]).sum(axis=1)
     return sight_vectors(problem.network.line_of_sight, stations, points)
 
@@ -124,7 +134,7 @@ def _lens(problem: Problem, state: State, camera: str) -> Lens:
 
 
 def observed_in_camera(problem: Problem, state: State) -> Array:
-    """The camera coordinates (n, 2) of the observations as they were made."""
+    """Transform the observations to camera coordinates (n, 2)."""
     camera_xy = np.empty_like(problem.network.observations.xy_mm)
     straight_mm = _straight(problem, state, problem.network.observations.xy_mm)
     for films in problem.films:
@@ -134,7 +144,7 @@ def observed_in_camera(problem: Problem, state: State) -> Array:
 
 
 def _straight(problem: Problem, state: State, xy_mm: Array) -> Array:
-    """The places (n, 2) of comparator coordinates (n, 2), freed of the scanners' bends."""
+    """Correct comparator coordinates (n, 2) for the scanners."""
     straight_mm = xy_mm.copy() if problem.scans else xy_mm
     for scans in problem.scans:
         straight_mm[scans.rows] = scans.bend.apply(state.values[scans.positions], xy_mm[scans.rows])
@@ -142,7 +152,7 @@ def _straight(problem: Problem, state: State, xy_mm: Array) -> Array:
 
 
 def _computed_in_comparator(problem: Problem, state: State, camera_xy: Array) -> tuple[Array, Mask]:
-    """The comparator coordinates (n, 2) of camera coordinates (n, 2), and which films and scanners give."""
+    """Comparator coordinates (n, 2) of camera coordinates (n, 2), and the mask of those found."""
     xy_mm = np.empty_like(camera_xy)
     found = np.empty(len(camera_xy), dtype=bool)
     for films in problem.films:
@@ -156,9 +166,9 @@ def _computed_in_comparator(problem: Problem, state: State, camera_xy: Array) ->
 
 
 def derivatives(problem: Problem, state: State, computed: Computed) -> Derivatives:
-    """The derivatives of F1 to F4 (Torlegård) at computed observations."""
+    """Compute the derivatives of F1 to F4 (Torlegård) at computed observations."""
     xy_mm, parts = computed.xy_mm, problem.parts
-    distorted = problem.network.observations.xy_mm if problem.by_elements else xy_mm  # where distortion is taken
+    distorted = problem.network.observations.xy_mm if problem.by_elements else xy_mm  # where distortion is evaluated
     film = _film_derivatives(problem, state, xy_mm)
     at_distorted = _film_derivatives(problem, state, distorted) if problem.by_elements else film
     by_camera_xy = laid_out(np.broadcast_to(np.eye(2), (len(xy_mm), 2, 2)))
@@ -174,7 +184,7 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
             by_camera_xy = at.xy_jacobian
         else:
             by_camera_xy[rows] = at.xy_jacobian
-        own = [k for k in parts.camera.members if k < len(lens.quantities)]  # others have other families
+        own = [k for k in parts.camera.members if k < len(lens.quantities)]  # other cameras may have other families
         by_camera = [at.quantity_derivative(k) for k in own]
         if compiled.kernels is not None and straight and not len(parts.board.members):
             numbers = np.arange(rows.start, rows.stop) if isinstance(rows, slice) else rows
@@ -200,14 +210,14 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
 
 
 def _no_derivatives(count: int, width: int) -> Array:
-    """(n, 2, k) zeros, in memory row by row as compiled loops take them, or column by column as numpy does."""
+    """(n, 2, k) zeros, stored by rows for the compiled loops or by columns for numpy."""
     return (
         np.zeros((count, 2, width)) if compiled.kernels is not None else np.zeros((width, count, 2)).transpose(1, 2, 0)
     )
 
 
 def _fill_targets(by_unknowns: Array, problem: Problem, state: State, shown: TargetImages, by_ray: Array) -> None:
-    """The derivatives by exterior orientation, point and board of what has a derivative (n, 2, 2) by the ray."""
+    """Fill the columns of exterior orientation, points and boards from the derivatives (n, 2, 2) w.r.t. the ray."""
     parts, rows, straight = problem.parts, shown.rows, problem.network.line_of_sight.is_straight
     images = problem.image_numbers[rows]
     by_in_camera = _camera_axes_derivative(by_ray, shown)
@@ -228,21 +238,27 @@ def _fill_targets(by_unknowns: Array, problem: Problem, state: State, shown: Tar
 
 
 def _fill(by_unknowns: Array, rows: Rows, part: Part, derivatives: Sequence[Array]) -> None:
-    """Put the derivatives (n, 2) by the members of a part into its columns."""
+    """Write the derivatives (n, 2) with respect to the members of a part into its columns."""
     for column, derivative in enumerate(derivatives, part.columns.start):
         by_unknowns[..., column][rows] = derivative
 
 
 def _camera_axes_derivative(ray_jacobian: Array, shown: TargetImages) -> Array:
-    """Derivative (n, 2, 3) by U, V, W of what has a derivative (n, 2, 2) by the ray -U/W, -V/W."""
+    """Derivatives (n, 2, 3) with respect to U, V, W from those (n, 2, 2) with respect to the ray -U/W, -V/W."""
     by_in_plane = ray_jacobian / -shown.in_camera[:, 2, None, None]
     return columns([by_in_plane[..., 0], by_in_plane[..., 1], applied(by_in_plane, shown.ray)])
 
 
 @dataclass(frozen=True)
 class _FilmDerivatives:
-    """Camera coordinates (n, 2), their derivatives by the comparator's (n, 2, 2), by the films' centred parameters
-    (n, 2, k) and by those of the scanners' bends (n, 2, s).
+    """Camera coordinates and their derivatives.
+
+    Attributes
+    ----------
+    camera_xy : (n, 2) camera coordinates.
+    xy_jacobian : (n, 2, 2) with respect to the comparator coordinates.
+    parameter_jacobian : (n, 2, k) with respect to the films' centred parameters.
+    by_scanner : (n, 2, s) with respect to the scanners' parameters.
     """
 
     camera_xy: Array
@@ -270,14 +286,17 @@ def _film_derivatives(problem: Problem, state: State, xy_mm: Array) -> _FilmDeri
 
 
 def _as_slice(rows: Indices) -> Rows:
-    """Ascending rows, as a slice, which takes no copy, where none is left out."""
+    """Ascending rows as a slice, which avoids a copy, if they are contiguous."""
     whole = len(rows) > 0 and rows[-1] - rows[0] + 1 == len(rows)
     return slice(int(rows[0]), int(rows[-1]) + 1) if whole else rows
 
 
 def blind_marks(problem: Problem, state: State) -> dict[str, tuple[str, str]]:
-    """By image the first mark that has no image in a state and why, and what to check; empty where all have one. Under
-    no name what is wrong with a whole camera."""
+    """Find by image the first mark without an image in a state.
+
+    Returns by image name the reason and what to check, empty where all marks have an image. The empty name stands for a
+    fault of a whole camera.
+    """
     observations, numbers = problem.network.observations, problem.image_numbers
     blind: dict[int, tuple[str, str]] = {}
     targets = [_image_targets(problem, state, name, rows) for name, rows in problem.targets_by_camera.items()]
@@ -307,7 +326,7 @@ def blind_marks(problem: Problem, state: State) -> dict[str, tuple[str, str]]:
 
 
 def _first_of_images(rows: Indices, image_numbers: Indices) -> list[int]:
-    """The first of some rows of each image that they are of."""
+    """First of some rows in each image."""
     return [int(rows[at]) for at in sorted(np.unique(image_numbers[rows], return_index=True)[1])]
 
 

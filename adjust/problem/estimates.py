@@ -1,4 +1,4 @@
-"""The adjusted quantities of a network, with their covariance."""
+"""Adjusted quantities of a network, with their covariance."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ Termination = Literal["converged", "singular", "iteration limit", "diverged"]
 
 @dataclass(frozen=True)
 class NullDirection:
-    """A change of the unknowns that the observations cannot see: what moves together, why, and what would remove it."""
+    """Null direction: unknowns that move together without changing the observations, the cause and the remedy."""
 
     parameters: tuple[Parameter, ...]
     cause: str
@@ -24,7 +24,7 @@ class NullDirection:
 
 
 class GivenGroup(NamedTuple):
-    """Values that a file gives of one owner, by their group: `datum` of a camera, `interior` of a camera and so on."""
+    """Given values of one owner in a file, by group: `datum` of a camera, `interior` of a camera and so on."""
 
     group: str
     owner: str
@@ -32,11 +32,15 @@ class GivenGroup(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class VarianceFactor:
-    """sigma0, the root of the variance factor, and what it was estimated from.
+    """sigma0, the square root of the variance factor, and its source.
 
-    redundancy: of the observations that it comes from, 0 where none have enough: sigma0 is then 1, and standard
-    deviations are a priori ones. left_out: given values that only place the datum or agree better than their standard
-    deviations allow, at `positions` (k,) of the unknowns: they take no part in sigma0, and it does not multiply them.
+    Attributes
+    ----------
+    sigma0 : 1 without sufficient redundancy; standard deviations are then a priori.
+    redundancy : redundancy of the observations used; 0 where none have enough.
+    left_out : given values that only define the datum or agree better than their standard deviations allow. They are
+        not used for sigma0 and not multiplied by it.
+    positions : (k,) positions of these unknowns.
     """
 
     sigma0: float
@@ -50,17 +54,17 @@ class VarianceFactor:
 
 
 class Cofactor(Protocol):
-    """The a-priori covariance (sigma0 = 1) of n quantities: their variances (n,) and, as asked for, any part of it."""
+    """A-priori covariance (sigma0 = 1) of n quantities: variances (n,) and, on demand, any block."""
 
     @property
     def variances(self) -> Array: ...
 
     def part(self, at: Indices) -> Array:
-        """The matrix (k, k) of some quantities, by their positions."""
+        """Matrix (k, k) of some quantities by position."""
         ...
 
     def parts(self, groups: Indices) -> Array:
-        """The matrices (g, k, k) of groups of quantities (g, k), each of one point's or of one image's."""
+        """Matrices (g, k, k) of groups of quantities (g, k), each of one point or of one image."""
         ...
 
 
@@ -68,12 +72,19 @@ class Cofactor(Protocol):
 class Estimates:
     """Values of all quantities of a network and their covariance.
 
-    parameters: the keys of all quantities, in the order of values and covariance (omega, phi, kappa in rad); fixed ones
-    included, with zero rows. `value`, `sigma` and the like take a key, or its text in the files. variance: sigma0, and
-    what it comes from. cofactor: computed where it is asked for; covariance is sigma0² times that. It is the a-priori
-    covariance (sigma0 = 1) where sigma0 multiplies all that was given; of the values that `variance` leaves out it has
-    the given variances over sigma0². Without a solution (termination "singular", "diverged") it is zero and means
-    nothing. mirrored: the images whose scan is mirrored, as in `Approximations`.
+    Attributes
+    ----------
+    network : adjusted network.
+    termination : how the iteration ended.
+    variance : sigma0 and its source.
+    parameters : keys of all quantities, in the order of values and covariance (omega, phi, kappa in rad); fixed ones
+        included, with zero rows. `value`, `sigma` and similar methods take a key, or its text in the files.
+    values : (n,) adjusted values.
+    cofactor : computed on demand; the covariance is sigma0² times the cofactor matrix. It is the a-priori covariance
+        (sigma0 = 1) where sigma0 multiplies all given values; for the values that `variance` leaves out it uses the
+        given variances over sigma0². Without a solution (termination "singular", "diverged") it is zero and has no
+        meaning.
+    mirrored : images whose scan is mirrored, as in `Approximations`.
     """
 
     network: Network
@@ -90,12 +101,12 @@ class Estimates:
 
     @property
     def sigma0(self) -> float:
-        """Square root of the a-posteriori variance of unit weight; 1 where standard deviations are a priori ones."""
+        """A-posteriori standard deviation of unit weight; 1 where standard deviations are a priori."""
         return self.variance.sigma0
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """The quantities' texts in the files: `IO.<camera>.k3`, `FID.<camera>.<id>.x`, `EO.<image>.X0`, `PT.<id>.X`."""
+        """Texts of the quantities in files: `IO.<camera>.k3`, `FID.<camera>.<id>.x`, `EO.<image>.X0`, `PT.<id>.X`."""
         return tuple(each.text for each in self.parameters)
 
     def has(self, parameter: Parameter | str) -> bool:
@@ -112,13 +123,13 @@ class Estimates:
         return float(self.values[self.index(parameter)])
 
     def values_of(self, parameters: Iterable[Parameter | str]) -> Array:
-        """(k,) the values of some quantities."""
+        """(k,) values of some quantities."""
         return self.values[[self.index(each) for each in parameters]]
 
     def cofactor_of(self, parameters: Sequence[Parameter | str]) -> Array:
-        """The cofactor matrix (k, k) of some quantities."""
+        """(k, k) cofactor matrix of some quantities."""
         return self.cofactor.part(np.array([self.index(each) for each in parameters], dtype=np.intp))
 
     def sigma(self, parameter: Parameter | str) -> float:
-        """A-posteriori standard deviation."""
+        """A-posteriori standard deviation of a quantity."""
         return self.sigma0 * float(np.sqrt(self.cofactor.variances[self.index(parameter)]))

@@ -1,7 +1,7 @@
-"""What is observed beside image points and single unknowns: distances, earlier calibrations, antennas.
+"""Observations other than image points and priors of single unknowns: distances, earlier calibrations, antennas.
 
-Each is a group of correlated observations l = f(x) + v of some of the unknowns. One concept serves all: positions of
-the unknowns in f, the observed values with their covariance, computed values and derivatives at a state.
+Each is a group of correlated observations l = f(x) + v of some unknowns, with the positions of the unknowns in f, the
+observed values and their covariance, and computed values and derivatives at a state.
 """
 
 from collections.abc import Iterator
@@ -19,11 +19,15 @@ from adjust.problem.unknowns import Unknowns
 
 @dataclass(frozen=True)
 class FurtherObservation:
-    """Correlated observations (m,) of functions of some unknowns; of these themselves, if it is of no other class.
+    """Correlated observations (m,) of functions of some unknowns; in this base class of the unknowns themselves.
 
-    group: what they are called in the result's groups. names (m,): what each is called in files, labels (m,): in
-    messages. positions (k,) of the unknowns that take part. observed (m,) and covariance (m, m) in the units of the
-    unknowns.
+    Attributes
+    ----------
+    group : name of the group in the result.
+    names, labels : (m,) names in files and in messages.
+    positions : (k,) positions of the unknowns.
+    observed : (m,) in the units of the unknowns.
+    covariance : (m, m).
     """
 
     group: str
@@ -34,16 +38,16 @@ class FurtherObservation:
     covariance: Array
 
     def computed(self, values: Array) -> Array:
-        """What the functions (m,) give for the values (n,) of all unknowns."""
+        """Compute the functions (m,) from the values (n,) of all unknowns."""
         return np.asarray(values[self.positions])
 
     def jacobian(self, values: Array) -> Array:
-        """Their derivatives (m, k) by the unknowns at `positions`."""
+        """Derivatives (m, k) with respect to the unknowns at `positions`."""
         return np.eye(len(self.positions))
 
 
 def further_observations(network: Network, unknowns: Unknowns) -> tuple[FurtherObservation, ...]:
-    """All of a validated network."""
+    """List all further observations of a validated network."""
     return (
         *_distances(network, unknowns),
         *(distance for _, distance in _fiducial_distances(network, unknowns)),
@@ -53,7 +57,7 @@ def further_observations(network: Network, unknowns: Unknowns) -> tuple[FurtherO
 
 
 class ObservedDistance(FurtherObservation):
-    """A distance between two points, stations or fiducials; positions (2 d,): the coordinates of one and the other."""
+    """Distance between two points, stations or fiducials; positions (2 d,): coordinates of both ends."""
 
     def computed(self, values: Array) -> Array:
         return np.array([np.linalg.norm(self._difference(values))])
@@ -87,13 +91,13 @@ def _fiducial_distances(network: Network, unknowns: Unknowns) -> Iterator[tuple[
 
 @dataclass(frozen=True)
 class ObservedCalibration(FurtherObservation):
-    """An earlier calibration; parameters (m,): the quantities that it gives."""
+    """Earlier calibration; parameters (m,): its quantities."""
 
     parameters: tuple[Parameter, ...]
 
 
 def _calibrations(network: Network, unknowns: Unknowns) -> Iterator[ObservedCalibration]:
-    """Those of the quantities that are free: a fiducial that no image shows is held, and has no part here."""
+    """Calibrations of the free quantities; a fiducial in no image is held and left out."""
     number = {parameter: i for i, parameter in enumerate(unknowns.parameters)} if network.calibrations else {}
     for each in network.calibrations:
         free = [i for i, key in enumerate(each.parameters) if key in number and unknowns.sigma[number[key]] > 0.0]
@@ -112,10 +116,10 @@ def _calibrations(network: Network, unknowns: Unknowns) -> Iterator[ObservedCali
 
 @dataclass(frozen=True)
 class ObservedAntenna(FurtherObservation):
-    """Coordinates of a point that is fixed to the camera; positions (6,): the exterior orientation of the frame.
+    """Coordinates of a point fixed to the camera; positions (6,): exterior orientation of the frame.
 
-    axes (m,): which coordinates are observed; offset (3,) from the projection centre along the camera's axes;
-    keeps_angles: whether the attitude moves by its angles and not by a rotation vector.
+    axes (m,): observed coordinates; offset (3,) from the projection centre along the camera's axes; keeps_angles:
+    whether the attitude is updated by its angles instead of a rotation vector.
     """
 
     axes: Indices
@@ -127,7 +131,7 @@ class ObservedAntenna(FurtherObservation):
         return np.asarray((values[self.positions[:3]] + rotation.T @ self.offset)[self.axes])
 
     def jacobian(self, values: Array) -> Array:
-        """A rotation by the vector t on top of M takes M' a to M' (a - t x a)."""
+        """Derivatives: a rotation by the vector t applied to M changes M' a to M' (a - t x a)."""
         angles = values[self.positions[3:]]
         by_attitude = rotation_from_angles(angles).T @ cross_matrix(self.offset)
         if self.keeps_angles:
@@ -136,7 +140,7 @@ class ObservedAntenna(FurtherObservation):
 
 
 def _antennas(network: Network, unknowns: Unknowns) -> Iterator[tuple[str, ObservedAntenna]]:
-    """By frame."""
+    """Antennas by frame."""
     for image in {image.frame: image for image in network.images}.values():
         exterior = image.exterior
         if exterior is None or not exterior.has_antenna or image.name in network.unoriented:
@@ -150,7 +154,7 @@ def _antennas(network: Network, unknowns: Unknowns) -> Iterator[tuple[str, Obser
 
 
 def error_free(network: Network, unknowns: Unknowns, values: Array) -> Network:
-    """The network with distances, calibrations and antennas as if they had been observed without error."""
+    """Replace distances, calibrations and antennas of a network by error-free values."""
     of_fiducials = [
         (each, replace(each, value_mm=float(observed.computed(values)[0])))
         for each, observed in _fiducial_distances(network, unknowns)
@@ -182,6 +186,6 @@ def error_free(network: Network, unknowns: Unknowns, values: Array) -> Network:
 
 
 def square_sum(further: tuple[FurtherObservation, ...], values: Array) -> float:
-    """Their share of v'Pv."""
+    """v'Pv of further observations."""
     differences = ((each.observed - each.computed(values), each.covariance) for each in further)
     return float(sum(v @ np.linalg.solve(covariance, v) for v, covariance in differences))

@@ -1,4 +1,4 @@
-"""The images of a network as they were adjusted: models that project points."""
+"""Adjusted images of a network, as models that project points."""
 
 from collections.abc import Sequence
 
@@ -18,7 +18,7 @@ from adjust.problem.parameter import Kind, Parameter
 
 
 def adjusted_image(estimates: Estimates, name: str) -> ImageModel:
-    """An image with the values of an adjustment."""
+    """Make the image model of an image from adjusted values."""
     network = estimates.network
     image = network.image_by_name[name]
 
@@ -41,7 +41,7 @@ def adjusted_image(estimates: Estimates, name: str) -> ImageModel:
 
 
 def adjusted_lens(estimates: Estimates, camera: str) -> Lens:
-    """A camera's lens with the values of an adjustment, without their covariance."""
+    """Make a camera's lens from adjusted values, without covariance."""
     distortion = estimates.network.camera_by_name[camera].distortion
     names = (*INTERIOR_NAMES, *parameter_names(distortion.family))
     interior, parameters = np.split(estimates.values_of(Parameter.interior(camera, each) for each in names), [3])
@@ -49,13 +49,13 @@ def adjusted_lens(estimates: Estimates, camera: str) -> Lens:
 
 
 def adjusted_places(estimates: Estimates, points: Sequence[str]) -> Array:
-    """(n, 3) where object points are, with the values of an adjustment: those of a bent board off its plane."""
+    """(n, 3) adjusted coordinates of object points, including the bend of their board."""
     places = estimates.values_of(Parameter.point(point, axis) for point in points for axis in "XYZ").reshape(-1, 3)
     return places + lifted(estimates, points)
 
 
 def lifted(estimates: Estimates, points: Sequence[str]) -> Array:
-    """(n, 3) how far the bends of boards put object points beside their flat places."""
+    """(n, 3) displacements of object points from their flat places by the bends of boards."""
     offsets = np.zeros((len(points), 3))
     for board in estimates.network.boards:
         bends = estimates.values_of(Parameter.board(board.name, name) for name in BOARD_NAMES)

@@ -1,6 +1,6 @@
-"""What is adjusted: cameras, images, object points and observations, each with what is known of it beforehand.
+"""Network to be adjusted: cameras, images, object points and observations, with their priors.
 
-Units: image mm, object units of the user's choice, angles rad.
+Units: image mm, object units chosen by the user, angles rad.
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ from adjust.functional_model.transformation import film_kind
 from adjust.problem.camera import Camera, FiducialDistance
 from adjust.problem.observations import Calibration, Distance, Observations
 
-Transformation = str  # as `adjust.functional_model.transformation` spells it
+Transformation = str  # name as in `adjust.functional_model.transformation`
 
 
 EXTERIOR_NAMES = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
@@ -28,11 +28,14 @@ EXTERIOR_NAMES = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
 
 @dataclass(frozen=True)
 class Exterior:
-    """An exterior orientation: X0, Y0, Z0 in object units, omega, phi, kappa in rad.
+    """Exterior orientation: X0, Y0, Z0 in object units, omega, phi, kappa in rad.
 
-    values (6,); sigmas (6,): inf for a mere approximation, else the standard deviation of an observed element, 0 fixed.
-    antenna: X0, Y0, Z0 are those of a point, an antenna say, that lies so far from the projection centre along the
-    camera's axes, in object units.
+    Attributes
+    ----------
+    values : (6,) elements.
+    sigmas : (6,) inf for an approximation, else the standard deviation of an observed element, 0 fixed.
+    antenna : offset of an observed point (an antenna) from the projection centre, along the camera's axes in object
+        units; X0, Y0, Z0 are then those of this point.
     """
 
     values: Array
@@ -54,16 +57,20 @@ class Exterior:
 
     @property
     def center(self) -> Array:
-        """The projection centre (3,)."""
+        """(3,) projection centre."""
         return np.asarray(self.values[:3] - rotation_from_angles(self.values[3:]).T @ np.array(self.antenna))
 
 
 @dataclass(frozen=True)
 class Scanner:
-    """A scanner as all its scans have it: the terms of its bend with their priors, see `functional_model.scanner`.
+    """Scanner: priors of its terms, common to all its scans (see `functional_model.scanner`).
 
-    center_mm, half_mm: middle and half the extent of the scans, in the comparator. lens: of a digital camera that is
-    the scanner, its interior orientation in the comparator; None of any other.
+    Attributes
+    ----------
+    name : name.
+    terms : priors by name of the term.
+    center_mm, half_mm : centre and half extent of the scans, in the comparator.
+    lens : lens of a digital camera used as scanner, interior orientation in the comparator; else None.
     """
 
     name: str
@@ -88,17 +95,23 @@ class Scanner:
 
     @property
     def given(self) -> Array:
-        """The given values (k,) of the terms."""
+        """(k,) given values of the terms."""
         return np.array([prior.value for prior in self.terms.values()])
 
 
 @dataclass(frozen=True)
 class Image:
-    """One scan of a frame: its camera's name, its film transformation, its exterior orientation where it is known.
+    """Scan of a frame.
 
-    scanner: the name of the scanner whose bend is adjusted with it, empty where none is. part_of: the name of the frame
-    of which it is one of several overlapping scans, empty where it is the frame's only one. Parts of a frame have
-    transformations of their own and one exterior orientation; points that two of them show are of the kind "join".
+    Attributes
+    ----------
+    name : name.
+    camera : name of the camera.
+    transformation : film transformation.
+    exterior : exterior orientation, where known.
+    scanner : name of the scanner whose terms are adjusted; empty for none.
+    part_of : name of the frame if the frame was scanned in several overlapping parts, else empty. Parts have separate
+        film transformations and a common exterior orientation; points in two parts are of the kind "join".
     """
 
     name: str
@@ -113,18 +126,18 @@ class Image:
 
     @property
     def frame(self) -> str:
-        """The name of its frame, whose exterior orientation it has."""
+        """Name of the frame, whose exterior orientation the image has."""
         return self.part_of or self.name
 
     @property
     def is_observed(self) -> bool:
-        """Whether its whole exterior orientation is given with standard deviations."""
+        """Whether the whole exterior orientation is given with standard deviations."""
         return self.exterior is not None and bool(np.isfinite(self.exterior.sigmas).all())
 
 
 @dataclass(frozen=True)
 class ObjectPoint:
-    """An object point: X, Y, Z, each with its prior; None where nothing is known of the coordinate."""
+    """Object point: X, Y, Z with their priors; None for unknown coordinates."""
 
     id: str
     X: Prior | None
@@ -134,10 +147,10 @@ class ObjectPoint:
 
 @dataclass(frozen=True, eq=False)
 class Board:
-    """A flat board that is bent: its points stand off their plane, see `functional_model.board`.
+    """Flat board with a bend, which displaces its points from the plane (see `functional_model.board`).
 
-    places: the flat coordinates (3,) of all its points by id, also of those that no image shows. bends: of bend_x and
-    bend_y, in object units, with their priors.
+    places: flat coordinates (3,) of all its points by id, including those in no image. bends: priors of bend_x and
+    bend_y, in object units.
     """
 
     name: str
@@ -145,18 +158,18 @@ class Board:
     bends: tuple[Prior, Prior] = (Prior(0.0, np.inf), Prior(0.0, np.inf))
 
     def __post_init__(self) -> None:
-        board_form(np.array(list(self.places.values())))  # refuses what is no board
+        board_form(np.array(list(self.places.values())))  # raises ValueError for points that are not a board
 
     @cached_property
     def lift_directions(self) -> dict[str, Array]:
-        """(2, 3) by id: where a bend of 1 along each axis moves a point."""
+        """(2, 3) displacement of a point by a bend of 1 along each axis, by id."""
         form = board_form(np.array(list(self.places.values())))
         return {id_: shape[:, None] * form.normal for id_, shape in zip(self.places, form.shapes, strict=True)}
 
 
 @dataclass(frozen=True)
 class Extent:
-    """Where the observations of an image lie in the comparator: the middle (2,) and half the larger side, mm."""
+    """Extent of an image's observations in the comparator: centre (2,) and half the larger side, mm."""
 
     center_mm: Array
     half_mm: float
@@ -164,9 +177,9 @@ class Extent:
 
 @dataclass(frozen=True, repr=False)
 class Network:
-    """Everything that one adjustment knows. Names are unique; the order of things does not matter.
+    """All input of an adjustment. Names are unique; order does not matter.
 
-    transparent: a flat board of given points can be seen from both sides.
+    transparent: whether flat boards of given points can be seen from both sides.
     """
 
     cameras: tuple[Camera, ...]
@@ -186,14 +199,14 @@ class Network:
 
     @cached_property
     def rows_by_scanner(self) -> dict[str, Indices]:
-        """The observations in the scans of every scanner that bends them."""
+        """Rows of the observations in the scans of each scanner with deformation."""
         names = np.array([image.scanner for image in self.images])[self.image_numbers]
         bending = (scanner.name for scanner in self.scanners if not scanner.bend.is_identity)
         return {name: np.flatnonzero(names == name) for name in bending}
 
     @cached_property
     def straight_xy_mm(self) -> Array:
-        """The observed coordinates (n, 2), freed of the scanners' bends as far as these are given."""
+        """(n, 2) observed coordinates, corrected for the given scanner terms."""
         xy_mm = self.observations.xy_mm
         if self.rows_by_scanner:
             xy_mm = xy_mm.copy()
@@ -222,13 +235,13 @@ class Network:
 
     @cached_property
     def image_numbers(self) -> Indices:
-        """(n,) the image of every observation, by its number."""
+        """(n,) number of each observation's image."""
         number = {image.name: i for i, image in enumerate(self.images)}
         return np.array([number[name] for name in self.observations.image], dtype=np.intp)
 
     @cached_property
     def frame_numbers(self) -> Indices:
-        """(images,) the frame of every image, by its number in the order of their first images."""
+        """(images,) number of each image's frame, in order of first appearance."""
         number: dict[str, int] = {}
         return np.array([number.setdefault(image.frame, len(number)) for image in self.images], dtype=np.intp)
 
@@ -239,7 +252,7 @@ class Network:
 
     @cached_property
     def joins(self) -> dict[tuple[str, str], Indices]:
-        """The observations of every join, by frame and point."""
+        """Rows of the observations of each join, by frame and point."""
         rows: dict[tuple[str, str], list[int]] = {}
         for row in np.flatnonzero(self.observations.has_kind("join")):
             frame = self.images[self.image_numbers[row]].frame
@@ -248,7 +261,7 @@ class Network:
 
     @cached_property
     def known_places(self) -> dict[str, Array]:
-        """The coordinates (3,) of the points that are given in X, Y and Z, by id."""
+        """(3,) coordinates of the points given in X, Y and Z, by id."""
         given = {point.id: [each for each in (point.X, point.Y, point.Z) if each] for point in self.points}
         return {
             id_: np.array([each.value for each in priors])
@@ -258,19 +271,19 @@ class Network:
 
     @cached_property
     def observed_points(self) -> frozenset[str]:
-        """The object points that are seen in an image."""
+        """Object points seen in an image."""
         names, of_name = self.observations.numbered_points
         return frozenset(names[i] for i in np.flatnonzero(np.bincount(of_name[~self.observations.is_fiducial])))
 
     @cached_property
     def observed_fiducials(self) -> frozenset[tuple[str, str]]:
-        """(camera, id) of the fiducials that are seen in an image."""
+        """(camera, id) of the fiducials seen in an image."""
         rows = np.flatnonzero(self.observations.has_kind("fiducial"))
         return frozenset((self.images[self.image_numbers[row]].camera, self.observations.point[row]) for row in rows)
 
     @cached_property
     def observed_distances(self) -> tuple[tuple[str, FiducialDistance], ...]:
-        """Distances between fiducials, with the camera, of which images show both ends; none between fixed marks."""
+        """Distances between fiducials, with the camera, both ends seen in images and not both fixed."""
         return tuple(
             (camera.name, each)
             for camera in self.cameras
@@ -281,7 +294,7 @@ class Network:
 
     @cached_property
     def objectless_images(self) -> frozenset[str]:
-        """The images whose frames show no object point, only fiducials or nothing."""
+        """Images whose frames show no object point."""
         frames = self.frame_numbers
         of_targets = frames[self.image_numbers[~self.observations.is_fiducial]]
         targets = np.bincount(of_targets, minlength=len(self.images))[frames]
@@ -289,12 +302,12 @@ class Network:
 
     @cached_property
     def unoriented(self) -> frozenset[str]:
-        """Those of them whose exterior orientation is not observed either: a film transformation is all they have."""
+        """Images without object points and observed orientation: only their film transformation is adjusted."""
         return frozenset(name for name in self.objectless_images if not self.image_by_name[name].is_observed)
 
     @cached_property
     def idle_cameras(self) -> frozenset[str]:
-        """The cameras none of whose images shows an object point: their interior orientation has no part."""
+        """Cameras without an image of object points: their interior orientation is not adjusted."""
         busy = {image.camera for image in self.images if image.name not in self.objectless_images}
         return frozenset(camera.name for camera in self.cameras if camera.name not in busy)
 
@@ -308,7 +321,7 @@ class Network:
 
 
 def _extent(lowest: Array, highest: Array) -> Extent:
-    """An image that shows less than two places has the extent of a millimetre."""
+    """Extent between two corners; 1 mm for an image with fewer than two places."""
     if not np.isfinite(lowest).all():
         return Extent(np.zeros(2), 1.0)
     return Extent((lowest + highest) / 2.0, float((highest - lowest).max()) / 2.0 or 1.0)
@@ -316,12 +329,17 @@ def _extent(lowest: Array, highest: Array) -> Extent:
 
 @dataclass(frozen=True, repr=False)
 class Approximations:
-    """Where the iteration starts: by camera, image and point name, in the units of the network.
+    """Initial values by camera, image and point name, in the units of the network.
 
-    interior (c, x0', y0'); exterior (6,), parts of a frame alike; transformation: the parameters of the image's kind in
-    the order of `functional_model.transformation`; points (3,); joins (2,): places in the camera frame, by frame and
-    point. mirrored: the images whose scan is mirrored (the determinant of
-    their transformation is negative), which a congruent, similarity or conformal one has to be told.
+    Attributes
+    ----------
+    interior : c, x0', y0' by camera.
+    exterior : (6,) by image, equal for parts of a frame.
+    transformation : parameters by image, in the order of `functional_model.transformation`.
+    points : (3,) by point.
+    mirrored : images whose scan is mirrored (the determinant of their transformation is negative); congruent,
+        similarity and conformal transformations need this.
+    joins : (2,) places in the camera frame, by frame and point.
     """
 
     interior: Mapping[str, Array]

@@ -1,4 +1,4 @@
-"""What is observed: marks in images, distances between points, cameras by earlier adjustments."""
+"""Observations: marks in images, distances between points, earlier calibrations."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,11 +15,14 @@ ObservationKind = Literal["target", "fiducial", "tie", "join"]
 
 @dataclass(frozen=True, repr=False)
 class Observations:
-    """Measured comparator coordinates, one row a mark in an image.
+    """Measured comparator coordinates, one row per mark and image.
 
-    image, point, kind: (n,) names; a fiducial's point is its id in the image's camera. A "join" is a point of the film
-    that is common to several scans of one frame: what it is in the object need not be known.
-    xy_mm (n, 2) in the comparator frame (y up); covariance_mm2 (n, 2, 2).
+    Attributes
+    ----------
+    image, point, kind : (n,) names; a fiducial's point is its id in the image's camera. A "join" is a film point common
+        to several scans of one frame, whose object point need not be known.
+    xy_mm : (n, 2) in the comparator frame (y up).
+    covariance_mm2 : (n, 2, 2).
     """
 
     image: tuple[str, ...]
@@ -36,11 +39,11 @@ class Observations:
 
     @cached_property
     def is_fiducial(self) -> Mask:
-        """(n,) whether it is a place in the camera frame that is observed, fiducial or join, and no object point."""
+        """(n,) mask of observations of a place in the camera frame (fiducial or join) instead of an object point."""
         return np.asarray(self.has_kind("fiducial") | self.has_kind("join"))
 
     def has_kind(self, kind: ObservationKind) -> Mask:
-        """(n,) whether it is of a kind."""
+        """(n,) mask of observations of a kind."""
         return np.asarray(self._kinds == kind)
 
     @cached_property
@@ -49,12 +52,12 @@ class Observations:
 
     @cached_property
     def numbered_points(self) -> tuple[tuple[str, ...], Indices]:
-        """The names of all points and fiducials, each once, and every observation's (n,) by its number among them."""
+        """Unique names of all points and fiducials, and the number (n,) of each observation's point among them."""
         number = {name: i for i, name in enumerate(dict.fromkeys(self.point))}
         return tuple(number), np.array([number[name] for name in self.point], dtype=np.intp)
 
     def only(self, rows: Indices) -> "Observations":
-        """Some of the rows."""
+        """Select rows."""
         return Observations(
             tuple(self.image[row] for row in rows),
             tuple(self.point[row] for row in rows),
@@ -66,9 +69,9 @@ class Observations:
 
 @dataclass(frozen=True)
 class Distance:
-    """A measured distance between two object points, two stations or one of each.
+    """Measured distance between two object points, two stations, or a point and a station.
 
-    start, end: a point's name; where no point has it, that of the image whose station it is. value and its standard
+    start, end: name of a point, or of the image if no point has this name. value, sigma: distance and its standard
     deviation in object units.
     """
 
@@ -80,10 +83,10 @@ class Distance:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What an earlier adjustment found of a camera, "equal to image observations" (Juhl).
+    """Earlier calibration of a camera, "equal to image observations" (Juhl).
 
-    parameters (m,): the keys of the camera's quantities; values (m,), covariance (m, m). What was given beforehand in
-    that adjustment is in it already: these quantities must be free of priors here.
+    parameters (m,): keys of the camera's quantities; values (m,), covariance (m, m). They include the priors of that
+    adjustment: these quantities must have no priors here.
     """
 
     parameters: tuple[Parameter, ...]

@@ -1,4 +1,4 @@
-"""The identity of every quantity of an adjustment: a key, its text in files, and its words in messages."""
+"""Keys of the quantities of an adjustment: their text in files and their description in messages."""
 
 import re
 from collections.abc import Collection, Iterable, Sequence
@@ -8,7 +8,7 @@ from adjust.errors import DatumError
 
 Kind = Literal["interior", "fiducial", "scanner", "board", "point", "exterior", "film", "join"]
 
-MANY = "*"  # in the place of an owner or an id: several of them
+MANY = "*"  # owner or id that stands for several
 CODES: dict[Kind, str] = {
     "interior": "IO",
     "fiducial": "FID",
@@ -31,10 +31,14 @@ _PLURALS: dict[Kind, str] = {
 
 
 class Parameter(NamedTuple):
-    """Which quantity: fixed or estimated, of a camera, a fiducial, an image and so on.
+    """Key of a quantity, fixed or estimated.
 
-    owner: the camera, scanner, board, image or frame, empty for an object point. id: of a fiducial or an object point,
-    the point that joins scans of a frame; empty otherwise. quantity: its name there, without a dot: "c", "x", "omega".
+    Attributes
+    ----------
+    kind : kind of its owner.
+    owner : camera, scanner, board, image or frame; empty for an object point.
+    id : fiducial, object point or join; else empty.
+    quantity : name without a dot: "c", "x", "omega".
     """
 
     kind: Kind
@@ -44,50 +48,50 @@ class Parameter(NamedTuple):
 
     @staticmethod
     def interior(camera: str, quantity: str) -> "Parameter":
-        """c, x0, y0 or a distortion parameter."""
+        """Key of c, x0, y0 or a distortion parameter."""
         return Parameter("interior", camera, "", quantity)
 
     @staticmethod
     def fiducial(camera: str, id: str, axis: str) -> "Parameter":
-        """x or y."""
+        """Key of a fiducial's x or y."""
         return Parameter("fiducial", camera, id, axis)
 
     @staticmethod
     def scanner(name: str, term: str) -> "Parameter":
-        """A term of the scanner's bend."""
+        """Key of a scanner term."""
         return Parameter("scanner", name, "", term)
 
     @staticmethod
     def board(name: str, bend: str) -> "Parameter":
-        """A bend of a board of targets."""
+        """Key of a bend of a board."""
         return Parameter("board", name, "", bend)
 
     @staticmethod
     def point(id: str, axis: str) -> "Parameter":
-        """X, Y or Z."""
+        """Key of an object point's X, Y or Z."""
         return Parameter("point", "", id, axis)
 
     @staticmethod
     def exterior(image: str, element: str) -> "Parameter":
-        """X0, Y0, Z0, omega, phi or kappa; image: the frame's name where it has several scans."""
+        """Key of X0, Y0, Z0, omega, phi or kappa; image: the frame's name where it has several scans."""
         return Parameter("exterior", image, "", element)
 
     @staticmethod
     def film(image: str, quantity: str) -> "Parameter":
-        """A parameter of the film transformation."""
+        """Key of a film transformation parameter."""
         return Parameter("film", image, "", quantity)
 
     @staticmethod
     def join(frame: str, point: str, axis: str) -> "Parameter":
-        """x or y in the camera of a point that scans of one frame have in common."""
+        """Key of x or y, in the camera frame, of a point common to several scans of one frame."""
         return Parameter("join", frame, point, axis)
 
     @property
     def text(self) -> str:
-        """As files name it: `IO.<camera>.k3`, `FID.<camera>.<id>.x`, `PT.<id>.X`.
+        """Name in files: `IO.<camera>.k3`, `FID.<camera>.<id>.x`, `PT.<id>.X`.
 
-        One text is of one key only, and `parameter_from_text` reads it back: where two names stand in it, a dot in the
-        second is written %2E.
+        The text is unique, and `parameter_from_text` reads it back: if it holds two names, a dot in the second is
+        written %2E.
         """
         match self.kind:
             case "point":
@@ -100,17 +104,17 @@ class Parameter(NamedTuple):
 
     @property
     def label_in_camera(self) -> str:
-        """The quantity of a camera, by itself or by its fiducial."""
+        """Name of a quantity of a camera within the camera."""
         return f"{self.quantity} of fiducial {self.id}" if self.id else self.quantity
 
     @property
     def label(self) -> str:
-        """As messages name it: "k3 of camera Wild RC8", "x of fiducial 3, camera Wild RC8"."""
+        """Name in messages: "k3 of camera Wild RC8", "x of fiducial 3, camera Wild RC8"."""
         return f"{self.quantity} of {self._owner_label}"
 
     @property
     def any_owner(self) -> "Parameter":
-        """The quantity of all that are alike: of any image, of any fiducial of the camera."""
+        """Key of the same quantity of several owners: of any image, of any fiducial of the camera."""
         match self.kind:
             case "interior" | "scanner":
                 return self
@@ -146,7 +150,7 @@ class Parameter(NamedTuple):
 
 
 def description(parameters: Iterable[Parameter]) -> str:
-    """Several in words, those of one owner together: "c and x0 of camera K; Z0 of several images"."""
+    """Describe several quantities, grouped by owner: "c and x0 of camera K; Z0 of several images"."""
     quantities: dict[str, list[str]] = {}
     for each in parameters:
         quantities.setdefault(each._owner_label, []).append(each.quantity)
@@ -154,10 +158,10 @@ def description(parameters: Iterable[Parameter]) -> str:
 
 
 def parameter_from_text(text: str, cameras: Collection[str] = ()) -> Parameter:
-    """The key of a text that `Parameter.text` has written. Raises ValueError for any other.
+    """Parse a text written by `Parameter.text`. Raises ValueError for any other.
 
-    cameras: all that the file has. An earlier version wrote a dot in a fiducial's id as it is; such an id is known by
-    its camera.
+    cameras: all cameras of the file. An earlier version did not escape dots in the ids of fiducials; such an id is
+    recognised by its camera.
     """
     parameter = _parameter(text)
     if parameter.kind != "fiducial" or not cameras or parameter.owner in cameras:
@@ -170,7 +174,7 @@ def parameter_from_text(text: str, cameras: Collection[str] = ()) -> Parameter:
 
 
 def parameters_from_texts(texts: Sequence[str]) -> tuple[Parameter, ...]:
-    """The keys of all texts of one file. Raises ValueError for a text that names nothing."""
+    """Parse all texts of one file. Raises ValueError for an invalid text."""
     cameras = {each.owner for each in map(_parameter, texts) if each.kind == "interior"}
     return tuple(parameter_from_text(text, cameras) for text in texts)
 
@@ -192,12 +196,12 @@ def _parameter(text: str) -> Parameter:
 
 
 def as_parameter(parameter: Parameter | str) -> Parameter:
-    """A key as it is, or that of a text."""
+    """Return a key unchanged, or parse a text."""
     return parameter_from_text(parameter) if isinstance(parameter, str) else parameter
 
 
 def object_coordinate(text: str) -> Parameter:
-    """The coordinate that a user calls "12.X". Raises DatumError where the last part is not X, Y or Z."""
+    """Parse a coordinate such as "12.X". Raises DatumError where the last part is not X, Y or Z."""
     point, _, axis = text.rpartition(".")
     if axis not in ("X", "Y", "Z"):
         raise DatumError(f"The datum coordinate {text} is none: write the point, a dot and X, Y or Z, such as 12.X.")
@@ -205,7 +209,7 @@ def object_coordinate(text: str) -> Parameter:
 
 
 def _escape_dots(name: str) -> str:
-    """A percent sign is written %25 where it could be mistaken for the beginning of %2E or %25."""
+    """Escape dots as %2E, and a percent sign as %25 where it would be ambiguous."""
     return re.sub(r"%(?=2E|25)", "%25", name).replace(".", "%2E") if "." in name or "%" in name else name
 
 
@@ -214,5 +218,5 @@ def _unescape_dots(name: str) -> str:
 
 
 def enumeration(names: Sequence[str]) -> str:
-    """Words as a sentence lists them: with commas, and `and` before the last one."""
+    """Join words with commas, and `and` before the last one."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -1,4 +1,4 @@
-"""The probabilities of the tests of observations, and the critical values that follow from them."""
+"""Significance levels and power of the tests of observations, and the critical values."""
 
 from dataclasses import dataclass
 
@@ -10,9 +10,13 @@ from adjust.array_types import Array, Indices
 
 @dataclass(frozen=True)
 class Probabilities:
-    """alpha: that a single good observation fails its test, and power: that an error of the smallest detectable size
-    is detected by it (Baarda's alpha0 and beta0). family: that any one of all good observations of an adjustment is
-    called suspect.
+    """Error probabilities of the tests.
+
+    Attributes
+    ----------
+    alpha : significance level of a single test.
+    power : probability of detecting an error of the smallest detectable size (Baarda's alpha0 and beta0).
+    family : family-wise significance level: probability that any good observation of an adjustment is rejected.
     """
 
     alpha: float = 0.001
@@ -27,25 +31,25 @@ class Probabilities:
             raise ValueError(f"the power ({self.power}) must be larger than alpha ({self.alpha})")
 
     def noncentrality(self, size: int) -> float:
-        """delta0: the shift, in standard deviations, of a test of `size` coordinates that `power` detects.
+        """delta0: shift in standard deviations that a test of `size` coordinates detects with the probability `power`.
 
-        Of one coordinate 4.13 with the usual probabilities. Source: W. Baarda, A Testing Procedure for Use in Geodetic
-        Networks, 1968.
+        It is 4.13 for one coordinate with the usual probabilities. Source: W. Baarda, A Testing Procedure for Use in
+        Geodetic Networks, 1968.
         """
         return float(np.sqrt(special.chndtrinc(special.chdtri(size, self.alpha), size, 1.0 - self.power)))
 
     def critical(self, sizes: Indices, tests: int) -> Array:
-        """What the squared test statistic of each of so many tests may reach, chi-square of `sizes` coordinates.
+        """Critical values of the squared test statistics, chi-square with `sizes` degrees of freedom, of several tests.
 
-        The probability `family` is shared out evenly (Sidak).
+        The level `family` is divided evenly over the tests (Sidak).
         """
         return np.asarray(special.chdtri(np.maximum(sizes, 1), _sidak(self.family, tests)), dtype=np.float64)
 
     def critical_tau(self, redundancy: int, tests: int = 1) -> float:
-        """What Pope's tau, the standardised residual over sigma0 of the same adjustment, may reach; inf: no test.
+        """Critical value of Pope's tau, the standardised residual over sigma0 of the same adjustment; inf: no test.
 
-        One test with the probability alpha, many share `family`. Source: A. J. Pope, The Statistics of Residuals and
-        the Detection of Outliers, NOAA Technical Report 65, 1976.
+        One test has the level alpha, several share `family`. Source: A. J. Pope, The Statistics of Residuals and the
+        Detection of Outliers, NOAA Technical Report 65, 1976.
         """
         if redundancy < 2:
             return np.inf
@@ -55,5 +59,5 @@ class Probabilities:
 
 
 def _sidak(family: float, tests: int) -> float:
-    """The probability for each of so many independent tests where that of any one failing is `family`."""
+    """Level of each of several independent tests with the family-wise level `family`."""
     return float(-np.expm1(np.log1p(-family) / max(tests, 1)))

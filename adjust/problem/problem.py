@@ -1,4 +1,4 @@
-"""A network whose quantities are numbered, observation by observation, and the state of its unknowns."""
+"""Network with numbered quantities, its observations indexed into them, and the state of the unknowns."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -20,7 +20,7 @@ from adjust.problem.unknowns import Unknowns, list_unknowns
 Number = TypeVar("Number", np.float64, np.intp)
 
 _NOWHERE = np.full(3, -1, dtype=np.intp)
-ABSENT = -1  # stands for the unknown of a column that an observation does not have
+ABSENT = -1  # position in a column that an observation does not use
 
 
 def number(network: Network, approximations: Approximations, by_elements: bool = False) -> "Problem":
@@ -33,9 +33,9 @@ def number(network: Network, approximations: Approximations, by_elements: bool =
 
 @dataclass(frozen=True)
 class State:
-    """The unknowns of the moment: values (n,) and, image by image, the rotations (images, 3, 3).
+    """Current values (n,) of the unknowns, and rotation matrices (images, 3, 3).
 
-    The angles among the values follow the rotations, except in images whose angles are observed or fixed, where the
+    The angles among the values follow the rotations, except in images whose angles are observed or fixed: there the
     rotations follow the angles.
     """
 
@@ -45,10 +45,16 @@ class State:
 
 @dataclass(frozen=True)
 class Films:
-    """The images with one kind of film transformation, and their observations.
+    """Images with one kind of film transformation, and their observations.
 
-    images (m,): their numbers; positions (m, k) of their parameters; center_mm (m, 2), half_mm (m,) of their extents;
-    rows (n,): their observations; of (n,): the image of each of these, counted among the m.
+    Attributes
+    ----------
+    kind : formula.
+    images : (m,) numbers of the images.
+    positions : (m, k) positions of their parameters.
+    center_mm, half_mm : (m, 2), (m,) centre and half size of their extents.
+    rows : (n,) rows of their observations.
+    of : (n,) index of each observation's image among the m.
     """
 
     kind: FilmKind
@@ -61,18 +67,18 @@ class Films:
 
     @cached_property
     def centers_mm(self) -> Array:
-        """(n, 2) of the image of every observation."""
+        """(n, 2) centre of the extent of each observation's image."""
         return np.asarray(self.center_mm.T[:, self.of].T)
 
     @cached_property
     def halves_mm(self) -> Array:
-        """(n,) of the image of every observation."""
+        """(n,) half size of the extent of each observation's image."""
         return self.half_mm[self.of]
 
 
 @dataclass(frozen=True)
 class Scans:
-    """The scans of one scanner that bends them: positions (k,) of its parameters, rows (n,) of the observations."""
+    """Scans of one scanner with deformation: positions (k,) of its parameters, rows (n,) of the observations."""
 
     bend: Bend
     positions: Indices
@@ -81,8 +87,10 @@ class Scans:
 
 @dataclass(frozen=True)
 class Part:
-    """Some columns of an observation's derivatives: by which members of an image's elements, a place's coordinates, a
-    film's parameters, a camera's, a scanner's or a board's, and where they stand.
+    """Block of columns of an observation's derivatives.
+
+    members: indices among the elements of an exterior orientation, the coordinates of a place, or the parameters of a
+    film, camera, scanner or board. columns: where the block stands.
     """
 
     members: Indices
@@ -90,7 +98,7 @@ class Part:
 
 
 class Parts(NamedTuple):
-    """The columns of an observation's derivatives."""
+    """Column blocks of an observation's derivatives."""
 
     exterior: Part
     place: Part
@@ -101,18 +109,23 @@ class Parts(NamedTuple):
 
     @property
     def width(self) -> int:
-        """Of all columns."""
+        """Number of columns."""
         return int(self.board.columns.stop)
 
 
 @dataclass(frozen=True)
 class Problem:
-    """A network with its list of unknowns; mirrored: the images whose scan is mirrored.
+    """Network with its list of unknowns.
 
-    by_elements: distortion is that of the observed camera point and not of the adjusted one, so that every observation
-    is an explicit function of the unknowns (adjustment by elements, of indirect observations).
-    pseudo_observed: positions of free unknowns that are held near their given values, and by which standard deviations
-    (see `rank_defect.flat_valleys`): no observations, and none of what the result tells of these.
+    Attributes
+    ----------
+    network : the network.
+    unknowns : all quantities, numbered.
+    mirrored : names of the images whose scan is mirrored.
+    by_elements : evaluate the distortion at the observed camera point instead of the adjusted one, so that every
+        observation is an explicit function of the unknowns (adjustment by elements, of indirect observations).
+    pseudo_observed : standard deviations of pseudo-observations that hold free unknowns near their given values, by
+        position (see `rank_defect.flat_valleys`). They are not observations and do not appear in the result.
     """
 
     network: Network
@@ -123,7 +136,7 @@ class Problem:
 
     @cached_property
     def prior_sigma(self) -> Array:
-        """(n,) the standard deviations of priors and pseudo-observations: 0 fixed, inf for what has neither."""
+        """(n,) standard deviations of priors and pseudo-observations: 0 fixed, inf without either."""
         sigma = self.unknowns.sigma.copy()
         for position, own in self.pseudo_observed.items():
             sigma[position] = min(sigma[position], own)
@@ -134,9 +147,10 @@ class Problem:
         return State(values, rotation_from_angles(values[self.exterior[:, 3:]]))
 
     def step_state(self, state: State, step: Array) -> State:
-        """The state after a step (n,) of the unknowns.
+        """Apply a step (n,) of the unknowns to a state.
 
-        Rotation vectors stand in the places of the angles, centred film parameters in those of the film parameters.
+        In the step, rotation vectors take the places of the angles, and centred film parameters those of the film
+        parameters.
         """
         values = state.values + step
         for positions, centred_jacobian in self.films_by_centred(state):
@@ -148,12 +162,12 @@ class Problem:
         return State(values, rotations)
 
     def attitude_by_unknowns(self, state: State) -> Array:
-        """(images, 3, 3) derivative of the rotation vector by what moves the attitude: the vector itself, or angles."""
+        """(images, 3, 3) derivatives of the rotation vector with respect to the attitude unknowns: vector or angles."""
         by_angles = vector_by_angles(state.values[self.exterior[:, 3:]])
         return np.where(self.keeps_angles[:, None, None], by_angles, np.eye(3))
 
     def films_by_centred(self, state: State) -> list[tuple[Indices, Array]]:
-        """Positions (m, k) of film parameters, and their derivatives (m, k, k) by what moves them, the centred ones."""
+        """Positions (m, k) of film parameters, and their derivatives (m, k, k) with respect to the centred ones."""
         return [
             (
                 films.positions,
@@ -164,7 +178,7 @@ class Problem:
 
     @cached_property
     def films(self) -> list[Films]:
-        """The film transformations of all images, those of one kind together."""
+        """Film transformations of all images, grouped by kind."""
         network, found = self.network, []
         members: dict[tuple[Transformation, bool], list[int]] = {}
         for i, image in enumerate(network.images):
@@ -183,7 +197,7 @@ class Problem:
 
     @cached_property
     def scans(self) -> list[Scans]:
-        """The scans of the scanners that bend them, those of one together."""
+        """Scans with scanner deformation, grouped by scanner."""
         return [
             Scans(self.network.scanner_by_name[name].bend, self.unknowns.scanner[name], rows)
             for name, rows in self.network.rows_by_scanner.items()
@@ -191,7 +205,7 @@ class Problem:
 
     @cached_property
     def parts(self) -> Parts:
-        """The columns of an observation's derivatives: those that are by free unknowns in some observation."""
+        """Column blocks of an observation's derivatives: columns of a free unknown in some observation."""
         free = np.append(self.unknowns.sigma > 0.0, False)  # the last stands for ABSENT
         shown = np.flatnonzero(np.bincount(self.image_numbers[~self.is_fiducial]))
         positions = (
@@ -208,38 +222,38 @@ class Problem:
 
     @cached_property
     def film_positions(self) -> Indices:
-        """(images, k) positions of the film parameters, ABSENT behind those of films that have less."""
+        """(images, k) positions of the film parameters, padded with ABSENT."""
         return side_by_side([self.unknowns.transformation[image.name] for image in self.network.images])
 
     @cached_property
     def _camera_positions(self) -> Indices:
-        """(images, k) positions of interior orientation and distortion, ABSENT behind shorter ones."""
+        """(images, k) positions of interior orientation and distortion, padded with ABSENT."""
         return side_by_side([self.unknowns.camera[image.camera] for image in self.network.images])
 
     @cached_property
     def _scanner_positions(self) -> Indices:
-        """(images, k) positions of the terms of the scanners' bends, ABSENT behind shorter ones."""
+        """(images, k) positions of the scanner terms, padded with ABSENT."""
         none = np.empty(0, dtype=np.intp)
         return side_by_side([self.unknowns.scanner.get(image.scanner, none) for image in self.network.images])
 
     @cached_property
     def further(self) -> tuple[FurtherObservation, ...]:
-        """What is observed beside image points and single unknowns."""
+        """Observations other than image points and priors of single unknowns."""
         return further_observations(self.network, self.unknowns)
 
     @cached_property
     def image_numbers(self) -> Indices:
-        """(n,) the image of every observation, by its number in the network."""
+        """(n,) number of each observation's image in the network."""
         return self.network.image_numbers
 
     @cached_property
     def is_fiducial(self) -> Mask:
-        """(n,) whether it is a place in the camera frame that is observed, and not an object point."""
+        """(n,) mask of observations of a place in the camera frame instead of an object point."""
         return self.network.observations.is_fiducial
 
     @cached_property
     def targets_by_camera(self) -> dict[str, Indices]:
-        """The observations of object points by every camera."""
+        """Rows of the observations of object points, by camera."""
         cameras = np.array([image.camera for image in self.network.images])[self.image_numbers]
         return {name: np.flatnonzero((cameras == name) & ~self.is_fiducial) for name in self.unknowns.camera}
 
@@ -250,12 +264,12 @@ class Problem:
 
     @cached_property
     def keeps_angles(self) -> Mask:
-        """(images,) whether the attitude is moved by its angles and not by a rotation vector."""
+        """(images,) mask of images whose attitude is updated by its angles instead of a rotation vector."""
         return np.array([self.unknowns.keeps_angles(image.name) for image in self.network.images])
 
     @cached_property
     def places(self) -> Indices:
-        """(n, 3) positions of the point's coordinates, or of the fiducial's or join's two and ABSENT."""
+        """(n, 3) positions of the point's coordinates; for a fiducial or join its two coordinates and ABSENT."""
         images, observations = self.network.images, self.network.observations
         names, of_name = observations.numbered_points
         places = np.array([self.unknowns.point.get(name, _NOWHERE) for name in names], dtype=np.intp)[of_name]
@@ -268,18 +282,18 @@ class Problem:
 
     @cached_property
     def board_positions(self) -> Indices:
-        """(n, 2) positions of the bends of the board that each point is on, ABSENT where it is on none."""
+        """(n, 2) positions of the bends of each point's board, ABSENT for points on none."""
         of_point = {id_: self.unknowns.board[board.name] for board in self.network.boards for id_ in board.places}
         return self._point_values(of_point, np.full(2, ABSENT, dtype=np.intp))
 
     @cached_property
     def lift_directions(self) -> Array:
-        """(n, 2, 3): where a bend of 1 along each of its board's axes moves the point; 0 where it is on none."""
+        """(n, 2, 3) displacement of the point by a bend of 1 along each axis of its board; 0 for points on none."""
         of_point = {id_: lifted for board in self.network.boards for id_, lifted in board.lift_directions.items()}
         return self._point_values(of_point, np.zeros((2, 3)))
 
     def _point_values(self, of_point: Mapping[str, NDArray[Number]], of_others: NDArray[Number]) -> NDArray[Number]:
-        """What every observation's point has, or what others have."""
+        """Look up a value for each observation's point; of_others for all other points."""
         names, of_name = self.network.observations.numbered_points
         if not of_point:
             return np.repeat(of_others[None], len(of_name), axis=0)
@@ -289,7 +303,7 @@ class Problem:
 
     @cached_property
     def columns(self) -> Indices:
-        """(n, k) positions of the unknowns in an observation's derivatives, those of `parts`."""
+        """(n, k) positions of the unknowns in an observation's derivatives, as in `parts`."""
         exterior, place, film, camera, scanner, board = self.parts
         by_image = np.empty((len(self.network.images), self.parts.width), dtype=np.intp)
         of_images = (
@@ -309,7 +323,7 @@ class Problem:
 
 
 def side_by_side(rows: list[Indices]) -> Indices:
-    """Rows of different lengths as one array, ABSENT behind the shorter."""
+    """Stack rows of different lengths in one array, padded with ABSENT."""
     array = np.full((len(rows), max(len(row) for row in rows)), ABSENT, dtype=np.intp)
     for own, row in zip(array, rows, strict=True):
         own[: len(row)] = row

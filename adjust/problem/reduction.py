@@ -1,7 +1,7 @@
-"""Reduction to the centroid: object coordinates counted from the middle of the network.
+"""Reduction of object coordinates to the centroid of the network.
 
-A coordinate of seven digits leaves a difference of two of them a nanometre or so of rounding, which keeps an iteration
-from standing still. All that is computed is therefore computed about the middle of the field.
+The difference of two coordinates of seven digits has a rounding error of about a nanometre, which keeps an iteration
+from converging. All computations therefore use coordinates relative to the centre of the field.
 """
 
 from dataclasses import dataclass, replace
@@ -16,17 +16,16 @@ from adjust.problem.unknowns import Unknowns
 
 @dataclass(frozen=True)
 class Reduction:
-    """origin (3,): what is taken off all object coordinates, stations' and points'."""
+    """Shift of object coordinates; origin (3,): subtracted from all stations and points."""
 
     origin: Array
 
     @classmethod
     def to_centroid(cls, network: Network) -> "Reduction":
-        """To a round place near the middle of what is given; none where the middle is nearer to 0 than the field is
-        wide.
+        """Choose a round origin near the centre of the given coordinates; zero where the field includes the origin.
 
         The origin is a multiple of a power of two near the field's extent, so that no digit of a coordinate is lost.
-        Heights are left as they are where the line of sight depends on them.
+        Heights are not reduced where the line of sight depends on them.
         """
         xyz = _given_places(network)
         count = (~np.isnan(xyz)).sum(axis=0)
@@ -45,11 +44,11 @@ class Reduction:
 
     @property
     def inverse(self) -> "Reduction":
-        """Back to the network's own coordinates."""
+        """Transformation back to the network's own coordinates."""
         return Reduction(-self.origin)
 
     def network(self, network: Network) -> Network:
-        """A network in reduced coordinates."""
+        """Reduce a network."""
         if self.is_none:
             return network
         return replace(
@@ -60,7 +59,7 @@ class Reduction:
         )
 
     def approximations(self, start: Approximations) -> Approximations:
-        """Approximations in reduced coordinates."""
+        """Reduce approximations."""
         if self.is_none:
             return start
         return replace(
@@ -70,7 +69,7 @@ class Reduction:
         )
 
     def unreduced_values(self, unknowns: Unknowns, values: Array, network: Network) -> Array:
-        """The values (n,) of reduced unknowns in the network's own coordinates; fixed ones exactly as given."""
+        """Convert values (n,) of reduced unknowns to the network's own coordinates; fixed ones exactly as given."""
         if self.is_none:
             return values
         whole = values.copy()
@@ -84,7 +83,7 @@ class Reduction:
 
     @property
     def _element_shift(self) -> Array:
-        """(6,) what is taken off an exterior orientation."""
+        """(6,) shift of an exterior orientation."""
         return np.append(self.origin, np.zeros(3))
 
     def _image(self, image: Image) -> Image:
@@ -102,7 +101,7 @@ class Reduction:
 
 
 def _given_places(network: Network) -> Array:
-    """(n, 3) what is given of the points, else of the stations; nan where nothing is."""
+    """(n, 3) given coordinates of the points, else of the stations; nan where not given."""
     priors = [(point.X, point.Y, point.Z) for point in network.points]
     rows = [[np.nan if prior is None else prior.value for prior in three] for three in priors]
     places = np.array(rows, dtype=np.float64).reshape(-1, 3)

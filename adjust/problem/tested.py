@@ -1,4 +1,4 @@
-"""What is tested as one: an image point, a given fiducial, any other given coordinate."""
+"""Units of the tests for gross errors: an image point, a given fiducial, or any other given quantity."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,12 +15,15 @@ PRIOR_GROUPS = ("datum", "control", "interior", "scanner", "board", "exterior")
 
 @dataclass(frozen=True)
 class Tested:
-    """One image point, or one given quantity: what a gross error would be found in, and taken out with.
+    """Unit of a test: one image point or one given quantity, rejected as a whole.
 
-    group: target, tie, fiducial or join in an image; datum (the given place of a fiducial), control (a given object
-    coordinate), interior, scanner, board or exterior (a given element). owner: its image, camera, scanner or board,
-    empty for object points. point: its id, empty for the elements. coordinates: x and y where both are tested as one,
-    else a single one.
+    Attributes
+    ----------
+    group : "target", "tie", "fiducial" or "join" in an image; "datum" (given place of a fiducial), "control" (given
+        object coordinate), "interior", "scanner", "board" or "exterior" (given element).
+    owner : image, camera, scanner or board; empty for object points.
+    point : id; empty for the elements.
+    coordinates : x and y if tested jointly, else a single one.
     """
 
     group: str
@@ -30,7 +33,7 @@ class Tested:
 
     @property
     def name(self) -> str:
-        """In words: "target 45 in image f1", "given fiducial 7 (camera RC20)", "control point 12 Z"."""
+        """Description: "target 45 in image f1", "given fiducial 7 (camera RC20)", "control point 12 Z"."""
         alone = f" {self.coordinates[0]}" if len(self.coordinates) == 1 else ""
         match self.group:
             case "datum":
@@ -49,7 +52,7 @@ class Tested:
                 return f"{self.group} {self.point}{alone} in image {self.owner}"
 
     def coordinate_name(self, axis: int) -> str:
-        """One of its coordinates in words: "target 45 x in image f1"."""
+        """Description of one coordinate: "target 45 x in image f1"."""
         return Tested(self.group, self.owner, self.point, (self.coordinates[axis],)).name if self.is_pair else self.name
 
     @property
@@ -59,7 +62,7 @@ class Tested:
 
 @dataclass(frozen=True)
 class TestedUnits:
-    """Everything that is tested in a problem: its observations in their order, then its priors."""
+    """All units of a problem: its observations in order, then its priors."""
 
     problem: Problem
 
@@ -68,10 +71,10 @@ class TestedUnits:
 
     @cached_property
     def positions(self) -> Indices:
-        """(m, 2) positions of the unknowns that the priors are of, ABSENT behind those that stand alone."""
+        """(m, 2) positions of the unknowns with priors, ABSENT as the second of single ones."""
         unknowns = self.problem.unknowns
         given = unknowns.has_prior
-        shared = dict.fromkeys(tuple(pair) for pair in unknowns.fiducial.values())  # by cameras of the same marks
+        shared = dict.fromkeys(tuple(pair) for pair in unknowns.fiducial.values())  # cameras may share marks
         pairs = [pair for pair in shared if given[list(pair)].all()]
         paired = np.array(pairs, dtype=np.intp).reshape(-1, 2)
         alone = np.setdiff1d(np.flatnonzero(given), paired)
@@ -79,19 +82,19 @@ class TestedUnits:
 
     @cached_property
     def sizes(self) -> Indices:
-        """(N,) the number of coordinates of each."""
+        """(N,) number of coordinates of each unit."""
         observed = np.full(len(self.problem.network.observations), 2)
         return np.concatenate([observed, (self.positions != ABSENT).sum(axis=1)])
 
     @cached_property
     def groups(self) -> NDArray[np.str_]:
-        """(N,) the group of each."""
+        """(N,) group of each unit."""
         parameters = self.problem.unknowns.parameters
         given = [_group(parameters[position]) for position in self.positions[:, 0]]
         return np.array([*self.problem.network.observations.kind, *given], dtype=np.str_)
 
     def named(self) -> tuple[Tested, ...]:
-        """All of them, with their names."""
+        """All units with their names."""
         observations = self.problem.network.observations
         rows = zip(observations.kind, observations.image, observations.point, strict=True)
         observed = [Tested(kind, image, point, ("x", "y")) for kind, image, point in rows]

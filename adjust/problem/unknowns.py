@@ -1,4 +1,4 @@
-"""The list of all quantities of a network: what is given of each, and where the iteration starts."""
+"""List of all quantities of a network: priors and initial values."""
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -21,12 +21,22 @@ Quantity = tuple[str, Prior | None, float | None]  # name, what is given, approx
 
 @dataclass(frozen=True)
 class Unknowns:
-    """Every quantity of a network by its key: its given value, how well that is known, where it starts.
+    """All quantities of a network, numbered.
 
-    given (n,): nan where nothing is given. sigma (n,): 0 fixed, inf free. start (n,): where the iteration starts.
-    Positions in these: camera by name (c, x0', y0', then the distortion parameters), fiducial by (camera, id),
-    scanner and board by name, point by id, transformation and exterior by image name, join by frame and point. Cameras,
-    scanners, boards and points stand before the images. Parts of one frame have the same exterior orientation.
+    Cameras, scanners, boards and points come before the images. Parts of one frame share the exterior orientation.
+
+    Attributes
+    ----------
+    parameters : keys.
+    given : (n,) given values, nan without.
+    sigma : (n,) standard deviations of the given values: 0 fixed, inf free.
+    start : (n,) initial values.
+    camera : positions by name: c, x0', y0', then the distortion parameters.
+    fiducial : positions by (camera, id).
+    scanner, board : positions by name.
+    point : positions by id.
+    transformation, exterior : positions by image name.
+    join : positions by frame and point.
     """
 
     parameters: tuple[Parameter, ...]
@@ -47,38 +57,38 @@ class Unknowns:
 
     @property
     def has_prior(self) -> Mask:
-        """Which quantities are pseudo-observed: F5 to F9 and their like."""
+        """Mask of quantities with a prior observation: F5 to F9 and similar."""
         return np.asarray((self.sigma > 0) & np.isfinite(self.sigma))
 
     @property
     def shared_count(self) -> int:
-        """How many quantities stand before those of the images."""
+        """Number of quantities before those of the images."""
         return min(int(positions.min(initial=len(self))) for positions in self.exterior.values())
 
     def keeps_angles(self, image: str) -> bool:
-        """Whether an image's attitude is moved by its angles: where one of them is observed or fixed."""
+        """Whether an image's attitude is updated by its angles: where one of them is observed or fixed."""
         return bool(np.isfinite(self.sigma[self.exterior[image][3:]]).any())
 
     def fixed(self, positions: Iterable[int]) -> "Unknowns":
-        """The same, with some quantities fixed where they start."""
+        """Fix some quantities at their initial values."""
         sigma = self.sigma.copy()
         sigma[list(positions)] = 0.0
         return replace(self, sigma=sigma)
 
     def fixed_as_given(self, positions: Indices) -> "Unknowns":
-        """The same, with some quantities fixed at their given values; where they start if none is given."""
+        """Fix some quantities at their given values, or at their initial values if none is given."""
         start = self.start.copy()
         start[positions] = np.where(np.isnan(self.given[positions]), start[positions], self.given[positions])
         return replace(self.fixed(positions), start=start)
 
 
 def list_unknowns(network: Network, approximations: Approximations) -> Unknowns:
-    """Take down all quantities: cameras with their fiducials, scanners, points, images.
+    """List all quantities: cameras with their fiducials, scanners, boards, points, images.
 
-    Cameras without an image are left out, and so are points that nobody saw; a fiducial that nobody saw and that is
-    free is held where it is given. Held, too, is what only object points tell and no image shows any: the interior
-    orientation of an idle camera, the exterior one of an image that has none. Raises AdjustmentError where a quantity
-    has neither a value nor an approximation.
+    Cameras without an image and points that were not observed are left out. A free fiducial that was not observed is
+    held at its given value. Quantities that only object points determine are held where there are none: the interior
+    orientation of an idle camera, the exterior orientation of an image. Raises AdjustmentError where a quantity has
+    neither a value nor an approximation.
     """
     rows = _Rows([], [], [])
     used = {image.camera for image in network.images}
@@ -122,7 +132,7 @@ def list_unknowns(network: Network, approximations: Approximations) -> Unknowns:
     given = np.array([np.nan if prior is None else prior.value for prior in rows.priors])
     sigma = np.array([np.inf if prior is None else prior.sigma for prior in rows.priors])
     start = np.array(rows.starts, dtype=np.float64)
-    start = np.where(np.isfinite(start) & (sigma > 0.0), start, given)  # what is fixed stays at its value
+    start = np.where(np.isfinite(start) & (sigma > 0.0), start, given)  # fixed quantities start at their given value
     for missing in np.flatnonzero(np.isnan(start)):
         raise AdjustmentError(
             f"{rows.parameters[missing].label} has neither a value nor an approximation. Give one of them, or observe "
@@ -134,14 +144,14 @@ def list_unknowns(network: Network, approximations: Approximations) -> Unknowns:
 
 @dataclass(frozen=True)
 class _Rows:
-    """The list as it grows: keys, what is given, where each starts, None where nothing is known."""
+    """Growing list: keys, priors, and initial values (None where unknown)."""
 
     parameters: list[Parameter]
     priors: list[Prior | None]
     starts: list[float | None]
 
     def add(self, kind: Kind, owner: str, id: str, quantities: Sequence[Quantity]) -> Indices:
-        """Quantities of one thing; their positions."""
+        """Append quantities of one owner; return their positions."""
         first = len(self.parameters)
         for name, prior, start in quantities:
             self.parameters.append(Parameter(kind, owner, id, name))
@@ -150,7 +160,7 @@ class _Rows:
         return np.arange(first, len(self.parameters))
 
     def add_points(self, points: Sequence[ObjectPoint], approximations: Approximations) -> dict[str, Indices]:
-        """The coordinates of many points, three each; their positions by id."""
+        """Append three coordinates for each point; return their positions by id."""
         first = len(self.parameters)
         self.parameters.extend(Parameter("point", "", point.id, axis) for point in points for axis in "XYZ")
         self.priors.extend(chain.from_iterable((point.X, point.Y, point.Z) for point in points))
@@ -162,11 +172,11 @@ class _Rows:
 
 
 def fiducial_datum(camera: Camera, observed: Collection[tuple[str, str]], idle: bool) -> frozenset[tuple[str, str]]:
-    """The coordinates (fiducial, axis) that are held where they are given, for distances alone place the marks.
+    """Choose coordinates (fiducial, axis) to hold where only distances place the marks.
 
-    Distances leave open where the marks lie and how they are turned: both coordinates of one mark and one of the mark
-    farthest from it settle that without strain. A principal point that is given says where they lie. Empty where there
-    are no distances, or a coordinate is given with a standard deviation.
+    Distances determine neither position nor rotation of the marks: both coordinates of one mark and one of the mark
+    farthest from it are minimum constraints. A given principal point determines the position. Empty without distances,
+    or where a coordinate is given with a standard deviation.
     """
     marks = {id_: mark for id_, mark in camera.fiducials.items() if (camera.name, id_) in observed}
     priors = [prior for mark in marks.values() for prior in (mark.x_mm, mark.y_mm)]
@@ -185,12 +195,12 @@ def fiducial_datum(camera: Camera, observed: Collection[tuple[str, str]], idle: 
 
 
 def _hold(prior: Prior) -> Prior:
-    """A quantity that nothing observes: fixed if it is free, otherwise its prior alone makes it regular."""
+    """Prior of a quantity without observations: fixed if free, else unchanged, since its prior makes it regular."""
     return prior if np.isfinite(prior.sigma) else Prior(prior.value, 0.0)
 
 
 def _stopped(quantities: list[Quantity]) -> list[Quantity]:
-    """Quantities that have no part: fixed where they are given, at 1 where nothing is, which stands for no value."""
+    """Fix quantities that are not adjusted at their given values, or at 1 as a placeholder."""
     return [(name, Prior(1.0 if prior is None else prior.value), None) for name, prior, _ in quantities]
 
 
