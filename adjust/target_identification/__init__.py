@@ -1,1 +1,1 @@
-"""Which mark of an image is which object point, where nothing is known of its orientation."""
+"""Identification of object points among the marks of an image without known orientation."""

@@ -1,13 +1,13 @@
-"""Which mark of an image is which object point, where nothing is known of the image's orientation.
+"""Identify the object points of an image's marks without a known orientation.
 
-Hypothesis and test. Three object points that lie close together are taken to be three marks that do; the poses from
-which they would be are tested on the points about them, the best ones grow over the whole image, and what has grown is
-believed only if chance would hardly do as well (a contrario: Desolneux, Moisan and Morel 2008). Then it is tried
-whether the same marks could bear other names. Of two namings the one counts whose points come far closer to the marks;
-a field that looks the same from another side has none, and that is said.
+Hypothesise and test: three neighbouring object points are matched to three neighbouring marks. The resulting poses are
+tested on the surrounding points, the best ones are grown over the whole image, and the result is accepted only if its
+expected number of false alarms is small (a contrario: Desolneux, Moisan and Morel 2008). Then other identifications of
+the same marks are tried. One of two is accepted if its points lie much closer to the marks; a field that looks the same
+from another side is reported as ambiguous.
 
-Where the principal distance is not known, either, some far apart are tried: what lies about three points looks nearly
-the same with any, and the growing finds the right one.
+Where the principal distance is unknown, a few widely spaced ones are tried: the neighbourhood of three points looks
+nearly the same with any, and growing finds the right one.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,24 +34,31 @@ from adjust.target_identification.unnamed_marks import Marks
 
 LEAST_POINTS = 5
 MOST_LOG10_CHANCE = -6.0
-LEAST_SHARE = 0.4  # of the points that the image should show
-ALIKE_SHARE = 0.7  # of the named marks, from which on other names may explain the image as well
-TOLD_LOG10 = 6.0  # of the likelihood, by which marks must lie closer to their points in one naming than in another
-MOST_POSES = 1_000_000  # that are tried: they bound the time
-MOST_LOG10_CHANCE_OF_CODES = -3.0  # of codes that agree: they were not chosen among many
-LEAST_CODES = 4  # three always give a pose
-KNOWN_SIGMA = 0.05  # of a principal distance that is known, relative
-# Where it is not known, over the frame's diagonal, the usual ones first; none is farther off than a factor of 1.41:
+LEAST_SHARE = 0.4  # fraction of the expected points that must be identified
+ALIKE_SHARE = 0.7  # fraction of the identified marks above which an alternative may be as good
+TOLD_LOG10 = 6.0  # log10 of the likelihood ratio that decides between two identifications
+MOST_POSES = 1_000_000  # largest number of poses tried, to limit the time
+MOST_LOG10_CHANCE_OF_CODES = -3.0  # for agreeing codes; a weaker limit, since few hypotheses are tested
+LEAST_CODES = 4  # three always agree with some pose
+KNOWN_SIGMA = 0.05  # relative standard deviation of a known principal distance
+# Unknown principal distance, in diagonals of the frame, usual ones first; the largest error is a factor of 1.41:
 UNKNOWN, UNKNOWN_SIGMA = (1.2, 0.6, 2.4, 0.3, 4.8), 0.3
-OTHER_CLUSTERS = 8  # named clusters that are tried as other points: with half of them seen, one case in 256 escapes
+OTHER_CLUSTERS = 8  # clusters tried as other points; if each is found with p = 0.5, one case in 256 is missed
 
 
 @dataclass(frozen=True, eq=False)
 class Names:
-    """mark: the mark (index) of each object point (index) that has one. pose, principal_distance_mm, radial: from which
-    they are seen so, images being p (1 + radial p²), p in principal distances; expected: how many points the image
-    should show; log10_chance: of the expected number of agreements as good by chance; gate_mm: how far marks may lie
-    from their points' places."""
+    """Identified marks of an image.
+
+    Attributes
+    ----------
+    mark : index of the mark by index of the object point.
+    pose : exterior orientation.
+    principal_distance_mm, radial : of the view; images are p (1 + radial p²), p in principal distances.
+    expected : number of points that the image should show.
+    log10_chance : log10 of the expected number of false alarms.
+    gate_mm : largest distance of a mark from the predicted place of its point.
+    """
 
     mark: dict[int, int]
     pose: Pose
@@ -70,11 +77,18 @@ def name_marks(
     principal_distance_mm: float | None,
     sigma_mm: float,
 ) -> Names | str:
-    """Name the marks of an image of known points; or why they have no names.
+    """Identify the marks of an image of known points; returns a sentence on the reason where this fails.
 
-    xyz (n, 3), normals (n, 3): where the points face, nan where that is not known; xy_mm (m, 2): ideal coordinates of
-    the marks about the principal point, y up, sigma_mm each; frame_mm: the least and the greatest (2,) that were
-    searched; principal_distance_mm: right to some percent, or None. The same input gives the same names.
+    The result is deterministic.
+
+    Parameters
+    ----------
+    xyz : (n, 3) object points.
+    normals : (n, 3) directions in which the points face, nan where unknown.
+    xy_mm : (m, 2) ideal coordinates of the marks relative to the principal point, y up.
+    frame_mm : lower and upper corner (2,) of the searched area.
+    principal_distance_mm : correct to some percent, or None.
+    sigma_mm : standard deviation of the marks.
     """
     n, m = len(xyz), len(xy_mm)
     if min(n, m) < LEAST_POINTS:
@@ -100,9 +114,10 @@ def name_coded(
     sigma_mm: float,
     codes: Mapping[int, int],
 ) -> Names | str:
-    """The same where codes say which points (by index) some of the marks (by index) are; not all of them need be right.
+    """Identify marks with the help of codes, which need not all be correct.
 
-    The pose that most codes agree with names the other marks. A mark whose code says another point has no name.
+    codes: point (index) by mark (index). The pose that agrees with most codes identifies the other marks. A mark whose
+    code contradicts its identification is left out.
     """
     if len(codes) < LEAST_CODES:
         return f"{len(codes)} coded targets were recognised, and {LEAST_CODES} are needed"
@@ -124,14 +139,17 @@ def name_coded(
 
 
 def _right_codes(grown: Grown, codes: Mapping[int, int]) -> int:
-    """How many codes agree with a naming."""
+    """Number of codes that agree with an identification."""
     return sum(grown.mark.get(point) == mark for mark, point in codes.items())
 
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """xyz, normals (n, 3) in units of the field's size about its middle, origin; the marks, in units of a principal
-    distance."""
+    """Search with one principal distance.
+
+    xyz, normals (n, 3): points relative to their centre `origin`, in units of the field's size; marks: in units of the
+    principal distance.
+    """
 
     origin: Array
     size: float
@@ -141,19 +159,18 @@ class _Search:
 
     @cached_property
     def clusters(self) -> list[Cluster]:
-        """To begin with."""
+        """Clusters to start with."""
         return clusters(self.xyz, self.normals, len(self.marks.places) / len(self.xyz))
 
     def names(self, found: Grown) -> Names:
-        """In the units of the object and mm."""
+        """Convert a result to object units and mm."""
         view, c = found.view, self.marks.c
         pose = Pose(view.rotation, self.origin - self.size * view.rotation.T @ view.shift)
         of_view = pose, c * (1.0 + view.scale), view.radial
         return Names(found.mark, *of_view, found.expected, found.log10_chance, found.gate * c)
 
     def grow_codes(self, codes: Mapping[int, int]) -> Grown | None:
-        """What the pose that most codes agree with grows to, and how likely the codes would agree by chance; None where
-        they are on one line."""
+        """Grow the pose that most codes agree with, and compute its false-alarm rate; None for codes on one line."""
         marks, coded, points = self.marks, np.array(list(codes)), np.array(list(codes.values()))
         found = resect(self.xyz[points], marks.places[coded], 1.0, marks.sigma)
         if found is None:
@@ -165,21 +182,20 @@ class _Search:
         return replace(grown, log10_chance=log10_of_chance(_right_codes(grown, codes), len(codes), chance, tests))
 
     def grow_cluster(self, cluster: Cluster) -> tuple[Grown | None, int]:
-        """The likeliest naming that one cluster leads to, if it leads to any, and how many poses were tried."""
+        """Return the most significant identification from one cluster, if any, and the number of poses tried."""
         triples = mark_triples(cluster, self.marks)
         poses = promising(self.xyz, self.normals, self.marks, cluster.triple[None], triples)
         return next(iter(self._grown(poses)), None), poses.tried
 
     def likeliest(self, found: Grown) -> tuple[Grown, Grown | None]:
-        """Of a naming and the others that the image may have the one that chance makes least likely; and another one
-        that explains the image as well, if there is one."""
+        """Return the most significant of an identification and its alternatives, and a rival as good, if any."""
         others = self._others(found)
         best = min([found, *others], key=attrgetter("log10_chance"))
         rivals = others if best is found else [found, *self._others(best)]
         return best, next((one for one in rivals if _is_alike(one, best)), None)
 
     def _others(self, found: Grown) -> list[Grown]:
-        """Other namings of the image: named clusters taken for other points."""
+        """Alternative identifications of the image: identified clusters matched to other points."""
         named = [cluster for cluster in self.clusters if all(int(point) in found.mark for point in cluster.triple)]
         others = []
         for cluster in named[:OTHER_CLUSTERS]:
@@ -208,7 +224,7 @@ def _searches(
     principal_distance_mm: float | None,
     sigma_mm: float,
 ) -> list[_Search]:
-    """One with the principal distance, or with each that is tried where it is not known."""
+    """Make a search with the given principal distance, or with each assumed one."""
     origin, size = xyz.mean(axis=0), float(np.linalg.norm(np.ptp(xyz, axis=0)))
     diagonal = float(np.linalg.norm(frame_mm[1] - frame_mm[0]))
     tried = [(share * diagonal, UNKNOWN_SIGMA) for share in UNKNOWN]
@@ -219,15 +235,20 @@ def _searches(
 
 
 def _is_alike(other: Grown, best: Grown) -> bool:
-    """Whether another naming explains about as many marks about as closely. How many it explains does not decide: of a
-    grid moved on by a step, what chance left out at one end is as many as what it left out anywhere."""
+    """Whether another identification explains about as many marks about as closely.
+
+    The number of marks alone does not decide: for a grid shifted by one step, the points lost at one end may be as many
+    as those missed by chance.
+    """
     closer = 2 * len(other.mark) * np.log10(other.gate / best.gate)  # likelihood of two coordinates each
     return len(other.mark) >= ALIKE_SHARE * len(best.mark) and bool(closer < TOLD_LOG10)
 
 
 def _first(searches: Sequence[_Search]) -> tuple[_Search, Grown | None]:
-    """The first naming that is believed, the clusters that need fewest trials first; the likeliest, if several
-    principal distances lead to one."""
+    """Return the first accepted identification, the most significant one of several principal distances.
+
+    The clusters that need the fewest trials come first.
+    """
     most = MOST_LOG10_CHANCE - np.log10(len(searches))
     tried = 0
     for cluster in searches[0].clusters:

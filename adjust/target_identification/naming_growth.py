@@ -1,4 +1,4 @@
-"""A pose that some named marks suggest grows over the whole image: each fit names what it predicts well enough."""
+"""Grow a pose from a few identified marks over the whole image, alternating fit and identification."""
 
 from dataclasses import dataclass, field
 
@@ -10,16 +10,16 @@ from adjust.target_identification.unnamed_marks import Marks, log10_of_agreement
 
 _ROUNDS = 25
 _GATE_SIGMAS = 3.5
-_MOST_CHANCE = 0.1  # that a mark lies in a point's gate and is none: more is not named yet
-_PRIOR_RADIAL = 0.1  # standard deviation of k1: a tenth of the distance where rays are 45 degrees oblique
-_ROBUST = 2.0  # sigmas, from which on a residual counts less (Huber)
+_MOST_CHANCE = 0.1  # largest probability of a random mark in a point's gate; otherwise not identified yet
+_PRIOR_RADIAL = 0.1  # standard deviation of k1: 10 % of the radius for rays at 45 degrees
+_ROBUST = 2.0  # in standard deviations, limit of Huber's weight function
 _BEFORE = -1e-6
-OF_POSE = 3  # points whose agreement a pose can always have
+OF_POSE = 3  # points that agree with some pose whatever they are
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """camera = R X + t; images are (1 + scale) p (1 + radial p²), p in principal distances."""
+    """Projection: camera = R X + t; images are (1 + scale) p (1 + radial p²), p in principal distances."""
 
     rotation: Array
     shift: Array
@@ -27,17 +27,17 @@ class View:
     radial: float = 0.0
 
     def images(self, xyz: Array) -> Array:
-        """(n, 2) places of points (n, 3); nan behind the camera."""
+        """(n, 2) images of points (n, 3); nan behind the camera."""
         p = self._ideal(xyz)
         return np.asarray((1.0 + self.scale) * p * (1.0 + self.radial * (p**2).sum(axis=1, keepdims=True)))
 
     def facing(self, xyz: Array, normals: Array) -> Mask:
-        """Which points turn their faces to the camera, as far as it is known where they face."""
+        """Mask of points that face the camera; True where their direction is unknown."""
         station = -self.rotation.T @ self.shift
         return np.asarray(~(np.einsum("ni,ni->n", normals, station - xyz) <= 0.0))
 
     def derivatives(self, xyz: Array) -> Array:
-        """(n, 2, 8) by a small turn of the camera, a shift in its frame, scale and radial."""
+        """(n, 2, 8) derivatives with respect to a small rotation, a shift in the camera frame, scale and radial."""
         camera = self._camera(xyz)
         u, v, w = camera.T
         p = self._ideal(xyz)
@@ -67,9 +67,16 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Grown:
-    """What a pose became. mark: of each point named; gate: how far marks may lie from their points' places; expected:
-    points that the frame should show; log10_chance: of the expected number of chance agreements as good as this, over
-    all that can be tried."""
+    """Result of growing a pose.
+
+    Attributes
+    ----------
+    view : fitted projection.
+    mark : mark of each identified point.
+    gate : largest distance of a mark from the predicted place of its point, in principal distances.
+    expected : number of points that the frame should show.
+    log10_chance : log10 of the expected number of false alarms over all possible hypotheses.
+    """
 
     view: View
     mark: dict[int, int] = field(default_factory=dict)
@@ -79,9 +86,9 @@ class Grown:
 
 
 def grow(view: View, points: Indices, named: Indices, xyz: Array, normals: Array, marks: Marks) -> Grown:
-    """From points (k,) that are the marks named (k,): fit, name anew, until nothing changes.
+    """Fit and identify alternately until nothing changes, from points (k,) identified as marks named (k,).
 
-    The gates are what the last fit's covariance makes of each point.
+    The gates follow from the covariance of the last fit.
     """
     sigma = marks.sigma
     for _ in range(_ROUNDS):
@@ -98,7 +105,7 @@ def grow(view: View, points: Indices, named: Indices, xyz: Array, normals: Array
 def _near(
     view: View, xyz: Array, normals: Array, marks: Marks, sigma: float, covariance: Array
 ) -> tuple[Indices, Indices]:
-    """Points, and the marks that they are: next to one another, in a gate that chance seldom reaches."""
+    """Points and their marks: nearest neighbours within gates that rarely contain a mark by chance."""
     shown = np.flatnonzero(_shown_points(view, xyz, normals, marks))
     places, by = view.images(xyz[shown]), view.derivatives(xyz[shown])
     predicted = np.einsum("nij,jk,nik->ni", by, covariance, by).sum(axis=1)
@@ -121,7 +128,9 @@ def _shown_points(view: View, xyz: Array, normals: Array, marks: Marks) -> Mask:
 
 
 def _fit_view(view: View, xyz: Array, places: Array, marks: Marks) -> tuple[View, float, Array]:
-    """Least squares, wrong names tolerated: the view, the marks' standard deviation, the parameters' covariance."""
+    """Fit a view by robust least squares; returns view, standard deviation of the marks, covariance of the
+    parameters.
+    """
     priors = np.diag([0.0] * 6 + [marks.c_sigma**-2, _PRIOR_RADIAL**-2])
     sigma = marks.sigma
     normal = np.eye(8)
@@ -148,21 +157,26 @@ def _fit_view(view: View, xyz: Array, places: Array, marks: Marks) -> tuple[View
 
 
 def _significance(view: View, xyz: Array, normals: Array, marks: Marks, sigma: float, mark: dict[int, int]) -> Grown:
-    """How likely chance would do as well: any three points as any three marks give a pose, and the others would have
-    to agree, each with the probability that a mark lies in its gate by chance."""
+    """Compute the expected number of false alarms of an identification.
+
+    Any three points matched to any three marks give a pose. The others must agree, each with the probability that its
+    gate contains a mark by chance.
+    """
     gate = _GATE_SIGMAS * sigma
     shown = np.flatnonzero(_shown_points(view, xyz, normals, marks))
     expected = len(shown)
     agreeing = min(len(mark), expected)
     if agreeing <= OF_POSE:
         return Grown(view)
-    # A pose that is fitted to all may lie as far off as the gate from the one that three of the points give.
+    # A pose fitted to all points may differ by the gate from that of three points: twice the gate.
     chance = float(marks.chance(view.images(xyz[shown]), np.full(expected, 2.0 * gate)).mean())
     tests = (float(len(xyz)) * len(marks.places)) ** OF_POSE
     return Grown(view, mark, gate, expected, log10_of_chance(agreeing, expected, chance, tests))
 
 
 def log10_of_chance(agreeing: int, expected: int, chance: float, tests: float) -> float:
-    """The logarithm of the expected number of poses with so many points that agree, if each agreed by chance; three of
-    them always do, with up to four poses for each of the tests that are possible."""
+    """log10 of the expected number of poses with so many agreeing points under the null hypothesis.
+
+    Three of the points always agree, with up to four poses for each of the possible tests.
+    """
     return log10_of_agreement(agreeing - OF_POSE, expected - OF_POSE, chance) + float(np.log10(4.0 * tests))

@@ -1,5 +1,7 @@
-"""Hypotheses of how marks are named: three points that lie together are three marks that do; the points about them
-test the poses from which they would be."""
+"""Hypotheses for the identification of marks: match three neighbouring points to three neighbouring marks.
+
+The surrounding points test the resulting poses.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,27 +14,33 @@ from adjust.initial_values.p3p import triple_poses
 from adjust.initial_values.pose import refined_poses
 from adjust.target_identification.unnamed_marks import Marks
 
-_DIRECTIONS = 24  # from which the field is looked at to learn how near in a picture its clusters stay
-_NEARBY = 6  # next points in space, two of which make a cluster with a point
-_RANK_SHARE = 0.8  # of the directions, in which a cluster's points stay so near neighbours
-_SLENDER = 0.25  # width of a triangle over its length, below which it gives a poor pose
-_ABOUT = 16  # points about a cluster that test it...
-_FARTHER = 40  # ...and those that test it again after it was fitted to them
-_DETECTED = 0.75  # of the points that are in the frame
+_DIRECTIONS = 24  # viewing directions for the ranks of neighbours in the image
+_NEARBY = 6  # nearest points in space, two of which form a cluster with a point
+_RANK_SHARE = 0.8  # quantile of the ranks over the directions
+_SLENDER = 0.25  # width over length of a triangle below which its pose is poor
+_ABOUT = 16  # points around a cluster that test it ...
+_FARTHER = 40  # ... and that test it again after a fit to them
+_DETECTED = 0.75  # assumed detection rate of points in the frame
 _REACH, _LATER_REACH = (
     0.07,
     0.02,
-)  # of the distance from the cluster: what a pose of three marks leaves, and a fitted one
-_NOISE = 3.0  # standard deviations of a mark
-_SELF_REACH = 1.3  # how much farther apart than a cluster's points others may be that are taken for them
+)  # gate as a fraction of the distance from the cluster, for a pose of three marks and a fitted one
+_NOISE = 3.0  # gate in standard deviations of a mark
+_SELF_REACH = 1.3  # factor on the distances in a cluster for points confused with it
 _KEPT, _RETURNED = 96, 6
-_CHUNK = 20_000  # hypotheses tested at a time: they bound the memory
+_CHUNK = 20_000  # hypotheses tested at a time, to limit memory
 
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """rotations (k, 3, 3), shifts (k, 3): camera = R X + t, those that explain most first; named: the points about the
-    cluster (indices) that agree, and the marks that they are, for each; tried: how many poses were tested."""
+    """Poses, camera = R X + t, best first.
+
+    Attributes
+    ----------
+    rotations, shifts : (k, 3, 3), (k, 3).
+    named : for each pose the agreeing points around the cluster (indices) and their marks.
+    tried : number of poses tested.
+    """
 
     rotations: Array
     shifts: Array
@@ -42,14 +50,18 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class Cluster:
-    """triple (3,): points; ranks (2,): among how many next marks of the first one the others are sought."""
+    """Three neighbouring points.
+
+    triple (3,): points. ranks (2,): number of nearest marks of the first point's mark among which the others are
+    sought.
+    """
 
     triple: Indices
     ranks: tuple[int, int]
 
 
 def clusters(xyz: Array, normals: Array, marks_per_point: float) -> list[Cluster]:
-    """Clusters to begin with, those that need fewest hypotheses first, each point at the head of one at most."""
+    """Choose clusters to start with, those that need fewest hypotheses first, at most one for each first point."""
     near = _next(xyz, min(_NEARBY, len(xyz) - 1))
     ranks = _ranks(xyz, normals, near) * max(marks_per_point, 1.0) + 2.0
     first, second = np.triu_indices(near.shape[1], 1)
@@ -72,7 +84,7 @@ def clusters(xyz: Array, normals: Array, marks_per_point: float) -> list[Cluster
 
 
 def _apart(ordered: Sequence[Cluster]) -> list[Cluster]:
-    """Those that share no point come first: what hides one cluster does not hide the next."""
+    """Put clusters without common points first: what occludes one cluster does not affect the next."""
     used: set[int] = set()
     first: list[Cluster] = []
     later: list[Cluster] = []
@@ -84,15 +96,15 @@ def _apart(ordered: Sequence[Cluster]) -> list[Cluster]:
 
 
 def _next(xyz: Array, count: int) -> Indices:
-    """(n, count) the points next to each."""
+    """(n, count) nearest neighbours of each point."""
     index = np.asarray(cKDTree(xyz).query(xyz, k=np.arange(1, count + 2))[1])
     others = index != np.arange(len(xyz))[:, None]
-    others[others.all(axis=1), -1] = False  # of points at one place any may count as the point itself
+    others[others.all(axis=1), -1] = False  # of coincident points any may count as the point itself
     return np.asarray(index[others].reshape(len(xyz), count), dtype=np.intp)
 
 
 def _ranks(xyz: Array, normals: Array, near: Indices) -> Array:
-    """(n, k) the rank, in most pictures, of each near point among a point's neighbours in the picture."""
+    """(n, k) rank of each near point among a point's neighbours in the image, for most viewing directions."""
     n = len(xyz)
     ranks = []
     for direction in _directions():
@@ -107,7 +119,7 @@ def _ranks(xyz: Array, normals: Array, near: Indices) -> Array:
 
 
 def _directions() -> Array:
-    """(k, 3) unit vectors spread over the sphere (Fibonacci's lattice)."""
+    """(k, 3) unit vectors distributed over the sphere (Fibonacci lattice)."""
     i = np.arange(_DIRECTIONS) + 0.5
     z, angle = 1.0 - 2.0 * i / _DIRECTIONS, np.pi * (1.0 + np.sqrt(5.0)) * i
     r = np.sqrt(1.0 - z**2)
@@ -115,7 +127,7 @@ def _directions() -> Array:
 
 
 def mark_triples(cluster: Cluster, marks: Marks) -> Indices:
-    """(k, 3) the marks that a cluster could be: any mark, and two of those next to it."""
+    """(k, 3) possible marks of a cluster: any mark and two of its nearest neighbours."""
     m = len(marks.places)
     first, second = (min(rank, m - 1) for rank in cluster.ranks)
     near = _next(marks.places, max(first, second))
@@ -126,7 +138,7 @@ def mark_triples(cluster: Cluster, marks: Marks) -> Indices:
 
 
 def point_triples(cluster: Cluster, xyz: Array) -> Indices:
-    """(k, 3) the points that a cluster could be confused with: any point, and two as near to it."""
+    """(k, 3) points that a cluster could be confused with: any point, and two as near to it."""
     head, *others = xyz[cluster.triple]
     reach = [float(np.linalg.norm(other - head)) for other in others]
     tree = cKDTree(xyz)
@@ -141,7 +153,9 @@ def point_triples(cluster: Cluster, xyz: Array) -> Indices:
 
 
 def promising(xyz: Array, normals: Array, marks: Marks, points: Indices, named: Indices) -> Poses:
-    """The poses that explain best what lies about three points (k or 1, 3) if they are three marks (k or 1, 3)."""
+    """Find the poses that best explain the points around three points (k or 1, 3) matched to three marks (k or 1,
+    3).
+    """
     count = max(len(points), len(named))
     about = _nearest_points(xyz, points, _ABOUT)
     kept: list[tuple[Array, Array, Indices, Array]] = []
@@ -176,12 +190,12 @@ def promising(xyz: Array, normals: Array, marks: Marks, points: Indices, named: 
 
 
 def _rows(table: Indices, rows: Indices) -> Indices:
-    """The rows of a table, of which there may be one for all."""
+    """Select rows of a table, which may have one row for all."""
     return table[rows] if len(table) > 1 else np.broadcast_to(table, (len(rows), table.shape[1]))
 
 
 def _nearest_points(xyz: Array, points: Indices, count: int) -> Indices:
-    """(k, count) the points next to the heads of clusters, the clusters' own points left out."""
+    """(k, count) nearest points of clusters, without the clusters' own points."""
     count = min(count, len(xyz) - 3)
     near = np.asarray(cKDTree(xyz).query(xyz[points].mean(axis=1), k=np.arange(1, count + 4))[1])
     own = (near[:, :, None] == points[:, None, :]).any(axis=2)
@@ -190,7 +204,7 @@ def _nearest_points(xyz: Array, points: Indices, count: int) -> Indices:
 
 
 def _facing(rotations: Array, shifts: Array, xyz: Array, normals: Array, points: Indices) -> Mask:
-    """Whether all three points turn their faces to the camera; where a point faces is not always known."""
+    """Mask of poses for which all three points face the camera; unknown directions count as facing."""
     stations = -np.einsum("kji,kj->ki", rotations, shifts)
     towards = np.einsum("kpi,kpi->kp", normals[points], stations[:, None] - xyz[points])
     return np.asarray(~(towards <= 0.0).any(axis=1))
@@ -199,7 +213,7 @@ def _facing(rotations: Array, shifts: Array, xyz: Array, normals: Array, points:
 def _tested(
     rotations: Array, shifts: Array, points: Array, anchors: Array, marks: Marks, reach: float
 ) -> tuple[Array, Indices, Mask]:
-    """The evidence (k,) for poses, and for each of the points (k, p, 3) the nearest mark and whether it agrees."""
+    """Log-likelihood ratios (k,) of poses; for each of the points (k, p, 3) the nearest mark and whether it agrees."""
     places = _projected(rotations, shifts, points)
     nearest = marks.nearest(places)
     gate = _NOISE * marks.sigma + reach * np.linalg.norm(places - anchors[:, None], axis=2)

@@ -1,4 +1,4 @@
-"""The marks of an image before they have names: which one is nearest to a place, and how likely by chance."""
+"""Unidentified marks of an image: nearest neighbours and the probability of chance agreement."""
 
 from dataclasses import dataclass
 
@@ -8,16 +8,25 @@ from scipy.special import bdtrc
 
 from adjust.array_types import Array, Indices, Mask
 
-_CELLS = 600  # of the look-up along either side of the frame
-_COARSE_CELLS = 60  # of that of the density
-_CROWD = 6  # marks about a place that tell how dense they are there
+_CELLS = 600  # cells of the look-up table along each side of the frame
+_COARSE_CELLS = 60  # cells of the density table along each side
+_CROWD = 6  # nearest marks from which the local density is estimated
 
 
 @dataclass(frozen=True, eq=False)
 class Marks:
-    """places (m, 2): ideal image coordinates about the principal point, y up, over the principal distance; least,
-    greatest (2,): the corners of the frame that was searched; sigma: of one coordinate. All in principal distances.
-    c: that distance, mm; c_sigma: how well it is known, relative."""
+    """Marks of an image; all lengths in principal distances.
+
+    Attributes
+    ----------
+    places : (m, 2) ideal image coordinates relative to the principal point, y up.
+    least, greatest : (2,) corners of the searched area.
+    sigma : standard deviation of one coordinate.
+    c : principal distance, mm.
+    c_sigma : its relative standard deviation.
+    tree : of the places.
+    nearest_of_cell, density_of_cell : look-up tables of the nearest mark and of the density of marks.
+    """
 
     places: Array
     least: Array
@@ -33,7 +42,7 @@ class Marks:
     def from_mm(
         cls, xy_mm: Array, least_mm: Array, greatest_mm: Array, sigma_mm: float, c: float, c_sigma: float
     ) -> "Marks":
-        """Marks (m, 2) in mm, of which there is at least one, in a frame between two corners."""
+        """Make marks from coordinates (m, 2) in mm, m > 0, in an area between two corners."""
         places, least, greatest = xy_mm / c, np.asarray(least_mm) / c, np.asarray(greatest_mm) / c
         tree = cKDTree(places)
         nearest = np.asarray(tree.query(_centres(least, greatest, _CELLS))[1], dtype=np.intp)
@@ -44,16 +53,15 @@ class Marks:
         )  # fmt: skip
 
     def inside(self, places: Array) -> Mask:
-        """Which of the places (..., 2) lie in the frame."""
+        """Mask of places (..., 2) inside the searched area."""
         return np.asarray(((places >= self.least) & (places <= self.greatest)).all(axis=-1))
 
     def nearest(self, places: Array) -> Indices:
-        """The mark next to each place (..., 2) in the frame, to the fineness of the look-up."""
+        """Nearest mark of each place (..., 2), to the resolution of the look-up table."""
         return self.nearest_of_cell[self._cell(places, _CELLS)]
 
     def chance(self, places: Array, reach: Array) -> Array:
-        """The probability that some mark lies within reach (...) of places (..., 2) if marks lie where they like, as
-        dense as they are there."""
+        """Probability of a mark within reach (...) of places (..., 2), for random marks of the local density."""
         return chance_of_a_mark(self.density_of_cell[self._cell(places, _COARSE_CELLS)], reach)
 
     def _cell(self, places: Array, cells: int) -> Indices:
@@ -64,25 +72,25 @@ class Marks:
 
 
 def mark_density(tree: cKDTree, places: Array) -> Array:
-    """(n,) how dense marks are about places (n, 2), by how far the nearest few reach."""
+    """(n,) local density of marks at places (n, 2), from the distance of the k-th nearest mark."""
     crowd = min(_CROWD, tree.n)
     reach = np.asarray(tree.query(places, k=[crowd])[0])[:, 0]
     return np.asarray(crowd / (np.pi * np.maximum(reach, 1e-12) ** 2))
 
 
 def chance_of_a_mark(density: Array, reach: Array | float) -> Array:
-    """The probability that a mark lies within reach of a place if marks lie where they like, as dense as this."""
+    """Probability of a mark within reach of a place, for randomly distributed marks of a density (Poisson)."""
     return np.asarray(-np.expm1(-density * np.pi * np.square(reach)))
 
 
 def log10_of_agreement(agreeing: int, of: int, chance: float) -> float:
-    """The logarithm of the probability that so many or more agree, of so many that agree by chance independently."""
-    with np.errstate(divide="ignore"):  # -inf below the smallest number
+    """log10 of the binomial probability that at least `agreeing` of `of` points agree by chance."""
+    with np.errstate(divide="ignore"):  # underflow gives -inf
         return float(np.log10(bdtrc(agreeing - 1, of, chance)))
 
 
 def _centres(least: Array, greatest: Array, cells: int) -> Array:
-    """(cells², 2) the centres of the cells, row by row."""
+    """(cells², 2) centres of the cells, row by row."""
     share = (np.arange(cells) + 0.5) / cells
     x, y = (low + share * (high - low) for low, high in zip(least, greatest, strict=True))
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
