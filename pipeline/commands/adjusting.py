@@ -1,4 +1,4 @@
-"""Commands about cameras: adjusted, checked, chosen, compared, oriented without anything known, and planned."""
+"""Commands for adjustment: adjust, check, choose models, orient blocks, compare calibrations, plan photographs."""
 
 from pathlib import Path
 from typing import Annotated

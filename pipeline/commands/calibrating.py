@@ -1,4 +1,4 @@
-"""The command that calibrates a digital camera from pictures of a board."""
+"""Command that calibrates a digital camera from images of a board."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Commands that make files of other kinds: frames, other programs' files, other lenses' words, scenes, templates."""
+"""Commands that write files: rectified scans, exchange formats, converted lenses, synthetic scans, templates."""
 
 from dataclasses import asdict, replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Commands about scans: what they are of, their marks, and what needs a look."""
+"""Commands for scans: create projects, measure marks, report status, review, identify cameras."""
 
 import dataclasses
 import re
@@ -267,7 +267,7 @@ def review(
     step = command_step("run", file, why="applies the decisions")
 
     def say_address(address: str) -> None:
-        typer.echo(address)  # with its token, which `say` would hide
+        typer.echo(address)  # not by `say`, which would hide the token
         print_next(False, "decide in the browser; end with Ctrl-C", *([] if scans else [step]))
 
     serve(given, port, who, not no_browser, say_address)
@@ -338,7 +338,7 @@ def _save_cameras(projects: "Sequence[Project]", out: Path | None, as_json: bool
 def _name_cameras(
     given: Sequence[Path], project: "Project | None", pitch_um: float | None, max_pixels: int | None, as_json: bool
 ) -> int:
-    """One scan with all that was tried on it; of many some of each kind."""
+    """Identify the cameras of scans: all trials of a single scan, or some scans of each group."""
     from pipeline.archive.catalogue import find_scan_files
     from pipeline.archive.scan_groups import group_scans, name_cameras, print_groups, trial_of_cameras
     from pipeline.files.library import PREFIX, read_library

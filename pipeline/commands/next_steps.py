@@ -1,6 +1,6 @@
-"""The last lines of a command: up to three steps that its result calls for, the most urgent first.
+"""Suggested next steps, printed at the end of a command: at most three, the most urgent first.
 
-A step is a command that can be copied, with a comment that says what it is for.
+A step is a command line that can be copied, with a comment on its purpose.
 """
 
 import shlex
@@ -22,24 +22,24 @@ MOST = 3
 
 
 def print_next(as_json: bool, *steps: str) -> None:
-    """Print the first of the steps, each once, on stdout; none beside JSON."""
+    """Print the first steps on stdout, without duplicates; none with JSON output."""
     for step in [] if as_json else list(dict.fromkeys(steps))[:MOST]:
         typer.echo(plain(f"Next: {step}"))
 
 
 def command_step(words: str, *arguments: Path | str, why: str = "") -> str:
-    """`reseau WORDS ARGUMENTS`, as it can be copied, and why."""
+    """Format `reseau WORDS ARGUMENTS`, quoted for the shell, with the reason as a comment."""
     line = " ".join(("reseau", words, *(shlex.quote(str(argument)) for argument in arguments)))
     return f"{line}  # {why}" if why else line
 
 
 def page_step(path: Path) -> str:
-    """The step that opens a page."""
+    """Format the step that opens a page."""
     return f"open {shlex.quote(str(path))}"
 
 
 def summary_steps(project: Path, summary: "Summary") -> Iterator[str]:
-    """What the summary of a stage of the chain calls for. project: its file."""
+    """Suggest steps after a stage, from its summary. project: the project file."""
     files, adjustment = summary.files, summary.adjustment
     if summary.parts:
         stores = shlex.quote(str(next(iter(files.values())).parent))
@@ -64,7 +64,7 @@ def summary_steps(project: Path, summary: "Summary") -> Iterator[str]:
 
 
 def init_steps(new: "NewProject") -> Iterator[str]:
-    """What the scans need that a new project does not measure yet."""
+    """Suggest steps for scans that a new project cannot measure yet."""
     from pipeline.archive.new_project import TEMPLATE_COMMAND
 
     if new.unknown:
@@ -80,7 +80,7 @@ def init_steps(new: "NewProject") -> Iterator[str]:
 
 
 def verdict_steps(project: Path, counts: Mapping[Verdict, int]) -> Iterator[str]:
-    """What scans of these verdicts need. counts: of scans, by verdict."""
+    """Suggest steps from the numbers of scans by verdict."""
     failed, stale = counts.get(Verdict.FAILED, 0), counts.get(Verdict.WAITING, 0) + counts.get(Verdict.OLD, 0)
     doubtful = counts.get(Verdict.LOOK, 0) + counts.get(Verdict.POOR, 0)
     if failed:

@@ -1,6 +1,6 @@
-"""What commands share: arguments and options that have one meaning everywhere, and how a result is told.
+"""Arguments and options common to several commands, and output of their results.
 
-Each command imports what it needs when it runs: numpy and what stands on it take longer than the help.
+Each command imports its modules when it runs: importing numpy and its dependants takes longer than printing the help.
 """
 
 import sys
@@ -36,12 +36,12 @@ OfCamera = Annotated[
 
 
 def pitch_option(help: str, *names: str) -> Any:
-    """A pixel's size in um; what it is of, and what it is by default, differs from command to command."""
+    """Option for a pixel size in µm; its meaning and default depend on the command."""
     return typer.Option(*(names or ("--pitch-um",)), metavar="UM", min=FINEST_PITCH_UM, help=help)
 
 
 def read(path: Path, max_pixels: int | None = None) -> "Project":
-    """The project. Raises InputError for what is wrong in it."""
+    """Read a project. Raises InputError for errors in it."""
     from pipeline.files.project_file import read_project
 
     return replace(read_project(path), max_pixels=max_pixels)
@@ -54,14 +54,15 @@ def run_stage(
     max_pixels: int | None = None,
     quiet: bool = False,
 ) -> int:
-    """Run a stage on a project and print its summary; the exit code."""
+    """Run a stage on a project and print its summary. Returns the exit code."""
     from pipeline.progress import Reporter
 
     return finish(stage(read(path, max_pixels), Reporter(quiet=quiet)), as_json, path)
 
 
 def finish(summary: "Summary", as_json: bool, project: Path | None) -> int:
-    """Print a summary and the next steps; its exit code. project: its file; None: the caller prints the steps."""
+    """Print a summary and the next steps. Returns the exit code. project: its file; None: the caller prints the
+    steps."""
     from pipeline.commands.next_steps import print_next, summary_steps
     from pipeline.summary import print_summary
 
@@ -72,22 +73,22 @@ def finish(summary: "Summary", as_json: bool, project: Path | None) -> int:
 
 
 def show(as_json: bool, content: Callable[[], Any], printed: Callable[[PlainConsole], None]) -> None:
-    """A result as JSON on stdout, or as it is printed for people."""
+    """Print a result on stdout, as JSON or as text."""
     if not as_json:
         printed(PlainConsole())
         return
-    letters = (sys.stdout.encoding or "").lower().startswith("utf")  # others get them as JSON's own codes
+    letters = (sys.stdout.encoding or "").lower().startswith("utf")  # otherwise escape them
     from pipeline.results.record_json import json_text
 
     typer.echo("".join(json_text(content(), ensure_ascii=not letters)), nl=False)
 
 
 def say(*lines: str) -> None:
-    """Lines on stdout, without what a terminal would take for a command."""
+    """Print lines on stdout, with control characters escaped and credentials removed."""
     for line in lines:
         typer.echo(plain(line))
 
 
 def choices_help(words: Mapping[str, Any] | tuple[str, ...]) -> str:
-    """The help of an argument that is one of several words."""
+    """Help of an argument that is one of several words."""
     return f"One of {', '.join(words)}."
