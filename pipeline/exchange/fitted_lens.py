@@ -45,8 +45,8 @@ class FittedLens:
 def nearest_lens(block: Block, frame: Frame, models: Sequence[Sequence[str]], options: ExportOptions) -> FittedLens:
     """Fit the lens of an image's camera in one of several models, each given by names of OpenCV's parameters.
 
-    The first model that is identical is taken; else the first that is close enough; else the last. If the frames are
-    resampled with the lens, the result is that of an ideal camera.
+    The first model that is identical is taken; else the first that is close enough; else the last. If the lens
+    distortion is removed from the frames, the result is a lens without distortion.
     """
     lens = frame.lens
     assert lens is not None

@@ -70,7 +70,7 @@ def _outline(corners_mm: Array) -> Array:
 
 
 def _feature(frame: WholeFrame, outline: Array, height: float) -> dict[str, object]:
-    ring = outline if _area(outline) > 0.0 else outline[::-1]  # clockwise for a mirrored image
+    ring = outline if _area(outline) > 0.0 else outline[::-1]  # clockwise if the plane is seen from its other side
     closed = [*ring.tolist(), ring[0].tolist()]
     return {
         "type": "Feature",

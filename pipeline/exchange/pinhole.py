@@ -143,7 +143,7 @@ def _pinhole(block: Block, frame: WholeFrame, lens: FittedLens, options: ExportO
 def pinholes_written(
     files: Mapping[str, str | bytes], frames: Sequence[PinholeFrame], left_out: Sequence[str], *notes: str, lost: str
 ) -> Written:
-    """Summary of an export of pinholes, with the misfit of the cameras. lost: what is lost of the marks."""
+    """Summary of an export of pinholes, with the misfit of the cameras. lost: marks that the format does not hold."""
     worst = max((frame.misfit_px for frame in frames), default=-1.0)
     if worst == 0.0:
         notes = ("The camera's model is the very same: nothing was fitted.", *notes)
