@@ -26,7 +26,7 @@ def orient_vertical_block(sights: Mapping[str, Sight], known: Mapping[str, Array
     Returns
     -------
     Poses by image name, good to a few degrees of tilt. Empty if only one point has planimetric control, or if fewer
-    than half of the points have height control only (the usual field of such a block).
+    than half of the points have a known height and unknown X and Y: the method is meant for such points.
 
     Notes
     -----

@@ -137,7 +137,7 @@ def prior_root_weights(numbering: Numbering) -> Array:
 
 
 def camera_mask(numbering: Numbering) -> Mask:
-    """Mask (f,) of the free unknowns of cameras (fiducials, interior orientation, distortion: F5 to F9) and
+    """(f,) mask of the free unknowns of cameras (F5 to F9: fiducials, interior orientation, distortion) and
     scanners."""
     unknowns = numbering.problem.unknowns
     positions = [*unknowns.camera.values(), *unknowns.fiducial.values(), *unknowns.scanner.values()]

@@ -83,8 +83,11 @@ class Fronts:
 
     @cached_property
     def table(self) -> Indices:
-        """(f, 5) of each front: first unknown, number of own unknowns, offset of its square in an array of all squares,
-        offset of its later unknowns in `later_unknowns`, and their number."""
+        """(f, 5) table of the fronts, for the compiled kernels.
+
+        Columns: first unknown, number of own unknowns, offset of the front's matrix in an array of all, offset of its
+        later unknowns in `later_unknowns`, and their number.
+        """
         count, later = np.array([(front.count, len(front.after)) for front in self], dtype=np.intp).T
         sizes = (count + later) ** 2
         return np.column_stack([self._starts, count, np.cumsum(sizes) - sizes, np.cumsum(later) - later, later])

@@ -54,8 +54,7 @@ class Pattern:
 
     @cached_property
     def order(self) -> Indices:
-        """(m,) pairs of rows with own unknowns, block by block, and within a block in elimination order of the
-        groups."""
+        """(m,) pairs of rows with own unknowns, sorted by block, and within a block in elimination order of groups."""
         order = np.lexsort((self._lowest[self.group], self.block))
         return order[: np.count_nonzero(self.block < len(self.own) - 1)]
 

@@ -61,8 +61,7 @@ def run_stage(
 
 
 def finish(summary: "Summary", as_json: bool, project: Path | None) -> int:
-    """Print a summary and the next steps. Returns the exit code. project: its file; None: the caller prints the
-    steps."""
+    """Print a summary, and the next steps if the project file is given. Returns the exit code."""
     from pipeline.commands.next_steps import print_next, summary_steps
     from pipeline.summary import print_summary
 
