@@ -27,10 +27,7 @@ from pipeline.text.wording import did_you_mean, listed
 
 Array = NDArray[np.float64]
 
-_LEAST_DIAMETER_PX, _GREATEST_SHARE = (
-    8.0,
-    0.04,
-)  # diameter of a dot: smallest in px, largest as a fraction of the diagonal
+_LEAST_DIAMETER_PX, _GREATEST_SHARE = 8.0, 0.04  # diameters of dots: px; fraction of the diagonal
 _LEAST_CONTRAST = 0.06  # fraction of full scale: coded targets are printed with high contrast
 _FOUND_WITHIN_PX = 2.0  # px, largest shift of the fit from the candidate
 
