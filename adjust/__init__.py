@@ -1,8 +1,7 @@
-"""Comparator coordinates in, calibration out: one least-squares adjustment of everything, fiducial marks included.
+"""Least-squares calibration from comparator coordinates: one adjustment of all unknowns, fiducial marks included.
 
-`adjust(network, approximate(network))` is the way in; the names below are loaded when they are first used.
-docs/how-to/python.md has an example. docs/code.md lists the modules in the order in which
-the observations go through them.
+Enter by `adjust(network, approximate(network))`; the names below are imported on first use. docs/how-to/python.md has
+an example. docs/code.md lists the modules in the order of processing.
 """
 
 import lazy_loader

@@ -1,18 +1,18 @@
-"""What adjust raises."""
+"""Exceptions of adjust."""
 
 from collections.abc import Mapping
 
 
 class AdjustmentError(Exception):
-    """A network that cannot be adjusted: contradictory, incomplete or empty.
+    """Error: the network cannot be adjusted because it is contradictory, incomplete or empty.
 
-    The message says what is wrong, at which image, point or mark, what would be right and what to do. A singular
-    network is no error: it is a result whose null directions are named.
+    The message says what is wrong, in which image, point or mark, what would be right and what to do. A singular
+    network is no error: its result names the null directions.
     """
 
 
 class UnorientedError(AdjustmentError):
-    """Images for which no orientation is found, though it is for others; reasons: a sentence on each, by its name."""
+    """Error: no orientation is found for some images; reasons: one sentence by name of the image."""
 
     def __init__(self, reasons: Mapping[str, str]) -> None:
         super().__init__(next(iter(reasons.values())))
@@ -20,8 +20,10 @@ class UnorientedError(AdjustmentError):
 
 
 class NoImageError(AdjustmentError):
-    """An adjustment that cannot start, for with the approximations some point has no image; reasons: a sentence on each
-    frame of such a point, by its name; none where it is the whole camera's fault."""
+    """Error: the adjustment cannot start because some point has no image with the approximations.
+
+    reasons: one sentence by name of the frame; empty where a whole camera is at fault.
+    """
 
     def __init__(self, message: str, reasons: Mapping[str, str]) -> None:
         super().__init__(message)
@@ -29,4 +31,4 @@ class NoImageError(AdjustmentError):
 
 
 class DatumError(AdjustmentError):
-    """A choice of the datum that holds the object too much or too little, or names what there is not."""
+    """Error: the chosen datum over- or under-constrains the object, or names unknown points."""

@@ -1,4 +1,4 @@
-"""What a network must have before it can be adjusted, told with the name of the culprit."""
+"""Validation of a network before its adjustment; messages name the faulty item."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -16,9 +16,9 @@ from adjust.problem.network import Image, Network
 from adjust.problem.parameter import Parameter, description
 
 TARGETS_NEEDED = 3
-DEFINITE = 1e-13  # least eigenvalue of an earlier calibration's correlation matrix
+DEFINITE = 1e-13  # smallest eigenvalue of an earlier calibration's correlation matrix
 
-Faults = Iterator[str]  # sentences, the first of which is raised
+Faults = Iterator[str]  # sentences; the first one is raised
 
 
 def validate(network: Network) -> None:
@@ -28,7 +28,7 @@ def validate(network: Network) -> None:
 
 
 def validate_plan(network: Network) -> None:
-    """As `validate`, of a network that is only planned: nothing is measured in it yet, whatever the places say."""
+    """Validate a planned network, whose image coordinates are not measured yet and are not checked."""
     for faults in (
         _name_faults,
         _camera_faults,
@@ -68,7 +68,7 @@ def _name_faults(network: Network) -> Faults:
 
 
 def _camera_faults(network: Network) -> Faults:
-    """Of cameras, and of images whose camera or scanner is not given, or whose station is fixed to an antenna's."""
+    """Faults of cameras, and of images with an unknown camera or scanner, or with a fixed antenna station."""
     for image in network.images:
         of: tuple[tuple[str, str, list[str]], ...] = (("camera", image.camera, list(network.camera_by_name)),)
         if image.scanner:
@@ -111,7 +111,7 @@ def _board_faults(network: Network) -> Faults:
 
 
 def _observation_faults(network: Network) -> Faults:
-    """Of rows that do not go together, or name what there is not."""
+    """Faults of observations: inconsistent numbers of rows, unknown names."""
     observations = network.observations
     image, point, kind, count = observations.image, observations.point, observations.kind, len(observations)
     shapes = len(point), len(kind), observations.xy_mm.shape, observations.covariance_mm2.shape
@@ -202,7 +202,7 @@ def _calibration_faults(network: Network) -> Faults:
 
 
 def _camera_sigmas(camera: Camera) -> Iterator[tuple[Parameter, float]]:
-    """The camera's quantities, and the standard deviations that they have of their own."""
+    """Quantities of a camera with the standard deviations of their own priors."""
     interior = {"c": camera.principal_distance_mm, "x0": camera.x0_mm, "y0": camera.y0_mm}
     named: dict[str, Prior | None] = {**interior, **camera.distortion.parameters}
     priors = {Parameter.interior(camera.name, name): prior for name, prior in named.items()}
@@ -213,7 +213,7 @@ def _camera_sigmas(camera: Camera) -> Iterator[tuple[Parameter, float]]:
 
 
 def _value_faults(network: Network) -> Faults:
-    """Of marks that are observed twice in an image, and of coordinates and covariances that are none."""
+    """Faults of values: marks observed twice in an image, invalid coordinates and covariances."""
     observations, covariance = network.observations, network.observations.covariance_mm2
     names, of_name = observations.numbered_points
     mark = (2 * network.image_numbers + observations.is_fiducial) * len(names) + of_name
@@ -244,7 +244,7 @@ def _value_faults(network: Network) -> Faults:
 
 
 def _place_faults(network: Network) -> Faults:
-    """Where all fiducials, or all object points, of an image have one and the same place in it."""
+    """Images whose fiducials, or object points, all lie at one place."""
     observations, numbers = network.observations, network.image_numbers
     for kind, rows in (("fiducials", observations.is_fiducial), ("targets", ~observations.is_fiducial)):
         chosen = np.flatnonzero(rows)
@@ -263,7 +263,7 @@ def _place_faults(network: Network) -> Faults:
 
 
 def _part_faults(network: Network) -> Faults:
-    """The scans of one frame are of one camera and know one orientation, and joins are common to two of them."""
+    """Faults of frames in several scans: different cameras, transformations or orientations; joins in one scan only."""
     first: dict[str, Image] = {}
     for image in network.images:
         other = first.setdefault(image.frame, image)
@@ -286,14 +286,14 @@ def _part_faults(network: Network) -> Faults:
 
 
 def _image_faults(network: Network) -> Faults:
-    """Of frames that show too few marks."""
+    """Frames with too few marks."""
     frames = {image.frame: image for image in network.images}
     for (frame, image), shown in zip(frames.items(), _mark_counts(network).tolist()[: len(frames)], strict=True):
         yield from _mark_faults(replace(image, name=frame), *shown)
 
 
 def _mark_counts(network: Network) -> Indices:
-    """(frames, 2) how many object points, and how many fiducials, every frame shows, those in several parts once."""
+    """(frames, 2) number of object points and of fiducials in every frame; those in several parts count once."""
     observations, frames = network.observations, network.frame_numbers[network.image_numbers]
     names, points = observations.numbered_points
     kinds = observations.has_kind("fiducial") + 2 * observations.has_kind("join")  # all others are object points

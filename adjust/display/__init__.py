@@ -1,1 +1,1 @@
-"""Results as plots of Matplotlib and as tables of pandas, where these are installed."""
+"""Plots (Matplotlib) and tables (pandas) of results, where these packages are installed."""

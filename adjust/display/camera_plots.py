@@ -1,4 +1,4 @@
-"""Plots of a calibrated camera by Matplotlib: residuals, distortion, uncertainty of projected points, coverage."""
+"""Matplotlib plots of a calibrated camera: residuals, distortion, uncertainty of projected points, coverage."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -20,35 +20,37 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import LogNorm
 
-BAND = 1.959964  # standard deviations to a probability of 95 %
-LONGEST = 0.08  # of the picture's longer side, drawn for the longest residuals
-CELLS = 8  # of the coverage along the longer side
+BAND = 1.959964  # in standard deviations, half width of the 95 % band
+LONGEST = 0.08  # length of the longest vectors, fraction of the longer side of the image
+CELLS = 8  # cells of the coverage along the longer side
 FEWEST_LEVELS = 5
-ROUND = (1.0, 2.0, 5.0)  # times powers of ten
+ROUND = (1.0, 2.0, 5.0)  # mantissas of round numbers
 FINER = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
 TARGET, FIDUCIAL, OUTLINE = "#1f5fa8", "#c2571a", "#777777"
 
 
 @dataclass(frozen=True, eq=False)
 class CameraPlots:
-    """What the plots of one camera show, in its frame.
+    """Data for the plots of one camera, in its frame.
 
     Attributes
     ----------
     name : str
+        Name of the camera.
     lens : Lens
-        With its covariance.
+        Lens with covariance.
     places_mm, vectors_mm : Array (n, 2)
-        Of the observations, and their residuals along the camera's axes.
+        Observations and their residuals, along the camera's axes.
     is_fiducial : Mask (n,)
+        Which observations are fiducials.
     images : int
-        How many show its targets.
+        Number of images of the camera.
     corners_mm : Array (2, 2)
-        The lower left and the upper right corner of the picture.
+        Lower left and upper right corner of the image.
     uncertainty : Callable
-        By the distance of points: places (r, c, 2) over the picture and standard deviations (r, c), mm.
+        Returns places (r, c, 2) over the image and standard deviations (r, c) in mm, for a distance of the points.
     pixel_mm : float or None
-        Side of a pixel; with it plots are in px, y down.
+        Side of a pixel; if given, plots are in px, y down.
     """
 
     name: str
@@ -62,11 +64,11 @@ class CameraPlots:
     pixel_mm: float | None = None
 
     def plot_residuals(self, axes: "Axes | None" = None) -> "Axes":
-        """Draw the residuals of all images as vectors over the picture.
+        """Draw the residuals of all images as vectors over the image area.
 
         Parameters
         ----------
-        axes : of Matplotlib; a new figure without
+        axes : Matplotlib axes; default: a new figure
         """
         axes = self._frame(axes)
         places, vectors = self._places(self.places_mm), self._lengths(self.vectors_mm)
@@ -87,11 +89,11 @@ class CameraPlots:
         return axes
 
     def plot_distortion(self, axes: "Axes | None" = None) -> "Axes":
-        """Draw the distortion over the radius with its 95 % bands; grey where no target was observed.
+        """Draw the distortion over the radius with 95 % bands; grey where no target was observed.
 
         Parameters
         ----------
-        axes : of Matplotlib; a new figure without
+        axes : Matplotlib axes; default: a new figure
         """
         axes = _axes(axes, (7.0, 4.0))
         corners = np.stack(np.meshgrid(*self.corners_mm.T), axis=-1).reshape(-1, 2)
@@ -121,12 +123,12 @@ class CameraPlots:
         return axes
 
     def plot_uncertainty(self, distance: float = np.inf, axes: "Axes | None" = None) -> "Axes":
-        """Draw the standard deviation of projected points over the picture, with contours.
+        """Draw the standard deviation of projected points over the image area, with contours.
 
         Parameters
         ----------
-        distance : of the points from the camera in object units; by default they are infinitely far
-        axes : of Matplotlib; a new figure without
+        distance : distance of the points from the camera in object units; default: infinity
+        axes : Matplotlib axes; default: a new figure
         """
         places_mm, sigma_mm = self.uncertainty(distance)
         axes = self._frame(axes)
@@ -150,11 +152,11 @@ class CameraPlots:
         return axes
 
     def plot_coverage(self, axes: "Axes | None" = None) -> "Axes":
-        """Draw where targets were observed, and how many in each cell of the picture.
+        """Draw the observed targets and their number in each cell of the image area.
 
         Parameters
         ----------
-        axes : of Matplotlib; a new figure without
+        axes : Matplotlib axes; default: a new figure
         """
         axes = self._frame(axes)
         places, corners = (
@@ -173,7 +175,7 @@ class CameraPlots:
         return axes
 
     def _frame(self, axes: "Axes | None") -> "Axes":
-        """Axes of the picture with its outline."""
+        """Axes with the outline of the image."""
         low, high = np.sort(self._places(self.corners_mm), axis=0)
         width, height = high - low
         axes = _axes(axes, (7.0, min(1.0 + 6.0 * float(height / width), 9.0)))
@@ -207,7 +209,7 @@ class CameraPlots:
 
     @property
     def _lengths_per_mm(self) -> float:
-        """Of residuals and standard deviations: µm or px."""
+        """Scale of residuals and standard deviations to µm or px."""
         return 1e3 if self.pixel_mm is None else 1.0 / self.pixel_mm
 
     @property
@@ -226,7 +228,7 @@ def adjusted_camera_plots(
     uncertainty: Callable[[float], tuple[Array, Array]],
     pixel_mm: float | None = None,
 ) -> CameraPlots:
-    """The plots of a camera from its adjustment; v_mm (n, 2): the residuals in the comparator."""
+    """Collect the data for the plots of a camera; v_mm (n, 2): residuals in the comparator."""
     observations = estimates.network.observations
     of_image, places, moved, is_fiducial = np.array(observations.image), [], [], []
     images = [each for each in estimates.network.images if each.camera == camera.name]
@@ -252,31 +254,31 @@ def adjusted_camera_plots(
 
 
 class PlottedResult(ABC):
-    """A result whose cameras can be plotted; `plots` gives what each plot shows."""
+    """Result whose cameras can be plotted; `plots` returns the data."""
 
     @abstractmethod
     def plots(self, camera: str = "") -> CameraPlots:
-        """What the plots of a camera show; its name may be left out where there is one."""
+        """Collect the data for the plots of a camera; its name is optional where there is one."""
 
     def plot_residuals(self, camera: str = "", axes: "Axes | None" = None) -> "Axes":
-        """Draw the residuals of all images as vectors over the picture."""
+        """Draw the residuals of all images as vectors over the image area."""
         return self.plots(camera).plot_residuals(axes)
 
     def plot_distortion(self, camera: str = "", axes: "Axes | None" = None) -> "Axes":
-        """Draw the distortion over the radius with its 95 % bands."""
+        """Draw the distortion over the radius with 95 % bands."""
         return self.plots(camera).plot_distortion(axes)
 
     def plot_uncertainty(self, distance: float = np.inf, camera: str = "", axes: "Axes | None" = None) -> "Axes":
-        """Draw the standard deviation of projected points over the picture, by default of points at infinity."""
+        """Draw the standard deviation of projected points over the image area; default: points at infinity."""
         return self.plots(camera).plot_uncertainty(distance, axes)
 
     def plot_coverage(self, camera: str = "", axes: "Axes | None" = None) -> "Axes":
-        """Draw where targets were observed, and how many in each cell of the picture."""
+        """Draw the observed targets and their number in each cell of the image area."""
         return self.plots(camera).plot_coverage(axes)
 
 
 def contour_levels(values: Array) -> list[float]:
-    """Round levels over values: by ratios, finer ones where these are few, or steps where values are close."""
+    """Choose round contour levels: by ratios, finer if these are too few, or equidistant for close values."""
     finite = values[np.isfinite(values)]
     if not finite.size or not finite.max() > 0.0:
         raise AdjustmentError("No point of the picture has a standard deviation: nothing was estimated of the camera.")
@@ -291,18 +293,18 @@ def contour_levels(values: Array) -> list[float]:
 
 
 def distance_text(distance: float) -> str:
-    """Four digits of a distance in object units."""
+    """Format a distance in object units with four digits."""
     return np.format_float_positional(distance, precision=4, fractional=False, trim="-")
 
 
 def _round_below(value: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not above a value."""
+    """Largest of 1, 2, 5 times a power of ten not above a value."""
     power = 10.0 ** np.floor(np.log10(value))
     return float(f"{max(m for m in ROUND if m * power <= value * (1.0 + 1e-9)) * power:.3g}")
 
 
 def _axes(axes: "Axes | None", size_in: tuple[float, float]) -> "Axes":
-    """The axes, or those of a new figure. Raises ImportError without Matplotlib."""
+    """Return the axes, or those of a new figure. Raises ImportError without Matplotlib."""
     if axes is not None:
         return axes
     try:
@@ -315,7 +317,7 @@ def _axes(axes: "Axes | None", size_in: tuple[float, float]) -> "Axes":
 
 
 def _log_norm(levels: list[float]) -> "LogNorm | None":
-    """Colours by ratios where the levels are."""
+    """Logarithmic colour scale where the levels span a large ratio."""
     from matplotlib.colors import LogNorm
 
     return LogNorm(levels[0], levels[-1]) if len(levels) > 1 and levels[-1] > 3.0 * levels[0] else None

@@ -1,4 +1,4 @@
-"""Results as tables of pandas, where it is installed."""
+"""Tables of results for pandas, where it is installed."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from adjust.quality.residuals import Residuals
 
 
 def data_frame(columns: dict[str, Any]) -> Any:
-    """A pandas.DataFrame. Raises ImportError without pandas."""
+    """Make a pandas.DataFrame. Raises ImportError without pandas."""
     try:
         import pandas as pd
     except ImportError:
@@ -19,7 +19,7 @@ def data_frame(columns: dict[str, Any]) -> Any:
 
 
 def parameter_columns(estimates: Estimates) -> dict[str, Any]:
-    """One row a quantity of an adjustment."""
+    """Columns of a table with one row per quantity."""
     keys = estimates.parameters
     return {
         "kind": [key.kind for key in keys],
@@ -32,7 +32,7 @@ def parameter_columns(estimates: Estimates) -> dict[str, Any]:
 
 
 def residual_columns(observations: Observations, residuals: Residuals) -> dict[str, Any]:
-    """One row an observation."""
+    """Columns of a table with one row per observation."""
     columns: dict[str, Any] = {"image": observations.image, "point": observations.point, "kind": observations.kind}
     pairs = {"{}_mm": observations.xy_mm, "v{}_um": 1e3 * residuals.v_mm, "redundancy_{}": residuals.redundancy}
     pairs["w_{}"] = residuals.w

@@ -1,1 +1,1 @@
-"""Which model the observations ask for, and what a planned network would give."""
+"""Selection of film transformation, distortion model and scanner terms."""

@@ -1,8 +1,8 @@
-"""Models as they were adjusted, compared with one another: nested ones by the F-test, any two by Akaike's criterion.
+"""Comparison of adjusted models: nested ones by the F-test, any two by Akaike's criterion.
 
     F = ((v'Pv_s - v'Pv_r) / (u_r - u_s)) / (v'Pv_r / r_r)  ~  F(u_r - u_s, r_r)
-    AIC = v'Pv + 2 u                                            where the given variances are taken as known
-    AICc = n ln(v'Pv / n) + 2 K + 2 K (K + 1) / (n - K - 1)     K = u + 1, where their common factor is estimated too
+    AIC = v'Pv + 2 u                                            for known variances
+    AICc = n ln(v'Pv / n) + 2 K + 2 K (K + 1) / (n - K - 1)     K = u + 1, variance factor estimated
 
 n counts the observations with the priors, u the unknowns. Sources: K. R. Koch, Parameter estimation and hypothesis
 testing in linear models, 1999, chapter 4.2; K. P. Burnham and D. R. Anderson, Model selection and multimodel inference,
@@ -19,14 +19,22 @@ from adjust.model_selection.cross_validation import CrossValidation
 from adjust.model_selection.models import Model
 from adjust.quality.significance import LEVEL
 
-DECISIVE = 10.0  # difference of AICc from which on the worse model has essentially no support (Burnham and Anderson)
+DECISIVE = 10.0  # difference of AICc above which the worse model has essentially no support (Burnham and Anderson)
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model as it was adjusted. problem: why it has no solution, empty where it has one.
+    """Adjusted model.
 
-    correlated: pairs of interior parameters that the data hardly tell apart, with their correlation.
+    Attributes
+    ----------
+    model : the model.
+    problem : why it has no solution; empty where it has one.
+    observations, unknowns, redundancy : counts.
+    vpv, sigma0 : of the adjustment.
+    cross_validation : prediction errors.
+    correlated : pairs of highly correlated interior parameters, with their correlation.
+    warnings : of the adjustment.
     """
 
     model: Model
@@ -46,7 +54,7 @@ class Candidate:
 
     @property
     def aicc(self) -> float:
-        """inf where there are too few observations for it."""
+        """AICc; inf with too few observations."""
         k, n = self.unknowns + 1, self.observations
         if n - k - 1 <= 0:
             return np.inf
@@ -55,7 +63,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Nested:
-    """The F-test of a model against a richer one that contains it."""
+    """F-test of a model against a richer one that contains it."""
 
     simpler: Model
     richer: Model
@@ -65,7 +73,7 @@ class Nested:
 
 
 def simplest_sufficient(candidates: Sequence[Candidate]) -> Candidate | None:
-    """The simplest candidate that no richer one is significantly better than; None where none has a solution."""
+    """Select the simplest candidate that no richer one improves significantly; None without a solution."""
     chosen = None
     for candidate in sorted(_solved(candidates), key=lambda each: (each.unknowns, each.vpv)):
         if chosen is None or _is_better(candidate, chosen):
@@ -74,7 +82,7 @@ def simplest_sufficient(candidates: Sequence[Candidate]) -> Candidate | None:
 
 
 def _is_better(richer: Candidate, simpler: Candidate) -> bool:
-    """Whether a model is significantly better than one of no more unknowns, and predicts better too."""
+    """Whether a model is significantly better than one with no more unknowns, and also predicts better."""
     a, b = richer.cross_validation, simpler.cross_validation
     if a is not None and b is not None and a.sigmas >= b.sigmas:
         return False
@@ -86,7 +94,7 @@ def _is_better(richer: Candidate, simpler: Candidate) -> bool:
 
 
 def f_test(simpler: Candidate, richer: Candidate) -> Nested:
-    """Whether the richer of two nested models leaves less than chance would."""
+    """Test two nested models by the F-test."""
     more, redundancy = richer.unknowns - simpler.unknowns, richer.redundancy
     variance = richer.vpv / redundancy if redundancy > 0 else 1.0
     f = max(simpler.vpv - richer.vpv, 0.0) / more / variance
@@ -95,7 +103,7 @@ def f_test(simpler: Candidate, richer: Candidate) -> Nested:
 
 
 def nested_tests(candidates: Sequence[Candidate]) -> tuple[Nested, ...]:
-    """Of all neighbours: pairs of which one contains the other with no candidate between them."""
+    """Test all neighbouring pairs: one contains the other, with no candidate between them."""
     solved = _solved(candidates)
     models = [each.model for each in solved]
     return tuple(
@@ -128,8 +136,10 @@ def verdict(given: Model, chosen: Candidate | None) -> str:
 
 
 def reasons(candidates: Sequence[Candidate], chosen: Candidate | None) -> tuple[str, ...]:
-    """A sentence on every other candidate that differs from the chosen one in one thing alone: distortion,
-    transformation or bends."""
+    """Explain the rejection of every candidate that differs from the chosen one in one respect only.
+
+    Respects are distortion, transformation and scanner terms.
+    """
     if chosen is None:
         return tuple(f"{each.model.name}: {each.problem}" for each in candidates)
     own, near = chosen.model, []

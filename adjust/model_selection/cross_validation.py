@@ -1,4 +1,4 @@
-"""Cross-validation over object points: how well a model predicts the images of points that had no part in its fit."""
+"""Cross-validation over object points: prediction errors of the images of points that were left out."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ from adjust.solution.reweighting import run
 from adjust.validation import validate
 
 FOLDS = 5
-FEWEST_KNOWN = 10  # known points below this number stay in every fold: they carry the datum
+FEWEST_KNOWN = 10  # fewer known points than this stay in every fit: they define the datum
 UM_PER_MM = 1000.0
 
 
@@ -28,8 +28,12 @@ UM_PER_MM = 1000.0
 class CrossValidation:
     """Prediction errors of the rays (image points) of left-out points.
 
-    rms_um: per axis, in the comparator. sigmas: the same in the standard deviations of the observations; 1 would be a
-    perfect model, but for the errors of what predicts. rays: how many were predicted.
+    Attributes
+    ----------
+    rms_um : rms per axis, in the comparator.
+    sigmas : the same in standard deviations of the observations; 1 for a perfect model, apart from the errors of the
+        prediction itself.
+    rays : number of predicted rays.
     """
 
     rms_um: float
@@ -38,9 +42,9 @@ class CrossValidation:
 
 
 def folds(network: Network, options: Options) -> tuple[frozenset[str], ...]:
-    """The points that are left out together, every point in one fold.
+    """Divide the object points into folds that are left out together.
 
-    Points that distances or the datum name stay in all fits, and so do known points where they are few.
+    Points in distances or in the datum stay in all fits, and so do known points if there are few.
     """
     held = {name for distance in network.distances for name in (distance.start, distance.end)}
     held |= {object_coordinate(text).id for text in options.datum_coordinates} | set(options.datum_points)
@@ -54,11 +58,12 @@ def folds(network: Network, options: Options) -> tuple[frozenset[str], ...]:
 def cross_validate(
     adjustment: Adjustment, left_out: Sequence[frozenset[str]], options: Options
 ) -> CrossValidation | None:
-    """The prediction errors of an adjusted model over all folds; None where a fold has no solution or predicts nothing.
+    """Compute the prediction errors of an adjusted model over all folds.
 
-    Every fold is adjusted without its points, from the whole's values on. A point of which all coordinates are given is
-    projected as it is given, that of a bent board from where the whole's bend puts it. Any other is intersected from
-    every second of its rays and predicted in the others, and the other way round, where they locate it.
+    Returns None where a fold has no solution or there is no prediction. Every fold is adjusted without its points,
+    starting from the values of the whole adjustment. A point with all coordinates given is projected from these; on a
+    bent board it is displaced by the bend of the whole adjustment. Any other point is intersected from every second of
+    its rays and predicted in the others, and vice versa, where the rays determine it.
     """
     errors, rows = np.empty((0, 2)), np.empty(0, dtype=np.intp)
     for points in left_out:
@@ -76,7 +81,7 @@ def cross_validate(
 
 
 def adjusted_values(adjustment: Adjustment) -> Approximations:
-    """The values of an adjustment as a start of another one."""
+    """Convert the values of an adjustment to approximations."""
     network, collected = adjustment.network, dict[tuple[Kind, str, str], list[float]]()
     for each, value in zip(adjustment.parameters, adjustment.values.tolist(), strict=True):
         collected.setdefault((each.kind, each.owner, each.id), []).append(value)
@@ -94,7 +99,7 @@ def adjusted_values(adjustment: Adjustment) -> Approximations:
 def _refitted_models(
     adjustment: Adjustment, points: frozenset[str], options: Options
 ) -> Mapping[str, ImageModel] | None:
-    """The images as the other points determine them, without the tests that take longest; None where these do not."""
+    """Adjust without some points, omitting the slow tests; returns the image models, None without a solution."""
     network = adjustment.network
     reduced = replace(
         network,
@@ -122,20 +127,20 @@ def _refitted_models(
 
 
 def _rows(network: Network, points: frozenset[str]) -> Indices:
-    """The observations of some object points, point by point and of each by image."""
+    """Rows of some object points, sorted by point and image."""
     observations = network.observations
     named = np.flatnonzero(np.isin(observations.point, list(points)) & ~observations.is_fiducial)
     return np.array(sorted(named, key=lambda row: (observations.point[row], observations.image[row])), dtype=np.intp)
 
 
 def _errors(models: Mapping[str, ImageModel], adjustment: Adjustment, points: frozenset[str]) -> tuple[Array, Indices]:
-    """Predicted less observed comparator coordinates (n, 2) of all rays that can be predicted, and their rows (n,)."""
+    """Predicted minus observed comparator coordinates (n, 2) of all predictable rays, and their rows (n,)."""
     network, observations = adjustment.network, adjustment.network.observations
     rows = _rows(network, points)
     names, point = np.unique(np.array(observations.point)[rows], return_inverse=True)
     known = np.array([_given_coordinates(network, name) for name in names]).reshape(-1, 3)
     known = known + lifted(adjustment, names.tolist())
-    second = (np.arange(len(point)) - np.searchsorted(point, point)) % 2 == 1  # and fourth ... ray of its point
+    second = (np.arange(len(point)) - np.searchsorted(point, point)) % 2 == 1  # second, fourth, ... ray of its point
     images = np.array(observations.image)[rows]
     rays_of = {str(image): np.flatnonzero(images == image) for image in np.unique(images)}
     centers, directions = np.empty((len(rows), 3)), np.empty((len(rows), 3))
@@ -159,14 +164,14 @@ def _errors(models: Mapping[str, ImageModel], adjustment: Adjustment, points: fr
 
 
 def _given_coordinates(network: Network, point: str) -> Array:
-    """(3,) the coordinates that are given, exactly or with a standard deviation, nan where none is."""
+    """(3,) given coordinates, exact or with a standard deviation; nan where not given."""
     each = network.point_by_id[point]
     priors = (each.X, each.Y, each.Z)
     return np.array([prior.value if prior is not None and np.isfinite(prior.sigma) else np.nan for prior in priors])
 
 
 def _directions(model: ImageModel, xy_mm: Array) -> Array:
-    """The directions (n, 3) of rays in the object space, from observed comparator points (n, 2)."""
+    """(n, 3) directions of rays in object space, from observed comparator points (n, 2)."""
     ideal, _ = model.lens.ideal_from_observed(model.camera_from_comparator(xy_mm))
     in_camera = np.column_stack([ideal - model.lens.interior[1:], np.full(len(ideal), -model.lens.interior[0])])
     return np.asarray(in_camera @ model.rotation)

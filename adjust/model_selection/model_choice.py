@@ -1,10 +1,8 @@
-"""Which model the data ask for: film transformations, distortion families and scanners' bends compared on the same
-observations.
+"""Model selection: compare film transformations, distortion families and scanner terms on the same observations.
 
-Every candidate is adjusted with the same weights. Of two of which one contains the other, the F-test of their sums of
-squares says whether the richer one is needed; any two are compared by Akaike's criterion; and all by how well they
-predict points that had no part in their fit (`adjust.model_selection.cross_validation`). Chosen is the simplest model
-that no richer one is significantly better than.
+Every candidate is adjusted with the same weights. Nested models are compared by the F-test, any two by Akaike's
+criterion, and all by their prediction of points that were left out (`adjust.model_selection.cross_validation`). The
+simplest model that no richer one improves significantly is chosen.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,14 +24,23 @@ from adjust.solution.adjustment import Options, adjust
 from adjust.solution.result import Adjustment
 
 HIGH_CORRELATION = 0.95
-ROUNDS = 3  # of choosing distortion, bends and transformation in turns
+ROUNDS = 3  # rounds of selecting distortion, scanner terms and transformation in turn
 
 Progress = Callable[[str, int], None]
 
 
 @dataclass(frozen=True)
 class Choice:
-    """All candidates, the F-tests of neighbours, the one chosen (None where none has a solution) and why."""
+    """Result of a model selection.
+
+    Attributes
+    ----------
+    given : model of the network as given.
+    candidates : all candidates.
+    tests : F-tests of neighbours.
+    chosen : chosen candidate, None without a solution.
+    verdict, reasons : sentences on the choice and on the rejected candidates.
+    """
 
     given: Model
     candidates: tuple[Candidate, ...]
@@ -51,10 +58,17 @@ def choose(
 ) -> Choice:
     """Compare the models that a network allows.
 
-    own: the network as it was adjusted with a model of its own, and the weights that robust estimation, data snooping
-    and variance components left its image points there: all candidates are given these. options: those of that
-    adjustment. half_mm: by camera half the frame, for the self-calibration sets; without it for every camera they are
-    left out.
+    Parameters
+    ----------
+    own : Adjustment
+        The network adjusted with its own model. All candidates get the weights that robust estimation, data snooping
+        and variance components gave its image points.
+    options : Options, optional
+        Options of that adjustment.
+    half_mm : mapping, optional
+        Half the frame by camera, for the self-calibration sets, which are left out unless every camera has it.
+    progress : callable
+        Called with the name of each model and the number of candidates done.
     """
     options = options or Options()
     half_mm = half_mm or {}
@@ -74,8 +88,11 @@ def choose(
 
 
 def _chosen(fits: "_Fits", given: Model, with_sets: bool) -> tuple[Candidate | None, tuple[str, ...]]:
-    """Distortion, bends and transformation in turns, each beside the others as they stand, until none changes; and what
-    is to be said of bends that are not told. The bends come before the transformation: a richer one could take them."""
+    """Select distortion, scanner terms and transformation in turn until none changes.
+
+    Also returns remarks on scanner terms that are not estimable. The scanner terms come before the transformation,
+    since a richer transformation could absorb them.
+    """
     film, bends = given.transformation, Bends()
     chosen: Candidate | None = None
     untold: tuple[str, ...] = ()
@@ -101,7 +118,7 @@ def _chosen(fits: "_Fits", given: Model, with_sets: bool) -> tuple[Candidate | N
 
 
 def weighted_network(own: Adjustment) -> Network:
-    """The network with the weights that its image points ended with in an adjustment; without those that have none."""
+    """Apply the final weights of an adjustment to the image points; those without weight are left out."""
     observations = own.network.observations
     weights = own.weights if len(own.weights) else np.ones(len(observations))
     factors = np.array([own.variance_factors.get(kind, 1.0) for kind in observations.kind])
@@ -112,7 +129,7 @@ def weighted_network(own: Adjustment) -> Network:
 
 @dataclass
 class _Fits:
-    """The candidates adjusted so far, and per transformation an adjustment from whose values others start."""
+    """Candidates adjusted so far, and for each transformation an adjustment that supplies initial values."""
 
     network: Network
     options: Options
@@ -128,8 +145,7 @@ class _Fits:
         return self.done[model]
 
     def needed_bends(self, model: Model) -> tuple[Bends, tuple[str, ...]]:
-        """The terms of scanners' bends that tests ask for beside a model that has none; and what is to be said of terms
-        that are not told."""
+        """Select significant scanner terms for a model without any; also return remarks on terms not estimable."""
         near = self.starts[model.transformation]
         network = self._network(model, near)
         if not any(image.scanner for image in network.images):
@@ -166,7 +182,7 @@ class _Fits:
         )
 
     def _from(self, model: Model, near: Adjustment | None) -> Adjustment:
-        """Adjusted from the values of a model near to it, or where that leads nowhere from the images themselves."""
+        """Adjust from the values of a similar model, or where that fails from the network's own approximations."""
         if near is not None:
             try:
                 result = adjust(self._network(model, near), adjusted_values(near), self.options)
@@ -178,14 +194,14 @@ class _Fits:
         return adjust(network, approximate(held_as_known(network, self.options.datum_coordinates)), self.options)
 
     def _network(self, model: Model, near: Adjustment | None) -> Network:
-        """The network with a model, parameters that the near one has too starting at its values."""
+        """Network with a model; parameters in common with the similar one start at its values."""
         same = near is not None and near.network.cameras[0].distortion.family == model.family
         values = dict(zip(near.parameters, near.values.tolist(), strict=True)) if near is not None and same else {}
         return model.build_network(self.network, values, self.half_mm)
 
 
 def _correlated(result: Adjustment) -> tuple[tuple[str, str, float], ...]:
-    """Pairs of interior parameters of a camera that are highly correlated, the highest first."""
+    """Pairs of highly correlated interior parameters of a camera, highest first."""
     pairs = []
     for camera in result.network.cameras:
         own = [each for each in result.parameters if each.kind == "interior" and each.owner == camera.name]

@@ -1,5 +1,4 @@
-"""The models that a choice is between: a film transformation, the distortion parameters and the terms of the scanners'
-bends that are estimated."""
+"""Models for selection: film transformation, estimated distortion parameters and scanner terms."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ from adjust.problem.network import Network, Transformation
 from adjust.problem.observations import Calibration
 from adjust.problem.parameter import Parameter
 
-# A transformation and the simpler ones that it contains, simplest first.
+# Simpler transformations that each transformation contains, simplest first.
 TRANSFORMATIONS: Mapping[Transformation, tuple[Transformation, ...]] = {
     "congruent": (),
     "similarity": ("congruent",),
@@ -26,15 +25,21 @@ TRANSFORMATIONS: Mapping[Transformation, tuple[Transformation, ...]] = {
     "polynomial(2)": ("congruent", "similarity", "affine", "conformal(2)", "bilinear"),
 }
 
-Bends = tuple[tuple[str, tuple[str, ...]], ...]  # of every scanner that has one, its name and its terms
+Bends = tuple[tuple[str, tuple[str, ...]], ...]  # (name, terms) of every scanner with terms
 
-SETS = {"ebner": ("b1", "b2"), "legendre(3)": ("a10", "a01")}  # with their parameters of affinity and shear
+SETS = {"ebner": ("b1", "b2"), "legendre(3)": ("a10", "a01")}  # their parameters of affinity and shear
 
 
 @dataclass(frozen=True)
 class Model:
-    """transformation: of all images that have one; family and parameters: what is estimated of every camera's lens;
-    bends: of the scanners."""
+    """Model of a network.
+
+    Attributes
+    ----------
+    transformation : of all images that have one.
+    family, parameters : distortion family and estimated parameters of every camera.
+    bends : scanner terms.
+    """
 
     transformation: Transformation
     family: str = "none"
@@ -43,7 +48,7 @@ class Model:
 
     @property
     def name(self) -> str:
-        """In words: "affine, torlegard k3 k5"; a set is not spelled out."""
+        """Description: "affine, torlegard k3 k5"; the parameters of a set are not listed."""
         lens = "no distortion" if self.family == "none" else self.family
         shown = () if self.family in SETS else self.parameters
         film = () if self.transformation == "none" else (f"{self.transformation},",)
@@ -51,7 +56,7 @@ class Model:
         return " ".join((*film, lens, *shown)) + "".join(bends)
 
     def contains(self, other: "Model") -> bool:
-        """Whether the other model is a special case of this one, some of its parameters being 0."""
+        """Whether the other model is a special case of this one with some parameters 0."""
         films = (self.transformation, *TRANSFORMATIONS.get(self.transformation, ()))
         same = other.family in (self.family, "none") and set(other.parameters) <= set(self.parameters)
         bends = dict(self.bends)
@@ -61,7 +66,7 @@ class Model:
     def build_network(
         self, network: Network, values: Mapping[Parameter, float], half_mm: Mapping[str, tuple[float, float]]
     ) -> Network:
-        """The network with this model, its parameters free. values: where they start."""
+        """Build the network with this model, its parameters free. values: initial values."""
         cameras = []
         for camera in network.cameras:
             given = camera.distortion
@@ -83,7 +88,7 @@ class Model:
 
 
 def _calibration_without_distortion(calibration: Calibration, network: Network) -> Calibration:
-    """What an earlier calibration says of everything but distortion, which is another in every candidate."""
+    """Drop the distortion from an earlier calibration, since it differs between candidates."""
     cameras = network.cameras
     distortion = {Parameter.interior(camera.name, name) for camera in cameras for name in camera.distortion.parameters}
     kept = [i for i, parameter in enumerate(calibration.parameters) if parameter not in distortion]
@@ -95,7 +100,7 @@ def _calibration_without_distortion(calibration: Calibration, network: Network) 
 
 
 def given_model(network: Network) -> Model:
-    """The network's own: its first camera's, its images' film transformation, and its scanners' bends."""
+    """Model of a network: distortion of the first camera, film transformation of the images, scanner terms."""
     films = [image.transformation for image in network.images if image.transformation != "none"]
     distortion = network.cameras[0].distortion
     estimated = [name for name, prior in distortion.parameters.items() if prior.sigma > 0.0]
@@ -105,13 +110,13 @@ def given_model(network: Network) -> Model:
 
 
 def remaining_bends(film: Transformation, bends: Bends) -> Bends:
-    """The terms of bends that a film transformation does not take."""
+    """Scanner terms that a film transformation does not absorb."""
     left = ((scanner, tuple(term for term in terms if is_left(film, term))) for scanner, terms in bends)
     return tuple((scanner, terms) for scanner, terms in left if terms)
 
 
 def transformations(network: Network) -> tuple[Transformation, ...]:
-    """The film transformations that every image has fiducial marks enough for; "none" where the images have none."""
+    """Film transformations for which every image has enough fiducial marks; "none" for images without films."""
     filmed = {image.name for image in network.images if image.transformation != "none"}
     if not filmed:
         return ("none",)
@@ -123,10 +128,11 @@ def transformations(network: Network) -> tuple[Transformation, ...]:
 
 
 def lenses(network: Network, transformation: Transformation, with_sets: bool) -> tuple[Model, ...]:
-    """No distortion, a ladder of the camera's own family (Torlegård's where that has none), the sets.
+    """Candidate lens models: no distortion, the ladder of the camera's family (else Torlegård's), the sets.
 
-    Each rung with b1, too, where no film takes the difference of the scales of x and y. And the network's own, where it
-    is none of these. Fiducials alone say nothing of a lens: then there is none.
+    Each rung is also tried with b1 where no film transformation absorbs the scale difference of x and y. The network's
+    own model is added if missing. Without object points, a lens cannot be estimated: the only candidate is no
+    distortion.
     """
     if len(network.idle_cameras) == len(network.cameras):
         return (Model(transformation),)
@@ -142,7 +148,7 @@ def lenses(network: Network, transformation: Transformation, with_sets: bool) ->
     if with_sets:
         for name, affinity in SETS.items():
             films = (transformation, *TRANSFORMATIONS.get(transformation, ()))
-            taken = affinity if "affine" in films else ()  # by the film
+            taken = affinity if "affine" in films else ()  # absorbed by the film transformation
             models.append(Model(transformation, name, tuple(p for p in parameter_names(name) if p not in taken)))
     own = replace(given_model(network), transformation=transformation, bends=())
     return tuple(models if own in models else [*models, own])

@@ -1,10 +1,10 @@
-"""The bend of a scanner that the observations ask for: few terms, each tested, of those that can be told at all.
+"""Selection of scanner terms: the few significant ones among those that are estimable.
 
-One adjustment with all terms, held together by a weak prior, gives their normal equations with everything else
-eliminated: G = Q⁻¹ - I / sigma², g = Q⁻¹ x, Q their cofactor matrix and x their values. From these any choice of terms
-follows, x_A = G_AA⁻¹ g_A with v'Pv smaller by g_A' G_AA⁻¹ g_A. Terms are taken in one after the other, smooth ones
-before those of the carriage and of these the one that explains most first, while its F-test is significant with all
-candidates counted (Bonferroni).
+One adjustment with all terms, constrained by a weak prior, gives their normal equations with all other unknowns
+eliminated: G = Q⁻¹ - I / sigma², g = Q⁻¹ x, with Q the cofactor matrix of the terms and x their values. The solution
+for any subset A follows from these: x_A = G_AA⁻¹ g_A, which lowers v'Pv by g_A' G_AA⁻¹ g_A. Terms are added one at a
+time (forward selection), smooth terms before carriage terms, the one with the largest decrease first, while its F-test
+is significant after Bonferroni correction for all candidates.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -23,22 +23,22 @@ from adjust.quality.significance import LEVEL
 from adjust.rank_defect.scanner_directions import HARDLY, scan_poses, undetermined_term_sentences
 from adjust.solution.result import Adjustment
 
-WEAK_MM = 0.1  # prior of every term in the trial, taken off again: what is not told stays as small as scanners bend
+WEAK_MM = 0.1  # weak prior of every term in the trial, removed afterwards; it keeps terms not estimable small
 
 
 @dataclass(frozen=True)
 class ScannerChoice:
-    """The network with the chosen terms of every scanner's bend; remarks: on what cannot be told."""
+    """Network with the selected terms of every scanner, and remarks on terms that are not estimable."""
 
     network: Network
     remarks: tuple[str, ...]
 
 
 def bent_network(network: Network, terms: Sequence[str] | None = None, sigma_mm: float = np.inf) -> Network:
-    """The network with a bend of every scanner that its images name, over the extent of their observations.
+    """Add terms to every scanner of a network's images, over the extent of their observations.
 
-    terms: of the bend; None: all of degree 2 and 3, and of degree 1, that no film transformation takes. sigma_mm: of
-    every term, which is given as 0.
+    terms: names; None: all smooth and combined terms that no film transformation absorbs. sigma_mm: standard deviation
+    of every term, given as 0.
     """
     smooth = smooth_terms(_films(network))
     return network_with_terms(
@@ -47,8 +47,10 @@ def bent_network(network: Network, terms: Sequence[str] | None = None, sigma_mm:
 
 
 def network_with_terms(network: Network, terms: Mapping[str, Sequence[str]], sigma_mm: float = np.inf) -> Network:
-    """The network with these terms of the bends of the scanners that its images name, each given as 0; terms: by
-    scanner, none of one that is not among them. Lenses of cameras that are scanners stay."""
+    """Set the terms of the scanners of a network's images, each given as 0.
+
+    terms: names by scanner; a missing scanner has none. Lenses of digital cameras used as scanners are kept.
+    """
     scanners = []
     lenses = {scanner.name: scanner.lens for scanner in network.scanners}
     for name in _scanners(network):
@@ -65,9 +67,9 @@ def network_with_terms(network: Network, terms: Mapping[str, Sequence[str]], sig
 def choose_bends(
     network: Network, adjusted: Callable[[Network], Adjustment], sigma_mm: float = np.inf
 ) -> ScannerChoice:
-    """The network with those terms of every scanner's bend that the observations ask for.
+    """Select the significant terms of every scanner.
 
-    adjusted: how a network is adjusted; once, with all candidates. sigma_mm: as in `bent_network`.
+    adjusted: adjusts a network; called once, with all candidates. sigma_mm: as in `bent_network`.
     """
     smooth, films = smooth_terms(_films(network)), _films(network)
     candidates = (*smooth, *carriage_terms(films))
@@ -105,10 +107,14 @@ def _scanners(network: Network) -> list[str]:
 
 @dataclass(frozen=True)
 class _Equations:
-    """The normal equations of the terms of one bend, everything else eliminated.
+    """Normal equations of the terms of one scanner, all other unknowns eliminated.
 
-    normal (k, k), right (k,); known (k,): the diagonal of `normal` if everything else were known. vpv, redundancy: of
-    the adjustment without a term.
+    Attributes
+    ----------
+    terms : names.
+    normal, right : (k, k), (k,).
+    known : (k,) diagonal of `normal` if everything else were known.
+    vpv, redundancy : of the adjustment without a term.
     """
 
     terms: tuple[str, ...]
@@ -119,12 +125,12 @@ class _Equations:
     redundancy: int
 
     def undetermined_terms(self, taken: Sequence[str]) -> list[str]:
-        """The terms that cannot be told, beside some that are taken, from the other unknowns."""
+        """Terms not estimable separately from the other unknowns and the terms taken."""
         left, _ = self._reduced(taken)
         return [term for term, determined in zip(self.terms, left, strict=True) if term not in taken and not determined]
 
     def next(self, taken: Sequence[str], among: Collection[str]) -> tuple[str, float] | None:
-        """Of some terms that which explains most beside those taken, and the probability of so much by chance."""
+        """Return the term that lowers v'Pv most in addition to those taken, and its p-value."""
         determined, explained = self._reduced(taken)
         open_ = np.array([each in among and each not in taken for each in self.terms]) & determined
         if not open_.any():
@@ -137,7 +143,7 @@ class _Equations:
         return self.terms[best], float(chdtrc(1, explained[best]))
 
     def _reduced(self, taken: Sequence[str]) -> tuple[Mask, Array]:
-        """Of every term beside those taken: whether it is told, and by how much it makes v'Pv smaller."""
+        """For every term, given those taken: whether it is estimable, and its decrease of v'Pv."""
         at = [self.terms.index(each) for each in taken]
         solved = np.linalg.solve(self.normal[np.ix_(at, at)], np.column_stack([self.normal[at], self.right[at]]))
         normal = np.diag(self.normal) - (self.normal[:, at] * solved[:, :-1].T).sum(axis=1)
@@ -151,14 +157,14 @@ class _Equations:
 
 
 def _free_distortion(trial: Adjustment) -> list[Parameter]:
-    """The distortion parameters of all cameras that are not fixed."""
+    """Distortion parameters of all cameras that are not fixed."""
     cameras = trial.network.cameras
     keys = [Parameter.interior(camera.name, name) for camera in cameras for name in camera.distortion.parameters]
     return [key for key in keys if trial.has(key) and trial.sigma(key) > 0.0]
 
 
 def _equations(trial: Adjustment, scanner: Scanner, held: Sequence[Parameter] = ()) -> _Equations:
-    """Of one scanner's terms, those of others being free beside them; held: other unknowns, taken as known."""
+    """Normal equations of one scanner's terms, with those of other scanners free; held: other unknowns held fixed."""
     terms = tuple(scanner.terms)
     keys = [Parameter.scanner(scanner.name, term) for term in terms]
     values = trial.values_of(keys)

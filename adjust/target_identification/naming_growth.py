@@ -128,8 +128,9 @@ def _shown_points(view: View, xyz: Array, normals: Array, marks: Marks) -> Mask:
 
 
 def _fit_view(view: View, xyz: Array, places: Array, marks: Marks) -> tuple[View, float, Array]:
-    """Fit a view by robust least squares; returns view, standard deviation of the marks, covariance of the
-    parameters.
+    """Fit a view by robust least squares.
+
+    Returns the view, the standard deviation of the marks and the covariance of the parameters.
     """
     priors = np.diag([0.0] * 6 + [marks.c_sigma**-2, _PRIOR_RADIAL**-2])
     sigma = marks.sigma

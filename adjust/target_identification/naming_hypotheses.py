@@ -153,9 +153,7 @@ def point_triples(cluster: Cluster, xyz: Array) -> Indices:
 
 
 def promising(xyz: Array, normals: Array, marks: Marks, points: Indices, named: Indices) -> Poses:
-    """Find the poses that best explain the points around three points (k or 1, 3) matched to three marks (k or 1,
-    3).
-    """
+    """Find the poses that best explain the surroundings of three points (k or 1, 3) as three marks (k or 1, 3)."""
     count = max(len(points), len(named))
     about = _nearest_points(xyz, points, _ABOUT)
     kept: list[tuple[Array, Array, Indices, Array]] = []
