@@ -59,10 +59,13 @@ class Found:
 
     @property
     def lacks_few_marks(self) -> bool:
-        """Whether a frame is taken that lacks fewer marks than film which was photographed obliquely would."""
+        """Whether a frame is taken in which fewer marks are missing than on film that was photographed obliquely.
+
+        Weak marks are not missing: a perspective moves marks off their places, and leaves their quality alone.
+        """
         if self.frame is None or not self.is_taken:
             return False
-        return self.frame.inside - self.frame.measured_count < max(_GAINED, _LACKED * self.frame.inside)
+        return self.frame.inside - int(self.frame.inliers.sum()) < max(_GAINED, _LACKED * self.frame.inside)
 
     @property
     def is_undoubted(self) -> bool:
