@@ -18,7 +18,7 @@ from adjust.linear_algebra.small_matrices import columns, matrices, vectors
 
 RADIAL_DEGREES = (3, 5, 7, 9, 11, 13)
 RADIAL = tuple(f"+r{degree}" for degree in RADIAL_DEGREES)
-DECENTERING = (("+p1", "+p2"), ("+p3", "+p4"))  # of the lowest degree, and of the next
+DECENTERING = (("+p1", "+p2"), ("+p3", "+p4"))  # lowest degree, next degree
 AFFINITY = ("+b1", "+b2")
 ADDED_NAMES = (*RADIAL, *DECENTERING[0], *DECENTERING[1], *AFFINITY)
 

@@ -63,8 +63,10 @@ class DistortedRay:
     parameter_derivative: Callable[[int], Array]
 
 
-Correct = Callable[[Settings, Array, Array, Array], Correction]  # of settings, points, principal point, parameters
-Image = Callable[[Settings, float, Array, Array], Imaged]  # of settings, c, rays, parameters
+Correct = Callable[
+    [Settings, Array, Array, Array], Correction
+]  # arguments: settings, points, principal point, parameters
+Image = Callable[[Settings, float, Array, Array], Imaged]  # arguments: settings, c, rays, parameters
 
 
 def no_correction(_: Settings, xy: Array, __: Array, parameters: Array) -> Correction:

@@ -24,7 +24,7 @@ Decentering = Literal["reduced", "paper"]
 
 INTERIOR_NAMES = ("c", "x0", "y0")
 NEWTON_STEPS = 30
-NEWTON_TOLERANCE = 1e-14  # of the principal distance
+NEWTON_TOLERANCE = 1e-14  # fraction of the principal distance
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.lens import INTERIOR_NAMES, Distortion, Lens
 
 SAME = 1e-9  # fraction of the principal distance: largest rounding difference of two equivalent descriptions
-_GRID = 25  # points a side of the grid over the frame
+_GRID = 25  # points per side of the grid over the frame
 _STEPS = 60
 _STEP = 1e-13  # fraction of the principal distance: a step with less effect in the image means convergence
 _RELATED = 1e-6  # fraction of a source parameter's effect in the image: a parameter that changes by more depends on it

@@ -113,9 +113,6 @@ def _refracted(unit_m: float, stations: Array, xyz: Array, apparent: SightVector
 
 
 # Refraction of the lines of sight in the standard atmosphere.
-#
-# ICAO standard atmosphere: temperature falls by 6.5 K/km up to 11 km and is constant above; heights above sea in m. Dry
-# air, refractivity by Edlén (1966) at 0.55 um; from 0.4 to 0.7 um it differs by less than 2 %.
 
 
 @dataclass(frozen=True)

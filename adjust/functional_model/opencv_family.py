@@ -25,7 +25,7 @@ OPENCV_UNITS = (*["–"] * 12, "rad", "rad", "–", "–")
 FISHEYE_NAMES = ("k1", "k2", "k3", "k4", "b1", "b2")
 FISHEYE_GROUPS = (("radial", FISHEYE_NAMES[:4]), ("affinity", FISHEYE_NAMES[4:]))
 DOWN = np.array([1.0, -1.0])  # from axes with y up to OpenCV's, and back
-CENTRAL = 1e-4  # tangents below which an angle and its tangent are expanded: the next term is below 1e-16
+CENTRAL = 1e-4  # tangent below which an angle is expanded in a series: the next term is below 1e-16
 
 
 def opencv(ray: Array, parameters: Array) -> DistortedRay:

@@ -16,7 +16,7 @@ from adjust.problem.camera import Camera
 from adjust.problem.network import EXTERIOR_NAMES, Approximations, Image, Network, ObjectPoint
 from adjust.problem.parameter import Kind, Parameter
 
-Quantity = tuple[str, Prior | None, float | None]  # name, what is given, approximation
+Quantity = tuple[str, Prior | None, float | None]  # name, prior, approximation
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ SCANNER, BOARD, GROUPS = "scanner", "board", "groups"
 NAMED = 5  # images named in a message
 ALIKE = 7.0  # difference of chi-square plus twice the unknowns below which two readings are not distinguished
 
-# Arguments: the adjustment with the added unknowns, their positions, and the rms in µm that they explain of residuals.
+# Arguments: adjustment with the added unknowns, their positions, rms of the residuals that they explain (µm).
 Words = Callable[[Run, Indices, float], tuple[str, str]]
 
 
