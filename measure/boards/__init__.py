@@ -1,1 +1,1 @@
-"""Calibration boards: what is printed on them, where a picture shows them, and their points measured."""
+"""Calibration boards: specifications, detection, and measurement of their points."""

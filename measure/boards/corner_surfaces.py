@@ -1,7 +1,7 @@
-"""The pictures of two edges that meet, under a Gaussian blur: bivariate normal integrals and their derivatives.
+"""Grey-value surfaces of two intersecting edges under a Gaussian blur: bivariate normal integrals and derivatives.
 
-u, v (n, pixels): the distances of pixels from two edges, over the blur's standard deviation; correlation (n, 1): the
-cosine of the angle between the edges' normals.
+u, v (n, pixels): distances of pixels from two edges, in standard deviations of the blur; correlation (n, 1): cosine of
+the angle between the edges' normals.
 """
 
 from collections.abc import Callable
@@ -13,19 +13,21 @@ from measure.array_types import Single
 
 Surface = Callable[[Single, Single, Single], tuple[Single, Single, Single, Single]]
 
-_FAR = np.float32(9.0)  # standard deviations: nothing changes beyond it, and smaller numbers take processors long
-_NODES, _MOST_NODES = ((0.3, 2), (0.55, 3), (0.8, 5)), 10  # by the correlation: to single precision
+_FAR = np.float32(9.0)  # standard deviations beyond which nothing changes; denormal numbers would be slow
+_NODES, _MOST_NODES = ((0.3, 2), (0.55, 3), (0.8, 5)), 10  # nodes of the quadrature by correlation, single precision
 _ERF_SCALE = 0.3275911
 _ERF_FACTORS = (1.061405429, -1.453152027, 1.421413741, -0.284496736, 0.254829592)
 
 
 def crossing(u: Single, v: Single, correlation: Single) -> tuple[Single, Single, Single, Single]:
-    """The mean of sign(u + z1) sign(v + z2) over standard normal z1, z2 of the given correlation, and its derivatives
-    by u, v and the correlation. Single precision, as exact as that.
+    """Mean of sign(u + z1) sign(v + z2) over standard normal z1, z2 of the given correlation, and its derivatives with
+    respect to u, v and the correlation. Exact to single precision.
 
-    Its derivative by the correlation is four times the normal density (Plackett 1954), which Gauss's rule integrates
-    over the arc sine of the correlation (Genz 2004, Numerical computation of rectangular bivariate and trivariate
-    normal and t probabilities, Statistics and Computing 14).
+    Notes
+    -----
+    The derivative with respect to the correlation is four times the normal density (Plackett 1954). It is integrated
+    over the arc sine of the correlation by Gauss's rule (Genz 2004, Numerical computation of rectangular bivariate and
+    trivariate normal and t probabilities, Statistics and Computing 14).
     """
     u, v = np.clip(u, -_FAR, _FAR), np.clip(v, -_FAR, _FAR)
     inverse_root = np.asarray(1 / np.sqrt(np.maximum(1 - correlation**2, np.float32(1e-6))), np.float32)
@@ -52,8 +54,8 @@ def crossing(u: Single, v: Single, correlation: Single) -> tuple[Single, Single,
 
 
 def quarter(u: Single, v: Single, correlation: Single) -> tuple[Single, Single, Single, Single]:
-    """Twice the probability that u + z1 and v + z2 are both positive, less one, and its derivatives: as `crossing`, for
-    a corner that is alone."""
+    """Twice the probability that u + z1 and v + z2 are both positive, minus one, and its derivatives: the counterpart
+    of `crossing` for a single corner."""
     value, by_u, by_v, by_correlation = crossing(u, v, correlation)
     u, v = np.clip(u, -_FAR, _FAR), np.clip(v, -_FAR, _FAR)
     density_u, density_v, half = _density(u), _density(v), np.float32(0.5)
@@ -82,5 +84,5 @@ def _density(place: Single) -> Single:
 
 @cache
 def _gauss_legendre(nodes: int) -> list[tuple[float, float]]:
-    """Places and weights of Gauss's rule."""
+    """Nodes and weights of Gauss-Legendre quadrature."""
     return list(zip(*(each.tolist() for each in np.polynomial.legendre.leggauss(nodes)), strict=True))

@@ -1,17 +1,17 @@
-"""Where two straight edges meet, to the noise of the picture: the crossings of a chessboard, the corners of a marker.
+"""Least-squares matching of two intersecting straight edges: crossings of a chessboard, corners of markers.
 
-The picture of two crossing edges under a Gaussian blur is known: with s1, s2 the signs of a point's distances from the
-edges it is the mean of s1 s2 over the blur, a bivariate normal integral, for any angle between the edges; a single dark
-or light quarter is the same integral. All corners of a board are fitted at once. Unknown are the point, both
-directions, the blur, and the grey values: contrast, offset, gradient and, of a crossing, the bend of the tone curve,
-which widens light squares at the cost of dark ones. A crossing looks the same after a half turn whatever the tone
-curve, so its place does not depend on it; a quarter's does, by as much as the edges are moved.
+The image of two intersecting edges under a Gaussian blur has a closed form: with s1, s2 the signs of a point's
+distances from the edges, it is the mean of s1 s2 over the blur, a bivariate normal integral, for any angle between the
+edges. A single dark or light quarter is the same integral. All corners of a board are fitted at once. The unknowns are
+the point, both directions, the blur, and the grey values: contrast, offset, gradient and, for a crossing, the curvature
+of the tone curve, which widens light squares at the expense of dark ones. A crossing is symmetric under a half turn for
+any tone curve, so its place does not depend on the curve. The place of a quarter does: it shifts with the edges.
 
-Beside it stands the junction: the place that the lines along the grey values' gradients miss least (Förstner and Gülch,
-1987, A fast operator for detection and precise location of distinct points, corners and centres of circular features).
-A lens with coma blurs edges to one side, and then a crossing has no one place: match and junction differ by tenths of a
-pixel, growing towards the picture's corners. There the junction, found by `cv2.cornerSubPix`, is what most published
-calibrations measure.
+The junction is determined in addition: the point closest to the edge lines, which run perpendicular to the grey-value
+gradients (Förstner and Gülch, 1987, A fast operator for detection and precise location of distinct points, corners and
+centres of circular features). A lens with coma blurs edges to one side; a crossing then has no unique place. Match and
+junction differ by tenths of a pixel, increasing towards the image corners. In this case the junction, found by
+`cv2.cornerSubPix`, is what most published calibrations measure.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,37 +34,42 @@ from measure.noise.robust_estimation import gauss_newton_step, robust_scale, tuk
 from measure.results import Covariance, MarkMeasurement
 
 Indices = NDArray[np.intp]
-_SCALE_FLOOR = 0.05  # of the contrast, under Tukey's scale: sharpening and tone curves are no damage
-_MAX_ITERATIONS = 30  # of a stage
-_UNDAMAGED = 0.05  # the robust weight below which a pixel shows something else
-# Plain, then twice robust: the scale of the residuals is taken once before each, so that it settles.
+_SCALE_FLOOR = 0.05  # fraction of the contrast, floor of Tukey's scale: sharpening and tone curves are not damage
+_MAX_ITERATIONS = 30  # per stage
+_UNDAMAGED = 0.05  # robust weight below which a pixel counts as an outlier
+# One plain and two robust stages. The residual scale is fixed at the start of each, so that the iteration converges.
 _STAGES_TOLERANCE_PX = (0.05, 0.01, 0.001)
 _SHAPE_UNKNOWNS = 5  # point (2), directions (2), blur
-_MOST_SHIFT = 0.6  # of the reach: farther off, another corner's edges are nearer
-_MOST_TURN_RAD = 0.35  # of an edge: twenty degrees, which no approximate place is wrong by
-_START_BLUR_PX, _LEAST_BLUR_PX = 0.8, 0.3  # the pixel's share included
-_DAMPING = 1e-9  # of a step: what hardly shows does not run away
-_GREY_DAMPING = 1e-12  # of grey values: nothing is singular
-_SPARE_PX = 2  # about the area: so far a corner may move from where it is expected
-_LONGEST_TURN_RAD = 0.15  # of an edge in a step: its picture is no longer linear in more
-_LARGEST_HALF_WINDOW_PX = 6  # about a junction: more shows what the lens does to longer edges
-_HALF_WINDOW = 0.85  # of the reach: the weight is 0.37 in the middle of the window's sides and 0.14 in its corners
-_SMOOTHING_PX = 1.0  # pixel noise has gone, the edges are still apart
-_BORDER_PX = 4  # reflected about each window: smoothing reaches as far
-_SUBPIX_BORDER_PX = 5  # what OpenCV wants of a picture beyond twice half a window
+_MOST_SHIFT = 0.6  # fraction of the reach; beyond it the edges of a different corner are nearer
+_MOST_TURN_RAD = 0.35  # rad (20°), largest turn of an edge; approximate directions are better
+_START_BLUR_PX, _LEAST_BLUR_PX = 0.8, 0.3  # px, pixel included
+_DAMPING = 1e-9  # of a step, stabilises poorly determined unknowns
+_GREY_DAMPING = 1e-12  # for grey values, which are never singular
+_SPARE_PX = 2  # px margin around the area, so that a corner can move
+_LONGEST_TURN_RAD = 0.15  # rad, largest turn of an edge in one step for which the linearisation holds
+_LARGEST_HALF_WINDOW_PX = 6  # px around a junction; larger windows include the distortion of longer edges
+_HALF_WINDOW = 0.85  # fraction of the reach; the weight is 0.37 at the middle of the window's sides, 0.14 at corners
+_SMOOTHING_PX = 1.0  # px, suppresses pixel noise while edges stay separate
+_BORDER_PX = 4  # px, reflected border of each window, the reach of the smoothing
+_SUBPIX_BORDER_PX = 5  # px that OpenCV requires in addition to twice the half window
 _SUBPIX_END = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-4)  # iterations, px of the last step
-_NEIGHBOURS = 4  # crossings: the next ones along the rows and columns
-_FEWEST_CROSSINGS = 30  # with fewer nobody can tell coma from noise
+_NEIGHBOURS = 4  # nearest crossings along the rows and columns
+_FEWEST_CROSSINGS = 30  # needed to distinguish coma from noise
 
 
 @dataclass(frozen=True, eq=False)
 class Corner:
-    """A corner as fitted; where reason is not empty the fit failed, and the numbers are its last.
+    """Fitted corner. If reason is not empty the fit failed, and the values are those of its last iteration.
 
-    center_px (2,), covariance_px2 (2, 2): as matched; contrast_dn: the grey value between the two steps less that
-    beside them, negative where it is dark between them; blur_px: the standard deviation; moved_px: from where the fit
-    began. junction_px (2,): where the
-    gradients' lines meet (`junctions`); None where they do not, and for a corner that is no crossing.
+    Attributes
+    ----------
+    center_px, covariance_px2 : (2,) and (2, 2), by least-squares matching.
+    contrast_dn : grey value between the two steps minus that outside, negative if dark between them.
+    noise_dn : standard deviation of one pixel's noise.
+    blur_px : standard deviation of the blur.
+    damaged_fraction : fraction of the area rejected as outliers.
+    moved_px : distance from the start of the fit.
+    junction_px : (2,) from `junctions`; None where not found, and for corners other than crossings.
     """
 
     center_px: Array
@@ -80,8 +85,8 @@ class Corner:
 
 @dataclass(frozen=True, eq=False)
 class CornerStart:
-    """Where a corner is expected: center_px (2,); steps_px (2, 2), whose columns run along the two edges; reach_px
-    (2,), how far along either of them, forth and back, grey values are used."""
+    """Initial values of a corner. center_px (2,); steps_px (2, 2): columns along the two edges; reach_px (2,): half
+    size of the window along each edge."""
 
     center_px: Array
     steps_px: Array
@@ -89,7 +94,7 @@ class CornerStart:
 
     @property
     def half_px(self) -> int:
-        """Pixels on either side of the middle that hold all grey values used, and somewhat more."""
+        """Half size (px) of a square window that contains all grey values used, plus a margin."""
         along = np.abs(self.steps_px / np.hypot(*self.steps_px)) @ self.reach_px
         return int(np.ceil(along).max()) + _SPARE_PX
 
@@ -101,8 +106,8 @@ def fit_corners(
 
     Parameters
     ----------
-    read : gives the square window with its first column and row and its side in px
-    starts : the places expected
+    read : returns the square window with the given first column, first row and side in px
+    starts : initial values
     surface : `crossing` or `quarter`
     """
     if not starts:
@@ -114,7 +119,7 @@ def fit_corners(
 
 
 class _CornerFits:
-    """The adjustments of n corners in progress. Arrays over pixels are (n, p): of each corner those that may count."""
+    """Adjustments of n corners in progress. Arrays over pixels are (n, p): p candidate pixels of each corner."""
 
     def __init__(self, windows: Sequence[ScanWindow], starts: Sequence[CornerStart], surface: Surface) -> None:
         self.windows, self.surface = windows, surface
@@ -124,7 +129,7 @@ class _CornerFits:
         steps = np.array([start.steps_px for start in starts], float)
         self.along_from_pixel = np.linalg.inv(steps / np.linalg.norm(steps, axis=1, keepdims=True))
         self.center = self.start.copy()
-        # An edge along a step has its normal a quarter turn on; the signs make the corner between the steps positive.
+        # The normal of an edge is its step turned by a quarter; the signs make the quadrant between the steps positive.
         mirrored = np.linalg.det(steps) < 0
         turn = np.pi * np.stack([mirrored, ~mirrored], axis=1)
         self.edges = np.arctan2(steps[:, 1], steps[:, 0]) + np.pi / 2 + turn
@@ -133,7 +138,7 @@ class _CornerFits:
         self.variance = np.full(len(starts), _START_BLUR_PX**2)
         self.max_variance = (self.reach.min(axis=1) / 2) ** 2 + PIXEL_VARIANCE_PX2
         self.bends = surface is crossing
-        self.linear = np.zeros((len(starts), 5 if self.bends else 4))  # half the contrast, offset, gradient (2), bend
+        self.linear = np.zeros((len(starts), 5 if self.bends else 4))  # contrast / 2, offset, gradient (2), curvature
         self.unknowns = _SHAPE_UNKNOWNS + self.linear.shape[1]
         self._choose_pixels()
         self.residuals = np.zeros(self.grey.shape, np.float32)
@@ -143,7 +148,8 @@ class _CornerFits:
         self.reasons = [NO_REASON if each.sum() > 2 * self.unknowns else outside for each in self.weights]
 
     def _choose_pixels(self) -> None:
-        """The pixels of each corner's area and about it, as far as the corner may move; the lists are filled up."""
+        """Select the pixels of each corner's area plus a margin for its movement; the lists are padded to one
+        length."""
         self.shape = self.windows[0].grey.shape
         self.grey_size = self.windows[0].grey.size
         row, col = np.indices(self.shape, np.float32).reshape(2, -1)
@@ -161,7 +167,8 @@ class _CornerFits:
         self.places = np.stack([axis[self.pixels] for axis in (col, row)], axis=1)
 
     def run(self) -> list[Corner]:
-        """Plain, then robust, until the corners stand still; or a reason why one does not."""
+        """Adjust by plain, then robust least squares until the corners converge; sets a reason for those that do
+        not."""
         scale = np.full(len(self.windows), np.inf)
         self._linearise(np.arange(len(self.windows)), is_first=True)
         for stage, tolerance_px in enumerate(_STAGES_TOLERANCE_PX):
@@ -182,7 +189,7 @@ class _CornerFits:
             self.reasons[number] = self.reasons[number] or reason
 
     def _corners(self) -> list[Corner]:
-        """The corners with their covariances, as the residuals' own autocovariances give them, and junctions."""
+        """Assemble the corners, with covariances from the autocovariance of the residuals, and junctions."""
         design, residuals = self.design, self.residuals
         area, used = self._area(np.arange(len(self.windows))), self.weights > _UNDAMAGED
         weighted = design * self.weights[:, None]
@@ -194,11 +201,11 @@ class _CornerFits:
         covariances = (covariances + covariances.swapaxes(1, 2)) / 2
         fails = np.array([bool(reason) for reason in self.reasons]) | (used.sum(axis=1) <= self.unknowns)
         covariances[fails], noise_dn = np.inf, np.where(fails, np.nan, np.sqrt(variances))
-        rounding_dn = np.finfo(np.float32).eps * np.abs(self.linear[:, 1])  # of an even window, whose noise is none
+        rounding_dn = np.finfo(np.float32).eps * np.abs(self.linear[:, 1])  # for a uniform window without noise
         faint = ~fails & ~(np.abs(self.linear[:, 0]) > 2 * np.maximum(noise_dn, rounding_dn))
         self._refuse(np.flatnonzero(faint), Reason("no edges stand out from the noise", Code.CONTRAST))
         junctions_px = np.full((len(self.windows), 2), np.nan)
-        if self.bends:  # damage is painted over with what was fitted
+        if self.bends:  # damaged pixels are replaced by the model
             damage = self._pictures(np.where(self.weights < _UNDAMAGED * area, residuals, np.float32(0.0)))
             greys = np.array([window.grey for window in self.windows]) - damage
             reach_px = self.reach.min(axis=1)
@@ -221,28 +228,28 @@ class _CornerFits:
         ]
 
     def _pictures(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Windows (n, ..., height, width) with the values (n, ..., p) of the corners' pixels, 0 elsewhere."""
+        """Scatter values (n, ..., p) of the corners' pixels to windows (n, ..., height, width), 0 elsewhere."""
         pictures = np.zeros((*values.shape[:-1], self.grey_size), values.dtype)
         for picture, value, pixels, count in zip(pictures, values, self.pixels, self.counts, strict=True):
             picture[..., pixels[:count]] = value[..., :count]
         return pictures.reshape(*values.shape[:-1], *self.shape)
 
     def _area(self, numbers: Indices) -> Single:
-        """Weights 0 to 1 of a parallelogram about each corner; its border is smooth, and it moves with the corner: a
-        window that is not centred would prefer one half of an edge."""
+        """Weights, 0 to 1, of a parallelogram around each corner. Its border is smooth, and it moves with the corner,
+        since an off-centre window would favour one half of an edge."""
         offset = self.places[numbers] - self.center[numbers, :, None].astype(np.float32)
         along = self.along_from_pixel[numbers].astype(np.float32) @ offset
         inside = (self.reach[numbers] + 0.5).astype(np.float32)[..., None] - np.abs(along, out=along)
         return np.asarray(self.valid[numbers] * np.clip(inside, 0.0, 1.0, out=inside).prod(axis=1))
 
     def _residual_scales(self, numbers: Indices) -> Array:
-        """(m,) under Tukey's weights."""
+        """(m,) residual scales for Tukey's weights."""
         floor = _SCALE_FLOOR * 2 * np.abs(self.linear[numbers, 0])
         robust = [robust_scale(self.residuals[number, self.weights[number] > 0]) for number in numbers]
         return np.asarray(np.maximum(np.maximum(robust, floor), 1e-9))
 
     def _linearise(self, numbers: Indices, is_first: bool = False) -> None:
-        """Take derivatives and residuals of some corners; the first time at the best grey values."""
+        """Compute derivatives and residuals of some corners. The first call estimates the grey values."""
         sigma = np.sqrt(self.variance[numbers, None])
         normals = np.stack([np.cos(self.edges[numbers]), np.sin(self.edges[numbers])], axis=-1)  # (m, 2 edges, 2)
         tangents = np.stack([-normals[..., 1], normals[..., 0]], axis=-1)
@@ -272,7 +279,7 @@ class _CornerFits:
         self.residuals[numbers] = self.grey[numbers] - (linear[:, None] @ grey)[:, 0]
 
     def _step(self, numbers: Indices, scale: Array) -> Array:
-        """Take a Gauss-Newton step, shortened to what a linearisation can bear; (m,) its lengths in px."""
+        """Apply a Gauss-Newton step, shortened to the range of the linearisation. Returns (m,) lengths in px."""
         design, residuals = self.design[numbers], self.residuals[numbers]
         relative = np.asarray(residuals / scale[:, None], np.float32)
         self.weights[numbers] = weights = np.asarray(self._area(numbers) * tukey_weights(relative, 1.0), np.float32)
@@ -296,32 +303,34 @@ class _CornerFits:
 
 
 def junctions(greys: NDArray[np.floating], starts_px: Array, reach_px: float) -> Array:
-    """Refine junctions near places by `cv2.cornerSubPix`.
-
-    OpenCV's equations are Förstner's: sum of w g g' (x - x0) = 0 over a window, with the gradients g and the weight w =
-    exp(-(dx² + dy²) / half²), where half is half the window's size. There is no zero zone. OpenCV takes differences of
-    neighbouring pixels for gradients; smoothed before, they have half the noise.
+    """Refine junctions near given places by `cv2.cornerSubPix`.
 
     Parameters
     ----------
     greys
-        Grey values (n, height, width) about each place.
+        Grey values (n, height, width) around each place.
     starts_px
-        (n, 2) column and row, in these.
+        (n, 2) column and row in these windows.
     reach_px
-        How far about the places the pictures show their edges and nothing else.
+        Distance up to which the windows show only the edges of the junction.
 
     Returns
     -------
     Array
-        (n, 2) column and row; not a number where OpenCV finds no place within its window.
+        (n, 2) column and row; nan where OpenCV finds no place within its window.
+
+    Notes
+    -----
+    OpenCV solves Förstner's equations: sum of w g g' (x - x0) = 0 over a window, with the gradients g and the weight w
+    = exp(-(dx² + dy²) / half²), where half is half the window's size. There is no zero zone. OpenCV's gradients are
+    differences of neighbouring pixels; smoothing beforehand halves their noise.
     """
     number, *shape = greys.shape
     half = min(_LARGEST_HALF_WINDOW_PX, round(_HALF_WINDOW * reach_px), (min(shape) - _SUBPIX_BORDER_PX) // 2)
     if half < 1:
         return np.full((number, 2), np.nan)
     border = (_BORDER_PX, _BORDER_PX)
-    column = np.pad(greys.astype(np.float32), ((0, 0), border, border), mode="reflect")  # one below the other
+    column = np.pad(greys.astype(np.float32), ((0, 0), border, border), mode="reflect")  # windows stacked vertically
     smooth = cv2.GaussianBlur(column.reshape(-1, column.shape[2]), (0, 0), _SMOOTHING_PX)
     offsets = np.stack([np.full(number, 0.0), np.arange(number) * column.shape[1]], axis=1) + _BORDER_PX
     starts = (starts_px + offsets).astype(np.float32)
@@ -330,25 +339,27 @@ def junctions(greys: NDArray[np.floating], starts_px: Array, reach_px: float) ->
 
 
 def one_definition(pictures: Sequence[Sequence[MarkMeasurement]]) -> tuple[tuple[MarkMeasurement, ...], ...]:
-    """The marks of a camera's pictures as they are, or all its crossings at their junctions where the lens has coma.
-
-    Where a symmetric blur describes the edges, match and junction differ by noise alone, of which the match has less.
-    Coma blurs edges to one side, the more so the farther from the axis. It moves match and junction apart alike in
-    neighbouring crossings, so that the mean product of neighbours' differences is its share of their mean square.
-    Beyond one half it is larger than what the junction's noise adds. Then the junctions are taken, which most published
-    calibrations measure too. Their error is made by the lens and not by noise: all have the standard deviation of a
-    place known to within the rms distance of match and junction, over the root of three (JCGM 100:2008, Guide to the
-    expression of uncertainty in measurement, 4.3.7).
+    """Use one definition of crossings for all images of a camera: the matched places, or the junctions under coma.
 
     Parameters
     ----------
     pictures
-        The marks of each picture of one camera.
+        The marks of each image of one camera.
 
     Returns
     -------
     tuple of tuples
-        The same marks; those with a junction moved there, with its covariance, where the lens has coma.
+        The same marks. If the lens has coma, those with a junction are moved there and get its covariance.
+
+    Notes
+    -----
+    If a symmetric blur describes the edges, match and junction differ by noise only, and the match has less of it. Coma
+    blurs edges to one side, increasingly with the distance from the axis. It separates match and junction by the same
+    amount in neighbouring crossings, so the mean product of neighbours' differences is its share of their mean square.
+    Above one half, coma exceeds the noise added by the junction. The junctions are then used, as in most published
+    calibrations. Their error comes from the lens, not from noise. All get the standard deviation of a place known to
+    within the rms distance of match and junction, divided by the root of three (JCGM 100:2008, Guide to the expression
+    of uncertainty in measurement, 4.3.7).
     """
     unmoved = tuple(tuple(marks) for marks in pictures)
     apart, alike = [np.zeros((0, 2))], [np.zeros((0, 2))]

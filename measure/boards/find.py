@@ -1,4 +1,5 @@
-"""Search for a calibration board in a reduced scan, to a pixel: chessboards here, other boards by their own modules."""
+"""Detection of calibration boards in a reduced scan, to a pixel: chessboards here, other boards in their own
+modules."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -27,32 +28,35 @@ Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 Integers = NDArray[np.int64]
 
-_UNEVEN = 0.25  # of a square, that a corner lies off an even grid: beside a line that is left out it is a half
-_TRUSTED = 0.1  # of a square, that no corner of the older detector is off, where its corners are taken
-_REFINED, _REFINING_END = 0.3, (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)  # of a square; px
-_INTO_SQUARE = 0.3  # of its sides: where the grey value of a square is taken
-_CROSSING = 0.25  # of the board's contrast: more between all neighbours of the four squares makes a crossing
-_SMOOTHED_PX = 10.0  # squares from this side on are looked at over 3 x 3 pixels
-_MOST_LINES = 500  # of a board, along a side
+_UNEVEN = 0.25  # in squares, largest median deviation of a line from a regular grid; next to a skipped line it is 0.5
+_TRUSTED = 0.1  # in squares, largest deviation of any corner accepted from OpenCV's older detector
+_REFINED, _REFINING_END = 0.3, (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)  # in squares; px
+_INTO_SQUARE = 0.3  # in squares from the corner, where a square's grey value is sampled
+_CROSSING = 0.25  # fraction of the board's contrast required between all neighbours of the four squares
+_SMOOTHED_PX = 10.0  # px, side from which on squares are sampled as means of 3 x 3 pixels
+_MOST_LINES = 500  # limit of the lines of a board along a side
 _THOROUGHLY = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
-_DRAWINGS = 3  # of the chessboard detector's random numbers for a second board: one in twenty missed one at the edge
-_CROSSINGS_SEEN = 0.8  # of a second board's, before it is searched
-_INTO_BORDER = 1.4  # of a square beyond the last crossings: where a border is light
-_LIGHT_BORDER = 0.4  # of the contrast, that it may be darker than the light squares
-_MOST = 0.85  # of a line
-_PLAIN_CORNERS = 8  # of a board of markers: two of them, which nothing else is read as
-_LEAST = 3  # lines that a chessboard has in either direction
-_FEWEST_MARKERS = 6  # that are no chance readings
-_FIRST_SIZE_PX, _LAST_SIZE_PX = 1500, 4000  # the longer side of the pictures that are searched
-_QUICK_SIZE_PX = 640  # that of one in which most boards are found, in a quarter of the time
-_ENOUGH_PIXELS = 100_000  # for the range of grey values
-_LEAST_CONTRAST = 0.01  # of the full scale; below it there is nothing to be seen, and searching takes long
+_DRAWINGS = 3  # random seeds tried for a second board: one in twenty missed one at the edge
+_CROSSINGS_SEEN = 0.8  # fraction of the crossings of a second board that must be visible before it is searched
+_INTO_BORDER = 1.4  # in squares beyond the last crossings, where the light border is sampled
+_LIGHT_BORDER = 0.4  # fraction of the contrast by which the border may be darker than the light squares
+_MOST = 0.85  # fraction of the places along a line
+_PLAIN_CORNERS = 8  # corners of a board of markers: two markers, which are never false alarms
+_LEAST = 3  # smallest number of lines of a chessboard in either direction
+_FEWEST_MARKERS = 6  # markers that exclude false alarms
+_FIRST_SIZE_PX, _LAST_SIZE_PX = 1500, 4000  # px, longer side of the reduced images searched
+_QUICK_SIZE_PX = 640  # px, longer side at which most boards are found in a quarter of the time
+_ENOUGH_PIXELS = 100_000  # sample for the range of grey values
+_LEAST_CONTRAST = 0.01  # fraction of full scale; below it nothing is visible, and the search takes long
 
 
 @dataclass(frozen=True, eq=False)
 class WholePattern:
-    """The pattern that a grid belongs to: grid (rows, columns, 2), grown to where the pattern ends; has_ended: before
-    its first row, behind its last column, its last row, and before its first column, whether the picture shows that."""
+    """Complete pattern around a grid.
+
+    grid: (rows, columns, 2), grown to the ends of the pattern; has_ended: whether the image shows the end before the
+    first row, after the last column, after the last row, and before the first column.
+    """
 
     grid: Array
     has_ended: tuple[bool, ...]
@@ -63,12 +67,15 @@ class WholePattern:
 
 
 def is_even(grid: Array, size_px: tuple[int, int], farthest: float = np.inf) -> bool:
-    """Whether the lines of corners (rows, columns, 2) lie evenly under one homography and a lens's radial distortion,
-    wherever the detector put single corners; none may be farther off than so many steps."""
+    """Whether corners (rows, columns, 2) form a regular grid under one homography and radial distortion.
+
+    The lines are tested by their medians, so single misplaced corners are tolerated. farthest: largest deviation of any
+    corner, in steps.
+    """
     rows, columns = grid.shape[:2]
     places = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2).astype(float)
     steps, plane = _shorter_steps(grid), cv2.findHomography(places, grid.reshape(-1, 2))[0]
-    if plane is not None:  # most lenses bend little of a square
+    if plane is not None:  # most lenses distort by little of a square
         off = cv2.perspectiveTransform(places[:, None], plane).reshape(grid.shape) - grid
         if (np.linalg.norm(off, axis=2) < _TRUSTED * steps).all():
             return True
@@ -80,7 +87,7 @@ def is_even(grid: Array, size_px: tuple[int, int], farthest: float = np.inf) -> 
 
 
 def whole_pattern(picture: Bytes, grid: Array) -> WholePattern | None:
-    """The pattern that a grid is a part of; None where the grid's own lines are not all lines of crossings."""
+    """Grow a grid to the complete pattern. None if a line of the grid is not mostly crossings."""
     if _shorter_steps(grid).min() > _SMOOTHED_PX:
         picture = np.asarray(cv2.blur(picture, (3, 3)), np.uint8)
     crossings = _crossing_contrast(picture, grid)
@@ -99,7 +106,7 @@ def whole_pattern(picture: Bytes, grid: Array) -> WholePattern | None:
 
 
 def _grown(picture: Bytes, grid: Array, contrast: float) -> tuple[Array, bool]:
-    """The grid with the pattern's further lines before its first row, and whether the picture shows where it ends."""
+    """Extend the grid by lines of crossings before its first row. Returns also whether the image shows the end."""
     parity = np.sign(np.median(_crossing_contrast(picture, grid)))
     while True:
         line = 3 * grid[0] - 3 * grid[1] + grid[2]
@@ -117,8 +124,8 @@ def _grown(picture: Bytes, grid: Array, contrast: float) -> tuple[Array, bool]:
 
 
 def _crossing_contrast(picture: Bytes, grid: Array) -> Array:
-    """(rows, columns) the least difference in grey value between neighbours of the four squares about each corner, with
-    the sign that the first corner's has; 0 where light and dark do not alternate about it."""
+    """(rows, columns) smallest difference in grey value between neighbours of the four squares around each corner, with
+    the sign relative to the first corner's parity; 0 where light and dark do not alternate."""
     right, down = np.gradient(grid, axis=1), np.gradient(grid, axis=0)
     corners = [grid + _INTO_SQUARE * (x * right + y * down) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     columns_rows = np.concatenate(corners).astype(np.float32)
@@ -131,7 +138,7 @@ def _crossing_contrast(picture: Bytes, grid: Array) -> Array:
 
 
 def _refined(picture: Bytes, grid: Array) -> Array:
-    """The grid with its corners at the junctions near them, where there are any."""
+    """Refine the corners of a grid to the nearest junctions, where there are any."""
     half = max(round(_REFINED * float(_shorter_steps(grid).min())), 2)
     height, width = picture.shape
     inside = np.all((grid > 2 * half + 5) & (grid < (width - 2 * half - 6, height - 2 * half - 6)), axis=-1)
@@ -145,15 +152,17 @@ def _refined(picture: Bytes, grid: Array) -> Array:
 
 
 def _shorter_steps(grid: Array) -> Array:
-    """(rows, columns) the shorter of the steps to the next column and the next row, px."""
+    """(rows, columns) shorter one of the steps to the next column and the next row, px."""
     across, down = (np.hypot(*np.moveaxis(np.gradient(grid, axis=axis), 2, 0)) for axis in (1, 0))
     return np.asarray(np.minimum(across, down))
 
 
 def find_chessboard(picture: Bytes, spec: ChessboardSpec, is_quick: bool = False) -> FoundBoard:
-    """The inner corners of a chessboard, and whether it is the only one. A board of another count is refused, with its
-    count: its corners would have their neighbours' names; so is a part of a board that may be another part. is_quick:
-    whether the quickest detector alone looks for a whole board."""
+    """Find the inner corners of a chessboard, and other boards that look the same.
+
+    A board of a different count is refused, with its count, since its corners would get wrong names. A part of a board
+    is refused if its position on the board is ambiguous. is_quick: use only the fastest detector, for a whole board.
+    """
     size_px = (picture.shape[1], picture.shape[0])
     other_size: WholePattern | None = None
     for grid, farthest in islice(_grids(picture, spec), 1 if is_quick else None):
@@ -172,8 +181,8 @@ def find_chessboard(picture: Bytes, spec: ChessboardSpec, is_quick: bool = False
 
 
 def _part_of_chessboard(picture: Bytes, pattern: WholePattern, spec: ChessboardSpec) -> FoundBoard:
-    """The corners of a board that is partly covered or outside of the picture, where its ends that are seen and the
-    colours of its squares leave one place on the board for them, but for a turn that changes nothing."""
+    """Name the corners of a partly covered or cropped board, if its visible ends and the colours of its squares leave
+    one position on the board, up to a turn that maps the board onto itself."""
     borders = tuple(
         ended and _has_border(picture, np.rot90(pattern.grid, side)) for side, ended in enumerate(pattern.has_ended)
     )
@@ -183,7 +192,7 @@ def _part_of_chessboard(picture: Bytes, pattern: WholePattern, spec: ChessboardS
         return FoundBoard({}, Reason(_refusal(spec, pattern), Code.NO_BOARD))
 
     def uprightness(naming: Integers) -> float:
-        """How far to the right in the picture the board's columns follow one another."""
+        """Covariance of the board's columns with the column in the image: largest for the upright naming."""
         return float(np.cov(naming.ravel() % spec.columns, pattern.grid[..., 0].ravel())[0, 1])
 
     naming = max(namings, key=uprightness)
@@ -191,7 +200,7 @@ def _part_of_chessboard(picture: Bytes, pattern: WholePattern, spec: ChessboardS
     contrasts = np.abs(_crossing_contrast(picture, grid))
     inside = np.all((grid > 1) & (grid < (width - 2, height - 2)), axis=-1)
     shown = inside & (contrasts > _CROSSING * np.median(contrasts[inside]))
-    # The sides of a square along the board's own rows and columns, however the grid lies on it.
+    # The sides of a square along the board's rows and columns, whatever the orientation of the grid.
     board = np.stack([naming % spec.columns, naming // spec.columns], axis=-1).astype(float)
     by_grid = np.stack([np.gradient(board, axis=1)[0, 0], np.gradient(board, axis=0)[0, 0]], axis=-1)
     steps = np.stack([np.gradient(grid, axis=1), np.gradient(grid, axis=0)], axis=-1) @ np.linalg.inv(by_grid)
@@ -204,8 +213,8 @@ def _part_of_chessboard(picture: Bytes, pattern: WholePattern, spec: ChessboardS
 
 
 def _namings(picture: Bytes, grid: Array, borders: tuple[bool, ...], spec: ChessboardSpec) -> Iterator[Integers]:
-    """Numbers (rows, columns) of the board's corners, row by row, that a grid's corners may have: neither its borders
-    nor the colours of its squares contradict them."""
+    """Possible numbers (rows, columns) of the board's corners, row by row, for the corners of a grid, consistent with
+    its borders and the colours of its squares."""
     board = np.arange(spec.rows * spec.columns).reshape(spec.rows, spec.columns)
     for turns in range(4):
         turned = np.rot90(grid, turns)
@@ -221,14 +230,14 @@ def _namings(picture: Bytes, grid: Array, borders: tuple[bool, ...], spec: Chess
 
 
 def _are_alike(naming: Integers, other: Integers, spec: ChessboardSpec) -> bool:
-    """Whether a turn of the board that changes nothing makes one naming of the other."""
+    """Whether two namings differ only by a turn that maps the board onto itself."""
     board = np.arange(spec.rows * spec.columns).reshape(spec.rows, spec.columns)
     step = 1 if spec.rows == spec.columns and spec.rows % 2 else 4 if (spec.rows + spec.columns) % 2 else 2
     return any(np.array_equal(np.rot90(board, turns).ravel()[naming], other) for turns in range(0, 4, step))
 
 
 def _has_border(picture: Bytes, grid: Array) -> bool:
-    """Whether a light border without squares lies beyond the half squares before a grid's first row."""
+    """Whether a light border without squares lies beyond the squares before a grid's first row."""
     middles, outward = (grid[0, 1:] + grid[0, :-1]) / 2, grid[0] - grid[1]
     step = (outward[1:] + outward[:-1]) / 2
 
@@ -252,12 +261,12 @@ def _has_border(picture: Bytes, grid: Array) -> bool:
 
 
 def _refusal(spec: ChessboardSpec, pattern: WholePattern | None) -> str:
-    """Why there is no board of the count that is asked for, with the count that fits, if there is one."""
+    """Message why no board of the specified count was found, with the count that fits, if any."""
     message = f"no chessboard of {spec.columns} x {spec.rows} inner corners is whole in the scan"
     if pattern is None:
         return message
     rows, columns = pattern.grid.shape[:2]
-    both = ((columns, rows), (rows, columns))  # nothing tells which are the rows
+    both = ((columns, rows), (rows, columns))  # rows and columns cannot be distinguished
     columns, rows = min(both, key=lambda one: ((one[0] - spec.columns) ** 2 + (one[1] - spec.rows) ** 2, -one[0]))
     message += f"; one of {columns} x {rows} is"
     if pattern.is_bounded and (columns, rows) == (spec.columns - 1, spec.rows - 1):
@@ -271,15 +280,15 @@ def _refusal(spec: ChessboardSpec, pattern: WholePattern | None) -> str:
 
 
 def _grids(picture: Bytes, spec: ChessboardSpec) -> Iterator[tuple[Array, float]]:
-    """(rows, columns, 2) grids of corners that may be the board, those of the quickest detector first, and how many
-    steps off even places each corner may be; the last is of any count."""
-    # The older detector takes a tenth of the time. It can search for minutes in vain; its fast check refuses a picture
-    # without squares first.
+    """Candidate grids of corners (rows, columns, 2), the fastest detector first, each with the largest deviation of a
+    corner from a regular grid, in steps. The last candidate is of any count."""
+    # The older detector takes a tenth of the time, but can search for minutes in vain. Its fast check first rejects
+    # images without squares.
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
     found, corners = cv2.findChessboardCorners(picture, (spec.columns, spec.rows), flags=flags)
     if found:
         grid = np.asarray(corners, float).reshape(spec.rows, spec.columns, 2)
-        half = max(round(_REFINED * float(_shorter_steps(grid).min())), 2)  # its own places are often some pixels off
+        half = max(round(_REFINED * float(_shorter_steps(grid).min())), 2)  # its places are often wrong by some pixels
         cv2.cornerSubPix(picture, corners, (half, half), (-1, -1), _REFINING_END)
         yield _right_handed(np.asarray(corners, float).reshape(grid.shape)), _TRUSTED
     for flags in (_THOROUGHLY, 0):
@@ -293,7 +302,7 @@ def _grids(picture: Bytes, spec: ChessboardSpec) -> Iterator[tuple[Array, float]
 
 
 def _chessboard_of_any_count(picture: Bytes) -> Array | None:
-    """(rows, columns, 2) the largest chessboard that the newer detector sees."""
+    """(rows, columns, 2) largest chessboard found by OpenCV's newer detector."""
     cv2.setRNGSeed(1)
     flags = _THOROUGHLY | cv2.CALIB_CB_LARGER
     found, corners, meta = cv2.findChessboardCornersSBWithMeta(picture, (_LEAST, _LEAST), flags)
@@ -301,8 +310,8 @@ def _chessboard_of_any_count(picture: Bytes) -> Array | None:
 
 
 def _drawn_chessboard_grid(picture: Bytes, spec: ChessboardSpec, flags: int, drawings: int) -> Array | None:
-    """(rows, columns, 2) as the newer detector sees them. It draws random numbers: always the same ones here, lest a
-    result depend on what was searched before it."""
+    """(rows, columns, 2) corners by OpenCV's newer detector. Its random numbers are seeded, so that the result does not
+    depend on earlier searches."""
     for seed in range(1, drawings + 1):
         cv2.setRNGSeed(seed)
         found, corners = cv2.findChessboardCornersSB(picture, (spec.columns, spec.rows), flags=flags)
@@ -312,11 +321,11 @@ def _drawn_chessboard_grid(picture: Bytes, spec: ChessboardSpec, flags: int, dra
 
 
 def _other_chessboards(picture: Bytes, grid: Array, spec: ChessboardSpec) -> tuple[Array, ...]:
-    """The middles of the chessboards beside those that were found, each painted over before the next is sought."""
+    """Centres of further chessboards; each is painted over before the next one is searched."""
     strength = saddle_strength(picture)
     columns, rows = np.clip(np.round(grid).astype(int), 0, np.array(picture.shape)[::-1] - 1).reshape(-1, 2).T
     known_strength = float(np.median(strength[rows, columns]))
-    crossings = spec.columns * spec.rows - 4  # of a board that hang together: all but its corners
+    crossings = spec.columns * spec.rows - 4  # connected crossings of a board: all but its corners
     picture, background = picture.copy(), int(np.median(picture[::4, ::4]))
     others: list[Array] = []
     while True:
@@ -333,22 +342,22 @@ def _other_chessboards(picture: Bytes, grid: Array, spec: ChessboardSpec) -> tup
 
 
 def _outline(grid: Array) -> Array:
-    """(n, 2) the convex outline of a chessboard's squares: its inner corners and a step beyond them."""
+    """(n, 2) convex hull of a chessboard's squares, one step beyond its inner corners."""
     columns = np.concatenate([2 * grid[:, :1] - grid[:, 1:2], grid, 2 * grid[:, -1:] - grid[:, -2:-1]], axis=1)
     squares = np.concatenate([2 * columns[:1] - columns[1:2], columns, 2 * columns[-1:] - columns[-2:-1]])
     return np.asarray(cv2.convexHull(squares.reshape(-1, 2).astype(np.float32)), float).reshape(-1, 2)
 
 
 def _right_handed(grid: Array) -> Array:
-    """A (rows, columns, 2) grid of which the columns' direction, then the rows', turn as column and row of a scan."""
+    """Mirror a grid (rows, columns, 2) if needed, so that its axes have the handedness of the scan's column and row."""
     across, down = grid[:, -1] - grid[:, 0], grid[-1] - grid[0]
     turn = np.linalg.det(np.stack([across.mean(axis=0), down.mean(axis=0)]))
     return grid if turn > 0 else grid[:, ::-1]
 
 
 def find_board(scan: Scan, spec: ChessboardSpec | ArucoSpec | CharucoSpec | SquareGridSpec) -> FoundBoard:
-    """Search a board at a size that shows it whole, then finer: small boards in large scans need it. A whole chessboard
-    is looked for in a coarse picture first."""
+    """Find a board in a reduced scan, then at a finer reduction, which small boards in large scans need. A whole
+    chessboard is first searched in a coarse image."""
     longest = max(scan.width_px, scan.height_px)
     *sizes, quick = (max(round(longest / size), 1) for size in (_FIRST_SIZE_PX, _LAST_SIZE_PX, _QUICK_SIZE_PX))
     if isinstance(spec, ChessboardSpec) and quick > max(sizes):
@@ -365,7 +374,7 @@ def find_board(scan: Scan, spec: ChessboardSpec | ArucoSpec | CharucoSpec | Squa
 def _find_reduced(
     scan: Scan, spec: ChessboardSpec | ArucoSpec | CharucoSpec | SquareGridSpec, factor: int, is_quick: bool = False
 ) -> FoundBoard:
-    """The board in the scan reduced by a factor, with the scan's own coordinates."""
+    """Find a board in the scan reduced by a factor. Returns coordinates of the full scan."""
     picture, reason = _searchable(scan, factor)
     if reason:
         return FoundBoard({}, reason)
@@ -373,7 +382,7 @@ def _find_reduced(
         found = find_chessboard(picture, spec, is_quick)
     else:
         found = find_squares(picture, spec) if isinstance(spec, SquareGridSpec) else _find_markers(picture, spec)
-    offset = (factor - 1) / 2  # pixel (i, j) of a reduced picture has its centre at factor j + (factor - 1) / 2
+    offset = (factor - 1) / 2  # pixel (i, j) of a reduced image has its centre at factor j + (factor - 1) / 2
     corners = {
         name: FoundCorner(corner.center_px * factor + offset, corner.steps_px * factor)
         for name, corner in found.corners.items()
@@ -382,7 +391,7 @@ def _find_reduced(
 
 
 def _find_markers(picture: Bytes, spec: ArucoSpec | CharucoSpec) -> FoundBoard:
-    """A board of markers, as it is printed or mirrored, in which no marker of a board can be read."""
+    """Find a board of markers as printed, or in the mirrored image, since mirrored markers cannot be read."""
 
     def find(shown: Bytes) -> FoundBoard:
         return find_charuco(shown, spec) if isinstance(spec, CharucoSpec) else find_aruco(shown, spec)
@@ -396,8 +405,8 @@ def _find_markers(picture: Bytes, spec: ArucoSpec | CharucoSpec) -> FoundBoard:
 
 
 def recognise_board(scan: Scan) -> str:
-    """What board a scan shows at reduced size, as `reseau calibrate` takes it: "--board 9x6" of a chessboard, the kind
-    and dictionary of markers; "" where none is seen."""
+    """Options of `reseau calibrate` for the board that a scan shows: "--board 9x6" for a chessboard, kind and
+    dictionary for markers; "" if no board is found."""
     factor = max(round(max(scan.width_px, scan.height_px) / _FIRST_SIZE_PX), 1)
     picture, reason = _searchable(scan, factor)
     if reason:
@@ -415,7 +424,7 @@ def recognise_board(scan: Scan) -> str:
 
 
 def _searchable(scan: Scan, factor: int) -> tuple[Bytes, Reason]:
-    """The reduced scan stretched to 8 bits, and why there is nothing to search in it, if so."""
+    """Reduced scan stretched to 8 bits, and the reason if it has no contrast to search in."""
     grey = scan.reduced(factor)
     every = max(round(np.sqrt(grey.size / _ENOUGH_PIXELS)), 1)
     low, high = np.percentile(grey[::every, ::every], (1, 99))

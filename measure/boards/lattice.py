@@ -1,4 +1,4 @@
-"""Points of a printed grid put in order: which of the points found belongs to which place of the grid."""
+"""Identification of the points of a printed grid: assignment of detected points to the places of the grid."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -19,26 +19,35 @@ Place = tuple[int, int]
 Bytes = NDArray[np.uint8]
 
 _NEIGHBOURS = 8  # of a point: those that touch its square
-_STEP_TOLERANCE = 0.3  # of a step, between where a neighbour is expected and where it is
-_SEEDS = 12  # points to begin at, spread over all
-_LIKENESS = 0.4  # of the logarithms of size and contrast
-_LEAST_SHARE = 0.8  # of the grid's places that must be seen
-_BLOCKS = (1 / 4, 1 / 8, 1 / 16)  # of the picture's shorter side: about so far the ground of a square is looked at
-_DARKER = 12  # grey values of 255 that a square is darker by than the mean about it
-_SMALLEST_SIDE_PX = 6.0  # of a square: with less its four corners are one spot
-_LARGEST = 0.2  # of the picture's area: what is larger is no square of a grid
-_STRAIGHT = 0.06  # of its outline: how far a quadrangle's sides may leave it
-_FILLED = 0.8  # of the quadrangle that the outline holds
+_STEP_TOLERANCE = 0.3  # in steps, between expected and actual place of a neighbour
+_SEEDS = 12  # start points, spread over all points
+_LIKENESS = 0.4  # largest difference of neighbours in log size and log contrast
+_LEAST_SHARE = 0.8  # fraction of the grid's places that must be detected
+_BLOCKS = (1 / 4, 1 / 8, 1 / 16)  # fractions of the image's shorter side: windows of the adaptive threshold
+_DARKER = 12  # grey values of 255 by which a square is darker than the mean around it
+_SMALLEST_SIDE_PX = 6.0  # px; the corners of smaller squares cannot be resolved
+_LARGEST = 0.2  # fraction of the image's area, limit of a square
+_STRAIGHT = 0.06  # fraction of the perimeter, tolerance of the quadrangle's sides
+_FILLED = 0.8  # fraction of the quadrangle's area enclosed by the outline
 
 
 def grid_places(points_px: Array, appearances: Array, places: list[Place]) -> list[dict[Place, int]]:
-    """Assignments of points to the places (row, column) of a grid: {place: index of the point}. The first explains most
-    points; further ones are ways to turn the grid, or to lay it on other points of a larger lattice, that explain as
-    many but for half a line of the grid. A lattice as large as the grid goes before a larger one. Empty where no
-    outline fits; the grid is never mirrored.
+    """Assign points to the places (row, column) of a grid.
 
-    points_px (n, 2) may hold others, too; appearances (n, k): what points look like, in which neighbours differ little,
-    logarithms of size and contrast. The grid's outline must be seen, a fifth of its places may be missing.
+    The grid's outline must be visible; a fifth of its places may be missing. The grid is never mirrored.
+
+    Parameters
+    ----------
+    points_px : (n, 2)
+        Detected points, which may include others.
+    appearances : (n, k)
+        Logarithms of size and contrast, in which neighbours differ little.
+
+    Returns
+    -------
+    Assignments {place: index of the point}, empty if no outline fits. The first one explains most points. Further ones
+    are turned grids, or other positions on a larger lattice, that explain as many up to half a line of the grid. A
+    lattice as large as the grid has priority over a larger one.
     """
     best: list[dict[Place, int]] = []
     for lattice in _lattices(points_px, appearances):
@@ -50,12 +59,13 @@ def grid_places(points_px: Array, appearances: Array, places: list[Place]) -> li
 
 
 def is_whole(assignments: list[dict[Place, int]]) -> bool:
-    """Whether assignments, of the same points all, are of a grid that is no part of a larger lattice."""
+    """Whether all assignments use the same points, so that the grid is not part of a larger lattice."""
     return len({frozenset(assignment.values()) for assignment in assignments}) == 1
 
 
 def _lattices(points_px: Array, appearances: Array) -> list[dict[Place, int]]:
-    """Lattices that the points form, {(i, j): index}, the largest first; i to j turns as column to row of a scan."""
+    """Lattices {(i, j): index} formed by the points, the largest first; i and j have the handedness of column and
+    row."""
     if len(points_px) < 4:
         return []
     tree = cKDTree(points_px)
@@ -65,7 +75,7 @@ def _lattices(points_px: Array, appearances: Array) -> list[dict[Place, int]]:
 
 
 def _grown(points_px: Array, appearances: Array, tree: cKDTree, seed: int) -> dict[Place, int]:
-    """The lattice about a point, grown from neighbour to neighbour; each step is expected to be like the last."""
+    """Grow a lattice around a point from neighbour to neighbour, predicting each step from the last."""
     basis = _seed_basis(points_px, tree, seed)
     if basis is None:
         return {}
@@ -94,7 +104,7 @@ def _grown(points_px: Array, appearances: Array, tree: cKDTree, seed: int) -> di
 
 
 def _seed_basis(points_px: Array, tree: cKDTree, seed: int) -> Array | None:
-    """(2, 2) rows: the two shortest steps from a point to neighbours that have a partner on the other side."""
+    """(2, 2) rows: the two shortest steps from a point to neighbours with a counterpart on the opposite side."""
     _, near = tree.query(points_px[seed], k=np.arange(2, min(_NEIGHBOURS + 1, len(points_px)) + 1))
     steps = points_px[near] - points_px[seed]
     paired = [step for step in steps if tree.query(points_px[seed] - step)[0] < _STEP_TOLERANCE * np.hypot(*step)]
@@ -106,7 +116,8 @@ def _seed_basis(points_px: Array, tree: cKDTree, seed: int) -> Array | None:
 
 
 def _outlines(lattice: dict[Place, int], places: list[Place]) -> list[dict[Place, int]]:
-    """The ways to lay the grid's outline on a lattice, those with most points first; others but for half a line."""
+    """Assignments of the grid's outline to a lattice, most points first; those that lack more than half a line are
+    dropped."""
     wanted = set(places)
     nodes = np.array(list(lattice)).reshape(-1, 2)
     indices = list(lattice.values())
@@ -128,8 +139,8 @@ def _outlines(lattice: dict[Place, int], places: list[Place]) -> list[dict[Place
 
 
 def _unit_steps(places: list[Place]) -> list[Integers]:
-    """(2, 2) matrices whose rows are the lattice's two steps in (column, row): all pairs of short steps that reach
-    every place of the grid, turning from column to row."""
+    """(2, 2) matrices whose rows are the lattice's two steps in (column, row): all right-handed pairs of short steps
+    that reach every place of the grid."""
     staggered = len({(row + column) % 2 for row, column in places}) == 1
     short = [np.array(step) for step in product((-2, -1, 0, 1, 2), repeat=2)]
     if staggered:
@@ -142,8 +153,8 @@ def _unit_steps(places: list[Place]) -> list[Integers]:
 
 
 def _outline_shifts(columns_rows: Integers, places: list[Place]) -> list[Integers]:
-    """Shifts that lay the grid's outline about a lattice's nodes. Other points beside the grid may widen the nodes'
-    outline by a line or two."""
+    """Shifts that place the grid's outline on a lattice's nodes. Points outside the grid may enlarge the lattice by a
+    line or two."""
     grid = np.array([(column, row) for row, column in places])
     size = grid.max(axis=0) + 1
     least, greatest = columns_rows.min(axis=0), columns_rows.max(axis=0)
@@ -155,8 +166,11 @@ def _outline_shifts(columns_rows: Integers, places: list[Place]) -> list[Integer
 
 @dataclass(frozen=True, eq=False)
 class FoundGrid:
-    """assignment: the index of the point at each place, empty where there is no grid, and then the reason why;
-    others_px: the middles of further grids; notes: what the user should know."""
+    """Grid found in a scan.
+
+    assignment: index of the point at each place, empty if no grid was found; others_px: centres of further grids;
+    notes: messages to the user; reason: why no grid was found.
+    """
 
     assignment: dict[Place, int]
     others_px: tuple[Array, ...] = ()
@@ -165,12 +179,12 @@ class FoundGrid:
 
 
 def find_grid(points_px: Array, appearances: Array, spec: CircleGridSpec | SquareGridSpec, what: str) -> FoundGrid:
-    """Find the one grid that points make, the most upright one in the scan.
+    """Find the grid formed by points. Of several orientations the most upright one in the scan is returned.
 
     Parameters
     ----------
-    points_px, appearances : as `grid_places` takes them.
-    what : the word for the points, in messages.
+    points_px, appearances : as in `grid_places`.
+    what : word for the points in messages.
     """
     size, places = f"{spec.columns} x {spec.rows} {what}", spec.places()
     assignments = grid_places(points_px, appearances, places)
@@ -181,7 +195,7 @@ def find_grid(points_px: Array, appearances: Array, spec: CircleGridSpec | Squar
         return FoundGrid({}, reason=Reason(message, Code.NO_BOARD))
 
     def uprightness(assignment: dict[Place, int]) -> float:
-        """How far to the right in the scan the grid's columns follow one another."""
+        """Covariance of the grid's columns with the column in the scan: largest for the upright grid."""
         columns = [column for _, column in assignment]
         return float(np.cov(columns, points_px[list(assignment.values()), 0])[0, 1])
 
@@ -198,8 +212,8 @@ def find_grid(points_px: Array, appearances: Array, spec: CircleGridSpec | Squar
 
 
 def find_squares(picture: Bytes, spec: SquareGridSpec) -> FoundBoard:
-    """Find the corners of a grid of separate dark squares in a picture, a pixel or so off; steps are the square's sides
-    that leave the corner. Nearly all squares must be seen."""
+    """Find the corners of a grid of separate dark squares, to about a pixel. Nearly all squares must be visible. A
+    corner's steps are the sides of the square that leave it."""
     reason = NO_REASON
     for share in _BLOCKS:
         quads = list(_dark_quads(picture, share))
@@ -214,7 +228,8 @@ def find_squares(picture: Bytes, spec: SquareGridSpec) -> FoundBoard:
 
 
 def _dark_quads(picture: Bytes, share: float) -> Iterator[Array]:
-    """The outlines (4, 2) of dark quadrangles, against the mean over a part of the picture's shorter side."""
+    """Outlines (4, 2) of dark quadrangles by an adaptive threshold. share: window, fraction of the image's shorter
+    side."""
     block = max(int(share * min(picture.shape)), 3) | 1
     dark = cv2.adaptiveThreshold(picture, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, block, _DARKER)
     outlines, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
@@ -230,7 +245,7 @@ def _dark_quads(picture: Bytes, share: float) -> Iterator[Array]:
 def _square_corners(
     quads: list[Array], centers: Array, assignment: dict[Place, int], spec: SquareGridSpec
 ) -> dict[str, FoundCorner]:
-    """The corners of a grid's squares, clockwise from the upper left one of each as the grid is meant to be seen."""
+    """Corners of a grid's squares, clockwise from the upper left one in the orientation of the specification."""
     grid = np.array([(column, row) for row, column in assignment], float)
     homography = np.asarray(cv2.findHomography(grid, centers[list(assignment.values())])[0], float)
     corners: dict[str, FoundCorner] = {}
@@ -242,6 +257,6 @@ def _square_corners(
 
 
 def homography_steps(homography: Array, place: Array) -> Array:
-    """(2, 2) derivatives of a homography at a place: its steps to the next column and the next row."""
+    """(2, 2) derivatives of a homography at a place, the steps to the next column and row."""
     x, y, w = homography @ (*place, 1.0)
     return np.asarray((homography[:2, :2] - np.outer((x, y), homography[2, :2]) / w) / w)

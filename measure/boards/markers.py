@@ -1,4 +1,4 @@
-"""The markers of a board read in a picture, each at one place: where one is read at several, its board says which."""
+"""Detection of a board's markers. A marker read at several places is resolved by the layout of the board."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -27,24 +27,27 @@ Bytes = NDArray[np.uint8]
 Markers = Mapping[int, Array]  # the corners (4, 2) of each on its board, by number
 Changes = dict[str, Any]
 Layout = TypeVar("Layout", ArucoSpec, CharucoSpec)
-_OFF_SQUARES = 0.25  # of a square, that a corner lies off where the markers beside it put it
+_OFF_SQUARES = 0.25  # in squares, largest distance of a corner from the place given by the adjacent markers
 _NO_LEGACY: tuple[Changes, ...] = ({},)
 _LEGACIES: tuple[Changes, ...] = ({"legacy": False}, {"legacy": True})  # OpenCV's two layouts of ChArUco boards
 _COMMON_DICTIONARIES = ("4X4_250", "5X5_250", "6X6_250", "7X7_250", "ARUCO_ORIGINAL", "APRILTAG_36h11")
-_FEWEST_CORNERS = 4  # that a homography takes
+_FEWEST_CORNERS = 4  # points needed for a homography
 
 
 @dataclass(frozen=True, eq=False)
 class MarkerReadings:
-    """All markers of a dictionary that a picture shows: outlines_px (4, 2) by number; border: the share of their sides
-    that the border about their code has."""
+    """All markers of a dictionary read in an image.
+
+    outlines_px: by number, list of outlines (4, 2); size_px: width and height of the image; border: width of the border
+    around the code, fraction of the marker's side.
+    """
 
     outlines_px: Mapping[int, list[Array]]
     size_px: tuple[int, int]
     border: float
 
     def quarter_turned(self, turns: int) -> "MarkerReadings":
-        """The same markers, printed turned: each begins at another of its corners."""
+        """Renumber the corners of all markers by quarter turns."""
         turned = {
             number: [np.roll(outline, turns, axis=0) for outline in places]
             for number, places in self.outlines_px.items()
@@ -54,8 +57,11 @@ class MarkerReadings:
 
 @dataclass(frozen=True, eq=False)
 class ReadMarkers:
-    """corners_px: (4, 2) of each marker, by number; refused: those that were read, but not where the board has them or
-    at places that nothing tells apart, and why; agreeing: how many lie where the board has them."""
+    """Markers of a board.
+
+    corners_px: (4, 2) by number; refused: by number, markers that contradict the board's layout or are ambiguous, with
+    the reason; agreeing: number of markers consistent with the layout.
+    """
 
     corners_px: Mapping[int, Array]
     refused: Mapping[int, Reason]
@@ -65,8 +71,8 @@ class ReadMarkers:
 def read_markers(
     picture: Bytes, dictionary: cv2.aruco.Dictionary, border_modules: int = 1, touched: bool = False
 ) -> MarkerReadings:
-    """Read all markers of a dictionary, of whatever board. border_modules: about the code of each; touched: whether
-    squares touch the corners, which an outline cuts off."""
+    """Read all markers of a dictionary, of any board. border_modules: around the code; touched: whether squares touch
+    the markers' corners, so that the corners must be refined."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = border_modules
     if touched:
@@ -82,14 +88,14 @@ def read_markers(
 
 
 def read_any_markers(picture: Bytes) -> tuple[str, int]:
-    """The dictionary of which most markers are read in a picture, and how many different ones."""
+    """Common dictionary of which most markers are read in an image, and the number of different markers."""
     numbers = {name: len(read_markers(picture, aruco_dictionary(name)).outlines_px) for name in _COMMON_DICTIONARIES}
     name = max(numbers, key=lambda each: numbers[each])
     return name, numbers[name]
 
 
 def placed_markers(read: MarkerReadings, board: Markers) -> ReadMarkers:
-    """The markers of a board, in the order in which they are read."""
+    """Select the markers consistent with a board, in the order in which they were read."""
     readings = {number: places for number, places in read.outlines_px.items() if number in board}
     view = _view(readings, board, read.size_px, read.border / 2)
     corners: dict[int, Array] = {}
@@ -120,7 +126,8 @@ def placed_markers(read: MarkerReadings, board: Markers) -> ReadMarkers:
 
 
 def other_first_numbers(read: MarkerReadings, first: int, count: int) -> list[int]:
-    """The numbers that a board of so many markers may begin at to have all that were read, where it has not."""
+    """Alternative first numbers with which a board of count markers contains all that were read; empty if it already
+    does."""
     numbers = sorted(read.outlines_px)
     if not numbers or (first <= numbers[0] and numbers[-1] < first + count):
         return []
@@ -130,8 +137,11 @@ def other_first_numbers(read: MarkerReadings, first: int, count: int) -> list[in
 def _view(
     readings: Mapping[int, list[Array]], board: Mapping[int, Array], size_px: tuple[int, int], half_border: float
 ) -> SheetView | None:
-    """Where the board lies by the markers that were read once; None where not most of all that were read agree, or
-    where they are not as large as they would be there: markers of two boards may lie as those of a squeezed one."""
+    """Fit the view of the board to the markers read once.
+
+    Returns None unless most markers agree with it and their corners fit: the markers of two boards may be arranged like
+    those of one compressed board.
+    """
     single = {number: places[0] for number, places in readings.items() if len(places) == 1}
     if len(single) < 2:
         return None
@@ -147,25 +157,25 @@ def _view(
 
 
 def _misfit(view: SheetView, corners: Array, image_px: Array) -> float:
-    """How far a marker's corners lie from where the board has them, rms in its sides."""
+    """RMS distance of a marker's corners from their predicted places, in sides of the marker."""
     return float(np.sqrt(np.mean(np.sum((view.places_px(corners) - image_px) ** 2, axis=1)))) / _side_px(image_px)
 
 
 def _off(view: SheetView | None, corners: Array, image_px: Array) -> float:
-    """How far a marker lies from where the board has it, in its sides: another one cannot be nearer than one. nan where
-    that is not known."""
+    """Distance of a marker from its predicted place, in sides of the marker; nan without a view. A different marker is
+    at least one side away."""
     if view is None:
         return np.nan
     return float(np.hypot(*(view.places_px(corners) - image_px).mean(axis=0))) / _side_px(image_px)
 
 
 def _side_px(image_px: Array) -> float:
-    """The longest side of a marker (4, 2) as it is seen."""
+    """Longest side of a marker (4, 2) in the image."""
     return float(np.hypot(*(np.roll(image_px, 1, axis=0) - image_px).T).max())
 
 
 def find_aruco(picture: Bytes, spec: ArucoSpec) -> FoundBoard:
-    """The corners of the board's markers that are read; steps are the marker's sides that leave the corner."""
+    """Find the corners of a board's ArUco markers. A corner's steps are the sides of the marker that leave it."""
     read, layout = _read_board(picture, spec)
     if layout != spec:
         return _other_layout_board(spec, layout)
@@ -176,8 +186,8 @@ def find_aruco(picture: Bytes, spec: ArucoSpec) -> FoundBoard:
 
 
 def find_charuco(picture: Bytes, spec: CharucoSpec) -> FoundBoard:
-    """The inner corners whose neighbouring markers are read. Where the specification does not say which of OpenCV's two
-    layouts the board has, its markers do."""
+    """Find the inner corners of a ChArUco board whose adjacent markers are read. If the specification does not state
+    which of OpenCV's two layouts the board has, the markers decide."""
     read, layout = _read_board(picture, spec)
     if layout not in (spec, replace(spec, legacy=True) if spec.legacy is None else spec):
         return _other_layout_board(spec, layout)
@@ -190,7 +200,7 @@ def find_charuco(picture: Bytes, spec: CharucoSpec) -> FoundBoard:
     if corners is None or len(corners) < _FEWEST_CORNERS:
         return FoundBoard({}, _too_few(spec, read), read.refused)
     places, ids = np.asarray(corners, float).reshape(-1, 2), np.asarray(numbers, int).ravel()
-    # The squares' sides at each corner, from a homography of the board: neighbours may be missing.
+    # Sides of the squares at each corner from a homography of the board, since neighbours may be missing.
     across = spec.columns - 1
     board = np.stack([ids % across, ids // across], axis=-1).astype(float)
     homography = np.asarray(cv2.findHomography(board, places)[0], float)
@@ -204,8 +214,8 @@ def find_charuco(picture: Bytes, spec: CharucoSpec) -> FoundBoard:
 
 
 def _read_board(picture: Bytes, spec: Layout) -> tuple[ReadMarkers, Layout]:
-    """A board's markers; and the layout, the one that is described or a better one, under which most of those that were
-    read lie where their board has them."""
+    """Read a board's markers. Returns them with the layout, the specified one or a variant, with which most of them
+    agree."""
     touched = isinstance(spec, AprilGridSpec)
     borders = (spec.border_modules, 1) if isinstance(spec, AprilGridSpec) else (1,)
     dictionary = aruco_dictionary(spec.dictionary)
@@ -214,7 +224,7 @@ def _read_board(picture: Bytes, spec: Layout) -> tuple[ReadMarkers, Layout]:
         key=lambda each: len(each.outlines_px),
     )
     best, layout = placed_markers(readings, _markers(spec)), spec
-    # Programs that print AprilTags do not agree which of a tag's corners is the first.
+    # Programs that print AprilTags differ in which of a tag's corners is the first.
     turned = [readings.quarter_turned(turns) for turns in range(4 if isinstance(spec, AprilGridSpec) else 1)]
     layouts: Iterator[Layout] = chain((spec,), _other_layouts(spec, readings))
     for other, read in product(layouts, turned):
@@ -227,7 +237,7 @@ def _read_board(picture: Bytes, spec: Layout) -> tuple[ReadMarkers, Layout]:
 
 
 def _other_layouts(spec: Layout, read: MarkerReadings) -> Iterator[Layout]:
-    """What a board may be that is taken for the one that is described."""
+    """Variants of a specification that may be confused with it: swapped counts, other first numbers, other layout."""
     is_aruco = isinstance(spec, ArucoSpec)
     first_key: str = "first_marker" if is_aruco else "first_id"
     legacies = _NO_LEGACY if is_aruco else _LEGACIES
@@ -239,19 +249,19 @@ def _other_layouts(spec: Layout, read: MarkerReadings) -> Iterator[Layout]:
 
 
 def _other_layout_board(spec: ArucoSpec | CharucoSpec, other: ArucoSpec | CharucoSpec) -> FoundBoard:
-    """No corners, and what of the description does not fit the markers."""
+    """Board without corners whose reason states which options of the specification contradict the markers."""
     keys = ("columns", "rows", "first_marker", "first_id", "legacy")
     differing = [key for key in keys if getattr(spec, key, None) != getattr(other, key, None)]
     if not getattr(other, "legacy", None):
         differing = [key for key in differing if key != "legacy" or getattr(spec, key)]
-    words = {"first_marker": "first_id"} if isinstance(spec, AprilGridSpec) else {}  # as [targets] has them
+    words = {"first_marker": "first_id"} if isinstance(spec, AprilGridSpec) else {}  # names used in [targets]
     fitting = ", ".join(f"{words.get(key, key)} = {str(getattr(other, key)).lower()}" for key in differing)
     message = f"the markers that were read do not lie as on the board that is described, but as with {fitting}"
     return FoundBoard({}, Reason(f"{message}. Set that, if it is the board's", Code.NO_BOARD))
 
 
 def _too_few(spec: ArucoSpec | CharucoSpec, read: ReadMarkers) -> Reason:
-    """Why a board was not found."""
+    """Reason why a board was not found."""
     if read.refused:
         return next(iter(read.refused.values()))
     if isinstance(spec, CharucoSpec):
@@ -263,7 +273,7 @@ def _too_few(spec: ArucoSpec | CharucoSpec, read: ReadMarkers) -> Reason:
 
 
 def _markers(spec: ArucoSpec | CharucoSpec) -> Markers:
-    """The markers of a board; of a ChArUco board as OpenCV has it: y down, its origin at the upper left square."""
+    """Corners of a board's markers. ChArUco boards use OpenCV's system: y down, origin at the upper left square."""
     if isinstance(spec, CharucoSpec):
         board = charuco_board(spec)
         return dict(zip(np.ravel(board.getIds()).tolist(), np.array(board.getObjPoints())[..., :2], strict=True))
@@ -282,7 +292,7 @@ def charuco_board(spec: CharucoSpec) -> cv2.aruco.CharucoBoard:
 
 
 def off_corners(found: Mapping[str, FoundCorner], spec: CharucoSpec, read: ReadMarkers) -> dict[str, Reason]:
-    """The corners that do not lie where the markers that touch them put them, and why."""
+    """Corners that contradict the homography of the adjacent markers, by id, with the reason."""
     on_board = _markers(spec)
     middles = {number: on_board[number].mean(axis=0) / spec.square_mm for number in read.corners_px}
     off = {}

@@ -32,25 +32,32 @@ from measure.targets.disks import FittedDisk, fit_plain_disks
 Array = NDArray[np.float64]
 
 _MIRROR = np.array([-1.0, 1.0])  # of column and row
-_SMALLEST_DOT_PX = 5.0  # its diameter
-_NEAREST_DOTS = 8  # whose places and shapes predict a missing one's
-# Along the edges, in shares of a square's side:
-_REACH = 0.3  # light, lens and paper change little over it
-_SHORTEST_REACH_PX = 5.0  # less shows too little of the edges...
-_FARTHEST_REACH = 0.6  # ...but beyond this share the neighbouring crossing begins to show
-_LONGEST_REACH_PX = 10.0  # enough for a hundredth of a pixel...
-_LARGE_REACH, _LARGEST_REACH_PX = 0.1, 15.0  # ...but squares this large may be blurred by some pixels
-_HALF_SIDE, _FREE_GAP = 0.5, 0.8  # of a square that stands alone, and of the gap beside it
-_MARKER_REACH = 0.8  # of a marker's black border, or of the gap beside it
-_WEAK_DAMAGE = 0.25  # of the pixels about a corner: with more of them left out it is weak
+_SMALLEST_DOT_PX = 5.0  # px, diameter
+_NEAREST_DOTS = 8  # neighbours whose places and shapes predict a missing dot
+# Reach of the window along the edges, as fractions of a square's side unless in px:
+_REACH = 0.3  # illumination, distortion and flatness change little over it
+_SHORTEST_REACH_PX = 5.0  # px; less shows too little of the edges...
+_FARTHEST_REACH = 0.6  # ...but beyond this fraction the neighbouring crossing becomes visible
+_LONGEST_REACH_PX = 10.0  # px, enough for 0.01 px...
+_LARGE_REACH, _LARGEST_REACH_PX = 0.1, 15.0  # ...but squares this large may be blurred by several pixels
+_HALF_SIDE, _FREE_GAP = 0.5, 0.8  # fractions of an isolated square's side, and of the gap around it
+_MARKER_REACH = 0.8  # fraction of a marker's black border, or of the gap around it
+_WEAK_DAMAGE = 0.25  # fraction of the pixels around a corner: if more are rejected the corner is weak
 
 
 @dataclass(frozen=True)
 class BoardMeasurement:
-    """A board in a scan: one mark for each of its points, found or not; reason: why the board was not found; notes:
-    what the user should know; refused: markers that were read and are not used, one sentence each; ambiguous: what else
-    in the scan may be the board as well, so that none of its points is an observation; is_mirrored: as `FoundBoard` has
-    it."""
+    """Measurement of a board in a scan.
+
+    Attributes
+    ----------
+    marks : one for each point of the board, found or not.
+    reason : why the board was not found.
+    notes : messages to the user.
+    refused : markers that were read but are not used, one sentence each.
+    ambiguous : further boards that look the same, so that no point is an observation.
+    is_mirrored : whether the image shows the board mirrored.
+    """
 
     marks: tuple[MarkMeasurement, ...]
     reason: Reason = NO_REASON
@@ -61,11 +68,11 @@ class BoardMeasurement:
 
 
 def _measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> BoardMeasurement:
-    """The dots of a grid; those that were not seen are sought where the others put them."""
+    """Measure the dots of a grid. Undetected dots are fitted at the places predicted from the others."""
     patches = disk_candidates(scan, DiskSearch((_SMALLEST_DOT_PX, _largest_dot_px(scan, spec))))
     centers = np.array([patch.center_px for patch in patches]).reshape(-1, 2)
     grid, is_mirrored = find_grid(centers, _appearances(patches), spec, "dots"), False
-    if grid.reason and spec.asymmetric:  # one of even columns and rows differs from its mirror image
+    if grid.reason and spec.asymmetric:  # with even columns and rows it differs from its mirror image
         mirrored = find_grid(centers * _MIRROR, _appearances(patches), spec, "dots")
         if not mirrored.reason:
             others_px = tuple(center_px * _MIRROR for center_px in mirrored.others_px)
@@ -85,21 +92,21 @@ def _measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> BoardMeasurement:
 
 
 def _appearances(patches: list[Candidate]) -> Array:
-    """(n, 3) logarithms of size and contrast, and which of both, light or dark."""
+    """(n, 3) logarithms of size and contrast, and sign of the contrast."""
     return np.array(
         [(np.log(patch.radius_px), np.log(abs(patch.contrast_dn)), np.sign(patch.contrast_dn)) for patch in patches]
     )
 
 
 def _largest_dot_px(scan: Scan, spec: CircleGridSpec) -> float:
-    """The largest that a dot can be when the grid fills the scan."""
+    """Largest possible diameter of a dot, if the grid fills the scan."""
     places = min(spec.columns, spec.rows)
     share = spec.diameter_mm / spec.spacing_mm
     return max(2 * _SMALLEST_DOT_PX, share * max(scan.width_px, scan.height_px) / places)
 
 
 def _predicted(place: Place, detected: Mapping[Place, Candidate]) -> Candidate:
-    """A dot by a homography of its nearest neighbours; its shape and contrast are their mean ones."""
+    """Predict a dot by a homography of its nearest neighbours, with their mean shape and contrast."""
     others = sorted(detected, key=lambda other: np.hypot(other[0] - place[0], other[1] - place[1]))
     nearest = others[: max(_NEAREST_DOTS, len(others) // 3)]
     homography, _ = cv2.findHomography(
@@ -112,7 +119,7 @@ def _predicted(place: Place, detected: Mapping[Place, Candidate]) -> Candidate:
 
 
 def _dot_mark(name: str, disk: FittedDisk, is_detected: bool) -> MarkMeasurement:
-    """The row of a dot."""
+    """Measurement record of a dot."""
     if disk.reason:
         status = Status.REJECTED if is_detected else Status.PREDICTED
         reason = disk.reason.reword(f"not fitted: {disk.reason}")
@@ -123,11 +130,12 @@ def _dot_mark(name: str, disk: FittedDisk, is_detected: bool) -> MarkMeasurement
 
 
 def measure_board(scan: Scan, spec: BoardSpec) -> BoardMeasurement:
-    """Measure a chessboard, grid of dots or squares, ArUco or ChArUco board.
+    """Measure a chessboard, a grid of dots or squares, an ArUco or a ChArUco board.
 
     Returns
     -------
-    One mark for each point of the board, found or not. A board that is not there is no error, but a reason.
+    One mark for each point of the board, found or not. If the board is not found the result has a reason; no error is
+    raised.
     """
     if isinstance(spec, CircleGridSpec):
         return _measure_circle_grid(scan, spec)
@@ -156,7 +164,7 @@ def measure_board(scan: Scan, spec: BoardSpec) -> BoardMeasurement:
 
 
 def _unless_alone(measured: BoardMeasurement, kind: str, others_px: Sequence[Array]) -> BoardMeasurement:
-    """A board beside others that look the same: its points have places, but nobody knows of which board they are."""
+    """Reject the points of a board if the scan shows others that look the same: their identity is ambiguous."""
     if not others_px:
         return measured
     middle = np.mean([mark.center_px for mark in measured.marks if mark.center_px is not None], axis=0)
@@ -171,7 +179,7 @@ def _unless_alone(measured: BoardMeasurement, kind: str, others_px: Sequence[Arr
 
 
 def _fit_found(scan: Scan, found: Mapping[str, FoundCorner], spec: BoardSpec) -> dict[str, Corner]:
-    """Least-squares matching about the corners that were found."""
+    """Fit the detected corners by least-squares matching."""
     board_reach_px = _common_reach_px(found.values()) if found else 0.0
     starts = [
         CornerStart(each.center_px, each.steps_px, _reach_px(np.hypot(*each.steps_px), spec, board_reach_px))
@@ -188,22 +196,22 @@ def _fit_found(scan: Scan, found: Mapping[str, FoundCorner], spec: BoardSpec) ->
 
 
 def _reach_px(sides_px: Array, spec: BoardSpec, board_reach_px: float) -> Array:
-    """(2,) how far along the sides (2,) of a square or marker grey values are used."""
+    """(2,) px, reach of the window along the sides (2,) of a square or marker."""
     if isinstance(spec, ArucoSpec):
         free = min(spec.border_modules / spec.modules, spec.gap_mm / spec.marker_mm)
         return np.asarray(np.minimum(_MARKER_REACH * free * sides_px, _LARGEST_REACH_PX))
-    if isinstance(spec, SquareGridSpec):  # to neither its next corner nor the next square
+    if isinstance(spec, SquareGridSpec):  # exclude its next corner and the next square
         free = min(_HALF_SIDE, _FREE_GAP * spec.gap_mm / spec.square_mm)
         return np.asarray(np.minimum(free * sides_px, _LARGEST_REACH_PX))
     farthest = _FARTHEST_REACH
-    if isinstance(spec, CharucoSpec):  # not into a marker in one of the squares
+    if isinstance(spec, CharucoSpec):  # exclude the marker in one of the squares
         farthest = (spec.square_mm - spec.marker_mm) / (2 * spec.square_mm)
     return np.full(2, min(board_reach_px, farthest * float(sides_px.min())))
 
 
 def _common_reach_px(corners: Iterable[FoundCorner]) -> float:
-    """One reach for a whole board: what a camera's sharpening does to a corner depends on the window, and where all
-    windows are alike it moves all corners alike, and not the near ones otherwise than the far ones."""
+    """One reach (px) for a whole board. The effect of a camera's sharpening depends on the window, so equal windows
+    make it the same for near and far corners."""
     sides = [float(np.hypot(*corner.steps_px).min()) for corner in corners]
     side_px = float(np.median(sides))
     longest_px = np.clip(_LARGE_REACH * side_px, _LONGEST_REACH_PX, _LARGEST_REACH_PX)
@@ -213,17 +221,18 @@ def _common_reach_px(corners: Iterable[FoundCorner]) -> float:
 def _named_by_colour(
     fitted: dict[str, Corner], found: dict[str, FoundCorner], spec: ChessboardSpec
 ) -> tuple[dict[str, Corner], tuple[str, ...]]:
-    """The corners named so that the square r0c0, r0c1, r1c1, r1c0 is dark; a board that looks the same after a half
-    turn is taken as upright. Boards of as many columns as rows are turned by quarters."""
+    """Rename the corners so that the square r0c0, r0c1, r1c1, r1c0 is dark. A board symmetric under a half turn is
+    assumed to be upright in the scan. Boards with equal numbers of columns and rows are turned by quarters."""
     names = np.array([[f"r{row}c{column}" for column in range(spec.columns)] for row in range(spec.rows)])
     contrasts = np.array([[fitted[name].contrast_dn for name in line] for line in names])
     columns_px = np.array([[found[name].center_px[0] for name in line] for line in names])
 
     def fits(quarter_turns: int) -> tuple[bool, float]:
-        """Whether the first square is dark, over the whole board; and how far to the right the first row runs."""
+        """Whether the first square is dark, by the median over the board; and the extent to the right of the first
+        row."""
         contrast, (first, *_, last) = np.rot90(contrasts, quarter_turns), np.rot90(columns_px, quarter_turns)[0]
         lighter = np.where(np.indices(contrast.shape).sum(axis=0) % 2 == 0, contrast, -contrast)
-        # Turned by a quarter, the square between a corner's steps is its neighbour of the other colour.
+        # After a quarter turn the square between a corner's steps is its neighbour of the opposite colour.
         return bool((-1) ** quarter_turns * np.nanmedian(lighter) < 0), float(last - first)
 
     ranks = {turns: fits(turns) for turns in (range(4) if spec.columns == spec.rows else (0, 2))}
@@ -234,7 +243,7 @@ def _named_by_colour(
 
 
 def _corner_mark(name: str, corner: Corner | None, missing: Reason) -> MarkMeasurement:
-    """The row of a point."""
+    """Measurement record of a point."""
     if corner is None:
         return MarkMeasurement(name, "target", None, None, Status.ABSENT, missing)
     if corner.reason:

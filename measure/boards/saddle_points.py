@@ -1,4 +1,4 @@
-"""Saddle points of the grey values that lie side by side as a chessboard's crossings do: a quick look for a board."""
+"""Saddle points of the grey values arranged like a chessboard's crossings: a fast test for the presence of a board."""
 
 from dataclasses import dataclass
 
@@ -15,26 +15,26 @@ Bytes = NDArray[np.uint8]
 Strength = NDArray[np.float32]
 
 _SMOOTHING_PX = 1.5
-_APART_PX = 3  # a saddle point is the strongest within it
-_STRENGTH = 0.02  # of those known: contrast enters with its square, so that a seventh of it will do
-_RING_PX, _RING_PLACES = 4.0, 16  # about a saddle point, where grey values go up and down twice
-_TWICE = 2.0  # times all other waves of the ring together
+_APART_PX = 3  # px, a saddle point is the maximum within this distance
+_STRENGTH = 0.02  # fraction of the known strength; contrast enters squared, so a seventh of it suffices
+_RING_PX, _RING_PLACES = 4.0, 16  # px and samples, ring around a saddle point with two periods of light and dark
+_TWICE = 2.0  # power of two periods over that of all others together
 _NEIGHBOURS = 8
-_LIKE = 3.0  # times the contrast that neighbours may have
-_LEAST_SINE = 0.3  # of the angle between the two lines
-_HALFWAY = 0.3  # of a step, that a crossing may lie off the middle of its neighbours
+_LIKE = 3.0  # largest ratio of contrasts of neighbours
+_LEAST_SINE = 0.3  # sine of the angle between the two lines
+_HALFWAY = 0.3  # in steps, tolerance of a crossing against the midpoint of its neighbours
 
 
 @dataclass(frozen=True, eq=False)
 class SaddlePoints:
-    """places_px (n, 2); waves (n,) complex: contrast, and twice the direction in which it is light."""
+    """Saddle points. places_px (n, 2); waves (n,) complex: modulus is the contrast, phase twice the light direction."""
 
     places_px: Array
     waves: NDArray[np.complexfloating]
 
 
 def saddle_strength(picture: Bytes) -> Strength:
-    """(height, width) the negative determinant of the second derivatives of the smoothed grey values."""
+    """(height, width) negative determinant of the Hessian of the smoothed grey values."""
     smooth = cv2.GaussianBlur(picture, (0, 0), _SMOOTHING_PX)
     across, down, both = (cv2.Sobel(smooth, cv2.CV_16S, *order) for order in ((2, 0), (0, 2), (1, 1)))
     squares = cv2.multiply(both, both, dtype=cv2.CV_32F)
@@ -42,11 +42,11 @@ def saddle_strength(picture: Bytes) -> Strength:
 
 
 def largest_lattice(picture: Bytes, strength: Strength, known_strength: float) -> int:
-    """How many saddle points at most hang together as a chessboard's crossings do.
+    """Size of the largest connected set of saddle points arranged like a chessboard's crossings.
 
-    A crossing belongs together with its neighbours along both lines: they are dark where it is light, and it lies in
-    their middle. strength: of the picture (`saddle_strength`), 0 where nothing is sought; known_strength: that of
-    crossings that are known; much fainter ones do not count.
+    A crossing is connected with its neighbours along both lines if they have the opposite sign and it lies midway
+    between them. strength: from `saddle_strength`, 0 where nothing is to be found; known_strength: that of known
+    crossings; much weaker ones are ignored.
     """
     points = _saddle_points(picture, strength, known_strength)
     number = len(points.places_px)
@@ -59,7 +59,7 @@ def largest_lattice(picture: Bytes, strength: Strength, known_strength: float) -
 
 
 def _line_neighbours(points: SaddlePoints, near: NDArray[np.intp]) -> Mask:
-    """(n, k): which of its k neighbours lie along the two lines through a saddle point; none where there are no two."""
+    """(n, k) mask of the k neighbours that lie on the two lines through a saddle point; empty without two lines."""
     steps = points.places_px[near] - points.places_px[:, None]
     lengths, products = np.linalg.norm(steps, axis=-1), points.waves[near] * points.waves[:, None].conj()
     contrast = np.abs(points.waves[near]) / np.abs(points.waves[:, None])
@@ -76,7 +76,7 @@ def _saddle_points(picture: Bytes, strength: Strength, known_strength: float) ->
     highest = cv2.dilate(strength, np.ones((2 * _APART_PX + 1, 2 * _APART_PX + 1)))
     is_top = (strength == highest) & (strength > _STRENGTH * known_strength)
     rows, columns = np.nonzero(is_top)
-    # One of equal neighbours: between four pixels a crossing is as strong in all of them.
+    # Keep one of equal neighbours: a crossing midway between four pixels is equally strong in all of them.
     earlier = np.pad(is_top, 1)[:-1]
     is_first = ~(earlier[rows, columns] | earlier[rows, columns + 1] | earlier[rows, columns + 2])
     is_first &= ~earlier[1:][rows, columns]

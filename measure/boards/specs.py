@@ -1,7 +1,7 @@
-"""Calibration boards as their makers describe them: what is printed, and where on the board its points lie.
+"""Specifications of calibration boards: the printed pattern and the object coordinates of its points.
 
-A board's frame: x right, y up, z towards the viewer, seen as it is meant to be seen, origin at its lower left point;
-units are those of the specification.
+Board coordinate system: x right, y up, z towards the viewer in the intended orientation, origin at the lower left
+point, units those of the specification.
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 
 class _Spec:
-    """A board of columns and rows; its lengths are positive."""
+    """Base of boards with columns and rows; validates counts and lengths."""
 
     fewest: ClassVar[int] = 3  # columns, and rows
 
@@ -34,7 +34,7 @@ class _Spec:
 
 @dataclass(frozen=True)
 class ChessboardSpec(_Spec):
-    """A chessboard of columns x rows INNER corners; a point's id is r{row}c{column}, row 0 the upper one."""
+    """Chessboard of columns x rows INNER corners. A point's id is r{row}c{column}; row 0 is the upper one."""
 
     columns: int
     rows: int
@@ -49,11 +49,11 @@ class ChessboardSpec(_Spec):
 
 @dataclass(frozen=True)
 class CircleGridSpec(_Spec):
-    """A grid of columns x rows dots; a point's id is r{row}c{column}.
+    """Grid of columns x rows dots. A point's id is r{row}c{column}.
 
-    spacing_mm: between neighbouring columns and rows. Asymmetric: only the places where row + column is even hold a dot
-    (every other row is moved by one column), columns and rows still counting places. row_spacing_mm: where rows lie at
-    another distance than columns (a hexagonal grid: sqrt(3) times the columns').
+    spacing_mm: between neighbouring columns and rows; asymmetric: only places with even row + column hold a dot (every
+    other row is shifted by one column), while columns and rows count all places; row_spacing_mm: spacing of the rows if
+    it differs from that of the columns (hexagonal grid: sqrt(3) times that).
     """
 
     columns: int
@@ -77,7 +77,7 @@ class CircleGridSpec(_Spec):
 
     @property
     def shortest_distance_mm(self) -> float:
-        """Between the centres of neighbouring dots."""
+        """Distance between the centres of neighbouring dots."""
         across, down = self.spacing_mm, self._row_step_mm
         return min(2 * across, 2 * down, float(np.hypot(across, down))) if self.asymmetric else min(across, down)
 
@@ -95,10 +95,10 @@ class CircleGridSpec(_Spec):
 
 @dataclass(frozen=True)
 class ArucoSpec(_Spec):
-    """A board of columns x rows ArUco markers, the first in the upper left corner, then row by row.
+    """Board of columns x rows ArUco markers, the first in the upper left corner, then row by row.
 
-    dictionary: OpenCV's name, "4X4_50" say. A point's id is {marker}.{corner}, the corner 0 being the marker's upper
-    left one, then clockwise.
+    dictionary: OpenCV's name, e.g. "4X4_50". A point's id is {marker}.{corner}; corner 0 is the marker's upper left
+    one, then clockwise.
     """
 
     dictionary: str
@@ -108,7 +108,7 @@ class ArucoSpec(_Spec):
     gap_mm: float
     first_marker: int = 0
     fewest = 1
-    border_modules: ClassVar[int] = 1  # of a marker, about its code
+    border_modules: ClassVar[int] = 1  # modules of black border around a marker's code
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -116,7 +116,7 @@ class ArucoSpec(_Spec):
 
     @property
     def modules(self) -> int:
-        """Along the side of a marker."""
+        """Number of modules along the side of a marker."""
         return int(aruco_dictionary(self.dictionary).markerSize) + 2 * self.border_modules
 
     def marker(self, row: int, column: int) -> int:
@@ -131,10 +131,10 @@ class ArucoSpec(_Spec):
 
 @dataclass(frozen=True)
 class AprilGridSpec(ArucoSpec):
-    """Kalibr's grid of AprilTags: two modules of border, or one as some programs print it, a dark square in each gap
-    that touches the markers' corners, the first marker in the LOWER left corner, then row by row upwards.
+    """Kalibr's grid of AprilTags. The first marker is in the LOWER left corner, then row by row upwards.
 
-    Corners are named as those of `ArucoSpec`.
+    Markers have two modules of border, or one as some programs print it. A dark square in each gap touches the markers'
+    corners. Corners are named as in `ArucoSpec`.
     """
 
     border_modules = 2
@@ -146,9 +146,9 @@ class AprilGridSpec(ArucoSpec):
 
 @dataclass(frozen=True)
 class SquareGridSpec(_Spec):
-    """A grid of columns x rows separate dark squares, as Zhang's pattern.
+    """Grid of columns x rows separate dark squares, like Zhang's pattern.
 
-    A point's id is r{row}c{column}.{corner}, row 0 the upper one, the corner 0 being the square's upper left one, then
+    A point's id is r{row}c{column}.{corner}; row 0 is the upper one, corner 0 the square's upper left one, then
     clockwise.
     """
 
@@ -163,7 +163,7 @@ class SquareGridSpec(_Spec):
 
     @staticmethod
     def square_name(place: tuple[int, int]) -> str:
-        """Of a square by its row and column."""
+        """Name of the square at (row, column)."""
         return f"r{place[0]}c{place[1]}"
 
     def object_points(self) -> dict[str, Point3]:
@@ -174,11 +174,11 @@ class SquareGridSpec(_Spec):
 
 @dataclass(frozen=True)
 class CharucoSpec(_Spec):
-    """A chessboard of columns x rows SQUARES with ArUco markers in its white ones, as OpenCV prints it.
+    """ChArUco board: chessboard of columns x rows SQUARES with ArUco markers in the white ones, as printed by OpenCV.
 
-    A point's id is c{number} of the inner corner, row by row from the upper left one. legacy: whether the board has the
-    layout of OpenCV before 4.6, a marker in the upper left square where the rows are even; None: the markers tell it.
-    first_id: the number of the first marker.
+    A point's id is c{number} of the inner corner, row by row from the upper left one. legacy: layout of OpenCV before
+    4.6, with a marker in the upper left square if the number of rows is even; None: determined from the markers.
+    first_id: number of the first marker.
     """
 
     dictionary: str
@@ -207,7 +207,7 @@ BoardSpec = ChessboardSpec | CircleGridSpec | ArucoSpec | CharucoSpec | SquareGr
 
 
 def _corners(columns: int, rows: int, side_mm: float, gap_mm: float) -> dict[tuple[int, int, int], Point3]:
-    """By row, column and corner: those of squares side by side, clockwise from the upper left one of each."""
+    """Object points by (row, column, corner) of separate squares, clockwise from the upper left corner of each."""
     step = side_mm + gap_mm
     top = (rows - 1) * step + side_mm
     corners = ((0.0, 0.0), (side_mm, 0.0), (side_mm, side_mm), (0.0, side_mm))
@@ -218,7 +218,7 @@ def _corners(columns: int, rows: int, side_mm: float, gap_mm: float) -> dict[tup
 
 
 def aruco_dictionary(name: str) -> cv2.aruco.Dictionary:
-    """OpenCV's predefined dictionary of that name, with or without DICT_ before it."""
+    """OpenCV's predefined dictionary of that name, with or without the prefix DICT_."""
     code = getattr(cv2.aruco, "DICT_" + name.upper().removeprefix("DICT_"), None)
     if code is None:
         known = ", ".join(sorted(known[5:] for known in dir(cv2.aruco) if known.startswith("DICT_")))
@@ -236,8 +236,8 @@ def _check_markers(name: str, first: int, count: int) -> None:
 
 @dataclass(frozen=True)
 class FoundCorner:
-    """A corner to a pixel. center_px (2,) in the scan; steps_px (2, 2): its columns are the sides of the square that
-    begins here (its right and its lower neighbour), or of the marker: the edges leaving the corner."""
+    """Corner detected to about a pixel. center_px (2,) in the scan; steps_px (2, 2): its columns are the edges that
+    leave the corner, to the right and lower neighbour or along the sides of a marker."""
 
     center_px: Array
     steps_px: Array
@@ -245,10 +245,18 @@ class FoundCorner:
 
 @dataclass(frozen=True)
 class FoundBoard:
-    """The corners found, by id; none, and the reason why; refused: the markers that were read and are not used, by
-    number, and why; off_corners: the corners that do not lie where the markers beside them put them, and why;
-    others_px: the middles of further boards that look the same; notes: what the user should know; is_mirrored: whether
-    the picture shows the board as a mirror does."""
+    """Board found in a scan.
+
+    Attributes
+    ----------
+    corners : by id; empty if the board was not found.
+    reason : why it was not found.
+    refused : by number, markers that were read but are not used, with the reason.
+    off_corners : by id, corners that contradict the adjacent markers, with the reason.
+    others_px : centres of further boards that look the same.
+    notes : messages to the user.
+    is_mirrored : whether the image shows the board mirrored.
+    """
 
     corners: dict[str, FoundCorner]
     reason: Reason = NO_REASON
@@ -259,7 +267,7 @@ class FoundBoard:
     is_mirrored: bool = False
 
     def mirrored(self, width_px: int) -> "FoundBoard":
-        """The board of a picture of which this is the mirror image, left to right."""
+        """Convert to the board of the image mirrored left to right."""
         sign = np.array([-1.0, 1.0])
         corners = {
             name: FoundCorner(corner.center_px * sign + [width_px - 1, 0], corner.steps_px * sign[:, None])
@@ -269,7 +277,7 @@ class FoundBoard:
 
 
 def corners_of_square(name: str, corners: Array) -> dict[str, FoundCorner]:
-    """The four corners (4, 2) of a square or marker, with its sides that leave them."""
+    """Convert the four corners (4, 2) of a square or marker to FoundCorners, with the sides that leave them."""
     found = {}
     for index, corner in enumerate(corners):
         sides = np.stack([corners[(index + 1) % 4] - corner, corners[(index - 1) % 4] - corner], axis=-1)
