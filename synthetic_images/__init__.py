@@ -1,1 +1,1 @@
-"""Scenes in, film scans and their truth out."""
+"""Rendering of synthetic film scans with their true values."""

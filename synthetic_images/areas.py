@@ -1,7 +1,7 @@
-"""Areas bounded by outlines, and how much of every pixel they cover, exactly.
+"""Areas bounded by outlines, and their exact coverage of pixels.
 
-An area is a tuple of closed outlines, each an (n, 2) array. Outlines of one area may lie side by side, and one that
-runs the other way round is a hole; outlines of different areas may overlap.
+An area is a tuple of closed outlines, each an (n, 2) array. Outlines of one area must not overlap; one of opposite
+orientation is a hole. Different areas may overlap.
 """
 
 import numpy as np
@@ -12,15 +12,25 @@ Cover = NDArray[np.float32]
 Point = tuple[float, float]
 Area = tuple[Array, ...]
 
-CIRCLE_VERTICES = 256  # a disk of 100 px radius is then true to 0.008 px everywhere, and its centre exactly
+CIRCLE_VERTICES = 256  # the outline of a disk of 100 px radius is accurate to 0.008 px, its centre is exact
 
 
 def coverage(areas: tuple[Area, ...], col0: int, row0: int, width: int, height: int, fold: int = 1) -> Cover:
-    """The share of every pixel of a window that the union of the areas covers: (height * fold, width * fold), 0 to 1.
+    """Coverage of the pixels of a window by the union of areas.
 
-    areas: outlines in (column, row) px, the centre of the top-left pixel being (0, 0); fold: every pixel is divided
-    into fold x fold. One area is integrated exactly (the signed area right of every piece of outline); where several
-    overlap, only pixels that edges of two of them cut are not exact.
+    Parameters
+    ----------
+    areas : outlines in (column, row), px; the centre of the top-left pixel is (0, 0).
+    fold : each pixel is divided into fold x fold.
+
+    Returns
+    -------
+    (height * fold, width * fold) covered fractions, 0 to 1.
+
+    Notes
+    -----
+    A single area is integrated exactly, by the signed area to the right of each piece of outline. For several areas,
+    pixels crossed by edges of two of them are approximate.
     """
     covered = _exact(areas[0], col0, row0, width, height, fold)
     for area in areas[1:]:
@@ -29,7 +39,7 @@ def coverage(areas: tuple[Area, ...], col0: int, row0: int, width: int, height: 
 
 
 def bounds(areas: tuple[Area, ...]) -> tuple[int, int, int, int]:
-    """The window (col0, row0, width, height) of all pixels that the areas touch."""
+    """Window (col0, row0, width, height) of all pixels that the areas touch."""
     vertices = np.concatenate([outline for area in areas for outline in area])
     low = np.floor(vertices.min(axis=0) + 0.5).astype(int)
     high = np.floor(vertices.max(axis=0) + 0.5).astype(int) + 1
@@ -37,7 +47,7 @@ def bounds(areas: tuple[Area, ...]) -> tuple[int, int, int, int]:
 
 
 def centroid(area: Area) -> Array:
-    """(2,) the centre of gravity of an area, exactly."""
+    """(2,) exact centroid of an area."""
     total, moment = 0.0, np.zeros(2)
     for outline in area:
         origin = outline[0]
@@ -50,20 +60,20 @@ def centroid(area: Area) -> Array:
 
 
 def disk(center: Point, radius: float) -> Area:
-    """A filled circle."""
+    """Filled circle."""
     angle = np.arange(CIRCLE_VERTICES) * (2 * np.pi / CIRCLE_VERTICES)
     return (np.asarray(center) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1),)
 
 
 def ring(center: Point, radius: float, line: float) -> Area:
-    """A circle drawn with a line whose middle has the radius."""
+    """Circle drawn with a line; radius: of the middle of the line, line: its width."""
     if line >= 2 * radius:
         return disk(center, radius + line / 2)
     return (*disk(center, radius + line / 2), disk(center, radius - line / 2)[0][::-1])
 
 
 def bar(start: Point, end: Point, line: float) -> Area:
-    """A straight line with square ends. Raises ValueError where it has no length."""
+    """Straight line with square ends. Raises ValueError if it has no length."""
     a, b = np.asarray(start, float), np.asarray(end, float)
     along = b - a
     if not along.any():
@@ -73,12 +83,12 @@ def bar(start: Point, end: Point, line: float) -> Area:
 
 
 def polygon(vertices: tuple[Point, ...]) -> Area:
-    """A filled simple polygon."""
+    """Filled simple polygon."""
     return (np.asarray(vertices, float),)
 
 
 def rounded_rectangle(half: Array, radius: float) -> Array:
-    """The outline of a rectangle of half sizes (2,) about the origin, its corners rounded."""
+    """Outline of a rectangle with rounded corners, centred on the origin; half: (2,) half sizes."""
     corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * half
     if radius == 0.0:
         return corners
@@ -91,21 +101,21 @@ def rounded_rectangle(half: Array, radius: float) -> Array:
 
 
 def stroke(path: Array, line: float) -> Area:
-    """A curved line of constant width along an (n, 2) path."""
+    """Curved line of constant width along an (n, 2) path."""
     along = np.gradient(path, axis=0)
     across = np.stack([-along[:, 1], along[:, 0]], axis=1) * (line / 2 / np.hypot(along[:, 0], along[:, 1]))[:, None]
     return (np.concatenate([path + across, (path - across)[::-1]]),)
 
 
 def subdivided(outline: Array, pieces: int) -> Array:
-    """The same outline with every edge cut in pieces, so that it can follow a curved map."""
+    """Divide each edge of an outline into pieces, so that it can follow a curved mapping."""
     share = np.arange(pieces)[None, :, None] / pieces
     edges = outline[:, None, :] * (1 - share) + np.roll(outline, -1, axis=0)[:, None, :] * share
     return np.asarray(edges.reshape(-1, 2))
 
 
 def _exact(area: Area, col0: int, row0: int, width: int, height: int, fold: int) -> Cover:
-    """Coverage of an area in pixels of 1/fold of the size, by the signed area right of each piece of outline."""
+    """Coverage of pixels of 1/fold of the size by one area, from the signed area to the right of each outline piece."""
     columns, rows = width * fold, height * fold
     corner = np.array([col0 - 0.5, row0 - 0.5])
     starts = np.concatenate([(outline - corner) * fold for outline in area])
@@ -125,13 +135,13 @@ def _exact(area: Area, col0: int, row0: int, width: int, height: int, fold: int)
         np.concatenate([fall * (1 - share), fall * share]),
         rows * (columns + 1),
     ).reshape(rows, columns + 1)
-    # Rounding leaves 1e-13 behind a closed outline; a mirrored one runs backwards and gives negative areas.
+    # abs: mirrored outlines have the opposite orientation and give negative areas; rounding leaves about 1e-13.
     covered = np.abs(np.cumsum(changes[:, :columns], axis=1))
     return np.asarray(np.minimum(covered, 1.0), np.float32)
 
 
 def _between_rows(starts: Array, ends: Array, rows: int) -> tuple[Array, Array]:
-    """The parts of the edges between row 0 and the last row; what lies above or below covers nothing here."""
+    """Clip edges to the rows of the window; the parts above and below cover nothing."""
     low, high = np.minimum(starts[:, 1], ends[:, 1]), np.maximum(starts[:, 1], ends[:, 1])
     crossing = (high > 0) & (low < rows) & (high > low)
     starts, ends = starts[crossing], ends[crossing]
@@ -141,7 +151,7 @@ def _between_rows(starts: Array, ends: Array, rows: int) -> tuple[Array, Array]:
 
 
 def _cut_at_pixel_sides(starts: Array, ends: Array, columns: int, rows: int) -> tuple[Array, Array]:
-    """The edges cut wherever they cross a pixel's side, so that each piece lies in one pixel."""
+    """Cut edges where they cross pixel borders, so that each piece lies within one pixel."""
     step = ends - starts
     edges, shares = [np.arange(len(starts)), np.arange(len(starts))], [np.zeros(len(starts)), np.ones(len(starts))]
     for axis, last in ((0, columns), (1, rows)):

@@ -1,4 +1,4 @@
-"""What the targets stand in: a plain or rough wall, or a landscape of fields, woods and roads seen from the air."""
+"""Image background: a plain or rough wall, or an aerial view of fields, woods and roads."""
 
 from dataclasses import dataclass
 
@@ -14,24 +14,24 @@ from synthetic_images.terrain import ground_width, object_from_pixel
 Array = NDArray[np.float64]
 Picture = NDArray[np.float32]
 
-TEXEL_PX = 3.0  # scan pixels that one pixel of the texture covers
+TEXEL_PX = 3.0  # px of the scan per texture pixel
 LEAST_TEXTURE_PX = 1024
-MOST_TEXTURE_PX = 3072  # its making takes 0.3 GB; a frame of more than some 9000 pixels sees it repeat itself
-PARCEL_PX = 90  # about the width of a parcel
-MARGIN_PX = 256  # beyond which hardly any pixel has the parcel nearest to it
-NODE_PX = 8  # between pixels whose rays are followed to the terrain; those between are interpolated
+MOST_TEXTURE_PX = 3072  # px; making it takes 0.3 GB; in frames of more than about 9000 px it repeats
+PARCEL_PX = 90  # texture px, approximate width of a parcel
+MARGIN_PX = 256  # texture px; hardly any pixel is farther from the nearest seed of a parcel
+NODE_PX = 8  # px, spacing of the rays intersected with the terrain; pixels in between are interpolated
 
 
 @dataclass(frozen=True, eq=False)
 class Background:
-    """A texture that repeats itself. texture: shares of full scale; texel: its pixel, object units or mm on film."""
+    """Periodic texture. texture: fractions of full scale; texel: size of its pixels, object units or mm on film."""
 
     scene: Scene
     texture: Picture
     texel: float
 
     def rows(self, geometry: FrameGeometry, row0: int, height: int) -> Picture:
-        """(height, width) of the scan from row0 on, as if the whole scan were exposed."""
+        """(height, width) background of rows from row0 on, as if the whole scan were exposed."""
         if self.scene.background == "terrain":
             return self._terrain_rows(geometry, row0, height)
         texture_from_pixel = np.diag([1 / self.texel, 1 / self.texel, 1.0]) @ geometry.camera_from_pixel
@@ -42,7 +42,7 @@ class Background:
         return np.asarray(picture, np.float32)
 
     def _terrain_rows(self, geometry: FrameGeometry, row0: int, height: int) -> Picture:
-        """The terrain's own texture where the rays meet it, distortion, film and relief included."""
+        """Texture at the intersections of the rays with the terrain; includes distortion, film and relief."""
         first = row0 // NODE_PX
         rows = np.arange(first - 1, (row0 + height - 1) // NODE_PX + 3) * NODE_PX
         columns = np.arange(-1, (geometry.width_px - 1) // NODE_PX + 3) * NODE_PX
@@ -50,14 +50,14 @@ class Background:
         plan = object_from_pixel(geometry, nodes)[:, :2].reshape(len(rows), len(columns), 2)
         coordinates = _between(_between(plan.transpose(2, 0, 1) / self.texel).transpose(0, 2, 1)).transpose(0, 2, 1)
         inner = coordinates[:, row0 - first * NODE_PX :][:, :height, : geometry.width_px]
-        # Only the sky has no terrain; single precision is enough within the texture.
+        # Only rays above the horizon miss the terrain; single precision is enough within the texture.
         x, y = np.mod(np.nan_to_num(inner), len(self.texture)).astype(np.float32)
         return np.asarray(cv2.remap(self.texture, x, y, cv2.INTER_LINEAR, None, cv2.BORDER_WRAP), np.float32)
 
 
 def _between(nodes: Array) -> Array:
-    """Values at every pixel of the last axis from those at every NODE_PX-th, by cubics through four (Lagrange); the
-    first and the last two nodes only lend their values."""
+    """Interpolate the last axis from every NODE_PX-th pixel to every pixel, by cubic Lagrange polynomials through four
+    nodes; the first and the last two nodes serve as support only."""
     t = np.arange(NODE_PX) / NODE_PX
     weights = np.stack(
         [
@@ -72,7 +72,7 @@ def _between(nodes: Array) -> Array:
 
 
 def scene_background(scene: Scene) -> Background:
-    """The background of all frames of a scene."""
+    """Background of all frames of a scene."""
     tones = scene.tones
     texel = TEXEL_PX * max(scene.scanner.pitch_um) / 1000
     if scene.background == "plain":
@@ -90,20 +90,20 @@ def scene_background(scene: Scene) -> Background:
 
 
 def _block_width(scene: Scene) -> float:
-    """The longer side of the ground that all frames show together, were they vertical."""
+    """Longer side of the ground covered by all frames, taken as vertical; object units."""
     stations = np.array([image.exterior[:2] for image in scene.images])
     return float(np.ptp(stations, axis=0).max()) + ground_width(scene)
 
 
 def _texture_size(width_px: float) -> int:
-    """A power of two in which so much has room, within limits."""
+    """Power of two that is at least width_px, within limits."""
     return int(np.clip(2 ** np.ceil(np.log2(width_px)), LEAST_TEXTURE_PX, MOST_TEXTURE_PX))
 
 
 def _landscape(generator: np.random.Generator, size: int) -> Picture:
-    """Parcels with their own tones, woods, roads along some of their sides.
+    """Parcels of different tones, woods, and roads along some parcel borders.
 
-    In single precision and one sheet at a time: making it is to take no more memory than a large frame does.
+    Single precision and in-place operations, so that it takes no more memory than rendering a large frame.
     """
     parcels, road, count = _parcels(generator, size)
     tones, are_woods = generator.normal(0.0, 0.7, count).astype(np.float32), generator.random(count) < 0.3
@@ -118,14 +118,13 @@ def _landscape(generator: np.random.Generator, size: int) -> Picture:
 
 
 def _parcels(generator: np.random.Generator, size: int) -> tuple[NDArray[np.int16], NDArray[np.bool_], int]:
-    """Which parcel every pixel belongs to (that of the nearest of some random places), where roads run, and how many
-    parcels there are."""
+    """Parcel index of each pixel (Voronoi cells of random seeds), mask of the roads, and number of parcels."""
     count = round((size / PARCEL_PX) ** 2)
     places = generator.choice(size**2, count, replace=False)
     owner = np.full(size**2, -1, np.int16)
     owner[places] = np.arange(count)
     straight, distance = _nearest(np.pad(owner.reshape(size, size), MARGIN_PX, mode="wrap"))
-    # Sides that wind a little, as they do on the ground.
+    # Slightly winding borders, as in nature.
     along = np.arange(MARGIN_PX, MARGIN_PX + size, dtype=np.float32)
     x, y = _rough(generator, size, 1.4), _rough(generator, size, 1.4)
     x *= 5
@@ -139,7 +138,7 @@ def _parcels(generator: np.random.Generator, size: int) -> tuple[NDArray[np.int1
 
 
 def _nearest(owner: NDArray[np.int16]) -> tuple[NDArray[np.int16], Picture]:
-    """The owner of the nearest pixel that has one (0 and up), and how far that is, at every pixel."""
+    """Owner of the nearest pixel that has one (0 and up), and the distance to it, for every pixel."""
     distance, labels = cv2.distanceTransformWithLabels(
         (owner < 0).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
@@ -150,7 +149,7 @@ def _nearest(owner: NDArray[np.int16]) -> tuple[NDArray[np.int16], Picture]:
 
 
 def _rough(generator: np.random.Generator, size: int, exponent: float) -> Picture:
-    """Noise of unit rms whose amplitude falls with frequency to the power `exponent`; it joins itself at the sides."""
+    """Periodic noise of unit RMS with amplitudes proportional to frequency to the power -exponent."""
     white = np.empty((size, size), np.float32)
     for row in white:
         row[:] = generator.standard_normal(size)

@@ -1,4 +1,4 @@
-"""A scanner that bends its scans: how far it puts a point beside its place, in polynomials over the bed."""
+"""Geometric error of a scanner: displacement of points, as Legendre polynomials over the bed."""
 
 import re
 from collections.abc import Mapping
@@ -10,15 +10,18 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-HIGHEST = 6  # degree in x and in y
-STEPS = 12  # of the inversion, each a thousandth of the one before
+HIGHEST = 6  # highest degree in x and in y
+STEPS = 12  # iterations of the inversion; each reduces the error by a factor of about a thousand
 
 
 @dataclass(frozen=True)
 class Bend:
-    """terms_um: by name: the factor of P_m P_n in x is "a" with the degrees m in x and n in y, in y it is "b".
+    """Geometric error of a scanner.
 
-    size_mm: the bed is a square of this size, whose upper left corner is the origin of the comparator.
+    Attributes
+    ----------
+    terms_um : coefficients of the Legendre products P_m(x) P_n(y) by name: "amn" for the displacement in x, "bmn" in y.
+    size_mm : side of the square bed, whose upper left corner is the origin of the comparator.
     """
 
     terms_um: Mapping[str, float]
@@ -29,7 +32,7 @@ class Bend:
         return self.size_mm / 2, -self.size_mm / 2
 
     def displacement_mm(self, scan_mm: Array) -> Array:
-        """(n, 2) scan less place of points whose coordinates in the scan (n, 2) are given."""
+        """(n, 2) displacement, scan minus bed, at scan coordinates (n, 2)."""
         across, up = ((scan_mm - self.center_mm) / (self.size_mm / 2)).T
         factors = np.zeros((2, HIGHEST + 1, HIGHEST + 1))
         for name, value in self.terms_um.items():
@@ -37,7 +40,7 @@ class Bend:
         return np.stack([legval2d(across, up, one) for one in factors], axis=1)
 
     def scan_from_bed(self, bed_mm: Array) -> Array:
-        """(n, 2) the coordinates that the scanner gives to places (n, 2) on its bed."""
+        """Convert places (n, 2) on the bed to scan coordinates (n, 2)."""
         scan_mm = bed_mm
         for _ in range(STEPS):
             scan_mm = bed_mm + self.displacement_mm(scan_mm)

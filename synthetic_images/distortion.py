@@ -1,4 +1,7 @@
-"""Corrections of the observed or the ideal camera point, as the papers define them; OpenCV distorts the ray itself."""
+"""Distortion corrections of the observed or the ideal image point, as the papers define them.
+
+OpenCV's models, which distort the ray itself, are in `projection`.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,13 +12,14 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 MM_PER_DM = 100.0
-JUHL_UNIT = 1e-5  # a micrometre in dm
+JUHL_UNIT = 1e-5  # dm, 1 µm
 
 
 def correction(distortion: Distortion, reduced: ComplexArray, point: Array) -> ComplexArray:
-    """(n, 2) what is subtracted from an observed point to get the ideal one, mm; with aicon from the ideal one.
+    """(n, 2) correction, mm: ideal = observed - correction, evaluated at the observed point; for aicon at the ideal
+    one.
 
-    reduced (n, 2): camera coordinates less the principal point (2,). Complex for derivatives by complex steps.
+    reduced: (n, 2) camera coordinates minus the principal point (2,). Complex, for complex-step derivatives.
     """
     value = dict.fromkeys(PARAMETERS[distortion.family], 0.0) | dict(distortion.parameters)
     families = {"torlegard": _torlegard, "brown": _brown, "australis": _australis, "aicon": _aicon, "juhl": _juhl}
@@ -44,7 +48,7 @@ def _brown(_: Distortion, value: dict[str, float], reduced: ComplexArray, __: Ar
 
 
 def _australis(_: Distortion, value: dict[str, float], reduced: ComplexArray, __: Array) -> ComplexArray:
-    """Added to the observed point."""
+    """The published terms are added to the observed point, hence the sign."""
     x, y = reduced.T
     r2 = x * x + y * y
     radial = value["k1"] * r2 + value["k2"] * r2**2 + value["k3"] * r2**3
@@ -54,7 +58,7 @@ def _australis(_: Distortion, value: dict[str, float], reduced: ComplexArray, __
 
 
 def _aicon(distortion: Distortion, value: dict[str, float], reduced: ComplexArray, _: Array) -> ComplexArray:
-    """Added to the ideal point, which is what is given here."""
+    """The published terms are added to the ideal point, which `reduced` is here."""
     x, y = reduced.T
     r2, zero2 = x * x + y * y, distortion.r0_mm**2
     radial = sum(value[f"a{n}"] * (r2**n - zero2**n) for n in (1, 2, 3))
@@ -64,10 +68,10 @@ def _aicon(distortion: Distortion, value: dict[str, float], reduced: ComplexArra
 
 
 def _juhl(distortion: Distortion, value: dict[str, float], reduced: ComplexArray, point: Array) -> ComplexArray:
-    """Program sANA: about the camera's origin, in dm, and added to the observed point."""
+    """Program sANA: relative to the camera's origin, in dm; terms added to the observed point."""
     x, y = np.asarray((reduced + point).T / MM_PER_DM, np.complex128)
     r0 = distortion.r0_mm / MM_PER_DM
-    r = np.sqrt(x * x + y * y + 1e-40)  # the origin itself has no bearing, and no deformation
+    r = np.sqrt(x * x + y * y + 1e-40)  # avoids 0 / 0 at the origin
     cos, sin = x / r, y / r
     cos2, sin2 = cos * cos - sin * sin, 2 * sin * cos
     tangential = r**1.85 * (value["t1"] * cos + value["t2"] * sin + value["t3"] * cos2 + value["t4"] * sin2)

@@ -1,4 +1,4 @@
-"""From the camera frame through the film and the scanner to pixels."""
+"""Transformation from camera coordinates via film and scanner to pixels."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,18 +13,21 @@ from synthetic_images.scene import Film, Scene, SceneImage, TakingLens
 
 Array = NDArray[np.float64]
 
-WAVES = 6  # of the smooth deformation
-LENS_STEPS = 12  # of the inversion of a taking lens, each a tenth of the one before or less
-INVERSION_STEPS = 5  # of the smooth deformation, each a ten-thousandth of the one before
+WAVES = 6  # sine waves of the smooth deformation
+LENS_STEPS = 12  # iterations of the inversion of a taking lens; each reduces the error by a factor of ten or more
+INVERSION_STEPS = 5  # iterations of the inversion of the smooth deformation; each by a factor of about ten thousand
 
 
 @dataclass(frozen=True, eq=False)
 class FrameGeometry:
-    """Where things of one frame come to lie in its scan.
+    """Geometry of one frame: mapping between camera frame, object and scan.
 
-    width_px, height_px: of the scan. comparator_from_camera: (3, 3), of homogeneous coordinates, exact where film has
-    no smooth deformation and the scanner no bend and no lens.
-    amplitudes_mm, waves_per_mm (WAVES, 2), phases_rad (WAVES,): the smooth deformation, a sum of sines.
+    Attributes
+    ----------
+    width_px, height_px : size of the scan.
+    comparator_from_camera : (3, 3) homography; exact without smooth film deformation, scanner error and taking lens.
+    amplitudes_mm, waves_per_mm : (WAVES, 2) amplitudes and wave vectors of the smooth film deformation, a sum of sines.
+    phases_rad : (WAVES,) its phases.
     """
 
     scene: Scene
@@ -37,7 +40,7 @@ class FrameGeometry:
     phases_rad: Array
 
     def pixel_from_camera(self, camera_mm: Array) -> Array:
-        """(n, 2) column and row of points (n, 2) of the camera frame."""
+        """Convert camera coordinates (n, 2), mm, to column and row (n, 2)."""
         film = camera_mm + self.deformation_mm(camera_mm)
         comparator = _projected(self.comparator_from_camera, film)
         if self.bend.terms_um:
@@ -47,7 +50,7 @@ class FrameGeometry:
         return pixels if lens is None else self._distort(lens, pixels)
 
     def _distort(self, lens: TakingLens, pixels: Array) -> Array:
-        """(n, 2) where the lens puts pixels (n, 2) of a picture without distortion."""
+        """Distort ideal pixel coordinates (n, 2) by the taking lens (OpenCV's formulas)."""
         middle = (self.width_px - 1) / 2, (self.height_px - 1) / 2
         center = np.asarray(lens.center_px or middle)
         x, y = ((pixels - center) / lens.focal_px).T
@@ -58,11 +61,11 @@ class FrameGeometry:
         return np.asarray(np.stack([distorted_x, distorted_y], axis=1) * lens.focal_px + center, np.float64)
 
     def pixel_from_object(self, points: Array) -> Array:
-        """(n, 2) column and row of object points (n, 3); nan where they cannot be imaged."""
+        """Project object points (n, 3) to column and row (n, 2); nan if not imaged."""
         return self.pixel_from_camera(camera_from_object(self.scene.camera, self.image.exterior, points))
 
     def camera_from_scan(self, pixels: Array) -> Array:
-        """(n, 2) points of the camera frame from column and row (n, 2), the inverse of `pixel_from_camera`."""
+        """Convert column and row (n, 2) to camera coordinates (n, 2), the inverse of `pixel_from_camera`."""
         lens, seen = self.scene.scanner.lens, pixels
         if lens is not None:
             for _ in range(LENS_STEPS):
@@ -76,14 +79,15 @@ class FrameGeometry:
         return np.asarray(camera_mm)
 
     def straight_camera_from_scan(self, pixels: Array) -> Array:
-        """The same without the smooth deformation and the scanner's bend."""
+        """Convert column and row to camera coordinates by the homography alone, without film deformation, scanner error
+        and taking lens."""
         return _projected(self.camera_from_pixel, pixels)
 
     def pixel_area(self, camera_mm: Area) -> Area:
         return tuple(self.pixel_from_camera(outline) for outline in camera_mm)
 
     def deformation_mm(self, camera_mm: Array) -> Array:
-        """(n, 2) how far the smooth deformation moves points of the camera frame."""
+        """(n, 2) displacement by the smooth film deformation at camera coordinates (n, 2)."""
         return np.asarray(np.sin(camera_mm @ self.waves_per_mm.T + self.phases_rad) @ self.amplitudes_mm)
 
     @cached_property
@@ -92,12 +96,12 @@ class FrameGeometry:
 
     @cached_property
     def camera_from_pixel(self) -> Array:
-        """(3, 3) the camera frame from column, row, 1, without the smooth deformation and the scanner's bend."""
+        """(3, 3) homography from (column, row, 1) to the camera frame, without film deformation and scanner error."""
         return self.camera_from_comparator @ np.diag([*(1 / self._pixel_per_mm), 1.0])
 
     @cached_property
     def camera_from_comparator(self) -> Array:
-        """(3, 3) the truth that an adjustment seeks."""
+        """(3, 3) true film transformation, to be estimated by an adjustment."""
         matrix = np.linalg.inv(self.comparator_from_camera)
         return np.asarray(matrix / matrix[2, 2], np.float64)
 
@@ -107,7 +111,7 @@ class FrameGeometry:
 
 
 def frame_geometry(scene: Scene, index: int) -> FrameGeometry:
-    """The geometry of one frame: the film's own transformation, then mirror, turn and place on the scanner's bed."""
+    """Geometry of one frame: film transformation, then mirroring, rotation and position on the scanner bed."""
     image, film = scene.images[index], scene.images[index].film
     whole_px, height_px = _scan_size(scene, image)
     first_px, end_px = (round(share * whole_px) for share in image.part)
@@ -121,7 +125,7 @@ def frame_geometry(scene: Scene, index: int) -> FrameGeometry:
     bed_from_photograph[:2, :2] = bed_from_film
     shift = bed_from_film @ np.asarray(film.shift_mm) + center + np.asarray(image.offset_mm)
     bed_from_photograph[:2, 2] = shift
-    frames = [each.frame for each in scene.images]  # the film deforms once, however many scans there are of it
+    frames = [each.frame for each in scene.images]  # all scans of a frame share its deformation
     generator = np.random.default_rng([scene.seed, frames.index(image.frame), 1])
     directions = generator.uniform(0, 2 * np.pi, WAVES)
     waves = 2 * np.pi / (generator.uniform(0.6, 1.6, WAVES) * max(scene.camera.frame_mm))
@@ -132,7 +136,7 @@ def frame_geometry(scene: Scene, index: int) -> FrameGeometry:
         width_px=end_px - first_px,
         height_px=height_px,
         comparator_from_camera=bed_from_photograph @ photograph_from_film(scene.film) @ film_from_camera,
-        # A sine's mean square is 1/2, and the waves' squares add up.
+        # The mean square of a sine is 1/2, and those of the waves add up.
         amplitudes_mm=generator.normal(size=(WAVES, 2)) * rms_mm * np.sqrt(2 / WAVES),
         waves_per_mm=np.stack([np.cos(directions), np.sin(directions)], axis=1) * waves[:, None],
         phases_rad=generator.uniform(0, 2 * np.pi, WAVES),
@@ -140,7 +144,7 @@ def frame_geometry(scene: Scene, index: int) -> FrameGeometry:
 
 
 def photograph_from_film(film: Film) -> Array:
-    """(3, 3) the picture of a film in its own scale, taken by a camera that was tilted about a line in the film."""
+    """(3, 3) homography of a film photographed at its own scale by a camera tilted around a line in the film."""
     tilt_rad, direction = np.deg2rad(film.tilt_deg), turn(np.deg2rad(film.tilt_direction_deg))
     tilted = np.diag([np.cos(tilt_rad), 1.0, 1.0])
     tilted[2, 0] = np.sin(tilt_rad) / film.photographed_from_mm
@@ -155,18 +159,19 @@ def _projected(matrix: Array, points: Array) -> Array:
 
 
 def scanner_bend(scene: Scene) -> Bend:
-    """The bend of the scene's scanner, over a square bed that holds the scans of all frames, however they are laid."""
+    """Geometric error of the scene's scanner, over a square bed that holds the scans of all frames in any
+    orientation."""
     return Bend(scene.scanner.bend_um, max(scene.camera.frame_mm) + 2 * scene.scanner.margin_mm)
 
 
 def turn(angle_rad: float) -> Array:
-    """Counter-clockwise turn."""
+    """(2, 2) counter-clockwise rotation."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([[c, -s], [s, c]])
 
 
 def _quarter_turn(pose: str) -> Array:
-    """The counter-clockwise turn that a pose names, exactly."""
+    """(2, 2) exact counter-clockwise rotation of a scan orientation (pose)."""
     return np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), int(pose.rstrip("m")) // 90)
 
 

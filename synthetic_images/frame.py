@@ -1,4 +1,4 @@
-"""One frame as it is painted: exposed parts, field, fiducials, damage; and the truth of where its marks lie."""
+"""Content of one frame: exposed parts, target field, fiducials and damage, and the true positions of its marks."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -34,14 +34,14 @@ from synthetic_images.writing import written_area
 
 Array = NDArray[np.float64]
 
-EDGE_PIECES = 64  # of the frame's edges, which a smooth deformation bends
-TAPE_MM = 3.0  # half the edge of the tape over a covered fiducial
+EDGE_PIECES = 64  # pieces of each frame edge, which the film deformation bends
+TAPE_MM = 3.0  # mm, half the side of the tape over a covered fiducial
 BOARD_WHITE, BOARD_BLACK = 0.8, 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """exposed: the parts of the scan that light has reached, as paints; paints: what lies on them, in this order."""
+    """Frame to be painted. exposed: exposed parts of the scan; paints: objects on top of them, in painting order."""
 
     truth: FrameTruth
     exposed: tuple[AreaPaint, ...]
@@ -49,7 +49,7 @@ class Frame:
 
 
 def make_frame(scene: Scene, index: int) -> Frame:
-    """Everything of one frame, ready to be painted."""
+    """Make the content of one frame, ready to be painted."""
     truth = frame_truth(scene, index)
     geometry = truth.geometry
     exposed = tuple(AreaPaint((geometry.pixel_area(area),), 1.0) for area in _exposed_areas(geometry))
@@ -62,14 +62,14 @@ def make_frame(scene: Scene, index: int) -> Frame:
 
 
 def frame_truth(scene: Scene, index: int) -> FrameTruth:
-    """Where the marks of one frame lie, and why some of them cannot be seen."""
+    """True positions of the marks of one frame, and why some of them are not visible."""
     geometry = frame_geometry(scene, index)
     fiducials = {fiducial.id: _fiducial_position(fiducial, geometry) for fiducial in scene.camera.fiducials}
     return FrameTruth(geometry, fiducials, _target_positions(geometry))
 
 
 def _exposed_areas(geometry: FrameGeometry) -> list[Area]:
-    """The exposed frame and the neighbour's, with the pockets of their fiducials, mm in this camera's frame."""
+    """Exposed areas of this and the neighbouring frame, with the pockets of their fiducials, camera mm."""
     half = np.asarray(geometry.scene.camera.frame_mm) / 2
     outline = subdivided(rounded_rectangle(half, geometry.scene.corner_radius_mm), EDGE_PIECES)
     outlines = [outline]
@@ -80,7 +80,7 @@ def _exposed_areas(geometry: FrameGeometry) -> list[Area]:
 
 
 def _advances(geometry: FrameGeometry) -> list[Array]:
-    """Where frames lie on the film: this one, and its neighbour."""
+    """Offsets of this frame (zero) and its neighbour on the film, mm."""
     image, frame_mm = geometry.image, np.asarray(geometry.scene.camera.frame_mm)
     shifts = [np.zeros(2)]
     if image.neighbour is not None:
@@ -98,7 +98,7 @@ def _fiducial_position(fiducial: SceneFiducial, geometry: FrameGeometry) -> Posi
 
 
 def _mark_extent(fiducial: SceneFiducial, geometry: FrameGeometry) -> tuple[int, int, int, int]:
-    """The window that the whole mark takes, its point alone where it has no drawing."""
+    """Window of the whole mark; of its point alone if it has no drawing."""
     paint = next(_mark_paints(fiducial, np.zeros(2), geometry), None)
     if isinstance(paint, AreaPaint):
         return bounds(paint.areas)
@@ -117,11 +117,11 @@ def _beyond_scan(geometry: FrameGeometry, window: tuple[int, int, int, int]) -> 
 
 
 def _target_positions(geometry: FrameGeometry) -> dict[str, Position]:
-    """Positions of all targets that are imaged somewhere, in the field's order."""
+    """Positions of all targets that are imaged, in the order of the field."""
     field = geometry.scene.field
     surround = max(field.surround, 1.0) if isinstance(field, DiskField) else 1.0
     positions: dict[str, Position] = {}
-    centers, reaches = np.empty((0, 2)), np.empty(0)  # of the nearer targets, with their surrounds
+    centers, reaches = np.empty((0, 2)), np.empty(0)  # of nearer targets, surrounds included
     for target in reversed(_far_to_near(geometry)):
         outline = target.center[None] if target.radius == 0.0 else disk_outline(target, figure_reach(field, target))
         pixels = geometry.pixel_from_object(np.vstack([target.center, outline]))
@@ -140,7 +140,7 @@ def _target_positions(geometry: FrameGeometry) -> dict[str, Position]:
 
 
 def _figure_center(geometry: FrameGeometry, target: Target, center: Array) -> Array:
-    """(2,) where the figure that is measured has its centre: a disk's ellipse beside the image of the disk's own."""
+    """(2,) centre of the measured figure: for a disk that of its ellipse, which is not the image of its centre."""
     field = geometry.scene.field
     if target.radius == 0.0 or (isinstance(field, DiskField) and isinstance(field.figure, CrossFigure)):
         return center
@@ -148,7 +148,7 @@ def _figure_center(geometry: FrameGeometry, target: Target, center: Array) -> Ar
 
 
 def _hidden(geometry: FrameGeometry, target: Target, outline_px: Array) -> str:
-    """Why a target alone cannot be seen whole; "" if it can."""
+    """Why a target is not wholly visible, other targets aside; "" if it is."""
     if target.normal @ (np.asarray(geometry.image.exterior[:3]) - target.center) <= 0.0:
         return "faces away"
     beyond = _beyond_scan(geometry, bounds(((outline_px,),)))
@@ -173,7 +173,7 @@ def _behind_a_fiducial(geometry: FrameGeometry, pixels: Array) -> bool:
 
 
 def _reach_mm(fiducial: SceneFiducial, geometry: FrameGeometry) -> float:
-    """How far from its point a fiducial, its pad or its tape hides what the lens shows."""
+    """Radius around a fiducial within which it, its pad or its tape hides the image."""
     reach = geometry.scene.pad_mm
     if fiducial.id in geometry.image.covered:
         reach = max(reach, TAPE_MM * np.sqrt(2))
@@ -186,13 +186,13 @@ def _reach_mm(fiducial: SceneFiducial, geometry: FrameGeometry) -> float:
 
 
 def _field_paints(geometry: FrameGeometry, positions: Mapping[str, Position]) -> Iterator[Paint]:
-    """The field, the far before the near."""
+    """Yield the paints of the target field, from far to near."""
     field, tones = geometry.scene.field, geometry.scene.tones
     if isinstance(field, BoardField):
         yield from _board_paints(geometry, field)
         return
     for target in _far_to_near(geometry):
-        # What only the frame's edge, a pad or a nearer target hides in part is painted too.
+        # Targets hidden in part by the frame's edge, a pad or a nearer target are painted too.
         if target.id not in positions or positions[target.id].hidden in ("faces away", "off the scan"):
             continue
         if field.surround:
@@ -216,7 +216,8 @@ def _board_paints(geometry: FrameGeometry, field: BoardField) -> Iterator[Paint]
 
 
 def _object_paint(geometry: FrameGeometry, areas: tuple[tuple[Array, ...], ...], tone: float) -> Iterator[Paint]:
-    """Areas of outlines (n, 3) in object space, in one paint; outlines that reach behind the camera are not seen."""
+    """Yield one paint for areas of outlines (n, 3) in object space; outlines that reach behind the camera are
+    dropped."""
     pixels = [[geometry.pixel_from_object(outline) for outline in area] for area in areas]
     seen = [tuple(outline for outline in area if np.isfinite(outline).all()) for area in pixels]
     if any(seen):
@@ -224,7 +225,7 @@ def _object_paint(geometry: FrameGeometry, areas: tuple[tuple[Array, ...], ...],
 
 
 def _fiducial_paints(geometry: FrameGeometry) -> Iterator[Paint]:
-    """Pads, marks (the neighbour's too), and tape."""
+    """Yield the paints of pads and marks, also of the neighbouring frame, and of tape."""
     scene = geometry.scene
     for advance in _advances(geometry):
         for fiducial in scene.camera.fiducials:

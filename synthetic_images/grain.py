@@ -1,4 +1,4 @@
-"""Film grain and the scanner's noise, the same for every division of the picture into strips."""
+"""Film grain and scanner noise, independent of the division of the image into strips."""
 
 from functools import lru_cache
 
@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 Picture = NDArray[np.float32]
 
 BLOCK_ROWS = 256
-REACH = 4.0  # sigmas of the grain's Gaussian
+REACH = 4.0  # half width of the grain's Gaussian kernel, in sigmas
 
 
 def white_noise(seed: tuple[int, ...], row0: int, height: int, width: int) -> Picture:
-    """Rows row0 to row0 + height of an endless picture of white noise of unit rms, which the seed decides."""
+    """Rows row0 to row0 + height of an unbounded image of white noise of unit RMS, determined by the seed."""
     first, last = row0 // BLOCK_ROWS, (row0 + height - 1) // BLOCK_ROWS
     rows = np.concatenate([_block(seed, block, width) for block in range(first, last + 1)])
     start = row0 - first * BLOCK_ROWS
@@ -21,7 +21,7 @@ def white_noise(seed: tuple[int, ...], row0: int, height: int, width: int) -> Pi
 
 
 def grain(seed: tuple[int, ...], row0: int, height: int, width: int, sigma_px: float) -> Picture:
-    """Rows of grain of unit rms: white noise after a Gaussian of sigma_px; 0: white."""
+    """Rows of grain of unit RMS: white noise filtered by a Gaussian of sigma_px; 0: white."""
     if sigma_px == 0.0:
         return white_noise(seed, row0, height, width)
     reach = int(np.ceil(REACH * sigma_px))
@@ -34,5 +34,5 @@ def grain(seed: tuple[int, ...], row0: int, height: int, width: int, sigma_px: f
 
 @lru_cache(maxsize=3)
 def _block(seed: tuple[int, ...], block: int, width: int) -> Picture:
-    """One block; strips that follow each other need their neighbours' blocks too. The halo of the first lies in -1."""
+    """Block of noise, cached since adjacent strips share blocks. Block -1 serves the margin of the first strip."""
     return np.random.default_rng([*seed, block + 1]).standard_normal((BLOCK_ROWS, width), np.float32)

@@ -1,7 +1,7 @@
-"""Areas as a scanner sees them: blurred by its optics, then averaged over every pixel's own area.
+"""Imaging of areas by a scanner: blur by the optics, then averaging over the area of each pixel.
 
-The optics come before the pixels. To blur what pixels have averaged already is not the same: sharp edges would be
-aliased, and the centre of a fine line would be off by up to 0.005 px. So edges are drawn in finer pixels.
+Blurring after the averaging would not be equivalent: sharp edges would be aliased, and the centre of a fine line would
+be wrong by up to 0.005 px. Edges are therefore rendered in finer pixels.
 """
 
 import cv2
@@ -9,22 +9,22 @@ import numpy as np
 
 from synthetic_images.areas import Area, Cover, coverage
 
-FOLD = 4  # a centre is then true to 0.0007 px for a dot of 1 px, 0.0001 px for a target of 5 px
-REACH = 5.0  # sigmas
+FOLD = 4  # fine pixels per pixel; centres are accurate to 0.0007 px for a dot of 1 px, 0.0001 px for a target of 5 px
+REACH = 5.0  # extent of the blur, in sigmas
 BLOCK_PX = 64
 
 
 def reach_px(blur_px: float) -> int:
-    """How far the optics spread an edge."""
+    """Extent of the blur of an edge, px."""
     return int(np.ceil(REACH * blur_px))
 
 
 def seen_coverage(
     areas: tuple[Area, ...], col0: int, row0: int, width: int, height: int, blur_px: float, fold: int = FOLD
 ) -> Cover:
-    """(height, width) the share of every pixel of a window that the union of the areas takes, after a Gaussian blur.
+    """(height, width) coverage of the pixels of a window by the union of areas, after a Gaussian blur.
 
-    fold: every pixel is divided into fold x fold.
+    fold: each pixel crossed by an edge is divided into fold x fold.
     """
     reach = reach_px(blur_px)
     plain = coverage(areas, col0 - reach, row0 - reach, width + 2 * reach, height + 2 * reach)
@@ -40,7 +40,7 @@ def seen_coverage(
 
 
 def _fine(areas: tuple[Area, ...], col0: int, row0: int, width: int, height: int, blur_px: float, fold: int) -> Cover:
-    """The same for a window that edges cross, by way of finer pixels."""
+    """Coverage of a window crossed by edges, computed in finer pixels."""
     reach = reach_px(blur_px)
     fine = coverage(areas, col0 - reach, row0 - reach, width + 2 * reach, height + 2 * reach, fold)
     if reach > 0:

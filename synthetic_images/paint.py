@@ -1,4 +1,4 @@
-"""Paints: what is laid on a scan, one after the other, each an area in pixels with one tone."""
+"""Paints: areas in pixels with one tone each, laid on a scan one after another."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,14 +20,14 @@ CHIP_FOLD = 4
 
 @dataclass(frozen=True, eq=False)
 class AreaPaint:
-    """A union of areas in (column, row). inside_frame: seen by the lens, and so nowhere but in the exposed frame."""
+    """Union of areas in (column, row). inside_frame: imaged by the lens, hence limited to the exposed frame."""
 
     areas: tuple[Area, ...]
     tone: float
     inside_frame: bool = False
 
     def rows(self, row0: int, height: int, width_px: int, blur_px: float) -> tuple[Window, Cover] | None:
-        """The window of a picture of rows row0 on that is touched, and its coverage; None where there is none."""
+        """Window within rows row0 to row0 + height that is touched, and its coverage; None if none is."""
         col0, top, width, tall = self._bounds
         reach = reach_px(blur_px)
         left, right = max(col0 - reach, 0), min(col0 + width + reach, width_px)
@@ -44,7 +44,7 @@ class AreaPaint:
 
 @dataclass(frozen=True, eq=False)
 class ChipPaint:
-    """A mark that is a picture: its coverage and the (column, row) of its first pixel."""
+    """Mark from an image: its coverage; col0, row0: position of its first pixel."""
 
     cover: Cover
     col0: int
@@ -53,7 +53,7 @@ class ChipPaint:
     inside_frame: bool = False
 
     def rows(self, row0: int, height: int, width_px: int, _: float) -> tuple[Window, Cover] | None:
-        """As `AreaPaint.rows`; a picture of a mark is blurred as it is."""
+        """As `AreaPaint.rows`, without further blur: the image of the mark is blurred already."""
         tall, width = self.cover.shape
         left, right = max(self.col0, 0), min(self.col0 + width, width_px)
         upper, lower = max(self.row0, row0), min(self.row0 + tall, row0 + height)
@@ -68,7 +68,7 @@ Paint = AreaPaint | ChipPaint
 
 
 def chip_paint(chip: ChipMark, xy_mm: Array, geometry: FrameGeometry, tone: float) -> ChipPaint:
-    """The chip at its place: sampled 4 x 4 times a pixel through the local affine map, between its pixels linearly."""
+    """Resample the image of a mark at its place: 4 x 4 samples per pixel through the local affine mapping, bilinear."""
     rows, columns = chip.image.shape
     mm = chip.pitch_um / 1000
     angle = np.deg2rad(chip.turn_deg)
@@ -82,7 +82,7 @@ def chip_paint(chip: ChipMark, xy_mm: Array, geometry: FrameGeometry, tone: floa
     low = np.floor(outline.min(axis=0)).astype(int)
     width, height = np.ceil(outline.max(axis=0)).astype(int) - low + 1
     chip_from_pixel = np.linalg.inv(pixel_from_chip)
-    # Fine pixel k of fold f lies at (k + 0.5) / f - 0.5 of its whole pixel.
+    # The centre of fine pixel k of fold f is at (k + 0.5) / f - 0.5 px.
     start = chip_from_pixel @ (low + 0.5 / CHIP_FOLD - 0.5 - origin) + chip.origin_px
     chip_from_fine = np.column_stack([chip_from_pixel / CHIP_FOLD, start])
     fine = cv2.warpAffine(

@@ -1,4 +1,4 @@
-"""From the object to the camera frame: central projection, then distortion. Formulas: Torlegård's functions F1, F2."""
+"""Central projection and distortion, from object to camera coordinates: Torlegård's functions F1, F2."""
 
 import cv2
 import numpy as np
@@ -9,7 +9,7 @@ from synthetic_images.scene import Distortion, SceneCamera
 
 Array = NDArray[np.float64]
 
-OF_THE_RAY = {  # families of OpenCV with their coefficients in its order
+OF_THE_RAY = {  # OpenCV's families, with their coefficients in its order
     "opencv": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4"),
     "opencv_fisheye": ("k1", "k2", "k3", "k4"),
 }
@@ -18,9 +18,9 @@ INVERSION_STEPS = 50
 
 
 def camera_from_object(camera: SceneCamera, exterior: tuple[float, ...], points: Array) -> Array:
-    """(n, 2) observed camera coordinates x', y' in mm of object points (n, 3); nan for points behind the camera.
+    """Project object points (n, 3) to observed camera coordinates x', y' (n, 2), mm.
 
-    nan too where the distortion has no inverse, far outside of the frame.
+    nan for points behind the camera, and far outside the frame, where the distortion has no inverse.
     """
     u, v, w = ((points - np.asarray(exterior[:3])) @ object_rotation(*exterior[3:]).T).T
     depth = np.where(w < 0.0, -w, np.nan)
@@ -47,7 +47,7 @@ def object_rotation(omega: float, phi: float, kappa: float) -> Array:
 
 
 def _distorted(camera: SceneCamera, tangents: Array) -> Array:
-    """(n, 2) observed camera coordinates in mm of directions (U, V) / -W (n, 2)."""
+    """(n, 2) observed camera coordinates, mm, of directions (U, V) / -W (n, 2)."""
     c, point = camera.principal_distance_mm, np.asarray(camera.principal_point_mm)
     ideal = c * tangents
     family = camera.distortion.family
@@ -61,7 +61,8 @@ def _distorted(camera: SceneCamera, tangents: Array) -> Array:
 
 
 def ray_from_camera(camera: SceneCamera, exterior: tuple[float, ...], camera_mm: Array) -> Array:
-    """(n, 3) directions in the object of what is seen at x', y' (n, 2) in mm: the inverse of `camera_from_object`."""
+    """(n, 3) directions of rays in the object frame from camera coordinates (n, 2), mm; inverse of
+    `camera_from_object`."""
     c, point = camera.principal_distance_mm, np.asarray(camera.principal_point_mm)
     reduced = camera_mm - point
     family = camera.distortion.family
@@ -78,7 +79,7 @@ def ray_from_camera(camera: SceneCamera, exterior: tuple[float, ...], camera_mm:
 
 
 def _opencv_ideal(distortion: Distortion, tangents: Array) -> Array:
-    """The inverse of `_opencv_distorted`, by OpenCV's iteration."""
+    """Inverse of `_opencv_distorted`, by OpenCV's iteration."""
     until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 4 * INVERSION_STEPS, 1e-14)
     seen = np.linalg.solve(_axes(distortion), tangents.T).T.reshape(-1, 1, 2)
     if distortion.family == "opencv_fisheye":
@@ -89,7 +90,7 @@ def _opencv_ideal(distortion: Distortion, tangents: Array) -> Array:
 
 
 def _opencv_distorted(distortion: Distortion, tangents: Array) -> Array:
-    """OpenCV's own models, whose y points down."""
+    """Distort by OpenCV's models, whose y axis points down."""
     seen = np.isfinite(tangents).all(axis=1)
     result = np.full_like(tangents, np.nan)
     if seen.any():
@@ -108,15 +109,15 @@ def _coefficients(distortion: Distortion) -> Array:
 
 
 def _axes(distortion: Distortion) -> Array:
-    """(2, 2) from OpenCV's axes to x right, y up; b1 makes its fx = c (1 + b1), b2 its skew c b2."""
+    """(2, 2) matrix from OpenCV's axes to x right, y up, with fx = c (1 + b1) and skew c b2."""
     b1, b2 = (distortion.parameters.get(name, 0.0) for name in ("b1", "b2"))
     return np.array([[1.0 + b1, b2], [0.0, -1.0]])
 
 
 def _inverted(distortion: Distortion, ideal: Array, point: Array) -> Array:
-    """The points, reduced to the principal point, whose correction leads to the given ones: Newton's method.
+    """Solve x - correction(x) = ideal for points x, reduced to the principal point, by Newton's method.
 
-    A correction is defined at the observed point, aicon's at the ideal one: one way it has to be inverted.
+    Corrections are defined at the observed point, those of aicon at the ideal one: one direction needs inversion.
     """
     observed = ideal.copy()
     open_ = np.asarray(np.isfinite(ideal).all(axis=1))
@@ -126,7 +127,7 @@ def _inverted(distortion: Distortion, ideal: Array, point: Array) -> Array:
         start = observed[open_]
         ideal_of, by_x, by_y = _corrected(distortion, start, point)
         miss = ideal_of - ideal[open_]
-        # Cramer's rule, a point a row.
+        # Cramer's rule, one point per row.
         determinant = by_x[:, 0] * by_y[:, 1] - by_y[:, 0] * by_x[:, 1]
         along_x = (miss[:, 0] * by_y[:, 1] - by_y[:, 0] * miss[:, 1]) / determinant
         along_y = (by_x[:, 0] * miss[:, 1] - miss[:, 0] * by_x[:, 1]) / determinant
@@ -137,7 +138,7 @@ def _inverted(distortion: Distortion, ideal: Array, point: Array) -> Array:
 
 
 def _corrected(distortion: Distortion, observed: Array, point: Array) -> tuple[Array, Array, Array]:
-    """Observed points (n, 2) less their correction, and the derivatives of that by x and by y, (n, 2) each."""
+    """Points (n, 2) minus their correction, and its complex-step derivatives with respect to x and y, (n, 2) each."""
     steps = np.concatenate([observed + step for step in 1e-30j * np.eye(2)])
     by_x, by_y = np.split(steps - correction(distortion, steps, point), 2)
     return by_x.real, by_x.imag / 1e-30, by_y.imag / 1e-30

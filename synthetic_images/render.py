@@ -1,7 +1,7 @@
-"""A scene rendered: scans/*.tif and truth.json.
+"""Rendering of a scene to scans/*.tif and truth.json.
 
-A frame is painted strip by strip, so that its size costs time but hardly memory: areas as the scanner's optics and
-pixels see them, then grain and noise, then whole grey values.
+A frame is painted in strips to limit memory: areas imaged by the scanner's optics and pixels, then grain and noise,
+then quantisation.
 """
 
 import os
@@ -25,15 +25,23 @@ Picture = NDArray[np.float32]
 Progress = Callable[[str, int, int], None]
 
 STRIP_PX = 256
-BORDER_PX = 2.0  # the Gaussian of the border's texture
-CHANNEL_GAINS = (1.0, 0.94, 0.8)  # a faintly warm film
+BORDER_PX = 2.0  # px, sigma of the Gaussian of the border's texture
+CHANNEL_GAINS = (1.0, 0.94, 0.8)  # R, G, B: a slightly warm film
 
 
 def render_scene(scene: Scene, out_dir: Path, progress: Progress | None = None) -> Truth:
-    """Write the scans of all frames and truth.json to a folder; every file whole or not at all.
+    """Write the scans of all frames and truth.json to a folder, each file atomically.
 
-    progress: called with the image's name, the strips done and the strips of the whole scene. The same scene gives the
-    same bytes. Raises OSError where the folder cannot be written.
+    The result is reproducible: the same scene gives the same bytes.
+
+    Parameters
+    ----------
+    progress : called with the image's name, the number of strips done and the number of strips of the scene.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be written.
     """
     background = scene_background(scene)
     frames = [make_frame(scene, index) for index in range(len(scene.images))]
@@ -62,7 +70,7 @@ def render_scene(scene: Scene, out_dir: Path, progress: Progress | None = None) 
 
 
 def grey_strips(frame: Frame, index: int, background: Background) -> Iterator[Grey]:
-    """The scan's grey values as its file holds them, in strips of STRIP_PX rows: (rows, width) or (rows, width, 3)."""
+    """Yield the grey values of the file in strips of STRIP_PX rows: (rows, width) or (rows, width, 3)."""
     geometry, scene = frame.truth.geometry, background.scene
     mask = scene.scanner.sharpen
     for row0 in range(0, geometry.height_px, STRIP_PX):
@@ -77,7 +85,7 @@ def grey_strips(frame: Frame, index: int, background: Background) -> Iterator[Gr
 
 
 def _painted(frame: Frame, index: int, background: Background, row0: int, height: int) -> Picture:
-    """Shares of full scale, after the scanner's optics and averaged over every pixel's area."""
+    """Fractions of full scale, blurred by the scanner's optics and averaged over the area of each pixel."""
     geometry, scene = frame.truth.geometry, background.scene
     window = (row0, height, geometry.width_px, scene.scanner.blur_px)
     exposed = np.zeros((height, geometry.width_px), np.float32)
@@ -85,7 +93,7 @@ def _painted(frame: Frame, index: int, background: Background, row0: int, height
         touched = part.rows(*window)
         if touched is not None:
             exposed[touched[0]] += touched[1]
-    np.minimum(exposed, 1.0, out=exposed)  # a pocket reaches into the frame
+    np.minimum(exposed, 1.0, out=exposed)  # pockets overlap the frame
     border = _border(scene, index, row0, height, geometry.width_px)
     picture = border + exposed * (background.rows(geometry, row0, height) - border)
     for paint in frame.paints:
@@ -100,7 +108,7 @@ def _painted(frame: Frame, index: int, background: Background, row0: int, height
 
 
 def _border(scene: Scene, index: int, row0: int, height: int, width_px: int) -> Picture:
-    """What nothing has exposed, with a texture of its own."""
+    """Unexposed film with its texture."""
     border = np.full((height, width_px), scene.tones.border, np.float32)
     if scene.tones.border_contrast > 0.0:
         border += scene.tones.border_contrast * grain((scene.seed, index, 5), row0, height, width_px, BORDER_PX)
@@ -108,7 +116,7 @@ def _border(scene: Scene, index: int, row0: int, height: int, width_px: int) -> 
 
 
 def _coded(shares: Picture, scene: Scene, index: int, row0: int) -> Picture:
-    """(rows, width, channels) codes: the channels, the noise of each, negative, the tone curve."""
+    """(rows, width, channels) codes: channel gains, negative, noise and tone curve."""
     scanner = scene.scanner
     channels = shares[:, :, None] * np.asarray(CHANNEL_GAINS, np.float32) if scanner.colour else shares[:, :, None]
     if scanner.negative:
@@ -121,7 +129,7 @@ def _coded(shares: Picture, scene: Scene, index: int, row0: int) -> Picture:
 
 
 def _sharpened(codes: Picture, mask: UnsharpMask) -> Picture:
-    """By an unsharp mask, before they are held within the depth."""
+    """Apply an unsharp mask, before clipping to the bit depth."""
     if mask.amount == 0.0:
         return codes
     blurred = gaussian_filter(codes, (mask.radius_px, mask.radius_px, 0.0), mode="nearest")
@@ -129,7 +137,7 @@ def _sharpened(codes: Picture, mask: UnsharpMask) -> Picture:
 
 
 def _digitised(channels: Picture, scene: Scene) -> Grey:
-    """Grey values: white as zero, rounded and held within the depth."""
+    """Grey values: white as zero if set, clipped and quantised to the bit depth."""
     scanner = scene.scanner
     channels = np.clip(channels, 0.0, 1.0)
     if scanner.white_is_zero:
@@ -146,7 +154,7 @@ def _strip_count(frame: Frame) -> int:
 
 @contextmanager
 def _whole(path: Path) -> Iterator[Path]:
-    """A temporary file that becomes `path` when the block ends well, and otherwise leaves nothing behind."""
+    """Temporary file, renamed to `path` if the block succeeds, else removed."""
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
         yield temporary

@@ -1,6 +1,6 @@
-"""A scene: everything that decides what the scans of a series of photographs look like.
+"""Scene: full description of the scans of a series of photographs.
 
-Lengths on the film in mm, in the object in the object's unit; grey values as shares of full scale (0 black, 1 white)
+Lengths on the film are in mm, in the object in object units; grey values are fractions of full scale (0 black, 1 white)
 on the positive. Axes, rotations and signs are those of the papers: camera frame x' right, y' up.
 """
 
@@ -22,7 +22,7 @@ Family = Literal["none", "torlegard", "brown", "australis", "aicon", "opencv", "
 Side = Literal["left", "right", "top", "bottom"]
 Compression = Literal["none", "lzw", "deflate", "zstd", "jpeg"]
 Background = Literal["plain", "wall", "terrain"]
-MOST_TILTED_DEG = 30  # of a camera that photographs film
+MOST_TILTED_DEG = 30  # degrees, largest tilt of a camera that photographs film
 FilmKind = Literal["similarity", "affine", "projective"]
 
 TONES = ("srgb", "s-curve")
@@ -41,7 +41,8 @@ PARAMETERS: Mapping[Family, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Distortion:
-    """A distortion family, its parameters by name (absent: 0), its reference radius, and Torlegård's literal terms."""
+    """Distortion model. parameters: by name, 0 if absent; r0_mm: reference radius; decentering: "paper" for Torlegård's
+    decentring terms as printed, not reduced to the principal point."""
 
     family: Family = "none"
     parameters: Mapping[str, float] = field(default_factory=dict)
@@ -58,7 +59,7 @@ class Distortion:
 
 @dataclass(frozen=True, eq=False)
 class DrawnMark:
-    """A fiducial drawn by areas about its origin, mm, x right and y up; light or dark on the positive."""
+    """Drawn fiducial: areas relative to its origin, mm, x right and y up; light or dark on the positive."""
 
     areas: tuple[Area, ...]
     light: bool = True
@@ -66,7 +67,7 @@ class DrawnMark:
 
 @dataclass(frozen=True, eq=False)
 class ChipMark:
-    """A fiducial that is a picture: (rows, columns) of 0 to 1, its pitch, and the (column, row) that is measured."""
+    """Fiducial from an image. image: (rows, columns), 0 to 1; origin_px: (column, row) of the measured point."""
 
     image: Array
     pitch_um: float
@@ -77,7 +78,7 @@ class ChipMark:
 
 @dataclass(frozen=True, eq=False)
 class SceneFiducial:
-    """A fiducial mark at its place in the camera frame; mark None: nothing is drawn (a corner of the frame, say)."""
+    """Fiducial mark in the camera frame. mark: None if nothing is drawn, such as for a corner of the frame."""
 
     id: str
     xy_mm: Point
@@ -86,7 +87,7 @@ class SceneFiducial:
 
 @dataclass(frozen=True, eq=False)
 class SceneCamera:
-    """The true camera. frame_mm: width and height of the exposed frame, which is centred in the camera frame."""
+    """True camera. frame_mm: width and height of the exposed frame, centred on the origin of the camera frame."""
 
     name: str
     frame_mm: Point
@@ -103,7 +104,7 @@ class SceneCamera:
 
 @dataclass(frozen=True)
 class DiskTarget:
-    """A round target: its centre and the direction it faces, in the object frame."""
+    """Round target: centre and normal in the object frame."""
 
     id: str
     center: tuple[float, float, float]
@@ -115,8 +116,8 @@ class DiskTarget:
 
 @dataclass(frozen=True)
 class CrossFigure:
-    """A cross in the place of a disk, as long as the disk is wide: one bar along the horizontal (along X where the
-    target faces up), one at right angles. line: the bars' width in halves of their length."""
+    """Cross instead of a disk, as long as the disk's diameter: one bar is horizontal (along X if the target faces up),
+    one perpendicular. line: width of the bars, fraction of half their length."""
 
     line: float
 
@@ -127,8 +128,14 @@ class CrossFigure:
 
 @dataclass(frozen=True)
 class RingFigure:
-    """Segments of a ring about some disks. numbers: by target, whose bits, the highest first and clockwise as seen, are
-    the segments that are drawn; inner, outer: the ring's radii in those of the disk."""
+    """Coded ring around some disks.
+
+    Attributes
+    ----------
+    bits : number of segments.
+    inner, outer : radii of the ring, in radii of the disk.
+    numbers : code by target; its set bits, the highest first, clockwise as seen, are the segments drawn.
+    """
 
     bits: int
     inner: float
@@ -142,7 +149,8 @@ class RingFigure:
 
 @dataclass(frozen=True)
 class DiskField:
-    """Disks of one diameter (object units), or other figures, each on a surround so many times as wide (0: none)."""
+    """Field of disks or other figures. diameter: object units; surround: diameter of the disk behind each target, in
+    diameters of the target, 0 for none."""
 
     targets: tuple[DiskTarget, ...]
     diameter: float
@@ -158,11 +166,11 @@ class DiskField:
 
 @dataclass(frozen=True)
 class BoardField:
-    """A board in the plane Z = 0, x right, y up, seen from above. Its point "r{row}c{column}" stands at
+    """Board in the plane Z = 0, x right, y up, seen from above. The point "r{row}c{column}" is at
     X = column · spacing, Y = (rows - 1 - row) · spacing.
 
-    A chessboard's columns and rows count inner corners. diameter: of the dots of a circle grid; in an asymmetric one
-    only places where row + column is even hold a dot.
+    columns, rows: of a chessboard, number of inner corners; diameter: of the dots of a circle grid; asymmetric: dots
+    only where row + column is even.
     """
 
     kind: Literal["chessboard", "circle-grid"]
@@ -183,7 +191,7 @@ class BoardField:
 
 @dataclass(frozen=True)
 class FilmTransformation:
-    """How one frame's film has moved: film = R(rotation) [[scale_x, shear], [0, scale_y]] camera + shift."""
+    """Film transformation of a frame: film = R(rotation) [[scale_x, shear], [0, scale_y]] camera + shift."""
 
     scale: Point = (1.0, 1.0)
     shear_rad: float = 0.0
@@ -197,10 +205,14 @@ class FilmTransformation:
 
 @dataclass(frozen=True)
 class Writing:
-    """A line of text on the film, light.
+    """Line of light text on the film.
 
-    xy_mm: its middle in the camera frame; height_mm: of capitals; turn_deg: counter-clockwise, 0 where x' runs along
-    the line. mirrored: whether it reads right only from the other face of the film.
+    Attributes
+    ----------
+    xy_mm : centre in the camera frame.
+    height_mm : of capitals.
+    turn_deg : counter-clockwise rotation; 0: the line runs along x'.
+    mirrored : whether it is legible only from the other side of the film.
     """
 
     text: str
@@ -219,13 +231,19 @@ class Writing:
 
 @dataclass(frozen=True, eq=False)
 class SceneImage:
-    """One frame: where it was taken, what its film did, and how it lay on the scanner.
+    """Image: exterior orientation, film transformation and scan orientation of a frame.
 
-    exterior: X0, Y0, Z0 in object units, omega, phi, kappa in rad. pose: as in `measure.results.Pose`; turn_rad: the
-    small turn beside it; offset_mm: of the frame's centre from the scan's centre. covered: fiducials under a piece of
-    tape; neighbour: the side of the camera frame where the next frame begins, neighbour_gap_mm away. writing: what
-    stands on this frame. part_of: the frame of which this is one of several scans; part: from where to where of the
-    whole scan's width it reaches, as shares.
+    Attributes
+    ----------
+    exterior : X0, Y0, Z0 in object units, omega, phi, kappa in rad.
+    pose : scan orientation as in `measure.results.Pose`.
+    turn_rad : small rotation in addition to the pose.
+    offset_mm : of the frame's centre from the scan's centre.
+    covered : fiducials under a piece of tape.
+    neighbour, neighbour_gap_mm : side of the camera frame on which the next frame lies, and the gap between them.
+    writing : lines of text on this frame.
+    part_of : frame of which this is one of several partial scans; "" for a whole scan.
+    part : start and end of the partial scan, as fractions of the width of the whole scan.
     """
 
     name: str
@@ -257,12 +275,16 @@ class SceneImage:
 
 @dataclass(frozen=True)
 class Film:
-    """What the film adds, alike in every frame: kind names the true transformation.
+    """Film properties common to all frames.
 
-    deformation_um: rms of a smooth deformation; grain: its rms as a share of full scale, correlated as white noise
-    after a Gaussian of grain_px; dust, scratches, hairs: how many in a frame. tilt_deg: of a camera that photographed
-    the film from a distance of photographed_from_mm, about a line across tilt_direction_deg (from x' to y'): a
-    projective transformation.
+    Attributes
+    ----------
+    kind : true film transformation.
+    tilt_deg, tilt_direction_deg, photographed_from_mm : tilt of a camera that photographed the film from a distance,
+        around a line perpendicular to tilt_direction_deg (from x' to y'): a projective transformation.
+    deformation_um : RMS of a smooth film deformation.
+    grain, grain_px : RMS of the grain, fraction of full scale, and sigma of the Gaussian that correlates it.
+    dust, scratches, hairs : number per frame.
     """
 
     kind: FilmKind = "affine"
@@ -290,7 +312,7 @@ class Film:
 
 @dataclass(frozen=True)
 class UnsharpMask:
-    """Codes are raised by amount times what they are above their mean under a Gaussian of radius_px."""
+    """Unsharp mask: code + amount (code - Gaussian mean of the codes with sigma radius_px)."""
 
     amount: float = 0.0
     radius_px: float = 1.0
@@ -301,15 +323,15 @@ class UnsharpMask:
 
     @property
     def reach_px(self) -> int:
-        """How far a code depends on others."""
+        """Half width of the filter."""
         return int(4 * self.radius_px + 0.5) if self.amount else 0
 
 
 @dataclass(frozen=True)
 class TakingLens:
-    """The lens of a digital camera that takes the scans, by OpenCV's formulas (calib3d, "detailed description").
+    """Lens of a digital camera that takes the scans, by OpenCV's formulas (calib3d, "detailed description").
 
-    focal_px: principal distance; center_px: the axis in the picture, None in its middle.
+    focal_px: principal distance; center_px: principal point, None for the centre of the image.
     """
 
     focal_px: float
@@ -326,14 +348,21 @@ class TakingLens:
 
 @dataclass(frozen=True)
 class Scanner:
-    """The scanner and its file.
+    """Scanner and file format.
 
-    margin_mm: how far the scan reaches beyond the frame; blur_px: Gaussian sigma of the MTF beside the pixel's own
-    area; noise: rms as a share of full scale, white; tile_px: edge of the file's tiles, 0 for strips.
-    white_is_zero: only how the file keeps the same picture; negative: the picture is a negative. tone: the gamma by
-    which light is coded, or one of TONES. bend_um: what the scanner bends in all scans alike, by the names of
-    `bend.Bend`. sharpen: the unsharp mask by which the codes are sharpened thereafter. lens: of a digital camera that
-    takes the scans.
+    Attributes
+    ----------
+    pitch_um : pixel pitch across and down.
+    margin_mm : margin of the scan around the frame.
+    blur_px : sigma of the Gaussian PSF, in addition to the averaging over the pixel.
+    noise : RMS of white noise, fraction of full scale.
+    negative : whether the image is a negative.
+    white_is_zero : whether the file stores white as zero; the image is the same.
+    tile_px : side of the file's tiles, 0 for strips.
+    tone : gamma of the coding, or one of TONES.
+    bend_um : geometric error common to all scans, terms by name as in `bend.Bend`.
+    sharpen : unsharp mask applied to the codes.
+    lens : of a digital camera that takes the scans; None for a scanner.
     """
 
     pitch_um: Point
@@ -375,8 +404,8 @@ class Scanner:
 
 @dataclass(frozen=True)
 class Tones:
-    """Grey values of the positive, as shares of full scale; contrast, border_contrast: rms of the background's and of
-    the border's texture. What is as dark as the border was no more exposed: it shows the border's texture."""
+    """Grey values of the positive, fractions of full scale. contrast, border_contrast: RMS of the textures of
+    background and border. Paints of the border's tone are unexposed too and show the border's texture."""
 
     border: float = 0.06
     border_contrast: float = 0.0
@@ -395,12 +424,14 @@ class Tones:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A series of photographs. pad_mm: radius of the unexposed disk behind every fiducial (0: none); pocket_mm:
-    half the side of the square about every fiducial that is exposed, too, as where marks stand in bays of the frame (0:
-    none); corner_radius_mm: of the rounded corners of the exposed frame (0: sharp).
+    """Series of photographs.
 
-    ground, relief: mean height of the terrain that carries the texture of a "terrain" background, and the rms of its
-    heights about it.
+    Attributes
+    ----------
+    ground, relief : mean height of the terrain of a "terrain" background, and RMS of the heights around it.
+    pad_mm : radius of the unexposed disk behind each fiducial, 0 for none.
+    pocket_mm : half the side of the exposed square around each fiducial, as for marks in bays of the frame; 0 for none.
+    corner_radius_mm : radius of the rounded corners of the exposed frame, 0 for sharp corners.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""The test field as it is drawn: targets with their names, true centres and outlines in the object frame."""
+"""Test field: targets with their names, true centres and outlines in the object frame."""
 
 from dataclasses import dataclass
 
@@ -10,15 +10,15 @@ from synthetic_images.scene import BoardField, CrossFigure, DiskField, DiskTarge
 
 Array = NDArray[np.float64]
 
-EDGE_PIECES = 16  # of a board's edges, which the distortion bends
-ARC_PIECES = 24  # of a segment of a ring
-FACES_UP = 0.9  # cosine of the angle to Z, above which a target's own X is the object's
+EDGE_PIECES = 16  # pieces of each straight edge, which the distortion bends
+ARC_PIECES = 24  # vertices of the arc of a ring segment
+FACES_UP = 0.9  # cosine of the angle between normal and Z above which a target's x axis is along the object's X
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """One point of the field. center, normal: (3,); radius: of its disk or half its cross, 0 for the corner of a
-    chessboard."""
+    """Point of the field. center, normal: (3,); radius: of the disk, or half the length of the cross; 0 for a
+    chessboard corner."""
 
     id: str
     center: Array
@@ -27,7 +27,7 @@ class Target:
 
 
 def field_targets(field: DiskField | BoardField) -> tuple[Target, ...]:
-    """Every point that a picture of the field lets one measure."""
+    """All measurable points of the field."""
     if isinstance(field, DiskField):
         return tuple(_disk_target(target, field.diameter) for target in field.targets)
     radius = field.diameter / 2 if field.kind == "circle-grid" else 0.0
@@ -41,12 +41,12 @@ def field_targets(field: DiskField | BoardField) -> tuple[Target, ...]:
 
 
 def _board_point(field: BoardField, row: int, column: int) -> tuple[float, float]:
-    """X and Y of a board's point."""
+    """X and Y of a point of a board."""
     return column * field.spacing, (field.rows - 1 - row) * field.spacing
 
 
 def disk_outline(target: Target, radius: float) -> Array:
-    """(n, 3) the outline of a disk about a target, in its plane."""
+    """(n, 3) outline of a disk around a target, in its plane."""
     helper = np.eye(3)[np.argmin(np.abs(target.normal))]
     u = np.cross(target.normal, helper)
     u /= np.linalg.norm(u)
@@ -55,14 +55,14 @@ def disk_outline(target: Target, radius: float) -> Array:
 
 
 def figure_reach(field: DiskField | BoardField, target: Target) -> float:
-    """The radius of the circle that holds all that is drawn of a target."""
+    """Radius of the circle that encloses the figure of a target."""
     if isinstance(field, DiskField) and isinstance(field.figure, RingFigure) and target.id in field.figure.numbers:
         return target.radius * field.figure.outer
     return target.radius
 
 
 def figure_outlines(field: DiskField, target: Target) -> tuple[tuple[Array, ...], ...]:
-    """The areas that are drawn of a target, each of outlines (n, 3)."""
+    """Areas of the figure of a target, each of outlines (n, 3)."""
     if isinstance(field.figure, CrossFigure):
         r, line = target.radius, target.radius * field.figure.line
         areas: tuple[Area, ...] = (bar((-r, 0.0), (r, 0.0), line), bar((0.0, -r), (0.0, r), line))
@@ -81,7 +81,7 @@ def figure_outlines(field: DiskField, target: Target) -> tuple[tuple[Array, ...]
 
 
 def _segments(figure: RingFigure, target: Target) -> tuple[Area, ...]:
-    """The segments of a target's ring that are set, clockwise from the top; neighbours in one piece."""
+    """Areas of the ring segments whose bits are set, clockwise from the top."""
     number, step = figure.numbers[target.id], 2.0 * np.pi / figure.bits
     areas: list[Area] = []
     for bit in range(figure.bits):
@@ -93,7 +93,7 @@ def _segments(figure: RingFigure, target: Target) -> tuple[Area, ...]:
 
 
 def _own_axes(normal: Array) -> tuple[Array, Array]:
-    """A target's right and up, as seen from where it faces."""
+    """Right and up axes of a target, as seen from its front."""
     if abs(normal[2]) < FACES_UP:
         right = np.cross([0.0, 0.0, 1.0], normal)
     else:
@@ -103,14 +103,14 @@ def _own_axes(normal: Array) -> tuple[Array, Array]:
 
 
 def board_sheet(field: BoardField) -> Array:
-    """(n, 3) the outline of the board's white sheet: one spacing and a half beyond its outer points."""
+    """(n, 3) outline of the board's white sheet, 1.5 spacings beyond the outer points."""
     edge = 1.5 * field.spacing
     right, top = _board_point(field, 0, field.columns - 1)
     return _rectangle(-edge, right + edge, -edge, top + edge)
 
 
 def chessboard_squares(field: BoardField) -> tuple[Array, ...]:
-    """Outlines (n, 3) of the black squares; the one above and left of the first inner corner is black."""
+    """Outlines (n, 3) of the black squares; the square above and left of the first inner corner is black."""
     squares = []
     for row in range(field.rows + 1):
         for column in range(row % 2, field.columns + 1, 2):

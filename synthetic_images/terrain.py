@@ -1,7 +1,7 @@
-"""Terrain: smooth relief about a height, and where the rays through a scan's pixels meet it.
+"""Terrain with smooth relief, and the intersection of image rays with it.
 
-A point of the terrain has an independent truth in every frame: the ray through a pixel of one leads to the terrain, and
-the projection of that place to the pixel of another.
+This gives true homologous points: the ray through a pixel of one frame is intersected with the terrain, and the point
+is projected into another frame.
 """
 
 from dataclasses import dataclass
@@ -16,14 +16,14 @@ from synthetic_images.scene import Scene
 Array = NDArray[np.float64]
 
 WAVES = 8
-WAVELENGTHS = (0.15, 0.6)  # of the ground that a frame shows
+WAVELENGTHS = (0.15, 0.6)  # range, fraction of the ground width of a frame
 NEWTON_STEPS = 30
-MET = 1e-10  # of the flying height: the last step, where a ray has met the terrain
+MET = 1e-10  # relative size of the last step at convergence
 
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
-    """Heights Z = ground + a sum of sines. amplitudes (w,), waves (w, 2) in rad a unit, phases_rad (w,)."""
+    """Terrain Z = ground + sum of sines. amplitudes: (w,); waves: (w, 2), rad per object unit; phases_rad: (w,)."""
 
     ground: float
     amplitudes: Array
@@ -31,15 +31,15 @@ class Terrain:
     phases_rad: Array
 
     def heights(self, plan: Array) -> Array:
-        """(n,) heights at X, Y (n, 2)."""
+        """(n,) heights at (X, Y), (n, 2)."""
         return np.asarray(self.ground + np.sin(plan @ self.waves.T + self.phases_rad) @ self.amplitudes)
 
     def slopes(self, plan: Array) -> Array:
-        """(n, 2) derivatives of the heights by X and Y."""
+        """(n, 2) derivatives of the heights with respect to X and Y."""
         return np.asarray((np.cos(plan @ self.waves.T + self.phases_rad) * self.amplitudes) @ self.waves)
 
     def met(self, station: Array, rays: Array) -> Array:
-        """(n, 3) where rays (n, 3) from a station (3,) first come near the terrain; nan where they do not."""
+        """(n, 3) intersections of rays (n, 3) from a station (3,) with the terrain, by Newton's method; nan without."""
         fall = np.where(rays[:, 2] < 0.0, rays[:, 2], np.nan)
         reach = (self.ground - station[2]) / fall
         step = np.zeros_like(reach)
@@ -56,7 +56,7 @@ class Terrain:
 
 
 def scene_terrain(scene: Scene) -> Terrain:
-    """The terrain of a scene: a plane, where it has no relief."""
+    """Terrain of a scene; a plane if it has no relief."""
     generator = np.random.default_rng([scene.seed, 3])
     directions = generator.uniform(0, 2 * np.pi, WAVES)
     lengths = ground_width(scene) * generator.uniform(*WAVELENGTHS, WAVES)
@@ -67,13 +67,13 @@ def scene_terrain(scene: Scene) -> Terrain:
 
 
 def ground_width(scene: Scene) -> float:
-    """How much ground the longer side of a vertical frame shows, object units."""
+    """Ground width of the longer side of a vertical frame, object units."""
     height = abs(scene.images[0].exterior[2] - scene.ground)
     return max(scene.camera.frame_mm) * height / scene.camera.principal_distance_mm
 
 
 def object_from_pixel(geometry: FrameGeometry, pixels: Array) -> Array:
-    """(n, 3) the terrain that pixels (n, 2) of a frame show; nan where they show none."""
+    """(n, 3) terrain points imaged at pixels (n, 2) of a frame; nan where there are none."""
     station = np.asarray(geometry.image.exterior[:3])
     camera_mm = geometry.camera_from_scan(pixels)
     rays = ray_from_camera(geometry.scene.camera, geometry.image.exterior, camera_mm)
@@ -81,5 +81,5 @@ def object_from_pixel(geometry: FrameGeometry, pixels: Array) -> Array:
 
 
 def transferred(pixels: Array, start: FrameGeometry, end: FrameGeometry) -> Array:
-    """(n, 2) where one frame shows the terrain that another shows at pixels (n, 2); nan where it does not."""
+    """Transfer pixels (n, 2) of a frame via the terrain to pixels (n, 2) of another; nan if not imaged there."""
     return end.pixel_from_object(object_from_pixel(start, pixels))

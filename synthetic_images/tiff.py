@@ -1,4 +1,4 @@
-"""Strips of grey values to a TIFF file, without ever holding the whole picture."""
+"""Writing of a TIFF file from strips of grey values, without holding the whole image in memory."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,9 +18,9 @@ JPEG_LEVEL = 92
 def write_tiff(
     path: Path, strips: Iterator[Grey], width_px: int, height_px: int, strip_px: int, scanner: Scanner
 ) -> None:
-    """Write strips of strip_px rows (the last may be lower), (rows, width) or (rows, width, 3), top to bottom.
+    """Write strips from top to bottom: (rows, width) or (rows, width, 3), of strip_px rows, fewer in the last one.
 
-    The resolution tags hold the pitch. Raises OSError where the file cannot be written.
+    The resolution tags hold the pixel pitch. Raises OSError if the file cannot be written.
     """
     pitch_x_um, pitch_y_um = scanner.pitch_um
     segments = _tiles(strips, scanner.tile_px) if scanner.tile_px else strips
@@ -42,7 +42,7 @@ def write_tiff(
 
 
 def _encoded(segment: Grey, compression: Compression) -> bytes:
-    """A tile or a strip as it stands in the file; a writer that is handed pictures wants all of them at once."""
+    """Encode a tile or strip. Given uncoded arrays, the TIFF writer would need all of them at once."""
     if compression == "jpeg":
         space = "RGB" if segment.ndim == 3 else None
         return bytes(imagecodecs.jpeg8_encode(segment, JPEG_LEVEL, colorspace=space, outcolorspace=space))
@@ -57,7 +57,7 @@ def _encoded(segment: Grey, compression: Compression) -> bytes:
 
 
 def _tiles(strips: Iterator[Grey], tile_px: int) -> Iterator[Grey]:
-    """Tiles row by row, the last of each row and column filled up with zeros."""
+    """Yield tiles row by row, those at the right and bottom edges padded with zeros."""
     held: list[Grey] = []
     for strip in strips:
         held.append(strip)

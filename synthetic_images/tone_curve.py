@@ -1,16 +1,16 @@
-"""The curve by which a scanner codes light as grey values, both as shares of full scale."""
+"""Tone curve of a scanner: from light to grey values, both as fractions of full scale."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 Picture = NDArray[np.float32]
 
-S_CURVE_STEEPNESS = 2.5  # of the hyperbolic tangent: its middle is half as steep again as a straight line
+S_CURVE_STEEPNESS = 2.5  # of the hyperbolic tangent: slope of about 1.5 in the middle
 
 
 def coded(light: Picture, tone: float | str) -> Picture:
-    """Grey values of light from 0 to 1: by a gamma, light to the power of 1 / tone; by "srgb" (IEC 61966-2-1); or by
-    "s-curve", flat in the dark and in the light."""
+    """Code light, 0 to 1, as grey values. tone: gamma (light to the power of 1 / tone), "srgb" (IEC 61966-2-1), or
+    "s-curve", flat in shadows and highlights."""
     if tone == "srgb":
         low = 12.92 * light
         return np.asarray(np.where(light <= 0.0031308, low, 1.055 * light ** np.float32(1 / 2.4) - 0.055), np.float32)

@@ -1,4 +1,4 @@
-"""The truth of a rendered scene, and its file truth.json: the names of adjustment.json, and where every mark lies."""
+"""True values of a rendered scene, and truth.json, which names them as adjustment.json does and adds all positions."""
 
 import json
 from collections.abc import Mapping
@@ -15,15 +15,18 @@ from synthetic_images.terrain import scene_terrain
 
 Array = NDArray[np.float64]
 
-SCANNER = "1"  # the name of the only one, as a project has it
+SCANNER = "1"  # name of the only scanner, as in a project
 
 
 @dataclass(frozen=True, eq=False)
 class Position:
-    """Where a mark lies in a scan.
+    """True position of a mark in a scan.
 
-    center_px: (2,) column and row of the mark's own point, for a target the projection of its centre; figure_px: (2,)
-    centre of the figure that is seen, for a disk that of its ellipse. hidden: why it cannot be seen; "" if it can.
+    Attributes
+    ----------
+    center_px : (2,) column and row of the mark's point; for a target the projection of its centre.
+    figure_px : (2,) centre of the imaged figure; for a disk that of its ellipse.
+    hidden : why it is not visible; "" if it is.
     """
 
     center_px: Array
@@ -33,9 +36,9 @@ class Position:
 
 @dataclass(frozen=True, eq=False)
 class FrameTruth:
-    """One frame: its geometry and the positions of fiducials and targets by id.
+    """Geometry of a frame and the positions of its fiducials and targets by id.
 
-    Targets that are not imaged anywhere near the frame have no position.
+    Targets that are not imaged in or near the frame have no position.
     """
 
     geometry: FrameGeometry
@@ -45,7 +48,7 @@ class FrameTruth:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """A scene and what became of it, frame by frame."""
+    """Scene with the true values of its frames."""
 
     scene: Scene
     frames: tuple[FrameTruth, ...]
@@ -55,7 +58,7 @@ class Truth:
 
 
 def truth_json(truth: Truth) -> str:
-    """The contents of truth.json."""
+    """Content of truth.json."""
     camera = truth.scene.camera
     content = {
         "scene": truth.scene.name,
@@ -74,7 +77,7 @@ def truth_json(truth: Truth) -> str:
 
 
 def _terrain(scene: Scene) -> dict[str, Any] | None:
-    """Z = ground + the sum of amplitude sin(wave · (X, Y) + phase), what lies between the targets."""
+    """Terrain between the targets: Z = ground + sum of amplitude sin(wave · (X, Y) + phase)."""
     if scene.background != "terrain":
         return None
     terrain = scene_terrain(scene)
@@ -143,7 +146,7 @@ def _frame(frame: FrameTruth) -> dict[str, Any]:
 
 
 def _written(writing: Writing, geometry: FrameGeometry) -> dict[str, Any]:
-    """What it says, where its middle lies, and how it lies in the camera frame."""
+    """Text of a line of writing, the position of its centre, and its orientation in the camera frame."""
     col, row = geometry.pixel_from_camera(np.array([writing.xy_mm]))[0].tolist()
     return {
         "text": writing.text,

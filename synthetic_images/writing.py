@@ -1,4 +1,4 @@
-"""Writing as areas: letters of Matplotlib's fonts by their outlines, those of OpenCV's fonts by what it draws."""
+"""Writing as areas: outlines of Matplotlib's fonts, contours of text drawn by OpenCV."""
 
 from functools import lru_cache
 from importlib.util import find_spec
@@ -12,23 +12,23 @@ from synthetic_images.checks import one_of
 
 Array = NDArray[np.float64]
 
-# As OpenCV names them, which draws them with outlines of its own since version 5.
+# Names as in OpenCV; since version 5 it draws them with its own outline fonts.
 HERSHEY = {
     "hershey-simplex": cv2.FONT_HERSHEY_SIMPLEX,
     "hershey-duplex": cv2.FONT_HERSHEY_DUPLEX,
     "hershey-italic": cv2.FONT_HERSHEY_SIMPLEX | cv2.FONT_ITALIC,
 }
-OUTLINED = ("DejaVu Sans", "DejaVu Sans Mono", "DejaVu Serif", "STIXGeneral", "cmr10")  # Matplotlib's own, an extra
-HANDWRITING = "handwriting"  # hershey-italic, no letter like the next
+OUTLINED = ("DejaVu Sans", "DejaVu Sans Mono", "DejaVu Serif", "STIXGeneral", "cmr10")  # from Matplotlib, an extra
+HANDWRITING = "handwriting"  # hershey-italic with random variation of each letter
 FONTS = (*HERSHEY, *OUTLINED, HANDWRITING)
-_CAPITAL_PX = 120  # of a letter that OpenCV draws, before its outlines are taken
+_CAPITAL_PX = 120  # px, height of capitals drawn by OpenCV before their contours are extracted
 _STROKE_PX = 12
-_BLANK = 0.5  # of a capital's height
-_UNEVEN_RAD, _UNEVEN = 0.08, 0.07  # of handwriting: a letter's turn, and its size and place in capitals' heights
+_BLANK = 0.5  # width of a blank in heights of a capital
+_UNEVEN_RAD, _UNEVEN = 0.08, 0.07  # handwriting: sigma of a letter's rotation; of its size and position, in capitals
 
 
 def check_font(what: str, font: str) -> None:
-    """Raises ValueError for a font that there is not, or not in this installation."""
+    """Raises ValueError for an unknown font, or one that is not installed."""
     one_of(what, font, FONTS)
     if font in OUTLINED and find_spec("matplotlib") is None:
         raise ValueError(
@@ -39,7 +39,7 @@ def check_font(what: str, font: str) -> None:
 
 @lru_cache(maxsize=256)
 def written_area(text: str, font: str) -> Area:
-    """A line of text, x right and y up, about its middle; its capitals are 1 high."""
+    """Area of a line of text, x right and y up, centred on the origin; capitals have height 1."""
     if font == HANDWRITING:
         outlines = _by_hand(text)
     elif font in HERSHEY:
@@ -52,7 +52,7 @@ def written_area(text: str, font: str) -> Area:
 
 
 def _by_hand(text: str) -> list[Array]:
-    """Letter by letter; the same text is written the same way."""
+    """Outlines of handwriting, letter by letter; reproducible for the same text."""
     rng = np.random.default_rng(list(text.encode()))
     outlines, end = list[Array](), 0.0
     for letter in text:
@@ -70,7 +70,8 @@ def _by_hand(text: str) -> list[Array]:
 
 
 def _drawn(text: str, font: int) -> list[Array]:
-    """What OpenCV draws, from the beginning of its base line; an outline within another one runs the other way."""
+    """Contours of text drawn by OpenCV, from the start of its baseline; inner contours have the opposite
+    orientation."""
     scale = float(cv2.getFontScaleFromHeight(font, _CAPITAL_PX, _STROKE_PX))
     (width, height), below = cv2.getTextSize(text, font, scale, _STROKE_PX)
     spare = _CAPITAL_PX
@@ -82,7 +83,7 @@ def _drawn(text: str, font: int) -> list[Array]:
 
 
 def _outlined(text: str, font: str) -> list[Array]:
-    # Half a second of imports that scenes without writing do not need.
+    # Imported here, since it takes half a second that scenes without writing do not need.
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import TextPath
 
