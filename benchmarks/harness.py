@@ -1,17 +1,17 @@
-"""What all benchmarks share: options, seeds, rows that are kept, processes, peak memory, tables and JSON.
+"""Harness of the benchmarks: options, seeds, stored rows, processes, peak memory, tables and JSON.
 
-A benchmark is a module of this package with a function `case`, from the options of one row to the values of the row. It
-may have
+A benchmark is a module of this package with a function `case`, which computes the values of one row from its options.
+It may define
 
-- `cells(...)`: the rows of the table, as keyword arguments of `case`. Its parameters are options of the command line.
-  An option of `case` on the command line leaves those rows that have its value, or makes one where none has it.
-- `COLUMNS`: what is printed of each row as soon as it is there, as format specifications by key.
-- `report(rows)`: the lines that follow when all rows are there.
-- `SEED`: the seed where the command line gives none.
-- `OWN_PROCESS = True`: each row is computed in a process of its own, with one thread. Its CPU seconds, user and system,
-  and its peak memory are added to the row.
+- `cells(...)`: the rows of the table, as keyword arguments of `case`. Its parameters are command-line options.
+  An option of `case` on the command line selects the rows with its value, or makes one row if there is none.
+- `COLUMNS`: columns printed for each row as soon as it is computed, as format specifications by key.
+- `report(rows)`: lines printed after all rows.
+- `SEED`: default seed.
+- `OWN_PROCESS = True`: each row is computed in its own process, with one thread. Its CPU time (user and system), s, and
+  its peak memory are added to the row.
 
-`seed` is given to `case` where it has such a parameter.
+`seed` is passed to `case` if it has such a parameter.
 """
 
 import argparse
@@ -40,9 +40,9 @@ from numpy.typing import ArrayLike
 
 Row = Mapping[str, Any]
 ROOT = Path(__file__).resolve().parents[1]
-DATA = ROOT.parent / "shared" / "data"  # real scans, which are not part of the project
+DATA = ROOT.parent / "shared" / "data"  # real scans, not part of the project
 HELPERS = tuple(str(ROOT / "tests" / name) for name in ("", "measure", "adjust", "pipeline", "synthetic_images"))
-START = "from pipeline.main import main; main()"  # the program, in a process of its own
+START = "from pipeline.main import main; main()"  # the program, run in its own process
 ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL")}
 
 
@@ -73,13 +73,13 @@ def run(module: ModuleType, arguments: Sequence[str]) -> None:
 
 
 def line(columns: Mapping[str, str], row: Row) -> str:
-    """A row of a table; what it has no value of is left empty."""
+    """Row of a table; missing values are left empty."""
     values = ("" if row.get(name) is None else format(row[name], spec) for name, spec in columns.items())
     return "| " + " | ".join(values) + " |"
 
 
 def table(columns: Mapping[str, str], rows: Iterable[Row]) -> Iterator[str]:
-    """The lines of a table, for `report`."""
+    """Yield the lines of a table, for `report`."""
     yield "| " + " | ".join(columns) + " |\n|" + "---|" * len(columns)
     yield from (line(columns, row) for row in rows)
 
@@ -100,7 +100,7 @@ def _parser(module: ModuleType) -> argparse.ArgumentParser:
     for option, parameter in _own_options(module).items():
         given: dict[str, Any] = {"default": None}
         kind = parameter.annotation
-        if isinstance(kind, types.UnionType):  # or nothing
+        if isinstance(kind, types.UnionType):  # optional
             kind = next(one for one in typing.get_args(kind) if one is not types.NoneType)
         if kind is bool:
             given["action"] = "store_true"
@@ -121,7 +121,7 @@ def _own_options(module: ModuleType) -> dict[str, inspect.Parameter]:
 
 
 def _chosen(module: ModuleType, options: Mapping[str, Any]) -> list[Row]:
-    """The rows that the options ask for, as keyword arguments of the case."""
+    """Rows selected by the options, as keyword arguments of `case`."""
     parameters = inspect.signature(module.case).parameters
 
     def given(function: Callable[..., Any]) -> dict[str, Any]:
@@ -164,7 +164,7 @@ def _rows(module: ModuleType, cells: Sequence[Row], processes: int) -> Iterator[
         yield from (module.case(**cell) for cell in cells)
         return
     os.environ.update(ONE_THREAD)
-    spawn = multiprocessing.get_context("spawn")  # nothing of what this process has held counts
+    spawn = multiprocessing.get_context("spawn")  # so that the memory of this process does not count
     per_child = 1 if own_process else None
     with ProcessPoolExecutor(processes, spawn, initializer=_import_helpers, max_tasks_per_child=per_child) as pool:
         yield from pool.map(_timed_row if own_process else _row, [module.__name__] * len(cells), cells)
@@ -187,7 +187,7 @@ def _timed_row(module: str, cell: Row) -> Row:
 
 
 def _plain(value: object) -> object:
-    """What JSON has no form for."""
+    """Convert values that JSON does not support."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     return str(value)
@@ -198,7 +198,7 @@ def _plain(value: object) -> object:
 
 @dataclass(frozen=True)
 class Command:
-    """A command that has ended: its exit code, what it printed, and what it took with the processes it waited for."""
+    """Finished command: exit code, output, and its time and peak memory, including its child processes."""
 
     code: int
     out: str
@@ -213,7 +213,7 @@ class Command:
 
 
 def reseau(*arguments: object, before: str = "", environment: Mapping[str, str] | None = None) -> Command:
-    """Run one command of the program in a process of its own.
+    """Run one command of the program in its own process.
 
     Parameters
     ----------
@@ -222,12 +222,12 @@ def reseau(*arguments: object, before: str = "", environment: Mapping[str, str] 
     before : str
         Python statements that the process runs first.
     environment : Mapping[str, str], optional
-        Variables beside those of this process.
+        Variables in addition to those of this process.
 
     Raises
     ------
     RuntimeError
-        If the command ends with another exit code than 0 or 1.
+        If the exit code is neither 0 nor 1.
     """
     program = f"import sys; sys.path[:0] = {[str(ROOT), *HELPERS]}; {before}\n{START}"
     command = [sys.executable, "-c", program, *map(str, arguments)]
@@ -251,7 +251,7 @@ def reseau(*arguments: object, before: str = "", environment: Mapping[str, str] 
 
 @contextmanager
 def replaced(where: Any, name: str, value: object) -> Iterator[None]:
-    """Put another value in the place of an attribute, for an ablation."""
+    """Replace the value of an attribute within the block, for an ablation."""
     before = getattr(where, name)
     setattr(where, name, value)
     try:
@@ -261,7 +261,7 @@ def replaced(where: Any, name: str, value: object) -> Iterator[None]:
 
 
 def rms(values: ArrayLike) -> float:
-    """Root mean square of the values that are not NaN; NaN where there are none."""
+    """Root mean square of the finite values; NaN if there are none."""
     finite = np.asarray(values, float).ravel()
     finite = finite[np.isfinite(finite)]
     return float(np.sqrt(np.mean(finite**2))) if len(finite) else float("nan")

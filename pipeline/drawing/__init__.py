@@ -1,1 +1,1 @@
-"""Pictures: drawing in SVG, for the report's page and for files of their own."""
+"""Drawing in SVG, for the report and for separate files."""

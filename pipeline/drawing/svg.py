@@ -1,4 +1,4 @@
-"""Drawing in SVG: elements, the axes of a chart, and files that hold one picture."""
+"""Drawing in SVG: elements, chart axes, and SVG files."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from pipeline.types import Array
 
 
 def style() -> str:
-    """What all pictures look like, as CSS."""
+    """CSS of all drawings."""
     return (files("pipeline.drawing") / "drawing.css").read_text(encoding="utf-8")
 
 
 def write_picture(path: Path, width: float, height: float, title: str, *content: Markup) -> None:
-    """A file of its own, on white; `title` as in `picture`. Raises InputError where it cannot be written."""
+    """Write a drawing on white to a file; `title` as in `picture`. Raises InputError if it cannot be written."""
     ground = tag("rect", width=width, height=height, fill="white")
     css = tag("style", Markup(style() + "svg { font-family: sans-serif; }"))
     drawn = picture(width, height, title, css, ground, *content, xmlns="http://www.w3.org/2000/svg")
@@ -28,7 +28,7 @@ def write_picture(path: Path, width: float, height: float, title: str, *content:
 
 
 def tag(name: str, *content: str, **attributes: object) -> Markup:
-    """One element; an underscore in an attribute's name stands for a hyphen, one at its end (class_) for nothing."""
+    """SVG element; underscores in attribute names become hyphens, a trailing one (class_) is removed."""
     pairs = "".join(
         f' {key.rstrip("_").replace("_", "-")}="{escape(_text(value))}"' for key, value in attributes.items()
     )
@@ -39,7 +39,7 @@ def tag(name: str, *content: str, **attributes: object) -> Markup:
 def picture(
     width: float, height: float, title: str, *content: Markup, class_: str = "plot", **attributes: str
 ) -> Markup:
-    """A whole drawing; `title` is what a reader who cannot see it is told; further attributes as of `tag`."""
+    """Complete drawing. title: text for screen readers; attributes: as in `tag`."""
     return tag(
         "svg",
         *content,
@@ -54,13 +54,13 @@ def picture(
 
 
 def line(x: ArrayLike, y: ArrayLike, class_: str, closed: bool = False) -> Markup:
-    """A polyline, or a filled shape where it is closed."""
+    """Polyline, or a filled shape if closed."""
     points = [f"{px:.1f} {py:.1f}" for px, py in zip(np.ravel(x), np.ravel(y), strict=True)]
     return tag("path", d="M" + "L".join(points) + ("Z" if closed else ""), class_=class_)
 
 
 def strokes(starts: Array, ends: Array, class_: str) -> Markup:
-    """Many straight strokes in one element: starts and ends (n, 2)."""
+    """Straight strokes in one element: starts and ends (n, 2)."""
     d = "".join(f"M{x0:.1f} {y0:.1f}L{x1:.1f} {y1:.1f}" for (x0, y0), (x1, y1) in zip(starts, ends, strict=True))
     return tag("path", d=d, class_=class_)
 
@@ -70,21 +70,21 @@ def words(x: float, y: float, content: str, class_: str = "label", anchor: str =
 
 
 def scale_bar(x: float, y: float, length: float, text: str) -> Markup:
-    """A bar with ends, and what its length stands for."""
+    """Scale bar with a label."""
     ends = (x, x, x, x + length, x + length, x + length)
     return line(ends, (y - 3, y + 3, y, y, y - 3, y + 3), "bar") + words(x + length + 6.0, y + 4.0, text, "tick")
 
 
 def ellipse_axes(covariance: Array) -> tuple[Array, Array]:
-    """Semi-axes (n, 2) of the ellipses that hold 95 %, the larger last, and its direction (n,), counter-clockwise from
-    x in degrees; covariance (n, 2, 2)."""
+    """Semi-axes (n, 2) of 95 % ellipses, the larger one last, and its direction (n,), degrees counter-clockwise from x;
+    covariance: (n, 2, 2)."""
     variances, directions = np.linalg.eigh(covariance)
     angles = np.degrees(np.arctan2(directions[:, 1, 1], directions[:, 0, 1]))
     return np.sqrt(chdtri(2, 0.05) * np.maximum(variances, 0.0)), angles
 
 
 def ellipses(centers: Array, radii_px: Array, angles_deg: Array) -> Iterator[Markup]:
-    """About centers (n, 2), as `ellipse_axes` gives them."""
+    """Yield ellipses around centers (n, 2); radii and angles as from `ellipse_axes`."""
     for (x, y), (minor, major), angle in zip(centers, radii_px, angles_deg, strict=True):
         yield tag(
             "ellipse",
@@ -97,9 +97,9 @@ def ellipses(centers: Array, radii_px: Array, angles_deg: Array) -> Iterator[Mar
 
 @dataclass(frozen=True)
 class Axes:
-    """A chart's plane: data ranges drawn into width x height px, with room for labels at the left and below.
+    """Axes of a chart of width x height px, with margins for the labels.
 
-    x_is_log, y_is_log: whether an axis is logarithmic. x_ticks: those along x, by their values; None: round ones.
+    x_is_log, y_is_log: whether an axis is logarithmic; x_ticks: labels of the x ticks by value, None for round values.
     """
 
     x_range: tuple[float, float]
@@ -122,7 +122,7 @@ class Axes:
         return self.height - self.bottom - _share(value, self.y_range, self.y_is_log) * span
 
     def grid(self, x_label: str, y_label: str) -> Markup:
-        """Grid, ticks and labels."""
+        """Draw grid, ticks and labels."""
         x_ticks = self.x_ticks
         if x_ticks is None:
             x_ticks = {t: _tick_text(t) for t in _ticks(self.x_range, self.x_is_log, self.width / 50.0)}
@@ -161,7 +161,7 @@ class Axes:
 
 
 def _share(value: ArrayLike, limits: tuple[float, float], is_log: bool) -> Array:
-    """Where values lie between the limits, from 0 to 1."""
+    """Relative position of values between the limits, 0 to 1."""
     values, (low, high) = np.asarray(value, dtype=float), limits
     if is_log:
         values, low, high = np.log(values), np.log(low), np.log(high)
@@ -169,7 +169,7 @@ def _share(value: ArrayLike, limits: tuple[float, float], is_log: bool) -> Array
 
 
 def _ticks(limits: tuple[float, float], is_log: bool, most: float) -> list[float]:
-    """Round values inside of the limits: of a wide logarithmic axis 1, 2 and 5 times powers of ten."""
+    """Round values within the limits; for a wide logarithmic axis 1, 2 and 5 times powers of ten."""
     low, high = limits
     if not is_log or high < 5.0 * low:
         return ticks(low, high, most)
@@ -179,14 +179,14 @@ def _ticks(limits: tuple[float, float], is_log: bool, most: float) -> list[float
 
 
 def ticks(low: float, high: float, most: float) -> list[float]:
-    """Round values inside of a range, `most` of them or fewer."""
-    step = 1.0 / round_step(most / (high - low))  # the smallest round step that is not too fine
+    """Round values within a range, `most` at most."""
+    step = 1.0 / round_step(most / (high - low))  # smallest round step that gives at most that many
     first, last = int(np.ceil(low / step - 1e-9)), int(np.floor(high / step + 1e-9))
     return [i * step for i in range(first, last + 1)]
 
 
 def round_step(size: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not above `size`."""
+    """Largest of 1, 2, 5 times a power of ten that does not exceed `size`."""
     power = 10.0 ** np.floor(np.log10(size))
     return float(power * max((m for m in (1.0, 2.0, 5.0) if m <= size / power * (1.0 + 1e-9)), default=1.0))
 

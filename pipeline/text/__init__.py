@@ -1,1 +1,1 @@
-"""The ground of all files: tables with errors that name their place, CSV, TOML, writing whole or not at all, words."""
+"""Text files: CSV and TOML tables with error messages that name the place, atomic writing, wording of messages."""

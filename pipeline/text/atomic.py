@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Atomic writing of files."""
 
 import os
 from collections.abc import Iterator
@@ -10,9 +10,9 @@ from pipeline.errors import WriteError, what_to_do
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary file beside `path`, renamed to it when the block ends well; otherwise `path` stays as it was.
+    """Temporary file in the folder of `path`, renamed to it if the block succeeds; otherwise `path` is unchanged.
 
-    Raises WriteError, with the reason, where the folder cannot be made or the file cannot be written.
+    Raises WriteError, with the reason, if the folder cannot be created or the file cannot be written.
     """
     with _temporary_file(path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}"), path) as temporary:
         yield temporary
@@ -21,7 +21,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _temporary_file(temporary: Path, told: Path) -> Iterator[Path]:
-    """In a folder that is made for it, gone when the block ends. told: what a WriteError says cannot be written."""
+    """Temporary file, in a folder created if necessary; removed at the end. told: path named in a WriteError."""
     try:
         with writing(told):
             temporary.parent.mkdir(parents=True, exist_ok=True)
@@ -33,7 +33,7 @@ def _temporary_file(temporary: Path, told: Path) -> Iterator[Path]:
 
 @contextmanager
 def writing(told: Path) -> Iterator[None]:
-    """What the operating system refuses in the block, as a WriteError that names the file."""
+    """Convert errors of the operating system in the block to a WriteError that names the file."""
     try:
         yield
     except (FileExistsError, NotADirectoryError) as error:
@@ -49,7 +49,7 @@ def writing(told: Path) -> Iterator[None]:
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write text (UTF-8) or bytes to `path`, whole or not at all. Raises WriteError where that cannot be done."""
+    """Write text (UTF-8) or bytes to `path` atomically. Raises WriteError if that fails."""
     data = content.encode("utf-8") if isinstance(content, str) else content
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         file.write(data)
@@ -58,6 +58,6 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 def check_writable(folder: Path) -> None:
-    """Know before long work whether its results can be written. Raises WriteError where they cannot."""
+    """Check before a long computation that its results can be written. Raises WriteError if not."""
     with _temporary_file(folder / f".writable.{os.getpid()}.part", folder) as temporary:
         temporary.touch()

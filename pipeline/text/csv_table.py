@@ -1,6 +1,6 @@
-"""CSV files with a header line, checked column by column; lines that begin with # are comments.
+"""CSV files with a header line and checked columns; lines that begin with # are comments.
 
-A cell that a spreadsheet would run as a formula is written with an apostrophe in front, and read without it.
+A cell that a spreadsheet would evaluate as a formula is written with a leading apostrophe, which is removed in reading.
 """
 
 import csv
@@ -19,13 +19,13 @@ SEPARATORS = {";": "semicolons", "\t": "tabs"}
 
 _LONGEST_NAME = 1000
 _FORMULA = re.compile(r"'*[=+\-@]")
-_NO_FORMULA = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|-")  # a number, or what stands for none
+_NO_FORMULA = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|-")  # a number, or a dash for none
 _TAKEN_FOR_TEXT = re.compile(r"'+[=+\-@]")
 
 
 @dataclass(frozen=True)
 class Row:
-    """One line of a CSV file, with its place for messages."""
+    """Row of a CSV file, with file and line for messages."""
 
     file: Path
     line: int
@@ -35,11 +35,11 @@ class Row:
         return InputError(f"{self.file}, line {self.line}, column {column}: {message}")
 
     def text(self, column: str) -> str:
-        """The cell without blanks around it; "" where the column is absent."""
+        """Cell without surrounding blanks; "" if the column is absent."""
         return self.cells.get(column, "")
 
     def name(self, column: str) -> str:
-        """A cell that must be one: not empty, nor without end, and of letters that can be shown."""
+        """Cell as a name: not empty, not too long, and printable. Raises InputError otherwise."""
         value = self.text(column)
         if not value:
             raise self.error(column, "is empty; every line needs it.")
@@ -48,7 +48,7 @@ class Row:
         return value
 
     def number(self, column: str) -> float | None:
-        """A finite number; None where the cell is blank or the column absent."""
+        """Cell as a finite number; None if it is blank or the column absent. Raises InputError otherwise."""
         value = self.text(column)
         if not value:
             return None
@@ -65,7 +65,7 @@ class Row:
         return number
 
     def sigma(self, column: str) -> float | None:
-        """A standard deviation: a number that is not negative; None where the cell is blank."""
+        """Cell as a standard deviation, 0 or positive; None if it is blank. Raises InputError otherwise."""
         sigma = self.number(column)
         if sigma is not None and sigma < 0.0:
             raise self.error(column, f"is a standard deviation and cannot be negative ({sigma:g}).")
@@ -75,8 +75,8 @@ class Row:
 
 
 def csv_line(cells: Sequence[str]) -> str:
-    """The cells as a line of CSV, without its end, that `read_csv` reads back as they are: in quotes where need be,
-    also where a line that begins with the cell would be a comment."""
+    """Format cells as a line of CSV without line end, which `read_csv` reads back unchanged. Cells are quoted if
+    necessary, also if the line would otherwise be a comment."""
     return ",".join(_quoted(_as_text(cell)) for cell in cells)
 
 
@@ -93,12 +93,13 @@ def _quoted(cell: str) -> str:
 
 
 def read_csv(path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> tuple[Row, ...]:
-    """The rows of a CSV file. Raises InputError for a missing file, a missing or unknown column, a line cut short."""
+    """Read the rows of a CSV file. Raises InputError for a missing file, a missing or unknown column, or an incomplete
+    line."""
     return tuple(csv_rows(path, required, optional))
 
 
 def csv_rows(path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> Iterator[Row]:
-    """The same one after the other, for files of very many rows."""
+    """Yield the rows of a CSV file one by one, as `read_csv` reads them, for large files."""
     try:
         data = read_bytes(path)
     except FileNotFoundError:
@@ -109,7 +110,7 @@ def csv_rows(path: Path, required: Sequence[str], optional: Sequence[str] = ()) 
 
 
 def parse_csv(data: bytes, path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> tuple[Row, ...]:
-    """The same of the file's content. path: for messages."""
+    """Read the rows of the content of a CSV file. path: for messages."""
     return tuple(_rows(data, path, required, optional))
 
 

@@ -1,4 +1,4 @@
-"""Names of images in tables and files, and names as paths: below the folder they are meant for, or refused."""
+"""Names of images, and safe conversion of names to paths below a folder."""
 
 import os
 from collections.abc import Collection
@@ -11,16 +11,16 @@ SCAN_ENDINGS = (".tif", ".tiff", ".jpg", ".jpeg", ".jp2", ".j2k", ".png")
 
 
 def image_name(text: str) -> str:
-    """An image's name: its file's, with the folders before it and `/` between, without a picture's ending, and without
-    blanks at its ends, which no table keeps."""
+    """Name of an image from its file: folders separated by `/`, without the file ending of an image format, and without
+    leading or trailing blanks, which tables do not preserve."""
     folder, slash, file = text.strip().rpartition("/")
     name, ending = os.path.splitext(file)
     return folder + slash + (name if ending.lower() in SCAN_ENDINGS else file).strip()
 
 
 def names_below(files: Collection[str | Path], others: Collection[str | Path] | None = None) -> list[str]:
-    """The names of images, in the order of their files: the path below the folder that all the files share. others:
-    whose names are asked for, if not those of the files."""
+    """Names of images in the order of their files: paths relative to the common folder of all files. others: files to
+    name instead, relative to the same folder."""
     given = {text[: text.rfind(os.sep) + 1] for text in map(str, files)}
     places = [text.rpartition(os.sep) for text in map(str, files if others is None else others)]
     folders = {folder: os.path.abspath(folder) for folder in given.union(folder + sign for folder, sign, _ in places)}
@@ -31,9 +31,9 @@ def names_below(files: Collection[str | Path], others: Collection[str | Path] | 
 
 
 def path_below(folder: Path, name: str, suffix: str = "") -> Path:
-    """The path of a name in a folder, with sub-folders where the name has `/`. suffix: after the name.
+    """Path of a name below a folder, with sub-folders for each `/`. suffix: appended to the name.
 
-    Raises InputError for a name that would lead out of the folder, or that no file can have on some system.
+    Raises InputError for a name that would lead out of the folder, or that is no valid file name on some system.
     """
     parts = name.split("/")
     if not name.isprintable() or any(map(_leads_elsewhere, parts)):
@@ -46,10 +46,10 @@ def path_below(folder: Path, name: str, suffix: str = "") -> Path:
 
 
 def _leads_elsewhere(part: str) -> bool:
-    return part.strip() in ("", ".", "..") or "\\" in part or part[1:2] == ":"  # a drive, on some systems
+    return part.strip() in ("", ".", "..") or "\\" in part or part[1:2] == ":"  # a Windows drive
 
 
 def file_word(name: str) -> str:
-    """A name as a part of a file's name: letters, digits, `-`, `_` and `.`, with `-` in the place of all others."""
+    """Convert a name to part of a file name: characters other than letters, digits, `-`, `_` and `.` become `-`."""
     word = "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in name)
     return word if word.strip(".") else "-"

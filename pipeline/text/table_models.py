@@ -1,6 +1,6 @@
 """TOML tables as pydantic models: each field is a key with its type, default and meaning.
 
-Names, defaults and unknown keys are pydantic's; a value is read by `Table`, whose errors name file, line and key.
+Pydantic handles names, defaults and unknown keys; `Table` reads the values, so that errors name file, line and key.
 """
 
 from collections.abc import Callable, Iterator
@@ -22,17 +22,18 @@ _UNITS = {"mm": "mm", "um": "µm", "deg": "°", "px": "px", "ppm": "ppm", "urad"
 
 @dataclass(frozen=True)
 class Key:
-    """How a key is read from its table, and what its type is called. model: of a table below this one."""
+    """Type of a key. words: name of the type; read: reads the value from its table; model: of a sub-table, else
+    None."""
 
     words: str
     read: Callable[[Table, str], Any]
     model: type | None = None
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
-        return PlainValidator(self._validated).__get_pydantic_core_schema__(Any, handler)  # `Table` knows the type
+        return PlainValidator(self._validated).__get_pydantic_core_schema__(Any, handler)  # `Table` checks the type
 
     def _validated(self, value: Any, info: ValidationInfo) -> Any:
-        """A value from a file is read from its table; one that a program gives stands as it is."""
+        """Read a value of a file from its table; a value given by a program is taken as it is."""
         if not isinstance(info.context, Table):
             return value
         assert info.field_name is not None
@@ -55,23 +56,23 @@ TRIPLE = Key("[x, y, z]", Table.triple)
 
 
 def whole(least: int = 0, most: int = 10**9) -> Key:
-    """A whole number within limits."""
+    """Key of a whole number within limits."""
     limits = f", {least} or more" if most == 10**9 else f" of {least} to {most}"
     return Key(f"whole number{limits}", lambda table, key: table.whole(key, least=least, most=most))
 
 
 def choice(*words: str) -> Key:
-    """One of some words."""
+    """Key of a choice of words."""
     return Key(" or ".join(f'"{word}"' for word in words), lambda table, key: table.text(key, choices=words))
 
 
 def subtable(model: type) -> Key:
-    """A table below this one."""
+    """Key of a sub-table."""
     return Key("table", lambda table, key: read_model(table.table(key), model), model)
 
 
 def subtables(model: type) -> Key:
-    """An array of tables below this one."""
+    """Key of an array of sub-tables."""
     return Key("tables", lambda table, key: tuple(read_model(each, model) for each in table.tables(key)), model)
 
 
@@ -81,7 +82,7 @@ def read_model(table: Table, model: type[Model]) -> Model:
     Raises
     ------
     InputError
-        With file, line and key, for a wrong value, a missing key or, all in one message, unknown keys.
+        For a wrong value, a missing key or unknown keys (all in one message), with file, line and key.
     """
     try:
         given: Model = _adapter(model).validate_python(dict(table.values), context=table)
@@ -103,7 +104,7 @@ def _input_error(table: Table, model: type, error: ValidationError) -> InputErro
 
 @dataclass(frozen=True)
 class KeyRow:
-    """A row of the table of keys: default "" where the key must be given."""
+    """Row of the table of keys in the documentation. default: "required" if the key must be given."""
 
     name: str
     type: str
@@ -113,7 +114,7 @@ class KeyRow:
 
 
 def key_rows(model: type) -> Iterator[KeyRow]:
-    """The keys of a model, in their order."""
+    """Yield the rows of the keys of a model, in order."""
     hints = get_type_hints(model, include_extras=True)
     for field in fields(model):
         key, hint = (
@@ -136,7 +137,7 @@ def _default_text(default: Any, field: Field[Any]) -> str:
         return "required" if field.default_factory is MISSING else ""
     if default is None or default == ():
         return "none"
-    if is_dataclass(default):  # of a table below this one
+    if is_dataclass(default):  # a sub-table
         return ""
     if isinstance(default, bool):
         return str(default).lower()

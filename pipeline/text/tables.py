@@ -1,4 +1,4 @@
-"""TOML files whose every key is checked: a wrong type, a missing key or a misspelt one gives a message that helps."""
+"""TOML files with checked keys: wrong types, missing and misspelt keys give helpful messages."""
 
 import math
 import os
@@ -13,17 +13,17 @@ from pipeline.text.text_file import LARGEST, quote_value, read_bytes
 from pipeline.text.wording import LISTED, did_you_mean, nearest
 
 FREE = "free"
-MOST_MB = 4  # marks that were learned from 12,000 scans make a camera file of this size
+MOST_MB = 4  # size of a camera file with marks learned from 12,000 scans
 
 _DEEP = re.compile(r"""(?<![\w"'-])(?:[\w"'-]++\s*+\.\s*+){30}""")
 _BARE = re.compile(
     r"""\s*(?P<key>[\w."'-]+)\s*=\s*(?:(?P<word>[A-Za-z][\w./-]*)|(?P<number>[+-]?\d[\d.]*)\s*[A-Za-zµμ°%]+)\s*(?:\#.*)?$"""
 )
-_LONGEST_PATH, _LONGEST_NAME = 4000, 255  # bytes, of most file systems
+_LONGEST_PATH, _LONGEST_NAME = 4000, 255  # bytes, limits of most file systems
 
 
 def read_toml(path: Path) -> "Table":
-    """The root table of a TOML file. Raises InputError for a missing file, bytes that are no text, a syntax error."""
+    """Read the root table of a TOML file. Raises InputError for a missing file, invalid UTF-8, or a syntax error."""
     return Table(_parse(path), path, "")
 
 
@@ -47,7 +47,7 @@ def _parse(path: Path) -> dict[str, Any]:
 
 
 def _mending(text: str, error: str) -> str:
-    """What the line of a syntax error should be, where that can be told."""
+    """Remedy of a syntax error; with the corrected line if it is known."""
     if re.search("Unescaped|hex value", error):
         return "Mend that line (a path has / in the place of \\)."
     place = re.search(r"at line (\d+)", error)
@@ -67,9 +67,10 @@ def _toml_files_sentence(folder: Path) -> str:
 
 
 class Table:
-    """One table of a TOML file, with its file and its place in it ("" the root, "distortion.sigma", "fiducial[2]").
+    """Table of a TOML file. place: its path in the file ("" for the root, "distortion.sigma", "fiducial[2]").
 
-    Every key that is read or asked after is remembered; `done` refuses the others.
+    Keys that were read or tested are recorded; `done` refuses all others. All readers raise InputError for a wrong type
+    or a missing key.
     """
 
     def __init__(self, values: Mapping[str, Any], file: Path, place: str) -> None:
@@ -83,7 +84,7 @@ class Table:
         return key in self.values
 
     def error(self, key: str, message: str) -> InputError:
-        """An InputError that names the file, the line (of the table where the key is missing) and the key."""
+        """InputError with file, line (that of the table if the key is missing) and key."""
         line = self._line_number(key)
         at = f"{self.file}, line {line}" if line else f"{self.file}"
         table = f"[{self.place}] " if self.place else ""
@@ -100,22 +101,22 @@ class Table:
         return value
 
     def path_value(self, key: str, default: str | None = None) -> Path:
-        """A file's or folder's name, relative to the folder of this file."""
+        """Path relative to the folder of this file."""
         return self.file.parent / self.path_text(key, default)
 
     def path_text(self, key: str, default: str | None = None) -> str:
-        """Text that may name a file."""
+        """Text that is a valid path."""
         return self._path(key, self.text(key, default))
 
     def path_texts(self, key: str) -> tuple[str, ...]:
         return tuple(self._path(key, text) for text in self.texts(key))
 
     def is_flag(self, key: str) -> bool:
-        """Whether a key that is there holds true or false."""
+        """Whether a key holds true or false. Raises InputError if it is missing."""
         return isinstance(self._get(key, None), bool)
 
     def is_list(self, key: str) -> bool:
-        """Whether a key is there and holds a list."""
+        """Whether a key exists and holds a list."""
         return isinstance(self.values.get(key), list)
 
     def flag(self, key: str, default: bool) -> bool:
@@ -135,7 +136,7 @@ class Table:
         return value
 
     def number_or_text(self, key: str, default: float | str, choices: Sequence[str], *, above: float) -> float | str:
-        """A number above a limit, or one of some words."""
+        """Number above a limit, or one of the choices."""
         value = self._get(key, default)
         if isinstance(value, str) and value not in choices:
             also = f"{did_you_mean(value, choices)} A number above {above:g}, without quotes, is possible, too."
@@ -156,7 +157,7 @@ class Table:
         return (x, y)
 
     def number_or_pair(self, key: str, default: tuple[float, float] | None = None) -> tuple[float, float]:
-        """One number for both axes, or [x, y]."""
+        """Pair, given as one number for both axes or [x, y]."""
         value = self._get(key, default)
         if isinstance(value, list | tuple):
             return self.pair(key, default)
@@ -179,11 +180,11 @@ class Table:
         return tuple((self._number(key, x), self._number(key, y)) for x, y in value)
 
     def sigma(self, key: str, default: float | None = None) -> float:
-        """A standard deviation: 0 fixes, "free" (inf) is no prior at all."""
+        """Standard deviation; 0: fixed, "free" (inf): no prior."""
         return self._sigma(key, self._get(key, default))
 
     def sigma_pair(self, key: str, default: tuple[float, float] | None = None) -> tuple[float, float]:
-        """A standard deviation for both axes, or [sx, sy]; each a number or "free"."""
+        """Pair of standard deviations, given as one for both axes or [sx, sy]; each a number or "free"."""
         value = self._get(key, default)
         if isinstance(value, Sequence) and not isinstance(value, str):
             if len(value) != 2:
@@ -199,7 +200,7 @@ class Table:
         return tuple(value)
 
     def numbers(self, key: str) -> tuple[float, ...]:
-        """A list of numbers, whole ones as they are."""
+        """List of numbers; integers remain integers."""
         value = self._get(key, None)
         if not isinstance(value, list) or not value:
             raise self.error(key, f"must be a list of numbers, [1.0, 2.0, ...], not {quote_value(value)}.")
@@ -207,14 +208,14 @@ class Table:
         return tuple(item if type(item) is int else number for item, number in zip(value, numbers, strict=True))
 
     def table(self, key: str) -> "Table":
-        """A table inside of this one; an empty one where it is absent."""
+        """Sub-table; empty if it is absent."""
         value = self._get(key, {})
         if not isinstance(value, dict):
             raise self.error(key, f"must be a table, [{self._inside(key)}], not {quote_value(value)}.")
         return Table(value, self.file, self._inside(key))
 
     def tables(self, key: str) -> tuple["Table", ...]:
-        """An array of tables; empty where it is absent."""
+        """Array of sub-tables; empty if it is absent."""
         value = self._get(key, [])
         if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
             raise self.error(key, f"must be written as [[{self._inside(key)}]], once for each.")
@@ -224,12 +225,12 @@ class Table:
         return tuple(self.values)
 
     def done(self) -> None:
-        """Refuse every key that nothing has asked for, all of them in one message."""
+        """Raise InputError for the keys that were not read or tested, all in one message."""
         if unknown := self.unknown_keys(self._known):
             raise unknown
 
     def unknown_keys(self, known: Collection[str]) -> InputError | None:
-        """What to say of keys that are not known; None where there are none."""
+        """InputError for unknown keys; None if there are none."""
         names, unknown = sorted(known), [key for key in self.values if key not in known]
         messages = [
             str(self.error(key, f"is no key of this table.{did_you_mean(key, names)} Known here: {list_words(names)}."))
@@ -240,7 +241,7 @@ class Table:
         return InputError("\n".join(messages)) if messages else None
 
     def missing_key(self, key: str, known: Collection[str]) -> InputError:
-        """What to say of a key that must be given."""
+        """InputError for a missing key."""
         near = nearest(key, [name for name in self.values if name not in known])
         return self.error(key, "is missing. Add it" + (f", or rename {near!r} to it." if near else "."))
 
@@ -284,7 +285,7 @@ class Table:
         return f"{self.place}.{key}" if self.place else key
 
     def _line_number(self, key: str) -> int | None:
-        """The line where the key, or the table of that name, stands inside this table; this table's own if nowhere."""
+        """Line of the key or sub-table of that name in this table; line of this table if it is missing."""
         try:
             lines = self.file.read_text(encoding="utf-8-sig").splitlines()
         except (OSError, UnicodeDecodeError):
@@ -306,5 +307,5 @@ class Table:
 
 
 def list_words(words: Sequence[str]) -> str:
-    """Words in quotes, with commas between."""
+    """Quoted words, separated by commas."""
     return ", ".join(repr(word) for word in words) or "none"

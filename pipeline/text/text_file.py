@@ -1,4 +1,4 @@
-"""Files that are read whole, regular ones of a stated size at most; numbers as JSON knows them."""
+"""Reading of whole files, regular ones of limited size, and of JSON with finite numbers."""
 
 import json
 import stat
@@ -7,8 +7,8 @@ from typing import Any
 
 from pipeline.errors import InputError
 
-MOST_MB = 200  # a comparator file of 50,000 scans has 50
-SHOWN = 60  # so many characters of a wrong value are quoted
+MOST_MB = 200  # MB; a comparator file of 50,000 scans has 50
+SHOWN = 60  # characters of a wrong value quoted in a message
 
 _KINDS = {
     stat.S_ISFIFO: "a pipe",
@@ -16,18 +16,18 @@ _KINDS = {
     stat.S_ISBLK: "a device",
     stat.S_ISSOCK: "a socket",
 }
-LARGEST = 1e15  # of a coordinate, a size, a standard deviation, in whatever unit: squares of larger ones are lost
-SMALLEST_SIGMA = 1e-9  # of a coordinate, in mm, m or degrees: weights of smaller ones swallow all others
+LARGEST = 1e15  # limit of coordinates, sizes and standard deviations, any unit: squares of larger ones lose precision
+SMALLEST_SIGMA = 1e-9  # limit of standard deviations, mm, m or degrees: weights of smaller ones dominate all others
 
 
-FINEST_PITCH_UM = 0.1  # below it mm or m were meant: no scanner and no sensor has such pixels
+FINEST_PITCH_UM = 0.1  # µm; no scanner or sensor has smaller pixels, so that mm or m must have been meant
 
 
 def read_bytes(path: Path, most_mb: int = MOST_MB) -> bytes:
-    """The content of a file.
+    """Read the content of a file.
 
-    Raises FileNotFoundError and IsADirectoryError, for which the caller has the better words, and InputError for what
-    is no regular file (a pipe would be waited for, a device has no end), is larger, or cannot be read.
+    Raises FileNotFoundError and IsADirectoryError, for which the caller has a better message, and InputError for a file
+    that is not regular (a pipe would block, a device has no end), too large, or unreadable.
     """
     try:
         found = path.stat()
@@ -50,13 +50,13 @@ def read_bytes(path: Path, most_mb: int = MOST_MB) -> bytes:
 
 
 def read_json(path: Path) -> Any:
-    """The content of a JSON file; FileNotFoundError as above. Raises InputError, which says how to make the file anew,
-    for what is no JSON: NaN, infinite and endless numbers, and tables nested beyond sense, too."""
+    """Read a JSON file. Raises as `read_bytes`, and InputError, with the remedy, for invalid JSON, which includes NaN,
+    infinite and overlong numbers, and excessive nesting."""
     return parse_json(read_bytes(path), path)
 
 
 def parse_json(data: bytes, path: Path) -> Any:
-    """The same of its content. path: for messages."""
+    """Parse the content of a JSON file, as `read_json` does. path: for messages."""
     try:
         return json.loads(data.decode("utf-8"), parse_constant=_no_number)
     except (ValueError, RecursionError) as error:
@@ -70,7 +70,7 @@ def _no_number(text: str) -> float:
 
 
 def quote_value(value: object) -> str:
-    """A wrong value as a message quotes it: of one line, and not longer than makes sense."""
+    """Quote a wrong value in a message, on one line and shortened."""
     try:
         text = repr(value)
     except (ValueError, RecursionError):

@@ -1,4 +1,4 @@
-"""Lists, counts and suggestions as the program words them, and values as the text of a TOML file."""
+"""Wording of lists, counts and suggestions in messages, and values as TOML text."""
 
 import difflib
 import json
@@ -9,53 +9,54 @@ from pathlib import PurePosixPath
 from typing import Any
 
 _BARE_KEY = re.compile("[A-Za-z0-9_-]+")
-LISTED = 8  # so many names are listed; the rest are counted
+LISTED = 8  # largest number of names listed; the rest are counted
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
-    """The known word that is the most like it; None where none is near."""
+    """Known word most similar to a word; None if none is similar."""
     words = list(known)
     alike = [each for each in words if each.casefold() == word.casefold()]
     return next(iter(alike or difflib.get_close_matches(word, words, n=1)), None)
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """The question " Did you mean '...'?", with the blank in front; "" where nothing is near."""
+    """Question " Did you mean '...'?", with a leading blank; "" if no known word is similar."""
     near = nearest(word, known)
     return "" if near is None else f" Did you mean {near!r}?"
 
 
 def listed(names: Sequence[str]) -> str:
-    """The first names, and how many there are beyond them."""
+    """List the first names, and count the rest."""
     more = len(names) - LISTED
     return ", ".join(names[:LISTED]) + (f" and {more} more" if more > 0 else "")
 
 
 def counted(number: int, one: str, many: str = "") -> str:
-    """The number with its noun."""
+    """Number with its noun, singular or plural."""
     return f"{number} {one if number == 1 else many or one + 's'}"
 
 
 def count_sentence(what: str, done: int, of: int, rest: Mapping[str, int]) -> str:
-    """How many scans of all are so: the one form in which commands count scans. rest: how many others, by word."""
+    """State how many of all scans are done, in the form common to all commands. rest: numbers of the others by word."""
     others = ", ".join(f"{number} {word}" for word, number in rest.items() if number)
     return f"{done} of {counted(of, 'scan')} {what}" + (f" ({others})" if others else "")
 
 
 def capitalised(sentence: str) -> str:
-    """The sentence with a capital at its beginning; the rest as it is."""
+    """Capitalise the first letter of a sentence; the rest is unchanged."""
     return sentence[:1].upper() + sentence[1:]
 
 
 def drop_file_name(sentence: str, file: str) -> str:
-    """The sentence without the name of the file that it begins with."""
+    """Remove the leading file name from a sentence."""
     name = f"{PurePosixPath(file.replace(chr(92), '/')).name}: "
     head, found, rest = sentence.partition(name)
     return rest if found and ": " not in head else sentence
 
 
 def gathered(told: Iterable[tuple[str, str, str]]) -> list[str]:
-    """What images have to say, each with its name and file: once where many say the same, with their number."""
+    """Merge equal messages of images. told: image, file and message; returns one sentence for each different message,
+    with the number of scans if there are several."""
     alike: dict[str, list[tuple[str, str]]] = {}
     for image, file, sentence in told:
         alike.setdefault(drop_file_name(sentence, file), []).append((image, sentence))
@@ -71,7 +72,7 @@ def quoted(text: str) -> str:
 
 
 def table_lines(values: Mapping[str, Any], name: str = "") -> list[str]:
-    """The lines of a TOML table of that name below its head; tables inside of it stand at its end."""
+    """Lines of a TOML table below its header; sub-tables come last. name: of the table."""
     inside = {key: value for key, value in values.items() if isinstance(value, Mapping) or _is_tables(value)}
     lines = [f"{_key(key)} = {_value(value)}" for key, value in values.items() if key not in inside]
     for key, value in inside.items():
@@ -91,7 +92,7 @@ def _key(key: str) -> str:
 
 
 def _value(value: Any) -> str:
-    """TOML has JSON's text, whole numbers, lists and flags; other numbers keep their point."""
+    """Value as TOML: strings, integers, lists and booleans as in JSON; floats keep their decimal point."""
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_value, value))}]"
     return repr(value) if isinstance(value, float) else json.dumps(value, ensure_ascii=False)
