@@ -1,1 +1,1 @@
-"""Detection: where in a scan something looks like a mark, by normalised cross-correlation, and how significantly."""
+"""Detection of marks in a scan by normalised cross-correlation, and its significance."""

@@ -1,4 +1,4 @@
-"""Normalised correlation with a mark's picture: in a scan freed of its ground, and of what lies beside the mark."""
+"""Normalised cross-correlation (NCC) with a mark's template under a mask, after background subtraction."""
 
 from dataclasses import dataclass, replace
 
@@ -11,23 +11,29 @@ from measure.noise.robust_estimation import SIGMA_OF_DEVIATION
 
 Map = Single
 
-_CLIP = 3.0  # times the local contrast
-_MEAN = 0.3  # of the coarse: the side of the squares whose median is background
-_MEDIAN = 5  # of these squares each way
-_DRAWN = 0.05  # of the mark's own contrast: what differs by more from the ground is the mark
-_SMOOTHED_PX = 3.0  # the standard deviation of a Gaussian that a reduced picture still shows
-_EVEN = 1e-5  # mean square in units of the local contrast: a three hundredth of it is rounding
-_TOLD_PX = 1 << 20  # pixels tell how noise is correlated
-_NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))  # rows and columns off, each with the one opposite
+_CLIP = 3.0  # times the local contrast, limit of flattened values
+_MEAN = 0.3  # in coarse widths, side of the squares whose median is the background
+_MEDIAN = 5  # size of the median filter, in these squares
+_DRAWN = 0.05  # fraction of the mark's contrast: pixels of the template that differ more from the rim are the mark
+_SMOOTHED_PX = 3.0  # px, standard deviation of a Gaussian that a reduced image still resolves
+_EVEN = 1e-5  # mean square in units of the local contrast below which a window is uniform; rounding is 1/300 of it
+_TOLD_PX = 1 << 20  # largest number of pixels used to estimate the noise's correlation
+_NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))  # offsets in rows and columns, each with its opposite
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """coarse: times the mark's finest detail: coarser structure is ground. beside: times the same: how far about the
-    drawing pixels count. robust: whether the local contrast is a median, which an edge that is far stronger than the
-    mark does not change, and not a mean square, which takes less of what noise there is for contrast: that is a closer
-    look. whitened: whether the drawing is weighed by the inverse covariance that neighbouring pixels have: grain hides
-    the coarse of a faint mark, and little of its fine lines; what is blurred more than it is drawn has none of them."""
+    """Treatment of a mark's background in template matching.
+
+    Attributes
+    ----------
+    coarse : in widths of the mark's finest detail; coarser structure is background.
+    beside : in the same unit, distance around the drawing up to which pixels are used.
+    robust : local contrast by a median, which is insensitive to edges far stronger than the mark, instead of a mean
+        square, which takes less of the noise for contrast.
+    whitened : weight the template by the inverse covariance of neighbouring pixels. Grain hides the coarse structure of
+        a faint mark more than its fine lines. Not suitable for marks blurred more than their drawing.
+    """
 
     coarse: float
     beside: float
@@ -35,15 +41,15 @@ class Surroundings:
     whitened: bool
 
     def ground_reach_px(self, detail_px: float) -> int:
-        """How far about a pixel its ground is taken from."""
+        """Distance (px) up to which the background of a pixel is estimated."""
         return _MEDIAN * _mean_px(self.coarse * detail_px) // 2 + 1
 
     def flattened(self, image: Map, detail_px: float, faint_dn: float) -> Map:
-        """The picture freed of what is much coarser than detail_px, in units of its contrast about every pixel: a thin
-        cross on a landscape answers as on an even ground. Contrasts of faint_dn or below count for less.
+        """Subtract structure much coarser than detail_px and normalise by the local contrast.
 
-        The ground is a median, which keeps the frame's edge: a mean would spread it over the marks beside it, and drown
-        those that are faint.
+        A thin cross then gives the same response on a landscape as on a uniform background. Contrasts of faint_dn or
+        below are damped. The background is a median, which preserves the frame's edge; a mean would spread the edge
+        over adjacent marks and hide faint ones.
         """
         coarse_px = self.coarse * detail_px
         detail = image - _median(image, coarse_px)
@@ -55,8 +61,8 @@ class Surroundings:
         return np.asarray(np.clip(detail / contrast, -_CLIP, _CLIP), np.float32)
 
     def pattern(self, template: Array, detail_px: float, image: Map) -> tuple[Map, Map]:
-        """What a flattened picture is correlated with, of mean 0, and how much each of its pixels counts: one that is
-        nan in the template does not."""
+        """Convert a template to the zero-mean pattern correlated with a flattened image, and its mask; nan pixels of
+        the template are masked."""
         about = self._template_mask(template, detail_px)
         template = np.nan_to_num(template)
         chip = np.asarray(template - cv2.GaussianBlur(template, (0, 0), self.coarse * detail_px), np.float32)
@@ -65,12 +71,12 @@ class Surroundings:
         return about * (chip - np.average(chip, weights=about)), about
 
     def _template_mask(self, template: Array, detail_px: float) -> Map:
-        """1 on the drawing and beside it, 0 elsewhere; 1 on all that is known where no ground is known about it."""
+        """1 on the drawing and around it, 0 elsewhere; 1 on all known pixels if the template has no known rim."""
         rim = np.concatenate([template[0], template[-1], template[:, 0], template[:, -1]])
         if np.isnan(rim).all():
             return np.asarray(~np.isnan(template), np.float32)
         drawn = np.nan_to_num(np.abs(template - np.nanmedian(rim)))
-        # Of a line far thinner than a pixel hardly anything is left.
+        # A line far thinner than a pixel has almost no contrast left.
         beside = (drawn < min(_DRAWN, float(drawn.max()) / 2)).astype(np.uint8)
         far_px = self.beside * detail_px + 1
         near = cv2.distanceTransform(beside, cv2.DIST_L2, 5) <= far_px
@@ -78,31 +84,31 @@ class Surroundings:
 
 
 def variation(image: Map, about: Map) -> Map:
-    """The sum of squared deviations from their mean, wherever the pixels about a drawing lie inside of the picture."""
+    """Sum of squared deviations from the mean under a mask, at every place where the mask lies inside the image."""
     sums, squares = (np.asarray(cv2.matchTemplate(each, about, cv2.TM_CCORR)) for each in (image, image**2))
     np.divide(np.square(sums, out=sums), about.sum(), out=sums)
     return np.asarray(np.subtract(squares, sums, out=squares), np.float32)
 
 
 def correlation(image: Map, chip: Map, about: Map, varied: Map | None = None) -> Map:
-    """Correlate a picture with a pattern, wherever that lies inside of it: the normalised cross-correlation (NCC).
+    """Compute the normalised cross-correlation (NCC) of an image with a pattern under a mask.
 
-    OpenCV's own correlation under a mask gives the same for three times the price.
+    OpenCV's masked correlation gives the same result in three times the time.
 
     Parameters
     ----------
     image : (rows, columns)
-        Flattened.
+        Flattened image.
     chip, about : (rows, columns)
-        As `Surroundings.pattern` gives them: beside the drawing may lie the frame's edge, or writing.
+        Pattern and mask of `Surroundings.pattern`. The mask excludes the frame's edge or writing around the drawing.
     varied : optional
-        The picture's variation about the drawing: patterns of which the same pixels count share it.
+        Variation of the image under the mask, shared by patterns with the same mask.
     """
     varied = variation(image, about) if varied is None else varied
     products = cv2.matchTemplate(image, chip, cv2.TM_CCORR)
     power = np.sum(chip**2)
     spread = varied * power
-    least = _EVEN * about.sum() * power  # nothing but even ground is no answer
+    least = _EVEN * about.sum() * power  # a uniform background gives no response
     even = spread <= least
     np.maximum(spread, least, out=spread)
     np.divide(products, np.sqrt(spread, out=spread), out=products)
@@ -111,13 +117,13 @@ def correlation(image: Map, chip: Map, about: Map, varied: Map | None = None) ->
 
 
 WIDE = Surroundings(coarse=4.0, beside=2.0, robust=False, whitened=False)
-CLOSE = Surroundings(coarse=2.0, beside=1.0, robust=True, whitened=False)  # for faint marks beside the frame's edge
+CLOSE = Surroundings(coarse=2.0, beside=1.0, robust=True, whitened=False)  # for faint marks near the frame's edge
 GRAINY = replace(CLOSE, whitened=True)  # for such marks in grain as wide as their lines
 
 
 def _inverse_covariance(image: Map) -> Map:
-    """(3, 3) a row of the inverse covariance of a picture's pixels, but for a factor: each less what its neighbours say
-    of it, by least squares (a conditional autoregression: Besag, 1974)."""
+    """(3, 3) row of the inverse covariance of an image's pixels, up to a factor: each pixel minus its least-squares
+    prediction from its neighbours (conditional autoregression: Besag, 1974)."""
     rows, cols = (np.arange(1, side - 1) for side in image.shape)
     rows = rows[:: max(1, image.size // _TOLD_PX)]
     pairs = np.stack(
@@ -136,14 +142,14 @@ def _median(image: Map, coarse_px: float) -> Map:
 
 
 def _mean_px(coarse_px: float) -> int:
-    """The side of the squares whose means are compared."""
+    """Side (px) of the squares whose means enter the median."""
     return max(1, int(_MEAN * coarse_px))
 
 
 def _smoothed(image: Map, sigma_px: float) -> Map:
-    """The picture under a Gaussian; a wide one takes, for its price, hardly more than a reduced picture tells."""
+    """Smooth an image by a Gaussian; a wide one is applied to a reduced image, to save time."""
     factor = max(1, int(sigma_px / _SMOOTHED_PX))
-    # The averaging and the straight lines between its pixels blur by themselves: f^2 / 12 and f^2 / 6 of variance.
+    # Averaging and linear interpolation add blur of variance f^2 / 12 and f^2 / 6.
     left = np.sqrt(sigma_px**2 - (factor**2 - 1) / 4) / factor
     return _enlarged(cv2.GaussianBlur(_reduced(image, factor), (0, 0), left), image)
 
@@ -155,5 +161,5 @@ def _reduced(image: Map, factor: int) -> Map:
 
 
 def _enlarged(small: NDArray[np.integer | np.floating], image: Map) -> Map:
-    """A reduced picture in the size of the other."""
+    """Enlarge a reduced image to the size of another."""
     return np.asarray(cv2.resize(small, image.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)

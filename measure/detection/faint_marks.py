@@ -1,10 +1,10 @@
-"""A mark that is barely there, at a place that the other marks give: its lines against the texture about it.
+"""Detection of faint marks at places predicted from the other marks, against the texture around them.
 
-Alone such a mark cannot be told from the many places where noise looks like it. Where the constellation is sure, only
-those as strong and as near to the predicted place are its rivals: how many the texture would give is known (Adler, The
-Geometry of Random Fields, 1981: excursions of a Gaussian field), and so is, from the same texture, how far it pulls
-the mark from its true place. How strong the texture is beside the lines depends on the tone curve: where that is not
-known, the mark is sought by two curves, and how far apart it is seen is in its covariance.
+Alone, such a mark cannot be distinguished from the many places where noise resembles it. With a certain constellation
+only responses as strong and as close to the predicted place compete. Their expected number follows from the texture
+(Adler, The Geometry of Random Fields, 1981: excursions of a Gaussian field), as does the covariance of the place. The
+strength of the texture relative to the lines depends on the tone curve. Where that is unknown, the mark is searched
+with two curves, and the difference enters the covariance.
 """
 
 from dataclasses import dataclass, replace
@@ -23,35 +23,37 @@ from measure.matching.window import FAINT, Coding
 from measure.results import Covariance, MarkFit
 from measure.scans.scan import Scan, means
 
-_BACKGROUND = 1.2  # times the finest detail: the standard deviation of the blur that is taken for background
-_TEXTURE = 2.0  # times that: over which the strength of the texture is averaged
-_CLIP = 3.0  # times the texture's strength: stones and edges count no more
-_RING = 30.0  # times the background's: how far about the mark the texture is asked
-_SELF = 0.1  # of the mark's own response: what is below it tells of the texture alone
-_SHOWN = 0.2  # of the mark's own weight: elsewhere the ground is too dark to tell
-_LINE = 0.25  # of the strongest: what counts as the mark's lines
-_ROUNDS = 8  # of rendering the mark anew where it was found, at most
-_SETTLED_PX = 1e-3  # a move that needs no further one: a fiftieth of what a faint mark is known to
-_STEP_PX = 0.5  # between the places by which a response's top is told
-_OWN_LINEAR = 0.01  # by so much marks are turned (rad) and larger than the frame says: a real register glass's by 0.012
-_LEAST_DISTANCE_PX = 1.0  # predictions are no better
-_LEAST_PLACES = 200  # of the texture that a covariance can be taken from
-_LEAST_NORM = 1e-6  # squared: where nothing shows of the mark nothing is divided by nothing
-_FINEST_PX = 16.0  # of a mark's lines: what is wider is sought in a picture that is reduced so far
+_BACKGROUND = 1.2  # in widths of the finest detail, standard deviation of the blur that estimates the background
+_TEXTURE = 2.0  # times that, standard deviation of the average of the texture's strength
+_CLIP = 3.0  # times the texture's strength, limit for stones and edges
+_RING = 30.0  # px of the window, radius around the mark within which the texture is estimated
+_SELF = 0.1  # fraction of the mark's response below which its own contribution is negligible
+_SHOWN = 0.2  # fraction of the template's norm at the mark; elsewhere the background is too extreme to show a mark
+_LINE = 0.25  # fraction of the maximum that delimits the mark's lines
+_ROUNDS = 8  # largest number of renderings at refined places
+_SETTLED_PX = 1e-3  # px, convergence limit: 1/50 of the standard deviation of a faint mark
+_STEP_PX = 0.5  # px between the places that define the peak of a response
+_OWN_LINEAR = 0.01  # rotation (rad) and scale of marks relative to the frame; 0.012 on a real register glass
+_LEAST_DISTANCE_PX = 1.0  # px, accuracy of predictions
+_LEAST_PLACES = 200  # places of texture needed to estimate a covariance
+_LEAST_NORM = 1e-6  # added to squared norms, to divide by
+_FINEST_PX = 16.0  # px, width of lines above which the window is reduced
 
 
 @dataclass(frozen=True, eq=False)
 class FaintMark:
-    """fit: the mark; its significance is in standard deviations of what the texture about it answers, and its
-    covariance comes from that texture. false_alarms: how many answers as strong and as near the
-    texture alone would give."""
+    """Faint mark.
+
+    fit: its significance is in standard deviations of the texture's response, from which its covariance is estimated,
+    too; false_alarms: expected number of responses of the texture as strong and as close.
+    """
 
     fit: MarkFit
     false_alarms: float
 
     @property
     def sigma_px(self) -> float:
-        """The standard deviation of its place, in the direction in which that is known least."""
+        """Standard deviation of the place in its least accurate direction, without the rotation uncertainty."""
         parts = self.fit.place_covariance.parts
         place_px2 = sum((part for cause, part in parts.items() if cause != Cause.OWN_TURN), np.zeros((2, 2)))
         return float(np.sqrt(np.linalg.eigvalsh(place_px2)[-1]))
@@ -63,14 +65,14 @@ def detect_faint(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_p
     Parameters
     ----------
     extreme_dn : float
-        The lightest or darkest grey value of the scan, which a mark of that polarity cannot pass: on ground as light or
-        as dark it does not show.
+        Lightest or darkest grey value of the scan, which a mark of that polarity cannot exceed. On a background of that
+        value it is invisible.
     blur_px : float
-        Of the scan.
+        Blur of the scan.
 
     Returns
     -------
-    FaintMark, or None where there is no contrast by any curve that the scan's may be.
+    FaintMark, or None if there is no contrast under one of the plausible tone curves.
     """
     curves = scan.tone.plausible_curves
     fields = (_Field(scan.replace_tone(curve), expected, extreme_dn, blur_px) for curve in curves)
@@ -90,8 +92,8 @@ def detect_faint(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_p
 
 
 class _Field:
-    """The window about a predicted place, freed of everything coarser than the mark's lines, step pixels of the scan to
-    one of its own, in which all its places are."""
+    """Window around a predicted place with the background subtracted. Its pixels are step pixels of the scan wide; all
+    places refer to it."""
 
     def __init__(self, scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px: float) -> None:
         self.blur_px = blur_px
@@ -100,7 +102,7 @@ class _Field:
         self.coarse_px = _BACKGROUND * detail_px(self.mark, self.linear)
         least, greatest = extent_px(self.mark, np.column_stack([self.linear, np.zeros(2)]))
         self.half = int(np.ceil(max(-least.min(), greatest.max()) + 2 * self.coarse_px)) + 1
-        moves_px = _ROUNDS * _STEP_PX + 1.0  # between the pixels its place may lie farther off than was searched
+        moves_px = _ROUNDS * _STEP_PX + 1.0  # the refined place may lie outside the search radius
         side = self.half + int(np.ceil(max(expected.search_px / step, _RING) + moves_px))
         first = np.floor(expected.center_px).astype(int) - side * step - step // 2
         self.origin = first + (step - 1) / 2
@@ -117,12 +119,12 @@ class _Field:
         inside = _reduced(scan.inside(*window).astype(np.float32), step) == 1.0
         room_dn = np.maximum(self.polarity * (extreme - ground), 0.0)
         self.room_dn = np.where(inside, room_dn, 0.0).astype(np.float32)
-        self.room = self.room_dn / self.texture_dn  # what a mark could change, over what the texture changes
+        self.room = self.room_dn / self.texture_dn  # largest possible contrast of a mark over the texture's strength
         self.detail: Array = np.asarray(np.clip(detail / self.texture_dn, -_CLIP, _CLIP) * self.polarity, dtype=float)
         self.weighted = self.detail * self.room
 
     def detect(self, search_px: float) -> FaintMark | None:
-        """The mark where the response is highest about its predicted place, None where nothing of its polarity is."""
+        """Detect the mark at the highest response around its predicted place. None without a positive response."""
         response = _Response(self, self.predicted)
         rows, cols = np.indices(response.value.shape)
         fraction = self.predicted - np.rint(self.predicted)
@@ -139,14 +141,15 @@ class _Field:
         return self._faint_mark(response)
 
     def template(self, off: Array) -> Array:
-        """The mark with its centre off the middle pixel's, freed of what is coarse."""
+        """Template of the mark with its centre offset from the centre pixel, background subtracted."""
         size = 2 * self.half + 1
         pixel_from_mark = np.column_stack([self.linear, off + self.half])
         shown = picture(self.mark, pixel_from_mark, size, size, self.blur_px / self.step)
         return np.asarray(shown - cv2.GaussianBlur(shown, (0, 0), self.coarse_px), dtype=float)
 
     def _faint_mark(self, response: "_Response") -> FaintMark | None:
-        """What the response at the mark's place is worth, against what the texture about it answers."""
+        """Evaluate the response at the mark's place against the responses of the texture around it. None if the texture
+        is not estimable or the peak is no maximum."""
         pixel, patch, center = response.pixel, response.patch, response.center
         height = float(response.value[pixel])
         amplitude = height / float(response.norm[pixel])
@@ -188,15 +191,16 @@ class _Field:
         return FaintMark(fit, _false_alarms(height / scatter, slopes / scatter**2, distance_px))
 
     def _leaning_px2(self, response: "_Response") -> Array:
-        """What the place of a mark whose lines lie to one side of its point takes from a turn and a size that are not
-        quite the frame's, as if its lines were all in their middle."""
+        """(2, 2) covariance due to the mark's own rotation and scale, for lines off to one side of its point. All lines
+        are assumed to lie at their centroid."""
         lit = np.abs(response.template) * self.room[response.patch] ** 2
         rows, cols = np.indices(lit.shape) - self.half
         middle_px = self.step * (np.array([(lit * cols).sum(), (lit * rows).sum()]) / lit.sum() - response.fraction)
         return np.asarray(_OWN_LINEAR**2 * (middle_px @ middle_px) * np.eye(2))
 
     def _texture(self, response: "_Response", signal: Array) -> Mask:
-        """Where about the mark responses are the texture's alone: on ground where the mark could show."""
+        """Mask of the places around the mark whose response is that of the texture alone and where a mark could be
+        visible."""
         (row, col), (rows, cols) = response.pixel, np.indices(signal.shape)
         near = np.hypot(rows - row, cols - col) <= _RING
         whole = np.zeros(signal.shape, dtype=bool)
@@ -206,7 +210,7 @@ class _Field:
 
 
 class _Response:
-    """What a field answers to a mark whose centre is off the pixels by as much as a centre is."""
+    """Response of a window to a mark with the sub-pixel phase of a centre."""
 
     def __init__(self, field: _Field, center: Array) -> None:
         self.field, self.center = field, center
@@ -217,37 +221,36 @@ class _Response:
 
     @cached_property
     def templates(self) -> Array:
-        """(3, 3, rows, columns): the mark with its centre _STEP_PX less, not, and as much more off in row and column: a
-        line may be finer than the pixels are far apart, and how its picture changes between them no picture of whole
-        pixels tells."""
+        """(3, 3, rows, columns) templates with the centre shifted by -_STEP_PX, 0 and _STEP_PX in row and column. They
+        are rendered, since thin lines are undersampled and cannot be interpolated."""
         off = (-_STEP_PX, 0.0, _STEP_PX)
         return np.array([[self.field.template(self.fraction + np.array([col, row])) for col in off] for row in off])
 
     @cached_property
     def template(self) -> Array:
-        """The mark as it looks so."""
+        """Template of the mark at this phase."""
         return self.field.template(self.fraction)
 
     @cached_property
     def norm(self) -> Array:
-        """Of the weighted template at every pixel."""
+        """Norm of the weighted template at every pixel."""
         return np.sqrt(np.maximum(_correlated(self.field.room**2, self.template**2), 0.0) + _LEAST_NORM)
 
     @cached_property
     def value(self) -> Array:
-        """The weighted correlation at every pixel."""
+        """Weighted correlation at every pixel."""
         return _correlated(self.field.weighted, self.template) / self.norm
 
     def top(self) -> Array:
-        """Of the paraboloid through the responses about the centre, as near as it tells."""
+        """Vertex of the paraboloid through the responses around the centre, at most _STEP_PX away."""
         gradient, hessian = self.bend(self.field.weighted)
         if not np.all(np.linalg.eigvalsh(hessian) < 0):
             return self.center
         return np.asarray(self.center + np.clip(-np.linalg.solve(hessian, gradient), -_STEP_PX, _STEP_PX))
 
     def bend(self, weighted: Array) -> tuple[Array, Array]:
-        """Gradient (2,) by (col, row) and Hessian (2, 2) of what a weighted picture answers to a mark at a centre that
-        moves: of the paraboloid through nine answers, by least squares."""
+        """Gradient (2,) by (col, row) and Hessian (2, 2) of the response of a weighted image at the centre, from the
+        least-squares paraboloid through nine responses."""
         norm = np.sqrt(((self.field.room[self.patch] * self.template) ** 2).sum() + _LEAST_NORM)
         nine = np.einsum("rcij,ij->rc", self.templates, weighted[self.patch]) / norm
         by_col, by_row = nine.mean(axis=0), nine.mean(axis=1)
@@ -257,7 +260,7 @@ class _Response:
         return gradient, np.array([[bends[0], mixed], [mixed, bends[1]]]) / _STEP_PX**2
 
     def slopes(self) -> Array:
-        """(2, rows, cols) by column and row, of the values."""
+        """(2, rows, cols) derivatives of the correlation with respect to column and row."""
         by_col, by_row = (self.templates[1, 2] - self.templates[1, 0], self.templates[2, 1] - self.templates[0, 1])
         return np.stack([_correlated(self.field.weighted, by) / (2 * _STEP_PX) / self.norm for by in (by_col, by_row)])
 
@@ -267,8 +270,10 @@ def _reduced(picture: NDArray[np.floating], step: int) -> NDArray[np.floating]:
 
 
 def _false_alarms(strength: float, slopes: Array, radius_px: float) -> float:
-    """How many maxima of at least this strength a Gaussian field of unit variance has in a circle, slopes (2, 2) being
-    the covariance of its gradient: Adler's expected Euler characteristic of the excursion set."""
+    """Expected number of maxima of at least this strength in a circle, for a Gaussian field of unit variance.
+
+    slopes (2, 2): covariance of its gradient. Adler's expected Euler characteristic of the excursion set.
+    """
     density = np.sqrt(np.linalg.det(slopes)) * (2 * np.pi) ** -1.5 * strength * np.exp(-(strength**2) / 2)
     return float(np.pi * radius_px**2 * density)
 

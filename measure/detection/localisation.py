@@ -1,5 +1,4 @@
-"""A mark localised near its predicted place: where it looks most like itself, at full or half resolution, and how many
-places noise would make that look as much so."""
+"""Localisation of a mark near its predicted place: highest NCC at full or half resolution, with its false alarms."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,16 +22,24 @@ from measure.scans.scan import Scan
 
 Map = Single
 
-_SURE = 1e-6  # what is less likely is the mark, however soft: there are many marks
-_HALVED_PX = 6.0  # of the finest line: from there on half the resolution shows it as well
-_SHARP_PX, _SOFT_PX = 1.0, 2.5  # blur of the picture that is looked for: a fine line seen softly is another picture
+_SURE = 1e-6  # false alarms below which no softer template is tried; small, since there are many marks
+_HALVED_PX = 6.0  # px, width of the finest line from which on half the resolution suffices
+_SHARP_PX, _SOFT_PX = 1.0, 2.5  # px, blurs of the two templates; a blurred thin line differs much from a sharp one
 
 
 @dataclass(frozen=True, eq=False)
 class MarkPrediction:
-    """pixel_from_mark: (2, 3), its last column the predicted place. search_px: the radius about it within which the
-    mark is looked for. polarity: +1 for a mark lighter than its surroundings, -1 for a darker one. weights: of the
-    scan's channels, None for its own. surroundings: what about the mark counts where it is looked for."""
+    """Predicted mark.
+
+    Attributes
+    ----------
+    mark : drawing or template.
+    pixel_from_mark : (2, 3); its last column is the predicted place.
+    search_px : search radius around it.
+    polarity : +1 for a mark lighter than its background, -1 for a darker one.
+    weights : of the scan's channels; None: the scan's own.
+    surroundings : treatment of the background in the search.
+    """
 
     mark: Mark
     pixel_from_mark: Array
@@ -48,24 +55,24 @@ class MarkPrediction:
 
     @property
     def center_px(self) -> Array:
-        """(2,) predicted."""
+        """(2,) predicted place."""
         return self.pixel_from_mark[:, 2]
 
     def moved(self, center_px: Array) -> Self:
-        """The same at another place."""
+        """Copy of the prediction at another place."""
         return replace(self, pixel_from_mark=np.column_stack([self.linear, center_px]))
 
 
 def localise(scan: Scan, expected: MarkPrediction) -> tuple[Array, float] | None:
     """Find the highest correlation peak within the search radius.
 
-    The mark is drawn sharp or soft, whichever noise is less likely to feign: a soft faint mark, drawn sharp, is no more
-    than its noise.
+    A sharp and a soft template are tried, and the one with fewer false alarms is used: a soft faint mark is not
+    significant with a sharp template.
 
     Returns
     -------
-    The peak's column and row in the scan, to a part of a pixel, and the expected number of false alarms; None where
-    noise would make as high a peak.
+    Column and row of the peak in the scan, with sub-pixel accuracy, and the expected number of false alarms; None if
+    the peak is not significant.
     """
     searches = [_PeakSearch(scan, expected, _SHARP_PX)]
     if searches[0].false_alarms > _SURE:
@@ -81,7 +88,7 @@ def highest_peak(scan: Scan, expected: MarkPrediction) -> tuple[Array, float]:
 
 
 class _PeakSearch:
-    """center_px (2,): where the mark, drawn with that blur, correlates best; height: how well."""
+    """Highest correlation peak of a mark rendered with a blur. center_px (2,); height: NCC."""
 
     def __init__(self, scan: Scan, expected: MarkPrediction, blur_px: float) -> None:
         mark, surroundings = expected.mark, expected.surroundings
@@ -98,7 +105,7 @@ class _PeakSearch:
         finest_px = max(detail_px(mark, reduced[:, :2]), blur_px)
         template_cols, template_rows = (high - low + 1).tolist()
         template = known_picture(mark, centred, template_cols, template_rows, blur_px)
-        # A median at the window's end would see half of what lies about it: beside the frame's edge only the border.
+        # At the window's end a median would cover only half of its surroundings, near the frame's edge only the border.
         rim = surroundings.ground_reach_px(finest_px)
         wide = mark_window(mark, reduced, search_px + spare + 2 + rim)
         window = scan.reduced_window(reduction, *wide, expected.weights)
@@ -106,21 +113,21 @@ class _PeakSearch:
         self._flat = expected.polarity * flattened[rim:-rim, rim:-rim]
         self._pattern, self._counts = surroundings.pattern(template, finest_px, self._flat)
         response = correlation(self._flat, self._pattern, self._counts)
-        first = np.array(wide[:2]) + rim - low  # the place of the first response
+        first = np.array(wide[:2]) + rim - low  # place of the first response
         rows, cols = np.indices(response.shape)
         near = np.hypot(cols + first[0] - reduced[0, 2], rows + first[1] - reduced[1, 2]) <= search_px
         self._best = divmod(int(np.where(near, response, -2.0).argmax()), response.shape[1])
         self._places = int(near.sum())
-        # A fit that begins within a part of a pixel takes a step less.
+        # A sub-pixel start saves the fit one step.
         top = highest_about(response, np.array([self._best[::-1]]), 0.0)[0][0]
         self.center_px: Array = (top + first) * reduction + (reduction - 1) / 2
         self.height = float(response[self._best])
 
     @cached_property
     def false_alarms(self) -> float:
-        """The expected number of peaks as high that noise makes. The correlation of two rows of numbers, each
-        with its own autocorrelation, varies by the sum of the products of these over how many they are (Bartlett,
-        1935); that sum is what one answers to the other at all offsets."""
+        """Expected number of peaks as high under noise. The variance of the correlation of two autocorrelated series is
+        the sum of the products of their autocorrelations over their number (Bartlett, 1935). That sum equals the sum of
+        squares of their cross-correlation over all offsets."""
         if self.height <= 0:
             return float(self._places)
         chip = self._pattern
@@ -129,7 +136,7 @@ class _PeakSearch:
         here -= chip * np.float32((here * chip).sum() / (chip**2).sum())
         shape = [fft.next_fast_len(sum(sides), real=True) for sides in zip(noise.shape, chip.shape, strict=True)]
         power = np.abs(fft.rfft2(noise, s=shape) * fft.rfft2(chip, s=shape)) ** 2
-        answers = float(fft.irfft(power.sum(axis=0), n=shape[1])[0]) / shape[0]  # their squares (Parseval)
+        answers = float(fft.irfft(power.sum(axis=0), n=shape[1])[0]) / shape[0]  # sum of squares (Parseval)
         energy = max(float((noise**2).sum() * (chip**2).sum()), 1e-12)
         variance = max(answers / energy, 1e-12) / float(self._counts.sum())
         unlike = max(1 - self.height**2, 1e-12)

@@ -1,4 +1,4 @@
-"""The templates by which marks are searched in a reduced scan: their pictures as the scan orientations show them."""
+"""Templates of marks for the search in a reduced scan, rendered in each scan orientation."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,36 +11,36 @@ from measure.marks.rendering import extent_px, known_picture
 from measure.marks.shapes import Bar, Mark, MarkShape, MarkTemplate, thinnest_mm
 from measure.scans.scan import Scan
 
-_EXTENT_PX = 14.0  # of the reduced mark
-_THINNEST_PX = 1.2  # of its thinnest line: below this the line drowns
-_BLUR_PX = 0.6  # of the reduced mark: the averaging's own 0.3, and what is left of the scan's
-_RIM_PX = 2  # of the reduced scan, about the drawing: so far the blur takes it
-_LARGEST_PX = 3000  # of the reduced scan: a larger one costs seconds
-_ALIKE = 0.8  # correlation above which two templates share one response
-_LEARNED = 2.0  # times its finest detail: a notch or block is wider, and would be most of what ground is the median of
+_EXTENT_PX = 14.0  # px, smallest extent of the reduced mark
+_THINNEST_PX = 1.2  # px, smallest width of its thinnest line, which would otherwise vanish
+_BLUR_PX = 0.6  # px, blur of the reduced mark: 0.3 from averaging, and the rest from the scan
+_RIM_PX = 2  # px of the reduced scan around the drawing, reach of the blur
+_LARGEST_PX = 3000  # px, larger side of the reduced scan; a larger one costs seconds
+_ALIKE = 0.8  # NCC above which two templates share one response
+_LEARNED = 2.0  # in widths of the finest detail: wide notches and blocks would dominate the median of the background
 
 
 @dataclass(frozen=True, eq=False)
 class MarkView:
-    """A mark as one scan orientation shows it: linear is the (2, 2) part of pixel_from_mark in the scan."""
+    """A mark in one scan orientation. linear: (2, 2) part of pixel_from_mark in the scan."""
 
     mark: Mark
     linear: Array
 
 
 def detail_px(mark: Mark, linear: Array) -> float:
-    """The width of the mark's finest detail in px, and no less than one."""
+    """Width of the mark's finest detail in px, at least 1."""
     return max(linear_scale(linear) * thinnest_mm(mark), 1.0)
 
 
 def ground_detail_px(view: MarkView, reduction: int) -> float:
-    """In px of the reduced scan, the width of what is no ground: the finest detail, or of a learned picture more."""
+    """Width of the structure that is not background, px of the reduced scan: the finest detail, more for a template."""
     wide = _LEARNED if isinstance(view.mark, MarkTemplate) else 1.0
     return max(wide * detail_px(view.mark, view.linear) / reduction, 1.0)
 
 
 def search_reduction(scan: Scan, views: Sequence[MarkView]) -> int:
-    """The largest that leaves every mark large enough, every line thick enough to be seen, and of the scan a pixel."""
+    """Reduction factor of the search: as large as needed, limited so that marks and lines remain visible."""
     limits = []
     for view in views:
         least, greatest = extent_px(view.mark, np.column_stack([view.linear, np.zeros(2)]))
@@ -51,11 +51,15 @@ def search_reduction(scan: Scan, views: Sequence[MarkView]) -> int:
 
 
 def distinct_templates(views: Sequence[MarkView], reduction: int, half_px: int) -> tuple[list[Array], tuple[int, ...]]:
-    """Draw the templates of views that differ, and say which of them stands for each view.
+    """Render the distinct templates of mark views.
 
     Parameters
     ----------
-    half_px : of the reduced scan, how far about its point a cross is drawn at most.
+    half_px : largest half size of the template of a cross, px of the reduced scan.
+
+    Returns
+    -------
+    The templates, and for each view the index of its template.
     """
     templates = _templates(views, reduction, half_px)
     own = list({id(template): template for template in templates}.values())
@@ -70,7 +74,7 @@ def distinct_templates(views: Sequence[MarkView], reduction: int, half_px: int) 
 
 
 def _templates(views: Sequence[MarkView], reduction: int, half_px: int) -> list[Array]:
-    """The same mark in the same direction shares its template, and one turned by quarters or mirrored has it turned."""
+    """Templates of views. Equal marks in the same direction share one; quarter turns and mirroring reuse it turned."""
     first: dict[Mark, tuple[Array, Array]] = {}
     drawn: dict[tuple[Mark, bytes], Array] = {}
     for view in views:
@@ -100,7 +104,7 @@ def _template(view: MarkView, reduction: int, half_px: int) -> Array:
 
 
 def _correlations(templates: Sequence[Array]) -> Array:
-    """(n, n) of templates about one centre, the smaller of two filled up with nothing."""
+    """(n, n) correlations of concentric templates; the smaller one of two is padded with zeros."""
     sizes = np.array([template.shape[0] for template in templates])
     flat = np.stack([np.pad(np.nan_to_num(each), (sizes.max() - len(each)) // 2).ravel() for each in templates])
     sums, count = flat.sum(axis=1), np.maximum(sizes[:, None], sizes) ** 2

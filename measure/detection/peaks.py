@@ -1,4 +1,4 @@
-"""Peaks of a correlation map: its highest local maxima, and the highest place about given ones."""
+"""Peaks of a correlation map: highest local maxima, and maxima around given places."""
 
 import cv2
 import numpy as np
@@ -13,8 +13,8 @@ def local_maxima(response: Map, count: int, least: float, apart_px: int = 3) -> 
     Parameters
     ----------
     response : (rows, columns).
-    count, least : how many at most, and what each is higher than.
-    apart_px : how far peaks lie from one another.
+    count, least : largest number, and threshold of the height.
+    apart_px : smallest distance between peaks.
 
     Returns
     -------
@@ -25,7 +25,7 @@ def local_maxima(response: Map, count: int, least: float, apart_px: int = 3) -> 
     is_top = (response == highest) & (response > least)
     rows, cols = np.nonzero(is_top)
     plateaus = cv2.connectedComponents(is_top.astype(np.uint8))[1][rows, cols]
-    first = np.unique(plateaus, return_index=True)[1]  # of equal neighbours
+    first = np.unique(plateaus, return_index=True)[1]  # one of equal neighbours
     rows, cols = rows[first], cols[first]
     heights = response[rows, cols].astype(float)
     order = np.argsort(-heights, kind="stable")[:count]
@@ -33,11 +33,11 @@ def local_maxima(response: Map, count: int, least: float, apart_px: int = 3) -> 
 
 
 def highest_about(response: Map, places: Array, radius_px: float) -> tuple[Array, Array]:
-    """Find the highest place within a square about each of places (n, 2), refined by parabolas.
+    """Find the maximum within a square around each of places (n, 2), refined by parabolas.
 
     Returns
     -------
-    (n, 2) column and row, and (n,) heights: 0 for a place outside of the map.
+    (n, 2) column and row, and (n,) heights; 0 for a place outside the map.
     """
     size = np.array(response.shape[::-1])
     low = np.clip(np.floor(places - radius_px).astype(int), 0, None)
@@ -63,7 +63,7 @@ def highest_about(response: Map, places: Array, radius_px: float) -> tuple[Array
 
 
 def _vertex(before: Map, middle: Map, after: Map) -> Array:
-    """Where parabolas through three values each, the middle one the highest, have their tops: -0.5 to 0.5."""
+    """Vertices, -0.5 to 0.5, of parabolas through three values each, the middle one being the highest."""
     bend = before - 2 * middle + after
     top = np.divide(before - after, 2 * bend, out=np.zeros(len(bend)), where=bend < 0)
     return np.asarray(np.clip(top, -0.5, 0.5))

@@ -1,8 +1,7 @@
-"""What the frames of a camera have in common near a place: a mark that nobody has shown, among changing landscape.
+"""Detection of an unknown mark near a place, as the structure common to all frames of a camera.
 
-A square that is a mark, or the frame's edge, recurs in every frame; one of landscape does not. An edge recurs all along
-itself, a mark in one place only: so the best square is the one whose best match in other frames most exceeds its
-second best.
+A mark or the frame's edge recurs in every frame, the landscape does not. An edge recurs along its whole length, a mark
+at one place only. The mark is therefore the square whose best match in other frames exceeds the second best most.
 """
 
 from collections.abc import Sequence
@@ -22,24 +21,24 @@ from measure.scans.scan import Scan
 Window = Single
 
 _SIDE = 24  # samples along the square
-_STEP = 3  # samples between the squares that are tried
-_APART = _SIDE // 3  # samples: what is nearer is the same place
-_DETAIL = 2.0  # samples: width of the finest detail that counts
-_LEAST_VARIANCE = 0.01  # of pictures whose own is about 1: few frames may agree by chance
+_STEP = 3  # samples between the squares tried
+_APART = _SIDE // 3  # samples within which two matches are the same place
+_DETAIL = 2.0  # samples, width of the finest detail
+_LEAST_VARIANCE = 0.01  # added to the variance of images of unit variance, since few frames may agree by chance
 
 
 @dataclass(frozen=True, eq=False)
 class Recurrence:
-    """offset_mm: (2,) from the place given, in the camera's axes. excess: by how much the best match in other frames
-    exceeds the second best, a difference of correlations, the median over the frames."""
+    """Recurring structure. offset_mm: (2,) from the given place, in the camera's axes; excess: NCC of the best match in
+    other frames minus that of the second best, median over the frames."""
 
     offset_mm: Array
     excess: float
 
 
 def about(scan: Scan, pixel_from_camera: Array, xy_mm: Array, size_mm: float, reach_mm: float) -> Window:
-    """The picture about a place of the frame, square, in the camera's axes (x right, y up), freed of everything coarse:
-    _SIDE samples to size_mm."""
+    """Resample the square around a place of the frame to the camera's axes (x right, y up), _SIDE samples per size_mm,
+    with the background subtracted."""
     pitch_mm = size_mm / _SIDE
     half = int(np.ceil((size_mm / 2 + reach_mm) / pitch_mm))
     step = np.arange(-half, half + 1) * pitch_mm
@@ -57,8 +56,8 @@ def about(scan: Scan, pixel_from_camera: Array, xy_mm: Array, size_mm: float, re
 
 
 def recurrence(reference: Window, others: Sequence[Window], size_mm: float) -> Recurrence:
-    """The square of the reference that recurs most plainly in the other windows, moved to where what recurs about it
-    tells most of a place."""
+    """Find the square of the reference that recurs most clearly in the other windows, then centre it where the
+    recurring structure gives the most precise place."""
     span = reference.shape[0] - _SIDE
     tried = [(row, col) for row in range(0, span + 1, _STEP) for col in range(0, span + 1, _STEP)]
     excess = [_excess(reference[row : row + _SIDE, col : col + _SIDE], others) for row, col in tried]
@@ -76,14 +75,14 @@ def recurrence(reference: Window, others: Sequence[Window], size_mm: float) -> R
 
 
 def _shift_window(window: Window, right: int, down: int) -> Window:
-    """The window moved by whole samples; where nothing comes in, nothing is."""
+    """Shift a window by whole samples, filling with zeros."""
     shift = np.array([[1.0, 0.0, right], [0.0, 1.0, down]], np.float32)
     return np.asarray(cv2.warpAffine(window, shift, window.shape[::-1], flags=cv2.INTER_NEAREST), np.float32)
 
 
 def _telling(stack: Window, square: tuple[int, int]) -> tuple[int, int]:
-    """Row and column, within the square at (row, col), about which the mean of aligned windows has most information of
-    a place in its worse direction: slopes that recur, over what differs from frame to frame."""
+    """Row and column within the square at (row, col) around which the mean of aligned windows has the most information
+    on a place in the weaker direction: squared gradients over the variance between frames."""
     mean = stack.mean(axis=0)
     noise = cv2.GaussianBlur(stack.var(axis=0) / max(len(stack) - 1, 1), (0, 0), _DETAIL) + _LEAST_VARIANCE
     by_row, by_col = np.gradient(mean)

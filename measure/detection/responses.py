@@ -1,5 +1,7 @@
-"""Responses of a reduced scan to marks: normalised cross-correlation with their templates, over the whole scan or in
-windows about expected places. A mark alone gives false peaks on every film: the constellation decides."""
+"""NCC of a reduced scan with the templates of marks, over the whole scan or in windows around expected places.
+
+A single mark gives false peaks on every film: the constellation decides.
+"""
 
 from collections import OrderedDict
 from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
@@ -22,43 +24,46 @@ from measure.scans.scan import SINGLE_CHANNELS, Scan
 Cached = TypeVar("Cached")
 Key = tuple[int, int]  # a kind of template, and the sign of the mark
 
-_GRID_PX = 16  # of the reduced scan: places so near to one another share a window
-_LEAST_RESPONSE = 0.2  # of a candidate
-_CANDIDATES = 100  # of each template
-_NARROWED = 0.7  # of the tolerance, once a placement is refined
-LEAST_TOLERANCE_PX = 1.5  # of the reduced scan: where a response is highest is known no better
-_BACKGROUND_PERCENT = 95  # of places that stay below what the background answers
-_SAMPLED = slice(None, None, 3)  # rows and columns from which that is estimated: neighbours answer alike
+_GRID_PX = 16  # px of the reduced scan: places in one cell of this grid share a window
+_LEAST_RESPONSE = 0.2  # smallest NCC of a candidate
+_CANDIDATES = 100  # largest number per template
+_NARROWED = 0.7  # factor of the tolerance for refined placements
+LEAST_TOLERANCE_PX = 1.5  # px of the reduced scan, accuracy of correlation peaks
+_BACKGROUND_PERCENT = 95  # percentile of the NCC that defines the background's response
+_SAMPLED = slice(None, None, 3)  # subsampling for that estimate, since neighbours are correlated
 
 
 def narrow_tolerance_px(tolerance_px: float) -> float:
-    """The tolerance of a refined placement."""
+    """Tolerance of a refined placement."""
     return max(_NARROWED * tolerance_px, LEAST_TOLERANCE_PX)
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much a search takes. cache_bytes: of correlations, at a time. half_px: how far about its point a cross is
-    drawn at most, in the reduced scan: where one arm is far longer the middle tells enough. all_orientations: whether
-    one that shows the same marks in the same places as another has placements of its own."""
+    """Effort of a search.
+
+    cache_bytes: size of the cache of correlation maps; half_px: largest half size of the template of a cross, px of the
+    reduced scan, since the centre suffices where one arm is far longer; all_orientations: whether scan orientations
+    that show the same marks in the same places are searched separately.
+    """
 
     cache_bytes: int
     half_px: int
     all_orientations: bool
 
     def scan_cache_bytes(self, pixels: int) -> int:
-        """What all searches of a scan of so many pixels cache together: some maps of a small one."""
+        """Size of the cache shared by all searches of a scan with this number of pixels; limited for small scans."""
         return min(self.cache_bytes, max(_SMALL_MAPS * 4 * pixels, _LEAST_CACHED))
 
 
-_SMALL_MAPS = 32  # not reduced
+_SMALL_MAPS = 32  # maps of a small scan at full resolution
 _LEAST_CACHED = 32 << 20  # bytes
-_SIXTEEN_MAPS = 768 << 20  # bytes: of four marks that differ, in a large scan
+_SIXTEEN_MAPS = 768 << 20  # bytes, maps of four different marks in a large scan
 FULL = Effort(cache_bytes=_SIXTEEN_MAPS, half_px=1000, all_orientations=True)
 
 
 class ByteCache(Generic[Cached]):
-    """Things by a key each. The one used longest ago goes first where there is no room."""
+    """Least-recently-used cache, limited by size in bytes."""
 
     def __init__(self, limit_bytes: int) -> None:
         self.limit_bytes = limit_bytes
@@ -66,28 +71,36 @@ class ByteCache(Generic[Cached]):
         self._bytes = 0
 
     def get(self, key: Hashable) -> Cached | None:
-        """What is cached of a key, None if nothing is."""
+        """Cached value of a key; None if absent."""
         if key not in self._entries:
             return None
         self._entries.move_to_end(key)
         return self._entries[key][0]
 
     def put(self, key: Hashable, value: Cached, size_bytes: int) -> None:
-        """Cache what is not cached yet."""
+        """Add a value that is not cached yet."""
         self.make_room(size_bytes)
         self._entries[key] = value, size_bytes
         self._bytes += size_bytes
 
     def make_room(self, size_bytes: int) -> None:
-        """Drop the oldest until so much more has room, or nothing is left."""
+        """Drop the least recently used entries until size_bytes fit or the cache is empty."""
         while self._entries and self._bytes + size_bytes > self.limit_bytes:
             self._bytes -= self._entries.popitem(last=False)[1][1]
 
 
 @dataclass(frozen=True)
 class TemplateSet:
-    """templates: of the kinds of mark views; details_px: of the reduced scan, the width of what is no ground beside
-    each; signs: lighter (+1) or darker (-1) than the ground; faint_dn: contrast that is rounding."""
+    """Templates of the distinct kinds of mark views.
+
+    Attributes
+    ----------
+    templates : one per kind.
+    details_px : width of the finest structure that is not background, px of the reduced scan, one per kind.
+    signs : lighter (+1) or darker (-1) than the background.
+    surroundings : treatment of the background.
+    faint_dn : contrast at the level of rounding.
+    """
 
     templates: Sequence[Array]
     details_px: Sequence[float]
@@ -97,12 +110,12 @@ class TemplateSet:
 
     @property
     def half_px(self) -> int:
-        """How far beyond its maps a picture has to reach."""
+        """Margin (px) by which an image must exceed its correlation map."""
         return max(len(template) for template in self.templates) // 2
 
     def maps(self, kinds: Sequence[int], pictures: Sequence[Map] | Iterator[Map]) -> dict[Key, Map]:
-        """The correlation maps of kinds that are alike in detail, at every place the highest of all channels' pictures.
-        Where the same pixels count, as in one template in eight orientations, the picture's variation is the same."""
+        """Correlation maps of kinds with equal detail width, the maximum over the images of all channels. Kinds with
+        the same mask, such as one template in eight orientations, share the image's variation."""
         maps, detail_px = dict[Key, Map](), self.details_px[kinds[0]]
         for picture in pictures:
             image = self.surroundings.flattened(picture, detail_px, self.faint_dn)
@@ -123,9 +136,11 @@ class TemplateSet:
 
 
 class ScanMaps(Mapping[Key, Map]):
-    """The correlation maps of the whole of a reduced scan, made when they are used. Marks that look otherwise in every
-    orientation have dozens, each as large as the reduced scan: what all searches of a scan cache together is limited,
-    and what is not cached any more is made again."""
+    """Correlation maps of a whole reduced scan, computed on demand.
+
+    Marks that look different in every orientation have dozens of maps, each as large as the reduced scan. The cache
+    shared by all searches of a scan is therefore limited, and dropped maps are recomputed.
+    """
 
     def __init__(
         self,
@@ -135,7 +150,7 @@ class ScanMaps(Mapping[Key, Map]):
         cache: ByteCache[Map],
     ) -> None:
         self._scan, self._reduction, self._set, self._cache = scan, reduction, template_set, cache
-        self._own = object()  # stands for these maps in the cache
+        self._own = object()  # identifies these maps in the cache
 
     def __getitem__(self, key: Key) -> Map:
         map_ = self._cache.get((self._own, key))
@@ -148,7 +163,8 @@ class ScanMaps(Mapping[Key, Map]):
         return len(self._set.templates) * len(self._set.signs)
 
     def _make(self, first: int) -> dict[Key, Map]:
-        """The maps of a kind and of as many later ones alike in detail as have room: they share most of their work."""
+        """Compute the maps of a kind and of as many later ones with equal detail width as fit: they share most of the
+        computation."""
         height, width = self._scan.height_px // self._reduction, self._scan.width_px // self._reduction
         kind_bytes = 4 * height * width * len(self._set.signs)
         most = max(self._cache.limit_bytes // kind_bytes, 1)
@@ -165,7 +181,7 @@ class ScanMaps(Mapping[Key, Map]):
         return maps
 
     def _pictures(self) -> Iterator[Map]:
-        """The reduced scan in every channel, its edge repeated beyond it."""
+        """Reduced scan in every channel, with its edge replicated as a margin."""
         half = self._set.half_px
         for weights in _channels(self._scan):
             grey = self._scan.reduced(self._reduction, weights)
@@ -173,8 +189,7 @@ class ScanMaps(Mapping[Key, Map]):
 
 
 class Dilation:
-    """The highest response within a radius of every place, area_px large, and what the background answers: nineteen in
-    twenty places stay below it."""
+    """Correlation map dilated by a disk of a radius and area_px. background: its 95th percentile, at least 0."""
 
     def __init__(self, map_: Map, origin: NDArray[np.int_], radius_px: float) -> None:
         size = 2 * round(radius_px) + 1
@@ -183,17 +198,17 @@ class Dilation:
         self.background = max(float(np.percentile(self.map[_SAMPLED, _SAMPLED], _BACKGROUND_PERCENT)), 0.0)
 
     def share(self, place: Array) -> float:
-        """Of all places, those that answer as strongly as the one (2,) of the reduced scan."""
+        """Fraction of all places whose response is at least that of a place (2,) of the reduced scan."""
         return float(np.mean(self.map >= self.height(place)))
 
     def height(self, place: Array) -> float:
-        """The highest response within the radius of a place (2,) of the reduced scan."""
+        """Highest response within the radius of a place (2,) of the reduced scan."""
         col, row = np.clip(np.rint(place).astype(int) - self.origin, 0, np.array(self.map.shape[::-1]) - 1)
         return float(self.map[row, col])
 
     def strength(self, places: NDArray[np.int_]) -> tuple[Array, Mask]:
-        """How much the places (n, 2) of the reduced scan answer beyond the background, and which of them lie in the
-        map; those that do not have no answer."""
+        """(n,) squared responses in excess of the background at places (n, 2) of the reduced scan, and mask of those
+        inside the map; 0 for others."""
         rows, cols = self.map.shape
         col, row = (places - self.origin).T
         inside = (col >= 0) & (row >= 0) & (col < cols) & (row < rows)
@@ -202,11 +217,11 @@ class Dilation:
 
 
 class ResponseMap:
-    """The responses to one template, and what every orientation and hypothesis that shares them derives from them."""
+    """Responses to one template, with derived quantities shared by all orientations and hypotheses."""
 
     def __init__(self, responses: "Responses", key: Key) -> None:
         self._responses, self._key = responses, key
-        self._own = object()  # stands for this map in the cache, which would else hold the map that holds it
+        self._own = object()  # identifies this map in the cache; self would create a reference cycle
         self.origin = np.zeros(2, dtype=int) if responses.origins is None else responses.origins[key[0]]
 
     @property
@@ -215,11 +230,11 @@ class ResponseMap:
 
     @cached_property
     def candidates(self) -> Array:
-        """(n, 2) px of the reduced scan."""
+        """(n, 2) candidates, px of the reduced scan."""
         return np.asarray(local_maxima(self.map, _CANDIDATES, _LEAST_RESPONSE)[0] + self.origin)
 
     def dilated(self, radius_px: float) -> Dilation:
-        """Dilated by a radius, to whole pixels."""
+        """Dilate the map by a radius, rounded to whole pixels."""
         key, cache = (self._own, round(radius_px)), self._responses.cache
         dilation = cache.get(key)
         if dilation is None:
@@ -228,19 +243,25 @@ class ResponseMap:
         return dilation
 
     def highest_about(self, places: Array, radius_px: float) -> tuple[Array, Array]:
-        """The highest responses about places (n, 2) of the reduced scan, and (n,) how high; 0 outside of the map."""
+        """Places (n, 2) of the highest responses around places (n, 2) of the reduced scan, and (n,) heights; 0 outside
+        the map."""
         tops, heights = highest_about(self.map, places - self.origin, radius_px)
         return tops + self.origin, heights
 
 
 @dataclass(frozen=True, eq=False)
 class Responses:
-    """Correlations with the templates of mark views, over the reduced scan.
+    """Correlations of the reduced scan with the templates of mark views.
 
-    maps: by the kind of template and the sign, +1 or -1, (rows, columns) of how much the place looks like the mark
-    lighter or darker than its ground. kinds: of each mark view. reduction: by which the scan was reduced. cache: of
-    dilations, and of others of the scan. origins: (kinds, 2) column and row of the reduced scan where the maps of each
-    kind begin; None: they hold all of it. surroundings: what counts about a mark.
+    Attributes
+    ----------
+    maps : by kind of template and sign (+1 lighter, -1 darker than the background), (rows, columns) NCC.
+    kinds : kind of template of each mark view.
+    reduction : factor by which the scan was reduced.
+    cache : of dilations, shared with other searches of the scan.
+    origins : (kinds, 2) column and row of the reduced scan where the maps of each kind begin; None: maps of the whole
+        scan.
+    surroundings : treatment of the background.
     """
 
     maps: Mapping[Key, Map]
@@ -252,15 +273,15 @@ class Responses:
 
     @cached_property
     def by_key(self) -> dict[Key, ResponseMap]:
-        """By the kind of template and the sign."""
+        """Response maps by kind of template and sign."""
         return {key: ResponseMap(self, key) for key in self.maps}
 
     def reduced_px(self, scan_px: Array) -> Array:
-        """Scan pixels (..., 2) in pixels of the reduced scan."""
+        """Convert scan pixels (..., 2) to pixels of the reduced scan."""
         return np.asarray((scan_px - (self.reduction - 1) / 2) / self.reduction)
 
     def scan_px(self, reduced_px: Array) -> Array:
-        """Pixels of the reduced scan (..., 2) in scan pixels."""
+        """Convert pixels of the reduced scan (..., 2) to scan pixels."""
         return np.asarray(reduced_px * self.reduction + (self.reduction - 1) / 2)
 
 
@@ -272,10 +293,13 @@ def correlate_scan(
     caches: tuple[ByteCache[Map], ByteCache[Dilation]],
     half_px: int = FULL.half_px,
 ) -> Responses:
-    """The responses of the whole scan to mark views, lighter (+1) or darker (-1) than the ground as signs says.
+    """Correlate the whole scan with mark views.
 
-    caches: of correlation maps and of dilations. half_px: of the reduced scan, how far about its point a cross is drawn
-    at most.
+    Parameters
+    ----------
+    signs : lighter (+1) or darker (-1) than the background.
+    caches : of correlation maps and of dilations.
+    half_px : largest half size of the template of a cross, px of the reduced scan.
     """
     reduction = search_reduction(scan, views)
     templates, kinds = distinct_templates(views, reduction, half_px)
@@ -294,14 +318,16 @@ def correlate_windows(
     cache: ByteCache[Dilation],
     half_px: int = FULL.half_px,
 ) -> Responses:
-    """The responses to each mark view about its place (n, 2) in the scan alone, as far as reach_px and a little
-    farther: of the file only these windows are read. A kind is a template at one place."""
+    """Correlate windows around the expected places (n, 2) of mark views, up to reach_px and slightly beyond.
+
+    Only these windows of the file are read. A kind is a template at one place.
+    """
     reduction = search_reduction(scan, views)
     templates, template_numbers = distinct_templates(views, reduction, half_px)
     details = [ground_detail_px(views[0], reduction)] * len(templates)
     template_set = TemplateSet(templates, details, signs, WIDE, scan.full_scale_dn * FAINT)
     reach, half = int(np.ceil(reach_px / reduction)), template_set.half_px
-    # Row by row: strips of the file that windows share are still decoded for the next one.
+    # Row by row, so that file strips shared by windows are still decoded for the next one.
     squares = np.floor(places_px[:, ::-1] / reduction / _GRID_PX)
     corners, numbers = np.unique(squares, axis=0, return_inverse=True)
     origins = corners[:, ::-1].astype(int) * _GRID_PX - reach
