@@ -300,6 +300,12 @@ def _misfit(difference: Array, covariance: Array, along: Array) -> float:
 
 
 def _estimate(run: Run, positions: Indices) -> tuple[Array, Array]:
-    """Values (k,) of unknowns and their cofactor matrix (k, k)."""
+    """Values (k,) of unknowns and their covariance matrix (k, k).
+
+    Scaled by the variance factor of the extended model where that exceeds 1: what it leaves unexplained is noise to its
+    unknowns.
+    """
     cofactor = free_cofactor(run.numbering, run.end.state, run.factor)
-    return run.end.state.values[positions], cofactor.part(positions)
+    vpv, redundancy = run.group_sums(run.weighting.used)
+    variance = max(vpv / redundancy, 1.0) if redundancy >= 1.0 else 1.0
+    return run.end.state.values[positions], variance * cofactor.part(positions)

@@ -43,6 +43,16 @@ def test_figures_are_those_that_were_planted() -> None:
     assert found.p < 1e-6
 
 
+def test_standard_deviations_of_figures_grow_with_the_noise_that_is_left() -> None:
+    made, kind = scene(6, flat=True), KINDS["pixels not square"]
+    sigmas = []
+    for noise in (1.0, 3.0):
+        result = adjust(network(made, Effects(b1=1e-2, noise=noise), kind, np.random.default_rng(1)))
+        found = result.explanations[0]
+        sigmas.append(float(found.cause.split(" ± ")[1].split(" ")[0]))
+    assert sigmas[1] / sigmas[0] == pytest.approx(3.0, rel=0.15)
+
+
 @pytest.mark.study
 def test_gross_errors_of_single_marks_are_no_fault_of_the_model() -> None:
     given = network(scene(6, flat=True), Effects(), SOUND, np.random.default_rng(1))
