@@ -1,4 +1,4 @@
-"""One frame of a scan as a value: its marks as detected, those that agree, and the interior orientation by these."""
+"""One frame of a scan as an immutable value: detections, inliers and the interior orientation from the inliers."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -22,34 +22,41 @@ from measure.scans.scan import Scan
 from measure.tone.curve import LINEAR
 from measure.tone.estimate import FrameTone
 
-MANY = 6  # marks that agree and tell where a faint one must be
-CLEAR_LIKENESS = 0.5  # below it a mark's picture has more in it that is not the mark
-CLEAR_DAMAGE = 0.25  # of a mark: with more of it gone, what is left may be another's
+MANY = 6  # inliers from which the predicted place of a faint mark is reliable
+CLEAR_LIKENESS = 0.5  # correlation with the drawing: below it most of the image is not the mark
+CLEAR_DAMAGE = 0.25  # fraction of a mark: with more of it damaged, the rest may belong to something else
 _CLEAR_SNR = 3.0  # contrast over the noise of a pixel: with less a mark is weak,
-_CLEAR_SIGNIFICANCE = 10.0  # unless its contrast is so many standard deviations of its own: texture feigns 4.5
-_AGREEING, _AGREEING_SHARE = 3, 0.3  # marks, and of those in the scan: two fit any similarity
-_CHECKED = 4  # marks that agree: an affine transformation through them has a check
-WRONG_PX = 0.5  # an error that a mark called measured must not have
-_PLAIN_SIGMA_PX = 0.25  # in plain noise a standard deviation says all; on a landscape it knows of in part only
-_MOST_LOST = 0.85  # of what tells a mark's place: what is left may be an end of a line, or another's
-_MOST_UNLIKE = 0.03  # of a mark that its drawing may lack: with more gone, what is left may still be another's
-_FAR = 4.0  # times the scatter of the others, a median: nearly five standard deviations
-_LEAST_SCATTER_MM = 2 * SCATTER_MM  # of few marks, which may agree by chance better than film keeps them
-_UNSETTLED = {Code.NO_FIT, Code.OFF_PLACE, Code.SIZE, Code.POLARITY}  # of marks that may fit under another tone curve
-_SAME_MARK_PX = 5.0  # two fits of one mark lie nearer to one another, two marks do not: each is some 14 px large
-_REDUCED_PX = 1.5  # of the reduced scan: how well a placement predicts
-_CLICK_REACH_PX = 6 * CLICK_SIGMA_PX  # about a click: its sigma three times, and as much for who points less well
+_CLEAR_SIGNIFICANCE = 10.0  # unless its contrast has this many standard deviations: texture alone reaches 4.5
+_AGREEING, _AGREEING_SHARE = 3, 0.3  # least inliers; fraction of the marks in the scan; two fit any similarity
+_CHECKED = 4  # inliers from which an affine transformation has redundancy
+WRONG_PX = 0.5  # px, an error that a mark with status measured must not have
+_PLAIN_SIGMA_PX = 0.25  # px; a standard deviation is reliable in white noise, but only in part on image texture
+_MOST_LOST = 0.85  # fraction of the information on the place: the rest may be the end of a line, or something else
+_MOST_UNLIKE = 0.03  # fraction of a mark that a wrong drawing may explain, added to CLEAR_DAMAGE
+_FAR = 4.0  # times the median misfit of the inliers: nearly five standard deviations
+_LEAST_SCATTER_MM = 2 * SCATTER_MM  # mm, least median misfit: a few marks may agree by chance better than film allows
+_UNSETTLED = {Code.NO_FIT, Code.OFF_PLACE, Code.SIZE, Code.POLARITY}  # failures that another tone curve may cure
+_SAME_MARK_PX = 5.0  # px between two fits of one mark at most; two marks lie farther apart: each is some 14 px large
+_REDUCED_PX = 1.5  # px of the reduced scan: accuracy of the places that a placement predicts
+_CLICK_REACH_PX = 6 * CLICK_SIGMA_PX  # px around a click: three sigma, doubled for people who point less accurately
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A frame of n marks in one placement, as far as it is measured: each step of measuring makes another value.
+    """Frame of n marks in one placement. Each step of the measurement returns a new value.
 
-    scan: seen through the tone curve by which its marks were fitted. pixel_from_camera: (2, 3), the placement's own
-    where fewer than two marks agree; linear_sigma: the standard deviation of its rotation (rad), scale, stretch and
-    shear, inf before. detections: of all marks. inliers: (n,) marks that were found and agree; certain: (n,) those that
-    stand out so much of their texture that they need not. weights: of the channels. tone: the curve by its marks.
-    film: what the project's film model adds to pixel_from_camera, None of an affine one.
+    Attributes
+    ----------
+    scan : with the tone curve through which the marks were fitted.
+    placement : from the coarse search.
+    pixel_from_camera : (2, 3) interior orientation; that of the placement if fewer than two marks agree.
+    detections : of all n marks.
+    inliers : (n,) marks that were found and agree.
+    certain : (n,) marks that stand out from the texture clearly enough to be exempt from the outlier test.
+    linear_sigma : standard deviation of the rotation (rad), scale, stretch and shear; inf before the adjustment.
+    weights : of the channels.
+    tone : tone curve estimated from the marks.
+    film : terms of the project's film deformation model beyond pixel_from_camera, None for an affine one.
     """
 
     scan: Scan
@@ -69,7 +76,7 @@ class Frame:
     def from_placement(
         cls, scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions
     ) -> "Frame":
-        """The frame before any of its marks is detected."""
+        """Start a frame from a placement, with no mark detected yet."""
         none = np.zeros(len(layout.marks), dtype=bool)
         places = placement.places_px(np.array([mark.xy_mm for mark in layout.marks]))
         detections = tuple(Detection(place, False, None) for place in places)
@@ -79,62 +86,62 @@ class Frame:
 
     @cached_property
     def camera_mm(self) -> Array:
-        """(n, 2) given."""
+        """(n, 2) given coordinates of the marks."""
         return np.array([mark.xy_mm for mark in self.layout.marks])
 
     @property
     def pitch_mm(self) -> Array:
-        """(2,) of a pixel."""
+        """(2,) pixel pitch."""
         return np.asarray(self.placement.pitch_mm)
 
     @property
     def gate_px(self) -> float:
-        """The search radius where the other marks predict a mark."""
+        """Search radius around a place predicted from the other marks."""
         return self.options.gate_mm / float(self.pitch_mm.mean())
 
     @property
     def first_search_px(self) -> float:
-        """The search radius where only the placement predicts a mark."""
+        """Search radius around a place predicted from the placement alone."""
         return self._reach_px(1.0)
 
     @property
     def near_px(self) -> float:
-        """The same on film that is hardly deformed."""
+        """First search radius for film that is hardly deformed."""
         return self._reach_px(NARROW)
 
     def _reach_px(self, share: float) -> float:
-        """How well the placement predicts marks that lie off by a share of what they may."""
+        """Search radius around a placement's predictions, for a share of the largest deviation allowed."""
         search_px = share * self.options.search_mm(self.layout) / float(self.pitch_mm.mean())
         return _REDUCED_PX * self.placement.reduction + search_px
 
     @cached_property
     def predicted_px(self) -> Array:
-        """(n, 2) where the interior orientation puts the marks."""
+        """(n, 2) places of the marks predicted from the interior orientation."""
         return self.fitted_placement.places_px(self.camera_mm)
 
     def linear(self, index: int) -> Array:
-        """(2, 2) the derivatives of the interior orientation at a mark, px per mm."""
+        """(2, 2) derivatives of the interior orientation at a mark, px per mm."""
         return self.fitted_placement.linear(self.camera_mm[index])
 
     @cached_property
     def misfit_mm(self) -> Array:
-        """(n,) how far each mark found is from where the frame puts it, nan without one."""
+        """(n,) distances of the fitted from the predicted places, nan for marks without a fit."""
         places = [np.full(2, np.nan) if each.fit is None else each.fit.center_px for each in self.detections]
         return np.asarray(np.hypot(*((np.array(places) - self.predicted_px) * self.pitch_mm).T))
 
     def up_mm(self, scan_px: Array) -> Array:
-        """Places (n, 2) of the scan in its mm, right and up, free of a taking lens's distortion."""
+        """Convert scan places (n, 2), px, to mm right and up, corrected for the distortion of a taking lens."""
         lens = self.options.lens
         ideal = scan_px if lens is None else lens.ideal_px(scan_px)
         return np.asarray(ideal * self.pitch_mm * (1.0, -1.0))
 
     @property
     def scatter_mm(self) -> float:
-        """The median misfit of the inliers; 0 where there is none."""
+        """Median misfit of the inliers; 0 without inliers."""
         return float(np.median(self.misfit_mm[self.inliers])) if self.inliers.any() else 0.0
 
     def prediction(self, index: int, search_px: float) -> MarkPrediction:
-        """A mark where the frame puts it now, or where a person sees it: then no farther off than that one points."""
+        """Predict a mark from the interior orientation, or from a click, which narrows the search radius."""
         mark, place = self.layout.marks[index], self.predicted_px[index]
         for click in self.options.clicks:
             if click.point == mark.id:
@@ -144,128 +151,127 @@ class Frame:
         return MarkPrediction(mark.mark, start, search_px, sign, self.weights, self.placement.surroundings)
 
     def is_clear(self, index: int) -> bool:
-        """Whether a mark is plainly there, be it where the others put it or not."""
+        """Whether a mark correlates clearly with its drawing, inlier or not."""
         fit = self.detections[index].fit
         return fit is not None and fit.likeness >= CLEAR_LIKENESS
 
     @property
     def is_certain_of_places(self) -> bool:
-        """Whether so many marks agree, some of them clear ones, that they tell where every other must be."""
+        """Whether enough marks agree, half of `MANY` of them clear, for the places of the others to be reliable."""
         return bool(self.inliers.sum() >= MANY and self._clear >= MANY / 2)
 
     def replace_detections(self, changed: Mapping[int, Detection]) -> "Frame":
-        """The frame with other detections of some marks, by index."""
+        """Return the frame with the detections of some marks replaced, by index."""
         return replace(self, detections=tuple(changed.get(index, each) for index, each in enumerate(self.detections)))
 
     def replace_fits(self, changed: Mapping[int, MarkFit]) -> "Frame":
-        """The frame with other fits of some marks, by index."""
+        """Return the frame with the fits of some marks replaced, by index."""
         return self.replace_detections(
             {index: replace(self.detections[index], fit=fit) for index, fit in changed.items()}
         )
 
     def add_reason(self, index: int, reason: Reason) -> "Frame":
-        """The frame with one more reason why a mark may be wrong."""
+        """Return the frame with one more reason why a mark may be wrong."""
         detection = self.detections[index]
         return self.replace_detections({index: replace(detection, reason=Reason.combine((detection.reason, reason)))})
 
     def add_covariance(self, index: int, cause: Cause, px2: Array) -> "Frame":
-        """The frame with a covariance (2, 2) added to a cause for the place of a mark that was found."""
+        """Return the frame with a covariance (2, 2) added under a cause to the place of a mark, if it was found."""
         fit = self.detections[index].fit
         if fit is None:
             return self
         return self.replace_fits({index: replace(fit, place_covariance=fit.place_covariance.plus(cause, px2))})
 
     def add_figures(self, index: int, figures: Mapping[str, float]) -> "Frame":
-        """The frame with figures of a mark beside the others, if it was found."""
+        """Return the frame with further figures of a mark, if it was found."""
         fit = self.detections[index].fit
         return self if fit is None else self.replace_fits({index: replace(fit, figures={**fit.figures, **figures})})
 
     @property
     def fits(self) -> list[MarkFit | None]:
-        """The fits of the inliers."""
+        """Fits of all marks, None for those that are not inliers."""
         return [s.fit if ok else None for s, ok in zip(self.detections, self.inliers, strict=True)]
 
     def centers_px(self, indices: Iterable[int]) -> dict[int, Array]:
-        """The places of inliers among some marks, by index."""
+        """(2,) fitted centre by index, of the inliers among some marks."""
         fits = {int(index): self.fits[index] for index in indices}
         return {index: fit.center_px for index, fit in fits.items() if fit}
 
     @cached_property
     def fitted_placement(self) -> Placement:
-        """Where the inliers put the frame."""
+        """Placement by the interior orientation from the inliers."""
         return replace(self.placement, pixel_from_camera=self.pixel_from_camera, film=self.film)
 
     @property
     def all_clear(self) -> bool:
-        """Whether every inlier is plainly there."""
+        """Whether every inlier is clear."""
         return all(fit is None or fit.likeness >= CLEAR_LIKENESS for fit in self.fits)
 
     @property
     def missed_px(self) -> list[Array]:
-        """Where the frame puts the marks in the scan that were not found."""
+        """Predicted places of the marks in the scan that were not found."""
         inside = np.array([detection.inside for detection in self.detections])
         return list(self.predicted_px[inside & ~self.inliers])
 
     @property
     def inside(self) -> int:
-        """How many marks it puts within the scan."""
+        """Number of marks predicted within the scan."""
         return sum(detection.inside for detection in self.detections)
 
     @property
     def agrees(self) -> bool:
-        """Whether enough marks agree, clear or not: three, and three in ten of those in the scan."""
+        """Whether enough marks are inliers, clear or not: three, and three in ten of those in the scan."""
         return int(self.inliers.sum()) >= self._enough
 
     @property
     def may_settle(self) -> bool:
-        """Whether it might be accepted, but for one mark, if all marks that something was found of were fitted."""
+        """Whether at most one mark would be missing for acceptance if every candidate could be fitted."""
         found = sum(each.fit is not None for each in self.detections)
         return found + len(self._unsettled) >= self._enough - 1
 
     def is_nearer_than(self, other: "Frame | None") -> bool:
-        """Whether it lacks less to be accepted than another one."""
+        """Whether it is nearer to acceptance than another frame: more inliers, then more clear ones."""
         return other is None or (int(self.inliers.sum()), self._clear) > (int(other.inliers.sum()), other._clear)
 
     @property
     def accepted(self) -> bool:
-        """Whether enough marks agree for the frame not to be chance, three of them clear ones."""
+        """Whether enough marks agree for the frame to be no false alarm, at least three of them clear."""
         return self.agrees and self._clear >= self._least
 
     @property
     def unblemished(self) -> list[int]:
-        """The marks that are measured, where the others have them."""
+        """Indices of the marks with status measured that agree with the others."""
         near = self.inliers & (self.misfit_mm <= _FAR * max(self.scatter_mm, _LEAST_SCATTER_MM))
         return [index for index in np.flatnonzero(near).tolist() if self.verdict(index)[0] is Status.MEASURED]
 
     @property
     def measured_count(self) -> int:
-        """How many marks are measured without blemish."""
+        """Number of unblemished marks."""
         return len(self.unblemished)
 
     @property
     def is_sure(self) -> bool:
-        """Whether it is accepted, as many marks being measured as have to agree: a frame that is seen elsewhere than it
-        lies has hardly any."""
+        """Whether it is accepted and has enough unblemished marks: a frame found at a wrong place has hardly any."""
         return self.accepted and self.measured_count >= self._least
 
     @property
     def is_complete(self) -> bool:
-        """Whether it needs no other search: every mark plainly seen where the others put it."""
+        """Whether no further search is needed: every mark is a clear inlier."""
         return bool(self.accepted and len(self.inliers) >= _CHECKED and self.inliers.all() and self.all_clear)
 
     @property
     def _clear(self) -> int:
-        """How many marks are plainly there."""
+        """Number of clear inliers."""
         return sum(fit is not None and fit.likeness >= CLEAR_LIKENESS for fit in self.fits)
 
     @property
     def _unsettled(self) -> list[int]:
-        """The marks of which something was found that came to no fit."""
+        """Indices of the marks with a candidate that could not be fitted."""
         return [i for i, each in enumerate(self.detections) if each.fit is None and _UNSETTLED & {*each.reason.codes}]
 
     @property
     def _enough(self) -> int:
-        """How many marks have to agree."""
+        """Least number of inliers."""
         return max(self._least, int(np.ceil(_AGREEING_SHARE * self.inside)))
 
     @property
@@ -273,8 +279,10 @@ class Frame:
         return 2 if self.options.part else max(min(_AGREEING, len(self.detections)), 2)
 
     def contains(self, other: "Frame") -> bool:
-        """Whether the marks of the other frame are some of this one's, under other names: a frame moved on by the
-        distance of two marks has its marks where this one has others."""
+        """Whether the other frame's inliers are a proper subset of this one's, under other names.
+
+        A frame shifted by the distance of two marks has its marks at places of other marks of this one.
+        """
         own, others = ([fit.center_px for fit in frame.fits if fit] for frame in (self, other))
         if not others or len(others) >= len(own):
             return False
@@ -283,12 +291,12 @@ class Frame:
 
     @property
     def _unlike_drawing(self) -> float:
-        """What of their pictures the marks lack alike: not they are damaged, but drawn otherwise than they are."""
+        """Median damaged fraction of the inliers: damage common to all means that the drawing is wrong."""
         fractions = [fit.damaged_fraction for fit in self.fits if fit is not None]
         return float(np.median(fractions)) if len(fractions) >= _CHECKED else 0.0
 
     def misfit(self, ids: Sequence[str]) -> Reason:
-        """A sentence for a frame that is not accepted. ids: of its marks, in the order of the detections."""
+        """Explain why the frame is not accepted. ids: of its marks, in the order of the detections."""
         found = f"{int(self.inliers.sum())} of {len(self.detections)} marks were found where the others put them"
         if self.agrees:
             return Reason(
@@ -304,7 +312,7 @@ class Frame:
         return Reason(f"the constellation does not fit: only {found}{self._marks_outside(ids)}", Code.NO_FRAME)
 
     def _marks_outside(self, ids: Sequence[str]) -> str:
-        """A part of a sentence on marks that the others put outside of the scan."""
+        """Clause on marks predicted outside the scan; empty if there are none."""
         outside = [
             id for id, detection in zip(ids, self.detections, strict=True) if Code.OUTSIDE in detection.reason.codes
         ]
@@ -316,7 +324,10 @@ class Frame:
         )
 
     def verdict(self, index: int) -> tuple[Status, Reason]:
-        """What became of a mark that was fitted, by its picture: where it lies beside the others tells of the frame."""
+        """Status of a mark and the reasons for it.
+
+        An inlier is judged by its image alone: its residual is evidence on the frame.
+        """
         fit = self.detections[index].fit
         if fit is None or not self.inliers[index]:
             off = f"{self.misfit_mm[index]:.2f} mm from where the other {int(self.inliers.sum())} marks put it"
@@ -340,17 +351,21 @@ class Frame:
 
 
 def may_be_wrong(covariance_px2: Array) -> bool:
-    """Whether a mark so well known (2, 2) may have an error that one called measured must not have."""
+    """Whether a place with this covariance (2, 2) may have a larger error than a measured mark may have."""
     return bool(chdtrc(2, (WRONG_PX / largest_sigma_px(covariance_px2)) ** 2) > LARGE_ERROR)
 
 
 def largest_sigma_px(covariance_px2: Array) -> float:
-    """In the direction in which it is largest."""
+    """Standard deviation in the direction in which it is largest: semi-major axis of the error ellipse (2, 2)."""
     return float(np.sqrt(np.linalg.eigvalsh(covariance_px2)[-1]))
 
 
 def orient_frame(frame: Frame) -> Frame:
-    """Separate inliers from gross errors and estimate the interior orientation from the inliers."""
+    """Separate inliers from gross errors and estimate the interior orientation from the inliers.
+
+    Each place has the covariance of its fit and of its given coordinates; the film's scatter is added to the weights.
+    Certain and clicked marks are never removed.
+    """
     found = np.array([each.fit is not None for each in frame.detections])
     inliers = found.copy()
     if found.sum() < 2:

@@ -1,9 +1,8 @@
-"""The search for a frame as a list of attempts: where, under which pitches, through which tone curve, and what beside
-a mark counts.
+"""Search for a frame as a list of attempts, which differ in region, pitch, tone curve and treatment of the background.
 
-One loop makes them in their order, as far as what was found before does not settle it; one limit decides on what they
-find: the expected number of false frames in all attempts so far, or in those under the given pitch, which is likelier
-than all others together.
+A single loop makes the attempts in order and skips those that an earlier result makes unnecessary. One criterion
+accepts a frame: the expected number of false frames in all attempts so far, or in those under the given pitch alone,
+which is likelier than all others together.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,23 +26,31 @@ from measure.marks.shapes import FiducialLayout
 from measure.results import Pose
 from measure.scans.scan import Scan
 
-# Placements, best first, and frames, those first that are to be preferred, each with its expected number of false ones.
+# Placements, best first; frames in order of preference, each with the expected number of false frames as good.
 Result = tuple[list[Placement], list[tuple[float, Frame]]]
 
-_TRIALS = 4  # placements tried at full resolution after the best one has failed
+_TRIALS = 4  # placements tried at full resolution after the best one
 _NOTHING = Reason("no two of the camera's marks were found in the scan", Code.NO_FRAME)
-_GAINED = 3  # marks: one more than what a perspective has of parameters may fit besides by chance
-_LACKED = 0.3  # of the marks: so many an affine transformation lacks under a perspective that hides any
-_OBLIQUE = 6  # marks that a perspective is shown by: four fit any, and two more check it
-_STRETCH = 3 * AFFINITY_SIGMA  # by which a given pitch may be wrong where marks are too faint to correct it
+_GAINED = 3  # marks: one more than the two additional parameters of a perspective may fit by chance
+_LACKED = 0.3  # fraction of the marks that an affine transformation misses if a perspective makes it miss any
+_OBLIQUE = 6  # marks needed to prove a perspective: any four fit one, and two more check it
+_STRETCH = 3 * AFFINITY_SIGMA  # relative error of a given pitch, where marks are too faint to correct it
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """The result of the attempts so far. search, placements: of the attempt that found the frame, the latter best
-    first. is_taken: whether it is hardly a false one. unsure: frames found only under another pixel pitch, possible
-    false alarms, accepted if the user gives that pitch. faint: the best rejected frame and its expected number of false
-    alarms. misfit: why there is none."""
+    """Result of the attempts so far.
+
+    Attributes
+    ----------
+    search : of the attempt that found the frame.
+    placements : of that attempt, best first.
+    frame : best frame so far, None without one.
+    is_taken : whether the frame is accepted as significant.
+    unsure : frames found only under another pixel pitch; possible false alarms, accepted if the user gives that pitch.
+    faint : expected number of false alarms and the best rejected frame.
+    misfit : why no frame was found.
+    """
 
     search: FrameSearch
     placements: Sequence[Placement] = ()
@@ -59,9 +66,9 @@ class Found:
 
     @property
     def lacks_few_marks(self) -> bool:
-        """Whether a frame is taken in which fewer marks are missing than on film that was photographed obliquely.
+        """Whether the frame is taken and misses fewer marks than one on film that was photographed obliquely.
 
-        Weak marks are not missing: a perspective moves marks off their places, and leaves their quality alone.
+        Weak marks do not count as missing: a perspective displaces marks, but leaves their quality unchanged.
         """
         if self.frame is None or not self.is_taken:
             return False
@@ -74,12 +81,17 @@ class Found:
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
-    """One way to search a frame.
+    """One way to search for a frame.
 
-    find: the result by so many hypotheses in all. is_settled: by what was found before. is_given: under what is
-    believed of the scan beforehand: what is found there takes the place of what was found before, taken or not.
-    at_given: under the given pitch. first: the attempt of which this one fits the marks again, beginning with another
-    tone curve: its placements are no further hypotheses.
+    Attributes
+    ----------
+    search : search in the scan.
+    hypotheses : about the pitch.
+    find : function of the search, the hypotheses and the total number of hypotheses tried; returns a Result.
+    is_settled : whether the earlier results make the attempt unnecessary.
+    is_given : under the prior belief about the scan; its result replaces an earlier one, taken or not.
+    at_given : under the given pitch.
+    first : attempt that this one repeats from another initial tone curve; its placements are no further hypotheses.
     """
 
     search: FrameSearch
@@ -98,8 +110,8 @@ def find_frame(
 
     Parameters
     ----------
-    hypotheses : about its pitch, the likelier groups first.
-    is_given : whether the first is that which the user or the file gives.
+    hypotheses : about the pitch, likelier groups first.
+    is_given : whether the user or the file gives the pitch of the first group.
     """
     found, every, at_given = Found(FrameSearch(scan, layout, options)), 0, 0
     ids = [mark.id for mark in layout.marks]
@@ -130,16 +142,22 @@ def find_frame(
 
 
 def _is_taken_if_given(result: tuple[float, Frame], attempt: Attempt, at_given: float) -> bool:
-    """Whether a frame under another pitch would be taken if that were given; at_given: the share of the hypotheses that
-    are under the given one."""
+    """Whether a frame under another pitch would be taken if that pitch were given.
+
+    at_given: share of the hypotheses that are under the given pitch.
+    """
     return not attempt.at_given and (result[1].accepted or result[0] * at_given <= FRAMES_BY_CHANCE)
 
 
 def _attempts(wide: FrameSearch, hypotheses: Sequence[Hypotheses], is_given: bool) -> list[Attempt]:
-    """In the middle of a large scan where the pitch is given, then anywhere; where marks are missed, as film that was
-    photographed obliquely; where what is found may be a false alarm, under other pitches; where nothing is, at a closer
-    look: less of what lies beside a mark counts there, for the frame's edge may drown it else, and then less of what
-    grain hides."""
+    """List the attempts in order.
+
+    1. The middle of a large scan, if the pitch is given; then the whole scan.
+    2. If marks are missing: with a perspective, for film that was photographed obliquely.
+    3. If the frame may be a false alarm: under other pitches.
+    4. If there is no frame: with narrower surroundings of the marks, since the frame's edge may mask a mark in wider
+       ones; then with surroundings for marks in strong grain.
+    """
     given, *others = hypotheses
     closer = [wide.with_surroundings(surroundings) for surroundings in (CLOSE, GRAINY)]
     oblique = wide.replace_film_model("projective")
@@ -160,7 +178,7 @@ def _attempts(wide: FrameSearch, hypotheses: Sequence[Hypotheses], is_given: boo
                 Attempt(wide, group, _search_other_pitch, lambda found: found.is_undoubted)
             )
         ),
-        *(  # here a mark need not look plainly like itself, whatever the curve
+        *(  # no other tone curves here: a mark need not correlate clearly with its drawing
             Attempt(close, group, _search_closer, lambda found: found.is_taken, at_given=group is near)
             for close in closer
             for group in (near, nearly)
@@ -170,7 +188,7 @@ def _attempts(wide: FrameSearch, hypotheses: Sequence[Hypotheses], is_given: boo
 
 
 def _through_tone_curves(first: Attempt) -> list[Attempt]:
-    """An attempt, and those that begin with other tone curves where it leaves no frame that is taken."""
+    """Repeat an attempt from other initial tone curves, unless a frame is taken before."""
     search = first.search
     return [
         first,
@@ -182,27 +200,29 @@ def _through_tone_curves(first: Attempt) -> list[Attempt]:
 
 
 def _search_middle(search: FrameSearch, hypotheses: Hypotheses, _: int) -> Result:
-    """The frame in the middle of a large scan, in the best of the placements there."""
+    """Measure the frame in the best placement in the middle of a large scan."""
     found = search.search_middle(hypotheses[0])
     return found, _result(measure_frame(search.scan, search.layout, found[0], search.options) if found else None)
 
 
 def _search_scan(search: FrameSearch, hypotheses: Hypotheses, _: int) -> Result:
-    """The frame in the whole scan: in the first of the best placements that is sure and not outdone, or else the sure
-    one of most measured marks, or else the first accepted, or else that of most marks; none where nothing looks like
-    the marks."""
+    """Search the whole scan and measure the best frame; no frame without placements."""
     found = search.search_scan(hypotheses)
     return found, _result(best_frame(search, found))
 
 
 def _result(frame: Frame | None) -> list[tuple[float, Frame]]:
-    """Where what is known of the scan puts it, a frame that is accepted is believed."""
+    """Result of a search under the prior belief about the scan: an accepted frame needs no test of false alarms."""
     return [] if frame is None else [(0.0 if frame.accepted else np.inf, frame)]
 
 
 def best_frame(search: FrameSearch, found: Sequence[Placement]) -> Frame | None:
-    """The frame in the best of these placements, as above. A frame is no other one where all its marks are among those
-    of an accepted one that was tried before it."""
+    """Measure the frame in the best placements and select one.
+
+    Selected is the first frame that is sure and not outdone by another placement; else the sure frame with most
+    measured marks; else the first accepted one; else the one with most inliers. Frames whose marks are all among those
+    of an accepted frame tried before are skipped.
+    """
     placements, frames = _places_to_try(search, found), list[Frame]()
     for placement in placements:
         frame = _measure_in_its_pose(search, placement)
@@ -219,16 +239,19 @@ def best_frame(search: FrameSearch, found: Sequence[Placement]) -> Frame | None:
 
 
 def _is_outdone(search: FrameSearch, frame: Frame, placements: Sequence[Placement]) -> bool:
-    """Whether more marks speak for another placement than the frame has measured ones, and it may be a false alarm."""
+    """Whether another placement is supported by more marks than the frame has measured, and it may be a false alarm."""
     more = any(placement.supported > frame.measured_count for placement in placements)
     return more and bool(doubt_frame(search, frame))
 
 
 def _measure_in_its_pose(search: FrameSearch, placement: Placement) -> Frame:
-    """The frame in a placement. At the right place in a wrong pose unlike marks are not found under one another's
-    names: where that is so, the pictures there decide the pose, and the frame is measured in it."""
+    """Measure the frame in a placement, and correct its pose if it is not accepted.
+
+    At the right place in a wrong pose, marks with different drawings are not found under one another's names. The
+    images of the marks then decide the pose, and the frame is measured again in it.
+    """
     frame = measure_frame(search.scan, search.layout, placement, search.options)
-    if frame.accepted and frame.scan.tone.sharpening:  # the scan's, wherever its frame lies
+    if frame.accepted and frame.scan.tone.sharpening:  # sharpening belongs to the scan, wherever its frame lies
         search.scan = search.scan.replace_tone(search.scan.tone.sharpened(frame.scan.tone.sharpening))
     if frame.may_settle and not frame.accepted and search.among is None:
         search.unsettled.append(placement)
@@ -241,8 +264,10 @@ def _measure_in_its_pose(search: FrameSearch, placement: Placement) -> Frame:
 
 
 def _search_oblique(search: FrameSearch, hypotheses: Hypotheses, tried: int) -> Result:
-    """The frame of film that was photographed obliquely, in the best placement: nearly all marks of the scan have to
-    be measured, for so much freedom fits some of any frame."""
+    """Search for the frame on film that was photographed obliquely, in the best placement only.
+
+    Nearly all marks in the scan have to be measured: a perspective has enough freedom to fit some marks of any frame.
+    """
     found = search.search_scan(hypotheses)
     if not found or found[0].supported < max(_OBLIQUE, len(search.layout.marks) - _GAINED + 1):
         return found, []
@@ -253,8 +278,10 @@ def _search_oblique(search: FrameSearch, hypotheses: Hypotheses, tried: int) -> 
 
 
 def _search_other_pitch(search: FrameSearch, hypotheses: Hypotheses, tried: int) -> Result:
-    """The accepted frames under other pitches than the given one, those first with the fewest false alarms, only marks
-    without blemish counting. So much freedom finds false frames too."""
+    """Search under other pitches than the given one; accepted frames by increasing number of false alarms.
+
+    Only unblemished marks count, since the additional freedom yields false frames too.
+    """
     found = search.search_scan(hypotheses)
     frames = [_measure_in_its_pose(search, place) for place in _likely_placements(search, found, len(hypotheses))]
     expected = [
@@ -266,10 +293,12 @@ def _search_other_pitch(search: FrameSearch, hypotheses: Hypotheses, tried: int)
 
 
 def _search_closer(search: FrameSearch, hypotheses: Hypotheses, tried: int) -> Result:
-    """The frames in the whole scan on whose places enough marks agree, those first with the fewest false alarms:
-    estimated from the marks as measured, and as they answer at reduced size; the less counts, times two.
+    """Search the whole scan for frames with enough inliers; by increasing number of false alarms.
 
-    The marks' pictures need not be clear: whether a frame is there is one question, which pose it has another."""
+    That number is estimated from the measured marks and from the responses at reduced resolution. The smaller one
+    counts, times two for the two criteria. The marks need not be clear: this search decides whether there is a frame,
+    not which pose it has.
+    """
     found, results = search.search_scan(hypotheses), list[tuple[float, Frame]]()
     for place in _likely_placements(search, found, tried):
         frames = [frame for frame in _measure_in_likeliest_pose(search, place) if frame.agrees]
@@ -283,8 +312,10 @@ def _search_closer(search: FrameSearch, hypotheses: Hypotheses, tried: int) -> R
 
 
 def _measure_in_likeliest_pose(search: FrameSearch, placement: Placement) -> list[Frame]:
-    """The frame in a placement, and in the pose that its pictures like best, for faint marks are not found under one
-    another's names, though they say not surely which these are."""
+    """Measure the frame in a placement and also in its likeliest pose.
+
+    Faint marks are not found under one another's names, although their images do not decide the pose reliably.
+    """
     frame = measure_frame(search.scan, search.layout, placement, search.options)
     if search.options.pose != "auto" or not frame.inliers.any():
         return [frame]
@@ -293,20 +324,19 @@ def _measure_in_likeliest_pose(search: FrameSearch, placement: Placement) -> lis
 
 
 def _likely_placements(search: FrameSearch, found: Sequence[Placement], tried: int) -> list[Placement]:
-    """The best placement and its rivals, without those that have many false ones as good."""
+    """Best placement and its rivals, without those with too many expected false placements."""
     places = _places_to_try(search, found)
     return [place for place in places if tried * search.false_placements(place) <= PLACEMENTS_BY_CHANCE]
 
 
 def _places_to_try(search: FrameSearch, found: Sequence[Placement]) -> list[Placement]:
-    """The best placement and its rivals, of those in which the search fits marks."""
+    """Best placement and its rivals, restricted to those in which the search fits marks."""
     places = [*found[:1], *(_rivals(found) if found else ())]
     return places if search.among is None else [place for place in places if place in search.among]
 
 
 def _rivals(found: Sequence[Placement]) -> list[Placement]:
-    """The placements that put the frame elsewhere, those first that many marks speak for: a few high peaks are often
-    false ones."""
+    """Placements of the frame elsewhere, by score times supporting marks: a few high peaks alone are often false."""
     others: list[Placement] = []
     for placement in sorted(found[1:], key=lambda placement: -placement.score * placement.supported):
         if not any(placement.same_place(other) for other in (found[0], *others)):
@@ -317,7 +347,7 @@ def _rivals(found: Sequence[Placement]) -> list[Placement]:
 
 
 def _pitch_to_try(unsure: Sequence[Frame]) -> str:
-    """A clause about the frame of most marks among the possible false alarms."""
+    """Clause on the best of the possible false alarms, with the pitch to try; empty without one."""
     if not unsure:
         return ""
     best = max(unsure, key=lambda frame: (frame.measured_count, int(frame.inliers.sum())))
@@ -327,7 +357,7 @@ def _pitch_to_try(unsure: Sequence[Frame]) -> str:
 
 
 def _too_faint(likeliest: tuple[float, Frame] | None) -> str:
-    """A clause about a frame that no pitch tells from a false alarm, where less than one of these is expected."""
+    """Clause on a rejected frame with less than one expected false alarm; empty otherwise."""
     if likeliest is None or likeliest[0] >= 1:
         return ""
     expected, frame = likeliest
@@ -339,6 +369,6 @@ def _too_faint(likeliest: tuple[float, Frame] | None) -> str:
 
 
 def likeliest_pose(search: FrameSearch, frame: Frame, lines: Sequence[Line] = ()) -> Pose:
-    """The pose that what is seen of the frame speaks for. lines: of writing."""
+    """Decide the pose of a frame from the images of its marks. lines: of writing, as further evidence."""
     placements = [frame.fitted_placement.posed(pose, frame.camera_mm) for pose in POSES]
     return decide_pose(search.scan, search.layout, placements, frame, search.options, lines)
