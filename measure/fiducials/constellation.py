@@ -1,6 +1,6 @@
-"""The frame's place in its scan: the small similarity, in each pose, under which most marks have a response.
+"""Coarse placement of a frame in its scan: for each pose, the small similarity under which most marks respond.
 
-Places are complex numbers here, x + iy in mm of the scan's own axes (right, up), so that a similarity is `a w + b`.
+Places are complex numbers here, x + iy in mm of the scan's axes (right, up), so that a similarity is `a w + b`.
 """
 
 from collections.abc import Sequence
@@ -21,25 +21,31 @@ from measure.marks.shapes import LayoutMark, Mark
 
 Complex = NDArray[np.complex128]
 
-NARROW = 0.25  # of the tolerance: marks on film that is hardly deformed agree as well
-_LEAST_WEIGHED = 0.1  # of a mark that a placement is refined by
-_PAIRS = 60  # of marks that hypotheses are made from
-_FAR = 0.4  # of the largest distance of two marks: nearer ones tell turn and scale badly
+NARROW = 0.25  # fraction of the tolerance within which marks agree on film that is hardly deformed
+_LEAST_WEIGHED = 0.1  # response above which a mark has weight in the refinement of a placement
+_PAIRS = 60  # pairs of marks from which hypotheses are made
+_FAR = 0.4  # fraction of the largest distance of two marks: nearer pairs determine rotation and scale poorly
 _KEPT = 12  # placements of a pose that are refined
-_STEPPED = 3  # of them, in a lattice, that are moved by its steps
-_NEIGHBOURS = 4  # of a mark of a lattice
-_ALIKE = 0.5  # of the marks that a step takes to others: they are a lattice
-_SAME_PX = 10  # of the reduced scan: placements no farther apart put a mark on itself, which is some 14 px large there
-_SAME_SIZE = 0.01  # the same at the frame's edge, a thousand of these pixels off the middle
-_SAME = 0.1  # of the tolerance: orientations whose marks lie so near to one another's have the same placements
-_OUTSIDE_COST = 0.1  # of a mark that a placement puts outside of the scan
-_STEP_MM = 0.01  # of derivatives
+_STEPPED = 3  # best placements that are shifted along a lattice of marks
+_NEIGHBOURS = 4  # nearest marks, which give the steps of a lattice
+_ALIKE = 0.5  # fraction of the marks that a step maps to others: above it they form a lattice
+_SAME_PX = 10  # px of the reduced scan: the shift up to which two placements are the same; a mark is some 14 px large
+_SAME_SIZE = 0.01  # relative difference of scale up to which they are: 10 px at the frame's edge, 1000 px off
+_SAME = 0.1  # fraction of the tolerance: orientations whose marks coincide so closely share their placements
+_OUTSIDE_COST = 0.1  # score subtracted for each mark outside the scan
+_STEP_MM = 0.01  # mm, step of numerical derivatives
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """What is known of the placement: scale is 1 within scale_tolerance for the pitch at hand, and it is turned by no
-    more than rotation_rad."""
+    """Bounds of a placement.
+
+    Attributes
+    ----------
+    scale_tolerance : largest deviation of the scale from 1, for the given pitch.
+    rotation_rad : largest rotation.
+    misfit_mm : largest deviation of a mark.
+    """
 
     scale_tolerance: float
     rotation_rad: float
@@ -48,11 +54,20 @@ class Bounds:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """A frame in its scan. score: how much of the constellation answers; supported: how many marks do.
+    """Place of a frame in its scan.
 
-    pixel_from_camera: (2, 3), to ideal pixels where the scan was taken through a lens. polarity: of the marks that are
-    not drawn with one, +1 lighter than their surroundings, -1 darker. reduction: of the scan, and pitch_mm and
-    surroundings that it was found with. film: what a film model adds to pixel_from_camera, None of an affine one.
+    Attributes
+    ----------
+    pose : scan orientation.
+    pixel_from_camera : (2, 3) camera mm to pixels; to ideal pixels if the scan was taken through a lens.
+    score : sum over the marks of the squared response beyond the background, less a cost for marks outside the scan.
+    supported : number of marks that respond.
+    polarity : of marks drawn without one: +1 lighter than their surroundings, -1 darker.
+    reduction : factor by which the scan was reduced for the search.
+    pitch_mm : pixel pitch of the search, across and down.
+    surroundings : of the marks in the search.
+    lens : of a camera that photographed the film, None for a scanner.
+    film : terms of a film deformation model beyond pixel_from_camera, None for an affine one.
     """
 
     pose: str
@@ -73,12 +88,12 @@ class Placement:
         return bool(shift < _SAME_PX * self.reduction and abs(sizes[0] / sizes[1] - 1) < _SAME_SIZE)
 
     def places_px(self, camera_mm: Array) -> Array:
-        """(n, 2) where it puts marks at camera_mm (n, 2)."""
+        """(n, 2) scan places of marks at camera_mm (n, 2)."""
         ideal = self._ideal_px(camera_mm)
         return ideal if self.lens is None else self.lens.scan_px(ideal)
 
     def _ideal_px(self, camera_mm: Array) -> Array:
-        """(n, 2) likewise, in the picture that a lens without distortion would have taken."""
+        """(n, 2) places in the ideal image, without the distortion of a taking lens."""
         if self.film is not None:
             return np.asarray(self.film.places_mm(camera_mm) * (1.0, -1.0) / self.pitch_mm)
         return np.asarray(camera_mm @ self.pixel_from_camera[:, :2].T + self.pixel_from_camera[:, 2])
@@ -92,8 +107,10 @@ class Placement:
         return np.column_stack([right - left, up - down]) / (2 * _STEP_MM)
 
     def names(self, places_px: Array, camera_mm: Array) -> NDArray[np.intp]:
-        """(k,) which mark lies at each of places_px (k, 2): the nearest one, -1 where it is as far as half way to the
-        next mark, or another place is nearer to it."""
+        """(k,) index of the mark nearest to each of places_px (k, 2).
+
+        -1 if it is farther away than half the least distance of two marks, or another place is nearer to it.
+        """
         own = self.places_px(camera_mm)
         distance = np.hypot(*np.moveaxis(places_px[:, None] - own[None], -1, 0))
         apart = np.hypot(*np.moveaxis(own[:, None] - own[None], -1, 0)) + np.diag(np.full(len(own), np.inf))
@@ -103,8 +120,11 @@ class Placement:
         return np.where(within & is_first, nearest, -1)
 
     def posed(self, pose: str, camera_mm: Array) -> "Placement":
-        """The same place of the frame, its marks named as in another pose; moved, turned and scaled by what the given
-        coordinates (n, 2) of the marks differ that lie at the same places."""
+        """Convert to another pose at the same place of the frame.
+
+        The marks get other names. A similarity corrects for the differences of the given coordinates camera_mm (n, 2)
+        between the old and new marks at the same places.
+        """
         turn = np.linalg.inv(up_from_camera(self.pose)) @ up_from_camera(pose)
         linear, shift = self.pixel_from_camera[:, :2] @ turn, self.pixel_from_camera[:, 2]
         film = None if self.film is None else replace(self.film, turn=up_from_camera(pose))
@@ -131,7 +151,7 @@ def same_picture(
     second: tuple[str, Sequence[int]],
     within_mm: float,
 ) -> bool:
-    """Whether two poses, each with the looks of its marks, put like marks in the same places."""
+    """Whether two poses have equal marks at equal places. first, second: pose and kind of template of every mark."""
     xy = np.array([mark.xy_mm for mark in marks])
     of_first, of_second = (xy @ up_from_camera(pose).T for pose, _ in (first, second))
     distance = np.hypot(*np.moveaxis(of_first[:, None] - of_second[None], -1, 0))
@@ -143,12 +163,12 @@ def same_picture(
 
 
 def mark_sign(mark: Mark, assumed: int) -> int:
-    """+1 for a mark lighter than its surroundings, -1 for a darker one: as drawn, or else as assumed."""
+    """Sign of a mark: +1 lighter than its surroundings, -1 darker; as drawn, or else as assumed."""
     return {"light": 1, "dark": -1, "auto": assumed}[mark.polarity]
 
 
 def mark_signs(marks: Sequence[LayoutMark]) -> set[int]:
-    """Which signs the marks can have."""
+    """Signs that the marks can have."""
     return {mark_sign(mark.mark, assumed) for mark in marks for assumed in (1, -1)}
 
 
@@ -162,11 +182,15 @@ def _different(found: Sequence[Placement], camera_mm: Array, tolerance_px: float
 
 
 class PlacementSearch:
-    """The search for placements of a frame under one pitch, in one scan orientation after another.
+    """Search for placements of a frame under one pitch, in one scan orientation after another.
 
-    kinds: by orientation, the kind of template of every mark; placements: by orientation, those of one that shows the
-    same marks in the same places as another only if all_orientations says so; distinct: orientations whose marks do not
-    lie within the tolerance of those of one before.
+    Attributes
+    ----------
+    tolerance_px : deviation allowed to a mark, px of the reduced scan.
+    kinds : by orientation, the kind of template of every mark.
+    placements : by orientation. An orientation with equal marks at the places of an earlier one gets the placements of
+        that one, converted, if all_orientations is set, else none.
+    distinct : orientations whose marks do not coincide, within the tolerance, with those of an earlier one.
     """
 
     def __init__(
@@ -188,7 +212,7 @@ class PlacementSearch:
         self.distinct: list[str] = []
 
     def search_pose(self, pose: str, kinds: tuple[int, ...]) -> None:
-        """Search in an orientation; if it shows the same as another, it has the placements of that."""
+        """Search in an orientation; one equivalent to an earlier one takes over its placements."""
         misfit_mm = self.bounds.misfit_mm
         same, similar = (
             next((each for each in self.kinds if self._same_picture(each, pose, kinds, within_mm)), "")
@@ -207,13 +231,13 @@ class PlacementSearch:
         return same_picture(self.marks, (known, self.kinds[known]), (pose, kinds), within_mm)
 
     def response_map(self, placement: Placement, index: int) -> ResponseMap:
-        """The responses to a mark, by index, as a placement shows it."""
+        """Responses to a mark, by index, in the orientation and polarity of a placement."""
         sign = mark_sign(self.marks[index].mark, placement.polarity)
         return self.responses.by_key[self.kinds[placement.pose][index], sign]
 
     @cached_property
     def steps_mm(self) -> Array:
-        """(n, 2) the steps from the middle mark to the nearest ones that take most marks to others."""
+        """(n, 2) steps of a lattice: from the middle mark to near ones, if they map most marks to others."""
         tree, middle = cKDTree(self.camera_mm), self.camera_mm.mean(axis=0)
         origin = self.camera_mm[np.hypot(*(self.camera_mm - middle).T).argmin()]
         near = np.ravel(tree.query(origin, k=min(len(self.camera_mm), _NEIGHBOURS + 1))[1])[1:]
@@ -222,8 +246,10 @@ class PlacementSearch:
         return np.asarray(steps[np.array(onto) > _ALIKE])
 
     def find_placements(self, pose: str, kinds: Sequence[int]) -> list[Placement]:
-        """The best placements of an orientation that differ from one another, best first; none where no two marks
-        respond. kinds: of each mark's template in this orientation."""
+        """Find the distinct placements of an orientation, best first; none if no two marks respond.
+
+        kinds: of each mark's template in this orientation.
+        """
         unsaid = any(mark.mark.polarity == "auto" for mark in self.marks)
         found: list[Placement] = []
         for polarity in (1, -1) if unsaid else (1,):
@@ -235,7 +261,7 @@ class PlacementSearch:
 
 
 class _Constellation:
-    """The marks as one pose names them, each with the map of its responses."""
+    """Marks in one pose, each with its response map."""
 
     def __init__(self, search: PlacementSearch, pose: str, maps: Sequence[ResponseMap]) -> None:
         self.search, self.pose, self.maps = search, pose, maps
@@ -270,8 +296,11 @@ class _Constellation:
         ]
 
     def _step_along_lattice(self, scale: Complex, offset: Complex) -> tuple[Complex, Complex]:
-        """The best hypotheses of a lattice, moved step by step as long as more marks answer: where it has too many for
-        all to be candidates these may be many steps off. None where the marks are no lattice."""
+        """Shift the best hypotheses of a lattice step by step while the score increases.
+
+        A lattice may have more marks than candidates are kept, so that the best hypothesis is many steps off. Returns
+        no hypotheses if the marks form no lattice.
+        """
         turned = self.search.steps_mm @ up_from_camera(self.pose).T
         steps = np.append(0.0, turned @ [1.0, 1.0j])
         best = np.full(len(scale) if len(steps) > 1 else 0, -1)
@@ -291,7 +320,7 @@ class _Constellation:
         return ideal if self.search.lens is None else self.search.lens.scan_px(ideal)
 
     def _hypotheses(self) -> tuple[Complex, Complex]:
-        """Every similarity within bounds that takes two marks to two of their candidates."""
+        """All similarities within bounds through two marks and two of their candidates."""
         candidates = {each: self._complex(self.responses.scan_px(each.candidates)) for each in dict.fromkeys(self.maps)}
         scales, offsets = [np.zeros(0, complex)], [np.zeros(0, complex)]
         upright = np.cos(self.bounds.rotation_rad)
@@ -306,7 +335,7 @@ class _Constellation:
         return np.concatenate(scales), np.concatenate(offsets)
 
     def _pairs(self) -> list[tuple[int, int]]:
-        """Pairs of marks far apart, spread evenly over all marks where there are too many."""
+        """Pairs of distant marks; an even selection if there are too many."""
         first, second = np.triu_indices(len(self.camera), 1)
         length = np.abs(self.camera[first] - self.camera[second])
         far = np.flatnonzero(length >= _FAR * length.max())
@@ -315,7 +344,7 @@ class _Constellation:
         return list(zip(first[chosen].tolist(), second[chosen].tolist(), strict=True))
 
     def _scores(self, radius_px: float, scale: Complex, offset: Complex) -> tuple[Array, Array]:
-        """Scores and numbers of supporting marks, which answer within the radius, of many placements at once."""
+        """Scores of many placements, and numbers of their marks that respond within the radius."""
         places = self.responses.reduced_px(self._scan_px(scale[:, None] * self.camera + offset[:, None]))
         nearest = np.rint(places).astype(int)
         answers = [each.dilated(radius_px).strength(nearest[:, k]) for k, each in enumerate(self.maps)]
@@ -324,7 +353,10 @@ class _Constellation:
         return score, (strength > 0).sum(axis=1)
 
     def _refined(self, scale: Complex, offset: Complex) -> tuple[Complex, Complex]:
-        """The similarities (n,) through the responses about their predictions, each weighed by its strength."""
+        """Refine similarities (n,) by least squares on the highest responses around their predictions.
+
+        Weights are the heights of the responses above a threshold.
+        """
         widest = self.search.tolerance_px
         scale, offset = scale.copy(), offset.copy()
         moving = np.ones(len(scale), dtype=bool)

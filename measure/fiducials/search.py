@@ -1,4 +1,4 @@
-"""The search for a camera's frame in a scan: hypotheses about its pixel pitch, placements, expected false alarms."""
+"""Search for a camera's frame in a scan: pitch hypotheses, placements, expected numbers of false alarms."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -31,25 +31,32 @@ from measure.tone.curve import Tone
 
 Pair = tuple[float, float]
 
-_PITCH_STRETCHES = (-0.015, 0.015, -0.03, 0.03)  # an office scanner's carriage may run by per cents too fast
-_SLIGHT = (-0.005, 0.005, -0.01, 0.01)  # where marks are so faint that they are looked for near by only
+_PITCH_STRETCHES = (-0.015, 0.015, -0.03, 0.03)  # relative: an office scanner's carriage may be some per cent too fast
+_SLIGHT = (-0.005, 0.005, -0.01, 0.01)  # relative stretches for faint marks, searched within narrow bounds only
 _SCALE_STEPS = (1.1, 1.0, 0.91, 0.83, 0.75)  # of the largest scale at which the frame fits into the scan
-_STEP_TOLERANCE = 0.06  # so that each step reaches the next
-_LARGE_PX = 1 << 24  # a smaller scan is read whole in no time
-_REACH = 0.025  # of the frame's side: laid by hand it is off by some millimetres and a degree
-_LARGEST_SHARE = 0.25  # of the scan: where windows hold more, the whole of it tells more
-_BEYOND_MM = 3.0  # the scan's edge: a frame may be cut off there by less than its rim
-_FINE = 0.05  # of how near steps are alike
-_ALIKE = 0.5  # of the marks: a lattice of which more fall on others one step aside could be one step off
-_WINDOWS_SHARE = 0.6  # of the scan: where windows hold more, the whole of it takes no longer
-_CRITERIA = 3  # of being as good: by heights, by the misfit, or by that under a stretch
-_STRETCHES = np.linspace(-0.03, 0.03, 13)  # of pixels longer one way, in steps that move no mark by more than is narrow
+_STEP_TOLERANCE = 0.06  # relative tolerance of each scale step: it reaches the next step
+_LARGE_PX = 1 << 24  # px in a large scan; smaller ones are read whole in a short time
+_REACH = 0.025  # fraction of the frame's side: film laid by hand is off by some millimetres and a degree
+_LARGEST_SHARE = 0.25  # fraction of the scan: above it the whole scan is searched, for the additional evidence
+_BEYOND_MM = 3.0  # mm beyond the scan's edge: a frame may be cut off there by less than its rim
+_FINE = 0.05  # fraction of the distance within which steps are alike: to which they are rounded
+_ALIKE = 0.5  # fraction of the marks that fall on others after one step: above it a lattice may be found one step off
+_WINDOWS_SHARE = 0.6  # fraction of the scan: above it the whole scan takes no longer than the windows
+_CRITERIA = 3  # by which a false frame may be as good: response heights, misfit, and misfit under a stretch
+_STRETCHES = np.linspace(-0.03, 0.03, 13)  # relative, of non-square pixels; a step moves marks within narrow bounds
 
 
 @dataclass(frozen=True)
 class PitchHypothesis:
-    """mm: of a pixel, across and down. tolerance: by what share both together may be wrong. drawn_mm: what the marks
-    are drawn with where they are looked for; for pixels longer one way that of pixels alike, which hardly differ."""
+    """Hypothesis about the pixel pitch.
+
+    Attributes
+    ----------
+    mm : pitch across and down.
+    tolerance : relative error of the scale, common to both.
+    drawn_mm : pitch at which the templates are rendered; for non-square pixels that of the square ones, so that several
+        hypotheses share the templates, which hardly differ.
+    """
 
     mm: tuple[float, float]
     tolerance: float
@@ -62,10 +69,12 @@ Hypotheses = Sequence[PitchHypothesis]
 def pitch_hypotheses(
     scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
 ) -> list[Hypotheses]:
-    """The hypotheses, the likelier ones first: those of a later group are for a scan in which the earlier ones fail.
+    """List groups of pitch hypotheses, likelier ones first; a later group is for scans in which the earlier ones fail.
 
-    pitch_um: as given; None where it is not known: then the frame's size is all there is, as it is where the frame
-    would be far from filling the scan at that pitch.
+    Parameters
+    ----------
+    pitch_um : given pitch in x and y; None if unknown. The pitches at which the frame about fills the scan are then
+        all there is. They also follow a given pitch, unless it is certain or the scan shows a part of its frame.
     """
     long_mm, short_mm = max(layout.frame_mm), min(layout.frame_mm)
     long_px, short_px = max(scan.width_px, scan.height_px), min(scan.width_px, scan.height_px)
@@ -86,35 +95,37 @@ def pitch_hypotheses(
 
 
 def slightly_longer(given: PitchHypothesis, tolerance: float) -> tuple[Hypotheses, Hypotheses]:
-    """A given pitch as it is, and with pixels slightly longer one way, each right by a tolerance."""
+    """Return the given pitch, and variants with slightly non-square pixels, each with a tolerance."""
     near = replace(given, tolerance=tolerance)
     return [near], [longer(near, stretch) for stretch in _SLIGHT]
 
 
 def longer(given: PitchHypothesis, stretch: float) -> PitchHypothesis:
-    """The same with pixels that are longer across than down by a share, or less long."""
+    """Stretch the pixels: longer across than down by a relative amount, or shorter if it is negative."""
     x, y = given.mm
     return replace(given, mm=(x * (1 + stretch / 2), y * (1 - stretch / 2)))
 
 
-# Where the marks are of a frame that lies in the middle of its scan, about so or as far as it has room: its marks are
-# looked for there only. In a large scan only the file about them is read; where any of them is not plainly there, the
-# whole scan is searched.
+# Search in windows for a frame near the middle of its scan, or as far off as the scan has room for it. Of a large scan
+# only the windows around the expected marks are read; if any mark is not clear there, the whole scan is searched.
 
 
 def reach_mm(layout: FiducialLayout) -> float:
-    """How far from its place in a centred frame a mark is looked for."""
+    """Search radius around the place of a mark in a centred frame."""
     return _REACH * max(layout.frame_mm)
 
 
 def room_mm(scan: Scan, layout: FiducialLayout, pitch_mm: tuple[float, float]) -> float:
-    """How far from the middle of the scan that of a frame may lie which is whole in it."""
+    """Largest distance between the centre of the scan and that of a frame wholly inside it."""
     scan_mm = scan.width_px * pitch_mm[0], scan.height_px * pitch_mm[1]
     return max((max(scan_mm) - min(layout.frame_mm)) / 2, 0.0) + _BEYOND_MM
 
 
 def is_searched_by_windows(scan: Scan, layout: FiducialLayout, pitch_mm: tuple[float, float]) -> bool:
-    """Whether windows about the marks are a small part of a large scan, and would not mistake one mark for the next."""
+    """Whether the scan is large, the windows around the marks a small part of it, and the marks no lattice.
+
+    In a lattice a window may hold the next mark instead.
+    """
     side_px = 2 * reach_mm(layout) / np.asarray(pitch_mm)
     size_px = scan.width_px * scan.height_px
     share = len(layout.marks) * float(np.prod(side_px)) / size_px
@@ -122,10 +133,10 @@ def is_searched_by_windows(scan: Scan, layout: FiducialLayout, pitch_mm: tuple[f
 
 
 def is_lattice(layout: FiducialLayout) -> bool:
-    """Whether one step takes more than half of the marks to others."""
+    """Whether one shift maps more than half of the marks to others."""
     xy, near = np.array([mark.xy_mm for mark in layout.marks]), reach_mm(layout) / 2
     steps = (xy[:, None] - xy[None]).reshape(-1, 2)
-    # Of a large lattice there are a million steps, and few that differ.
+    # A large lattice has a million steps, few of them distinct: count rounded ones.
     rounded = np.round(steps[np.hypot(*steps.T) > near] / (_FINE * near))
     fine, times = np.unique(rounded @ [1, 1j], return_counts=True)
     places = _FINE * near * np.stack([fine.real, fine.imag], axis=1)
@@ -134,18 +145,23 @@ def is_lattice(layout: FiducialLayout) -> bool:
 
 
 def centred_places_px(scan: Scan, layout: FiducialLayout, pixel_from_camera: Array) -> Array:
-    """(n, 2) where the marks are in the scan if the middle of their constellation is that of the scan;
-    pixel_from_camera: (2, 2), of a pose."""
+    """(n, 2) places of the marks if their constellation is centred in the scan.
+
+    pixel_from_camera: (2, 2), of a pose.
+    """
     xy = np.array([mark.xy_mm for mark in layout.marks])
     middle = (xy.min(axis=0) + xy.max(axis=0)) / 2
     return np.asarray((xy - middle) @ pixel_from_camera.T + np.array([scan.width_px - 1, scan.height_px - 1]) / 2)
 
 
 class FrameSearch:
-    """The search in one scan; it draws and correlates the marks once for hypotheses that share a drawing.
+    """Search in one scan. Templates are rendered and correlated once for hypotheses with the same drawn_mm.
 
-    unsettled: placements with marks that were not fitted, where another tone curve may fit them; among: those in which
-    marks are fitted, None for all."""
+    Attributes
+    ----------
+    unsettled : placements with unfitted marks that another tone curve may fit.
+    among : placements in which marks are fitted, None for all.
+    """
 
     def __init__(
         self,
@@ -164,19 +180,19 @@ class FrameSearch:
         self.unsettled: list[Placement] = []
         self.among: list[Placement] | None = None
         self._found: dict[tuple[PitchHypothesis, ...], list[Placement]] = {}
-        # Of dilations there are two for each of the views of one pose.
+        # Two thirds for the correlation maps, one third for the dilations: two for each view of one pose.
         cache_bytes = effort.scan_cache_bytes(scan.width_px * scan.height_px)
         self._caches = ByteCache[Map](2 * cache_bytes // 3), ByteCache[Dilation](cache_bytes // 3)
         self._effort = effort
 
     def with_surroundings(self, surroundings: Surroundings) -> "FrameSearch":
-        """The search with other surroundings of a mark; both share what they cache."""
+        """Return a search with other surroundings of the marks; both share the caches."""
         search = FrameSearch(self.scan, self.layout, self.options, surroundings, self._effort)
         search._caches = self._caches
         return search
 
     def search_scan(self, hypotheses: Sequence[PitchHypothesis]) -> list[Placement]:
-        """The placements in the whole scan, of all poses, best first."""
+        """Find placements in the whole scan, of all poses, best first."""
         key, found = tuple(hypotheses), list[Placement]()
         if key in self._found:
             return self._found[key]
@@ -189,26 +205,30 @@ class FrameSearch:
         return self._found.setdefault(key, _best_first(found))
 
     def replace_tone(self, tone: Tone) -> "FrameSearch":
-        """The same search where marks are fitted through another tone curve. Its placements are these, which the
-        stored grey values give; only in those that are unsettled marks are fitted again."""
+        """Return the search with another tone curve for the fits.
+
+        The placements stay, since the correlation uses the stored grey values. Marks are fitted again only in the
+        unsettled placements.
+        """
         search = copy(self)
         search.scan, search.among = self.scan.replace_tone(tone), self.unsettled
         return search
 
     def replace_film_model(self, model: str) -> "FrameSearch":
-        """The same search of a film of another deformation model, in the same responses."""
+        """Return the search with another film deformation model, in the same responses."""
         search = copy(self)
         search.options, search._searches, search._found = replace(self.options, film_model=model), {}, {}
         return search
 
     def search_middle(self, hypothesis: PitchHypothesis) -> list[Placement]:
-        """The placements of a frame that lies about in the middle of the scan, best first. Only the windows are read
-        in which its marks lie then."""
+        """Find placements of a frame near the middle of the scan, best first. Reads only windows around its marks."""
         return _best_first(self._placements([hypothesis], self._middle_responses(hypothesis.mm, reach_mm(self.layout))))
 
     def search_room(self, hypotheses: Sequence[PitchHypothesis]) -> list[Placement]:
-        """The placements of a frame that the scan holds all of, best first: its marks are then searched only where it
-        has room for them, if that is a small part of the scan."""
+        """Find placements of a frame that lies wholly inside the scan, best first.
+
+        Each mark is searched only in the window that this leaves, if the windows are smaller than the scan.
+        """
         found: list[Placement] = []
         for drawn_mm, alike in groupby(hypotheses, attrgetter("drawn_mm")):
             own = list(alike)
@@ -221,17 +241,18 @@ class FrameSearch:
         return _best_first(found)
 
     def is_exhaustive(self, placement: Placement) -> bool:
-        """Whether the whole scan was searched for the frame of a placement, and not the middle alone."""
+        """Whether the placement was found by a search of the whole scan, not of windows alone."""
         search = self._searches.get(placement.pitch_mm)
         return search is not None and search.responses.origins is None
 
     def false_placements(self, placement: Placement) -> float:
-        """The expected number of placements as good in a scan like this without any frame, by this placement's
-        hypothesis alone.
+        """Expected number of placements as good in a similar scan without any frame, under this pitch hypothesis alone.
 
-        Of n marks in the scan k answer, the weakest of them as strongly as a share p of all places do: a frame at
-        random has so many with a probability of about (n over k) p^k. The frames that differ are all pairs of places,
-        one for each of two marks far apart, which the bounds of turn and scale allow.
+        Notes
+        -----
+        Of n marks in the scan k respond, the weakest at least as strongly as a share p of all places. A random frame
+        has as many with a probability of about (n over k) p^k. The number of distinct frames is that of all pairs of
+        places, for two marks far apart, that the bounds of rotation and scale allow.
         """
         places = placement.places_px(self._camera_mm)
         inside = np.all((places >= 0) & (places < (self.scan.width_px, self.scan.height_px)), axis=1)
@@ -239,11 +260,15 @@ class FrameSearch:
         return self._false_frames(placement, found, len(found), self._searches[placement.pitch_mm].tolerance_px)
 
     def false_frames(self, placement: Placement, inside: int, found_px: dict[int, Array]) -> float:
-        """The expected number of false frames that are as good as one whose marks were found at found_px, by index,
-        of so many inside the scan.
+        """Expected number of false frames as good as one with marks found at given places.
 
-        Null hypothesis: detections are uniform within the search tolerance. Marks that a similarity fits better, or
-        one under one of the stretches, are the less likely, the more of them there are.
+        Null hypothesis: detections are uniform within the search tolerance. A good fit of many marks by a similarity,
+        with or without a stretch, is then improbable.
+
+        Parameters
+        ----------
+        inside : number of marks inside the scan.
+        found_px : (2,) place of each mark found, by index.
         """
         widest_px, expected = self._searches[placement.pitch_mm].tolerance_px, list[float]()
         for stretches in (np.zeros(1), _STRETCHES):
@@ -253,8 +278,7 @@ class FrameSearch:
         return _CRITERIA * min(expected)
 
     def places_as_good(self, placement: Placement, index: int, found_px: Array) -> Array:
-        """(n, 2) the highest places of the scan that at reduced size answer to a mark, by index, as strongly as the one
-        (2,) where it was found."""
+        """(n, 2) candidates of a mark that respond at least as strongly, at reduced resolution, as found_px (2,)."""
         search = self._searches[placement.pitch_mm]
         response_map, responses = search.response_map(placement, index), search.responses
         height = response_map.dilated(search.tolerance_px).height(responses.reduced_px(found_px))
@@ -262,8 +286,7 @@ class FrameSearch:
         return responses.scan_px(response_map.candidates[heights >= height])
 
     def _misfit_px(self, placement: Placement, found_px: dict[int, Array], stretches: Array) -> float:
-        """How far from its place (px of the reduced scan) the best similarity leaves a mark that was found, pixels
-        being longer one way by the best of the stretches."""
+        """Largest residual, px of the reduced scan, of the marks found after a similarity with the best stretch."""
         if not found_px:
             return 0.0
         pitch = np.asarray(placement.pitch_mm)
@@ -280,8 +303,10 @@ class FrameSearch:
     def _false_frames(
         self, placement: Placement, found_px: dict[int, Array], inside: int, tolerance_px: float
     ) -> float:
-        """found_px: by index, where marks were found, within tolerance_px (of the reduced scan) of the frame's
-        places."""
+        """Expected number of false frames, from the shares of places that respond as strongly as the marks found.
+
+        found_px: places by index; they agree with the frame within tolerance_px (of the reduced scan).
+        """
         search, shares, same_px = self._searches[placement.pitch_mm], [], 1
         for index, place in found_px.items():
             dilation = search.response_map(placement, index).dilated(tolerance_px)
@@ -291,7 +316,7 @@ class FrameSearch:
         if len(counts) == 0:
             return np.inf
         likely = comb(inside, counts) * np.sort(shares)[counts - 1] ** counts
-        # How many frames differ; places within same_px (of the reduced scan) of one another answer alike.
+        # Number of distinct frames: same_px neighbouring places of the reduced scan have the same dilated response.
         extent_mm = float(np.hypot(*np.ptp(self._camera_mm, axis=0)))
         span_px = extent_mm / float(search.pitch.mean()) / search.responses.reduction
         places = next(iter(search.responses.by_key.values())).map.size
@@ -301,28 +326,29 @@ class FrameSearch:
         return float(len(counts) * likely.min() * different)
 
     def _slack_mm(self, hypotheses: Sequence[PitchHypothesis]) -> float:
-        """How far a turn, and a pitch that is wrong or longer one way, move a mark from where the frame's middle puts
-        it."""
+        """Largest shift of a mark, relative to the frame's centre, by a rotation and a wrong or non-square pitch."""
         scale = max(each.tolerance + float(np.abs(np.divide(each.mm, each.drawn_mm) - 1).max()) for each in hypotheses)
         farthest_mm = float(np.abs(self._camera_mm).max())
         turn = float(np.deg2rad(self.options.rotation_deg))
         return (scale + turn) * farthest_mm + self.options.search_mm(self.layout)
 
     def _middle_responses(self, drawn_mm: Pair, reach: float) -> Responses:
-        """The responses of the windows that reach so far, mm, about the marks of a frame in the middle of the scan."""
+        """Responses in windows of half-width reach, mm, around the marks of a frame centred in the scan."""
         linear, views = _pixel_from_up(drawn_mm), self._views(drawn_mm)
         places = [centred_places_px(self.scan, self.layout, linear @ up_from_camera(pose)) for pose in self.poses]
         effort = self._caches[1], self._effort.half_px
         return correlate_windows(self.scan, views, np.concatenate(places), reach / max(drawn_mm), self._signs, *effort)
 
     def _views(self, drawn_mm: Pair) -> list[MarkView]:
-        """Of all marks, in one pose after another."""
+        """Views of all marks, pose by pose."""
         linear = _pixel_from_up(drawn_mm)
         return [MarkView(mark.mark, linear @ up_from_camera(pose)) for pose in self.poses for mark in self.layout.marks]
 
     def _placements(self, hypotheses: Sequence[PitchHypothesis], responses: Responses) -> list[Placement]:
-        """The placements under hypotheses that share a drawing. Pose by pose, for the responses of all may be more
-        than can be cached."""
+        """Find placements under hypotheses that share templates.
+
+        Pose by pose, since the responses of all poses may exceed the cache.
+        """
         marks = self.layout.marks
         rotation_rad, misfit_mm = float(np.deg2rad(self.options.rotation_deg)), self.options.search_mm(self.layout)
         searches = {
@@ -344,8 +370,10 @@ class FrameSearch:
         return [placement for placement in every if self._shows_middle(placement)]
 
     def _shows_middle(self, placement: Placement) -> bool:
-        """Whether the scan's middle is in the frame, where it shows a part of it: two marks fit others as well, whose
-        frame would lie beside the scan."""
+        """Whether the frame contains the scan's centre, for a scan of a part of a frame; True for a whole one.
+
+        Two marks, enough for a part, also fit frames that would lie beside the scan.
+        """
         if not self.options.part:
             return True
         linear, shift = placement.pixel_from_camera[:, :2], placement.pixel_from_camera[:, 2]
@@ -354,10 +382,10 @@ class FrameSearch:
 
 
 def _pixel_from_up(pitch_mm: Pair) -> Array:
-    """(2, 2) from mm right and up to pixels across and down."""
+    """(2, 2) matrix from mm right and up to pixels across and down."""
     return np.diag([1 / pitch_mm[0], -1 / pitch_mm[1]])
 
 
 def _best_first(found: list[Placement]) -> list[Placement]:
-    """Poses that score alike keep their order: of a symmetric camera's eight, "0" comes first."""
+    """Sort by score. Equal scores keep their order: of a symmetric camera's eight poses, "0" comes first."""
     return sorted(found, key=lambda placement: -round(placement.score, 2))
