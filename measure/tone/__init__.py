@@ -1,1 +1,1 @@
-"""The tone curve of a scan: what is known of it, what its file declares, what its marks tell."""
+"""Tone curve and sharpening of a scan: priors, declarations in the file, and estimation from marks."""

@@ -1,9 +1,9 @@
-"""The curve through which a scanner or a converter stored light as grey values.
+"""Tone curve by which a scanner or converter stores light as grey values (codes).
 
-Film, lens and scanner blur light; only then is it coded. A fit in light needs the curve from code to light, and light
-may be anything that grows linearly with it: gain and offset are in every fit. So a curve is known by the logarithm of
-its slope, up to a constant. Its distribution has a base curve and normal departures from it: of the logarithm of the
-slope, a power's share and a few smooth waves over the range of codes.
+Film, lens and scanner blur the light before it is coded. A fit in linear light needs the curve from code to light, up
+to gain and offset, which every fit estimates. A curve is therefore described by the logarithm of its slope, up to a
+constant. Its distribution consists of a base curve and normally distributed departures of that logarithm: a power
+(gamma) term and a few smooth waves over the range of codes.
 """
 
 from collections.abc import Sequence
@@ -17,26 +17,26 @@ from numpy.typing import NDArray
 from measure.array_types import Array, Single
 from measure.tone.sharpening import Sharpening
 
-_PIECES = 1024  # of the range of codes, in which a curve is straight
+_PIECES = 1024  # linear pieces over the range of codes
 _NODES = np.linspace(0.0, 1.0, _PIECES + 1)
 _MIDDLES = (_NODES[1:] + _NODES[:-1]) / 2
-_TOE = 0.005  # of full scale: the slope of a power has no logarithm at black
-# The prior of a curve that no file declares: between linear and sRGB, and a scanner may bend it further. The waves are
-# Legendre's polynomials; their standard deviations let S-curves be that a scanner's "contrast" makes.
+_TOE = 0.005  # fraction of full scale added to the code: the log slope of a power is singular at black
+# Prior of a curve that no file declares: between linear and sRGB, with further bending by a scanner. The waves are
+# Legendre polynomials; their standard deviations admit S-curves such as those of a scanner's "contrast" setting.
 _POWER, _POWER_SIGMA = 1.6, 0.6
 _WAVE_SIGMAS = (0.3, 0.5, 0.2, 0.15)
 _SIGMAS = np.array([_POWER_SIGMA, *_WAVE_SIGMAS])
 _COUNT = len(_SIGMAS)
-# The prior of a curve that the file declares: programs round it, and a scanner's light and dark are not exactly its.
-_DECLARED_SIGMA = 0.1  # of the standard deviations above
-# By how much pictures' own curves may differ from the scanner's: variances of each departure that are tried.
+# Prior of a declared curve: programs round it, and a scanner does not follow it exactly in highlights and shadows.
+_DECLARED_SIGMA = 0.1  # fraction of the standard deviations above
+# Variances tried for the departures of the images' own curves from the scanner's.
 _SCATTERS = (0.0, *np.geomspace(0.003, 30.0, 17))
-_CONTRADICTED = np.log(1000.0)  # log-odds, at which the pictures outweigh the curve that the file declares
-_STARTS, _ANOTHER = (1.0, 1.6, 0.5, 2.4), 0.3  # powers to begin with, and how far they lie at least from what was tried
+_CONTRADICTED = np.log(1000.0)  # log-odds above which the images overrule the declared curve
+_STARTS, _ANOTHER = (1.0, 1.6, 0.5, 2.4), 0.3  # initial powers, and their smallest distance from those tried before
 
 
 def power(exponent: float) -> Array:
-    """(nodes,) light of a code raised to a power."""
+    """(nodes,) light as a power of the code."""
     return np.asarray(_NODES**exponent)
 
 
@@ -46,7 +46,8 @@ def srgb() -> Array:
 
 
 def sampled_curve(light: Array) -> Array:
-    """(nodes,) light of a curve that is given by values (n,) at evenly spaced codes; it has to grow."""
+    """(nodes,) curve interpolated from values (n,) at evenly spaced codes. Raises ValueError if it does not
+    increase."""
     even = np.interp(_NODES, np.linspace(0.0, 1.0, len(light)), light)
     low, high = float(even[0]), float(even[-1])
     if not (high > low and np.all(np.diff(even) >= 0)):
@@ -56,12 +57,17 @@ def sampled_curve(light: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class ToneInformation:
-    """Information of pictures on the departures of a curve, as a normal equation.
+    """Information of images on the departures of a curve, as normal equations.
 
-    matrix (k, k): the information; right_side (k,): the matrix times the most likely departures; sum_of_squares: of the
-    misfit without departures, in units of its standard deviations; count: of independent figures. common_variance: of
-    each departure by which all pictures deviate from the scanner's curve in the same way, as JPEG's rounding makes
-    them: it is not in the matrix, and no number of pictures averages it. sharpening: of the scan.
+    Attributes
+    ----------
+    matrix : (k, k) information matrix.
+    right_side : (k,) matrix times the most likely departures.
+    sum_of_squares : weighted sum of squares of the misfit without departures.
+    count : number of independent quantities.
+    common_variance : variance of each departure common to all images, for example by JPEG's rounding. It is not in the
+        matrix and does not average out over images.
+    sharpening : of the scan.
     """
 
     matrix: Array
@@ -77,19 +83,19 @@ class ToneInformation:
 
     @classmethod
     def from_score(cls, normal: Array, score: Array, covariance: Array) -> "ToneInformation":
-        """Information of a score (k,) with that covariance (k, k), which grows with the departures by normal (k, k)."""
+        """Information of a score (k,) with a covariance (k, k) and derivatives normal (k, k) by the departures."""
         weighted = np.linalg.solve(covariance, np.column_stack([normal, score])).T
         matrix = weighted[:-1] @ normal
         return cls((matrix + matrix.T) / 2, weighted[-1] @ normal, float(weighted[-1] @ score), len(score))
 
     @classmethod
     def pooled(cls, each: Sequence["ToneInformation"], scatter: float = 0.0) -> "ToneInformation":
-        """Information of several pictures on the scanner's curve.
+        """Pool the information of several images on the scanner's curve.
 
         Parameters
         ----------
-        each : of the pictures. What they have in common counts by the trace of their matrices.
-        scatter : variance by which each departure of a picture's own curve differs from the scanner's.
+        each : information of each image. Their common variances are averaged with the traces of their matrices.
+        scatter : variance of each departure of an image's own curve around the scanner's.
         """
         matrices = np.array([one.matrix for one in each])
         right_sides = np.array([one.right_side for one in each])[..., None]
@@ -107,13 +113,13 @@ class ToneInformation:
 
     @property
     def scanner_information(self) -> "ToneInformation":
-        """With the common variance taken into the matrix."""
+        """Information on the scanner's curve, with the common variance included in the matrix."""
         return replace(ToneInformation.pooled([self], self.common_variance), common_variance=0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class ToneEstimate:
-    """A tone curve estimated from pictures. scatter: the variance of each departure of their own curves from it."""
+    """Tone curve estimated from images. scatter: variance of each departure of their own curves around it."""
 
     tone: "Tone"
     scatter: float = 0.0
@@ -121,14 +127,18 @@ class ToneEstimate:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Tone:
-    """The tone curve of a scan, with its uncertainty.
+    """Tone curve of a scan, with its uncertainty.
 
-    base (nodes,): light, 0 to 1, at evenly spaced codes. mean (k,), covariance (k, k): of the departures from it, each
-    in units of the standard deviation that it has where nothing is known. source: where the curve is from, a part of a
-    sentence; is_declared: by the file, which the pictures may contradict. other_scans: the curve before other scans of
-    the scanner gave information, and that information; None where none did. before: the curve as it was believed
-    before this scan, where this one is to begin with, or estimated from it; None of that curve itself. sharpening: what
-    was done to the codes thereafter.
+    Attributes
+    ----------
+    base : (nodes,) light, 0 to 1, at evenly spaced codes.
+    mean, covariance : (k,) and (k, k) of the departures from the base, in units of their standard deviations without
+        prior knowledge.
+    source : origin of the curve, as part of a sentence.
+    is_declared : whether the file declares it; images may contradict that.
+    other_scans : curve before the information of other scans of the scanner, and that information; None without any.
+    before : prior curve from which this one starts or was estimated; None for the prior itself.
+    sharpening : applied to the codes after the tone curve.
     """
 
     base: Array = field(default_factory=lambda: power(1.0))
@@ -146,7 +156,7 @@ class Tone:
 
     @classmethod
     def declared(cls, base: Array, source: str) -> "Tone":
-        """A curve that the file declares."""
+        """Curve declared by the file."""
         return cls(base, covariance=_DECLARED_SIGMA**2 * np.eye(_COUNT), source=source, is_declared=True)
 
     @property
@@ -159,18 +169,18 @@ class Tone:
 
     @property
     def prior(self) -> "Tone":
-        """The curve as it was believed before this scan."""
+        """Prior curve, before this scan."""
         return self.before or self
 
     @property
     def without_priors(self) -> "Tone":
-        """The curve as a result, without what was believed before."""
+        """The curve without its prior, as a result."""
         return replace(self, before=None, sharpening=replace(self.sharpening, prior=None))
 
     @property
     def starting_curves(self) -> tuple["Tone", ...]:
-        """Other curves to begin with, where this one is not known: noise and grain may hide a mark that is fitted
-        through a curve far from the right one."""
+        """Alternative initial curves if this one is uncertain: with a curve far from the true one, a mark may be lost
+        in noise and grain."""
         curves = list[Tone]() if self.is_known else [self]
         for power in _STARTS if curves else ():
             apart = min(abs(power - each.equivalent_power(0.1, 0.9)[0]) for each in curves)
@@ -178,19 +188,19 @@ class Tone:
         return tuple(curves[1:])
 
     def doubted(self, other: "Tone", value: float) -> "Tone":
-        """The curve where pictures say another one, of a power that no scanner has: it may be as far off as that."""
+        """Enlarge the covariance by the distance to an implausible estimate, whose power is value."""
         off = other.mean - self.mean
         source = f"{self.source}; the marks say {value:.2f}, as no scanner does, which was not taken"
         return replace(self, covariance=self.covariance + np.outer(off, off), source=source, before=self)
 
     def vague_prior(self) -> "Tone":
-        """The base with departures of which only the prior is known: the curve lies between linear and sRGB."""
+        """Base curve with the vague prior of an undeclared one, between linear and sRGB."""
         mean = np.zeros(_COUNT)
         mean[0] = (_POWER - self._base_power) / _POWER_SIGMA
         return replace(self, mean=mean, covariance=np.eye(_COUNT))
 
     def shift_to_power(self, value: float) -> "Tone":
-        """The curve to begin with that has the departure which makes it most like a power."""
+        """Initial curve, shifted in its first departure so that it approximates a power."""
         mean = self.mean.copy()
         mean[0] += (value - self.equivalent_power(0.1, 0.9)[0]) / _POWER_SIGMA
         return replace(self, mean=mean, before=self.prior)
@@ -200,16 +210,17 @@ class Tone:
 
     @property
     def plausible_curves(self) -> tuple["Tone", ...]:
-        """The curve itself where it is known, else those one standard deviation of power to either side."""
+        """The curve itself if known, else the two curves one standard deviation of the power to either side."""
         if self.is_known:
             return (self,)
         sigma = np.sqrt(self.covariance[0, 0]) * np.eye(_COUNT)[0]
         return self.replace_departures(self.mean - sigma), self.replace_departures(self.mean + sigma)
 
     def include_information(self, others: Sequence[ToneInformation]) -> "Tone":
-        """The curve after information from other scans of the scanner.
+        """Update the curve by information from other scans of the scanner.
 
-        It is kept, and pooled anew with that of the scan itself: what is wrong alike in all scans does not average.
+        The information is kept and pooled again with that of the scan itself, since errors common to all scans do not
+        average out.
         """
         if not others:
             return self
@@ -217,11 +228,11 @@ class Tone:
         return replace(self.estimate(others).tone, other_scans=(self, tuple(others)), sharpening=sharpening)
 
     def estimate(self, each: Sequence[ToneInformation]) -> ToneEstimate:
-        """The curve after information from pictures.
+        """Update the curve by information from images.
 
         Parameters
         ----------
-        each : information of each picture. Pictures that agree may contradict a curve that the file declares.
+        each : information of each image. Images that agree may overrule the declared curve.
         """
         if self.other_scans is not None:
             before, others = self.other_scans
@@ -238,12 +249,13 @@ class Tone:
         return replace(free, tone=replace(free.tone, source=source, is_declared=False))
 
     def _most_likely(self, each: Sequence[ToneInformation]) -> tuple[ToneEstimate, float]:
-        """The estimate by its most likely scatter, and the logarithm of its marginal likelihood.
+        """Estimate with the most likely scatter, and the logarithm of its marginal likelihood.
 
-        Pictures that contradict one another or the prior beyond chance have edges that are not as they are drawn: of
-        sharpened pictures, of film developed unevenly. So each speaks of a curve of its own, and how far these scatter
-        about the scanner's is estimated with it, as the most likely variance of random effects. Beforehand its root
-        has a half-Cauchy distribution (Gelman, 2006, Prior distributions for variance parameters)."""
+        Images that contradict one another or the prior significantly have edges that are not as drawn, for example by
+        sharpening or uneven development. Each image therefore has its own curve, and the scatter of these curves around
+        the scanner's is estimated as the variance of random effects. The prior of its root is half-Cauchy (Gelman,
+        2006, Prior distributions for variance parameters).
+        """
         return max((self._scatter_estimate(each, scatter) for scatter in _SCATTERS), key=itemgetter(1))
 
     def _scatter_estimate(self, each: Sequence[ToneInformation], scatter: float) -> tuple[ToneEstimate, float]:
@@ -259,7 +271,7 @@ class Tone:
         return ToneEstimate(tone, scatter), log_likelihood / 2
 
     def light(self, code: NDArray[np.floating] | NDArray[np.integer], full_scale: float) -> Single:
-        """Light of grey values of a file whose largest is full_scale, on the same scale: 0 stays 0, and white white."""
+        """Convert grey values to light on the same scale, 0 to full_scale; both ends are fixed."""
         if self.is_identity:
             return np.asarray(code, np.float32)
         share = np.asarray(code, np.float32) * np.float32(_PIECES / full_scale)
@@ -268,27 +280,27 @@ class Tone:
         return np.asarray(np.float32(full_scale) * (table[whole] + steps[whole] * (share - whole)), np.float32)
 
     def code(self, light: NDArray[np.floating], full_scale: float) -> Array:
-        """The grey value that such light is stored as."""
+        """Convert light to grey values."""
         return np.asarray(full_scale * np.interp(np.asarray(light) / full_scale, self._table, _NODES))
 
     def sharpened(self, sharpening: Sharpening) -> "Tone":
-        """The curve of a scan that is sharpened so."""
+        """Copy of the curve, and of its prior, with the scan's sharpening."""
         before = self.before and replace(self.before, sharpening=sharpening)
         return replace(self, sharpening=sharpening, before=before)
 
     def slope(self, light: NDArray[np.floating], full_scale: float) -> Array:
-        """By how much light grows with the grey value that it is stored as."""
+        """Derivative of light with respect to the grey value, at a light."""
         steps = np.diff(self._table) * _PIECES
         share = np.asarray(self.code(light, full_scale)) / full_scale
         return np.asarray(steps[np.clip((share * _PIECES).astype(int), 0, _PIECES - 1)])
 
     def derivatives(self, light: NDArray[np.floating], full_scale: float) -> Array:
-        """(k, ...) derivatives of light by the departures, at the codes that stand for this light."""
+        """(k, ...) derivatives of light with respect to the departures, at the codes of this light."""
         share = self.code(light, full_scale) / full_scale
         return full_scale * np.stack([np.interp(share, _NODES, each) for each in self._departure_derivatives])
 
     def equivalent_power(self, low: float, high: float) -> tuple[float, float]:
-        """The power that the curve is most like between two codes, shares of full scale, and its standard deviation."""
+        """Power (gamma) fitted to the curve between two codes, fractions of full scale, and its standard deviation."""
         codes = np.linspace(max(low, 0.02), max(high, low + 0.02), 50)
         at = np.clip((codes * _PIECES).astype(int), 0, _PIECES - 1)
         slope = np.log(np.maximum(np.diff(self._table)[at], 1e-12))
@@ -315,7 +327,7 @@ class Tone:
 
     @cached_property
     def _departure_derivatives(self) -> Array:
-        """(k, nodes) derivatives of the table, but for a constant share of light: a fit's gain takes that."""
+        """(k, nodes) derivatives of the table, up to a part proportional to light, which the gain of a fit absorbs."""
         sums = np.cumsum(self._steps * _WAVES, axis=1) / self._steps.sum()
         return np.concatenate([np.zeros((_COUNT, 1)), sums], axis=1)
 
@@ -329,13 +341,13 @@ class Tone:
 
 
 def _log_determinant(variance: float, each: Sequence[ToneInformation]) -> float:
-    """The logarithm of the determinant by which the covariance of the pictures' estimates grows with that variance."""
+    """Sum of log det(I + variance * matrix): increase of the images' log covariance determinants by that variance."""
     matrices = np.array([one.matrix for one in each])
     return float(np.linalg.slogdet(np.eye(_COUNT) + variance * matrices)[1].sum())
 
 
 def _waves(code: Array) -> Array:
-    """(k, n) departures of one standard deviation: what each adds to the logarithm of the slope."""
+    """(k, n) change of the log slope by one standard deviation of each departure."""
     x = 2 * code - 1
     waves = [np.polynomial.legendre.Legendre.basis(degree)(x) for degree in range(1, len(_WAVE_SIGMAS) + 1)]
     return np.asarray(_SIGMAS[:, None] * np.stack([np.log(code + _TOE), *waves]))

@@ -1,4 +1,4 @@
-"""The tone curve that a file says it has: its ICC profile, a TransferFunction, PNG's sRGB and gAMA, or Exif."""
+"""Tone curve declared by a file: ICC profile, TransferFunction, PNG's sRGB and gAMA, or Exif."""
 
 import struct
 from collections.abc import Mapping
@@ -10,17 +10,17 @@ import numpy as np
 from measure.array_types import Array
 from measure.tone.curve import Tone, power, sampled_curve, srgb
 
-_ICC_HEADER, _CURVES = 128, (b"kTRC", b"gTRC")  # of a grey profile, and of green (ICC.1:2022, 7.2 and 9.2)
+_ICC_HEADER, _CURVES = 128, (b"kTRC", b"gTRC")  # bytes; tags of a grey curve and of green (ICC.1:2022, 7.2 and 9.2)
 _SAMPLES = np.linspace(0.0, 1.0, 1025)  # codes at which a parametric curve is tabulated
-_EXIF_SRGB = 1  # of ColorSpace (Exif 2.3)
+_EXIF_SRGB = 1  # value of ColorSpace (Exif 2.3)
 
 
 @dataclass(frozen=True, eq=False)
 class ColourTags:
-    """What a file says of how its grey values code light, as far as it says it.
+    """Tags of a file that declare its tone curve.
 
-    icc_profile: empty without one; transfer_function: (codes,) light of each code; exif: the tags of its Exif block;
-    is_srgb: PNG's sRGB chunk; light_power: the inverse of PNG's gAMA.
+    icc_profile: empty if absent; transfer_function: (codes,) light of each code; exif: tags of the Exif block; is_srgb:
+    PNG's sRGB chunk is present; light_power: inverse of PNG's gAMA.
     """
 
     icc_profile: bytes = b""
@@ -31,16 +31,16 @@ class ColourTags:
 
 
 def tone_of_tags(tags: ColourTags) -> Tone | None:
-    """The curve that a file declares: by its profile before all other tags.
+    """Read the tone curve declared by a file. The ICC profile has priority over all other tags.
 
     Returns
     -------
-    None where the tags say nothing that can be used.
+    Tone, or None if no tag declares a usable curve.
 
     Raises
     ------
     ValueError, LookupError, ArithmeticError, struct.error
-        For tags that are broken.
+        If the tags are corrupt.
     """
     if tags.icc_profile and (curve := curve_of_profile(tags.icc_profile)) is not None:
         return Tone.declared(curve, "the file's ICC profile says it")
@@ -59,8 +59,8 @@ def tone_of_tags(tags: ColourTags) -> Tone | None:
 
 
 def curve_of_profile(profile: bytes) -> Array | None:
-    """(nodes,) light by the grey or green curve of an ICC profile; None where it has none, as profiles that are
-    tables of colours have none. Raises struct.error or ValueError for one that is broken."""
+    """(nodes,) light by the grey or green curve of an ICC profile; None if it has none, such as profiles with colour
+    tables. Raises struct.error or ValueError if it is corrupt."""
     (count,) = struct.unpack_from(">I", profile, _ICC_HEADER)
     for entry in range(min(count, 100)):
         name, offset, size = struct.unpack_from(">4sII", profile, _ICC_HEADER + 4 + 12 * entry)
@@ -70,7 +70,7 @@ def curve_of_profile(profile: bytes) -> Array | None:
 
 
 def _curve(data: bytes) -> Array | None:
-    """By curveType and parametricCurveType (ICC.1:2022, 10.6 and 10.18)."""
+    """Decode curveType and parametricCurveType (ICC.1:2022, 10.6 and 10.18)."""
     if data[:4] == b"curv":
         (count,) = struct.unpack_from(">I", data, 8)
         if count == 0:

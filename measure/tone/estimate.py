@@ -1,4 +1,4 @@
-"""The tone curve of a scan estimated from its marks, and what its uncertainty adds to their places."""
+"""Estimation of a scan's tone curve from its marks, and the effect of its uncertainty on their places."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -8,14 +8,17 @@ import numpy as np
 from measure.array_types import Array
 from measure.tone.curve import Tone, ToneInformation
 
-_POWERS = 0.4, 3.0  # that curves are like: what marks say beyond has another cause
-_LONGEST = 1.0  # departure that is changed at a time, in its standard deviations
+_POWERS = 0.4, 3.0  # range of gamma; an estimate outside has a different cause
+_LONGEST = 1.0  # in standard deviations, largest change of a departure per iteration
 
 
 @dataclass(frozen=True, eq=False)
 class MarkTone:
-    """A mark and the tone curve. information: on the departures of the curve. on_place (2, k): px by which the mark
-    moves for each departure of 1. least, greatest: the codes of the mark's picture, shares of full scale."""
+    """Relation of a mark to the tone curve.
+
+    information: on the departures of the curve; on_place: (2, k) derivatives of the place (px) with respect to the
+    departures; least, greatest: range of codes of the mark's image, fractions of full scale.
+    """
 
     information: ToneInformation
     on_place: Array
@@ -24,17 +27,21 @@ class MarkTone:
 
     @property
     def sensitivity_px(self) -> float:
-        """The standard deviation of the mark's place for a curve of which only the prior is known."""
+        """Sensitivity of the place: shift in px by one prior standard deviation of the first departure."""
         return float(np.hypot(*self.on_place[:, 0]))
 
 
 @dataclass(frozen=True, eq=False)
 class FrameTone:
-    """The curve estimated from all marks of a frame.
+    """Tone curve estimated from all marks of a frame.
 
-    tone: the curve; information: of the marks alone, None where they give none; least, greatest: the codes between
-    which they lie, shares of full scale; scatter: the variance by which each departure of their own curves differs from
-    it; apart: the squared distance of the curve from the one by which they were matched.
+    Attributes
+    ----------
+    tone : the curve.
+    information : of the marks alone; None if they give none.
+    least, greatest : range of codes of the marks, fractions of full scale.
+    scatter : variance of each departure of the marks' own curves around it.
+    apart : squared distance of the curve from the one used for matching.
     """
 
     tone: Tone
@@ -48,14 +55,14 @@ class FrameTone:
     def from_marks(
         cls, prior: Tone, marks: Mapping[int, MarkTone], matched_by: Tone, edges: Sequence[ToneInformation] = ()
     ) -> "FrameTone":
-        """Estimates the curve.
+        """Estimate the curve.
 
         Parameters
         ----------
-        prior : the curve before this frame.
-        marks : what each mark gives.
-        matched_by : the curve by which they were matched.
-        edges : information of edges that are no marks.
+        prior : prior of the curve.
+        marks : contribution of each mark.
+        matched_by : curve used for matching them.
+        edges : information of edges other than marks.
         """
         if not marks:
             return cls(prior)
@@ -77,27 +84,27 @@ class FrameTone:
 
     @property
     def disagreement(self) -> float:
-        """Of the marks with one another and with the curve that they were matched by, a variance of departures."""
+        """Variance of departures: disagreement of the marks with one another and with the curve used for matching."""
         return self.scatter + self.apart
 
     @property
     def note(self) -> str:
-        """A sentence: which curve, and whence."""
+        """Sentence that states the curve and its source."""
         value, sigma = self.tone.equivalent_power(self.least, self.greatest)
         exact = f"{value:.2f}" if self.tone.is_known else f"{value:.2f} (σ {sigma:.2f})"
         return f"Scanner gamma: {exact}: {self.tone.source}. {self.tone.sharpening.note}".rstrip()
 
     def shift_px(self, mark: MarkTone, before: Tone) -> float:
-        """The distance of a mark's place by this curve from that by another one."""
+        """Shift (px) of a mark's place from another curve to this one."""
         return float(np.hypot(*(mark.on_place @ (self.tone.mean - before.mean))))
 
     def covariance_px2(self, mark: MarkTone) -> Array:
-        """(2, 2) of a mark's place: the uncertainty of the curve, and the scatter of the marks' own curves about it.
-        The scatter may have another cause than a curve: it counts at most as much as the prior of a curve."""
+        """(2, 2) covariance of a mark's place due to the uncertainty of the curve and the scatter of the marks' own
+        curves. The scatter may have a different cause, so it is limited to the variance of the prior."""
         covariance = self.tone.covariance + self.scatter / (1 + self.scatter) * np.eye(len(self.tone.covariance))
         return np.asarray(mark.on_place @ covariance @ mark.on_place.T)
 
     def next_curve(self, before: Tone) -> Tone:
-        """The curve to match with next: no farther from the one before than what was linearised there holds."""
+        """Curve for the next matching, limited to the range of the linearisation around the previous one."""
         step = self.tone.mean - before.mean
         return self.tone.replace_departures(before.mean + step / max(float(np.abs(step).max()) / _LONGEST, 1.0))

@@ -1,9 +1,10 @@
-"""What pictures say of a tone curve: the one estimate from what other unknowns leave, of marks and of edges.
+"""Score of a tone curve from the residuals of fits of marks and edges, with their other unknowns eliminated.
 
-In light the two sides of a blurred edge are alike; under a wrong curve one of them is softer. That is left over when
-place, blur and contrast are fitted, and by how much tells the curve: one more linear estimate from the residuals. With
-the departures d of the curve the residuals of a fit are r + H d - D x. The score H'r of what D leaves of H grows with d
-by N and has the covariance S that the noise gives it: N' S^-1 N is the information, also where the noise is not white.
+In linear light both sides of a blurred edge are symmetric; under a wrong curve one side is softer. The asymmetry
+remains after place, blur and contrast are fitted, and gives a linear estimate of the curve from the residuals. With the
+departures d of the curve, the residuals of a fit are r + H d - D x. Let L be the part of H orthogonal to D. The score
+L'r grows with d by N = L'H and has the covariance S of the noise. N' S^-1 N is the information, also for correlated
+noise.
 """
 
 from dataclasses import dataclass
@@ -13,14 +14,20 @@ import numpy as np
 from measure.array_types import Array
 from measure.tone.curve import Tone, ToneInformation
 
-_SINGULAR = 1e-12  # of the normal matrix of unknowns of one size: less is rounding of its sums
+_SINGULAR = 1e-12  # relative eigenvalue of the normalised normal matrix below which it is numerical rounding
 
 
 @dataclass(frozen=True, eq=False)
 class ToneScore:
-    """Of one picture, or of many along the first axes: left (..., k, pixels) of the changes by the departures, beside
-    the unknowns; value (..., k), the score; normal (..., k, k), by which it grows with the departures; by_unknown
-    (..., unknowns, k), by which each departure moves the unknowns."""
+    """Score of one image, or of several along the first axes.
+
+    Attributes
+    ----------
+    left : (..., k, pixels) derivatives by the departures, after elimination of the unknowns.
+    value : (..., k) score.
+    normal : (..., k, k) derivatives of the score with respect to the departures.
+    by_unknown : (..., unknowns, k) derivatives of the unknowns with respect to the departures.
+    """
 
     left: Array
     value: Array
@@ -28,7 +35,7 @@ class ToneScore:
     by_unknown: Array
 
     def information(self, covariance: Array, tone: Tone) -> ToneInformation:
-        """Of all pictures together, fitted by a tone curve; covariance (k, k): of the sum of their scores."""
+        """Pool the information of all images, fitted with a tone curve. covariance (k, k): of the sum of the scores."""
         count = self.value.shape[-1]
         normal, value = self.normal.reshape(-1, count, count).sum(axis=0), self.value.reshape(-1, count).sum(axis=0)
         return ToneInformation.from_score(normal, value + normal @ tone.mean, covariance)
@@ -37,19 +44,19 @@ class ToneScore:
 def tone_score(
     design: Array, changes: Array, residuals: Array, priors: Array | None = None, departures: Array | None = None
 ) -> ToneScore:
-    """Score the departures of a tone curve beside the unknowns of fits.
+    """Score the departures of a tone curve, with the unknowns of the fits eliminated.
 
     Parameters
     ----------
     design : (..., unknowns, pixels)
-        Derivatives of the model by its unknowns; 0 in pixels that do not count.
+        Derivatives of the model with respect to its unknowns; 0 in unused pixels.
     changes : (..., k, pixels)
-        Of the light, by the departures, alike.
+        Derivatives of the light with respect to the departures; 0 in unused pixels.
     residuals : (..., pixels)
-        What the fits leave.
+        Residuals of the fits.
     priors, departures : (unknowns,), optional
-        Weights of what was known of the unknowns before, and how far the fit departs from that, which are residuals
-        like those of pixels.
+        Weights of the priors of the unknowns, and deviations of the fit from them, treated as residuals of
+        pseudo-observations.
 
     Returns
     -------
@@ -59,7 +66,7 @@ def tone_score(
     if priors is not None:  # a row each
         columns = np.concatenate([columns, np.diag(np.sqrt(priors))])
         wanted = np.concatenate([wanted, np.zeros((len(priors), wanted.shape[-1]))])
-    # All unknowns are brought to one size: beside a strong prior the others would pass for nothing.
+    # Normalise the columns; otherwise a strong prior would make all others numerically zero.
     size = np.maximum(np.linalg.norm(columns, axis=-2, keepdims=True), 1e-300)
     columns = columns / size
     across = columns.swapaxes(-1, -2)

@@ -1,11 +1,11 @@
-"""The sharpening of a scan: an unsharp mask, by which scanners and converters raise edges after the tone curve.
+"""Sharpening of a scan: an unsharp mask applied by scanners and converters after the tone curve.
 
-A code c is stored as c + amount (c - G c), G being a Gaussian of a radius. The spectrum of that,
-1 + amount (1 - exp(-(radius k)^2 / 2)), lies between 1 and 1 + amount: it is undone without amplifying any noise, but
-for what it drove beyond the scanner's range. So marks are fitted in light whose code is not sharpened.
+A code c is stored as c + amount (c - G c), where G is a Gaussian of a radius. Its transfer function,
+1 + amount (1 - exp(-(radius k)^2 / 2)), lies between 1 and 1 + amount. It can be inverted without amplifying noise,
+except where values were clipped. Marks are therefore fitted in light of unsharpened codes.
 
-Sharpening is taken for a curve, for damage beside a mark and for a blur below any scanner's. How strong it is the
-edges of marks tell, by the same score as the tone curve, beside which it is estimated: see `measure.tone.score`.
+Undetected sharpening is mistaken for a tone curve, for damage around a mark, and for a blur smaller than any scanner's.
+It is estimated from the edges of marks together with the tone curve, by the same score: see `measure.tone.score`.
 """
 
 from collections.abc import Sequence
@@ -17,24 +17,24 @@ from scipy import fft
 
 from measure.array_types import Array
 
-RADII_PX = (0.6, 1.0, 1.6, 2.6)  # with which sharpening is looked for; it is estimated from the best of them on
+RADII_PX = (0.6, 1.0, 1.6, 2.6)  # px, radii tried for detection; the best one starts the estimation
 _AMOUNTS, _RADIUS_RANGE_PX = (0.0, 2.5), (0.4, 5.0)
-_SIGMAS = np.array([1.0, 0.5])  # of the amount and of the logarithm of the radius, before any picture is seen
-_USUAL = np.array([0.0, 0.2])  # where these are expected
-_SCATTER = np.array([0.1, 0.1])  # from scan to scan of a scanner
-_LONGEST = np.array([1.0, 0.3])  # step of these
-_TAIL = 1e-3  # of a pixel: what is farther off than where the inverse has so little changes nothing
-_EVIDENCE = np.log(100.0)  # log-odds, at which a scan counts as sharpened
+_SIGMAS = np.array([1.0, 0.5])  # prior standard deviations of the amount and of the logarithm of the radius
+_USUAL = np.array([0.0, 0.2])  # prior means of these
+_SCATTER = np.array([0.1, 0.1])  # their standard deviations between scans of one scanner
+_LONGEST = np.array([1.0, 0.3])  # their largest step
+_TAIL = 1e-3  # fraction of a pixel's weight, below which the inverse filter is truncated
+_EVIDENCE = np.log(100.0)  # log-odds above which a scan counts as sharpened
 _LEAST_AMOUNT = 0.1
-_FEWEST, _ODD = 3, 3.0  # marks that tell it; standard deviations from the others', beyond which a mark does not count
-_SAME = 0.01  # of amount and radius: less is no step
-_CLOSE = 0.5  # of its standard deviations: a step that needs no further one
+_FEWEST, _ODD = 3, 3.0  # marks needed; standard deviations from the median beyond which a mark is an outlier
+_SAME = 0.01  # of amount and log radius, convergence limit in addition to the next one
+_CLOSE = 0.5  # in standard deviations, convergence limit
 
 
 @dataclass(frozen=True, eq=False)
 class Sharpening:
-    """An unsharp mask. covariance (2, 2): of the amount and of the logarithm of the radius. prior: what other scans of
-    the scanner say, None where none does."""
+    """Unsharp mask. covariance (2, 2): of the amount and of the logarithm of the radius; prior: from other scans of the
+    scanner, None without any."""
 
     amount: float = 0.0
     radius_px: float = 1.0
@@ -43,7 +43,8 @@ class Sharpening:
 
     @classmethod
     def pooled(cls, each: Sequence["Sharpening"]) -> "Sharpening":
-        """Of a scanner by some of its scans, none where most are not sharpened; covariance: of one more scan."""
+        """Pool the sharpening of several scans of a scanner as prior of a further scan; none if most are not
+        sharpened."""
         found = [one for one in each if one]
         if 2 * len(found) <= len(each):
             return cls()
@@ -64,20 +65,20 @@ class Sharpening:
 
     @property
     def reach_px(self) -> int:
-        """How far what is stored tells of what it was before: the inverse is a sum of Gaussians of growing radius."""
+        """Reach of the inverse filter, which is a sum of Gaussians of increasing radius."""
         share = self.amount / (1 + self.amount)
         terms = max(np.log(_TAIL) / np.log(share), 1.0) if share > 0 else 0.0
         return int(np.ceil(3.0 * self.radius_px * np.sqrt(terms)))
 
     def undone(self, codes: NDArray[np.floating]) -> Array:
-        """(..., height, width) codes before they were sharpened; they are wrong within the reach of a border."""
+        """Remove the sharpening of codes (..., height, width). The result is wrong within reach_px of a border."""
         smooth = _gaussian_spectrum(self.radius_px, codes.shape)
         return _filtered(codes, 1 / (1 + self.amount * (1 - smooth)))
 
     def changes(self, codes: NDArray[np.floating]) -> Array:
-        """(m, height, width) by how much what `undone` gives grows with m figures of the sharpening; codes
-        (height, width): not sharpened. The figures are the amount and the logarithm of the radius or, as long as
-        nothing is sharpened, the amounts with each of `RADII_PX`."""
+        """(m, height, width) halos: minus the derivatives of the result of `undone`, codes (height, width), with
+        respect to m parameters. These are the amount and the logarithm of the radius or, without sharpening, the
+        amounts for each of `RADII_PX`."""
         if not self:
             return _filtered(codes, np.stack([1 - _gaussian_spectrum(radius, codes.shape) for radius in RADII_PX]))
         smooth = _gaussian_spectrum(self.radius_px, codes.shape)
@@ -85,20 +86,20 @@ class Sharpening:
         return _filtered(codes, np.stack([1 - smooth, by_radius]) / (1 + self.amount * (1 - smooth)))
 
     def moved(self, step: Array, covariance: Array) -> "Sharpening":
-        """After a step (2,) of amount and logarithm of radius, shortened where it is long."""
+        """Apply a step (2,) of amount and logarithm of the radius, limited in length."""
         step = step / max(float((np.abs(step) / _LONGEST).max()), 1.0)
         amount = float(np.clip(self.amount + step[0], *_AMOUNTS))
         radius_px = float(np.clip(self.radius_px * np.exp(step[1]), *_RADIUS_RANGE_PX))
         return replace(self, amount=amount, radius_px=radius_px, covariance=covariance)
 
     def is_as(self, other: "Sharpening") -> bool:
-        """Whether it differs from another one by hardly more than nothing, beside what is not known of it."""
+        """Whether it differs from another one by little compared with its standard deviations."""
         step = np.array([self.amount - other.amount, np.log(self.radius_px / other.radius_px)])
         return bool(np.all(np.abs(step) < _CLOSE * np.sqrt(np.diag(self.covariance)) + _SAME))
 
     @property
     def note(self) -> str:
-        """A sentence; empty where nothing is sharpened."""
+        """Sentence for the user; empty without sharpening."""
         if not self:
             return ""
         sigmas = np.sqrt(np.diag(self.covariance)) * (1.0, self.radius_px)
@@ -109,23 +110,29 @@ class Sharpening:
 
 
 def _gaussian_spectrum(radius_px: float, shape: tuple[int, ...]) -> Array:
-    """(height, width) of a Gaussian, in the cosine transform of pictures of a shape."""
+    """(height, width) transfer function of a Gaussian in the cosine transform of images of a shape."""
     rows, cols = (np.exp(-0.5 * (radius_px * np.pi * np.arange(size) / size) ** 2) for size in shape[-2:])
     return np.outer(rows, cols)
 
 
 def _filtered(codes: NDArray[np.floating], spectrum: Array) -> Array:
-    """By even filters (..., height, width), as if the picture were mirrored at its borders: a cosine transform."""
+    """Apply symmetric filters (..., height, width) by cosine transform, which mirrors the image at its borders."""
     return np.asarray(fft.idctn(fft.dctn(codes, axes=(-2, -1)) * spectrum, axes=(-2, -1)))
 
 
 @dataclass(frozen=True, eq=False)
 class SharpeningScore:
-    """What a mark says of sharpening beside the tone curve.
+    """Score of a mark for sharpening and tone curve.
 
-    value (k + m,), normal and covariance (k + m, k + m): the score of k departures of the curve and of m changes by
-    sharpening, how it grows with them, and its covariance. Without sharpening these are the amounts with each of
-    `RADII_PX`, else the amount and the logarithm of the radius. on_place (2, m): px by which they move the mark.
+    There are k departures of the curve and m parameters of the sharpening: the amounts for each of `RADII_PX` without
+    sharpening, otherwise the amount and the logarithm of the radius.
+
+    Attributes
+    ----------
+    value : (k + m,) score.
+    normal : (k + m, k + m) derivatives of the score with respect to the parameters.
+    covariance : (k + m, k + m) of the score.
+    on_place : (2, m) derivatives of the place (px) with respect to the parameters of the sharpening.
     """
 
     value: Array
@@ -134,8 +141,8 @@ class SharpeningScore:
     on_place: Array
 
     def covariance_px2(self, sharpening: Sharpening) -> Array:
-        """(2, 2) of the mark's place, for what is not known of the sharpening; all of it in a mark that was
-        fitted as if there were none."""
+        """(2, 2) covariance of the place due to the uncertainty of the sharpening, or its whole effect if the mark was
+        fitted without sharpening."""
         if self.on_place.shape[1] == len(RADII_PX):
             nearest = int(np.argmin(np.abs(np.log(RADII_PX) - np.log(sharpening.radius_px))))
             moved = sharpening.amount * self.on_place[:, nearest]
@@ -143,7 +150,7 @@ class SharpeningScore:
         return np.asarray(self.on_place @ sharpening.covariance @ self.on_place.T)
 
     def information(self, among: Sequence[int]) -> tuple[Array, Array]:
-        """The normal equations of some of them."""
+        """Normal equations of some of the parameters."""
         chosen = np.ix_(among, among)
         weighted = np.linalg.solve(self.covariance[chosen], self.normal[chosen]).T
         matrix = weighted @ self.normal[chosen]
@@ -152,7 +159,7 @@ class SharpeningScore:
 
 @dataclass(frozen=True, eq=False)
 class _Estimate:
-    """step (m,) from where the marks were fitted, its covariance (m, m), and the log-odds that there is one."""
+    """Estimate of a step. step (m,) from the parameters of the fit; covariance (m, m); log_odds: that it is real."""
 
     step: Array
     covariance: Array
@@ -160,15 +167,17 @@ class _Estimate:
 
 
 def estimate_sharpening(before: Sharpening, scores: Sequence[SharpeningScore], departures: int) -> Sharpening | None:
-    """The sharpening by marks that were fitted with one of before.
+    """Estimate the sharpening from marks.
 
     Parameters
     ----------
-    departures : of the tone curve, of the first figures of each score.
+    before : sharpening with which the marks were fitted.
+    scores : of the marks.
+    departures : number of departures of the tone curve, the first parameters of each score.
 
     Returns
     -------
-    None where the marks do not say that there is any.
+    Sharpening, or None if it is not significant.
     """
     scores = [score for score in scores if score.normal.any()]
     if len(scores) < _FEWEST:
@@ -189,7 +198,7 @@ def estimate_sharpening(before: Sharpening, scores: Sequence[SharpeningScore], d
 def _estimate(
     scores: Sequence[SharpeningScore], tone: Sequence[int], among: Sequence[int], before: Sharpening
 ) -> _Estimate:
-    """From some of the marks' figures, beside the curve's."""
+    """Estimate some parameters of the sharpening together with the tone curve, excluding outlying marks."""
     prior, pull = np.eye(len(tone) + len(among)), np.zeros(len(tone) + len(among))
     weight = np.diag(_SIGMAS**-2) if before.prior is None else np.linalg.inv(before.prior.covariance)
     off = (_USUAL if before.prior is None else before.prior.values) - before.values
@@ -214,6 +223,6 @@ def _estimate(
 
 
 def _solved(matrix: Array, right: Array, prior: Array, pull: Array, first: int) -> tuple[Array, Array]:
-    """The unknowns from the first one on, and their covariance."""
+    """Solve the normal equations. Returns the unknowns from the index first on, and their covariance."""
     covariance: Array = np.asarray(np.linalg.inv(matrix + prior), float)
     return (covariance @ (right + pull))[first:], covariance[first:, first:]
