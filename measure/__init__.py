@@ -1,8 +1,7 @@
-"""A scan in, comparator coordinates out: marks and targets to a few hundredths of a pixel, with honest covariances.
+"""Measurement of marks and targets in scans: comparator coordinates to a few hundredths of a pixel, with covariances.
 
-`measure_fiducials(open_scan(path), layout, pitch_um)` is the way in; the names below are loaded when first used.
-docs/how-to/python.md has an example. docs/code.md lists the modules in the order in which
-a scan goes through them.
+The entry point is `measure_fiducials(open_scan(path), layout, pitch_um)`; names are loaded when first used.
+docs/how-to/python.md has an example. docs/code.md lists the modules in the order of processing.
 """
 
 import lazy_loader

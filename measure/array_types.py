@@ -1,4 +1,4 @@
-"""Types of arrays."""
+"""Array type aliases."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,21 +1,21 @@
-"""What measure raises."""
+"""Exceptions raised by measure."""
 
 
 class MeasurementError(Exception):
-    """A scan that cannot be opened, or that cannot be what it is said to be.
+    """A scan cannot be opened, or contradicts its description.
 
-    The message says what is wrong, in which file, what would be right and what to do. A mark that cannot be measured is
-    no error: it is a measurement with a status and a reason.
+    The message states what is wrong, in which file, what would be valid, and the remedy. A mark that cannot be measured
+    is not an error but a measurement with a status and a reason.
     """
 
 
 class MissingError(MeasurementError):
-    """There is no such file."""
+    """The file does not exist."""
 
 
 class UnreachableError(MeasurementError):
-    """A store or a server did not give it: what is there is not known, and may be whole."""
+    """A store or a server did not deliver the file, which may be intact."""
 
 
 class TooLargeError(MeasurementError):
-    """The file claims more pixels than are read, unless the user allows them."""
+    """The file declares more pixels than the limit that the user can raise."""

@@ -1,6 +1,7 @@
-"""Statuses, reason codes, causes of uncertainty and false-alarm limits of measuring: one table of each.
+"""Tables of statuses, reason codes, causes of uncertainty, and significance and false-alarm limits of measuring.
 
-The documentation and the report are made from these tables, or checked against them."""
+The documentation and the report are generated from these tables or checked against them.
+"""
 
 from collections.abc import Iterable
 from enum import StrEnum
@@ -8,7 +9,7 @@ from typing import Self
 
 
 class Status(StrEnum):
-    """What became of a mark. Only `measured` and `weak` are observations of the adjustment."""
+    """Status of a mark. Only `measured` and `weak` marks are observations of the adjustment."""
 
     MEASURED = "measured"
     WEAK = "weak"
@@ -31,7 +32,7 @@ STATUS_MEANING = {
 
 
 class Code(StrEnum):
-    """What kind of reason a sentence gives."""
+    """Code of a reason."""
 
     OUTSIDE = "outside"
     DAMAGED_FILE = "damaged-file"
@@ -126,7 +127,7 @@ CODE_MEANING = {
 
 
 class Reason(str):
-    """A sentence, or some joined by "; ", with the codes of what it says; empty where there is nothing to say."""
+    """A sentence, or several joined by "; ", with its reason codes; empty if there is no reason."""
 
     codes: tuple[Code, ...]
 
@@ -140,22 +141,22 @@ class Reason(str):
 
     @classmethod
     def combine(cls, reasons: Iterable["Reason"]) -> Self:
-        """All that are not empty, with the codes of all."""
+        """Join all non-empty reasons and their codes."""
         present = [reason for reason in reasons if reason]
         return cls("; ".join(present), *(code for reason in present for code in reason.codes))
 
     @classmethod
     def read(cls, sentence: str, code: str) -> Self:
-        """As it was written. Raises ValueError for a code that is not in the table."""
+        """Read a stored reason. Raises ValueError for an unknown code."""
         return cls(sentence, *(Code(each) for each in code.split()))
 
     def reword(self, sentence: str) -> Self:
-        """The same reason in another sentence."""
+        """Copy of the reason with another sentence and the same codes."""
         return type(self)(sentence, *self.codes)
 
     @property
     def code(self) -> str:
-        """Its codes, separated by spaces."""
+        """Codes, separated by spaces."""
         return " ".join(self.codes)
 
 
@@ -163,7 +164,7 @@ NO_REASON = Reason()
 
 
 class Cause(StrEnum):
-    """What a part of a covariance comes from, in the order in which the parts are listed."""
+    """Cause of a part of a covariance, in the order in which the parts are listed."""
 
     NOISE = "noise"
     ROUNDING = "rounding"
@@ -212,8 +213,8 @@ CAUSE_MEANING = {
 
 
 class Limit(float):
-    """A probability, or the number of things that chance is expected to make; of: what it is a probability, or a
-    number, of; decides: what becomes of what lies beyond it."""
+    """Significance level, or limit of an expected number of false alarms. of: the event it refers to; decides: the
+    consequence beyond the limit."""
 
     of: str
     decides: str
@@ -280,7 +281,7 @@ FALSE_DOUBT = _limit(
 )
 RIGHT_PITCH_REFUSED = _limit(0.01, "calling a right pitch wrong", "the frame has a problem")
 
-# What a fit believes of its window.
+# Tests of a window before a fit.
 NATURAL_END = _limit(  # there are many windows
     1e-6, "grey values heaping up so at an end by nature", "they count as clipped"
 )
@@ -294,7 +295,7 @@ DISK_UNLIKE_THE_OTHERS = _limit(
     0.01, "a right disk differing so much from the others of its scan", "the disk is weak: dust may hide in it"
 )
 TARGET_OFF_PLACE = _limit(1e-3, "a right target lying farther off its place", "the target is weak")
-TARGET_ELSEWHERE = _limit(  # in a thousand fields of a thousand targets one is
+TARGET_ELSEWHERE = _limit(  # one target in a thousand fields of a thousand targets
     1e-6, "a right target lying still farther off", "the target is rejected"
 )
 SHEET_POINT_OFF_PLACE = _limit(

@@ -1,4 +1,4 @@
-"""What measuring hands on: marks with covariance, status and reason, and the frame they were found in."""
+"""Results of measuring: marks with covariance, status and reason, and the frame that contains them."""
 
 from collections import Counter
 from collections.abc import Collection, Mapping
@@ -18,46 +18,45 @@ from measure.tone.estimate import FrameTone, MarkTone
 from measure.tone.sharpening import SharpeningScore
 
 Kind = Literal["fiducial", "target", "tie", "join"]
-ON_FILM: tuple[Kind, ...] = ("fiducial", "join")  # what is a place of the film, and no point of the object
-# Stored results are used again only where this is the same. Raise it whenever scans would be measured otherwise:
-# tests/measure/test_revision.py fails where that was forgotten.
+ON_FILM: tuple[Kind, ...] = ("fiducial", "join")  # kinds that are points of the film, not of the object
+# Stored results are reused only if this is unchanged. Increase it whenever measurements would change:
+# tests/measure/test_revision.py fails if that was forgotten.
 MEASURE_REVISION = 22
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Covariance:
-    """The covariance of a place, (column, row): parts (2, 2) px2 by their causes, independent of one another.
+    """Covariance of a place (column, row): independent parts (2, 2) px² by their causes.
 
-    What is common to several marks of a frame, as `tone` is, is in each of them by its own part.
+    A cause common to several marks of a frame, such as `tone`, is included in each of them.
     """
 
     parts: Mapping[Cause, Array]
 
     @classmethod
     def from_noise(cls, px2: Array) -> "Covariance":
-        """Of a place of which the noise (2, 2) is all that is known."""
+        """Covariance with noise (2, 2) as its only part."""
         return cls({Cause.NOISE: np.asarray(px2, float)})
 
     @cached_property
     def px2(self) -> Array:
-        """(2, 2): the sum."""
+        """(2, 2) sum of the parts."""
         return np.asarray(sum(self.parts.values(), np.zeros((2, 2))))
 
     @property
     def sigmas_px(self) -> dict[Cause, float]:
-        """Of each cause the standard deviation of a coordinate, the mean of both; causes that add nothing are left
-        out."""
+        """Standard deviation of a coordinate by cause, root mean square of both; zero parts are omitted."""
         sigmas = {cause: float(np.sqrt(np.trace(self.parts[cause]) / 2)) for cause in Cause if cause in self.parts}
         return {cause: sigma for cause, sigma in sigmas.items() if sigma > 0}
 
     def plus(self, cause: Cause, px2: Array) -> "Covariance":
-        """With what a cause adds (2, 2); the same where that is nothing."""
+        """Add the part (2, 2) of a cause; unchanged if it is zero."""
         if not np.any(px2):
             return self
         return Covariance({**self.parts, cause: self.parts.get(cause, np.zeros((2, 2))) + px2})
 
     def through(self, matrix: Array) -> "Covariance":
-        """Of a place whose errors are these times a matrix (2, 2)."""
+        """Propagate through a matrix (2, 2) that multiplies the errors."""
         return Covariance({cause: matrix @ part @ matrix.T for cause, part in self.parts.items()})
 
     def __repr__(self) -> str:
@@ -66,13 +65,19 @@ class Covariance:
 
 @dataclass(frozen=True, repr=False)
 class MarkMeasurement:
-    """One mark in one scan.
+    """Measurement of one mark in one scan.
 
-    center_px: (2,) column and row, the centre of the top-left pixel being (0, 0). With status `predicted` it is the
-    predicted place, with `absent` it may be None: there is nothing to say.
-    covariance: of the centre, by its causes; None where nothing was fitted.
-    reason: one sentence, with its codes (`measure.flags`); empty only when the status is `measured`.
-    quality: named figures of the fit: snr, contrast_dn, blur_px, noise_dn, damaged_fraction, second_method_sigmas, ...
+    Attributes
+    ----------
+    point : name of the mark or point.
+    kind : kind of the mark.
+    center_px : (2,) column and row; the centre of the top-left pixel is (0, 0). With status `predicted` it is the
+        predicted place, with `absent` it may be None.
+    covariance : of the centre, by causes; None if nothing was fitted.
+    status : see `measure.flags`.
+    reason : one sentence with its codes (`measure.flags`); may be empty only with status `measured`.
+    quality : named quantities of the fit: snr, contrast_dn, blur_px, noise_dn, damaged_fraction, second_method_sigmas,
+        ...
     """
 
     point: str
@@ -91,14 +96,14 @@ class MarkMeasurement:
 
     @property
     def covariance_px2(self) -> Array | None:
-        """(2, 2) of (column, row), all causes together; None where nothing was fitted."""
+        """(2, 2) covariance of (column, row), sum of all causes; None if nothing was fitted."""
         return None if self.covariance is None else self.covariance.px2
 
     def __repr__(self) -> str:
         return f"MarkMeasurement({self.kind} {' '.join(cell for cell in self.cells() if cell)})"
 
     def cells(self) -> tuple[str, str, str, str, str]:
-        """Name, status, place, standard deviations and reason in words; blank where there is none."""
+        """Name, status, place, standard deviations and reason as text; empty where not available."""
         place = "" if self.center_px is None else f"({self.center_px[0]:.3f}, {self.center_px[1]:.3f})"
         sigmas = None if self.covariance_px2 is None else np.sqrt(np.diag(self.covariance_px2))
         sigmas_text = "" if sigmas is None else f"+- ({sigmas[0]:.3f}, {sigmas[1]:.3f})"
@@ -107,16 +112,20 @@ class MarkMeasurement:
 
 @dataclass(frozen=True)
 class Pose:
-    """How the scan was laid on the scanner: its counter-clockwise turn in degrees, "m" behind it if mirrored.
+    """Scan orientation: counter-clockwise turn in degrees, followed by "m" if mirrored.
 
-    A scan of pose "90m": the camera frame (x' right, y' up) is first mirrored (x' to -x'), then turned by 90 degrees
-    counter-clockwise, and so seen in the scan.
-    decided: whether something in the picture (or the user) decides it; otherwise it is assumed.
-    evidence: what speaks for it, and by how much, one sentence each.
-    written: log-likelihoods of the poses, by name, by what is written alone; empty where nothing was read. writing: the
-    pose in which most of that lies in the scan; "" where that is not clear. roll: what is to be asked once for all
-    frames of the camera; "" where there is no such question. rivals: the poses, in the frame's own axes, in which it
-    may lie as well, where what is seen does not tell them apart.
+    In orientation "90m" the camera frame (x' right, y' up) is first mirrored (x' to -x'), then turned by 90 degrees
+    counter-clockwise, to give the scan.
+
+    Attributes
+    ----------
+    name : one of `measure.geometry.POSES`.
+    decided : whether the image or the user determines it; otherwise it is assumed.
+    evidence : one sentence for each piece of evidence, with its weight.
+    written : log-likelihoods of the orientations, by name, from writing alone; empty if nothing was read.
+    writing : orientation of most of the writing in the scan; "" if unclear.
+    roll : question to the user, asked once for all frames of the camera; "" if there is none.
+    rivals : orientations, in the frame's own axes, that the image does not distinguish from this one.
     """
 
     name: str
@@ -128,20 +137,25 @@ class Pose:
     rivals: tuple[str, ...] = ()
 
     def is_decided_but_for(self, alike: Collection[str]) -> bool:
-        """Whether it is decided, or no other than poses under which the marks are alike may be right."""
+        """Whether it is decided, or all its rivals are orientations under which the marks look alike."""
         return self.decided or bool(self.rivals and set(self.rivals) <= set(alike))
 
 
 @dataclass(frozen=True, repr=False)
 class FrameMeasurement:
-    """All marks of one scan.
+    """Measurement of all marks of one scan.
 
-    pixel_from_camera: (2, 3) affine matrix, camera mm (x', y', 1) to (column, row), from the fiducials found; None
-    where there are too few.
-    weights: what each channel of a colour scan counts in what its fiducials were measured in; None for its grey value.
-    problems: what the user should look at, one sentence each, with its codes.
-    tone: what is believed of the curve by which its light was stored; None where no frame was found.
-    writing: the lines read about the frame; None where none was looked for.
+    Attributes
+    ----------
+    image : name of the scan.
+    marks : measurements of all marks, found or not.
+    pose : scan orientation.
+    pixel_from_camera : (2, 3) affine matrix, camera mm (x', y', 1) to (column, row), from the fiducials found; None if
+        there are too few.
+    problems : messages to the user, one sentence each, with codes.
+    weights : channel weights with which the fiducials of a colour scan were measured; None for its grey value.
+    tone : tone curve of the scan; None if no frame was found.
+    writing : lines of text read around the frame; None if text was not searched.
     """
 
     image: str
@@ -155,16 +169,16 @@ class FrameMeasurement:
 
     @property
     def px_per_mm(self) -> float | None:
-        """The scale of pixel_from_camera, the mean of both directions; None without one."""
+        """Mean scale of pixel_from_camera; None without it."""
         matrix = self.pixel_from_camera
         return None if matrix is None else linear_scale(matrix)
 
     def marks_because(self, code: Code) -> tuple[MarkMeasurement, ...]:
-        """Those of whose reason this is a code."""
+        """Marks whose reason has this code."""
         return tuple(mark for mark in self.marks if code in mark.reason.codes)
 
     def to_pandas(self) -> Any:
-        """One row a mark, as pandas.DataFrame, in px. Raises ImportError where pandas is not installed."""
+        """Convert to a pandas.DataFrame, one row per mark, in px. Raises ImportError if pandas is not installed."""
         try:
             import pandas as pd
         except ImportError:
@@ -189,7 +203,7 @@ class FrameMeasurement:
         return f"FrameMeasurement({self.image!r}: {counts_text or 'no marks'}{pose})"
 
     def _repr_html_(self) -> str:
-        """Its marks, as a notebook shows them."""
+        """Table of the marks for notebooks."""
         rows = "".join(
             f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in mark.cells())}</tr>" for mark in self.marks
         )
@@ -198,7 +212,7 @@ class FrameMeasurement:
 
 
 def moved_frame(frame: FrameMeasurement, shift_px: Array) -> FrameMeasurement:
-    """The frame where pixels count from elsewhere: all its places moved by (2,) column and row."""
+    """Shift all places of a frame by (2,) column and row, for another pixel origin."""
     return replace(
         frame,
         marks=tuple(_moved_mark(mark, shift_px) for mark in frame.marks),
@@ -222,26 +236,30 @@ def _moved_line(line: Line, shift_px: Array) -> Line:
 
 @dataclass(frozen=True, eq=False)
 class SecondPlace:
-    """offset_px (2,): the second place less the matched one; covariance_px2 (2, 2): of that difference."""
+    """Second place by another method. offset_px (2,): second place minus matched one; covariance_px2 (2, 2): of that
+    difference."""
 
     offset_px: Array
     covariance_px2: Array
 
     @property
     def sigmas(self) -> float:
-        """The length of the difference in its own standard deviations."""
+        """Mahalanobis length of the difference."""
         return float(np.sqrt(self.offset_px @ np.linalg.solve(self.covariance_px2, self.offset_px)))
 
     @property
     def chance(self) -> float:
-        """The probability that noise alone makes the difference as long."""
+        """p-value of the difference under noise alone (chi-square, 2 degrees of freedom)."""
         return float(chdtrc(2, self.sigmas**2))
 
 
 @dataclass(frozen=True, eq=False)
 class OwnShape:
-    """change (2,): scale and rotation (rad) by the picture alone, less those of the frame, and sigma (2,), their
-    standard deviations; on_place (2, 2): px by which the place would follow, did the match not keep to the frame's."""
+    """Scale and rotation by the mark's own image.
+
+    change: (2,) scale and rotation (rad) from the image alone minus those of the frame; sigma: (2,) their standard
+    deviations; on_place: (2, 2) derivatives of the place (px) if they were not held at the frame's values.
+    """
 
     change: Array
     sigma: Array
@@ -250,24 +268,38 @@ class OwnShape:
 
 @dataclass(frozen=True, eq=False)
 class MarkFit:
-    """A mark as fitted. Where converged is false, reason says why and the numbers are the last approximations.
+    """Fit of a mark. If converged is False, reason states why, and the values are those of the last iteration.
 
-    center_px (2,) with its place_covariance, pixel_from_mark (2, 3): of the scan, not of the window. covariance: of all
-    unknowns of the `PictureModel` by the noise, None where another model was fitted.
-    contrast_dn: the mark's light less the background's, negative for a dark mark; stored_contrast_dn: the same of the
-    grey values that the file has. noise_dn: standard deviation of
-    one pixel, of a chip's picture after smoothing. damaged_fraction: share of the pixels about the mark, within
-    plain_px of it, that were cut out; lost_fraction: of what tells its place in the direction in which least of that is
-    left, what was. redundancy: pixels used less unknowns. neighbour_correlation: of the residuals;
-    they were taken as white where covariance_is_white. likeness: correlation of the fitted picture with the window,
-    less its plane background: 1 for a perfect mark, 0 for none.
-    significance: the contrast over its own standard deviation. blur_sigma: of the logarithm of the blur, the pixel's
-    share included, and size_sigma of the mark's size; infinite where they were not estimated, or the blur is at an end
-    of its range. edges: the mark's place by another method, to compare;
-    sloping: an ellipse's, if its paint may grow lighter or darker from side to side. own_shape: what the picture says
-    of rotation and scale, where the frame gave them; tone: and of a tone curve that is not known; sharpening: and of
-    a scan's sharpening. figures: what is compared with other frames: size_ratio and blur_ratio to the other marks,
-    turn_rad where the frame gave the rotation, arm1_ratio ... of a cross; size_sigma ...: of logarithms, of the turn.
+    Attributes
+    ----------
+    converged, reason : whether the fit converged, and why not.
+    center_px : (2,) column and row in the scan, not in the window.
+    place_covariance : of the centre, by causes.
+    pixel_from_mark : (2, 3) mm of the mark to pixels of the scan.
+    contrast_dn : light of the mark minus that of the background, negative for a dark mark.
+    stored_contrast_dn : the same in grey values of the file.
+    noise_dn : standard deviation of one pixel's noise, for a chip after smoothing.
+    blur_px : standard deviation of the blur.
+    damaged_fraction : fraction of the pixels within plain_px of the mark that were masked.
+    lost_fraction : fraction of the place's information lost to damage, in the direction with the largest loss.
+    redundancy : pixels used minus unknowns.
+    neighbour_correlation : of the residuals.
+    covariance_is_white : whether the residuals were treated as white noise.
+    likeness : correlation of the fitted model with the window after subtraction of its plane background: 1 for a
+        perfect mark, 0 for none.
+    significance : contrast over its standard deviation.
+    blur_sigma : standard deviation of the logarithm of the blur, pixel included; infinite if the blur was not estimated
+        or is at a limit of its range.
+    size_sigma : standard deviation of the mark's relative size; infinite if not estimated.
+    edges : second place by the mark's edges.
+    sloping : second place of an ellipse with a contrast gradient.
+    own_shape : rotation and scale by the image alone, where the frame determined them.
+    tone : information on an unknown tone curve.
+    sharpening : score of the scan's sharpening.
+    covariance : of all unknowns of the `PictureModel`, by noise; None if a different model was fitted.
+    figures : quantities compared with other frames: size_ratio and blur_ratio relative to the other marks, turn_rad
+        where the frame determined the rotation, arm1_ratio ... of a cross, with standard deviations size_sigma ... of
+        the logarithms and of the turn.
     """
 
     converged: bool
@@ -298,7 +330,7 @@ class MarkFit:
 
     @property
     def covariance_px2(self) -> Array:
-        """(2, 2) of the centre, all causes together."""
+        """(2, 2) covariance of the centre, sum of all causes."""
         return self.place_covariance.px2
 
     @property
