@@ -2,13 +2,14 @@
 
     o - g = F x + H a + K c + film + noise                     (mark by mark, mm, in the camera's axes)
 
-F: shifts, a rotation, and what the project's film model adds (free). H a: size, stretch and shear of the film, normal
-about what the camera's other frames show, or with `AFFINITY_SIGMA` in a lone frame. K c: a perspective, 0 unless the
-film was photographed obliquely. The film scatters each mark; each mark and given place has a covariance of its own.
+F x: shifts, a rotation and the additional terms of the project's film model, all free. H a: size, stretch and shear of
+the film, normally distributed around those of the camera's other frames, or with `AFFINITY_SIGMA` in a single frame.
+K c: a perspective, 0 unless the film was photographed obliquely. The film scatters each mark independently; measured
+and given places have their own covariances.
 
 The chi-square of the residuals tests the frame, a mean shift of mark k tests the mark (data snooping: Baarda 1968).
 Hypotheses are compared by their evidence (marginal likelihood): the film is ordinary, bent, stretched by a wrong pitch,
-or photographed obliquely, and in each of these a mark k is wrong or none is.
+or photographed obliquely; under each of these either no mark or one mark k has a gross error.
 """
 
 from dataclasses import dataclass, field, replace
@@ -25,25 +26,25 @@ from measure.fiducials.film_model import film_terms, interleaved
 from measure.fiducials.options import AFFINITY_SIGMA, MOST_BENT_MM, SCATTER_DEGREES, SCATTER_MM
 from measure.flags import FALSE_DOUBT
 
-NAMED = float(np.log(100.0))  # log-odds from which one cause rather than another is taken for what is off
-_SUSPECT = -float(np.log(10.0))  # log-odds from which a mark may be the wrong one
-_RANK = 1e-9  # of the largest singular value: directions below it are not determined
-_LEAST_MM = 1e-6  # standard deviation of a mark
-_KNOWN = 1e6  # degrees of freedom of a variance that is known
-_MOST_OFF_MM = 0.5  # standard deviation of a wrong mark: none is sought farther off than some 1 mm
-_FEWEST = 3  # marks of a frame
-_LEAST_GATE = 0.1  # of the gate: film bends marks so far off, however well most agree
-_TURNED = 0.2  # of what a wrong pitch stretches: sheared in a frame that is turned by up to 6 degrees
-_MOST_STRETCHED = 0.05  # of a frame in a wrong pitch
-_MOST_PERSPECTIVE = 2e-4  # per mm: of film photographed from 0.6 m, tilted by 7 degrees
-_PRIOR = np.log(FALSE_DOUBT)  # of each thing that is wrong
-_QUANTILES = (np.arange(3) + 0.5) / 3  # by which a variance that is not known exactly is averaged
-_WIDTHS = 10  # of an effect of which the range is known only
-_TESTS = 2  # of a frame that do not depend on one another: beyond affine, as a whole or at each mark, and affine
+NAMED = float(np.log(100.0))  # log-odds above which one cause is accepted against all others
+_SUSPECT = -float(np.log(10.0))  # log-odds above which a mark may have the gross error
+_RANK = 1e-9  # fraction of the largest singular value, below which a direction is a null direction
+_LEAST_MM = 1e-6  # smallest standard deviation of a mark
+_KNOWN = 1e6  # degrees of freedom of a known variance
+_MOST_OFF_MM = 0.5  # largest standard deviation of a gross error: marks are not searched farther off than some 1 mm
+_FEWEST = 3  # marks needed for a frame
+_LEAST_GATE = 0.1  # fraction of the gate: film may displace a mark by this much, however well most of them agree
+_TURNED = 0.2  # shear per stretch that a wrong pitch causes in a frame rotated by up to 6 degrees
+_MOST_STRETCHED = 0.05  # largest stretch by a wrong pitch
+_MOST_PERSPECTIVE = 2e-4  # per mm: film photographed from 0.6 m, tilted by 7 degrees
+_PRIOR = np.log(FALSE_DOUBT)  # log prior probability of each deviation from an ordinary frame
+_QUANTILES = (np.arange(3) + 0.5) / 3  # at which an estimated variance is sampled, to average over it
+_WIDTHS = 10  # standard deviations, in equal logarithmic steps, of an effect of which only the range is known
+_TESTS = 2  # independent tests of a frame: misfit beyond an affine transformation (global or one mark), and affinity
 
 
 class Hypothesis(IntEnum):
-    """What may be said of a frame beside a wrong mark."""
+    """State of a frame's film, in addition to a possible gross error in one mark."""
 
     SOUND = 0
     BENT = 1
@@ -53,20 +54,20 @@ class Hypothesis(IntEnum):
 
 @dataclass(frozen=True)
 class Scatter:
-    """A standard deviation, known with so many degrees of freedom."""
+    """Standard deviation sigma, estimated with the given degrees of freedom."""
 
     sigma: float
     degrees: float = _KNOWN
 
     def variances(self) -> Array:
-        """Equally likely ones, of the scaled inverse chi-square distribution."""
+        """(3,) equally probable variances: quantiles of the scaled inverse chi-square distribution."""
         return np.asarray(self.sigma**2 * self.degrees / chdtri(self.degrees, 1 - _QUANTILES))
 
 
 @dataclass(frozen=True, eq=False)
 class Affinity:
-    """Size, stretch and shear of the frames that lie alike: mean (3,) and the scatter of each. size_is_free: of a lone
-    frame, whose size speaks of its pitch."""
+    """Size, stretch and shear of the frames with one scan orientation: mean (3,) and scatter of each. size_is_free: the
+    size is not tested; so in a single frame, where it depends on the pitch."""
 
     mean: Array = field(default_factory=lambda: np.zeros(3))
     scatter: Scatter = field(default_factory=lambda: Scatter(AFFINITY_SIGMA))
@@ -78,9 +79,15 @@ LONE_FILM, LONE_AFFINITY = Scatter(SCATTER_MM, SCATTER_DEGREES), Affinity(size_i
 
 @dataclass(frozen=True, eq=False)
 class FrameMarks:
-    """The n >= 3 marks of a frame: given_mm (n, 2); off_mm (n, 2) measured less given, in the camera's axes, rotated
-    and shifted upon the given places; covariance_mm2 (2n, 2n), the film's scatter left out. model: the film deformation
-    model that the project states."""
+    """Marks of a frame, n >= 3.
+
+    Attributes
+    ----------
+    given_mm : (n, 2) given places, relative to their centroid.
+    off_mm : (n, 2) measured less given places, in the camera's axes, after a rotation and shift onto the given ones.
+    covariance_mm2 : (2n, 2n) covariance without the scatter of the film.
+    model : film deformation model of the project.
+    """
 
     given_mm: Array
     off_mm: Array
@@ -91,7 +98,8 @@ class FrameMarks:
     def from_places(
         cls, given_mm: Array, measured_mm: Array, covariances_mm2: Array, model: str = "affine"
     ) -> "FrameMarks":
-        """Of marks given at (n, 2) and measured at (n, 2), in any axes, with covariances (n, 2, 2) in these."""
+        """Rotate and shift measured places (n, 2) onto given ones (n, 2), with a mirror if needed. The measured places
+        and their covariances (n, 2, 2) may be in any axes."""
         centers = given_mm.mean(axis=0), measured_mm.mean(axis=0)
         left, _, right = np.linalg.svd((given_mm - centers[0]).T @ (measured_mm - centers[1]))
         turn = left @ right
@@ -107,13 +115,13 @@ class FrameMarks:
 
     @cached_property
     def affine(self) -> Array:
-        """(2n, 3) by size, stretch and shear."""
+        """(2n, 3) derivatives of the places with respect to size, stretch and shear."""
         x, y = self.given_mm.T
         return interleaved((x, y), (x, -y), (y, x))
 
     @cached_property
     def perspective(self) -> Array:
-        """(2n, 2) by a perspective that moves the outermost mark by about a mm."""
+        """(2n, 2) derivatives with respect to a perspective, per mm of displacement of the outermost mark."""
         return film_terms("projective", self.given_mm, self.given_mm + self.off_mm) / self.radius_mm**2
 
     @cached_property
@@ -126,58 +134,60 @@ class FrameMarks:
 
     @property
     def redundancy(self) -> int:
-        """Size, stretch and shear being free."""
+        """Redundancy with size, stretch and shear free."""
         return len(self._beyond_affine.variances)
 
     def chi_square(self, film_mm: float) -> float:
-        """Likewise, of film that scatters by film_mm."""
+        """Chi-square of the misfit with size, stretch and shear free, for a film scatter of film_mm."""
         reduced = self._beyond_affine
         return float((reduced.residuals**2 / (reduced.variances + film_mm**2)).sum())
 
     def film_variance_mm2(self) -> float:
-        """What scatters the marks beyond their own covariances: the variance with which chi-square is as large as its
-        redundancy (Paule and Mandel, 1982), so that a mark that is hardly known takes nothing from the others' misfit.
-        0 where the covariances explain it."""
+        """Variance of the film's scatter with which chi-square equals the redundancy (Paule and Mandel, 1982).
+
+        An imprecise mark does not dilute the misfit of the others. 0 where the marks' covariances explain the misfit.
+        """
         if self.redundancy == 0 or self.chi_square(0.0) <= self.redundancy:
             return 0.0
         most = float(np.sqrt((self._beyond_affine.residuals**2).sum()))
         return float(brentq(lambda film_mm: self.chi_square(film_mm) - self.redundancy, 0.0, most)) ** 2
 
     def log_density(self, film_mm: float) -> float:
-        """Of the misfit, likewise, but for a constant."""
+        """Log density of the misfit up to a constant, size, stretch and shear free."""
         return -0.5 * (float(np.log(self._beyond_affine.variances + film_mm**2).sum()) + self.chi_square(film_mm))
 
     def precision(self, film_mm: float) -> Array:
-        """(2n, 2n) of off_mm, likewise."""
+        """(2n, 2n) weight matrix of off_mm, reduced by all free parameters including size, stretch and shear."""
         return self._beyond_affine.precision(film_mm)
 
     def affinity(self, film_mm: float) -> tuple[Array, Array]:
-        """(3,) size, stretch and shear by least squares, and their covariance (3, 3)."""
+        """Least-squares estimate (3,) of size, stretch and shear, and its covariance (3, 3)."""
         moved = self._beyond_congruent.precision(film_mm) @ self.affine
         covariance = np.asarray(np.linalg.pinv(self.affine.T @ moved, hermitian=True), dtype=np.float64)
         return covariance @ (moved.T @ self.off_mm.ravel()), covariance
 
     def distances_mm(self) -> Array:
-        """(n,) of each mark from where the others have it, by least squares, all parameters of the film being free."""
+        """(n,) residual lengths of an unweighted least-squares fit of all free parameters, size, stretch and shear
+        included."""
         basis = self._beyond_affine.basis
         return np.asarray(np.hypot(*(basis @ (basis.T @ self.off_mm.ravel())).reshape(-1, 2).T))
 
     def expecting(self, off_mm: Array, covariance_mm2: Array) -> "FrameMarks":
-        """Beside a misfit off_mm (n, 2) that is expected with a covariance (2n, 2n)."""
+        """Subtract an expected misfit off_mm (n, 2), and add its covariance (2n, 2n)."""
         return replace(self, off_mm=self.off_mm - off_mm, covariance_mm2=self.covariance_mm2 + covariance_mm2)
 
     def widen(self, variances_mm2: Array) -> "FrameMarks":
-        """Add (n,) to the variances of each mark's coordinates."""
+        """Add variances (n,) to both coordinates of each mark."""
         return replace(self, covariance_mm2=self.covariance_mm2 + np.diag(np.repeat(variances_mm2, 2)))
 
     def select(self, index: NDArray[np.intp]) -> "FrameMarks":
-        """Some of the marks, by index."""
+        """Keep the marks of the given indices."""
         both = (2 * index[:, None] + np.arange(2)).ravel()
         covariance = self.covariance_mm2[np.ix_(both, both)]
         return replace(self, given_mm=self.given_mm[index], off_mm=self.off_mm[index], covariance_mm2=covariance)
 
     def rotate(self, turn: Array) -> "FrameMarks":
-        """In axes turned by (2, 2)."""
+        """Rotate the axes by turn (2, 2)."""
         every = np.kron(np.eye(len(self.given_mm)), turn)
         return replace(
             self,
@@ -189,8 +199,10 @@ class FrameMarks:
 
 @dataclass(frozen=True, eq=False)
 class _Reduced:
-    """A frame's misfit less what its free parameters take: basis (2n, m), orthonormal, in which the covariance is
-    diagonal: variances (m,); residuals (m,)."""
+    """Misfit of a frame projected on the complement of its free parameters.
+
+    basis: (2n, m) orthonormal, diagonalises the covariance; variances (m,) and residuals (m,) in this basis, mm.
+    """
 
     basis: Array
     variances: Array
@@ -198,7 +210,7 @@ class _Reduced:
 
     @classmethod
     def from_free(cls, marks: FrameMarks, also: Array) -> "_Reduced":
-        """also: (2n, k) what is free beside shift, rotation and the film model's terms."""
+        """Eliminate shift, rotation, the terms of the film model, and also: (2n, k) further free parameters."""
         x, y = marks.given_mm.T
         one, none = np.ones_like(x), np.zeros_like(x)
         measured = (marks.given_mm + marks.off_mm) / marks.radius_mm
@@ -217,8 +229,15 @@ class _Reduced:
 
 @dataclass(frozen=True, eq=False)
 class FrameConsistency:
-    """What a frame's marks say. p_value: of the frame. log_evidence (4, n + 1): of the hypotheses, without a wrong mark
-    and with each, given that something is wrong; off_mm (n, 2): where each mark lies, if it alone is wrong."""
+    """Result of the consistency test of a frame.
+
+    Attributes
+    ----------
+    p_value : p-value of the frame.
+    log_evidence : (4, n + 1) log evidence of the hypotheses without a gross error (first column) and with one in each
+        mark, given that something is wrong.
+    off_mm : (n, 2) estimated gross error of each mark, if it is the only one.
+    """
 
     p_value: float
     log_evidence: Array
@@ -226,24 +245,24 @@ class FrameConsistency:
 
     @property
     def log_odds(self) -> Array:
-        """(n,) of each mark being wrong against all else."""
+        """(n,) log-odds of a gross error in each mark against all other explanations."""
         whole = logsumexp(self.log_evidence, axis=0)
         return np.array([whole[k] - logsumexp(np.delete(whole, k)) for k in range(1, len(whole))])
 
     @property
     def wrong_mark(self) -> int | None:
-        """The mark that is named."""
+        """Mark whose gross error is accepted; None if there is none."""
         odds = self.log_odds
         return int(odds.argmax()) if odds.max() > NAMED else None
 
     @property
     def suspects(self) -> NDArray[np.bool_]:
-        """(n,) the marks that may be wrong."""
+        """(n,) mask of the marks that may have a gross error."""
         return self.log_odds > _SUSPECT
 
     @property
     def best_hypothesis(self) -> Hypothesis:
-        """What explains the frame far better than all else together, bent film where nothing does."""
+        """Hypothesis without a gross error that is accepted against all others; bent film if none is."""
         own = self.log_evidence[:, 0]
         best = Hypothesis(int(own.argmax()))
         rest = np.delete(self.log_evidence, best, axis=0)
@@ -251,7 +270,11 @@ class FrameConsistency:
 
 
 def frame_p_value(marks: FrameMarks, film: Scatter = LONE_FILM, affinity: Affinity = LONE_AFFINITY) -> float:
-    """That film and affinity as they are known make as large a misfit, beyond affinity or by it, or at one mark."""
+    """p-value of a frame, with film and affinity as they are known.
+
+    The smallest p-value, corrected for the number of tests, of: the misfit beyond an affine transformation; the
+    affinity; and the largest misfit of a single mark.
+    """
     off, weight = marks.off_mm.ravel(), marks.precision(film.sigma)
     chi_square, degrees = marks.chi_square(film.sigma), marks.redundancy
     p_values = [1.0]
@@ -277,22 +300,24 @@ def frame_p_value(marks: FrameMarks, film: Scatter = LONE_FILM, affinity: Affini
 def frame_consistency(
     marks: FrameMarks, film: Scatter = LONE_FILM, affinity: Affinity = LONE_AFFINITY
 ) -> FrameConsistency:
-    """Test a frame and compare what may be wrong with it.
+    """Test a frame, and compare the hypotheses on what is wrong with it.
 
     Parameters
     ----------
-    marks: the frame's marks. film: scatter of marks along an axis, mm. affinity: of frames that lie alike.
+    marks : the frame's marks.
+    film : scatter of marks along an axis, mm.
+    affinity : affinity of frames with the same scan orientation.
 
     Returns
     -------
     FrameConsistency
-        With the p-value of the frame, the evidence of each hypothesis, and each mark's own shift.
+        p-value of the frame, evidence of each hypothesis, and gross error of each mark.
 
     Notes
     -----
-    Normal distributions throughout; unknown widths are averaged over equal steps of their logarithm, so that what needs
-    a larger width is the less likely the narrower its part of the range is. That nothing is wrong is for the p-value to
-    refuse: the evidence compares what else may be. Random effects of low rank are added by the
+    All distributions are normal. Unknown standard deviations are averaged over equal logarithmic steps, so that an
+    effect which needs a large one is the less likely, the smaller that part of the range is. The p-value alone decides
+    whether something is wrong; the evidence compares only the alternatives. Random effects of low rank are added by the
     matrix determinant lemma (Harville 1997, 18.1).
     """
     states = _states(marks, film, affinity)
@@ -311,7 +336,7 @@ def frame_consistency(
     known = known - 0.5 * (np.linalg.slogdet(inner)[1] + chi_square)
     pulls = (shifts[:, 0] / spread) @ shifts[:, 1:] - np.einsum("sp,spj->sj", cross[:, :, 0], taken[:, :, 1:])
     pulls = pulls.reshape(-1, n, 2)
-    # Of the coordinates' weights only those within a mark are needed: all of many marks would take minutes.
+    # Only the diagonal 2 x 2 blocks of the weight matrix are needed: the whole one of many marks would take minutes.
     own, by_mark = shifts[:, 1:].reshape(-1, n, 2), (len(spread), 5, n, 2)
     blocks = (1 / spread) @ (own[..., :, None] * own[..., None, :]).reshape(len(own), -1)
     blocks = blocks.reshape(-1, n, 2, 2) - np.einsum(
@@ -331,10 +356,15 @@ def frame_consistency(
 
 
 def gross_errors(marks: FrameMarks, film: Scatter, gate_mm: float) -> NDArray[np.bool_]:
-    """Find the marks of a lone frame that have no part in its interior orientation.
+    """Find the marks of a single frame that are excluded from its interior orientation.
 
-    The likeliest wrong mark is set aside until the others agree. Those marks are taken that together explain the frame
-    far better than none does, each if it is named beside the marks that agree, or lies off by more than the gate.
+    Marks are removed one by one, the most likely gross error first, until the others agree. Of these, the set with the
+    highest evidence is taken, if it explains the frame significantly better than no gross error. Each of its marks is
+    then tested with the agreeing marks: it is excluded if its gross error is accepted, or exceeds the gate.
+
+    Returns
+    -------
+    (n,) mask of the excluded marks.
     """
     order, odds, kept = list[int](), [0.0], np.arange(len(marks.given_mm))
     while len(kept) > _FEWEST and frame_p_value(own := marks.select(kept), film) < FALSE_DOUBT:
@@ -358,8 +388,15 @@ def gross_errors(marks: FrameMarks, film: Scatter, gate_mm: float) -> NDArray[np
 
 @dataclass(frozen=True, eq=False)
 class _States:
-    """s states of film and scan: hypothesis (s,), film (s,) variance, effects (s, 5) variances of affinity and
-    perspective, log_prior (s,)."""
+    """Grid of s states of film and scan, over which the evidence is summed.
+
+    Attributes
+    ----------
+    hypothesis : (s,) `Hypothesis`.
+    film : (s,) variance of the film's scatter, mm2.
+    effects : (s, 5) variances of affinity (3) and perspective (2).
+    log_prior : (s,) log prior probability.
+    """
 
     hypothesis: NDArray[np.intp]
     film: Array
@@ -373,7 +410,7 @@ def _states(marks: FrameMarks, film: Scatter, affinity: Affinity) -> _States:
     pitch = (films, np.geomspace(AFFINITY_SIGMA / 10, _MOST_STRETCHED, _WIDTHS) ** 2, np.zeros(1))
     most_mm = max(_MOST_PERSPECTIVE * marks.radius_mm**2, 2 * SCATTER_MM)
     oblique = (films.mean(keepdims=True), stretches.mean(keepdims=True), _widths(most_mm) ** 2)
-    # The more film is bent, the rarer it is: a density of the inverse square of the width.
+    # Prior of bent film: the density falls with the inverse square of the standard deviation.
     rarity = {Hypothesis.BENT: np.repeat(1 / bends, len(stretches))}
     parts = []
     for hypothesis, each in enumerate(((films, stretches, np.zeros(1)), bent, pitch, oblique)):

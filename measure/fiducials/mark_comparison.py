@@ -1,10 +1,10 @@
-"""Each mark of a frame compared with the others: in blur, for one lens and one scanner blur them alike, and in size and
-rotation, for marks of one drawing have one size.
+"""Comparison of each mark of a frame with the others: in blur, which lens and scanner make uniform, and in size and
+rotation, which marks of one drawing have in common.
 
-A faint mark, or one on rough ground, hardly tells its own blur. Where noise makes its edges look sharp, its standard
-deviation comes out as small as a sharp mark's. So it is matched with the others' blur as an observation, and where its
-own is not theirs something else than noise is in its picture. A speck that covers a dot looks like a dot of another
-size.
+The blur of a faint mark, or of one on a textured background, is poorly determined. If noise makes its edges look sharp,
+its standard deviation becomes as small as that of a sharp mark. It is therefore matched with the blur of the others as
+an observation; if its own blur differs significantly, its image contains something other than noise. A speck that
+covers part of a dot changes its apparent size.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,48 +18,51 @@ from measure.flags import MARK_UNLIKE_THE_OTHERS, Code, Reason
 from measure.matching.models import PIXEL_VARIANCE_PX2
 from measure.results import MarkFit
 
-# The standard deviation of a figure from mark to mark, by the variance that so many marks show exceedance their own.
+# Standard deviation of a figure from mark to mark: from the variance between marks in excess of their own variances,
+# and the number of marks.
 _Spread = Callable[[float, int], float]
 
-_FEWEST_BLURS = 3  # other marks: of fewer nobody knows by how much they differ
-_FEWEST_SHAPES = 2  # the same: how much sizes differ is known beforehand, but not which of two marks is off
-_BLUR_SPREAD = 0.05  # of the logarithm: so much blur differs within a field
-_TELLING = 0.05  # of the same: a standard deviation of the place is wrong by no more where its blur is known so well
-# By so much exposure spreads the marks of a frame in the logarithm of their size and, its edges being uneven, in
-# rotation, as if two marks had shown it before. In three frames of ring-crosses it was 0.005 to 0.008, in four of a
-# réseau 0.014 to 0.021: this is their root mean square.
+_FEWEST_BLURS = 3  # other marks needed to estimate their scatter in blur
+_FEWEST_SHAPES = 2  # other marks needed: the scatter in size has a prior, but of two marks either may be the outlier
+_BLUR_SPREAD = 0.05  # standard deviation of the logarithm of the blur within an image
+_TELLING = 0.05  # standard deviation of the log blur up to which that of the place is wrong by no more than this share
+# Exposure scatters the marks of a frame in the logarithm of their size and, since the edges are uneven, in rotation.
+# Prior standard deviation, with the weight of two marks. In three frames of ring-crosses it was 0.005 to 0.008, in four
+# of a réseau 0.014 to 0.021: this is their root mean square.
 _SIZE_SPREAD, _BEFORE = 0.014, 2
-# The share of marks that something touches on one side: of those with nothing cut out beside them, and with something.
+# Prior probability that something touches a mark on one side, without and with damaged pixels cut out beside it.
 _WHOLE, _DAMAGED = 0.01, 0.03
-# A speck is as large beside a large mark as beside a small one: it moves a round mark's mean outline by so much, rms,
-# over its radius. Five dots of 0.15 mm that were touched had it moved by 8 um.
+# Specks are equally large beside large and small marks: rms displacement of the mean outline of a touched round mark,
+# multiplied by its radius. Five touched dots of 0.15 mm had it displaced by 8 um.
 _SPECK_MM2 = 0.00125
-_TOUCHED_PX = 0.3  # the same along the edges of wedges and notches, which landscape touches
-# What moves one place of an outline by d moves the mean radius by a share of d, and the centre by twice that share.
+_TOUCHED_PX = 0.3  # rms displacement of the edges of wedges and notches that the background touches
+# A local displacement of an outline shifts the centre by twice as much as it changes the mean radius.
 _AS_MUCH = 2.0
 
 
 @dataclass(frozen=True)
 class SharedBlur:
-    """What the other marks tell of a mark's blur: blur_px, and sigma, the standard deviation of its logarithm, the
-    pixel's share included. differs: whether the mark's own is another, by more than chance; else it is just poorly
-    known."""
+    """Blur of a mark predicted from the other marks.
+
+    blur_px; sigma: standard deviation of the logarithm of the total blur, pixel included; differs: whether the mark's
+    own blur differs significantly, or else is only poorly determined.
+    """
 
     blur_px: float
     sigma: float
     differs: bool
 
     def is_confirmed(self, fit: MarkFit) -> bool:
-        """Whether a match that took it as an observation comes out with such a blur: noise moves the estimate from an
-        observation by the root of what it takes from its variance."""
+        """Whether a match with this blur as an observation agrees with it. Noise shifts the estimate from the
+        observation by the square root of the reduction in variance."""
         moved = _log_total_px(fit.blur_px) - _log_total_px(self.blur_px)
         off = abs(moved) / np.sqrt(max(self.sigma**2 - fit.blur_sigma**2, 1e-12))
         return bool(fit.blur_sigma < self.sigma and 2 * ndtr(-off) >= MARK_UNLIKE_THE_OTHERS)
 
 
 def shared_blurs(fits: Sequence[MarkFit]) -> list[SharedBlur | None]:
-    """For each mark what the others tell of its blur, None where they need not, for its own picture tells it well and
-    it is as theirs, or where they are too few."""
+    """Predict the blur of each mark from the others. None if these are too few, or if the mark's own blur is well
+    determined and agrees with theirs."""
     own = np.array([_log_total_px(fit.blur_px) for fit in fits])
     sigma = np.array([fit.blur_sigma for fit in fits])
     expected_blurs = _expect_from_others(own, sigma, blur_spread, _FEWEST_BLURS)
@@ -73,18 +76,19 @@ def shared_blurs(fits: Sequence[MarkFit]) -> list[SharedBlur | None]:
 
 @dataclass(frozen=True, eq=False)
 class SharedShape:
-    """A mark's shape beside that of the others: off (k,), the logarithm of its size less theirs, and its rotation (rad)
-    too where the frame gave it; sigma (k,): standard deviations of these. differs: whether it is another by more than
-    chance."""
+    """Shape of a mark relative to the others.
+
+    off: (k,) difference in the logarithm of its size, and in its rotation (rad) if the frame gave it; sigma: (k,) their
+    standard deviations; differs: whether the mark is an outlier.
+    """
 
     off: Array
     sigma: Array
     differs: bool
 
     def touched(self, spread: float, is_damaged: bool) -> float:
-        """The probability that something touches the mark on one side, by as much as its shape speaks for it more than
-        for what may happen to any mark. spread: of the figures of marks that are touched; is_damaged: whether something
-        was cut out beside it."""
+        """Posterior probability that something touches the mark on one side, less the prior one. spread: standard
+        deviation of the figures of touched marks; is_damaged: whether damaged pixels were cut out beside it."""
         share = _DAMAGED if is_damaged else _WHOLE
         touched = share * _density(self.off, np.hypot(self.sigma, spread))
         untouched = (1 - share) * _density(self.off, self.sigma)
@@ -92,7 +96,7 @@ class SharedShape:
 
 
 def unlike_others(size_ratio: float, turn_rad: float | None) -> Reason:
-    """Why a mark is weak that has another size than the others, and another turn where the frame holds that."""
+    """Reason of a weak mark whose size, or also its rotation where the frame gave it, differs from the others."""
     larger = f"{size_ratio:.2f} times as large as the other marks"
     if turn_rad is None:
         figure = f"it is {larger}"
@@ -102,18 +106,19 @@ def unlike_others(size_ratio: float, turn_rad: float | None) -> Reason:
 
 
 def unlike_blur(ratio: float) -> Reason:
-    """Why a mark is weak that has another blur than the others."""
+    """Reason of a weak mark whose blur differs from the others."""
     return Reason(f"its blur is {ratio:.2f} times that of the other marks", Code.BLUR)
 
 
 def _density(off: Array, sigma: Array) -> float:
-    """Of independent normal deviations."""
+    """Density of independent normal deviations."""
     return float(np.prod(np.exp(-0.5 * (off / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)))
 
 
 @dataclass(frozen=True)
 class Touch:
-    """What may touch a mark: with which probability, and how far, px, it has then moved it: a normal distribution."""
+    """Possible contact of a mark with another object: its probability, and the displacement it causes, normally
+    distributed (px)."""
 
     probability: float
     moved_px: float
@@ -121,17 +126,17 @@ class Touch:
 
     @property
     def variance_px2(self) -> float:
-        """Of a coordinate, whichever way it was moved."""
+        """Variance of a coordinate, for a displacement in an unknown direction."""
         return self.probability * (self.moved_px**2 + self.sigma_px**2) / 2
 
     def exceedance(self, px: float) -> float:
-        """The probability that it was moved farther."""
+        """Probability of a displacement larger than px."""
         ends = (np.array([self.moved_px, -self.moved_px]) - px) / max(self.sigma_px, 1e-12)
         return self.probability * float(ndtr(ends).sum())
 
 
 def touch_of_round(shape: SharedShape, radius_px: float, px_per_mm: float, is_damaged: bool) -> Touch:
-    """Of a round mark, by its size."""
+    """Estimate the displacement of a round mark from its size."""
     spread = _SPECK_MM2 * px_per_mm**2 / radius_px**2
     prior, measured = spread**2, float(shape.sigma[0]) ** 2
     moved = _AS_MUCH * radius_px * abs(float(shape.off[0])) * prior / (prior + measured)
@@ -140,22 +145,25 @@ def touch_of_round(shape: SharedShape, radius_px: float, px_per_mm: float, is_da
 
 
 def touch_of_edges(shape: SharedShape, on_place: Array, middle_px: float, is_damaged: bool) -> Touch:
-    """Of a wedge or a notch, whose place follows its own rotation and scale by on_place (2, k); middle_px: how far its
-    edges are from its point, on average."""
+    """Estimate the displacement of a wedge or notch from its own scale and rotation.
+
+    on_place: (2, k) derivatives of the place with respect to these; middle_px: mean distance of the edges from the
+    measured point.
+    """
     return Touch(shape.touched(_TOUCHED_PX / middle_px, is_damaged), float(np.hypot(*(on_place @ shape.off))), 0.0)
 
 
 def shared_shapes(own: Array, sigma: Array) -> list[SharedShape | None]:
-    """Compare the shapes of marks that are drawn alike, or are all held by the frame.
+    """Compare the shapes of marks of one drawing, or of all marks held by the frame.
 
     Parameters
     ----------
-    own, sigma : (n, k) of each mark the logarithm of its size, and where the frame held it its rotation (rad), with
-        their standard deviations, inf where a mark does not tell it.
+    own, sigma : (n, k) logarithm of the size of each mark, and its rotation (rad) if the frame gave it, and their
+        standard deviations, inf where not estimated.
 
     Returns
     -------
-    Each mark's shape beside that of the others, None where these are too few.
+    Shape of each mark relative to the others, None where these are too few.
     """
     columns = [_expect_from_sound(*pair) for pair in zip(own.T, sigma.T, strict=True)]
     result: list[SharedShape | None] = []
@@ -171,8 +179,7 @@ def shared_shapes(own: Array, sigma: Array) -> list[SharedShape | None]:
 
 
 def _expect_from_sound(own: Array, sigma: Array) -> "list[_Expected | None]":
-    """For each mark what the others let expect of one figure of its shape: those alone that do not differ themselves,
-    where these are enough."""
+    """Predict one figure of each mark's shape from the others, without outliers if enough marks remain."""
     every = _expect_from_others(own, sigma, size_spread, _FEWEST_SHAPES)
     odd = np.array([each is not None and each.differs for each in every])
     sound = _expect_from_others(own, np.where(odd, np.inf, sigma), size_spread, _FEWEST_SHAPES)
@@ -180,17 +187,18 @@ def _expect_from_sound(own: Array, sigma: Array) -> "list[_Expected | None]":
 
 
 def blur_spread(shown: float, marks: int) -> float:
-    """By which blurs differ, where so many of them show a variance beyond their own."""
+    """Standard deviation of the log blur from mark to mark. shown: observed variance in excess of the marks' own."""
     return float(np.hypot(np.sqrt(shown), _BLUR_SPREAD))
 
 
 def size_spread(shown: float, marks: int) -> float:
-    """By which sizes and turns differ, where so many of them show a variance beyond their own."""
+    """Standard deviation of log size or rotation from mark to mark, combined with the prior. shown: variance that the
+    marks show in excess of their own."""
     return float(np.sqrt((_BEFORE * _SIZE_SPREAD**2 + (marks - 1) * shown) / (_BEFORE + marks - 1)))
 
 
 def _log_total_px(blur_px: float) -> float:
-    """The logarithm of a blur with the pixel's share."""
+    """Logarithm of the total blur, pixel included."""
     return float(np.log(blur_px**2 + PIXEL_VARIANCE_PX2) / 2)
 
 
@@ -200,8 +208,8 @@ def _remove_pixel(log_seen_px: float) -> float:
 
 @dataclass(frozen=True)
 class _Expected:
-    """value: what the others let expect, and sigma, its standard deviation for one more mark. differs: whether the
-    mark's own figure is another, by more than chance."""
+    """Figure predicted from the other marks. sigma: standard deviation of the prediction for one more mark; differs:
+    whether the mark's own figure differs significantly."""
 
     value: float
     sigma: float
@@ -209,9 +217,10 @@ class _Expected:
 
 
 def _expect_from_others(own: Array, sigma: Array, spread: _Spread, fewest: int) -> "list[_Expected | None]":
-    """For each mark what the others let expect, None where they are fewer than so many.
+    """Predict the figure of each mark from the others; None where these are too few.
 
-    own, sigma (n,): each mark's figure and its standard deviation, infinite where it has none.
+    own, sigma: (n,) figure of each mark and its standard deviation, infinite where not estimated; fewest: other marks
+    needed.
     """
     result: list[_Expected | None] = []
     for index in range(len(own)):
@@ -227,8 +236,16 @@ def _expect_from_others(own: Array, sigma: Array, spread: _Spread, fewest: int) 
 
 
 def mean_of_unlike(values: Array, sigma: Array, spread: _Spread) -> tuple[float, float, float]:
-    """The weighted mean of values that differ by more than their standard deviations, its own standard deviation, and
-    by how much more: by the moments of what they leave (DerSimonian and Laird, 1986)."""
+    """Random-effects mean of values that scatter by more than their standard deviations.
+
+    Returns
+    -------
+    Weighted mean, its standard deviation, and the standard deviation between the values, as spread gives it.
+
+    Notes
+    -----
+    The variance between the values is the moment estimator of DerSimonian and Laird (1986).
+    """
     weights = 1 / sigma**2
     rest = values - weights @ values / weights.sum()
     exceedance = weights @ rest**2 - (len(values) - 1)

@@ -1,7 +1,7 @@
-"""What explains the misfits of a camera's frames: a pattern that they share, their film and affinity, or wrong marks.
+"""Explanation of the misfits of a camera's frames: a common pattern, film scatter and affinity, or gross errors.
 
-Patterns are estimated from all frames, film and affinity from those that do not stand out, and each frame is tested by
-`frame_consistency` against what the others have.
+The pattern is estimated from all frames, film scatter and affinity from those that are no outliers. Each frame is
+tested by `frame_consistency` against the other frames.
 """
 
 from collections import Counter
@@ -27,20 +27,30 @@ from measure.fiducials.consistency import (
 from measure.fiducials.options import SCATTER_DEGREES
 from measure.flags import FALSE_DOUBT
 
-_UNKNOWN_MM = 1.0  # of a pattern of which nothing is known beforehand
-_LEAST_MM = 1e-6
-_FEWEST_ALIKE = 3  # frames: of two nobody knows which one is off
-_ROUNDS = 3  # of pattern, film and affinity in turn
-_AS_ODD = 0.5  # of the logarithm of the least p-value: frames that stand out as well are explained together
-_CLIPPED_AT = 0.25  # p-value of a frame beyond which its chi-square counts as this quantile
-_CLIPPED_EFFICIENCY = 0.6  # of a variance from these, against one from the mean of squares
+_UNKNOWN_MM = 1.0  # standard deviation of a pattern without prior knowledge
+_LEAST_MM = 1e-6  # smallest standard deviation of a site
+_FEWEST_ALIKE = 3  # frames of one scan orientation: of two, either may be the outlier
+_ROUNDS = 3  # alternations of pattern and film scatter
+_AS_ODD = 0.5  # fraction of the log of the smallest p-value: frames below it are explained in the same round
+_CLIPPED_AT = 0.25  # upper-tail probability at whose quantile chi-squares are clipped
+_CLIPPED_EFFICIENCY = 0.6  # of a variance from clipped chi-squares, relative to one from the mean of squares
 
 
 @dataclass(frozen=True, eq=False)
 class FrameMisfit:
-    """A frame's marks, the sites (n,) of the pattern at which they lie, and what explains them. p_value: of one that
-    stands out; film_mm: of its film, None of an ordinary one; hypothesis: the best; off_mm: how far wrong marks lie
-    off, by their number; suspect_mm2 (n,): variances of marks that may be wrong."""
+    """Marks of a frame and the explanation of their misfit.
+
+    Attributes
+    ----------
+    marks : n marks.
+    sites : (n,) their sites in the pattern.
+    pose : scan orientation.
+    p_value : p-value of an outlying frame.
+    film_mm : own scatter of its film; None for an ordinary frame.
+    hypothesis : accepted hypothesis.
+    off_mm : size of the gross errors, by mark.
+    suspect_mm2 : (n,) variances of marks that may have a gross error.
+    """
 
     marks: FrameMarks
     sites: NDArray[np.intp]
@@ -53,26 +63,29 @@ class FrameMisfit:
 
     @property
     def places(self) -> NDArray[np.intp]:
-        """(2n,) of its marks' coordinates in the pattern."""
+        """(2n,) indices of its marks' coordinates in the pattern."""
         return np.asarray((2 * self.sites[:, None] + np.arange(2)).ravel())
 
     @cached_property
     def widened(self) -> FrameMarks:
-        """With the variances of marks that are wrong."""
+        """Marks with variances enlarged by their gross errors."""
         off = np.zeros(len(self.sites))
         off[list(self.off_mm)] = list(self.off_mm.values())
         return self.marks.widen(off**2)
 
 
-Frames = Mapping[int, FrameMisfit]  # by their places among the camera's
+Frames = Mapping[int, FrameMisfit]  # by index among the camera's frames
 
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """How far off the given places marks lie in all frames alike, at m sites.
+    """Misfit of m sites that is common to all frames.
 
-    places_mm (m, 2), sigma_mm (m,): of the sites; free_mm: by how much more it may be; information (2m, 2m) and right
-    (2m,): of the normal equations by the frames, whose films scatter by given standard deviations.
+    Attributes
+    ----------
+    places_mm, sigma_mm : (m, 2) places of the sites, (m,) their standard deviations.
+    free_mm : standard deviation of the pattern in addition to sigma_mm.
+    information, right : (2m, 2m) and (2m,) normal equations, summed over the frames with given film scatters.
     """
 
     places_mm: Array
@@ -93,8 +106,8 @@ class Pattern:
         return cls(places_mm, sigma_mm, free_mm, information, right)
 
     def expected_marks(self, frame: FrameMisfit, film_mm: float, is_pooled: bool = False) -> FrameMarks:
-        """The frame's marks beside the pattern that all others show. is_pooled: the pattern's own affinity, which no
-        frame shows, is counted to the mean affinity of the frames."""
+        """Marks of a frame less the pattern of all other frames. is_pooled: remove the affinity from the pattern; it
+        cannot be separated from the mean affinity of the frames, and is counted there."""
         weight, own = frame.widened.precision(film_mm), np.ix_(frame.places, frame.places)
         information, right = self._posterior.copy(), self.right.copy()
         information[own] -= weight
@@ -106,25 +119,25 @@ class Pattern:
 
     @cached_property
     def mm(self) -> Array:
-        """(m, 2) its estimate."""
+        """(m, 2) estimated pattern, mm."""
         return np.asarray(np.linalg.solve(self._posterior, self.right)).reshape(-1, 2)
 
     @property
     def p_value(self) -> float:
-        """Of the pattern against nothing but its sites' standard deviations."""
+        """p-value of the pattern under the null hypothesis that the sites deviate by sigma_mm only."""
         spread = self.information + self.information @ np.diag(np.repeat(self.sigma_mm**2, 2)) @ self.information
         chi_square = float(self.right @ np.linalg.pinv(spread, hermitian=True) @ self.right)
         return float(chdtrc(max(int(np.linalg.matrix_rank(self.information, hermitian=True)), 1), chi_square))
 
     @property
     def log_density(self) -> float:
-        """Of all frames with it over that without any."""
+        """Log density of all frames with the pattern, relative to that without."""
         shared = np.log(self._prior_information).sum() - np.linalg.slogdet(self._posterior)[1]
         return float(shared + self.right @ self.mm.ravel()) / 2
 
     @cached_property
     def _beyond_affine(self) -> Array:
-        """(2m, 2m) projection on what no affine transformation makes of the sites."""
+        """(2m, 2m) projection on the complement of affine transformations of the sites."""
         design = np.kron(np.column_stack([self.places_mm, np.ones(len(self.places_mm))]), np.eye(2))
         return np.eye(len(design)) - design @ np.linalg.pinv(design)
 
@@ -139,8 +152,8 @@ class Pattern:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """Of all frames of a camera, with the pattern that they share. film_is_more: whether they scatter more than was
-    believed, beyond chance."""
+    """Explanation of all frames of a camera, with their common pattern. film_is_more: whether the film scatters
+    significantly more than its prior."""
 
     frames: Frames
     pattern: Pattern
@@ -149,33 +162,37 @@ class Explanation:
 
     @property
     def is_quiet(self) -> bool:
-        """Whether nothing stands out."""
+        """Whether there is no outlier."""
         return not (self.film_is_more or any(each.film_mm or each.off_mm for each in self.frames.values()))
 
     @property
     def log_evidence(self) -> float:
-        """What stands out costs as much as it is rare."""
+        """Log evidence of the explanation. Each outlying frame or mark has the prior probability `FALSE_DOUBT`."""
         odd = sum((each.film_mm is not None) + len(each.off_mm) for each in self.frames.values())
         alone = sum(each.widened.log_density(each.film_mm or self.film.sigma) for each in self.frames.values())
         return alone + self.pattern.log_density + odd * float(np.log(FALSE_DOUBT))
 
 
 def explain_by_pattern(frames: Frames, places_mm: Array, sigma_mm: Array, believed_mm: float) -> Explanation:
-    """With a pattern beyond its sites' standard deviations, as large as it is: what is not believed beforehand speaks
-    against a hypothesis by how much room it takes."""
+    """Explain the frames with a pattern larger than the standard deviations of its sites.
+
+    Its prior standard deviation is set to its estimated size, since a wider prior lowers the evidence of the
+    hypothesis.
+    """
     wide = explain(frames, places_mm, sigma_mm, _UNKNOWN_MM, believed_mm)
     size_mm = float(np.sqrt(np.mean(wide.pattern.mm**2)))
     return explain(frames, places_mm, sigma_mm, max(size_mm, believed_mm), believed_mm)
 
 
 def explain(frames: Frames, places_mm: Array, sigma_mm: Array, free_mm: float, believed_mm: float) -> Explanation:
-    """Explain the frames that stand out, the worst first, each by one of its marks or by its film.
+    """Explain outlying frames, the worst first, each by a gross error in one of its marks or by its film.
 
     Parameters
     ----------
-    places_mm, sigma_mm : (m, 2) and (m,), of the pattern's sites.
-    free_mm : by how much it may differ from that beforehand.
-    believed_mm : standard deviation of film, beforehand.
+    frames : frames, by index.
+    places_mm, sigma_mm : (m, 2) places of the pattern's sites, (m,) their standard deviations.
+    free_mm : prior standard deviation of the pattern in addition to sigma_mm.
+    believed_mm : prior standard deviation of the film's scatter.
     """
     frames, sites = dict(frames), (places_mm, sigma_mm, free_mm)
     film, is_more = Scatter(believed_mm, SCATTER_DEGREES), False
@@ -183,7 +200,7 @@ def explain(frames: Frames, places_mm: Array, sigma_mm: Array, free_mm: float, b
         ordinary = [place for place, each in frames.items() if each.film_mm is None]
         alike = Counter(frames[place].pose for place in ordinary)
         films_mm = {place: each.film_mm or film.sigma for place, each in frames.items()}
-        for _ in range(_ROUNDS):  # film gives the weights of the pattern, and the pattern what is left for film
+        for _ in range(_ROUNDS):  # the film scatter weights the pattern; the residuals of the pattern give the scatter
             pattern = Pattern.from_frames(frames, films_mm, *sites)
             expected = {
                 place: pattern.expected_marks(each, films_mm[place], alike[each.pose] >= _FEWEST_ALIKE)
@@ -205,8 +222,10 @@ def explain(frames: Frames, places_mm: Array, sigma_mm: Array, free_mm: float, b
 
 
 def _explain_alone(frame: FrameMisfit, marks: FrameMarks, film: Scatter, affinity: Affinity) -> FrameMisfit:
-    """Explain a frame that stands out by a mark, or else by its film, its pitch or a perspective. Marks that may be the
-    wrong one are known no better than they would then lie off."""
+    """Explain an outlying frame by a gross error in one mark, or else by its film, its pitch or a perspective.
+
+    Marks that may have the gross error get the variance that corresponds to its size.
+    """
     found = frame_consistency(marks, film, affinity)
     off_mm, mark = np.hypot(*found.off_mm.T), found.wrong_mark
     if mark is not None and mark not in frame.off_mm:
@@ -220,13 +239,14 @@ def _explain_alone(frame: FrameMisfit, marks: FrameMarks, film: Scatter, affinit
 
 
 def _own_film_mm(marks: FrameMarks, film: Scatter) -> float:
-    """A frame's film where films scatter as Student's t: a frame that stands out has little weight in the pattern."""
+    """Film scatter of one frame with Student's t as the distribution across frames: outlying frames get little weight
+    in the pattern."""
     known = SCATTER_DEGREES * film.sigma**2 + marks.redundancy * marks.film_variance_mm2()
     return float(np.sqrt(known / (SCATTER_DEGREES + marks.redundancy)))
 
 
 def _film(frames: Sequence[FrameMarks], believed_mm: float) -> tuple[Scatter, bool]:
-    """From frames that do not stand out, beside what is believed; and whether it is more than that."""
+    """Film scatter from ordinary frames, combined with its prior; and whether it is significantly larger than that."""
     frames = [each for each in frames if each.redundancy]
     if len(frames) < 2:
         return Scatter(believed_mm, SCATTER_DEGREES), False
@@ -239,7 +259,8 @@ def _film(frames: Sequence[FrameMarks], believed_mm: float) -> tuple[Scatter, bo
 
 
 def _affinities(frames: Mapping[int, tuple[FrameMarks, str]], film_mm: float) -> dict[int, Affinity]:
-    """Of each frame, with its pose, what the others show that lie alike, about their median."""
+    """For each frame, given with its scan orientation: median and scatter of the affinity of the others with the same
+    orientation."""
     result = dict.fromkeys(frames, LONE_AFFINITY)
     for pose in {pose for _, pose in frames.values()}:
         alike = [place for place, (_, own) in frames.items() if own == pose]
@@ -262,7 +283,7 @@ def _affinities(frames: Mapping[int, tuple[FrameMarks, str]], film_mm: float) ->
 
 
 def _clipped_variance(chi_squares: Callable[[float], Array], degrees: Array) -> float:
-    """The variance with which clipped chi-squares (n,) have their expected mean: what stands out moves it little."""
+    """Variance with which the sum of the clipped chi-squares (n,) equals its expectation: robust against outliers."""
     limit = chdtri(degrees, _CLIPPED_AT)
     expected = degrees * (1 - chdtrc(degrees + 2, limit)) + _CLIPPED_AT * limit
 

@@ -1,4 +1,5 @@
-"""What a found mark's picture says of which of the camera's marks it is, in whichever direction a pose shows it."""
+"""Likelihood of the scan orientations from the images of the marks: each orientation predicts a mark and its rotation
+at each place."""
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
@@ -18,23 +19,24 @@ from measure.noise.robust_estimation import TukeyFit, robust_scale, tukey_fit
 from measure.results import MarkFit
 from measure.scans.scan import Scan, means
 
-_ALIKE = 0.05  # of the contrast: pictures that differ nowhere by more are one
-_FINEST_PX = 3.0  # of the finest line on the grid
-_CUBIC_PX = 3.0  # that an interpolation asks beyond its last place
-_ABOUT_PX = 3.0  # how far about the drawings the ground tells of its grey value
-_PIXELS_PER_DEGREE = 4.0  # of freedom: blur, grain and compression make neighbours alike
-_OUTLIER = 4.0  # in standard deviations: beyond it a pixel's misfit counts no more
-_ROUNDS, _LEAST_SCALE = 4, 1e-9  # of robust weights
+_ALIKE = 0.05  # fraction of the contrast: images that differ nowhere by more count as equal
+_FINEST_PX = 3.0  # smallest width of the finest line on the grid
+_CUBIC_PX = 3.0  # border that cubic interpolation needs
+_ABOUT_PX = 3.0  # width of the background around the drawings that is compared
+_PIXELS_PER_DEGREE = 4.0  # pixels per degree of freedom: blur, grain and compression correlate neighbours
+_OUTLIER = 4.0  # in standard deviations: larger residuals of a pixel are clipped
+_ROUNDS, _LEAST_SCALE = 4, 1e-9  # reweightings of the robust fit; smallest standard deviation in it
 _FLIP = np.diag([1.0, -1.0])  # from right and up to columns and rows
-_ALIGNMENTS = 3  # steps: the chip lies right to a cell before
-_FEWEST = 40  # pixels that two chips are compared by
-_CHANCE_SIGMAS = 3.0  # what chance may make of a difference
-SPOILT = 0.01  # probability that writing, dust or a neighbour beside a mark feigns or hides what tells marks apart
+_ALIGNMENTS = 3  # Gauss-Newton steps; the chip is already placed to within a cell
+_FEWEST = 40  # pixels needed to compare two chips
+_CHANCE_SIGMAS = 3.0  # standard deviations by which noise may enlarge a difference
+SPOILT = 0.01  # probability that writing, dust or an adjacent object imitates or hides a difference between marks
 
 
 @dataclass(frozen=True, eq=False)
 class PosedMark:
-    """A mark as a pose shows it at a site: turn (2, 2), from its x and y to right and up. None: bare ground."""
+    """Mark that a scan orientation predicts at a site. turn (2, 2): from its x and y to right and up. mark None: plain
+    background."""
 
     mark: Mark | None
     turn: Array
@@ -42,10 +44,16 @@ class PosedMark:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A mark's picture on the drawings' grid, (size, size) with its origin in the middle. known: where it tells the
-    grey values: a learned chip has the landscape of other scans beside its mark. covered: the chip, which tells nothing
-    beyond its edge; of a drawn mark everything. noise: of the chip's own pixels, in shares of the contrast, inf where
-    it is not known."""
+    """Image of a mark on the drawings' grid, with its origin in the middle.
+
+    Attributes
+    ----------
+    grey : (size, size) image.
+    known : (size, size) mask of the pixels with known grey values: a learned chip also contains the background of other
+        scans.
+    covered : (size, size) mask of the chip's area; everything for a drawn mark.
+    noise : standard deviation of the chip's pixels, fraction of the contrast; inf where unknown.
+    """
 
     grey: Array
     known: Mask
@@ -53,11 +61,11 @@ class View:
     noise: float = 0.0
 
     def replace_pictures(self, change: Callable[[Any], Any]) -> "View":
-        """With the same change, a turn say, of all three pictures."""
+        """Apply the same change, for example a rotation, to the image and both masks."""
         return replace(self, grey=change(self.grey), known=change(self.known), covered=change(self.covered))
 
     def align(self, window: Array) -> "View":
-        """Moved by the part of a cell that makes it most like a window (size, size), which it lies on to a cell."""
+        """Shift by a fraction of a cell to match a window (size, size), on which it already lies to within a cell."""
         used, moved, shift = self.known & self.covered, self, np.zeros(2)
         for _ in range(_ALIGNMENTS):
             factors = moved.fit(window, used).factors
@@ -68,9 +76,8 @@ class View:
         return moved
 
     def unlike(self, other: "View", contrast: float) -> float:
-        """The sum of the squares by which two chips differ wherever both tell something, one moved as it is most like
-        the other, beyond what their noise makes of a pixel. contrast: of the picture, in standard deviations of its
-        noise: what is an outlier there counts as one."""
+        """Sum of squared differences of two chips beyond their noise, where both are known, after alignment. contrast:
+        of the image in the scan, in standard deviations of its noise; differences are clipped as its outliers are."""
         used = self.known & other.known & self.covered & other.covered
         if used.sum() < _FEWEST:
             return 0.0
@@ -81,8 +88,8 @@ class View:
         return float(((residuals**2 - alike**2) * contrast**2).clip(0.0, _OUTLIER**2).sum())
 
     def fit(self, window: Array, used: Mask) -> TukeyFit:
-        """The fit to a window in the pixels used, robust against writing and dust in it. Factors: offset, gain, by row
-        and by column."""
+        """Robust fit to a window in the pixels used. Factors: offset, gain, derivatives with respect to row and
+        column."""
         slopes = [np.asarray(np.gradient(self.grey, axis=axis))[used] for axis in (0, 1)]
         return tukey_fit(
             np.stack([np.ones(int(used.sum())), self.grey[used], *slopes]), window[used], _ROUNDS, _LEAST_SCALE
@@ -98,17 +105,20 @@ _BARE = View(np.zeros((1, 1)), _EVERYWHERE, _EVERYWHERE)
 
 
 def _turn_and_pad(picture: Any, turn: Array, spare: int) -> Any:
-    """Turned by quarters, on a larger grid. A drawing's edge goes on; beyond a template's there is nothing."""
+    """Rotate by quarter turns, and pad by repeating the edge."""
     return np.pad(turn_by_quarters(picture, turn), spare, mode="edge")
 
 
 class Drawings:
-    """A camera's marks on a grid that lies upright in the frame, where poses turn and mirror them by whole quarters: so
-    each is drawn once. The grid is coarser than the scan, as far as the finest line of the marks allows: what tells
-    them apart is coarser."""
+    """Images of a camera's marks on a grid that is upright in the frame.
+
+    Scan orientations rotate the marks by quarter turns and mirror them, so each mark is drawn once. The grid is coarser
+    than the scan, as far as the finest line of the marks allows: the differences between marks are coarser.
+    """
 
     def __init__(self, marks: Collection[Mark], scan_from_up: Array, blur_px: float) -> None:
-        """scan_from_up (2, 2): px of the scan from mm right and up in the frame; blur_px: of the scan."""
+        """Draw the marks. scan_from_up (2, 2): from mm right and up in the frame to px of the scan; blur_px: blur of
+        the scan."""
         finest_px = min(detail_px(mark, scan_from_up) for mark in marks)
         self.reduction = max(1, int(finest_px / _FINEST_PX))
         per_mm = linear_scale(scan_from_up) / self.reduction
@@ -117,8 +127,8 @@ class Drawings:
         self._views = {mark: _draw_view(mark, grid_from_up, blur_px / self.reduction) for mark in set(marks)}
 
     def views(self, shown: Sequence[PosedMark], spare: int) -> list[View]:
-        """What each pose shows at a place, which is in the middle, on grids of one size, so many cells larger on every
-        side than the largest picture."""
+        """Image that each orientation predicts at a place, centred on grids of one size: spare cells larger on every
+        side than the largest image."""
         drawn = [_BARE if each.mark is None else self._views[each.mark] for each in shown]
         half = max(len(each.grey) // 2 for each in drawn) + spare
         turns = [_FLIP @ each.turn @ _FLIP for each in shown]
@@ -129,10 +139,12 @@ class Drawings:
 
 
 class MarkSite:
-    """A place where a mark was found, or where it should be and was not: then like is the fit of another mark.
+    """Place where a mark was found, or predicted but not found; like is then the fit of another mark.
 
-    reach_px: how far off a chip may lie in another pose than the one it was found in. A drawn mark's origin is its
-    middle in every pose; a chip's is where somebody clicked, and one that shows an edge is found anywhere along it."""
+    reach_px: largest shift of a chip in another orientation than the one it was found in. The origin of a drawn mark is
+    its middle in every orientation; the origin of a chip is where the user clicked, and a chip that contains only an
+    edge is found anywhere along it.
+    """
 
     def __init__(
         self,
@@ -150,8 +162,8 @@ class MarkSite:
         self.noise_dn = like.noise_dn / drawings.reduction
 
     def likelihoods(self, shown: Sequence[PosedMark]) -> Array:
-        """The log-likelihood of the picture under what each pose shows here, up to a constant: 0 for the best, and no
-        less than the probability that something else spoils the picture."""
+        """Log-likelihood of the image under each orientation, up to a constant: 0 for the best, at least
+        log(`SPOILT`), the probability that something else disturbs the image."""
         chips = any(isinstance(each.mark, MarkTemplate) for each in shown)
         spare = int(np.ceil(self.reach_px / self.drawings.reduction)) if chips else 0
         views, view_of = _distinct(self.drawings.views(shown, spare))
@@ -161,9 +173,9 @@ class MarkSite:
         views = [self._placed(window, view, spare) for view in views]
         area = _area([view.grey for view in views])
         residuals = [self._residuals(window, view.grey, area & view.known) for view in views]
-        # Where even the best picture leaves much, what is left is no noise, and tells the pictures apart less surely.
+        # Large residuals of even the best image are not noise, and reduce the significance of the differences.
         scale = max(self.noise_dn, min(robust_scale(each) for each in residuals), 1e-9)
-        misfits = np.full((len(views), *window.shape), _OUTLIER**2)  # what a chip does not tell it misses
+        misfits = np.full((len(views), *window.shape), _OUTLIER**2)  # unknown pixels of a chip count as outliers
         for misfit, view, residual in zip(misfits, views, residuals, strict=True):
             misfit[area & view.known] = np.minimum(np.abs(residual) / scale, _OUTLIER) ** 2
         excess = _excess(misfits, np.stack([area & view.covered for view in views]))
@@ -174,15 +186,15 @@ class MarkSite:
         return np.asarray(np.log((1 - SPOILT) * relative + SPOILT))[view_of]
 
     def _most_excess(self, best: View, view: View, scale_dn: float) -> float:
-        """By how much more than the best chip another one can miss the picture for being another mark, chance included:
-        the more the two differ. The rest comes of the chips' own noise, or of a place that is not quite right."""
+        """Largest excess misfit of a chip over the best one that their difference explains, noise included. Any further
+        excess comes from the noise of the chips or from a wrong placement."""
         if view is best or not view.is_chip:
             return 0.0 if view is best else np.inf
         squares = view.unlike(best, abs(self.contrast_dn) / scale_dn)
         return squares + 2 * _CHANCE_SIGMAS * float(np.sqrt(squares))
 
     def _placed(self, window: Array, view: View, spare: int) -> View:
-        """A chip moved to where the window is most like it."""
+        """Shift a chip to the maximum of its correlation (NCC) with the window."""
         if not view.is_chip or not view.known.any():
             return view
         core = slice(spare, len(window) - spare)
@@ -194,7 +206,7 @@ class MarkSite:
         return view.replace_pictures(partial(np.roll, shift=shift, axis=(0, 1))).align(window)
 
     def _window(self, size: int) -> Array:
-        """(size, size) grey values of the scan on the drawings' grid, the site in the middle."""
+        """(size, size) grey values of the scan on the drawings' grid, centred on the site."""
         reduction = self.drawings.reduction
         fine = size * reduction
         scan_from_fine = self.drawings.scan_from_grid / reduction
@@ -209,8 +221,8 @@ class MarkSite:
         return np.asarray(means(np.asarray(upright, np.float32)[..., None], reduction)[..., 0], np.float64)
 
     def _residuals(self, window: Array, shown: Array, area: Mask) -> Array:
-        """What the picture on a plane ground leaves, the mark being light or dark as the one that was found; its place
-        may be off by a little, for it was fitted with another drawing."""
+        """Residuals of a fit of the image on a plane background, with the polarity of the mark that was found. A small
+        shift is estimated, since the place was fitted with another drawing."""
         grey = window[area]
         row, col = np.nonzero(area)
         ground = [np.ones_like(grey), col / len(window), row / len(window)]
@@ -224,7 +236,7 @@ class MarkSite:
 
 
 def _draw_view(mark: Mark, grid_from_mark: Array, blur_px: float) -> View:
-    """The mark's picture about its origin."""
+    """Draw a mark centred on its origin."""
     place = np.column_stack([grid_from_mark, np.zeros(2)])
     half = int(np.ceil(np.abs(extent_px(mark, place)).max() + 2 * _ABOUT_PX))
     place[:, 2] = half
@@ -237,7 +249,7 @@ def _draw_view(mark: Mark, grid_from_mark: Array, blur_px: float) -> View:
 
 
 def _noise(mark: Mark) -> float:
-    """Of a chip's pixels, in shares of its contrast; inf where nobody knows it."""
+    """Standard deviation of a chip's pixels, fraction of its contrast; inf where unknown, 0 for a drawn mark."""
     if not isinstance(mark, MarkTemplate):
         return 0.0
     if mark.noise_dn == 0.0:
@@ -247,7 +259,7 @@ def _noise(mark: Mark) -> float:
 
 
 def _distinct(views: Sequence[View]) -> tuple[list[View], list[int]]:
-    """The views whose pictures differ, and which of them each is."""
+    """Views with different images, and the index of each view among these."""
     kinds: list[View] = []
     index = []
     for each in views:
@@ -259,8 +271,8 @@ def _distinct(views: Sequence[View]) -> tuple[list[View], list[int]]:
 
 
 def _excess(misfits: Array, areas: Mask) -> Array:
-    """(n,) by how much each picture's misfit exceeds the least one, over the area of both: a chip is neither better for
-    being smaller nor for what lies beyond another's edge. misfits, areas: (n, size, size)."""
+    """(n,) excess of each image's misfit over that of the best one, over the common area: neither a small chip nor the
+    surroundings of another chip give an advantage. misfits, areas: (n, size, size)."""
     counts = areas.sum(axis=(1, 2)).clip(min=1)
     best = int(((misfits * areas).sum(axis=(1, 2)) / counts).argmin())
     excess = ((misfits - misfits[best]) * (areas & areas[best])).sum(axis=(1, 2))
@@ -268,6 +280,6 @@ def _excess(misfits: Array, areas: Mask) -> Array:
 
 
 def _area(pictures: Sequence[Array]) -> Mask:
-    """The pixels about all drawings: farther off lies what no mark explains."""
+    """Mask of the pixels on and around all drawings; no mark explains the image farther off."""
     outside = (np.max(pictures, axis=0) - np.min(pictures, axis=0).clip(max=0.0) < _ALIKE).astype(np.uint8)
     return np.asarray(cv2.distanceTransform(outside, cv2.DIST_L2, 5) <= _ABOUT_PX)

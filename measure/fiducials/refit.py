@@ -1,5 +1,5 @@
-"""The marks of a frame fitted once more with what the frame says of them: rotation, scale and strain, tone curve, blur;
-and those doubted that look unlike the others."""
+"""Refinement of a frame's mark fits with its rotation, scale, strain, tone curve and blur; test of marks that look
+unlike the others."""
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -39,27 +39,27 @@ from measure.tone.curve import Tone, ToneInformation
 from measure.tone.estimate import FrameTone, MarkTone
 from measure.tone.sharpening import estimate_sharpening
 
-_NEAR_MM = 3.0  # from the frame's edge: a mark nearer has it beside itself, in what is read of the scan anyway
-_BESIDE_MM, _LONGEST_MM = 0.5, 6.0  # from a mark, to where an edge begins and ends
-_PIECES = 8  # of edges that are asked, at most
-_SEARCH_MM = 0.3  # about where the frame's size puts its edge
-_SHARE_PX, _FEWEST = 8.0, 5  # of an edge that a profile is of, and how many an edge has at least
-_STRAINED = 1 / 3  # of its standard deviation: an error of a twentieth more
-_TONE_ROUNDS = 5  # of fitting by a better curve
-_OTHER_STARTS, _AGREED = (2.2, 1.0), 0.1  # powers; how unsettled a curve is that needs none of them
-_TELLING = 8  # marks, the plainest of a frame, that tell its scan's sharpening: more take their time
-_SHARPENING_ROUNDS = 6  # of fitting by a better estimate of a scan's sharpening
-_MOVED = 0.3  # of its standard deviation that a mark may still move
+_NEAR_MM = 3.0  # largest distance of a mark from the frame edge, which then lies in the part of the scan being read
+_BESIDE_MM, _LONGEST_MM = 0.5, 6.0  # gap between a mark and a section of the edge; farthest end of it from the mark
+_PIECES = 8  # about this many sections of the edge are measured
+_SEARCH_MM = 0.3  # search range around the edge that the frame's size predicts
+_SHARE_PX, _FEWEST = 8.0, 5  # length of edge per profile; fewest profiles of a section
+_STRAINED = 1 / 3  # fraction of a mark's standard deviation: a larger strain error raises it by more than a twentieth
+_TONE_ROUNDS = 5  # largest number of refits with an improved tone curve
+_OTHER_STARTS, _AGREED = (2.2, 1.0), 0.1  # gammas of further initial curves; disagreement up to which none is tried
+_TELLING = 8  # most significant marks used to estimate the sharpening after the first round: more cost time
+_SHARPENING_ROUNDS = 6  # largest number of refits with an improved sharpening
+_MOVED = 0.3  # fraction of a mark's standard deviation: smaller shifts by a better curve are ignored
 _UNCHECKED = 3  # marks, which an affine transformation fits without residuals
-_REFIT_PX = 1.5  # about a mark that was fitted already
+_REFIT_PX = 1.5  # search range around a mark that was fitted already
 
 
 def refit_frame(frame: Frame) -> Frame:
-    """Fit the marks of a frame once more with all that the frame says of them, and compare them with one another.
+    """Refit the marks of a frame with parameters estimated from all of them, and compare them with one another.
 
-    Marks whose own pictures do not tell rotation and scale get the frame's; marks that the frame's stretch and shear
-    move get these, which no single fit tells; what the tone curve moves is fitted by the curve that the marks tell;
-    marks that hardly tell their own blur get that of the others.
+    Marks whose image does not determine rotation and scale take those of the frame. Marks displaced by stretch and
+    shear, which no single fit determines, take these too. Marks displaced by the tone curve are refitted with the curve
+    estimated from all marks. Marks whose blur is poorly determined take that of the others.
     """
     if frame.inliers.sum() >= 2:
         frame = _refit_with_tone(frame)
@@ -68,8 +68,10 @@ def refit_frame(frame: Frame) -> Frame:
 
 
 def sharpen_frame(frame: Frame) -> Frame:
-    """The frame with its clear marks fitted in what the scan was before it was sharpened, as they say by how much; the
-    same where they do not say that it was."""
+    """Estimate the sharpening of the scan from the clear marks, and refit them in the scan without it.
+
+    Returns the frame unchanged where no sharpening is found.
+    """
     if not frame.agrees:
         return frame
     plainest, begun = sorted(clear_fits(frame).items(), key=lambda item: -item[1].significance), frame
@@ -90,8 +92,11 @@ def sharpen_frame(frame: Frame) -> Frame:
 
 
 def _refit_with_tone(frame: Frame) -> Frame:
-    """Far from the right curve noise is not even, and may hide it: where what the marks say does not agree, other
-    curves are begun with, too."""
+    """Refit the marks with the tone curve estimated from them.
+
+    Far from the right curve the noise depends on the grey value, and may hide that curve: where the marks disagree,
+    further initial curves are tried.
+    """
     prior = frame.scan.tone.prior
     best = _refit_from_curve(frame, prior, frame.scan.tone)
     for power in _OTHER_STARTS if best.tone.disagreement > _AGREED and _depends_on_tone(best) else ():
@@ -101,7 +106,8 @@ def _refit_with_tone(frame: Frame) -> Frame:
 
 
 def _refit_from_curve(frame: Frame, prior: Tone, start: Tone) -> Frame:
-    """From where the marks were found, beginning with a tone curve; prior: the one before this frame."""
+    """Refit the marks at their measured places, alternating with the tone curve. prior: curve known before this frame;
+    start: initial curve."""
     if start is frame.scan.tone:
         pending = {index for index, fit in clear_fits(frame).items() if _needs_frame(frame, index, fit)}
     else:
@@ -120,8 +126,8 @@ def _refit_from_curve(frame: Frame, prior: Tone, start: Tone) -> Frame:
 
 
 def _needs_frame(frame: Frame, index: int, fit: MarkFit) -> bool:
-    """Whether a fit changes with the frame's rotation and scale, or with its stretch and shear: on film that is more
-    than affinely deformed, or seen through a lens, every one does, for there marks look otherwise at each place."""
+    """Whether a fit depends on the rotation and scale, or the stretch and shear, of the frame. With a film model beyond
+    affine, or a taking lens, every fit does: the shape of a mark then varies with its place."""
     if frame.film is not None or frame.options.lens is not None:
         return True
     mark, linear = frame.layout.marks[index].mark, frame.linear(index)
@@ -130,22 +136,23 @@ def _needs_frame(frame: Frame, index: int, fit: MarkFit) -> bool:
 
 
 def _moved_by_tone(frame: Frame, estimate: FrameTone) -> set[int]:
-    """The marks that tell something of the curve, if the estimated one moves any of them."""
+    """Indices of all marks with information on the tone curve, if the estimated curve displaces any of them; otherwise
+    none."""
     fits, tones = clear_fits(frame), _mark_tones(frame)
     moves = (estimate.shift_px(tone, frame.scan.tone) > _MOVED * fits[index].sigma_px for index, tone in tones.items())
     return set(tones) if any(moves) else set()
 
 
 def _edges(frame: Frame) -> Sequence[ToneInformation]:
-    """Of the curve by the frame's edges beside the marks, where one of these depends on it. What lossy compression
-    rounds away is alike all along an edge, and looks like a curve."""
+    """Information on the tone curve from the edges of the frame next to the marks; none where no mark depends on the
+    curve. Lossy scans are excluded: their quantisation is alike all along an edge, and resembles a tone curve."""
     if frame.scan.is_lossy or not _depends_on_tone(frame):
         return []
     return edge_tone_information(frame.scan, frame.layout, frame.fitted_placement, frame.weights)
 
 
 def _depends_on_tone(frame: Frame) -> bool:
-    """Whether what is not known of any curve moves a mark by more than its standard deviation."""
+    """Whether the prior uncertainty of a tone curve displaces any mark by more than its standard deviation."""
     fits = clear_fits(frame)
     return any(tone.sensitivity_px > fits[index].sigma_px for index, tone in _mark_tones(frame).items())
 
@@ -155,7 +162,7 @@ def _mark_tones(frame: Frame) -> dict[int, MarkTone]:
 
 
 def _add_tone_covariance(frame: Frame) -> Frame:
-    """What is not known of tone curve and sharpening, in the covariance of each mark that it moves."""
+    """Add the uncertainty of tone curve and sharpening to the covariance of each mark."""
     for index, detection in enumerate(frame.detections):
         if detection.fit is not None and detection.fit.tone is not None:
             frame = frame.add_covariance(index, Cause.TONE, frame.tone.covariance_px2(detection.fit.tone))
@@ -166,7 +173,8 @@ def _add_tone_covariance(frame: Frame) -> Frame:
 
 
 def _add_lens_covariance(frame: Frame) -> Frame:
-    """What is not known of the taking lens and the film model does not take, in the covariance of each mark."""
+    """Add to each mark the uncertainty of the taking lens, projected on the complement of the affine transformation and
+    the film model."""
     fits, lens = _inlier_fits(frame), frame.options.lens
     if lens is None or not fits:
         return frame
@@ -183,8 +191,10 @@ def _add_lens_covariance(frame: Frame) -> Frame:
 
 
 def _refit_with_blur(frame: Frame) -> Frame:
-    """Fit marks that hardly tell their own blur once more with that of the others, and faint marks, whose places are a
-    filter's, too; what differs from the others' blur is doubted."""
+    """Refit marks with a poorly determined blur, using the blur of the others as an observation.
+
+    Faint marks, located so far by a filter, are refitted too. Marks whose blur differs from the others' become weak.
+    """
     drawn = {index: fit for index, fit in _inlier_fits(frame).items() if _is_drawn(frame, index)}
     faint = {index: fit for index, fit in drawn.items() if fit.covariance is None}
     fits = {index: fit for index, fit in drawn.items() if index not in faint and frame.is_clear(index)} | faint
@@ -210,8 +220,8 @@ def _set_blur(options: MatchOptions, blur: SharedBlur) -> MatchOptions:
 
 
 def _is_better(before: MarkFit, fit: MarkFit, blur: SharedBlur | None) -> bool:
-    """Whether a fit of a faint mark counts: where it means the same mark, of the others' blur, and is the better known.
-    A faint mark takes all that is finer than the mark for texture: in plain noise a fit knows its place far better."""
+    """Whether the fit of a faint mark replaces its filtered place: same mark, blur of the others, smaller standard
+    deviation. The filter counts everything finer than the mark as texture: in white noise a fit is far more precise."""
     if blur is not None and not blur.is_confirmed(fit):
         return False
     off = fit.center_px - before.center_px
@@ -219,10 +229,11 @@ def _is_better(before: MarkFit, fit: MarkFit, blur: SharedBlur | None) -> bool:
 
 
 def _compare_shapes(frame: Frame) -> Frame:
-    """Doubt marks of another size, or turn, than the others: something, dust say, covers or touches one.
+    """Mark fits with an outlying size or rotation as weak: something, dust for example, covers or touches the mark.
 
-    Marks that tell their own size are compared with those drawn alike; those held by the frame all together, by what
-    their own pictures say of its rotation and scale. A mark is known no better than what may touch it moves it.
+    Marks whose size is estimated are compared with those of the same drawing. Marks fitted with the frame's rotation
+    and scale are compared all together, by the rotation and scale that their own images show. The covariance of each
+    mark grows by the displacement that an object touching it may cause.
     """
     fits = {index: fit for index, fit in clear_fits(frame).items() if fit.covariance is not None}
     groups: dict[Mark | None, list[int]] = defaultdict(list)
@@ -242,14 +253,15 @@ def _compare_shapes(frame: Frame) -> Frame:
 
 
 def _shape_figures(fit: MarkFit, linear: Array, is_held: bool) -> tuple[Array, Array]:
-    """The logarithm of a mark's size over the frame's, and its turn where the frame held it; standard deviations."""
+    """Log ratio of a mark's size to the frame's, and its rotation (rad) if the frame gave it; standard deviations."""
     if is_held and fit.own_shape is not None:
         return fit.own_shape.change, fit.own_shape.sigma
     return np.array([np.log(linear_scale(fit.pixel_from_mark) / linear_scale(linear))]), np.array([fit.size_sigma])
 
 
 def _doubt_shape(frame: Frame, index: int, fit: MarkFit, shape: SharedShape, sigma: Array) -> Frame:
-    """sigma (k,): standard deviations of the mark's own figures."""
+    """Store the shape of a mark relative to the others; flag an outlier and add the covariance of a touching object.
+    sigma (k,): standard deviations of the mark's own figures."""
     mark, is_damaged, touch = frame.layout.marks[index].mark, fit.damaged_fraction > 0, None
     figures = dict(
         zip(("size_ratio", "turn_rad"), (float(np.exp(shape.off[0])), *shape.off[1:].tolist()), strict=False)
@@ -280,13 +292,13 @@ def _doubt_shape(frame: Frame, index: int, fit: MarkFit, shape: SharedShape, sig
 
 
 def _radius_mm(mark: Mark) -> float:
-    """Of a round mark's outline."""
+    """Radius of the outline of a round mark."""
     parts = mark.parts if isinstance(mark, MarkShape) else ()
     return max(part.radius_mm for part in parts if isinstance(part, Disk | Ring))
 
 
 def _is_drawn(frame: Frame, index: int) -> bool:
-    """Whether a mark is a drawing: a template has a blur of its own."""
+    """Whether a mark is given as a drawing; a template brings its own blur."""
     return isinstance(frame.layout.marks[index].mark, MarkShape)
 
 
@@ -295,14 +307,14 @@ def _inlier_fits(frame: Frame) -> dict[int, MarkFit]:
 
 
 def clear_fits(frame: Frame) -> dict[int, MarkFit]:
-    """The fits of the inliers that are plainly there, by index."""
+    """Fits of the inliers with a likeness of at least `CLEAR_LIKENESS`, by index."""
     return {index: fit for index, fit in _inlier_fits(frame).items() if fit.likeness >= CLEAR_LIKENESS}
 
 
 def _linear_sigma(frame: Frame) -> float:
-    """The standard deviation of rotation (rad), scale, stretch and shear at a mark: of the frame by its marks, and by
-    as much as film bends between them. Three marks show no gross error: a mark under a wrong name, or off its place,
-    makes stretch and shear of its own, so that what they show of these counts as unknown."""
+    """Standard deviation of rotation (rad), scale, stretch and shear at a mark: of the frame's parameters, and of the
+    film's bending between marks. Three marks reveal no gross error: a wrong name or place appears as stretch and shear,
+    so their estimate of these is added as uncertainty."""
     places = frame.camera_mm[frame.inliers]
     radius_mm = float(np.hypot(*(places - places.mean(axis=0)).T).mean())
     bend = float(np.hypot(frame.options.film_sigma_mm, frame.scatter_mm)) / radius_mm
@@ -314,8 +326,8 @@ def _linear_sigma(frame: Frame) -> float:
 
 
 def _refit(frame: Frame, options: Mapping[int, MatchOptions], orient: bool = True) -> Frame:
-    """Fit marks, by index, where they were found. What does not look like the mark any longer, a line along which it
-    slid, is no better than what did."""
+    """Refit marks at their measured places, with options by index. A clear mark keeps its previous fit if the new one
+    is not clear, for example because it slid along a line."""
     fits = {index: _fit_again(frame, index, each) for index, each in sorted(options.items())}
     kept = {
         index: fit
@@ -327,7 +339,7 @@ def _refit(frame: Frame, options: Mapping[int, MatchOptions], orient: bool = Tru
 
 
 def _fit_again(frame: Frame, index: int, options: MatchOptions) -> MarkFit | None:
-    """A mark where it was found, with the frame's rotation and scale where it is held by them."""
+    """Refit a mark at its measured place, with the frame's rotation and scale if it is held by them."""
     before = frame.detections[index].fit
     if before is None:
         return None
@@ -335,14 +347,14 @@ def _fit_again(frame: Frame, index: int, options: MatchOptions) -> MarkFit | Non
     return detect_mark(frame.scan, expected, options, _linear_sigma(frame)).fit
 
 
-# Tips of wedges, wings and notches are short, and their own edges tell the tone curve badly. The edge of the exposed
-# frame beside them is a long one, between the same dark and the same light.
+# The edges of wedges, wings and notches are short, and determine the tone curve poorly. The edge of the exposed frame
+# next to them is long, and separates the same dark and light grey values.
 
 
 def edge_tone_information(
     scan: Scan, layout: FiducialLayout, placement: Placement, weights: Sequence[float] | None
 ) -> list[ToneInformation]:
-    """None or one, of all pieces of the frame's edge that are seen as straight lines."""
+    """Pool the information on the tone curve of all straight sections of the frame's edge: a list of at most one."""
     px_per_mm = linear_scale(placement.pixel_from_camera)
     tones = []
     pieces = list(_pieces(layout))
@@ -367,8 +379,8 @@ def edge_tone_information(
 
 
 def _pieces(layout: FiducialLayout) -> Iterator[tuple[Array, Array, Array, float]]:
-    """Of the frame's edge on both sides of each mark near it, in mm: where it begins, which way it runs, which way the
-    frame's inside lies, and its length."""
+    """Sections of the frame's edge on both sides of each mark near it: start (mm), unit vectors along the edge and
+    towards the inside of the frame, length (mm)."""
     half = np.array(layout.frame_mm) / 2
     for mark in layout.marks:
         at = np.array(mark.xy_mm)
@@ -380,7 +392,7 @@ def _pieces(layout: FiducialLayout) -> Iterator[tuple[Array, Array, Array, float
         on_edge = np.where(np.arange(2) == side, np.sign(at) * half, at)
         reach = _reach_mm(mark, 1 - side) + _BESIDE_MM
         for way in (1.0, -1.0):
-            room = half[1 - side] - way * at[1 - side]  # to the corner
+            room = half[1 - side] - way * at[1 - side]  # distance to the corner
             neighbours = [
                 way * (np.array(other.xy_mm) - at)[1 - side] for other in _same_side_marks(layout, mark, side)
             ]
@@ -389,16 +401,12 @@ def _pieces(layout: FiducialLayout) -> Iterator[tuple[Array, Array, Array, float
 
 
 def _same_side_marks(layout: FiducialLayout, mark: LayoutMark, side: int) -> list[LayoutMark]:
-    """The other marks near the same edge."""
+    """Other marks near the same edge."""
     half, sign = layout.frame_mm[side] / 2, np.sign(mark.xy_mm[side])
     return [one for one in layout.marks if one is not mark and half - sign * one.xy_mm[side] < 2 * _NEAR_MM]
 
 
 def _reach_mm(mark: LayoutMark, axis: int) -> float:
-    """How far a mark reaches from its place along an axis."""
+    """Largest extent of a mark from its place along an axis."""
     least, greatest = extent_px(mark.mark, np.eye(2, 3))
     return float(max(-least[axis], greatest[axis]))
-
-
-# The marks of a frame fitted once more with what the frame says of them: rotation, scale and strain, tone curve, blur;
-# and those doubted that look unlike the others.

@@ -1,9 +1,9 @@
-"""Which of the eight poses a frame has: decided by what breaks its symmetry, or said to be undecided.
+"""Scan orientation of a frame, one of eight: decided by features that break its symmetry, or reported as undecided.
 
-Every pose gives the marks found other names. Under the right one their pictures fit (identification dots, unlike
-marks), their coordinates fit (asymmetries larger than their standard deviations), and what is written beside the frame
-reads as it should, where the camera has it. All are summed as log-likelihoods; a pose is decided only where it beats
-every other by odds of a thousand to one. Of poses that nothing tells apart an unmirrored one is the likelier.
+Each orientation assigns other names to the marks found. Under the right one, their images fit (identification dots,
+different marks), their coordinates fit (asymmetries larger than their standard deviations), and the writing beside the
+frame has the direction and place known from the camera. The log-likelihoods are summed. An orientation is decided only
+if its odds against every other are a thousand to one. Among equal ones an unmirrored orientation has the higher prior.
 """
 
 from collections.abc import Sequence
@@ -26,18 +26,27 @@ from measure.scans.parallel import map_in_threads
 from measure.scans.scan import Scan
 
 DECIDED = 7.0  # log-odds: a thousand to one
-TOLD = 1.0  # log-odds: less than e to one is no evidence worth a sentence
-_NAMED = 4.0  # times the gate: how far from where a pose's placement puts a mark it still has its name
-_UNMIRRORED = 2.3  # log-odds before anything is seen: ten to one; of 16 scans of archives none was mirrored
-_QUOTED = 3  # lines of writing that are told
-_FREE_MM = 1e3  # the standard deviation of a place that is not given
+TOLD = 1.0  # log-odds: weaker evidence, below e to one, is not reported
+_NAMED = 4.0  # in gates: largest distance of a mark from its predicted place for which it gets the name
+_UNMIRRORED = 2.3  # prior log-odds of an unmirrored scan: ten to one; of 16 scans of archives none was mirrored
+_QUOTED = 3  # lines of writing that are quoted
+_FREE_MM = 1e3  # standard deviation of a place that is not given
 
 
 @dataclass(frozen=True, eq=False)
 class _Verdict:
-    """One pose's log-likelihoods, of the pictures (sites,), of the coordinates and of the writing; names: of each
-    site's mark, -1 for none; chi_square: of the coordinates; by_chance: likelihood of all pictures if what they differ
-    in does not belong to the marks."""
+    """Log-likelihoods of one scan orientation.
+
+    Attributes
+    ----------
+    pose : scan orientation.
+    names : index of the mark at each site, -1 for none.
+    pictures : (sites,) log-likelihoods of the images.
+    coordinates : log-likelihood of the coordinates.
+    chi_square : chi-square of the coordinates.
+    by_chance : log-likelihood of all images if their differences do not belong to the marks.
+    writing : log-likelihood of the writing.
+    """
 
     pose: str
     names: tuple[int, ...]
@@ -53,12 +62,12 @@ class _Verdict:
 
     @property
     def likelihood(self) -> float:
-        """Of all that is observed."""
+        """Log-likelihood of all observations."""
         return self.pictures_total + self.coordinates + self.writing
 
     @property
     def total(self) -> float:
-        """And what was to be expected before, which tells what is assumed, and never decides."""
+        """Log-likelihood plus the prior. Selects the assumed orientation, but never decides one."""
         return self.likelihood + (0.0 if self.pose.endswith("m") else _UNMIRRORED)
 
 
@@ -70,8 +79,15 @@ def decide_pose(
     options: FiducialOptions,
     lines: Sequence[Line] = (),
 ) -> Pose:
-    """The pose, from a placement for each (at the place of the frame that was measured in one of them). lines: what is
-    written about the frame, as far as it was read."""
+    """Decide the scan orientation of a measured frame.
+
+    Parameters
+    ----------
+    scan, layout, options : scan, marks of the camera, and options.
+    placements : one for each orientation, all at the place of the measured frame.
+    frame : frame measured in one of the orientations.
+    lines : writing around the frame, as far as it was read.
+    """
     fits = [fit for fit in frame.fits if fit is not None]
     missed = frame.missed_px
     named = [
@@ -86,7 +102,7 @@ def decide_pose(
     drawings = Drawings([mark.mark for mark in layout.marks], scan_from_up, blur_px)
     reach_px = frame.first_search_px
     sites = [MarkSite(scan, fit, fit.center_px, frame.weights, drawings, reach_px) for fit in fits]
-    # Where no mark was found the others tell what one looks like: under another pose there may be one after all.
+    # Sites without a mark take contrast and noise from a typical one: another orientation may predict a mark there.
     usual = sorted(fits, key=lambda fit: abs(fit.contrast_dn))[len(fits) // 2]
     sites += [MarkSite(scan, usual, place, frame.weights, drawings, reach_px) for place in missed]
 
@@ -104,21 +120,20 @@ def decide_pose(
 
 
 def _is_bare_chip(mark: Mark) -> bool:
-    """Whether it is cut from one scan alone: then nobody knows what in it is the mark, and what a landscape or a stamp
-    beside it."""
+    """Whether a mark is a chip cut from a single scan: its mark cannot be separated from background or writing."""
     return isinstance(mark, MarkTemplate) and mark.steadiness is None
 
 
 def _chance_likelihood(pictures: Array) -> float:
-    """The log-likelihood of pictures (sites, poses) in which something else than the marks looks most like one pose or
-    another, like each as often: then as many sites agree on a pose as chance lets."""
+    """Log-likelihood of the images (sites, poses) under the null hypothesis that each of them favours an orientation
+    at random, all with equal probability."""
     return float((np.logaddexp.reduce(pictures, axis=1) - np.log(pictures.shape[1])).sum())
 
 
 @dataclass(frozen=True, eq=False)
 class _Named:
-    """The places of marks, found or missed, by the names that a pose gives them (-1: none), and the frame through those
-    found, if there are two."""
+    """Names that an orientation assigns to the places of found and missed marks (-1: none), and the fit of the frame to
+    the found ones, if there are two."""
 
     pose: str
     names: tuple[int, ...]
@@ -133,7 +148,8 @@ class _Named:
         missed: Sequence[Array],
         options: FiducialOptions,
     ) -> "_Named | None":
-        """None where the pose names fewer than two of the marks found, having two, or gives two the same name."""
+        """Name each place after the nearest predicted mark, and fit the frame. Returns None if a name is assigned
+        twice, or fewer than two of two or more marks found are named."""
         pitch, camera = np.asarray(placement.pitch_mm), np.array([mark.xy_mm for mark in layout.marks])
         predicted = placement.places_px(camera)
         centers = np.array([*(fit.center_px for fit in fits), *missed])
@@ -161,7 +177,8 @@ class _Named:
         return PosedMark(None if name < 0 else layout.marks[name].mark, up_from_camera(self.pose))
 
     def verdict(self, pictures: Array, by_chance: float) -> _Verdict:
-        """The coordinates' likelihood is Student's: nobody knows the film's standard deviation well."""
+        """Log-likelihoods of this orientation. The coordinates follow Student's t distribution, since the scatter of
+        the film is known with few degrees of freedom."""
         if self.fit is None:
             return _Verdict(self.pose, self.names, pictures, 0.0, 0.0, by_chance)
         degrees = SCATTER_DEGREES + max(self.fit.redundancy, 0)
@@ -170,14 +187,17 @@ class _Named:
 
 
 def _given_sigma_mm(mark: LayoutMark) -> float:
-    """What was found under one name has that learned mark's origin; under another one it would lie elsewhere."""
+    """Standard deviation of a given place, including that of a learned mark's origin: it differs from name to name."""
     origin_mm = LEARNED_ORIGIN * mark.mark.learned_mm if isinstance(mark.mark, MarkTemplate) else 0.0
     return float(np.hypot(min(max(mark.sigma_mm), _FREE_MM), origin_mm))
 
 
 def _decision(verdicts: Sequence[_Verdict], layout: FiducialLayout, found: int, lines: Sequence[Line] = ()) -> Pose:
-    """The likeliest pose, and what speaks for it; of those that are as likely the one in which most of the writing is
-    upright, so that a roll's frames are named alike. found: marks, beside which the places of missed ones count too."""
+    """Select the most likely orientation, with the evidence in sentences.
+
+    Among equally likely ones, the orientation in which most of the writing is upright is assumed, so that the frames of
+    a roll are named consistently. found: number of marks found; the verdicts also use the places of missed ones.
+    """
     if not verdicts:
         return Pose("0", False, ("no pose names the marks that were found.",))
     best_likelihood = max(verdict.likelihood for verdict in verdicts)
@@ -214,7 +234,7 @@ def _decision(verdicts: Sequence[_Verdict], layout: FiducialLayout, found: int, 
 
 
 def _against(best: _Verdict, rival: _Verdict, layout: FiducialLayout, lines: Sequence[Line]) -> tuple[str, ...]:
-    """What speaks for the best pose against the likeliest of those that it rules out, a sentence each."""
+    """Sentences with the evidence for the best orientation against the most likely rejected one."""
     sentences = []
     by_site, lead = best.pictures - rival.pictures, best.pictures_total - rival.pictures_total
     if lead > TOLD:
@@ -237,7 +257,7 @@ def _against(best: _Verdict, rival: _Verdict, layout: FiducialLayout, lines: Seq
 
 
 def _writing_sentence(best: _Verdict, rival: _Verdict, layout: FiducialLayout, lines: Sequence[Line]) -> str:
-    """What the writing says of two poses, and the lines that say most of it."""
+    """Sentence with the evidence of the writing on two orientations, quoting the most significant lines."""
     lead = best.writing - rival.writing
     by_line = [
         (line_score(line, layout.writing, best.pose) - line_score(line, layout.writing, rival.pose)) * np.sign(lead)
@@ -250,7 +270,7 @@ def _writing_sentence(best: _Verdict, rival: _Verdict, layout: FiducialLayout, l
 
 
 def _difference(one: int, other: int, layout: FiducialLayout) -> str:
-    """What two marks of the camera are told apart by."""
+    """Feature that distinguishes two marks of the camera."""
     if one < 0 or other < 0:
         return "marks where the other pose has none"
     (core, dots), (other_core, other_dots) = (_figure(layout.marks[index].mark) for index in (one, other))
@@ -260,7 +280,7 @@ def _difference(one: int, other: int, layout: FiducialLayout) -> str:
 
 
 def _figure(mark: Mark) -> tuple[object, int]:
-    """A mark's figure, whichever way it is turned, and how many dots stand beside it."""
+    """Figure of a mark irrespective of its rotation, and number of its identification dots."""
     if not isinstance(mark, MarkShape):
         return mark, 0
     dots = [part for part in mark.parts if isinstance(part, Disk) and part.center_mm != (0.0, 0.0)]
