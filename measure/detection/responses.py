@@ -189,7 +189,7 @@ class ScanMaps(Mapping[Key, Map]):
 
 
 class Dilation:
-    """Correlation map dilated by a disk of a radius and area_px. background: its 95th percentile, at least 0."""
+    """Correlation map dilated by a disk. area_px: of the disk; background: 95th percentile of the map, at least 0."""
 
     def __init__(self, map_: Map, origin: NDArray[np.int_], radius_px: float) -> None:
         size = 2 * round(radius_px) + 1

@@ -160,7 +160,7 @@ def second_order(design: Array, slopes: Array, used: Mask, covariance: Array, pr
     normal, shared = products(used_design, used_design), products(used_design, changes)
     inverse: Array = np.asarray(np.linalg.inv(normal + np.diag(priors_dn2)), float)
     taken_up = np.asarray(inverse @ shared, float)
-    by_unknown = np.trace(taken_up[:2].reshape(2, 2, moving))  # first-order term of the variance's logarithm
+    by_unknown = np.trace(taken_up[:2].reshape(2, 2, moving))  # minus the derivatives of the variance's logarithm
     both = taken_up.T @ shared
     left = products(changes, changes) - both - both.T + taken_up.T @ normal @ taken_up
     turning = np.einsum("jl,ijml->im", among, left.reshape(2, moving, 2, moving))
@@ -349,7 +349,7 @@ def own_shape(fit: LinearFit, shape: slice, strain: slice, departures: Array) ->
     resolution = products(fit.by_grey, fit.design)
     if np.diag(resolution)[shape].min() > _OWN:
         return None
-    let_go = resolution.copy()  # resolution matrix without the priors of all other unknowns
+    let_go = resolution.copy()  # its inverse removes the priors, except those of the strain
     let_go[:, strain] = np.eye(len(resolution))[:, strain]
     try:
         freed = np.asarray(np.linalg.inv(let_go), float)[shape]

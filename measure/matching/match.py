@@ -170,7 +170,7 @@ def _mark_fit(fit: PictureFit, window: ScanWindow, grey: Array) -> MarkFit:
         pixel_from_mark=place,
         contrast_dn=model.contrast_dn,
         stored_contrast_dn=stored(ground_dn, model.contrast_dn),
-        # The blur of the scan; for a chip only its excess over the chip's own smoothing.
+        # The blur of the scan; for a chip, only the blur in addition to the chip's own.
         blur_px=float(np.sqrt(max(fit.state.variance_px2 - model.smoothed_px2, 0.0))),
         damaged_fraction=fit.damaged_fraction,
         redundancy=int(used.sum()) - len(model.design),
