@@ -1,4 +1,4 @@
-"""One mark, looked for about a predicted place at full resolution and matched."""
+"""Detection and least-squares matching of one mark around its predicted place, at full resolution."""
 
 from dataclasses import dataclass, replace
 
@@ -18,24 +18,26 @@ from measure.scans.compression import covariance_of_compression, tone_variance
 from measure.scans.scan import Scan
 from measure.tone.curve import LINEAR
 
-_DRIFT_PX = 2.0  # of a fit, from the pixel where it begins: what goes farther has found something else, dust say
-_MOST_CONTRAST = (
-    2.0  # times the scanner's range: more than that no light takes, and lines are hardly twice as wide as drawn
-)
+_DRIFT_PX = 2.0  # px that a fit may move beyond the search radius: farther off it has found something else, e.g. dust
+_MOST_CONTRAST = 2.0  # times full scale: more is impossible, and lines are hardly twice as wide as drawn
 _SURE = 3.0  # standard deviations
-_SOLID_MARGIN_PX = 7.0  # of ground: with 6 a sharp dot loses a hundredth and a notch two, and they cost little
-_SOLID_MARGIN_BLURS = 5.0  # the ground and blur of a wide edge are told apart farther off: 4 lose a sixth at 1.6 px
-_DRAWN_SIGMA = 0.04  # of a drawing that is true in part only: its angles (rad) and sizes are as good as film shows them
+_SOLID_MARGIN_PX = 7.0  # px of background: 6 would lose 1 % of the accuracy of a sharp dot and 2 % of a notch's
+_SOLID_MARGIN_BLURS = 5.0  # in blurs: separates background and blur of a wide edge; 4 would lose a sixth at 1.6 px
+_DRAWN_SIGMA = 0.04  # of angles (rad) and relative sizes of a drawing that is exact in part only, as seen on film
 
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """A mark detected where it was predicted, or why it was not.
+    """Result of the detection of one mark.
 
-    predicted_px (2,); fit: None where nothing could be fitted, and reason says why. inside: whether the scan shows the
-    predicted place: it lies in it, and its file gives the pixels. false_alarms: the expected number of places about it
-    that noise makes look as much like the mark. closer: whether it was found at a closer look only, where the other
-    marks put it.
+    Attributes
+    ----------
+    predicted_px : (2,) predicted place.
+    inside : whether the predicted place lies in the scan and its pixels can be read.
+    fit : None if nothing could be fitted.
+    reason : why there is no fit, or why it may be wrong.
+    false_alarms : expected number of places within the search radius at which noise correlates as well.
+    closer : whether the mark was found only with narrow robust surroundings, where the other marks predict it.
     """
 
     predicted_px: Array
@@ -54,8 +56,8 @@ def detect_mark(
     Parameters
     ----------
     expected : the predicted place; without a search radius the mark is fitted at that place.
-    frame_sigma : standard deviation of the predicted rotation (rad), scale, stretch and shear, where a frame fitted to
-        all marks gives them.
+    frame_sigma : standard deviation of the predicted rotation (rad), scale, stretch and shear; None unless they come
+        from a frame fitted to all marks.
     """
     predicted = expected.center_px.copy()
     inside = bool(np.all(predicted >= -0.5) and np.all(predicted < np.array([scan.width_px, scan.height_px]) - 0.5))
@@ -80,25 +82,25 @@ def detect_mark(
 
 
 def not_found(search_px: float) -> Reason:
-    """Why a mark was not found."""
+    """Reason for a mark that was not found."""
     return Reason(f"nothing within {search_px:.0f} px of its place matches its drawing", Code.NOT_FOUND)
 
 
 def _lost(scan: Scan, expected: MarkPrediction) -> Reason:
-    """That the file does not give all pixels of the mark, where it is expected or was fitted; empty where it does."""
+    """Reason if pixels of the mark cannot be read from the file; empty otherwise."""
     why = scan.loss_reason(*mark_window(expected.mark, expected.pixel_from_mark, 0.0))
     return Reason(f"the scan's file is damaged at its place: {why}", Code.DAMAGED_FILE) if why else NO_REASON
 
 
 def _unlike(fit: MarkFit, expected: MarkPrediction, full_scale_dn: float) -> Reason:
-    """Why what was fitted is no such mark; empty where it may be."""
+    """Reason why the fit cannot be that of the mark; empty if it may be."""
     off_px = float(np.hypot(*(fit.center_px - expected.center_px)))
     if off_px > expected.search_px + _DRIFT_PX:
         return Reason(f"what lies there is {off_px:.0f} px from its place", Code.OFF_PLACE)
     contrast = abs(fit.stored_contrast_dn) / full_scale_dn
     if contrast < FAINT:
         return Reason("there is no contrast at its place", Code.CONTRAST)
-    # On ground near black a grey value's own curve makes much of little light, and may be the wrong one.
+    # On a background near black the tone curve enlarges small differences of light, and may be wrong.
     contrast = min(contrast, abs(fit.contrast_dn) / full_scale_dn)
     if contrast * (1 - _SURE / max(fit.significance, _SURE)) > _MOST_CONTRAST:
         return Reason(
@@ -114,8 +116,7 @@ def _unlike(fit: MarkFit, expected: MarkPrediction, full_scale_dn: float) -> Rea
 def _localise_and_fit(
     scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sigma: float | None
 ) -> tuple[MarkFit | None, float]:
-    """The mark matched where it looks most like itself, and the expected number of places that noise makes look so;
-    None where nothing looks like it."""
+    """Match the mark at the highest correlation peak. Returns the fit, None without a peak, and its false alarms."""
     mark = expected.mark
     if isinstance(mark, FrameCorner):
         return fit_frame_corner(
@@ -131,7 +132,7 @@ def _localise_and_fit(
 def _fit_from(
     scan: Scan, expected: MarkPrediction, center_px: Array, options: MatchOptions, frame_sigma: float | None
 ) -> MarkFit:
-    """The mark matched from a place."""
+    """Match the mark from an initial place."""
     mark, start = expected.mark, expected.moved(center_px).pixel_from_mark
     coded = scan.replace_tone(LINEAR) if isinstance(mark, MarkTemplate) else scan  # stored values
     window = read_window(coded, mark_window(mark, start, options.margin_px + BESIDE_PX), expected.weights)
@@ -142,9 +143,12 @@ def _fit_from(
 
 
 def options_for(mark: Mark, options: MatchOptions, frame_sigma: float | None) -> MatchOptions:
-    """A solid mark gets more ground. What a mark's own picture may not tell stays as predicted, or as near it as the
-    frame knows it: rotation and scale where the mark leans on the frame, and stretch and shear where more of it lies
-    to one side."""
+    """Adapt the options of least-squares matching to a mark.
+
+    A solid mark gets a wider margin of background. Parameters that the mark's image may not determine keep their
+    predicted values, or get the standard deviation of the frame as prior: rotation and scale if the mark is held by
+    the frame, stretch and shear if its drawing is one-sided.
+    """
     if _is_solid(mark):
         options = replace(
             options,
@@ -162,19 +166,27 @@ def options_for(mark: Mark, options: MatchOptions, frame_sigma: float | None) ->
 
 
 def _is_solid(mark: Mark) -> bool:
-    """Whether the mark has an outline only and no lines, whose two edges hold it whatever the ground's slope is."""
+    """Whether the mark has an outline only.
+
+    The two edges of a line fix its place whatever the slope of the background is; an outline lacks that.
+    """
     return isinstance(mark, MarkShape) and all(isinstance(part, Polygon | Disk) for part in mark.parts)
 
 
 def is_held_by_frame(mark: Mark) -> bool:
-    """Whether the mark's own picture may not tell its scale from its place, as a wedge's or a notch's edges do not, nor
-    a chip of them: then rotation and scale come from the other marks."""
+    """Whether rotation and scale have to come from the other marks.
+
+    The edges of a wedge or a notch, or a template of them, do not separate scale from place.
+    """
     return isinstance(mark, MarkTemplate) or all(isinstance(part, Polygon) for part in mark.parts)
 
 
 def strain_error_px(mark: Mark, fitted: Array, linear: Array, sigma: float) -> float:
-    """How far about a mark may be off because it was fitted with the stretch and shear of fitted (2, 2) instead of
-    those of linear, of that standard deviation: by as much as they move what of its drawing lies to one side."""
+    """Approximate error of a mark's place from the stretch and shear with which it was fitted.
+
+    It is the shift of the drawing's one-sided part by the difference of stretch and shear between fitted (2, 2) and
+    linear (2, 2), combined with sigma, their standard deviation in linear.
+    """
     change = linear @ np.linalg.inv(fitted) - np.eye(2)
     strain = (change + change.T) / 2 - np.trace(change) / 2 * np.eye(2)
     one_sided = _one_sided_px(mark, linear)
@@ -182,6 +194,6 @@ def strain_error_px(mark: Mark, fitted: Array, linear: Array, sigma: float) -> f
 
 
 def _one_sided_px(mark: Mark, linear: Array) -> Array:
-    """(2,) how much farther a mark's drawing reaches to one side than to the other."""
+    """(2,) difference between the extents of a mark's drawing to either side, in x and y."""
     least, greatest = extent_px(mark, np.column_stack([linear, np.zeros(2)]))
     return least + greatest

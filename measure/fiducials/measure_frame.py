@@ -1,5 +1,8 @@
-"""One frame measured at full resolution from its placement: detect its marks, orient the frame by those that agree,
-detect the others where these put them, refit all of them by what the frame says."""
+"""Measurement of one frame at full resolution, starting from its placement.
+
+The marks are detected, the interior orientation is estimated from the inliers, the other marks are detected where it
+predicts them, and all marks are refitted with the frame's rotation, scale, stretch and shear as priors.
+"""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -20,15 +23,14 @@ from measure.marks.shapes import FiducialLayout
 from measure.scans.parallel import map_in_threads
 from measure.scans.scan import Scan
 
-LEAST_LIKENESS = 0.35  # below it texture, text and scratches look like a mark as well
-_LEAST_SIGNIFICANCE = 4.5  # of the contrast: what texture feigns stays below it
-_FAINT_SIGNIFICANCE = 2.0  # the same where noise hardly makes what is seen: contrast there is, at 95 %
-_ROUNDS = 2  # of detecting faint marks: the first ones tell where the others are
+LEAST_LIKENESS = 0.35  # correlation with the drawing: below it texture, text and scratches are as similar
+_LEAST_SIGNIFICANCE = 4.5  # standard deviations of the contrast: texture alone stays below it
+_FAINT_SIGNIFICANCE = 2.0  # the same where noise hardly gives such a peak: there is contrast, at 95 %
+_ROUNDS = 2  # of detecting faint marks: the first marks found improve the predictions of the others
 
 
 def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
-    """Measure a frame from its placement. Marks that are not clear are detected again in a scan that shows itself to be
-    sharpened."""
+    """Measure a frame from its placement. If the scan proves to be sharpened, unclear marks are detected again."""
     frame = detect_frame(scan, layout, placement, options)
     sharpened = sharpen_frame(frame)
     if sharpened.scan.tone.sharpening and not scan.tone.sharpening:
@@ -37,18 +39,18 @@ def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, opti
 
 
 def detect_frame(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
-    """Measure a frame without the refit: which of its marks are there, and how they look."""
+    """Detect the marks of a frame, clear and faint ones, without the refit."""
     return detect_missing_marks(detect_clear_marks(scan, layout, placement, options))
 
 
 def detect_clear_marks(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
-    """Detect the marks of a frame that are clear where its placement puts them."""
+    """Detect the marks of a frame around the places predicted by its placement, and orient the frame."""
     frame = choose_channels(Frame.from_placement(scan, layout, placement, options))
     return orient_frame(_detect(frame, range(len(layout.marks)), frame.first_search_px))
 
 
 def _detect_unfitted(frame: Frame) -> Frame:
-    """Detect once more the marks that are not clear, or were placed by a filter only; what is no clearer stays."""
+    """Detect unclear marks again, and those placed by a filter only; only clear new detections replace the old ones."""
     fits = [each.fit for each in frame.detections]
     pending = [i for i, fit in enumerate(fits) if not frame.is_clear(i) or (fit and fit.covariance is None)]
     again = _detect(frame, pending, frame.gate_px)
@@ -58,8 +60,8 @@ def _detect_unfitted(frame: Frame) -> Frame:
 def rename_frame(scan: Scan, frame: Frame, pose: str) -> Frame:
     """Name the marks of a frame as in another pose.
 
-    They are fitted where they were found, and the others are detected. The frame is kept as it is where fewer of its
-    marks agree under those names.
+    Marks found are fitted at their places, the others are detected. The frame is kept unchanged if fewer marks agree
+    under the new names.
     """
     placement = frame.fitted_placement.posed(pose, frame.camera_mm)
     found = np.array([fit.center_px for fit in frame.fits if fit])
@@ -77,15 +79,15 @@ def rename_frame(scan: Scan, frame: Frame, pose: str) -> Frame:
 
 
 def detect_missing_marks(frame: Frame) -> Frame:
-    """Detect the marks that are not clear where the others put them."""
+    """Detect the missing and unclear marks around the places predicted from the inliers."""
     if frame.accepted:
         frame = orient_frame(_detect_closer(frame))
     if frame.inliers.sum() >= 2 and not frame.is_certain_of_places:
         if len(frame.detections) > MANY:
-            # Where the frame is hardly known to be there, texture must not feign a mark of it so far off.
+            # If the frame itself is uncertain, the wide radius would turn texture into marks.
             reach_px = frame.near_px if frame.placement.surroundings.robust else frame.gate_px
             frame = detect_faint_marks(frame, reach_px)
-            # So far from its place a mark still has to agree with the others.
+            # With such a search radius no mark is exempt from the outlier test.
             frame = replace(frame, certain=np.zeros_like(frame.certain))
         else:
             frame = _detect_elsewhere(frame)
@@ -97,16 +99,19 @@ def detect_missing_marks(frame: Frame) -> Frame:
 
 
 def _detect(frame: Frame, indices: Iterable[int], search_px: float) -> Frame:
-    """Detect marks anew, within search_px of where they are predicted now."""
-    # From below upwards: the search of windows ended there, and what it read last is still decoded.
+    """Detect marks again within search_px of their current predictions."""
+    # From the bottom upwards: the search in windows ended there, and the rows read last are still decoded.
     upwards = sorted(indices, key=lambda index: -frame.predicted_px[index, 1])
     detections = map_in_threads(lambda index: _detection(frame, frame.prediction(index, search_px)), upwards)
     return frame.replace_detections(dict(zip(upwards, detections, strict=True)))
 
 
 def _detection(frame: Frame, expected: MarkPrediction) -> Detection:
-    """At a closer look a mark may be as faint as what texture feigns, where it seldom does so near by: all marks
-    together decide of the frame."""
+    """Detect one mark; fits that texture could give are dropped.
+
+    With robust local contrast (faint frames), fainter fits are kept if noise seldom gives such a peak nearby: the marks
+    together then decide on the frame.
+    """
     detection = detect_mark(frame.scan, expected, replace(frame.options.match, tells_sharpening=True))
     fit, closer = detection.fit, frame.placement.surroundings.robust
     sure = closer and detection.false_alarms <= FAINT_MARK_BY_NOISE
@@ -117,8 +122,10 @@ def _detection(frame: Frame, expected: MarkPrediction) -> Detection:
 
 
 def _detect_closer(frame: Frame) -> Frame:
-    """Detect marks that are not clear or do not agree at a closer look, where the others put them: beside one may lie
-    dust, or the frame's edge. Only what is plainly there counts."""
+    """Detect marks that are unclear or no inliers again, with the narrow robust surroundings `CLOSE`.
+
+    Dust or the frame's edge may lie beside such a mark. Only clear fits count.
+    """
     changed = {}
     for index in range(len(frame.detections)):
         if frame.is_clear(index) and frame.inliers[index]:
@@ -132,8 +139,10 @@ def _detect_closer(frame: Frame) -> Frame:
 
 
 def _detect_elsewhere(frame: Frame) -> Frame:
-    """Detect marks that are not clear where the others put them, first near by, then as far off as one may lie that
-    keeps the gate: so far only what is plainly there counts."""
+    """Detect unclear marks within the gate of their predictions, then farther off, where only clear fits count.
+
+    The larger radius is the farthest at which a mark, once fitted, still keeps the gate.
+    """
     for index in [index for index in range(len(frame.detections)) if not frame.is_clear(index)]:
         near = _detect(frame, [index], frame.gate_px)
         far_px = _farthest_px(frame, index)
@@ -143,8 +152,11 @@ def _detect_elsewhere(frame: Frame) -> Frame:
 
 
 def _farthest_px(frame: Frame, index: int) -> float:
-    """A mark that is fitted pulls the frame to itself, and the more the fewer the others are: its distance from where
-    they alone put it is its residual times one more than their prediction's variance, a mark's being one."""
+    """Largest distance of a mark from the place predicted by the others at which its residual keeps the gate.
+
+    In the adjustment with the mark itself, the residual is that distance divided by 1 + q, where q is the variance of
+    the prediction from the others in units of a mark's variance.
+    """
     others = np.flatnonzero(frame.inliers & (np.arange(len(frame.inliers)) != index))
     affine = np.column_stack([frame.camera_mm, np.ones(len(frame.camera_mm))])
     if np.linalg.matrix_rank(affine[others]) < affine.shape[1]:

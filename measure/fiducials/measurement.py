@@ -1,4 +1,4 @@
-"""Fiducial marks of one scan: found by their constellation, named by the frame's pose, measured at full resolution."""
+"""Fiducials of one scan: found by their constellation, named by the scan orientation, measured at full resolution."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -35,10 +35,10 @@ _OBLIQUE = Reason(
     '"projective" under [adjust].',
     Code.PERSPECTIVE,
 )
-_BESIDE = 0.95  # of the frame's size: a rival farther off is another photograph
-_AMBIGUOUS = 0.9  # a placement that scores this share of the best one is a rival
-_ROOM = 0.9  # of the frame's sides that are free beside it: less shows no whole frame
-_MOST_MARKS = 0.75  # of the layout's, measured: then it is a frame as this one is
+_BESIDE = 0.95  # fraction of the frame's size: a rival shifted by more is another photograph
+_AMBIGUOUS = 0.9  # fraction of the best score from which another placement is a rival
+_ROOM = 0.9  # fraction of the frame's sides: a free margin narrower than this holds no second frame
+_MOST_MARKS = 0.75  # fraction of the layout's marks that must be measured in a second frame
 _FEWEST_MARKS = 3
 
 
@@ -48,11 +48,20 @@ def measure_fiducials(
     pitch_um: tuple[float, float] | None,
     options: FiducialOptions | None = None,
 ) -> FrameMeasurement:
-    """Measure every mark of the layout in the scan: one row a mark, whatever became of it.
+    """Measure every mark of the layout in the scan.
 
-    pitch_um: of the scan in x and y; None where it is not known: then the frame's size says about what it is.
-    The centres are in the scan's pixels, the centre of the top-left one being (0, 0). Never raises for what the
-    picture shows: statuses, reasons and problems say it.
+    Parameters
+    ----------
+    pitch_um : pixel pitch of the scan in x and y; None if unknown: it is then derived roughly from the frame's size.
+
+    Returns
+    -------
+    FrameMeasurement
+        One row for each mark, found or not. Centres are in pixels; the centre of the top-left pixel is (0, 0).
+
+    Notes
+    -----
+    Never raises because of the image content: statuses, reasons and problems describe what was not found.
     """
     options = options or FiducialOptions()
     layout = limit_to_crossings(limit_to_frame(layout))
@@ -70,7 +79,7 @@ def measure_fiducials(
 
 
 def _refused(frame: FrameMeasurement, why: Reason) -> FrameMeasurement:
-    """The frame, none of its marks an observation."""
+    """Reject all marks of the frame that are observations."""
     marks = (
         replace(mark, status=Status.REJECTED, reason=why) if mark.status.is_observation else mark
         for mark in frame.marks
@@ -81,7 +90,7 @@ def _refused(frame: FrameMeasurement, why: Reason) -> FrameMeasurement:
 def _search_frame(
     scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
 ) -> FrameMeasurement:
-    """The same where nobody shows where the frame is."""
+    """Search for the frame without clicks that give its place, and measure its marks."""
     hypotheses = pitch_hypotheses(scan, layout, pitch_um, options)
     result = find_frame(scan, layout, hypotheses, pitch_um is not None, options)
     search, frame = result.search, result.frame
@@ -110,8 +119,7 @@ def _search_frame(
 
 
 def _rename(search: FrameSearch, frame: Frame, pose: Pose) -> tuple[Frame, Pose]:
-    """The frame with its marks named as in that pose. Where fewer of them agree then, it stays as it is, its pose being
-    no more than assumed."""
+    """Rename the marks to those of a pose. If fewer of them agree then, keep the frame, its pose only assumed."""
     if pose.name == frame.placement.pose:
         return frame, pose
     renamed = rename_frame(search.scan, frame, pose.name)
@@ -124,8 +132,10 @@ def _rename(search: FrameSearch, frame: Frame, pose: Pose) -> tuple[Frame, Pose]
 def _read(
     scan: Scan, layout: FiducialLayout, frame: Frame | None, known_lines: Sequence[KnownLine] = ()
 ) -> tuple[Line, ...] | None:
-    """What is written about the frame, or along the scan's edges; None where nothing is there that reads. Where a known
-    line is read at its place, only what stands about it."""
+    """Read the writing around the frame, or along the scan's edges without one.
+
+    If a known line is read at its place, only its surroundings are read. None: the text networks are not available.
+    """
     nets = networks()
     if nets is None:
         return None
@@ -143,7 +153,7 @@ def _read(
 
 
 def _against_the_set_pose(search: FrameSearch, frame: Frame, lines: Sequence[Line]) -> Reason:
-    """A sentence where what is seen decides for another pose than the one that the project sets."""
+    """Warn if the image decides for another pose than the one set in the project; empty otherwise."""
     likeliest = likeliest_pose(search, frame, lines)
     if likeliest.name == frame.placement.pose or not frame.measured_count:
         return NO_REASON
@@ -161,7 +171,7 @@ def _against_the_set_pose(search: FrameSearch, frame: Frame, lines: Sequence[Lin
 
 
 def _rivals(search: FrameSearch, found: Sequence[Placement], frame: Frame) -> list[Reason]:
-    """Sentences about other placements in the same pose that nearly as many marks speak for, or that show a frame."""
+    """Warn of other placements in the same pose that are nearly as good, or that show another frame."""
     problems, best = [], frame.placement
     for other in found:
         if other.pose != best.pose or other.same_place(best):
@@ -188,7 +198,7 @@ def _rivals(search: FrameSearch, found: Sequence[Placement], frame: Frame) -> li
 
 
 def _is_another_frame(search: FrameSearch, other: Placement, frame: Frame) -> bool:
-    """Whether a placement shows another frame, of as many marks: of two photographs in a scan one may answer better."""
+    """Whether a placement with as many supporting marks is another frame, as in a scan of two photographs."""
     if other.supported < frame.placement.supported or not search.is_exhaustive(other):
         return False
     if search.false_placements(other) > FRAMES_BY_CHANCE:
@@ -198,8 +208,14 @@ def _is_another_frame(search: FrameSearch, other: Placement, frame: Frame) -> bo
 
 
 def second_frame(scan: Scan, layout: FiducialLayout, frame: FrameMeasurement, options: FiducialOptions) -> Reason:
-    """Where a second frame lies in the scan, with what names both; empty where there is no room for a whole one, or
-    where none is found."""
+    """Search the rest of the scan for a second frame.
+
+    Returns
+    -------
+    Reason
+        States the windows that name both frames in images.csv; empty if there is no room for a whole second frame, or
+        none is found.
+    """
     named = any(Code.OTHER_FRAME in problem.codes for problem in frame.problems)
     if frame.pixel_from_camera is None or frame.px_per_mm is None or options.part or named:
         return NO_REASON
@@ -222,20 +238,20 @@ def second_frame(scan: Scan, layout: FiducialLayout, frame: FrameMeasurement, op
 
 
 def _outline(frame: FrameMeasurement, layout: FiducialLayout) -> Array:
-    """(4,) first and last column and row of the rectangle about a frame: col, row, col, row."""
+    """(4,) bounding rectangle of a frame, px: first column, first row, last column, last row."""
     assert frame.pixel_from_camera is not None
     places = _corners_px(frame.pixel_from_camera, layout)
     return np.concatenate([places.min(axis=0), places.max(axis=0)])
 
 
 def _corners_px(pixel_from_camera: Array, layout: FiducialLayout) -> Array:
-    """(4, 2) the corners of a frame, in the order in which they follow one another."""
+    """(4, 2) corners of a frame, in order around it."""
     corners_mm = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.array(layout.frame_mm) / 2
     return np.asarray(corners_mm @ pixel_from_camera[:, :2].T + pixel_from_camera[:, 2])
 
 
 def _rests(scan: Scan, outline: Array) -> list[Window]:
-    """What of the scan lies beside, above and below a frame, where it has room for another one."""
+    """Windows to the left and right of a frame, above and below it, that have room for another one."""
     col0, row0, col1, row1 = (int(value) for value in outline)
     width, height = outline[2:] - outline[:2]
     rests = [
@@ -248,7 +264,7 @@ def _rests(scan: Scan, outline: Array) -> list[Window]:
 
 
 def _words(scan: Scan, outline: Array) -> str:
-    """A window about a frame, as images.csv has it."""
+    """Window around a frame, in the notation of images.csv."""
     low = np.maximum(np.floor(outline[:2]), 0).astype(int)
     high = np.minimum(np.ceil(outline[2:]), (scan.width_px, scan.height_px)).astype(int)
     return f'"{low[0]} {low[1]} {high[0] - low[0]} {high[1] - low[1]}"'
