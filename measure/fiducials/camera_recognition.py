@@ -1,5 +1,8 @@
-"""How a scan answers to the marks of a camera, so that cameras can be told apart: where they answer best at reduced
-size, how often chance makes that, and how the marks look there. The retries of a measurement are no part of it."""
+"""Response of a scan to the marks of a camera, as a criterion for recognising the camera.
+
+It consists of the best placements at reduced resolution, their expected number of false alarms, and the likeness of the
+marks there. The repeated attempts of a measurement are left out.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,25 +23,28 @@ from measure.matching.options import MatchOptions
 from measure.results import MarkFit
 from measure.scans.scan import Scan
 
-_COMPARED = 3  # best placements: the one that chance makes least is among them
+_COMPARED = 3  # best placements: the one with the fewest false alarms is among them
 _QUICK = Effort(cache_bytes=48 << 20, half_px=16, all_orientations=False)
-_AT_LEAST = 3  # marks that are seen of a frame
-_TRIED = 3  # at the best of these
-_PLACES = 2  # that are looked at, each in the poses that answer there
-_QUICK_OPTIONS = FiducialOptions(match=MatchOptions(damage_rounds=1))  # how a mark looks takes less than where it lies
+_AT_LEAST = 3  # marks of a frame that must be detected
+_TRIED = 3  # best placements that are tried
+_PLACES = 2  # distinct places that are tried, each in the poses that respond there
+_QUICK_OPTIONS = FiducialOptions(match=MatchOptions(damage_rounds=1))  # likeness needs less accuracy than the place
 
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """expected: how many constellations that answer as well as the scan's best one chance would find in a scan like it
-    without any frame of this camera, infinite where none answers. placements: best first."""
+    """Response of a scan to a camera's constellation of marks.
+
+    expected: number of constellations as good expected in a similar scan without a frame of this camera, infinite
+    without a placement. placements: best first.
+    """
 
     expected: float
     placements: tuple[Placement, ...]
 
 
 def search_camera(scan: Scan, layout: FiducialLayout, hypotheses: Sequence[PitchHypothesis], tried: int = 0) -> Answer:
-    """How the scan answers to the constellation under hypotheses about its pitch. tried: how many were before."""
+    """Search a scan for the constellation of a camera, under pitch hypotheses. tried: number of earlier hypotheses."""
     search, tried = FrameSearch(scan, layout, FiducialOptions(), effort=_QUICK), tried + len(hypotheses)
     found = search.search_room(hypotheses)[:_COMPARED]
     expected = [tried * search.false_placements(placement) for placement in found]
@@ -46,9 +52,13 @@ def search_camera(scan: Scan, layout: FiducialLayout, hypotheses: Sequence[Pitch
 
 
 def recognise_frame(scan: Scan, layout: FiducialLayout, answered: Answer, times: float = 1.0) -> Frame | None:
-    """The frame as its marks look at the first of the best placements where they agree, at one of two places in any of
-    the poses that answer there, None where they do nowhere. times: how many pixels a side the scan has for one of what
-    answered, a thumbnail of it."""
+    """Detect the frame of a camera in the best placements; None if it is accepted in none.
+
+    Parameters
+    ----------
+    answered : response of a thumbnail of the scan; at most two places are tried, in all poses that respond there.
+    times : pixels of the scan for one pixel of the thumbnail, along a side.
+    """
     places = list[Placement]()
     for placement in answered.placements[:_TRIED]:
         if not any(placement.same_place(other) for other in places):
@@ -65,8 +75,10 @@ def recognise_frame(scan: Scan, layout: FiducialLayout, answered: Answer, times:
 
 
 def _may_be_there(scan: Scan, layout: FiducialLayout, placement: Placement) -> bool:
-    """Whether noise hardly makes three of the marks look like themselves as much as they do. A fit takes ten times as
-    long as to see that."""
+    """Whether the three most significant correlation peaks of the marks are improbable as noise.
+
+    The test is ten times as fast as a fit.
+    """
     frame = Frame.from_placement(scan, layout, placement, _QUICK_OPTIONS)
     peaks = [localise(scan, frame.prediction(index, frame.first_search_px)) for index in range(len(layout.marks))]
     false_alarms = np.sort([1.0 if peak is None else peak[1] for peak in peaks])[:_AT_LEAST]
@@ -74,7 +86,7 @@ def _may_be_there(scan: Scan, layout: FiducialLayout, placement: Placement) -> b
 
 
 def _enlarged(placement: Placement, times: float) -> Placement:
-    """The same in a scan of so many pixels a side for one."""
+    """Convert a placement to a scan with times as many pixels along a side."""
     pixel_from_camera = times * placement.pixel_from_camera
     pixel_from_camera[:, 2] += (times - 1) / 2
     x, y = placement.pitch_mm
@@ -87,8 +99,10 @@ def _enlarged(placement: Placement, times: float) -> Placement:
 
 
 def likeness(frame: Frame) -> float:
-    """The mean, over all marks, of likeness times the share of the mark that is undamaged. What belongs to another
-    mark, the ring about a cross that is drawn without one, counts as damage; a mark that is not found counts 0."""
+    """Mean over all marks of the likeness times the undamaged fraction of the mark; a mark not found counts 0.
+
+    Parts of another mark count as damage, such as a ring around a cross that is drawn without one.
+    """
     return float(np.mean([0.0 if fit is None else _undamaged(fit) for fit in frame.fits]))
 
 

@@ -1,4 +1,4 @@
-"""The faint marks of a frame: detected where the marks that agree put them."""
+"""Detection of the faint marks of a frame, around the places predicted from its inliers."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,22 +16,28 @@ from measure.marks.shapes import FrameCorner, Mark
 from measure.results import MarkFit
 from measure.scans.scan import Scan
 
-_FAINT_CONTRAST = 1 / 250  # of full scale: less is a grey level of eight bits, or what compression made of it
-_FAINT_SIGMA_PX = 0.75  # a mark that is known no better is not measured
-_LEAST_REACH_PX = 3.0  # film bends marks so far off, however well most agree
-_SAME_PX = 1.0  # apart: two places of one mark, each of which is known to better than that
-_REACH = 4.0  # times the scatter of the others, a median: nearly five standard deviations
+_FAINT_CONTRAST = 1 / 250  # fraction of full scale: less is one grey level of 8 bits, or a compression artefact
+_FAINT_SIGMA_PX = 0.75  # px, largest standard deviation of a measured faint mark
+_LEAST_REACH_PX = 3.0  # px: film deformation displaces single marks so far, however well most agree
+_SAME_PX = 1.0  # px between two places of one mark at most; each is more accurate than that
+_REACH = 4.0  # times the median misfit of the inliers: nearly five standard deviations
 _NEAR = 2.0  # times the same: one good mark in sixteen lies farther off
-_EXTREMES = (0.5, 99.5)  # per cent: of the darkest and lightest grey values about all marks, or about one
-_SURROUND = 6.0  # times as far about each as it reaches itself: enough of the scan to tell how dark or light it can be
-_TYPICAL = 8  # marks that agree: these tell how light or dark marks are
-_SHOWS = 1 / 3  # of the others' contrast: ground that leaves less to a mark hides it
+_EXTREMES = (0.5, 99.5)  # percentiles of the grey values taken as darkest and lightest
+_SURROUND = 6.0  # times a mark's own extent: enough of the scan for its darkest and lightest grey values
+_TYPICAL = 8  # inliers from which the usual grey values of marks are taken
+_SHOWS = 1 / 3  # fraction of the usual contrast: a background that leaves less to a mark hides it
 
 
 @dataclass(frozen=True)
 class Ground:
-    """The ground at a mark's place. is_light: whether a mark is sought that is lighter than it; room_dn: by which such
-    a mark could change it, the scan having none lighter or darker; sigma_dn: its own standard deviation."""
+    """Background at a mark's place.
+
+    Attributes
+    ----------
+    is_light : whether the mark is lighter than its background.
+    room_dn : largest contrast that a mark can have there, given the extreme grey values.
+    sigma_dn : standard deviation of the grey values there.
+    """
 
     is_light: bool
     room_dn: float
@@ -39,20 +45,22 @@ class Ground:
 
 
 def detect_faint_marks(frame: Frame, reach_px: float) -> Frame:
-    """Detect every mark once more that is not clear, or does not lie where the others put it: what stands out of its
-    texture there is this mark, the film being deformed where it lies off. A clear one may be a pattern beside it.
+    """Detect again every mark that is not clear or deviates from its predicted place.
+
+    A candidate that stands out from the texture there is taken for the mark; its deviation is film deformation. A clear
+    fit farther off may be a pattern beside the mark.
     """
     near = frame.inliers & (frame.misfit_mm <= _NEAR * max(frame.scatter_mm, frame.options.film_sigma_mm))
     faint = [
         index
         for index, detection in enumerate(frame.detections)
         if detection.inside and not (frame.is_clear(index) and near[index])
-        if not isinstance(frame.layout.marks[index].mark, FrameCorner)  # it has no lines to stand out of texture
+        if not isinstance(frame.layout.marks[index].mark, FrameCorner)  # it has no lines that stand out from texture
     ]
     agreeing = {index: fit for index, fit in enumerate(frame.fits) if fit}
     if not faint or not agreeing:
         return frame
-    # The marks that agree tell both better than a faint mark does itself.
+    # Blur and contrast come from the inliers: a faint mark gives both less accurately.
     blur_px = float(np.median([fit.blur_px for fit in agreeing.values()]))
     usual_dn = float(np.median([abs(fit.stored_contrast_dn) for fit in agreeing.values()]))
     extremes, reached = _extremes_dn(frame), _reached_dn(frame, agreeing)
@@ -70,13 +78,15 @@ def detect_faint_marks(frame: Frame, reach_px: float) -> Frame:
 
 
 def faint_reach_px(frame: Frame) -> float:
-    """How far a faint mark can be from where many others put it."""
+    """Search radius around a place predicted from many other marks."""
     return min(frame.gate_px, max(_REACH * frame.scatter_mm / float(frame.pitch_mm.mean()), _LEAST_REACH_PX))
 
 
 def _extremes_dn(frame: Frame) -> Array:
-    """The darkest and the lightest grey values about the marks: they are spread over the scan, and no more of it has
-    to be read."""
+    """Darkest and lightest grey values around the marks.
+
+    The marks are spread over the scan, so that no more of it has to be read.
+    """
     inside = [index for index, detection in enumerate(frame.detections) if detection.inside]
     expected = [frame.prediction(index, 0.0) for index in inside]
     grey = [_surrounding_grey(frame, each.mark, each.pixel_from_mark, _SURROUND).ravel() for each in expected]
@@ -84,7 +94,7 @@ def _extremes_dn(frame: Frame) -> Array:
 
 
 def _reached_dn(frame: Frame, agreeing: Mapping[int, MarkFit]) -> dict[int, float]:
-    """How light, or dark, the marks that agree are: in a scan without lights they pass its extreme."""
+    """Usual grey value of light (+1) and dark (-1) inliers: it may exceed the extreme of the scan around them."""
     reached: dict[int, list[float]] = {}
     for index, fit in list(agreeing.items())[:_TYPICAL]:
         is_light = fit.contrast_dn > 0
@@ -94,14 +104,14 @@ def _reached_dn(frame: Frame, agreeing: Mapping[int, MarkFit]) -> dict[int, floa
 
 
 def _ground(frame: Frame, expected: MarkPrediction, tones_dn: Sequence[float]) -> Ground:
-    """About a mark's place; tones_dn: grey values that a mark can have."""
+    """Describe the background around a mark's place. tones_dn: grey values that a mark can have."""
     grey = _surrounding_grey(frame, expected.mark, expected.pixel_from_mark)
     room_dn = max(*(expected.polarity * (tone_dn - float(np.median(grey))) for tone_dn in tones_dn), 0.0)
     return Ground(expected.polarity > 0, room_dn, float(grey.std()))
 
 
 def _surrounding_grey(frame: Frame, mark: Mark, pixel_from_mark: Array, times: float = 1.0) -> Array:
-    """The grey values about a mark's place, as far as it reaches or so many times as far."""
+    """Grey values in a mark's bounding rectangle, enlarged by a factor."""
     center = pixel_from_mark[:, 2]
     least, greatest = (center + times * (corner - center) for corner in extent_px(mark, pixel_from_mark))
     low, size = np.floor(least).astype(int), np.ceil(greatest - least).astype(int) + 1
@@ -110,15 +120,18 @@ def _surrounding_grey(frame: Frame, mark: Mark, pixel_from_mark: Array, times: f
 
 
 def _decide(frame: Frame, index: int, mark: FaintMark | None, why_not: Reason) -> tuple[Detection, bool]:
-    """The detection of a mark, and whether it is certain. A clear fit stays where the faint mark is the same one; else
-    the faint mark counts, or that there is none. Texture does not feign it; but where a clear fit lies elsewhere,
-    either may be the mark."""
+    """Choose between the earlier detection of a mark and the faint one. Returns the detection and whether it is
+    certain.
+
+    A clear fit stays if there is no faint mark or it is at the same place; otherwise the faint mark replaces it, since
+    it is significant against the texture. A clear fit elsewhere makes the place ambiguous.
+    """
     before, is_clear = frame.detections[index], frame.is_clear(index)
     if mark is None:
         return before if is_clear else Detection(before.predicted_px, True, None, why_not), False
     away_px = np.inf if before.fit is None else float(np.hypot(*(before.fit.center_px - mark.fit.center_px)))
     if is_clear and away_px <= _SAME_PX:
-        # That the same pixels answer twice proves nothing of a clear mark that agreed with the others anyway.
+        # A second detection from the same pixels is no new evidence for a clear inlier.
         return before, bool(frame.certain[index]) or not frame.inliers[index]
     reason = NO_REASON
     if is_clear:
@@ -127,7 +140,7 @@ def _decide(frame: Frame, index: int, mark: FaintMark | None, why_not: Reason) -
 
 
 def _is_certain(scan: Scan, mark: FaintMark) -> bool:
-    """Whether neither texture nor rounding feigns it."""
+    """Whether the mark is significant against texture and rounding."""
     strong = abs(mark.fit.stored_contrast_dn) >= _FAINT_CONTRAST * scan.full_scale_dn
     return mark.false_alarms <= TEXTURE_LIKE_A_FAINT_MARK and strong
 
@@ -135,11 +148,15 @@ def _is_certain(scan: Scan, mark: FaintMark) -> bool:
 def reason_not_found(
     ground: Ground, usual_dn: float, reach_px: float, mark: FaintMark | None, is_certain: bool
 ) -> Reason:
-    """A sentence, the first that holds: ground as dark as anything in the scan leaves a dark mark no room; too little
-    of it shows to give its place; what answers is no more than rounding; texture hides it.
+    """Give the first reason that holds: no room for contrast, too little of it visible, rounding, or texture.
 
-    usual_dn: by which the other marks change their ground. mark: the strongest answer within reach_px; is_certain:
-    whether it is no false alarm.
+    Parameters
+    ----------
+    ground : background at the mark's place.
+    usual_dn : usual contrast of the other marks.
+    reach_px : search radius.
+    mark : best candidate within it.
+    is_certain : whether that candidate is no false alarm.
     """
     if ground.room_dn < _SHOWS * usual_dn:
         shade = "light" if ground.is_light else "dark"

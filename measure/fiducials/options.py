@@ -1,4 +1,4 @@
-"""What a user may set about the measurement of fiducial marks, and prior knowledge of film and scanner."""
+"""Options of the measurement of fiducials, and priors of film and scanner."""
 
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
@@ -12,37 +12,46 @@ from measure.geometry import POSES
 from measure.marks.shapes import FiducialLayout
 from measure.matching.options import MatchOptions
 
-SCATTER_MM = 0.005  # of a mark, along an axis: a project's film_sigma_um says it better
-AFFINITY_SIGMA = 5e-3  # film stretches by a few parts in ten thousand, an office scanner by several thousandths
-SCATTER_DEGREES = 4.0  # of freedom that it is known with: to a third
-MOST_BENT_MM = 0.3  # beside an affine transformation
-_PERSPECTIVE = 1.5e-5  # mm a mm2 of a frame's span: film photographed from 0.6 m at 5 degrees, less a similarity
+SCATTER_MM = 0.005  # mm, scatter of a mark along an axis by default; a project may state film_sigma_um
+AFFINITY_SIGMA = 5e-3  # relative stretch: a few parts in ten thousand by film, several thousandths by an office scanner
+SCATTER_DEGREES = 4.0  # degrees of freedom of the scatter: it is known to a third
+MOST_BENT_MM = 0.3  # mm, largest deviation from an affine transformation
+_PERSPECTIVE = 1.5e-5  # mm per mm2 of a frame's span: film photographed from 0.6 m at 5 degrees, less a similarity
 Reads = Literal["none", "pose", "all"]
-CLICK_SIGMA_PX = 0.5  # of a place at which a person points, in a picture that is enlarged for it
+CLICK_SIGMA_PX = 0.5  # px, standard deviation of a click in an enlarged image
 
 
 class TakingLens(Protocol):
-    """The lens of a digital camera that photographed the film, as calibrated: between pixels of the scan, which is its
-    picture, and the ideal pixels of a picture without distortion."""
+    """Calibrated lens of a digital camera that photographed the film.
+
+    It converts between pixels of the scan, which is the camera's image, and of the ideal image without distortion.
+    """
 
     def ideal_px(self, scan_px: Array) -> Array:
-        """Pixels (..., 2) of the scan in the ideal picture."""
+        """Convert pixels (..., 2) of the scan to the ideal image."""
 
     def scan_px(self, ideal_px: Array) -> Array:
-        """Pixels (..., 2) of the ideal picture in the scan."""
+        """Convert pixels (..., 2) of the ideal image to the scan."""
 
     def covariance_px2(self, scan_px: Array) -> Array:
-        """(2n, 2n) of ideal pixels, by what is not known of the lens, all of pixels (n, 2) together."""
+        """(2n, 2n) joint covariance of the ideal pixels of scan pixels (n, 2), due to the uncertainty of the lens."""
 
     def crop(self, col: int, row: int) -> "TakingLens":
-        """The lens of a part of the scan that begins at a pixel."""
+        """Return the lens for a crop of the scan that begins at a pixel."""
 
 
 @dataclass(frozen=True)
 class BelievedFilm:
-    """The scatter of marks by film and scanner, along an axis. is_stated: somebody says so, and adds it to every mark
-    where it is adjusted; else a frame that scatters more has to bring all of its scatter along. model: the film
-    deformation model that the project states. lens: of the camera that photographed the film, None of a scanner."""
+    """Prior of the film.
+
+    Attributes
+    ----------
+    sigma_mm : scatter of marks by film and scanner, along an axis.
+    is_stated : whether the project states the scatter; the adjustment then adds it to every mark. Otherwise the
+        covariances of a frame that scatters more must contain all of its scatter.
+    model : film deformation model of the project.
+    lens : of the camera that photographed the film, None for a scanner.
+    """
 
     sigma_mm: float = SCATTER_MM
     is_stated: bool = False
@@ -59,7 +68,7 @@ ANY_FILM = BelievedFilm()
 
 @dataclass(frozen=True)
 class Click:
-    """A mark where a person sees it, in the scan's pixels."""
+    """Place of a mark as clicked by a person, in pixels of the scan."""
 
     point: str
     col_px: float
@@ -68,20 +77,33 @@ class Click:
 
 @dataclass(frozen=True)
 class FiducialOptions:
-    """How fiducial marks are measured.
+    """Options of the measurement of fiducials.
 
-    pose: "auto", or one of the eight where the user knows it. rotation_deg, scale_tolerance: how far the frame may be
-    turned and scaled against its pose and the pitch. pitch_is_right: whether a given pitch is right to some per cents
-    for sure; else the frame may also fill the scan. misfit_mm, affinity: how far a mark may lie from its given place
-    when it is searched, plus what share of the constellation's span. gate_mm: how far a measured mark may lie from
-    where the others put it. film_sigma_mm: scatter of marks by film and scanner. film_model: of its
-    deformation, as the project states it. match: of the fit at full resolution;
-    a polygon is matched with the rotation and scale of the frame. writing: what is written about the frame is read in
-    "none", where nothing else decides the "pose", or in "all". known_lines: of the same roll; where one of them is read
-    at its place, the pose asks for no more. part: the scan shows a part of its frame, that about the scan's middle: two
-    marks are enough then, for the other parts check them. clicks: where a person sees marks: they are matched from
-    there, and three or more say where the frame is. lens: of the camera that photographed the film, None of a scanner.
-    Raises ValueError, naming the option, for a value that is none.
+    Attributes
+    ----------
+    pose : "auto", or one of the eight scan orientations if the user knows it.
+    rotation_deg : largest rotation of the frame against its pose.
+    scale_tolerance : largest relative error of the scale against the pitch.
+    pitch_is_right : whether a given pitch is certain to some per cent; otherwise pitches at which the frame fills the
+        scan are tried too.
+    misfit_mm : largest deviation of a mark from its given place in the search,
+    affinity : plus this fraction of the constellation's span.
+    gate_mm : largest deviation of a measured mark from the place predicted by the others.
+    film_sigma_mm : scatter of marks by film and scanner.
+    film_model : film deformation model of the project.
+    match : options of least-squares matching; a polygon is matched with the rotation and scale of the frame.
+    writing : in which scans the writing around the frame is read: "none", those where nothing else decides the "pose",
+        or "all".
+    known_lines : lines of the same roll; if one is read at its place, no more is read for the pose.
+    part : the scan shows the part of its frame around the scan's centre; two marks then suffice, since the other parts
+        check them.
+    clicks : places clicked by a person, from which the marks are matched; three or more give the place of the frame.
+    lens : of the camera that photographed the film, None for a scanner.
+
+    Raises
+    ------
+    ValueError
+        Names the option whose value is invalid.
     """
 
     pose: str = "auto"
@@ -108,7 +130,7 @@ class FiducialOptions:
                 raise ValueError(f"{name} is {getattr(self, name)}; a positive number is right")
 
     def search_mm(self, layout: FiducialLayout) -> float:
-        """How far from its given place a mark of the layout is searched."""
+        """Largest deviation of a mark of the layout from its given place in the search."""
         places = np.array([mark.xy_mm for mark in layout.marks])
         span_mm = float(np.hypot(*np.ptp(places, axis=0)))
         tilted_mm = _PERSPECTIVE * span_mm**2 if film_terms(self.film_model, places).shape[1] else 0.0

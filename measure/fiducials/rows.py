@@ -1,5 +1,4 @@
-"""What is handed on of a scan's fiducials: a row for each mark, with its status, reason and figures, and the frame's
-problems."""
+"""Results of a scan's fiducials: a row for each mark with status, reason and figures, and the frame's problems."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,7 +13,7 @@ from measure.matching.covariance import honest_covariance
 from measure.results import FrameMeasurement, MarkMeasurement, Pose, SecondPlace
 from measure.scans.scan import Scan
 
-_PLAIN_PX = 3.0  # of the finest line of a mark: it shows its edges and what lies between them
+_PLAIN_PX = 3.0  # px across the finest line of a mark: both edges and the inside are resolved
 _FAINT = Reason("the frame was found only by the search for faint marks", Code.FAINT_FRAME)
 _ASSUMED = Reason(
     "the frame's pose is only assumed, and another of the learned marks would have its origin elsewhere", Code.POSE
@@ -23,7 +22,7 @@ _OWN = Reason("its template is its own picture: nothing checks its place", Code.
 
 
 def lost_frame(scan: Scan, layout: FiducialLayout) -> FrameMeasurement:
-    """Of a scan whose file gives none of its pixels."""
+    """Return the result for a scan none of whose pixels can be read."""
     reason = Reason(f"not found: {scan.damage}", Code.DAMAGED_FILE)
     marks = tuple(MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, reason) for mark in layout.marks)
     return FrameMeasurement(scan.name, marks)
@@ -36,8 +35,14 @@ def absent_frame(
     rotation_deg: float,
     pitch_um: tuple[float, float] | None,
 ) -> FrameMeasurement:
-    """Of a scan in which no frame was found; reason: why, a part of a sentence; rotation_deg: by how much turned it was
-    sought; pitch_um: as given."""
+    """Return the result for a scan in which no frame was found.
+
+    Parameters
+    ----------
+    reason : why, as a clause.
+    rotation_deg : largest rotation of the search.
+    pitch_um : given pixel pitch in x and y, None if unknown.
+    """
     also = "; parts of the scan's file are damaged" if scan.damage else ""
     codes = dict.fromkeys((Code.NO_FRAME, *reason.codes, *([Code.DAMAGED_FILE] if scan.damage else [])))
     why = Reason(f"not found: {reason}{also}", *codes)
@@ -55,7 +60,7 @@ def absent_frame(
 
 
 def _too_coarse(layout: FiducialLayout, pitch_um: float) -> Reason:
-    """A sentence on pixels that are large for the marks' drawings; empty where they are not."""
+    """Warn if the pixels are too large for the marks' finest detail; empty otherwise."""
     finest_um = 1000 * min(finest_detail_mm(mark.mark) for mark in layout.marks)
     if finest_um >= _PLAIN_PX * pitch_um:
         return NO_REASON
@@ -75,10 +80,19 @@ def present_frame(
     problems: Sequence[Reason],
     chance: Reason,
 ) -> FrameMeasurement:
-    """Of a frame that was found. pitch_um: as given; None: pixels are taken as square. problems: why it may lie
-    elsewhere, sentences, beside those that its marks show; chance: why it may be none at all: then none of its marks is
-    certain, nor if it was found at a closer look. Where chance is likelier to have made it than not, it gives no
-    observation."""
+    """Return the result for a frame that was found.
+
+    Parameters
+    ----------
+    pitch_um : given pixel pitch in x and y; None: pixels are taken as square.
+    problems : sentences on why the frame may lie elsewhere, in addition to the problems that its marks show.
+    chance : why the frame may be a false alarm; empty if it is significant.
+
+    Notes
+    -----
+    Measured marks become weak if the frame may be a false alarm, if its names are ambiguous, or if it was found only by
+    the search for faint marks. If the frame is more likely a false alarm than not, no mark is an observation.
+    """
     if Code.NO_FRAME in chance.codes:
         return replace(_predicted_frame(scan, layout, frame, chance), pose=pose, problems=tuple(problems))
     marks = tuple(_row(mark, index, frame, scan.name) for index, mark in enumerate(layout.marks))
@@ -95,7 +109,7 @@ def present_frame(
 
 
 def _predicted_frame(scan: Scan, layout: FiducialLayout, frame: Frame, why: Reason) -> FrameMeasurement:
-    """Of a frame that may well be none: its marks where they would lie."""
+    """Return the predicted places of the marks of a frame that is probably a false alarm."""
     marks = tuple(
         MarkMeasurement(mark.id, "fiducial", place, None, Status.PREDICTED, why)
         if detection.inside
@@ -108,7 +122,7 @@ def _predicted_frame(scan: Scan, layout: FiducialLayout, frame: Frame, why: Reas
 
 
 def _problems(scan: Scan, frame: Frame, pitch_um: tuple[float, float] | None) -> list[Reason]:
-    """What the user should look at in the frame itself."""
+    """Problems of the interior orientation: an implausible stretch, or no redundancy."""
     problems = []
     per_mm = np.hypot(*frame.pixel_from_camera[:, :2].T)
     given = pitch_um or (1.0, 1.0)
@@ -124,7 +138,7 @@ def _problems(scan: Scan, frame: Frame, pitch_um: tuple[float, float] | None) ->
 
 
 def _stretch(scan: Scan, wide_um: float, tall_um: float, pitch_um: tuple[float, float] | None) -> str:
-    """A sentence on pixels that are longer one way than they are given, with who gives them so."""
+    """Sentence on a pixel aspect ratio that differs from the given one, with the likely cause."""
     if pitch_um is None:
         given, cause = "no pitch is given, so that pixels are taken as square", "pixels that are not square"
     elif pitch_um == scan.pitch_um:
@@ -169,15 +183,18 @@ def _row(mark: LayoutMark, index: int, frame: Frame, scan: str) -> MarkMeasureme
 
 
 def _weaken_assumed_name(row: MarkMeasurement, mark: LayoutMark, pose: Pose) -> MarkMeasurement:
-    """A drawn mark is the same place under every name. A learned one's origin is where somebody clicked: at another
-    mark that looks like it, it lies elsewhere, but where the marks' symmetry leaves it the same."""
+    """Make a measured learned mark weak if the pose is only assumed.
+
+    The point of a drawn mark does not depend on its name. The origin of a learned mark is where somebody clicked; at
+    another mark that looks alike it lies elsewhere, unless the symmetry of the marks maps the origins onto each other.
+    """
     if not isinstance(mark.mark, MarkTemplate) or mark.mark.learned_mm == 0 or pose.is_decided_but_for(mark.mark.alike):
         return row
     return replace(row, status=Status.WEAK, reason=_ASSUMED) if row.status is Status.MEASURED else row
 
 
 def _edge_figures(edges: SecondPlace | None) -> dict[str, float]:
-    """How far from the matched place the second method puts the mark, and in standard deviations of that."""
+    """Offset of the second method's place from the matched one, px, and in its standard deviations."""
     if edges is None:
         return {}
     col, row = edges.offset_px

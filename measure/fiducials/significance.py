@@ -1,8 +1,8 @@
-"""Whether a frame that shows only some of its marks may be chance: how often places beside the marks look like marks.
+"""Significance of a frame of which only some marks are found, from the correlation at places beside the marks.
 
-A dot on a rough ground is like many a speck, a ring-cross like nothing else; no threshold holds for both. So the marks
-are sought, in the same way, where they are not, and the share of those places that answer as strongly as the weakest of
-the marks found says what these are worth.
+A dot on a rough background resembles many specks, a cross in a ring nothing else: no single threshold fits both. The
+marks are therefore searched in the same way where they are not. The share of those places that correlate at least as
+strongly as the weakest mark found is the false-alarm rate of one mark.
 """
 
 from collections.abc import Sequence
@@ -17,21 +17,30 @@ from measure.fiducials.search import FrameSearch
 from measure.flags import FRAME_BY_CHANCE, NO_FRAME, NO_REASON, Code, Reason
 from measure.scans.scan import Scan
 
-_SELDOM, _HOPELESS = 1e-3, 1e6  # expected frames: fewer are no question, and of more nothing becomes a frame
-_COUNTED = 3  # marks that at least are no chance
-_PLACES = 64  # that are looked at beside the marks: enough to tell three marks of four from chance
-_OFFSETS = (2.5, 4.5)  # search radii off: beyond what the mark itself answers
-_FREE = 2  # marks that a similarity goes through wherever they lie
-_SURE = 12  # marks that agree: no speck feigns so many
-_FITTED_PX = 3.0  # the fitted place is no farther from the one that answers
-_REDUCED_PX = 1.5  # of the reduced scan: so near to where it answers there a mark answers in the scan
-_APART = 2.0  # search radii off: beyond what a mark itself answers
+_SELDOM, _HOPELESS = 1e-3, 1e6  # expected false frames between which full resolution may change the decision
+_COUNTED = 3  # marks at most to whose false-alarm rates the share at full resolution applies
+_PLACES = 64  # compared beside the marks: enough to test three marks found of four
+_OFFSETS = (2.5, 4.5)  # in search radii: beyond the response of the mark itself
+_FREE = 2  # marks that a similarity fits wherever they lie
+_SURE = 12  # inliers from which the frame is no false alarm: specks do not agree so often
+_FITTED_PX = 3.0  # px, largest distance between the fitted place and the correlation peak
+_REDUCED_PX = 1.5  # px of the reduced scan: largest distance between the peaks at reduced and full resolution
+_APART = 2.0  # in search radii: beyond the response of a mark itself
 
 
 def doubt_frame(search: FrameSearch, frame: Frame) -> Reason:
-    """A sentence where chance may have made the frame, with the code no-frame where it is likelier to than not; empty
-    where it is unlikely to. One that was found at a closer look is taken only where chance hardly makes it, though none
-    of its marks may be clear."""
+    """Test whether a frame may be a false alarm.
+
+    Returns
+    -------
+    Reason
+        Empty if the frame is significant. Contains the code no-frame if it is more likely a false alarm than not.
+
+    Notes
+    -----
+    Frames found by the search for faint marks are not tested again: they were accepted only if significant, although
+    none of their marks may be clear.
+    """
     if frame.placement.surroundings.robust:
         return NO_REASON
     inside = [index for index, detection in enumerate(frame.detections) if detection.inside]
@@ -40,7 +49,7 @@ def doubt_frame(search: FrameSearch, frame: Frame) -> Reason:
         for index, fit in enumerate(frame.fits)
         if fit
         and fit.likeness >= CLEAR_LIKENESS
-        and not frame.detections[index].closer  # those were seen for the others
+        and not frame.detections[index].closer  # searched only where the others predict it: no independent evidence
     }
     if frame.inliers.sum() >= _SURE:
         return NO_REASON
@@ -50,8 +59,11 @@ def doubt_frame(search: FrameSearch, frame: Frame) -> Reason:
 
 
 def false_frames(search: FrameSearch, frame: Frame, found_px: dict[int, Array]) -> float:
-    """The expected number of false frames as good in the scan; found_px: of the marks that count, by index. Places that
-    answer as strongly at reduced size are many; few of them look so in the scan itself."""
+    """Expected number of false frames as good in the scan.
+
+    found_px: (2,) place of each mark that counts, by index. Many places respond as strongly at reduced resolution, but
+    few of them at full resolution: the number is multiplied by their share to the power of at most `_COUNTED` marks.
+    """
     expected = search.false_frames(frame.placement, frame.inside, found_px)
     if frame.placement.reduction == 1 or not _SELDOM < expected < _HOPELESS:
         return expected
@@ -59,8 +71,10 @@ def false_frames(search: FrameSearch, frame: Frame, found_px: dict[int, Array]) 
 
 
 def _doubt_by_scan(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -> Reason:
-    """Where every mark was found: whether the scan has many places that answer as strongly. A frame that was looked for
-    in the middle of its scan is not doubted: the windows about its marks tell of no other places."""
+    """Test a frame of which every mark was found, by the number of false frames expected in the whole scan.
+
+    A frame found by the search in windows is not tested: the windows give no responses elsewhere.
+    """
     if len(clear) <= _FREE or not search.is_exhaustive(frame.placement):
         return NO_REASON
     expected = false_frames(search, frame, clear)
@@ -74,7 +88,7 @@ def _doubt_by_scan(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -
 
 
 def _share_at_full_resolution(search: FrameSearch, frame: Frame, found_px: dict[int, Array]) -> float:
-    """Of the places that answer as strongly as the marks at reduced size, the share that does so in the scan itself."""
+    """Share of the places with responses as strong at reduced resolution that also have them at full resolution."""
     marks_px, apart_px = np.array([*found_px.values()]), _APART * frame.first_search_px
     others = [
         (index, place)
@@ -91,7 +105,10 @@ def _share_at_full_resolution(search: FrameSearch, frame: Frame, found_px: dict[
 def _doubt_by_neighbourhood(
     search: FrameSearch, frame: Frame, inside: Sequence[int], clear: dict[int, Array]
 ) -> Reason:
-    """Where some marks were not found: whether places beside them look as much like marks as those that were."""
+    """Test a frame of which some marks were not found, by the correlation at places beside the marks.
+
+    The p-value is binomial: that of as many marks or more, two being free, at the false-alarm rate of those places.
+    """
     found, radius = len(clear), frame.first_search_px
     places = _neighbouring_places(search.scan, frame, inside, radius)
     weakest = min((_response(search, frame, index, place, _FITTED_PX) for index, place in clear.items()), default=0.0)
@@ -107,17 +124,17 @@ def _doubt_by_neighbourhood(
 
 
 def _response(search: FrameSearch, frame: Frame, index: int, place: Array, radius_px: float) -> float:
-    """How strongly a mark, by index, answers at most within a radius of a place in the scan."""
+    """Highest correlation of a mark, by index, within a radius of a place in the scan."""
     return highest_peak(search.scan, frame.prediction(index, radius_px).moved(place))[1]
 
 
 def _share(hits: int, places: int) -> float:
-    """Laplace: none of sixty does not mean never."""
+    """Share by Laplace's rule of succession: no hit among sixty places does not mean a rate of zero."""
     return (hits + 1) / (places + 2)
 
 
 def _neighbouring_places(scan: Scan, frame: Frame, inside: Sequence[int], radius_px: float) -> list[tuple[int, Array]]:
-    """Places about the marks in the scan, in eight directions, each with the mark that is sought there."""
+    """Places around the marks, in eight directions, each with the index of the mark that is searched there."""
     angles = np.arange(8) * np.pi / 4
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     size = np.array([scan.width_px, scan.height_px])
