@@ -86,8 +86,8 @@ class FiducialOptions:
     scale_tolerance : largest relative error of the scale against the pitch.
     pitch_is_right : whether a given pitch is certain to some per cent; otherwise pitches at which the frame fills the
         scan are tried too.
-    misfit_mm : largest deviation of a mark from its given place in the search,
-    affinity : plus this fraction of the constellation's span.
+    misfit_mm : constant part of the largest deviation of a mark from its given place in the search.
+    affinity : part proportional to the constellation's span, as a fraction of it.
     gate_mm : largest deviation of a measured mark from the place predicted by the others.
     film_sigma_mm : scatter of marks by film and scanner.
     film_model : film deformation model of the project.

@@ -73,7 +73,7 @@ def pitch_hypotheses(
 
     Parameters
     ----------
-    pitch_um : given pitch in x and y; None if unknown. The pitches at which the frame about fills the scan are then
+    pitch_um : given pitch in x and y; None if unknown. The pitches at which the frame roughly fills the scan are then
         all there is. They also follow a given pitch, unless it is certain or the scan shows a part of its frame.
     """
     long_mm, short_mm = max(layout.frame_mm), min(layout.frame_mm)
@@ -227,7 +227,8 @@ class FrameSearch:
     def search_room(self, hypotheses: Sequence[PitchHypothesis]) -> list[Placement]:
         """Find placements of a frame that lies wholly inside the scan, best first.
 
-        Each mark is searched only in the window that this leaves, if the windows are smaller than the scan.
+        Each mark is searched only in the window that this leaves, if all windows together are clearly smaller than the
+        scan.
         """
         found: list[Placement] = []
         for drawn_mm, alike in groupby(hypotheses, attrgetter("drawn_mm")):
