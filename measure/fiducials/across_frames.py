@@ -1,8 +1,9 @@
-"""The frames of a camera checked together: wrong marks, bent film, wrong given coordinates, scanner distortion.
+"""Joint check of a camera's frames: gross errors, bent film, wrong given coordinates, scanner distortion.
 
-What a frame's marks leave after an affine transformation is alike in all frames in the camera's axes where given
-coordinates are wrong, in the scan's axes where the scanner bends; in one frame it is its film or a mark (`misfits`).
-Nothing that was measured is changed: film is a variance of its frame's marks, and a mark that alone is wrong is weak.
+Wrong given coordinates cause equal residuals of an affine transformation in all frames in the camera's axes, scanner
+distortion in the scan's axes. Residuals of one frame only come from its film or a gross error (`misfits`). Measured
+places are not changed: film deformation adds a variance to the marks of its frame, and a single mark with a gross error
+becomes weak.
 """
 
 from collections.abc import Collection, Sequence
@@ -22,14 +23,19 @@ from measure.geometry import up_from_camera
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
 from measure.results import FrameMeasurement
 
-_SAME_SITE = 1 / 3  # of the least distance of two marks: marks of two frames nearer by lie at one place of the scan
-_NAMED_MARKS = 4  # in a sentence
+_SAME_SITE = 1 / 3  # fraction of the least distance of two marks: closer marks of two frames share a site of the scan
+_NAMED_MARKS = 4  # largest number of marks named in a sentence
 
 
 @dataclass(frozen=True, eq=False)
 class CheckedFrames:
-    """frames: with the statuses, covariances and problems that all frames together give. film_sigma_mm: of each frame,
-    along an axis; what is believed beforehand where the frames do not contradict it."""
+    """Frames after the joint check.
+
+    Attributes
+    ----------
+    frames : with the statuses, covariances and problems that follow from all frames.
+    film_sigma_mm : of each frame, scatter of the film along an axis; the prior unless the frames contradict it.
+    """
 
     frames: tuple[FrameMeasurement, ...]
     film_sigma_mm: tuple[float, ...]
@@ -45,7 +51,10 @@ def check_frames(
 
     Parameters
     ----------
-    pitches_um: of each scan, in x and y. film: what is believed of it beforehand.
+    frames : measured frames.
+    layout : marks of the camera.
+    pitches_um : pixel pitch of each scan, in x and y.
+    film : prior knowledge of the film.
     """
     checked, films = check_own_figures(check_second_places(frames)), [film.sigma_mm] * len(frames)
     found = {i: _misfit(*pair, layout, film) for i, pair in enumerate(zip(checked, pitches_um, strict=True))}
@@ -63,7 +72,7 @@ def check_frames(
 def _misfit(
     frame: FrameMeasurement, pitch_um: tuple[float, float], layout: FiducialLayout, film: BelievedFilm
 ) -> FrameMisfit | None:
-    """None of a frame of fewer than three marks, or of marks in a line."""
+    """Misfit of a frame; None for fewer than three marks, or collinear ones."""
     number = {mark.id: place for place, mark in enumerate(layout.marks)}
     marks = [mark for mark in observed_fiducials(frame) if mark.point in number]
     sites = np.array([number[mark.point] for mark in marks], dtype=np.intp)
@@ -79,8 +88,8 @@ def _misfit(
 
 
 def _explain_together(frames: Frames, layout: FiducialLayout, film_mm: float) -> tuple[Explanation, Reason]:
-    """What explains the misfits best: the given places being right, or wrong, or the scanner bending all scans; and a
-    sentence where it is not the first."""
+    """Explain the misfits by film and marks alone, by wrong given coordinates, or by scanner distortion, whichever is
+    best. Returns also the problem in the latter two cases."""
     places = np.array([mark.xy_mm for mark in layout.marks])
     given_mm = np.array([min(max(mark.sigma_mm), MOST_GIVEN_SIGMA_MM) for mark in layout.marks])
     if len(frames) == 1:
@@ -106,7 +115,7 @@ def _explain_together(frames: Frames, layout: FiducialLayout, film_mm: float) ->
 
 
 def _scan_sites(frames: Frames) -> Array:
-    """(m, 2) places in the scan's axes at which marks lie in the frames."""
+    """(m, 2) sites of the marks of all frames, in the scan's axes."""
     places = [each.marks.given_mm @ up_from_camera(each.pose).T for each in frames.values()]
     near = _SAME_SITE * min(float(pdist(own).min()) for own in places)
     sites = list[Array]()
@@ -117,8 +126,8 @@ def _scan_sites(frames: Frames) -> Array:
 
 
 def _in_scan_axes(frame: FrameMisfit, sites: Array, given_mm: Array) -> FrameMisfit:
-    """The frame in the scan's axes, right and up, and at the sites (m, 2) of the scan, its given places as uncertain as
-    given_mm says."""
+    """Transform a frame to the scan's axes, right and up, and to the nearest sites (m, 2) of the scan. The
+    variances of its given places, from the standard deviations given_mm, are added to its marks."""
     marks = frame.marks.widen(given_mm[frame.sites] ** 2).rotate(up_from_camera(frame.pose))
     nearest = np.hypot(*np.moveaxis(marks.given_mm[:, None] - sites[None], -1, 0)).argmin(axis=1)
     return FrameMisfit(marks, nearest, frame.pose)
@@ -127,7 +136,7 @@ def _in_scan_axes(frame: FrameMisfit, sites: Array, given_mm: Array) -> FrameMis
 def _add_findings(
     frame: FrameMeasurement, own: FrameMisfit, shared: Explanation, names: Sequence[str], film: BelievedFilm
 ) -> tuple[FrameMeasurement, float]:
-    """The frame with what its marks say, and its film's standard deviation."""
+    """Add the findings to a frame: covariances, statuses and problems. Returns also the film's standard deviation."""
     film_mm = own.film_mm or (shared.film.sigma if shared.film_is_more else film.sigma_mm)
     px_per_mm = frame.px_per_mm or 1.0
     code, cause = Code.OFF_FRAMES, Cause.OTHER_FRAMES
@@ -147,7 +156,7 @@ def _add_findings(
         for name, variance in zip(names, variances.tolist(), strict=True)
         if variance > 0
     }
-    known_um = 1000 * float(np.sqrt(max(variances.max(), film_mm**2)))  # with what is added when it is adjusted
+    known_um = 1000 * float(np.sqrt(max(variances.max(), film_mm**2)))  # including what the adjustment adds later
     problem = _problem(own, shared, names, suspects, known_um)
     is_known = own.hypothesis is Hypothesis.PITCH and any(Code.PITCH in each.codes for each in frame.problems)
     said = [each for each in frame.problems if not {*each.codes} & {*problem.codes} & {Code.PERSPECTIVE}]
@@ -156,16 +165,17 @@ def _add_findings(
 
 
 def _suspicion(off_mm: float) -> Reason:
-    """Why a mark is weak that may be the wrong one of its frame."""
+    """Reason of a weak mark that may have the gross error of its frame."""
     return Reason(f"it may be wrong, by {off_mm:.3f} mm then: its frame is bent or one mark is off", Code.BENT_FRAME)
 
 
 def _problem(
     own: FrameMisfit, shared: Explanation, names: Sequence[str], suspects: Collection[str], known_um: float
 ) -> Reason:
-    """A sentence on a frame that stands out, whose marks are known to known_um then; empty of any other.
+    """Problem of an outlying frame; empty for any other.
 
-    It speaks of the frame. Marks are named as wrong only if they are weak for it: suspects.
+    suspects: names of its weak marks, the only ones named as possibly wrong; known_um: standard deviation to which its
+    marks are set.
     """
     if own.film_mm is None:
         return NO_REASON
@@ -229,7 +239,7 @@ def _bent_scans(shared: Explanation) -> Reason:
 
 
 def _distances(names: Sequence[str], off_mm: Array) -> str:
-    """Those marks farthest off, with their distances."""
+    """List the marks with the largest deviations."""
     worst = np.argsort(-off_mm, kind="stable")[:_NAMED_MARKS]
     rest = f", {len(names) - len(worst)} others by less" if len(names) > len(worst) else ""
     return ", ".join(f"{names[k]} by {off_mm[k]:.3f} mm" for k in worst) + rest

@@ -1,4 +1,4 @@
-"""The combination of a colour scan's channels in which the marks stand out most."""
+"""Combination of a colour scan's channels with the highest contrast of the marks over the noise."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,16 +13,19 @@ from measure.marks.shapes import Mark
 from measure.matching.match import mark_window
 from measure.scans.scan import LUMINANCE, SINGLE_CHANNELS, Scan
 
-_MARGIN_PX = 4.0  # of ground about a mark, from which its offset and slopes are told
-_BLUR_PX = 0.8  # of a mark's picture: what a match begins with
-_CLEAR_PEAK = 0.25  # correlation of marks before they are fitted, where the fitted likeness is that of clear ones
-_TRIALS = 6  # marks that the channels are chosen from
-_SHRINK = 0.1  # of the noise covariance towards a multiple of the unit matrix: few pixels know it badly
+_MARGIN_PX = 4.0  # width of the background around a mark, used to estimate its offset and slopes
+_BLUR_PX = 0.8  # blur of a mark's image, the initial value of a match
+_CLEAR_PEAK = 0.25  # NCC before the fit that corresponds to the likeness of a clear mark after it
+_TRIALS = 6  # about this many marks are used to choose the channels
+_SHRINK = 0.1  # shrinkage of the noise covariance towards a multiple of the unit matrix: few pixels determine it poorly
 
 
 def choose_channels(frame: Frame) -> Frame:
-    """Choose the channels of a colour scan: that in which some marks correlate best, then from these marks the best
-    combination. Where no mark is drawn light or dark, the polarity is that of the combination."""
+    """Choose the channel weights of a colour scan.
+
+    Some marks are located in the channel with the highest correlation; the weights are then estimated from these marks.
+    If no mark is drawn as light or dark, the weights also determine the polarity.
+    """
     if frame.scan.channels == 1:
         return frame
     marks = frame.layout.marks
@@ -46,12 +49,21 @@ def choose_channels(frame: Frame) -> Frame:
 def best_weights(
     scan: Scan, marks: Sequence[tuple[Mark, Array, int]], signs: Sequence[int] = (1,)
 ) -> tuple[tuple[float, ...], int] | None:
-    """Weights (sum 1) of the channels after Fisher's discriminant, from marks with their pixel_from_mark (2, 3) and
-    their sign, +1 lighter than their ground and -1 darker; and which of signs it is to be multiplied by: the same mark
-    may be lighter in one channel and darker in another.
+    """Estimate channel weights by Fisher's linear discriminant.
 
-    None for a grey scan, or where no mark shows any contrast. No channel counts negatively: a difference of channels
-    would show where they do not lie on one another.
+    Parameters
+    ----------
+    scan : colour scan.
+    marks : marks with pixel_from_mark (2, 3) and sign: +1 lighter than the background, -1 darker.
+    signs : common factors of all signs to try, since a mark may be lighter in one channel and darker in another.
+
+    Returns
+    -------
+    Weights with sum 1, and the best of signs. None for a grey scan, or if no mark has any contrast.
+
+    Notes
+    -----
+    Negative weights are set to 0: a difference of channels would show their misregistration.
     """
     if scan.channels == 1 or not marks:
         return None
@@ -75,7 +87,7 @@ def best_weights(
     discriminant = np.linalg.solve(covariance, contrast)
 
     def contrast_over_noise(sign: int) -> float:
-        """The contrast over its noise."""
+        """Contrast over noise of the non-negative weights for a sign."""
         weights = np.maximum(sign * discriminant, 0.0)
         return float(sign * weights @ contrast / np.sqrt(max(weights @ covariance @ weights, 1e-300)))
 

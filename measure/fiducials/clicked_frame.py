@@ -1,4 +1,4 @@
-"""The frame where a person shows it: three or more of its marks were pointed at, by their names."""
+"""Measurement of a frame from clicks: the user marked three or more of its marks by name."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,27 +16,30 @@ from measure.marks.shapes import FiducialLayout
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from measure.scans.scan import Scan
 
-LEAST_CLICKS = 3  # two do not tell a mirrored frame from one that is not
+LEAST_CLICKS = 3  # two do not determine whether the frame is mirrored
 _TOLD = ("the marks that were pointed at say so.",)
-_COLLINEAR = 1e-3  # of their extent: marks nearer to a line than that do not tell it either
+_COLLINEAR = 1e-3  # fraction of their extent: marks closer to a line do not determine it either
 
 
 def is_shown(layout: FiducialLayout, options: FiducialOptions) -> bool:
-    """Whether enough marks were pointed at to say where the frame is."""
+    """Whether enough marks were clicked to determine the frame."""
     return len(_clicked_places(layout, options.clicks)[0]) >= LEAST_CLICKS
 
 
 def clicked_frame(
     scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
 ) -> tuple[Frame, Pose]:
-    """The frame measured from a similarity through the marks that were pointed at, and its pose, which they tell
-    unless they lie on a line, or the project sets it."""
+    """Measure the frame from a similarity through the clicked marks.
+
+    Returns the frame and its scan orientation, which is decided if the project sets it or the clicked marks are not
+    collinear.
+    """
     camera, clicked = _clicked_places(layout, options.clicks)
     pixel_mm = np.array(pitch_um or (1.0, 1.0)) / 1000.0
     ideal = clicked if options.lens is None else options.lens.ideal_px(clicked)
     up_mm = ideal * pixel_mm * (1.0, -1.0)
     pose, up = _clicked_pose(camera, up_mm, POSES if options.pose == "auto" else (options.pose,))
-    if pitch_um is None:  # then it is what the marks' separations say
+    if pitch_um is None:  # estimate it from the separations of the marks
         pixel_mm = pixel_mm / linear_scale(up)
         up = up / linear_scale(up)
     matrix = np.diag([1.0, -1.0]) @ up / pixel_mm[:, None]
@@ -53,7 +56,8 @@ def clicked_frame(
 
 
 def contradicted_pose(layout: FiducialLayout, options: FiducialOptions, pitch_um: tuple[float, float] | None) -> Reason:
-    """Why the clicks do not go with the scan orientation that is set; empty where they do, or cannot tell."""
+    """Reason why the clicks contradict the scan orientation that is set; empty if they agree or do not determine
+    one."""
     camera, clicked = _clicked_places(layout, options.clicks)
     if options.pose == "auto" or are_collinear(camera):
         return NO_REASON
@@ -69,20 +73,20 @@ def contradicted_pose(layout: FiducialLayout, options: FiducialOptions, pitch_um
 
 
 def are_collinear(places: Array) -> bool:
-    """Whether places (n, 2) do not tell a mirrored frame from one that is not."""
+    """Whether places (n, 2) are collinear, and so do not determine whether the frame is mirrored."""
     singular = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
     return bool(singular[1] <= _COLLINEAR * singular[0])
 
 
 def place_clicked_marks(frame: FrameMeasurement, clicks: Sequence[Click]) -> FrameMeasurement:
-    """Marks that were pointed at and could not be matched are where the person saw them, as well as one points."""
+    """Place clicked marks that could not be matched where the user clicked, with the standard deviation of a click."""
     by_point = {click.point: click for click in clicks}
     marks = (_place_clicked(mark, by_point[mark.point]) if mark.point in by_point else mark for mark in frame.marks)
     return replace(frame, marks=tuple(marks))
 
 
 def _clicked_places(layout: FiducialLayout, clicks: Sequence[Click]) -> tuple[Array, Array]:
-    """(n, 2) camera mm of the marks that were pointed at, and (n, 2) where."""
+    """(n, 2) given places of the clicked marks, mm, and (n, 2) clicked places, px."""
     places = {mark.id: mark.xy_mm for mark in layout.marks}
     known = [click for click in clicks if click.point in places]
     camera = np.array([places[click.point] for click in known]).reshape(-1, 2)
@@ -90,15 +94,16 @@ def _clicked_places(layout: FiducialLayout, clicks: Sequence[Click]) -> tuple[Ar
 
 
 def _clicked_pose(camera: Array, up_mm: Array, poses: Sequence[str]) -> tuple[str, Array]:
-    """Of the poses the one that fits the marks best, and is turned least; and its similarity (2, 3)."""
+    """Select the scan orientation that fits the marks best, then the one with the least rotation. Returns also its
+    similarity (2, 3)."""
     found = [(pose, *_similarity(camera, up_mm, pose)) for pose in poses]
     pose, up, _ = min(found, key=lambda one: (round(one[2] / np.ptp(up_mm), 9), abs(_turn_rad(one[1], one[0]))))
     return pose, up
 
 
 def _similarity(camera: Array, up_mm: Array, pose: str) -> tuple[Array, float]:
-    """(2, 3), camera mm to the scan's mm (right, up) through a pose and a similarity, least squares, and what is left
-    of the places, mm."""
+    """Fit a similarity on top of a scan orientation by least squares. Returns (2, 3) from camera mm to the scan's mm
+    (right, up), and the largest residual, mm."""
     turned = camera @ up_from_camera(pose).T
     own, observed = turned @ (1.0, 1j), up_mm @ (1.0, 1j)
     design = np.column_stack([own, np.ones(len(own))])
@@ -109,7 +114,7 @@ def _similarity(camera: Array, up_mm: Array, pose: str) -> tuple[Array, float]:
 
 
 def _turn_rad(up_from_mm: Array, pose: str) -> float:
-    """How far the frame is turned against a pose."""
+    """Rotation of the frame relative to a scan orientation."""
     own = up_from_mm[:, :2] @ np.linalg.inv(up_from_camera(pose))
     return float(np.arctan2(own[1, 0], own[0, 0]))
 

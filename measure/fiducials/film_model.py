@@ -1,4 +1,4 @@
-"""Film deformation models: what each adds to an affine transformation, as columns of linear equations."""
+"""Film deformation models: the terms of each in addition to an affine transformation, as columns of a design matrix."""
 
 import numpy as np
 
@@ -6,15 +6,23 @@ from measure.array_types import Array
 
 
 def interleaved(*columns: tuple[Array, Array]) -> Array:
-    """(2n, k) of k columns, each of them (n,) in x and (n,) in y."""
+    """(2n, k) design matrix from k columns, each given as (n,) in x and (n,) in y; rows x1, y1, x2, ..."""
     return np.stack([np.stack(each, axis=1).ravel() for each in columns], axis=1)
 
 
 def film_terms(model: str, places: Array, measured: Array | None = None) -> Array:
-    """(2n, k) what a film model adds to an affine transformation at places (n, 2).
+    """Terms of a film model in addition to an affine transformation.
 
-    model: projective, bilinear, conformal(n) or polynomial(n); any other adds nothing. measured: (n, 2) where they are
-    pictured, with which the equations of a projective transformation are linear (DLT); else it is taken to first order.
+    Parameters
+    ----------
+    model : projective, bilinear, conformal(n) or polynomial(n); any other has no further terms.
+    places : (n, 2) given places.
+    measured : (n, 2) measured places, with which the equations of a projective transformation are linear (DLT). None:
+        it is linearised.
+
+    Returns
+    -------
+    (2n, k) columns of the design matrix.
     """
     x, y = places.T
     u, v = places.T if measured is None else measured.T

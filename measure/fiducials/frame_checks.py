@@ -1,4 +1,4 @@
-"""Checks of one measured frame: its pixel pitch, and marks on pixels that its file does not give."""
+"""Checks of one measured frame: its pixel pitch, and marks on damaged parts of its file."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,26 +12,34 @@ from measure.marks.shapes import FiducialLayout
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.scans.scan import Scan
 
-_LEAST_MARKS = 3  # with two, a false one makes a pitch of its own
-_REACH_PX = 20.0  # about a mark whose size is not told: that of a disk or crossing of a field, with its ground
+_LEAST_MARKS = 3  # with two, a false one yields a wrong pitch
+_REACH_PX = 20.0  # around a mark of unknown size: that of a disk or crossing of a test field, with its background
 
 
 def pitch_problem(
     frame: FrameMeasurement, layout: FiducialLayout, pitch_um: tuple[float, float], source: str
 ) -> Reason | None:
-    """A sentence that names the pitch which the marks suggest, None where the given one (um, by source) is as good.
+    """Test the given pixel pitch against the separations of the marks.
 
-    Film and scanner stretch by some thousandths, and the given separations have their own standard deviations: what
-    goes beyond both, at a probability of one in a hundred for the two axes together, is the pitch's.
+    Film and scanner stretch by some thousandths, and the given separations have their own standard deviations. The
+    pitch is rejected beyond both, at a significance level of 1 % for the two axes together.
+
+    Parameters
+    ----------
+    pitch_um, source : given pitch and where it comes from.
+
+    Returns
+    -------
+    Problem with the pitch that the marks suggest; None if the given one is not rejected.
     """
     found = {mark.point for mark in frame.marks if mark.kind == "fiducial" and mark.status.is_observation}
     marks = [mark for mark in layout.marks if mark.id in found]
-    is_named = any(Code.PITCH in problem.codes for problem in frame.problems)  # of pixels longer one way
+    is_named = any(Code.PITCH in problem.codes for problem in frame.problems)  # unequal pixel sizes
     if frame.pixel_from_camera is None or len(marks) < _LEAST_MARKS or is_named:
         return None
-    seen_um = 1000 / np.hypot(*frame.pixel_from_camera[:, :2].T)  # film mm for each pixel, across and down
+    seen_um = 1000 / np.hypot(*frame.pixel_from_camera[:, :2].T)  # film per pixel, um, across and down
     places = np.array([mark.xy_mm for mark in marks])
-    lever_mm = float(np.sqrt(((places - places.mean(axis=0)) ** 2).sum(axis=0)).min())  # of all marks, along one axis
+    lever_mm = float(np.sqrt(((places - places.mean(axis=0)) ** 2).sum(axis=0)).min())  # root sum of squares, one axis
     given = float(np.median([max(mark.sigma_mm) for mark in marks]))
     if not lever_mm > given:
         return None
@@ -50,12 +58,12 @@ def pitch_problem(
 
 
 def without_lost(scan: Scan, marks: Sequence[MarkMeasurement]) -> tuple[MarkMeasurement, ...]:
-    """The marks; those at places where the file does not give the pixels are `predicted` there, with that reason."""
+    """Set marks on damaged parts of the scan's file to `predicted`, with this reason."""
     return tuple(_check_loss(scan, mark) for mark in marks)
 
 
 def with_damage(scan: Scan, frame: FrameMeasurement) -> FrameMeasurement:
-    """The frame without observations where the scan's file is damaged, which is the first of its problems."""
+    """Remove the observations on damaged parts of the scan's file, and put the damage first among the problems."""
     if not scan.damage:
         return frame
     marks = without_lost(scan, frame.marks)

@@ -1,5 +1,5 @@
-"""The interior orientation by weighted least squares: a similarity with the affinity that film and scanner have, and
-what the film model of the project adds."""
+"""Interior orientation by weighted least squares: a similarity, an affinity with a prior, and the terms of the film
+model."""
 
 from dataclasses import dataclass
 
@@ -9,19 +9,24 @@ from measure.array_types import Array
 from measure.fiducials.film_model import film_terms
 from measure.fiducials.options import AFFINITY_SIGMA
 
-_LINEAR = [0, 1, 4, 5]  # of the unknowns: all but the shift
-_FREE = 0.03  # standard deviation of stretch, shear and film terms that are free, as shares of the frame's radius
-_INVERSIONS = 6  # of a perspective, each a fiftieth of the one before
+_LINEAR = [0, 1, 4, 5]  # indices of the unknowns of the affine model without the shift
+_FREE = 0.03  # fraction of the frame's radius: prior standard deviation of free stretch, shear and film terms
+_INVERSIONS = 6  # iterations of the inversion of a perspective, each correction a fiftieth of the one before
 
 
 @dataclass(frozen=True, eq=False)
 class FrameFit:
-    """An interior orientation. up_from_camera: (2, 3), camera mm to the scan's mm (right, up), the best affine one.
-    residuals_mm: (n, 2) measured less predicted.
+    """Interior orientation.
 
-    chi_square holds the pseudo-observations of affinity and film terms too; redundancy counts them: 2 n - 4.
-    linear_sigma: standard deviation of rotation (rad), scale, stretch and shear, the root of their mean variance.
-    film: what a film model adds, None of an affine one.
+    Attributes
+    ----------
+    up_from_camera : (2, 3) affine transformation from camera mm to the scan's mm (right, up); the best approximation
+        where a film model has further terms.
+    residuals_mm : (n, 2) measured less predicted.
+    chi_square : including the pseudo-observations of affinity and film terms.
+    redundancy : 2 n - 4, which counts these pseudo-observations.
+    linear_sigma : rms of the standard deviations of rotation (rad), scale, stretch and shear.
+    film : transformation with a film model; None for an affine one.
     """
 
     up_from_camera: Array
@@ -34,8 +39,17 @@ class FrameFit:
 
 @dataclass(frozen=True, eq=False)
 class FilmFit:
-    """A film model of more than an affine transformation: centered, in units of radius_mm, an affine part (2, 3) and
-    the coefficients (k,) of its terms; turn (2, 2): of the scan orientation; center_mm (2,): in the scan."""
+    """Fitted film model with terms beyond an affine transformation, in units of radius_mm.
+
+    Attributes
+    ----------
+    model : film deformation model.
+    turn : (2, 2) rotation, and mirror if any, of the scan orientation.
+    radius_mm : unit of length.
+    center_mm : (2,) centroid of the marks in the scan.
+    affine : (2, 3) affine part.
+    terms : (k,) coefficients of the further terms.
+    """
 
     model: str
     turn: Array
@@ -45,7 +59,7 @@ class FilmFit:
     terms: Array
 
     def places_mm(self, camera_mm: Array) -> Array:
-        """(n, 2) in the scan (right, up) of places (n, 2) in the camera."""
+        """Transform places (n, 2) in the camera to the scan (right, up), (n, 2)."""
         given = camera_mm @ self.turn.T / self.radius_mm
         straight = given @ self.affine[:, :2].T + self.affine[:, 2]
         places = straight
@@ -55,11 +69,24 @@ class FilmFit:
 
 
 def fit_frame(camera_mm: Array, up_mm: Array, sigma_mm: Array, turn: Array, model: str = "affine") -> FrameFit:
-    """Fit the frame to n >= 2 marks at camera_mm (n, 2) seen at up_mm (n, 2), with standard deviations sigma_mm (n,).
+    """Fit the interior orientation to n >= 2 marks.
 
-    turn: the pose's (2, 2), so that the similarity is a small one on top of it. model: the film deformation model.
-    Raises ValueError for fewer than two
-    marks: they determine nothing.
+    Parameters
+    ----------
+    camera_mm : (n, 2) given places.
+    up_mm : (n, 2) measured places in the scan (right, up).
+    sigma_mm : (n,) standard deviations.
+    turn : (2, 2) rotation, and mirror if any, of the scan orientation; the similarity is estimated relative to it.
+    model : film deformation model.
+
+    Returns
+    -------
+    FrameFit
+
+    Raises
+    ------
+    ValueError
+        For fewer than two marks.
     """
     if len(camera_mm) < 2:
         raise ValueError(f"{len(camera_mm)} marks do not determine a frame; two or more do")
@@ -83,7 +110,7 @@ def fit_frame(camera_mm: Array, up_mm: Array, sigma_mm: Array, turn: Array, mode
 
 
 def _linear(solution: Array, turn: Array) -> Array:
-    """(2, 2) of rotation and scale, stretch and shear."""
+    """(2, 2) matrix of rotation and scale, stretch and shear, after turn."""
     a, b, _, _, stretch, shear = solution[:6]
     return np.asarray(np.array([[a + stretch, -b + shear], [b + shear, a - stretch]]) @ turn)
 
@@ -91,8 +118,9 @@ def _linear(solution: Array, turn: Array) -> Array:
 def _solve(
     given: Array, measured: Array, sigma: Array, terms: Array, affinity_sigma: float
 ) -> tuple[Array, Array, float, Array]:
-    """Rotation and scale, shift, stretch and shear and coefficients of the terms by least squares, with pseudo-
-    observations of all but the first four: the solution, its inverse design, chi-square and the residuals (n, 2)."""
+    """Estimate rotation and scale, shift, stretch and shear, and the coefficients of the terms, by least squares, with
+    pseudo-observations of 0 for all but the first four unknowns. Returns the solution, the pseudo-inverse of the design
+    matrix, chi-square and the residuals (n, 2)."""
     x, y = given.T
     one, none = np.ones_like(x), np.zeros_like(x)
     rows = np.concatenate([np.stack([x, -y, one, none, x, y], axis=1), np.stack([y, x, none, one, -y, x], axis=1)])

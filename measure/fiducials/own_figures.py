@@ -1,7 +1,7 @@
-"""Arms of crosses, sizes, turns and blurs of a camera's marks by all of its frames.
+"""Test of sizes, rotations, blurs and cross arms of a camera's marks across its frames.
 
-A cross of a réseau plate one arm of which is short looks covered in every frame. What is alike in all frames is the
-plate's: from three frames on a mark is tested against what it is in the others, and no longer against the other marks.
+A cross of a réseau plate with one short arm looks covered in every frame. Deviations common to all frames belong to the
+plate: with three or more frames a mark is tested against itself in the others, no longer against the other marks.
 """
 
 from collections import defaultdict
@@ -16,19 +16,21 @@ from measure.fiducials.mark_comparison import blur_spread, mean_of_unlike, size_
 from measure.flags import FALSE_DOUBT, NO_REASON, Code, Reason, Status
 from measure.results import FrameMeasurement, MarkMeasurement
 
-_FEWEST = 3  # frames: of two nobody knows which is as the plate is
+_FEWEST = 3  # frames needed: of two, either may be the outlier
 _NEAR = 3.0  # standard deviations from the median, within which frames agree
-_SHORTEST = 0.1  # of an arm: what is shorter is as good as gone
+_SHORTEST = 0.1  # lower bound of ratios: an arm shorter than this counts as missing
 _ARM, _SHAPE, _BLUR = "arm", "shape", "blur"
 Key = tuple[str, str]  # a mark and its figure: size, turn, blur, arm1, arm2, ...
 
 
 @dataclass(frozen=True, eq=False)
 class OwnFigure:
-    """A figure of a mark by the frames that agree: a logarithm of a ratio, or its turn (rad).
+    """Figure of a mark, estimated from the frames that agree: logarithm of a ratio, or rotation (rad).
 
-    value, sigma: mean and its standard deviation. off (n,): of each frame from the mean of the others that agree, and
-    off_sigma (n,), its standard deviation.
+    Attributes
+    ----------
+    value, sigma : mean and its standard deviation.
+    off, off_sigma : (n,) deviation of each frame from the mean of the other agreeing ones, and its standard deviation.
     """
 
     value: float
@@ -38,8 +40,8 @@ class OwnFigure:
 
     @classmethod
     def from_frames(cls, values: Array, sigmas: Array, is_blur: bool) -> "OwnFigure | None":
-        """From the figures (n,) of a mark in the frames; None of fewer than three, or where no more than half of them
-        agree."""
+        """Estimate the figure from its values (n,) in the frames. Returns None for fewer than three frames, or if no
+        more than half of them agree."""
         spread_of = blur_spread if is_blur else size_spread
         near = _NEAR * np.hypot(sigmas, spread_of(0.0, 1))
         agrees = np.abs(values - np.median(values)) <= near
@@ -53,7 +55,8 @@ class OwnFigure:
 
 
 def own_figures(frames: Sequence[FrameMeasurement]) -> dict[Key, tuple[list[int], OwnFigure]]:
-    """Of each mark and figure, where enough frames agree: the frames that tell it, by index, and what they tell."""
+    """For each mark and figure on which enough frames agree: indices of the frames that contain it, and its
+    estimate."""
     figures = defaultdict[Key, list[tuple[int, float, float]]](list)
     for place, frame in enumerate(frames):
         for key, (value, sigma) in _figures(frame).items():
@@ -68,8 +71,8 @@ def own_figures(frames: Sequence[FrameMeasurement]) -> dict[Key, tuple[list[int]
 
 
 def _figures(frame: FrameMeasurement) -> dict[Key, tuple[float, float]]:
-    """Of its marks, with standard deviations, as a scan that is not mirrored shows them; arms beside those of the whole
-    frame, which exposure makes longer or shorter."""
+    """Figures of the marks of a frame and their standard deviations. Rotations are those of an unmirrored scan. Arms
+    are relative to the median of the frame, since exposure makes all of them longer or shorter."""
     mirrored = -1.0 if frame.pose and frame.pose.name.endswith("m") else 1.0
     figures: dict[Key, tuple[float, float]] = {}
     for mark in frame.marks:
@@ -88,8 +91,8 @@ def _figures(frame: FrameMeasurement) -> dict[Key, tuple[float, float]]:
 
 
 def check_own_figures(frames: Sequence[FrameMeasurement]) -> list[FrameMeasurement]:
-    """The frames of a camera, with marks weak that have another size, arm or turn in one of them only, and without the
-    doubt of those that have it in all."""
+    """Set marks to weak whose figures differ in one frame only, and back to measured where all frames share the
+    deviation."""
     figures = own_figures(frames)
     tests = sum(len(places) for places, _ in figures.values())
     findings: list[dict[str, dict[str, Reason]]] = [defaultdict(dict) for _ in frames]
@@ -110,7 +113,7 @@ def check_own_figures(frames: Sequence[FrameMeasurement]) -> list[FrameMeasureme
 
 
 def _unlike_frames(kind: str, off: float) -> Reason:
-    """Why a mark differs from what it is in the other frames."""
+    """Reason of a mark that differs from itself in the other frames."""
     there, covered = "in the camera's other frames", "something may cover or touch it"
     if kind == _BLUR:
         return Reason(f"its blur is {np.exp(off):.2f} times that {there}", Code.BLUR)
@@ -123,8 +126,8 @@ def _unlike_frames(kind: str, off: float) -> Reason:
 
 
 def _assess_mark(mark: MarkMeasurement, findings: Mapping[str, Reason], arms: Sequence[float]) -> MarkMeasurement:
-    """The mark with what the other frames say; findings: why shape and blur are not as there, empty where they are;
-    arms: of its plate, which explain the size of a cross if one of them has it."""
+    """Update the status of a mark. findings: reason why shape or blur differ from the other frames, empty if they
+    agree; arms: log lengths of the arms on the plate, which explain the size of a cross within their range."""
     quality, unlike = mark.quality, findings.get(_SHAPE, NO_REASON)
     if unlike and Code.SIZE not in mark.reason.codes:
         return replace(mark, status=Status.WEAK, reason=Reason.combine((mark.reason, unlike)))
@@ -138,7 +141,7 @@ def _assess_mark(mark: MarkMeasurement, findings: Mapping[str, Reason], arms: Se
 
 
 def _explains(arms: Sequence[float], quality: Mapping[str, float]) -> bool:
-    """Whether the arms of a plate's cross, if it has any, explain its size: a match takes that of some of them."""
+    """Whether the arms of a cross, if it has any, explain its size: a match yields a size between those of its arms."""
     size = float(np.log(quality["size_ratio"]))
     near = _NEAR * float(np.hypot(quality["size_sigma"], size_spread(0.0, 1)))
     return not arms or min(arms) - near <= size <= max(arms) + near

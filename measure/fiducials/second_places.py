@@ -1,9 +1,10 @@
-"""Second places. The edges of a mark put it elsewhere than the match does where it is damaged or not as drawn.
+"""Test of second places: the place from a mark's edges differs from the matched one if the mark is damaged or not as
+drawn.
 
-Noise explains such a difference by its covariance. Where more is left in many of a camera's marks, their drawings are
-not quite true, or the film's noise is not quite what it is taken for: their median gives the factor of the variance
-of the differences, beside 1 as it is believed. A mark that stands out among them too is damaged, and weak; any other
-is known no better than its two places differ, and weak only if that is more than a measured mark may be off by.
+The covariance of the difference describes the noise. Larger differences in many of a camera's marks mean that the
+drawings are not exact, or the noise model is not: a variance factor of the differences is estimated from their median,
+with a prior of 1. An outlier even with this factor is damaged, and becomes weak. Any other significant difference is
+added to the mark's covariance, and makes it weak only if it exceeds the error allowed for a measured mark.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,13 +20,13 @@ from measure.noise.robust_estimation import MEDIAN_EFFICIENCY
 from measure.results import FrameMeasurement, MarkMeasurement
 
 _AXES = 2
-_BELIEVED_DEGREES = 4.0  # of freedom of the factor of second places' variances: on real film the edges differ by 1.4
+_BELIEVED_DEGREES = 4.0  # degrees of freedom of the prior of the variance factor: on real film the edges differ by 1.4
 
 
 @dataclass(frozen=True)
 class Doubt:
-    """The variance, along an axis, by which a check finds a mark less well known, and the cause to which that is
-    counted; reason: why it is no longer called measured, empty where it still is."""
+    """Variance along an axis that a check adds to a mark, and its cause. reason: why the mark becomes weak, empty if it
+    does not."""
 
     variance_px2: float
     cause: Cause
@@ -33,12 +34,12 @@ class Doubt:
 
 
 def observed_fiducials(frame: FrameMeasurement) -> list[MarkMeasurement]:
-    """The fiducials of a frame that are observations."""
+    """Fiducials of a frame that are observations."""
     return [mark for mark in frame.marks if mark.kind == "fiducial" and mark.status.is_observation]
 
 
 def add_doubts(frame: FrameMeasurement, doubts: Mapping[str, Doubt]) -> FrameMeasurement:
-    """The frame, its fiducials less well known by doubts, by name, and weak where these have a reason."""
+    """Add doubts, by name, to the fiducials of a frame: their variance, and the status weak if they have a reason."""
     marks = list(frame.marks)
     for number, mark in enumerate(marks):
         doubt = doubts.get(mark.point) if mark.kind == "fiducial" else None
@@ -51,7 +52,8 @@ def add_doubts(frame: FrameMeasurement, doubts: Mapping[str, Doubt]) -> FrameMea
 
 
 def check_second_places(frames: Sequence[FrameMeasurement]) -> list[FrameMeasurement]:
-    """The frames of a camera, with doubt where second places differ from matched ones by more than noise explains."""
+    """Test the second places of all frames of a camera, and add doubts where they differ significantly from the
+    matched places."""
     tested = [[mark for mark in observed_fiducials(each) if "second_method_sigmas" in mark.quality] for each in frames]
     squares = np.array([mark.quality["second_method_sigmas"] ** 2 for own in tested for mark in own])
     by_noise = iter(chdtrc(_AXES, squares) * len(squares))
@@ -65,11 +67,12 @@ def check_second_places(frames: Sequence[FrameMeasurement]) -> list[FrameMeasure
 
 
 def _p_values_among_others(squares: Array) -> Array:
-    """(n,) that a mark's two places differ by so many standard deviations, squared, as the others' do."""
+    """(n,) p-values of squared normalised differences of the two places, with the variance factor of the other
+    marks."""
     others = [np.median(np.delete(squares, n)) for n in range(len(squares))] if len(squares) > 1 else [0.0]
     degrees = MEDIAN_EFFICIENCY * _AXES * (len(squares) - 1)
     factor = (_BELIEVED_DEGREES + degrees * np.array(others) / chdtri(_AXES, 0.5)) / (_BELIEVED_DEGREES + degrees)
-    # Differences that are smaller than noise makes them are no reason to ask more of the others.
+    # A variance factor below 1 is not applied: small differences do not make the test stricter.
     return np.asarray(fdtrc(_AXES, _BELIEVED_DEGREES + degrees, squares / _AXES / np.maximum(factor, 1.0)))
 
 
