@@ -1,12 +1,12 @@
-"""The camera library's files, made from calibration reports.
+"""Camera library: camera files generated from calibration reports.
 
 python -m benchmarks camera_library REPORTS_FOLDER OUT_FOLDER
 
-The folder holds usgs_reports.csv (a line a report: camera, focal length, coordinates and separations of the marks),
-cameras.json and OSL_1785.json (single cameras, written out). What is typed there has errors, and some cameras of a
-model had other marks: medians are taken, spreads are 1.4826 times the median of absolute deviations, and what lies
-outside of a camera's gate is left out and printed. The plate of crosses, hasselblad-reseau, has no reports: its file
-is written by hand.
+The folder holds usgs_reports.csv (one line per report: camera, focal length, coordinates and separations of the marks),
+and cameras.json and OSL_1785.json (single cameras, transcribed). The data contain typing errors, and some cameras of a
+model had other marks. Therefore medians are used, spreads are 1.4826 times the median absolute deviation, and values
+outside a camera's gate are rejected and printed. The réseau plate hasselblad-reseau has no reports: its file is written
+by hand.
 """
 
 import csv
@@ -53,8 +53,8 @@ from benchmarks.mark_drawings import (
 )
 from measure.noise.robust_estimation import SIGMA_OF_DEVIATION
 
-# Numbered as in the reports of the US Geological Survey, x' to the right and y' up. Their form, as in OSL/1785, has the
-# data strip to the left; what forms of other makers and of before 1960 have is not known.
+# Numbers of the marks as in the reports of the US Geological Survey, x' to the right and y' up. Their form, as in
+# OSL/1785, has the data strip on the left; that of other makers and of before 1960 is not known.
 PLACES = {"ll": "1", "ur": "2", "ul": "3", "lr": "4", "ml": "5", "mr": "6", "mt": "7", "mb": "8"}
 DIRECTIONS = {"ll": (-1, -1), "ur": (1, 1), "ul": (-1, 1), "lr": (1, -1)} | {
     "ml": (-1, 0),
@@ -65,16 +65,16 @@ DIRECTIONS = {"ll": (-1, -1), "ur": (1, 1), "ul": (-1, 1), "lr": (1, -1)} | {
 SEPARATIONS = {"lr_dist": "left to right", "tb_dist": "top to bottom", "llur_dist": "1 to 2", "ullr_dist": "3 to 4"}
 ENDS = {"lr_dist": ("ml", "mr"), "tb_dist": ("mb", "mt"), "llur_dist": ("ll", "ur"), "ullr_dist": ("ul", "lr")}
 
-ENOUGH = 5  # reports for a spread
-LEAST_SIGMA_MM = 0.005  # what the reports give as their own accuracy
-PRINCIPAL_POINT_MM = 0.02  # the rms of nine cameras written out is 0.013 mm an axis
-CONE_MM = 6.0  # how far a focal length may lie from its cone's nominal one
-CONE_SPREAD = 0.002  # of the focal length, where a cone has too few reports for a spread of its own
+ENOUGH = 5  # smallest number of cameras for a spread
+LEAST_SIGMA_MM = 0.005  # mm, accuracy stated in the reports
+PRINCIPAL_POINT_MM = 0.02  # mm, sigma; the RMS of nine transcribed cameras is 0.013 mm per axis
+CONE_MM = 6.0  # mm, largest deviation of a focal length from the nominal one of its cone
+CONE_SPREAD = 0.002  # sigma as a fraction of the focal length, for cones with too few reports
 
 
 @dataclass(frozen=True)
 class Report:
-    """One calibration: the coordinates of the marks by place, separations by name, mm."""
+    """Calibration report: coordinates of the marks by place and separations by name, mm."""
 
     source: str
     model: str
@@ -84,20 +84,26 @@ class Report:
     separations_mm: Mapping[str, float]
 
     def key(self) -> tuple[object, ...]:
-        """Equal for a report that was typed twice."""
+        """Key for finding duplicates."""
         marks, separations = tuple(self.marks_mm.items()), tuple(self.separations_mm.items())
         return (self.model, self.serial, self.focal_mm, marks, separations)
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of camera: the models in the reports that count as it, and what the reports do not say.
+    """Type of camera: its models in the reports, and data that the reports lack.
 
-    cones_mm: nominal focal lengths. gate_mm: farther from the median is another kind of mark, or a typing error.
-    separated: take the marks' places from their separations. sigma_mm: of coordinates with too few reports for a
-    spread. writing: the line that says where the camera writes, as
-    far as anybody knows. drawn: by place, which of the drawings `marks` its mark has; `shape` tells about them. A kind
-    may stand for some cameras of a model only, those with such marks.
+    A type may stand for some cameras of a model only, those with such marks.
+
+    Attributes
+    ----------
+    cones_mm : nominal focal lengths.
+    gate_mm : larger deviations from the median mean another type of mark or a typing error.
+    sigma_mm : of coordinates with too few reports for a spread.
+    shape : source of the drawings, in words.
+    separated : whether the places of the marks are computed from their separations.
+    drawn : by place, which of the drawings `marks` its mark has.
+    writing : line on the places where the camera writes, if known.
     """
 
     file: str
@@ -118,7 +124,7 @@ class Kind:
 
 @dataclass(frozen=True)
 class TypicalMark:
-    """A mark of a kind of camera: the median of so many reports."""
+    """Typical mark: median of a number of reports. spread: whether sigma_mm is the spread of the reports."""
 
     place: str
     xy_mm: tuple[float, float]
@@ -217,7 +223,7 @@ KINDS = (
 
 
 def main() -> None:
-    """Write every camera of the library, and print what was left out."""
+    """Write all cameras of the library, and print the rejected reports."""
     reports_folder, out = Path(sys.argv[1]), Path(sys.argv[2])
     reports = list({report.key(): report for report in [*_typed(reports_folder), *_single(reports_folder)]}.values())
     for kind in KINDS:
@@ -351,7 +357,7 @@ def _coordinates(kind: Kind, own: Sequence[Report]) -> list[TypicalMark]:
 
 
 def _select_reports(kind: Kind, own: Sequence[Report], places: Sequence[str]) -> list[Report]:
-    """The reports with all of these marks, each within the gate of its median."""
+    """Select the reports with all of these marks, each within the gate around its median."""
     whole = [report for report in own if all(place in report.marks_mm for place in places)]
     xy = np.array([[report.marks_mm[place] for place in places] for report in whole])
     off = np.abs(xy - np.median(xy, axis=0)).max(axis=(1, 2))
@@ -363,7 +369,8 @@ def _select_reports(kind: Kind, own: Sequence[Report], places: Sequence[str]) ->
 
 
 def _separated(kind: Kind, own: Sequence[Report]) -> list[TypicalMark]:
-    """Half the separations. The sigma is that of a whole one: where its middle lies is not known either."""
+    """Marks at half the median separations. Their sigma is that of a full separation, since its centre is uncertain,
+    too."""
     marks = []
     for place in kind.places:
         right, up = DIRECTIONS[place]
@@ -385,7 +392,8 @@ def _separation_lines(kind: Kind, own: Sequence[Report]) -> list[str]:
 
 
 def _distance_lines(kind: Kind, own: Sequence[Report], marks: Sequence[TypicalMark]) -> Iterator[str]:
-    """Distances between marks: with the standard deviations of their coordinates they have the separations' spread."""
+    """Yield distances between marks, weighted so that together with the coordinates they have the spread of the
+    separations."""
     by_place = {mark.place: mark for mark in marks}
     for name, (start, end) in ENDS.items():
         values = _separations(own, name, kind.gate_mm)
@@ -423,7 +431,7 @@ def _source(own: Sequence[Report]) -> str:
 
 
 def _cameras(reports: Sequence[Report]) -> int:
-    """How many cameras they are of: one that was calibrated often tells little of the others."""
+    """Number of different cameras: repeated calibrations of one tell little about the others."""
     return len({report.serial for report in reports})
 
 

@@ -1,11 +1,12 @@
-"""A rendered block of 32 frames over relief without any orientation: through COLMAP and one adjustment, and alone.
+"""Rendered block of 32 frames over relief without orientations: by `reseau block` (COLMAP and one adjustment), and by
+COLMAP alone.
 
 python -m benchmarks colmap_block FOLDER [SEED...]
 
-Renders 4 strips of 8 frames (60 % and 40 % overlap, 1:10,000, relief 60 m rms, six poses, films of their own), runs
-`reseau measure` for the fiducials, marks 12 control points in every frame that shows them (true places with 0.3 px of
-noise: what a person would do), and runs `reseau block`. FOLDER is kept: what is there already is not made again. Of
-several seeds each has a folder in it.
+Renders 4 strips of 8 frames (60 % and 40 % overlap, 1:10,000, relief 60 m RMS, six poses, different film deformations),
+runs `reseau measure` for the fiducials, marks 12 control points in all frames that show them (true places with 0.3 px
+of noise, as a person would click them), and runs `reseau block`. FOLDER is kept, and existing files are used again.
+With several seeds, each has its own sub-folder.
 """
 
 import csv
@@ -38,7 +39,7 @@ BASE_M, STRIP_M, HEIGHT_M, GROUND_M = 912.0, 1370.0, 1530.0, 100.0
 POSES = ("0", "180", "90m", "270", "0m", "90")
 CONTROL = (4, 3)
 CONTROL_SIGMA_M, CLICK_PX = 0.05, 0.3
-MARGIN_MM = 12.0  # of the frame: there are its fiducials
+MARGIN_MM = 12.0  # mm, margin of the frame that contains the fiducials
 SEED = 11
 
 PROJECT = """camera = "project/camera.toml"
@@ -96,7 +97,7 @@ def main() -> None:
 
 
 def one_block(folder: Path, seed: int) -> None:
-    """Render, measure, orient and adjust by the user's commands, and compare; each step is timed."""
+    """Render, measure, orient and adjust a block by the user's commands, timed, and compare it with the true values."""
     print(f"seed {seed}", flush=True)
     scene = rendered(folder, seed)
     project, comparator = folder / "block.toml", folder / "comparator.csv"
@@ -112,7 +113,7 @@ def one_block(folder: Path, seed: int) -> None:
 
 
 def reseau(*arguments: str) -> str:
-    """What a command prints; how long it takes is told."""
+    """Run a command and print its time; returns its output."""
     start, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
     command = [str(Path(sys.executable).with_name("reseau")), *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -136,7 +137,7 @@ def rendered(folder: Path, seed: int) -> Scene:
 
 
 def images(rng: np.random.Generator) -> str:
-    """The frames' tables: strips flown there and back."""
+    """Image tables of the scene: strips flown in alternating directions."""
     tables = []
     for number in range(STRIPS * FRAMES):
         strip, frame = divmod(number, FRAMES)
@@ -153,7 +154,7 @@ def images(rng: np.random.Generator) -> str:
 
 
 def control_points(scene: Scene) -> Array:
-    """(n, 3) on the ground, on a grid over the block."""
+    """(n, 3) control points on the ground, in a grid over the block."""
     reach = np.array([(FRAMES - 1) * BASE_M, (STRIPS - 1) * STRIP_M]) / 2.0
     x, y = np.meshgrid(*(np.linspace(-end, end, count) for end, count in zip(reach, CONTROL, strict=True)))
     plan = np.column_stack([x.ravel(), y.ravel()])
@@ -161,7 +162,7 @@ def control_points(scene: Scene) -> Array:
 
 
 def give_control(folder: Path, scene: Scene, seed: int) -> None:
-    """control.csv, as a survey would give it."""
+    """Write control.csv with survey errors."""
     true = control_points(scene)
     given = true + np.random.default_rng([seed, 6]).normal(0.0, CONTROL_SIGMA_M, true.shape)
     rows = [[f"control-{number}", *xyz, *[CONTROL_SIGMA_M] * 3] for number, xyz in enumerate(given.round(3).tolist())]
@@ -170,7 +171,7 @@ def give_control(folder: Path, scene: Scene, seed: int) -> None:
 
 
 def click_control(comparator: Path, scene: Scene, seed: int) -> None:
-    """Mark control points in every frame that shows them within its marks."""
+    """Add the control points, with click errors, in all frames that show them inside their fiducials."""
     rng, true = np.random.default_rng([seed, 5]), control_points(scene)
     pitch = (float(scene.scanner.pitch_um[0]), float(scene.scanner.pitch_um[1]))
     half = np.array(scene.camera.frame_mm) / 2.0 - MARGIN_MM
@@ -188,7 +189,7 @@ def click_control(comparator: Path, scene: Scene, seed: int) -> None:
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors (n,) and their standard deviations (n,)."""
+    """Errors (n,) of a quantity and their standard deviations (n,)."""
 
     name: str
     error: Array
@@ -196,7 +197,7 @@ class Errors:
 
 
 def tell(adjustment: dict[str, Any], scene: Scene) -> None:
-    """Orientation, lens and fiducials against the truth."""
+    """Print the errors of orientations, lens and fiducials against the true values."""
     truth = {image.name: np.array(image.exterior) for image in scene.images}
     images = adjustment["images"]
     rows = []
@@ -242,8 +243,8 @@ def tell_ground(name: str, points: Array, scene: Scene) -> None:
 
 
 def tell_alone(folder: Path, scene: Scene) -> None:
-    """COLMAP by itself, of the same features, its camera estimated as it does by default, its block laid on the true
-    stations."""
+    """Print the errors of COLMAP alone, from the same features and with its default camera estimation, after a
+    similarity to the true stations."""
     pycolmap = quiet_colmap()
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = 0
@@ -270,7 +271,7 @@ def tell_alone(folder: Path, scene: Scene) -> None:
 
 
 def read_pitch(folder: Path) -> float:
-    """mm, of the block's pictures."""
+    """Pixel pitch of the block's images, mm."""
     import tifffile
 
     with tifffile.TiffFile(next((folder / "frames").glob("*.tif"))) as file:

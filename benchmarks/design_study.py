@@ -1,8 +1,8 @@
-"""The tables and figures of docs/how-to/plan-a-network.md.
+"""Design study: tables and figures of docs/how-to/plan-a-network.md.
 
 python -m benchmarks design_study [FOLDER]
 
-The expected precision of fiducial marks, interior orientation and distortion, the study that Torlegård announces: "for
+Expected precision of fiducial marks, interior orientation and distortion: the study announced by Torlegård, "for
 various testfields, cameras and photogrammetric network design"; and Juhl's table and figures 1 and 2.
 """
 
@@ -34,7 +34,7 @@ LAYOUTS = 30
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera and how far away it is used: mm and object units (m)."""
+    """Camera (mm) and its object distance (m)."""
 
     name: str
     frame_mm: float
@@ -49,11 +49,18 @@ HANDY = Camera("6 x 6 / 60 (close range)", 55.0, 60.0, 4.0)
 
 @dataclass(frozen=True)
 class Plan:
-    """One plan of the study; what is not said is the standard one.
+    """Network design of the study; the defaults are the standard one.
 
-    relief: height of the field, both ways together, in parts of the distance. control: known, heights or unknown.
-    tilt_deg: of the outer photographs towards the middle; kappas_deg: theirs, in turn, counter-clockwise.
-    point_um: standard deviation of the given coordinates at image scale.
+    Attributes
+    ----------
+    points, photos, fiducials, layouts : numbers of points, photographs, fiducial marks and random layouts.
+    relief : height range of the field, fraction of the distance.
+    control : "known", "heights" or "unknown".
+    tilt_deg : of the outer photographs towards the centre.
+    kappas_deg : of the outer photographs in turn, counter-clockwise.
+    point_um : standard deviation of the given coordinates at image scale.
+    transformation : film transformation.
+    target_um, fiducial_um : standard deviations of image coordinates.
     """
 
     camera: Camera = WIDE
@@ -71,10 +78,10 @@ class Plan:
     layouts: int = 5
 
     def scene(self) -> dict[str, Any]:
-        """The scene file's values."""
+        """Content of the scene file."""
         camera = self.camera
         half = camera.frame_mm / 2
-        side = camera.frame_mm / camera.c_mm * camera.distance  # of what a vertical photograph shows
+        side = camera.frame_mm / camera.c_mm * camera.distance  # ground width of a vertical photograph
         sigma: float | str = self.point_um / 1000.0 * camera.distance / camera.c_mm
         plane = {"known": sigma, "heights": "free", "unknown": "free"}[self.control]
         height = {"known": sigma, "heights": sigma, "unknown": "free"}[self.control]
@@ -120,7 +127,8 @@ class Plan:
         }
 
     def _image(self, number: int) -> dict[str, Any]:
-        """The first over the middle, the others on a circle about it, a tenth of the distance away, or tilted to it."""
+        """Image table: the first over the centre, the others on a circle around it, with a radius of a tenth of the
+        distance or as required by the tilt."""
         distance = self.camera.distance
         if number == 0:
             return {"name": "1", "position": [0.0, 0.0, distance], "angles_deg": [0.0, 0.0, 0.0]}
@@ -128,7 +136,7 @@ class Plan:
         around = 2 * math.pi * (number - 1) / max(self.photos - 1, 1)
         tilt = math.radians(self.tilt_deg)
         out = max(math.sin(tilt), 0.1) * distance
-        # Turned about the axis across the direction outwards, so that it looks at the middle of the field.
+        # Tilted around the axis perpendicular to the outward direction, towards the centre of the field.
         axis = np.array([-math.sin(around), math.cos(around), 0.0])
         omega, phi, kappa_rad = _angles(axis, -tilt, math.radians(kappa))
         return {
@@ -139,7 +147,7 @@ class Plan:
 
 
 def _angles(axis: np.ndarray[Any, Any], turn: float, kappa: float) -> tuple[float, float, float]:
-    """omega, phi, kappa of a camera that looks down, is turned about a level axis and then about its own."""
+    """omega, phi, kappa of a vertical camera rotated around a horizontal axis, then around its own axis."""
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     tilted = np.eye(3) + math.sin(turn) * cross + (1 - math.cos(turn)) * cross @ cross
@@ -152,9 +160,10 @@ HEADS = ("fiducials", "c", "x0', y0'", "radial", "tangential")
 
 
 def row(plan: Plan) -> tuple[list[float], int]:
-    """HEADS in um, of the photographs alone in the fiducials' frame, mean over layouts; the null directions.
+    """Expected sigmas in the order of HEADS, µm, mean over the layouts, and the number of undetermined quantities.
 
-    inf: not determined. The distortion at 0.435 frame widths, 100 mm of an aerial camera.
+    They are those of the photographs alone, in the datum of the fiducials; inf: not determined. The distortion is at
+    0.435 frame widths, 100 mm for an aerial camera.
     """
     scene = Variations(Path("study"), plan.scene())
     found = []
@@ -171,7 +180,7 @@ def row(plan: Plan) -> tuple[list[float], int]:
 
 
 def study() -> Iterable[tuple[str, str, list[tuple[str, Plan]]]]:
-    """Key, title and plans of every table."""
+    """Yield key, title and designs of each table."""
     fields = [
         ("known, flat", Plan()),
         ("known, relief 5 %", Plan(relief=0.05)),
@@ -243,7 +252,7 @@ def study() -> Iterable[tuple[str, str, list[tuple[str, Plan]]]]:
 
 
 def tables(folder: Path) -> str:
-    """All tables in Markdown; the numeric ones as figures too."""
+    """All tables in Markdown; those over a numeric quantity are also drawn as figures."""
     text = []
     for key, title, plans in study():
         rows = [(words, row(plan)[0]) for words, plan in plans]
@@ -255,7 +264,7 @@ def tables(folder: Path) -> str:
 
 
 def markdown(heads: Sequence[str], rows: Iterable[Row]) -> str:
-    """A table; numbers to two digits, a dash for what is not determined."""
+    """Markdown table; numbers to two digits, a dash for undetermined ones."""
     lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
     lines += ["| " + " | ".join(_cell(cell) for cell in cells) + " |" for cells in rows]
     return "\n".join(lines) + "\n"
@@ -270,7 +279,7 @@ def _cell(cell: str | float) -> str:
 
 
 def draw_study(path: Path, title: str, rows: list[tuple[str, list[float]]]) -> None:
-    """Standard deviations over the quantity of a table."""
+    """Plot the standard deviations over the quantity of a table."""
     figure, axes = _figure()
     places = np.arange(len(rows))
     for k, head in enumerate(HEADS):
@@ -287,7 +296,7 @@ def draw_study(path: Path, title: str, rows: list[tuple[str, list[float]]]) -> N
 
 
 def juhl(folder: Path) -> str:
-    """His table, his figures and his fourth photograph."""
+    """Juhl's table, figures and fourth photograph."""
     scene = Variations.read(JUHL)
     scene.values["design"]["layouts"] = LAYOUTS
     points = sweep(scene, 1, Sweep("field.points", (75, 100, 125, 150, 175, 200)))
@@ -364,7 +373,7 @@ def _figure() -> tuple[Figure, Axes]:
 
 
 def main() -> None:
-    """Print the tables, write the figures."""
+    """Print the tables and write the figures."""
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path("docs/design")
     folder.mkdir(parents=True, exist_ok=True)
     print(juhl(folder), flush=True)

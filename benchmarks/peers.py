@@ -1,13 +1,13 @@
-"""reseau, OpenCV, mrcal and COLMAP in turn: CPU seconds of calibrations, and what each solves of gross errors.
+"""Comparison of reseau, OpenCV, mrcal and COLMAP: CPU time of calibrations, and robustness against gross errors.
 
 python -m benchmarks peers [boards] [bundles] [gross] [commands] [VIEWS ...]     tables, all where none is named
 python -m benchmarks peers one PROGRAM VIEWS flat|relief given|free PERCENT     one measurement
 
-Every measurement is a process of its own with one thread; in each of five rounds the programs follow one another, and
-medians and ranges are told. Nobody gets orientations. c is given half a percent off, or not at all: then mrcal, which
-must have one, gets twice the true one, and so does OpenCV for points in relief. mrcal, which knows flat boards alone,
-is that of the system's interpreter; a program that is not installed is left out. Time is that of start values,
-adjustment and, of reseau and OpenCV, standard deviations; COLMAP resects image by image and adjusts with Ceres.
+Each measurement runs in its own process with one thread; in each of five rounds the programs alternate, and medians and
+ranges are printed. No program gets orientations. c is given with an error of half a percent, or not at all; then mrcal,
+which requires one, gets twice the true value, and so does OpenCV for points in relief. mrcal, limited to flat boards,
+runs in the system's interpreter; programs that are not installed are left out. The time includes approximate values,
+adjustment and, for reseau and OpenCV, standard deviations. COLMAP resects image by image and adjusts with Ceres.
 """
 
 import json
@@ -38,13 +38,13 @@ Figures = dict[str, Any]
 
 VIEWS, ROUNDS = (20, 50, 200, 1000), 5
 BUNDLES = ((60, 5000), (200, 20000))
-GROSS_PERCENT, GROSS_MM = (1, 5, 20), 20.0  # of the points, and how far at most they are moved along either axis
-OFF = 1.005  # a principal distance that is given, in parts of the true one
-GUESS = 2.0  # one that is not
+GROSS_PERCENT, GROSS_MM = (1, 5, 20), 20.0  # per cent of the points, and largest error per axis
+OFF = 1.005  # given principal distance in units of the true one
+GUESS = 2.0  # the same if it is unknown but required
 PIXELS_PER_MM = 10.0
-PATIENCE_S = 60.0  # a program that takes longer is measured once
+PATIENCE_S = 60.0  # s; slower programs are measured once only
 SYSTEM_PYTHON = "/usr/bin/python3"
-SOLVED_SIGMAS = 5.0  # of c, as reseau knows it without gross errors
+SOLVED_SIGMAS = 5.0  # largest error of c, in sigmas of reseau without gross errors
 
 
 def main() -> None:
@@ -58,7 +58,7 @@ def main() -> None:
 
 
 def one(program: str, views: int, relief: bool, given: bool, percent: int) -> Figures:
-    """Seconds, and how far c is off in the standard deviations of an adjustment without gross errors."""
+    """CPU seconds, and the error of c in standard deviations of an adjustment without gross errors."""
     clean = make_board(views, 0.05 if relief else 0.0)
     begin = time.process_time()
     c_mm, cpu_s = PROGRAMS[program](spoilt(clean, percent), relief, given, percent > 0)
@@ -68,7 +68,7 @@ def one(program: str, views: int, relief: bool, given: bool, percent: int) -> Fi
 
 
 def spoilt(scene: Scene, percent: int) -> Scene:
-    """The same scene, some of whose observations are gross errors."""
+    """Add gross errors to some of the observations of a scene."""
     rng = np.random.default_rng(percent)
     xy_mm = scene.network.observations.xy_mm.copy()
     rows = rng.permutation(len(xy_mm))[: len(xy_mm) * percent // 100]
@@ -79,7 +79,7 @@ def spoilt(scene: Scene, percent: int) -> Scene:
     return replace(scene, network=network, seen=view)
 
 
-Found = tuple[float, float | None]  # c in mm, and CPU seconds where another process took them
+Found = tuple[float, float | None]  # c, mm, and CPU seconds if another process was used
 
 
 def reseau(scene: Scene, relief: bool, given: bool, gross: bool) -> Found:
@@ -92,7 +92,7 @@ def reseau(scene: Scene, relief: bool, given: bool, gross: bool) -> Found:
 
 
 def _pixels(scene: Scene) -> list[Array]:
-    """Per image the places (m, 2) of its marks, y down."""
+    """Pixel coordinates (m, 2) of the marks of each image, y down."""
     return [(places * (1.0, -1.0) + FRAME_MM / 2) * PIXELS_PER_MM for _, places in scene.seen]
 
 
@@ -177,7 +177,7 @@ print(json.dumps([float(intrinsics[0, :2].mean()), time.process_time() - begin])
 
 
 def mrcal(scene: Scene, relief: bool, given: bool, gross: bool) -> Found:
-    """In a process of the system's interpreter."""
+    """Run mrcal in a process of the system's interpreter."""
     observations = np.full((len(scene.seen), 100, 3), -1.0)
     for of_view, (inside, _), places in zip(observations, scene.seen, _pixels(scene), strict=True):
         of_view[inside] = np.column_stack([places, np.ones(len(places))])
@@ -209,7 +209,7 @@ def _once(program: str, views: int, shape: str, c: str, percent: int) -> Figures
 
 
 def _rounds(programs: Sequence[str], measure: Callable[[str], Figures]) -> dict[str, list[Figures]]:
-    """Program after program, five times; one that fails, or takes too long, once."""
+    """Measure the programs in turn, ROUNDS times; those that fail or are too slow once."""
     found: dict[str, list[Figures]] = {program: [] for program in programs}
     for _ in range(ROUNDS):
         for program, figures in found.items():
@@ -226,7 +226,7 @@ def _describe(figures: Sequence[Figures]) -> str:
 
 
 def boards(views_of_tables: Sequence[int]) -> None:
-    """100 points a view."""
+    """Print the CPU times of calibrations with 100 points per view."""
     print(f"\n{'views':>5} {'points':7} {'c':6}" + "".join(f"{program:>26}" for program in PROGRAMS))
     for views in views_of_tables:
         for shape in ("flat", "relief"):
@@ -245,7 +245,7 @@ def _cell(figures: Sequence[Figures]) -> str:
 
 
 def bundles(_: Sequence[int]) -> None:
-    """With the covariance of camera, images and points."""
+    """Print the CPU times of bundle adjustments with the covariance of camera, images and points."""
     for images, points in BUNDLES:
         found = _rounds(("reseau", "ceres"), partial(_bundle, images=images, points=points))
         ours, theirs = (statistics.median(each["seconds"] for each in figures) for figures in found.values())
@@ -259,7 +259,7 @@ def _bundle(program: str, images: int, points: int) -> Figures:
 
 
 def gross(views_of_tables: Sequence[int]) -> None:
-    """How far c is off, in standard deviations, and CPU seconds; of the smaller numbers of views."""
+    """Print errors of c in standard deviations and CPU times with gross errors, for up to 50 views."""
     print(f"\n{'views':>5} {'points':7} {'c':6} {'%':>3}" + "".join(f"{program:>20}" for program in PROGRAMS))
     for views in [each for each in views_of_tables if each <= 50]:
         for shape in ("flat", "relief"):
@@ -276,7 +276,7 @@ def gross(views_of_tables: Sequence[int]) -> None:
 
 
 def commands(_: Sequence[int]) -> None:
-    """Small commands, from their start to their end, on the demonstration's five frames."""
+    """Print the CPU times of commands on the demonstration's five frames."""
     command = str(Path(sys.executable).with_name("reseau"))
     with TemporaryDirectory() as folder:
         subprocess.run([command, "demo", folder], capture_output=True, check=False, env=os.environ | ONE_THREAD)
@@ -288,9 +288,9 @@ def commands(_: Sequence[int]) -> None:
 
 
 def _run_once(command: Sequence[str]) -> Figures:
-    before = sum(os.times()[2:4])  # of children
+    before = sum(os.times()[2:4])  # CPU time of child processes
     done = subprocess.run(command, capture_output=True, check=False, env=os.environ | ONE_THREAD)
-    return {} if done.returncode > 1 else {"seconds": sum(os.times()[2:4]) - before}  # 1: something needs a look
+    return {} if done.returncode > 1 else {"seconds": sum(os.times()[2:4]) - before}  # 1: needs a look
 
 
 TABLES = {"boards": boards, "bundles": bundles, "gross": gross, "commands": commands}

@@ -1,12 +1,12 @@
-"""From how poor a start the adjustment still finds its minimum, or from none: five kinds of networks.
+"""Convergence from poor approximate values, or from none, for five types of networks.
 
 python -m benchmarks poor_starts [RUNS]
 
-Attitudes are turned by 30 degrees about random axes, stations shifted by 20 % of their distance in random directions,
-the principal distance is wrong by 20 %, and unknown points by 20 % of their distance. The right minimum is that from
-the truth; iterations are the median and the most. Then with no start at all, some of the targets being gross errors
-of up to a tenth of the frame, estimated robustly (igg3): right is what is within five standard deviations of that
-minimum.
+Attitudes are rotated by 30 degrees around random axes, stations shifted by 20 % of their distance in random directions,
+the principal distance is wrong by 20 %, and unknown points by 20 % of their distance. The correct minimum is that
+reached from the true values; iterations: median and maximum. Then without approximate values, with gross errors of up
+to a tenth of the frame in some of the targets and robust estimation (igg3): correct is a result within five standard
+deviations of that minimum.
 """
 
 import sys
@@ -35,8 +35,8 @@ Ended = tuple[str, int]
 Row = tuple[str, str, ObservationKind, Array]  # image, point, kind, place in mm
 
 ANGLE_DEG = 30.0
-SHARE = 0.2  # of distances
-SAME = 1e-3  # standard deviations within which two results are one
+SHARE = 0.2  # errors as a fraction of distances
+SAME = 1e-3  # standard deviations; largest difference of results at the same minimum
 STARTS = {
     "attitude": {"attitude"},
     "station": {"station"},
@@ -44,14 +44,14 @@ STARTS = {
     "everything": {"attitude", "station", "c", "point"},
 }
 GROSS_PERCENT = (0, 5, 20)
-GROSS = 0.1  # of the targets' extent in the images
-NEAR = 5.0  # standard deviations
+GROSS = 0.1  # largest gross error, fraction of the targets' extent in the images
+NEAR = 5.0  # standard deviations; largest difference of correct robust results
 FIDUCIALS = {"1": (106.0, -106.0), "2": (-106.0, -106.0), "3": (-106.0, 106.0), "4": (106.0, 106.0)}
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A network with the truth it was simulated from, and how its object space is held."""
+    """Simulated network with its true values. options: of the adjustment, with the datum."""
 
     network: Network
     truth: Approximations
@@ -59,7 +59,7 @@ class Scene:
 
 
 def main() -> None:
-    """One line a network: how many starts of each kind of error come to the right minimum, and where the others end."""
+    """Print a line for each network and type of error: rate of correct results, and the outcome of the others."""
     runs = int(sys.argv[1]) if len(sys.argv) > 1 else 100
     print(f"{'network':18} {'start':12} {'right':>7} {'iterations':>11} {'seconds':>8}  others")
     for name, scene in scenes().items():
@@ -79,7 +79,7 @@ def from_nothing(scene: Scene, right: Adjustment, percent: int, rng: np.random.G
 
 
 def study(title: str, one: Callable[[np.random.Generator], Ended], runs: int) -> None:
-    """Adjust at random and print what becomes of it."""
+    """Run random adjustments and print the outcomes."""
     ends: Counter[str] = Counter()
     iterations = []
     begin = time.process_time()
@@ -96,7 +96,7 @@ def study(title: str, one: Callable[[np.random.Generator], Ended], runs: int) ->
 
 
 def outcome(scene: Scene, right: Adjustment, start: Approximations | None, near: float) -> Ended:
-    """Where an adjustment ends, and its iterations; near: standard deviations from the right values that are right."""
+    """Outcome of an adjustment, and its iterations. near: tolerance around the correct values, standard deviations."""
     try:
         result = adjust(scene.network, start, scene.options)
     except AdjustmentError as error:
@@ -110,7 +110,7 @@ def outcome(scene: Scene, right: Adjustment, start: Approximations | None, near:
 
 
 def spoilt(scene: Scene, percent: int, rng: np.random.Generator) -> Scene:
-    """The same scene, some of whose targets are gross errors, to be estimated robustly."""
+    """Add gross errors to some of the targets of a scene, with robust estimation."""
     observations = scene.network.observations
     targets = np.flatnonzero(~observations.is_fiducial)
     wrong = rng.permutation(targets)[: len(targets) * percent // 100]
@@ -121,7 +121,7 @@ def spoilt(scene: Scene, percent: int, rng: np.random.Generator) -> Scene:
 
 
 def poor_start(scene: Scene, errors: set[str], rng: np.random.Generator) -> Approximations:
-    """The truth, spoilt."""
+    """True values with errors added."""
     truth = scene.truth
     known = {point.id: point for point in scene.network.points}
     middle = np.mean(list(truth.points.values()), axis=0)
@@ -151,7 +151,7 @@ def direction(rng: np.random.Generator) -> Array:
 
 
 def scenes() -> dict[str, Scene]:
-    """The five kinds of networks: aerial ones in metres, those of a digital camera in units of half a metre."""
+    """The five types of networks: aerial ones in metres, those of a digital camera in units of half a metre."""
     rng = np.random.default_rng(2)
     plan = np.stack(np.meshgrid(np.linspace(-800, 800, 6), np.linspace(-800, 800, 5)), axis=-1).reshape(-1, 2)
     relief = np.column_stack([plan + rng.uniform(-60, 60, plan.shape), rng.uniform(-150, 150, len(plan))])
@@ -194,7 +194,8 @@ def scenes() -> dict[str, Scene]:
 
 @dataclass(frozen=True)
 class Optics:
-    """A camera with its true lens (7,) and the half side of its frame; sigma_mm: of a measured coordinate."""
+    """Camera with its true lens. lens: (7,) distortion parameters; half_mm: half the side of the frame; sigma_mm: of a
+    measured coordinate."""
 
     camera: Camera
     lens: Array
@@ -203,13 +204,14 @@ class Optics:
 
     @property
     def interior(self) -> Array:
-        """(3,) the true principal distance and point."""
+        """(3,) true principal distance and point."""
         distance = self.camera.principal_distance_mm
         return np.array([0.0 if distance is None else distance.value, 0.1, -0.1])
 
 
 def film_scene(rng: np.random.Generator, exteriors: list[Array], xyz: Array, known: str) -> Scene:
-    """A film camera of 153 mm. known, of the object points: "fixed", "heights", or four "control" points."""
+    """Scene of a film camera of 153 mm. known: object points that are known, "fixed" (all), "heights" or "control"
+    (four)."""
     free = () if known == "heights" else ("k3", "k5", "p1", "p2")
     camera = Camera(
         "K",
@@ -228,7 +230,7 @@ def film_scene(rng: np.random.Generator, exteriors: list[Array], xyz: Array, kno
 
 
 def digital_scene(rng: np.random.Generator, exteriors: list[Array], xyz: Array, known: str) -> Scene:
-    """A digital camera of 8 mm, object points "fixed" or "unknown"."""
+    """Scene of a digital camera of 8 mm with "fixed" or "unknown" object points."""
     nothing = Prior(0.0, np.inf)
     camera = Camera("K", Prior(8.0, np.inf), nothing, nothing, Distortion("brown", {"k1": nothing, "k2": nothing}))
     lens = np.array([1e-3, -2e-5, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -237,7 +239,7 @@ def digital_scene(rng: np.random.Generator, exteriors: list[Array], xyz: Array, 
 
 
 def make_points(xyz: Array, known: str) -> list[tuple[ObjectPoint, Array]]:
-    """The points as they are given, and where they are (3,)."""
+    """Object points with their priors, and their true places (3,)."""
     corners = {int(np.argmax(xyz[:, :2] @ np.array(corner))) for corner in ((1, 1), (1, -1), (-1, 1), (-1, -1))}
     sigmas = {"fixed": (0.0, 0.0, 0.0), "unknown": (np.inf,) * 3, "heights": (np.inf, np.inf, 0.05)}
     by_point = [sigmas.get(known, sigmas["fixed" if j in corners else "unknown"]) for j in range(len(xyz))]
@@ -254,7 +256,7 @@ def simulated(
     films: list[Film],
     points: list[tuple[ObjectPoint, Array]],
 ) -> Scene:
-    """The points in the frame that two images show at least, with errors."""
+    """Simulate observations, with errors, of the points that at least two images show."""
     xyz = np.array([place for _, place in points])
     pairs = list(zip(exteriors, films, strict=True))
     rows = [row for i, (exterior, film) in enumerate(pairs) for row in exposed(optics, f"i{i}", exterior, film, xyz)]
@@ -282,7 +284,7 @@ def simulated(
 
 
 def exposed(optics: Optics, image: str, exterior: Array, film: Film, xyz: Array) -> list[Row]:
-    """The points (n, 3) in an image's frame, and its fiducials, without errors."""
+    """Error-free observations of the points (n, 3) within an image's frame, and of its fiducials."""
     camera, rotation = optics.camera, rotation_from_angles(exterior[3:])
     model = ImageModel(Lens(camera.distortion, optics.interior, optics.lens), rotation, exterior[:3], film)
     xy, projected = model.camera_from_object(xyz)
@@ -296,7 +298,7 @@ def exposed(optics: Optics, image: str, exterior: Array, film: Film, xyz: Array)
 
 
 def looking_at_origin(station: list[float], kappa: float) -> Array:
-    """The exterior orientation (6,) of a camera that looks at the origin."""
+    """Exterior orientation (6,) of a camera that points at the origin."""
     back = np.array(station) / np.linalg.norm(station)
     right = np.cross([0.0, 1.0, 0.0], back)
     right /= np.linalg.norm(right)

@@ -1,11 +1,10 @@
-"""What resampling does to a picture: marks shifted, noise and sharpness lost, beside other programs' interpolations.
+"""Effects of resampling on an image, compared with other programs: shifts of marks, loss of noise and contrast.
 
     python -m benchmarks resampling [side_px] [--large]
 
-The picture is of known formula, turned by 0.37 degrees at a scale of 0.9985. --large: time and peak memory of a scan of
-side_px (11,500; 23,000 takes some five minutes), 16 bit, in strips, that lies turned by 90 degrees, each program in a
-process of its own; a line as soon as each is done. Rows of libvips and GDAL come where pyvips and rasterio are
-installed, which this project does not need.
+The image is synthetic, rotated by 0.37 degrees at a scale of 0.9985. --large: time and peak memory for a scan of
+side_px (11,500; 23,000 takes about five minutes), 16 bit, in strips, rotated by 90 degrees; each program runs in its
+own process. libvips and GDAL are included if pyvips and rasterio are installed, which the project does not require.
 """
 
 import multiprocessing
@@ -34,7 +33,7 @@ Method = Callable[[Array, Array, Array], Array]
 TURN, SCALE = np.radians(0.37), 0.9985
 BLUR_PX, PEAK = 1.4, 20000.0
 SPACING_PX, WINDOW_PX = 40, 8
-HALF_NYQUIST = 0.25  # cycles a pixel
+HALF_NYQUIST = 0.25  # cycles per pixel
 
 
 def opencv_method(kind: int) -> Method:
@@ -50,7 +49,7 @@ def spline_method(degree: Degree) -> Method:
 
 
 def vips_method(kind: str) -> Method:
-    """libvips' mapim, whose places count from the first pixel's centre."""
+    """Interpolation by libvips' mapim, with coordinates from the centre of the first pixel."""
 
     def method(picture: Array, cols: Array, rows: Array) -> Array:
         import pyvips
@@ -64,7 +63,7 @@ def vips_method(kind: str) -> Method:
 
 
 def gdal_method(kind: str) -> Method:
-    """GDAL's warp between two affine frames, without its own approximation."""
+    """Interpolation by GDAL's warp between two affine frames, without its approximation."""
 
     def method(picture: Array, cols: Array, rows: Array) -> Array:
         from rasterio.transform import Affine
@@ -96,7 +95,7 @@ METHODS: dict[str, Method] = {
 
 
 def source_places(side: int) -> tuple[Array, Array]:
-    """Where the result's pixels lie in the picture."""
+    """Columns and rows in the image of the pixels of the result."""
     col, row = np.meshgrid(np.arange(side, dtype=float), np.arange(side, dtype=float))
     u, v = col - side / 2, row - side / 2
     return (
@@ -106,7 +105,7 @@ def source_places(side: int) -> tuple[Array, Array]:
 
 
 def marks(side: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """A picture of Gaussian marks, and their middles (n, 2)."""
+    """Image of Gaussian marks, and their centres (n, 2)."""
     grid = np.arange(SPACING_PX, side - SPACING_PX, SPACING_PX, dtype=float)
     middles = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2) + rng.uniform(0, 1, (grid.size**2, 2))
     picture = np.full((side, side), 8000.0)
@@ -119,7 +118,7 @@ def marks(side: int, rng: np.random.Generator) -> tuple[Array, Array]:
 
 
 def target_places(side: int) -> tuple[Array, Array]:
-    """The way back: where the picture's pixels lie in the result."""
+    """Inverse: columns and rows in the result of the pixels of the image."""
     col, row = np.meshgrid(np.arange(side, dtype=float), np.arange(side, dtype=float))
     u, v = (col - side / 2) / SCALE, (row - side / 2) / SCALE
     return (
@@ -129,13 +128,13 @@ def target_places(side: int) -> tuple[Array, Array]:
 
 
 def shift_middles(middles: Array, side: int) -> Array:
-    """Where marks (n, 2) of the picture lie in the result."""
+    """Transform the centres (n, 2) of marks from the image to the result."""
     u, v = (middles - side / 2).T / SCALE
     return np.stack([np.cos(TURN) * u + np.sin(TURN) * v, -np.sin(TURN) * u + np.cos(TURN) * v], axis=1) + side / 2
 
 
 def shift_rms_px(picture: Array, places: Array, blur_px: float) -> float:
-    """How far marks lie from where they should be, by least squares with their true form."""
+    """RMS shift of marks from their true places, by least-squares matching with their true shape."""
     side, at, off = len(picture), np.arange(-WINDOW_PX, WINDOW_PX + 1), []
     for x, y in places[((places > side // 16) & (places < side - side // 16)).all(axis=1)]:
         col, row = round(x), round(y)
@@ -149,7 +148,7 @@ def shift_rms_px(picture: Array, places: Array, blur_px: float) -> float:
 
 
 def compare(side: int) -> None:
-    """There, and there and back: the same picture, with nothing that is not interpolated twice."""
+    """Print the effects of resampling once, and of resampling to the result and back."""
     rng = np.random.default_rng(5)
     there, back = source_places(side), target_places(side)
     inner = slice(side // 8, -side // 8)
@@ -180,12 +179,12 @@ def compare(side: int) -> None:
 
 
 STRIP_PX = 64
-TURNED = np.array([1.0, 0.002, -1.0, -1.0, 1.0, 0.002])  # the film of a scan that lies turned by 90 degrees
+TURNED = np.array([1.0, 0.002, -1.0, -1.0, 1.0, 0.002])  # film transformation of a scan rotated by 90 degrees
 PITCH_MM = 0.02
 
 
 def make_scan(path: Path, side: int) -> None:
-    """A scan of noise on slow waves, made strip by strip in a file beside it: no more of it need be in memory."""
+    """Make a scan of noise on long waves, strip by strip in a memory-mapped file, to limit memory."""
     rng = np.random.default_rng(5)
     wave = 14000.0 + 4000.0 * np.sin(np.arange(side) / 90.0)
     raw = np.memmap(path.with_suffix(".raw"), np.uint16, "w+", shape=(side, side))
@@ -204,7 +203,7 @@ def resample_reseau(folder: Path, degree: Degree) -> str:
 
 
 def resample_vips(folder: Path, _: Degree) -> str:
-    """The same turn by libvips' affine, stored alike: tiles, deflate, predictor."""
+    """Resample by libvips' affine with the same storage: tiles, deflate, predictor."""
     import pyvips
 
     image = pyvips.Image.new_from_file(str(folder / "scan.tif"))
@@ -223,7 +222,7 @@ PROGRAMS: dict[str, tuple[Callable[[Path, Degree], str], Degree]] = {
 
 
 def print_measures(name: str, folder: Path) -> None:
-    """Run one program in this process, and print what it took."""
+    """Run one program in this process, and print its time and peak memory."""
     program, degree = PROGRAMS[name]
     start = time.perf_counter()
     try:
@@ -237,7 +236,7 @@ def print_measures(name: str, folder: Path) -> None:
 
 
 def large(side: int = 11500) -> None:
-    spawn = multiprocessing.get_context("spawn")  # so that nothing counts what another has held
+    spawn = multiprocessing.get_context("spawn")  # so that peak memory counts for each program alone
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         print(f"a scan of {side} px, 16 bit, LZW in strips of {STRIP_PX} rows, turned by 90 degrees", flush=True)

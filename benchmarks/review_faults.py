@@ -1,12 +1,13 @@
-"""A person who sees what is there goes through forty frames with twenty faults, by keys alone in a real browser. Do the
-decisions lead to the right marks? Are the rows that change those decided about, and no others? How many keys does it
-take, and how long?
+"""Review of forty frames with twenty planted faults, by keyboard in a real browser.
+
+Do the decisions lead to correct marks? Do only the rows change that were decided on? How many keys and how much time
+does it take?
 
     python -m benchmarks review_faults [SEED] [FOLDER]
 
-The person is a rule: shown a mark, it accepts what lies where the mark was drawn, places a mark that is seen elsewhere,
-rejects what was measured where none is seen, and else says that it is not there. Truth is the renderer's. FOLDER: where
-the project is left to be looked at. Needs Chromium.
+The reviewer is simulated: it accepts a mark measured at its true place, places a mark that is visible elsewhere,
+rejects a measurement where no mark is visible, and otherwise states that the mark is absent. The true values are those
+of the renderer. FOLDER: where the project is kept for inspection. Requires Chromium.
 """
 
 import csv
@@ -39,17 +40,17 @@ FRAMES = 40
 PITCH_UM, PX_PER_MM = 50.0, 20.0
 CORNERS = ((6.0, -6.0), (-6.0, -6.0), (-6.0, 6.0), (6.0, 6.0))
 PLACES = dict(enumerate((*CORNERS, (6.0, 0.0), (0.0, -6.0), (-6.0, 0.0), (0.0, 6.0)), 1))
-OFF_MM = (0.18, 0.1)  # of a false mark, where the true one is hidden
-ASKEW_RAD = 0.35  # no search looks for a frame that lies so
-SEEN_PX = 1.5  # how far off a person sees that a cross is beside its mark
-RIGHT_PX = 0.5  # of a mark that counts as measured
-ROUNDS = 4  # of deciding and measuring again, at most
+OFF_MM = (0.18, 0.1)  # mm, offset of a false mark from the hidden true one
+ASKEW_RAD = 0.35  # rotation of a frame outside the search range
+SEEN_PX = 1.5  # px, offset of a cross from its mark that a reviewer notices
+RIGHT_PX = 0.5  # px, tolerance of a measured mark
+ROUNDS = 4  # largest number of rounds of review and measurement
 
 RING, BARS = (
     areas.ring((0.0, 0.0), 0.5, 0.1),
     (areas.bar((-0.8, 0), (0.8, 0), 0.1), areas.bar((0, -0.8), (0, 0.8), 0.1)),
 )
-DOTS = {1: ((1.05, -0.3), (1.05, 0.3)), 2: ((1.05, 0.3),)}  # beside these marks, mm: they tell the pose
+DOTS = {1: ((1.05, -0.3), (1.05, 0.3)), 2: ((1.05, 0.3),)}  # mm, dots next to these marks, which determine the pose
 DOT_MM = 0.12
 SHAPES = (
     'shape = "ring"\ncenter_mm = [0, 0]\nradius_mm = 0.5\nline_mm = 0.1\n',
@@ -77,7 +78,7 @@ PROJECT = f'camera = "camera.toml"\nscans = ["scans/*.tif"]\npitch_um = {PITCH_U
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with a frame. mark: with which of its marks."""
+    """Fault of a frame. mark: number of the mark concerned, 0 for none."""
 
     kind: str
     pose: str = "0"
@@ -99,7 +100,7 @@ FAULTS = (
 
 @dataclass(frozen=True)
 class Truth:
-    """px: where each mark was drawn, by its name; seen: which a person sees there."""
+    """True values of a frame. px: place of each mark by name; seen: names of the visible marks."""
 
     pose: str
     px: Mapping[str, Array]
@@ -108,7 +109,7 @@ class Truth:
 
 @dataclass
 class Session:
-    """What a person did. marks: about how many of these single keys decided, and how many keys that took."""
+    """Statistics of a review. marks: number of decisions on marks; keys_of_marks: keys pressed for them."""
 
     keys: int = 0
     marks: int = 0
@@ -132,7 +133,7 @@ def main(seed: int, folder: Path) -> int:
 def print_outcome(
     seed: int, truths: Mapping[str, Truth], before: Rows, after: Rows, made: list[dict[str, Any]], session: Session
 ) -> int:
-    """Print what came of it; 1 where a mark is not right, or a row changed that nobody decided about."""
+    """Print the outcome; returns 1 if a mark is wrong or a row changed without a decision, else 0."""
     kinds = Counter(fault.kind for fault in FAULTS)
     print(f"{FRAMES} frames of {len(PLACES)} marks, seed {seed}; faults: "
           f"{', '.join(f'{count} {kind}' for kind, count in kinds.items())}")  # fmt: skip
@@ -156,7 +157,7 @@ def print_outcome(
 
 
 def is_right(row: Mapping[str, str], truth: Truth) -> bool:
-    """A mark that is seen is measured where it is; one that is not is no observation."""
+    """Whether a visible mark is measured at its place, or an invisible one is not an observation."""
     is_observation = row["status"] in ("measured", "weak")
     if row["point"] not in truth.seen or not is_observation:
         return is_observation == (row["point"] in truth.seen)
@@ -169,7 +170,7 @@ def is_right(row: Mapping[str, str], truth: Truth) -> bool:
 
 
 def planted(folder: Path, rng: np.random.Generator) -> dict[str, Truth]:
-    """Render the project, its faults in frames by chance, and tell what is right."""
+    """Render the project with faults in random frames; returns the true values."""
     at = dict(zip(rng.permutation(FRAMES)[: len(FAULTS)].tolist(), FAULTS, strict=True))
     faults = {f"f{k:02}": at.get(k, Fault("none", turn_rad=float(rng.uniform(-0.01, 0.01)))) for k in range(FRAMES)}
     images = tuple(
@@ -205,7 +206,7 @@ def planted(folder: Path, rng: np.random.Generator) -> dict[str, Truth]:
 
 
 def plant(path: Path, fault: Fault, px: Mapping[str, Array], rng: np.random.Generator) -> None:
-    """Paint into a scan what is wrong with it."""
+    """Paint a fault into a scan."""
     grey = tifffile.imread(path).astype(np.float64)
     design = np.column_stack([np.array(list(PLACES.values())), np.ones(len(PLACES))])
     matrix = np.linalg.lstsq(design, np.array([px[str(n)] for n in PLACES]), rcond=None)[0].T
@@ -240,11 +241,11 @@ def plant(path: Path, fault: Fault, px: Mapping[str, Array], rng: np.random.Gene
     tifffile.imwrite(path, np.clip(np.rint(grey), 0, 65535).astype(np.uint16))
 
 
-# --- the person
+# --- the reviewer
 
 
 def reviewed(project: Path, truths: Mapping[str, Truth], session: Session) -> int:
-    """Answer what is asked, until nothing is left; how many answers that took."""
+    """Answer all questions of the queue; returns the number of answers."""
     command = [sys.executable, "-c", START, "review", str(project), "--no-browser", "--who", "ann"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
@@ -269,7 +270,7 @@ def reviewed(project: Path, truths: Mapping[str, Truth], session: Session) -> in
 
 @dataclass
 class Person:
-    """Looks at what the page shows, knows a mark when it sees one, and has a keyboard."""
+    """Simulated reviewer with a keyboard, who knows the true places of the marks."""
 
     page: Page
     truths: Mapping[str, Truth]
@@ -311,7 +312,7 @@ class Person:
         self.press("Enter", "frame")
 
     def steers(self, view: str, place_px: Array) -> None:
-        """By arrow keys to a step of them."""
+        """Move the cursor to a place by arrow keys, to the nearest step."""
         self.press("ArrowRight")
         first = self.cursor(view)
         self.press("ArrowRight")
@@ -337,7 +338,7 @@ _READY = """() => {
   return shown('whole-view') && (shown('pose-view') || document.activeElement.id === 'whole');
 }"""
 
-# Where the page says that the mark was measured.
+# Measured place of the mark as shown on the page.
 _SHOWN = """() => {
   const terms = [...document.querySelectorAll('#facts dt')];
   const place = terms.find((term) => term.textContent === 'column, row')?.nextElementSibling.textContent;

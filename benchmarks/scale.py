@@ -1,13 +1,13 @@
-"""Time and memory of large adjustments beside OpenCV, SciPy and Ceres, each in a process of its own with one thread.
+"""Time and memory of large adjustments compared with OpenCV, SciPy and Ceres, each in its own process with one thread.
 
 python -m benchmarks scale                                                          the whole table
 python -m benchmarks scale --case unknown --program ceres --images 60 --points 5000 --json
 
-Cases: "known", a board of 100 known points, from approximations; "free", the same without any, not even of the
-principal distance (`--flat`: points in a plane); "unknown", an aerial block; "strip". cpu_seconds are those of the
-adjustment with all its covariances, and of start values in "free"; vpv is the weighted sum of squared residuals.
+Cases: "known", a board of 100 known points, from approximate values; "free", the same without any, not even a principal
+distance (`--flat`: points in a plane); "unknown", an aerial block; "strip". cpu_seconds include the adjustment with all
+its covariances, and in "free" the approximate values; vpv is the weighted sum of squared residuals.
 
-Ceres is measured where pycolmap is installed, which brings it.
+Ceres is measured if pycolmap, which includes it, is installed.
 """
 
 import json
@@ -57,9 +57,9 @@ COLUMNS = {
 VIEWS, VIEWS_OF_RESEAU_ALONE = (20, 50, 200, 1000), (4000,)
 NETWORKS = ((60, 5000), (200, 20000), (500, 50000))  # images and unknown points
 STRIPS, STRIPS_OF_RESEAU_ALONE, HANGING = (500,), (1000, 2000, 4000), 1000  # images
-LEAST_SCIPY_IMAGES = 200  # and beyond: it takes minutes
-PATIENCE_S = 300.0  # of CPU time, for SciPy
-GUESS = 2.0  # of the principal distance, in true ones, for a program that must have one
+LEAST_SCIPY_IMAGES = 200  # largest number of images for SciPy, which takes minutes
+PATIENCE_S = 300.0  # s, limit of the CPU time of SciPy
+GUESS = 2.0  # principal distance in units of the true one, for programs that require one
 
 
 def cells() -> Iterator[Row]:
@@ -77,7 +77,7 @@ def cells() -> Iterator[Row]:
 
 
 def case(case: str, program: str, images: int, points: int = 0, flat: bool = False) -> Row:
-    """One program on one network."""
+    """Measure one program on one network."""
     scene = {
         "known": lambda: make_board(images, 0.0 if flat else 0.05),
         "free": lambda: make_board(images, 0.0 if flat else 0.05),
@@ -95,8 +95,8 @@ def case(case: str, program: str, images: int, points: int = 0, flat: bool = Fal
 
 
 def report(rows: Sequence[Row]) -> Iterator[str]:
-    """Where several programs adjusted one network: how long the first took in terms of each, and whether they came to
-    the same minimum."""
+    """Yield, for networks adjusted by several programs, the time of the first one relative to each other one, and
+    whether they reached the same minimum."""
     networks: dict[tuple[object, ...], list[Row]] = {}
     for row in rows:
         networks.setdefault((row["case"], row["images"], row.get("points")), []).append(row)
@@ -109,7 +109,7 @@ def report(rows: Sequence[Row]) -> Iterator[str]:
 
 
 def run_timed(program: str, *, images: int, points: int) -> Figures:
-    """The figures of one program on an aerial block, in a process of its own."""
+    """Measure one program on an aerial block in its own process."""
     options = ["--case", "unknown", "--program", program, "--images", str(images), "--points", str(points), "--json"]
     command = [sys.executable, "-m", "benchmarks", "scale", *options]
     environment = os.environ | ONE_THREAD
@@ -128,7 +128,7 @@ def _peak_mib() -> float:
 
 
 def reseau(scene: Scene) -> Figures:
-    """With the covariance of camera, images and points; what the observations tell besides is measured by itself."""
+    """Measure reseau with the covariance of camera, images and points; residuals, tests and reliability separately."""
     result, seconds = _timed(lambda: adjust(scene.network, scene.start))
     assert result.converged
     cameras = [name for name in result.names if name.startswith("IO.")]
@@ -142,7 +142,7 @@ def reseau(scene: Scene) -> Figures:
 
 
 def reseau_alone(scene: Scene) -> Figures:
-    """Start values and adjustment where nothing is given but the points, not even a principal distance."""
+    """Measure approximate values and adjustment with only the points given, not even a principal distance."""
     cameras = tuple(
         replace(camera, principal_distance_mm=None, x0_mm=None, y0_mm=None) for camera in scene.network.cameras
     )
@@ -158,8 +158,8 @@ def reseau_alone(scene: Scene) -> Figures:
 
 
 def opencv(scene: Scene, free: bool, flat: bool) -> Figures:
-    """OpenCV's calibration with its standard deviations; free: from no principal distance, or a wrong one where points
-    in relief ask for one."""
+    """Measure OpenCV's calibration with its standard deviations. free: without a principal distance, or with a wrong
+    one for points in relief, which require one."""
     cv2.setNumThreads(1)
     model = [scene.points[inside].astype(np.float32) for inside, _ in scene.seen]
     imaged = [((places * (1.0, -1.0) + FRAME_MM / 2) * 10.0).astype(np.float32) for _, places in scene.seen]
@@ -174,11 +174,11 @@ def opencv(scene: Scene, free: bool, flat: bool) -> Figures:
 
 
 class SparseProblem:
-    """The residuals of a scene and their analytic sparse Jacobian, as SciPy asks for them."""
+    """Residuals of a scene and their analytic sparse Jacobian, in SciPy's form."""
 
     def __init__(self, scene: Scene) -> None:
         exterior = np.full(6, np.inf)
-        exterior[3:] = 1e6  # angles as unknowns, all but free: they add up
+        exterior[3:] = 1e6  # nearly free, so that angles are additive unknowns
         images = tuple(
             replace(image, exterior=Exterior(scene.start.exterior[image.name], exterior))
             for image in scene.network.images
@@ -202,7 +202,7 @@ class SparseProblem:
         return linear.v_mm.ravel() / SIGMA_MM, csr_array((by[used], (rows[used], columns[used])), shape=shape)
 
     def of_camera(self, jacobian: csr_array) -> Array:
-        """The columns of the covariance that are the camera's."""
+        """Columns of the covariance for the camera parameters."""
         scale = diags_array(1.0 / np.sqrt((jacobian**2).sum(axis=0)))
         normal = (scale @ jacobian.T @ jacobian @ scale).tocsc()
         factor = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
@@ -213,7 +213,7 @@ class SparseProblem:
 
 
 def scipy(scene: Scene) -> Figures:
-    """Trust region with LSMR on the same residuals and their analytic sparse Jacobian; then the camera's covariance."""
+    """Measure SciPy: trust region with LSMR and the analytic sparse Jacobian, then the covariance of the camera."""
     problem = SparseProblem(scene)
     begin = time.process_time()
 
@@ -238,7 +238,8 @@ def scipy(scene: Scene) -> Figures:
 
 
 def ceres(scene: Scene) -> Figures:
-    """COLMAP's bundle adjustment by Ceres, and its covariance of camera, images and points by the Schur complement."""
+    """Measure COLMAP's bundle adjustment by Ceres, with the covariance of camera, images and points by the Schur
+    complement."""
     import pycolmap
 
     unit = 1.0 / SIGMA_MM  # pixels of unit weight

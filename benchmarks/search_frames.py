@@ -1,5 +1,5 @@
-"""Small frames for the study of search and pose: every kind of mark, in all poses, among all that marks are confused
-with. Each is drawn by chance, from a seed of its own."""
+"""Random small frames for the study of search and pose: all kinds of marks, in all poses, among clutter similar to
+marks. Each frame has its own seed."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -53,14 +53,22 @@ PITCH_UM = 28.0
 MARGIN_MM = 4.0
 GIVEN_SIGMA_MM = 0.005
 FILM_UM = 3.0
-APART_MM = 2.0  # of clutter from the marks: what covers a mark is damage, another study
+APART_MM = 2.0  # mm, distance of clutter from the marks; damaged marks are another study
 SIDES: tuple[Side, ...] = ("left", "right", "top", "bottom")
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A frame and its truth. picture: what disturbs it, in words; centers_px: (2,) of each mark by id; hidden: the ids
-    of marks that cannot be seen. without_marks: paints the same picture (rows, columns) anew, its marks left out."""
+    """Frame with its true values.
+
+    Attributes
+    ----------
+    picture : kind of exposure, in words.
+    pitch_um : given pixel pitch, None if it is not given.
+    centers_px : (2,) true centre of each mark by id.
+    hidden : ids of the marks that are not visible.
+    without_marks : paints the same image (rows, columns) without its marks.
+    """
 
     kind: str
     symmetry: str
@@ -75,14 +83,14 @@ class Case:
 
 
 def draw_case(seed: int, index: int, pitch_um: float = PITCH_UM) -> Case:
-    """The index-th frame of the study of that seed."""
+    """Frame number index of the study with that seed."""
     rng = np.random.default_rng([seed, index])
     kind, symmetry = str(rng.choice(KINDS)), str(rng.choice(SYMMETRIES))
     return make_case(rng, kind, symmetry, _layout(rng, kind, symmetry), f"{index}.tif", pitch_um=pitch_um)
 
 
 def is_overexposed(seed: int, index: int) -> bool:
-    """Of that frame, without drawing it."""
+    """Whether that frame is overexposed, without rendering it."""
     rng = np.random.default_rng([seed, index])
     kind, symmetry = str(rng.choice(KINDS)), str(rng.choice(SYMMETRIES))
     _layout(rng, kind, symmetry)
@@ -99,8 +107,8 @@ def make_case(
     gamma: float = 1.0,
     pitch_um: float = PITCH_UM,
 ) -> Case:
-    """A frame with the marks of the layout, all else drawn by chance. tones: of marks that grow out of the frame's
-    border, with no pads behind them; else by chance, too. gamma: by which the scanner codes light."""
+    """Make a frame with the marks of the layout, everything else random. tones: of marks that are connected to the
+    frame's border, without pads behind them; None: random. gamma: tone curve of the scanner."""
     of_border, (tones, picture) = tones is not None, (tones, "solid marks") if tones else _tones(rng)
     scene = _scene(rng, layout, tones)
     scene = replace(scene, scanner=replace(scene.scanner, tone=gamma, pitch_um=(pitch_um, pitch_um)))
@@ -125,7 +133,8 @@ def make_case(
 
 
 def _layout(rng: Generator, kind: str, symmetry: str) -> FiducialLayout:
-    """Corners, or corners and sides; alike, or made different by a few um, by dots beside the marks, or by kind."""
+    """Random layout of marks in the corners, or corners and sides; alike, or different by a few µm, by dots next to the
+    marks, or by kind."""
     at = float(rng.uniform(10.0, 11.2))
     places = [(at, -at), (-at, -at), (-at, at), (at, at)]
     if rng.random() < 0.6:
@@ -211,13 +220,14 @@ def _scene(rng: Generator, layout: FiducialLayout, tones: Tones) -> Scene:
 
 
 def _draw_place(rng: Generator, mark: LayoutMark) -> tuple[float, float]:
-    """Where the camera has its mark: beside its given place by the given standard deviation."""
+    """True place of a mark: normally distributed around the given one."""
     x, y = rng.normal(mark.xy_mm, mark.sigma_mm)
     return float(x), float(y)
 
 
 def _clutter(rng: Generator, layout: FiducialLayout, geometry: FrameGeometry, tones: Tones) -> list[Paint]:
-    """Writing, stamps, and figures as the camera's own and other marks, anywhere on the film but on the marks."""
+    """Random writing, stamps, and figures like the camera's own and other marks, anywhere on the film except on the
+    marks."""
     if rng.random() < 0.15:
         return []
     draw: Sequence[Callable[[], Paint]] = (
@@ -230,7 +240,7 @@ def _clutter(rng: Generator, layout: FiducialLayout, geometry: FrameGeometry, to
 
 
 def _free_place(rng: Generator, layout: FiducialLayout) -> Array:
-    """(2,) camera mm, inside of the frame or in the margin about it."""
+    """(2,) random place in camera mm, within the frame or its margin, away from the marks."""
     marks = np.array([mark.xy_mm for mark in layout.marks])
     while True:
         place = rng.uniform(-1.0, 1.0, 2) * (FRAME_MM / 2 + MARGIN_MM - 1.0)
@@ -271,7 +281,7 @@ def _write(cover: Sheet, letters: str, size: float) -> None:
 def _chip(
     rng: Generator, layout: FiducialLayout, geometry: FrameGeometry, tones: Tones, draw: Callable[[Sheet], None]
 ) -> ChipPaint:
-    """A drawing on a small sheet, turned by quarters, that covers no mark."""
+    """Paint of a small drawing, in a random quarter turn, that covers no mark."""
     sheet = np.zeros((44, 120), np.uint8)
     draw(sheet)
     cover = np.asarray(np.rot90(sheet / 255.0, int(rng.integers(4))), np.float32)
