@@ -1,9 +1,9 @@
-"""CPU seconds of `reseau calibrate` beside OpenCV's own corners and calibration, in one process with one thread.
+"""CPU time of `reseau calibrate` compared with OpenCV's corner detection and calibration, in one process and thread.
 
-Drawn pictures of a chessboard of 9 x 6 corners and of OpenCV's circle grid of 44 dots. OpenCV: its corners (`classic`:
-findChessboardCorners and cornerSubPix; `sector`: findChessboardCornersSB) and calibrateCamera. This program: measuring,
-and choosing the lens and adjusting, which the ratio is of; and the whole command, which starts a process, checks by
-OpenCV's corners and calibration, and writes project and report.
+Synthetic images of a chessboard of 9 x 6 corners and of OpenCV's circle grid of 44 dots. OpenCV: corners (`classic`:
+findChessboardCorners and cornerSubPix; `sector`: findChessboardCornersSB) and calibrateCamera. This program:
+measurement, and selection of the lens model with adjustment, for which the ratio is given; and the whole command, which
+also starts a process, checks against OpenCV, and writes project and report.
 """
 
 import os
@@ -52,7 +52,7 @@ BOARDS: dict[str, tuple[Grid, tuple[str, str, str, str | None, None, bool]]] = {
         ("asymmetric-circle-grid", "4x11", "18mm", "20mm", None, False),
     ),
 }
-DOT_PX = 4  # of the painted board, a mm
+DOT_PX = 4  # px per mm of the painted board
 DISTORTION = np.array([-0.12, 0.05, 0.0, 0.0])
 
 
@@ -64,7 +64,7 @@ def cells() -> Iterator[dict[str, Any]]:
 
 
 def case(board: str, width: int, pictures: int, opencv: str, seed: int) -> dict[str, Any]:
-    """One set of pictures, calibrated by both."""
+    """Calibrate one set of images by both programs."""
     cv2.setNumThreads(1)
     spec, options = BOARDS[board]
     size_px = width, round(0.75 * width) if width > 600 else round(width / 1.5)
@@ -78,7 +78,7 @@ def case(board: str, width: int, pictures: int, opencv: str, seed: int) -> dict[
             with open_scan(path) as scan:
                 measure_board(scan, spec)
         measuring_s = time.process_time() - begun
-        begun = sum(os.times()[:4])  # the process that measures, too
+        begun = sum(os.times()[:4])  # child processes included
         calibrate_pictures(
             [Path(folder)], Path(folder) / "out", CalibrationOptions(board_options(*options)), reporter, 1
         )
@@ -94,7 +94,7 @@ def case(board: str, width: int, pictures: int, opencv: str, seed: int) -> dict[
 
 
 class CpuReporter(Reporter):
-    """Adds up the CPU seconds of each stage."""
+    """Reporter that adds up the CPU time of each stage."""
 
     def __init__(self) -> None:
         super().__init__(Console(quiet=True))
@@ -109,7 +109,7 @@ class CpuReporter(Reporter):
 
 
 def drawn_pictures(spec: Grid, size_px: tuple[int, int], count: int, seed: int) -> Iterator[Bytes]:
-    """A board in so many positions, through a lens with distortion, with a blur of 0.7 px and noise of 1.5."""
+    """Yield count images of a board in random poses, with lens distortion, a blur of 0.7 px and noise of 1.5."""
     rng = np.random.default_rng(seed)
     paper, paper_from_board = painted_board(spec)
     points = np.array(list(spec.object_points().values()))
@@ -133,7 +133,7 @@ def drawn_pictures(spec: Grid, size_px: tuple[int, int], count: int, seed: int) 
 
 
 def painted_board(spec: Grid) -> tuple[Bytes, Array]:
-    """The board, DOT_PX pixels a mm, and the pixel of a point of it (3, 3)."""
+    """Paint the board with DOT_PX pixels per mm; returns it and the transformation (3, 3) from board to pixels."""
     points = np.array(list(spec.object_points().values()))[:, :2]
     margin_mm = 60.0
     width, height = (np.ptp(points, axis=0) + 2 * margin_mm) * DOT_PX

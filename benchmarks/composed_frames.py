@@ -1,14 +1,14 @@
-"""Notches, blocks, curves and triangles of real cameras: learned, found in any pose and measured.
+"""Notches, blocks, curves and triangles of real cameras: templates learned, found in any pose and measured.
 
 python -m benchmarks composed_frames MARKS_FOLDER OUT.jsonl [--frames 8] [--first 0]
 
-A folder of four crops (L, T, R, B) is one camera. Frames are put together from them: each crop at its side of a
-textured square, its own landscape (what is lighter than Otsu's threshold) exchanged for another, averaged over a few
-pixels that begin at other ones in every frame, so that the marks move by known parts of a pixel. Templates are learned
-from three frames, then a fourth is measured as of unknown pose: by turns in all eight, beside landscapes as light as
-those that were learned from or not, and with the marks' origins in the middles of the crops or somewhere beside them.
+A folder of four crops (L, T, R, B) is one camera. Frames are composed from them: each crop at its side of a textured
+square, its background (above Otsu's threshold) replaced by another, averaged over a few pixels with a different offset
+in each frame, so that the marks shift by known fractions of a pixel. Templates are learned from three frames, then a
+fourth is measured with unknown pose: in all eight poses in turn, with backgrounds as light as in the learned frames or
+not, and with the origins of the marks at the centres of the crops or off them.
 
-One line a frame is added to OUT.jsonl, and frames that stand there already are left out; then all its lines are told.
+A line per frame is appended to OUT.jsonl, and frames already in it are skipped; then all its lines are summarised.
 """
 
 import argparse
@@ -35,17 +35,17 @@ Crops = dict[str, NDArray[np.uint8]]
 
 SIDES = {"L": (-1, 0), "T": (0, 1), "R": (1, 0), "B": (0, -1)}
 SIZE_PX, REACH_PX, PITCH_MM = 820, 280, 0.1
-REDUCED_PX = 160  # of a crop's longer side
+REDUCED_PX = 160  # px, approximate longer side of a reduced crop
 NOISE_DN = 1.5
 MIDDLE_PX = (SIZE_PX - 1) / 2
 FLIP = np.diag([1.0, -1.0])
-# Grey values of the landscape, in the frames that are learned from and in the one that is measured: in turn.
+# Grey values of the background, in the learned frames and in the measured one, used in turn.
 LANDSCAPES_DN = ((150, 150), (245, 245), (200, 200), (150, 200), (200, 245), (150, 245), (245, 220), (100, 60))
-OFF_PX = (0, 5)  # how far the origins may lie from the crops' middles, in turn
+OFF_PX = (0, 5)  # px, offsets of the origins from the crops' centres, used in turn
 
 
 def main() -> None:
-    """Measure the frames that are missing, and print what became of all."""
+    """Measure the missing frames, and print the outcomes of all."""
     parser = argparse.ArgumentParser()
     parser.add_argument("marks", type=Path)
     parser.add_argument("out", type=Path)
@@ -64,13 +64,13 @@ def main() -> None:
 
 
 def find_cameras(marks: Path) -> list[str]:
-    """The folders that hold four crops."""
+    """Folders with four crops, relative to marks."""
     folders = sorted({path.parent for path in marks.rglob("*.*")})
     return [str(each.relative_to(marks)) for each in folders if set(SIDES) <= {path.stem for path in each.iterdir()}]
 
 
 def draw_case(camera: Path, index: int, turn: int) -> Case:
-    """The index-th frame of a camera. turn: by which poses and landscapes are taken, other ones for every camera."""
+    """Make frame number index of a camera. turn: selects pose and background, differently for each camera."""
     learned_dn, view_dn = LANDSCAPES_DN[turn % len(LANDSCAPES_DN)]
     round_, pose = index // len(LANDSCAPES_DN), POSES[(3 * index + turn) % len(POSES)]
     grey, places = composed(cut_crops(camera), np.random.default_rng([index, 1]), view_dn)
@@ -96,14 +96,14 @@ def cut_crops(camera: Path) -> Crops:
 
 
 def origins_px(round_: int) -> dict[str, Array]:
-    """Where the marks' origins lie right and down of the crops' middles."""
+    """Offsets (right, down) of the marks' origins from the crops' centres."""
     off = np.random.default_rng([round_, 0]).integers(-1, 2, (len(SIDES), 2)) * OFF_PX[round_ % len(OFF_PX)]
     return dict(zip(SIDES, off.astype(float), strict=True))
 
 
 @cache
 def learned_layout(camera: Path, learned_dn: float, round_: int) -> FiducialLayout:
-    """The camera's marks, learned from three frames."""
+    """Layout of the camera's marks with templates learned from three frames."""
     crops, origins, marks = cut_crops(camera), origins_px(round_), []
     frames = [composed(crops, np.random.default_rng([round_, 3, seed]), learned_dn) for seed in range(3)]
     scans = [(make_scan(f"learned {number}", grey), places) for number, (grey, places) in enumerate(frames)]
@@ -118,11 +118,12 @@ def learned_layout(camera: Path, learned_dn: float, round_: int) -> FiducialLayo
 
 
 def composed(crops: Crops, rng: np.random.Generator, level_dn: float) -> tuple[NDArray[np.uint8], dict[str, Array]]:
-    """A frame beside a landscape of that grey value, and the places (col, row) of the crops' middles."""
+    """Compose a frame with a background of that grey value; returns it and the places (col, row) of the crops'
+    centres."""
     grey, places = landscape(rng, (SIZE_PX, SIZE_PX), level_dn), {}
     for side, (x, y) in SIDES.items():
         fine, step = crops[side], fold(crops[side])
-        first = rng.integers(step, size=2)  # row and column of the fine pixels that the means begin with
+        first = rng.integers(step, size=2)  # row and column of the first fine pixel averaged
         rows, cols = ((np.array(fine.shape) - first) // step).tolist()
         part = relandscaped(fine, rng, level_dn)[first[0] : first[0] + rows * step, first[1] : first[1] + cols * step]
         part = part.reshape(rows, step, cols, step).mean(axis=(1, 3))
@@ -135,7 +136,7 @@ def composed(crops: Crops, rng: np.random.Generator, level_dn: float) -> tuple[N
 
 
 def relandscaped(fine: NDArray[np.uint8], rng: np.random.Generator, level_dn: float) -> Array:
-    """The crop with another landscape where it is light, through a soft edge."""
+    """Replace the background of a crop, where it is light, with a soft edge."""
     _, light = cv2.threshold(fine, 0, 1, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
     share = cv2.GaussianBlur(light.astype(np.float64), (0, 0), 1.5)
     dark = np.where(light > 0, np.median(fine[light == 0]), fine)
@@ -152,7 +153,7 @@ def fold(fine: NDArray[np.uint8]) -> int:
 
 
 def posed(grey: NDArray[np.uint8], pose: str) -> NDArray[np.uint8]:
-    """The frame as it lies in a scan."""
+    """Rotate and mirror the frame to a scan orientation (pose)."""
     mirrored = grey[:, ::-1] if pose.endswith("m") else grey
     return np.ascontiguousarray(np.rot90(mirrored, int(pose.removesuffix("m")) // 90))
 

@@ -1,9 +1,9 @@
-"""Boards of nine kinds, drawn by OpenCV's generators and photographed by a known lens: corners beside OpenCV's own.
+"""Boards of nine kinds, drawn by OpenCV's generators and imaged by a known lens: corners compared with OpenCV's.
 
     python -m benchmarks drawn_boards
 
-Three pictures of 640 x 480 px a kind, tilted, 5 % of radial distortion at the corner, blur of 0.7 px, noise of 2 grey
-values. `detector` is what `reseau check` compares with: OpenCV's function for the kind with its customary settings.
+Three tilted images of 640 x 480 px per kind, with 5 % radial distortion at the corner, a blur of 0.7 px and noise of 2
+grey values. OpenCV's function for each kind is used with its customary settings, as in `reseau check`.
 """
 
 from collections.abc import Iterator
@@ -38,12 +38,13 @@ WIDTH, HEIGHT, FINENESS, PX_PER_MM = 640, 480, 3, 6
 MATRIX = np.array([[700.0, 0.0, 325.0], [0.0, 700.0, 236.0], [0.0, 0.0, 1.0]])
 LENS = np.array([-0.16, 0.03, 1e-3, -5e-4])
 TURNS = [(0.35, 0.1, 0.05), (-0.3, 0.3, -0.1), (0.1, -0.4, 0.15)]
-NEAR_PX = 3.0  # of a true place, within which a point of OpenCV's is that one
+NEAR_PX = 3.0  # px, largest distance of a point of OpenCV from its true place
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """drawing: PX_PER_MM, its upper left corner at corner_mm; view: a window of the picture, or how it is flipped."""
+    """Board and its drawing. drawing: with PX_PER_MM, its upper left corner at corner_mm; is_mirrored, cut_px: whether
+    the image is mirrored, and columns cut off at its left."""
 
     name: str
     spec: BoardSpec
@@ -103,7 +104,7 @@ def main() -> None:
 
 
 def photographed(case: Case, number: int) -> tuple[Bytes, dict[str, Array]]:
-    """A picture, and where its points are."""
+    """Image of a board, and the true places of its points."""
     rotation = np.asarray(cv2.Rodrigues(np.array(TURNS[number]))[0]) @ np.diag([1.0, -1.0, -1.0])
     points = case.spec.object_points()
     xyz = np.array(list(points.values()))
@@ -128,7 +129,7 @@ def photographed(case: Case, number: int) -> tuple[Bytes, dict[str, Array]]:
 
 @cache
 def _rays() -> Array:
-    """(n, 2) of all parts of pixels, by OpenCV's projection alone."""
+    """(n, 2) ray directions of all sub-pixels, by inversion of OpenCV's projection."""
     col, row = (((np.arange(size * FINENESS) + 0.5) / FINENESS - 0.5) for size in (WIDTH, HEIGHT))
     pixels = np.stack(np.meshgrid(col, row), axis=-1).reshape(-1, 2)
     rays = (pixels - MATRIX[:2, 2]) / 700.0
@@ -141,7 +142,8 @@ def _rays() -> Array:
 
 
 def _found_by_opencv(picture: Bytes, spec: BoardSpec) -> Array:
-    """(n, 2); of the asymmetric grid, which the check leaves out, by findCirclesGrid; both layouts of ChArUco."""
+    """(n, 2) points found by OpenCV; the asymmetric grid, not included in the check, by findCirclesGrid; for ChArUco
+    the better of both layouts."""
     if isinstance(spec, CircleGridSpec) and spec.asymmetric:
         size = (spec.columns // 2, spec.rows)
         found, points = cv2.findCirclesGrid(picture, size, flags=cv2.CALIB_CB_ASYMMETRIC_GRID)

@@ -1,10 +1,11 @@
-"""Do standard deviations of board calibrations hold? Differences between two random halves of the pictures.
+"""Validity of the standard deviations of board calibrations: differences between two random halves of the images.
 
-Each set is split 40 times into two halves that are calibrated by themselves: this program with an unmodelled error and
-the larger of the model's standard deviation and that over pictures, and `cv2.calibrateCameraExtended` with the same
-corners. A difference over the root of the sum of both claimed variances should scatter by 1: the figures are 1.48 times
-the median of its size. All splits of a set share its pictures: `range` holds 90 % of the figures that a true claim
-gives, by simulation with as many pictures. --corners FOLDER keeps what was measured.
+Each set is split 40 times into two halves, which are calibrated separately: by this program with an unmodelled error
+and the larger of the standard deviations of the model and by leaving out images, and by `cv2.calibrateCameraExtended`
+with the same corners. A difference over the root of the sum of both claimed variances should have standard deviation 1:
+the figures are 1.48 times the median of its absolute value. All splits of a set share its images: `range` is the 90 %
+interval of the figure for correct variances, by simulation with as many images. --corners FOLDER keeps the measured
+corners.
 """
 
 import pickle
@@ -41,13 +42,13 @@ COLUMNS |= {"model": ".2f", "opencv": ".2f"}
 SPLITS, SIMULATIONS = 40, 2000
 PIXEL_MM = 0.005
 SEED = 1
-GIVEN_PX = 0.02  # of published corners, whose standard deviations nobody tells
+GIVEN_PX = 0.02  # px, assumed standard deviation of published corners
 ROBUST = 1.4826
 
 
 @dataclass(frozen=True, eq=False)
 class Corners:
-    """Of a picture: points (n, 3) of the board and places (n, 2) in px, y down, with covariances (n, 2, 2)."""
+    """Corners of an image: board points (n, 3), and places (n, 2), px, y down, with covariances (n, 2, 2)."""
 
     points: Array
     places_px: Array
@@ -56,7 +57,7 @@ class Corners:
 
 @dataclass(frozen=True)
 class BoardSet:
-    """Pictures of one camera; corners: by picture."""
+    """Images of one camera. corners: returns the corners of each image."""
 
     size_px: tuple[int, int]
     lens: LensModel
@@ -64,7 +65,7 @@ class BoardSet:
 
 
 def measure_pattern(pattern: str, spec: ChessboardSpec) -> list[Corners]:
-    """Corners of pictures, measured by this program."""
+    """Measure the corners of images by this program."""
     marks, points = [], spec.object_points()
     for path in sorted(DATA.glob(pattern)):
         with open_scan(path) as scan:
@@ -80,7 +81,7 @@ def measure_pattern(pattern: str, spec: ChessboardSpec) -> list[Corners]:
 
 
 def published(name: str) -> list[Corners]:
-    """Corners that Bouguet's toolbox measured, as its result has them."""
+    """Read the corners measured by Bouguet's toolbox from its result file."""
     from scipy.io import loadmat
 
     found = loadmat(DATA / "chessboards" / "bouguet" / name)
@@ -91,7 +92,7 @@ def published(name: str) -> list[Corners]:
 
 
 def listed(folder: Path, pitch_mm: float) -> list[Corners]:
-    """Corners of a comparator.csv."""
+    """Read corners from a comparator.csv."""
     lines = (folder / "points.csv").read_text(encoding="utf-8").splitlines()[1:]
     points = {line.split(",")[0]: [float(value) for value in line.split(",")[1:4]] for line in lines}
     by_image: dict[str, list[Any]] = {}
@@ -135,7 +136,7 @@ def cells() -> Iterator[dict[str, Any]]:
 
 
 def case(set: str, seed: int, corners: str | None = None) -> dict[str, Any]:
-    """The splits of one set; corners: a folder that keeps what was measured."""
+    """Evaluate the splits of one set. corners: folder that keeps the measured corners."""
     chosen = SETS[set]
     pictures = kept_corners(set, None if corners is None else Path(corners))
     rng = np.random.default_rng(seed)
@@ -184,7 +185,7 @@ def kept_corners(name: str, folder: Path | None) -> Sequence[Corners]:
 
 
 def calibrated(chosen: BoardSet, pictures: Sequence[Corners]) -> Mapping[str, tuple[Array, Array]] | None:
-    """Values and standard deviations of QUANTITIES, by who claims them; None without a solution."""
+    """Values and standard deviations of QUANTITIES by each method; None without a solution."""
     network = board_network(chosen, pictures)
     result = adjust_unmodelled(network, adjust)
     if not result.converged:
@@ -238,8 +239,8 @@ def calibrate_opencv(chosen: BoardSet, pictures: Sequence[Corners]) -> tuple[Arr
 
 @cache
 def honest_range(pictures: int) -> tuple[float, float]:
-    """90 % of the figures of one quantity: pictures are independent normal values, a half's estimate is their mean, and
-    the claim is its true standard deviation."""
+    """90 % interval of the figure of one quantity for correct variances, by simulation: each image contributes an
+    independent normal value, and a half is estimated by their mean."""
     rng, figures = np.random.default_rng(0), []
     half = pictures // 2
     for _ in range(SIMULATIONS):

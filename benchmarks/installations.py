@@ -1,10 +1,10 @@
-"""What users install: wheel and sdist, each in fresh environments with the lowest versions that pyproject.toml promises
-and with the newest, on each Python. The demonstration runs there, and then, with all extras, every command.
+"""Installation test of wheel and sdist in fresh environments, with the lowest versions that pyproject.toml allows and
+with the newest, on each Python. The demonstration is run, and then, with all extras, every command.
 
     python -m benchmarks installations [--only wheel|sdist] [--versions lowest|newest] [PYTHON...]
 
-PYTHON: interpreters; by default every python3.11 and newer on the PATH. What is committed is built. A lower bound must
-be a version that there is. Ends with 1 where anything fails.
+PYTHON: interpreters; by default every python3.11 and newer on the PATH. The committed state is built. Each lower bound
+must be an existing version. Exit code 1 if anything fails.
 """
 
 import argparse
@@ -25,13 +25,13 @@ from urllib.request import HTTPCookieProcessor, build_opener
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("reseau", "measure", "adjust", "compiled", "pipeline", "synthetic_images")
-NEWEST_MINOR = 30  # of the Pythons that are looked for
-WITHOUT_ANSWER = {"http", "s3"}  # extras whose calls have no server here
-LAST_LINES = 5  # of what failed
+NEWEST_MINOR = 30  # newest Python 3 searched for
+WITHOUT_ANSWER = {"http", "s3"}  # extras whose calls need a server
+LAST_LINES = 5  # lines printed of a failure
 
 
 def main(pythons: Sequence[str], kinds: Sequence[str], versions: Sequence[str]) -> int:
-    """Build, install and run; a line each."""
+    """Build, install and run; print a line for each installation."""
     problems = 0
     with TemporaryDirectory() as place:
         folder = Path(place)
@@ -55,7 +55,7 @@ def main(pythons: Sequence[str], kinds: Sequence[str], versions: Sequence[str]) 
 
 
 def build(folder: Path) -> tuple[Path, Path]:
-    """sdist and the wheel that is made of it."""
+    """Build the sdist, and the wheel from it."""
     source, tools = folder / "source", folder / "tools"
     subprocess.run(["git", "clone", "--quiet", "--depth", "1", f"file://{ROOT}", str(source)], check=True)
     made_environment(sys.executable, tools)
@@ -68,13 +68,13 @@ def build(folder: Path) -> tuple[Path, Path]:
 
 
 def committed_files(source: Path) -> set[str]:
-    """Of the packages, whatever their kind."""
+    """Committed files of the packages, of all kinds."""
     command = ["git", "-C", str(source), "ls-files", *PACKAGES]
     return set(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split())
 
 
 def held_files(path: Path) -> set[str]:
-    """What a distribution holds, by the names below the project's root."""
+    """Files in a distribution, relative to the project's root."""
     if path.suffix == ".whl":
         with zipfile.ZipFile(path) as wheel:
             return set(wheel.namelist())
@@ -83,7 +83,7 @@ def held_files(path: Path) -> set[str]:
 
 
 def lowest_versions() -> Iterator[str]:
-    """Constraints for pip: of every dependency and extra that version which is its bound."""
+    """Yield constraints for pip that pin all dependencies and extras to their lower bounds."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
     for requirement in (*project["dependencies"], *(one for name in user_extras() for one in extras[name])):
@@ -98,7 +98,7 @@ def user_extras() -> list[str]:
 
 
 def tried(python: str, distribution: Path, bounds: Path | None, environment: Path) -> tuple[str, int]:
-    """What came out in an environment of its own, and how many things failed."""
+    """Install and run in a new environment; returns the outcome in words and the number of failures."""
     made_environment(python, environment)
     bin = environment / "bin"
     install: list[str | Path] = [bin / "pip", "install", "--quiet", "--only-binary", ":all:", "--no-binary", "reseau"]
@@ -116,7 +116,7 @@ def tried(python: str, distribution: Path, bounds: Path | None, environment: Pat
 
 
 def install_extras(environment: Path) -> str:
-    """What fails of all commands and modules; empty where nothing does."""
+    """Run all commands and import all modules; returns the failures, "" if there are none."""
     bin = environment / "bin"
     (environment / "small").mkdir()
     done = run([bin / "python", "-P", ROOT / "tests" / "every_command.py", environment / "small"])
@@ -140,7 +140,7 @@ def answers(reseau: Path, project: Path) -> bool:
         assert process.stdout is not None
         address = next((line.strip() for line in process.stdout if line.startswith("http")), "")
         try:
-            with build_opener(HTTPCookieProcessor).open(address) as page:  # the page sets one, and asks for it
+            with build_opener(HTTPCookieProcessor).open(address) as page:  # the page requires its cookie
                 return bool(page.status == 200)
         except (OSError, ValueError):
             return False
@@ -166,7 +166,7 @@ def read_version(python: str) -> str:
 
 
 def found_pythons() -> list[str]:
-    """On the PATH; a name there may stand for a version that is not installed."""
+    """Working interpreters on the PATH; a name there may belong to a version that is not installed."""
     paths = filter(None, (shutil.which(f"python3.{minor}") for minor in range(11, NEWEST_MINOR)))
     return [path for path in paths if run([path, "--version"]).returncode == 0]
 

@@ -1,9 +1,9 @@
-"""Frames scanned in halves: claimed against realised standard deviations of what joins them, by many adjustments.
+"""Frames scanned in halves: claimed against realised standard deviations, by many adjustments.
 
     python -m benchmarks joins [--runs 200] [--pictures]
 
-Four frames of known points, each in two halves with films of their own, errors drawn anew in every run (seed 0 and on).
---pictures: rendered frames instead, whose joins are measured: their errors beside their standard deviations.
+Four frames of known points, each in two halves with separate film transformations, with new errors in each run (seeds
+from 0). --pictures: errors of measured tie points between the halves of rendered frames, relative to their sigmas.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from halves import Halves, halves
 
 Array = NDArray[np.float64]
 
-CASES = (  # joins, overlap in mm of 228, how the right halves lie
+CASES = (  # number of tie points, overlap in mm of 228, whether the right halves are rotated by 180 degrees
     (6, 40.0, False),
     (12, 40.0, False),
     (40, 40.0, False),
@@ -93,7 +93,7 @@ def _error_sigmas(adjustment: Adjustment, name: str, true: float) -> float:
 
 
 def _corner_errors_um(simulated: Halves, adjustment: Adjustment) -> Array:
-    """How far each half's film puts the frame's outer corners beside their places."""
+    """Errors, µm, of the film transformation of each half at the outer corners of the frame."""
     off = []
     for name, true in simulated.films.items():
         found = np.array([adjustment.value(f"T.{name}.{each}") for each in ("a1", "a2", "a3", "b1", "b2", "b3")])
@@ -157,7 +157,7 @@ pose = "{pose}"
 
 
 def pictures() -> None:
-    """The right half of every other frame lies turned by half a turn."""
+    """Measure tie points between halves of rendered frames; every other right half is rotated by 180 degrees."""
     print("| grain | overlap, mm | scans | measured | weak | difference, rms px | over sigma |")
     print("|---|---|---|---|---|---|---|")
     for grain in (0.0, 0.01, 0.03):
@@ -171,7 +171,7 @@ def _pictured(grain: float, share: float, seed: int) -> str:
         folder = Path(name)
         turned = seed % 2 == 0
         halves_text = IMAGE.format(half="a", first=0.0, end=share, pose="0")
-        # A scan that lies turned shows the other end of the frame at its left.
+        # A scan rotated by 180 degrees has the other end of the frame on its left.
         first, end = (0.0, share) if turned else (1.0 - share, 1.0)
         halves_text += IMAGE.format(half="b", first=first, end=end, pose="180" if turned else "0")
         scene = folder / "scene.toml"
@@ -199,7 +199,8 @@ def _pictured(grain: float, share: float, seed: int) -> str:
 
 
 def _camera_mm(image: dict[str, dict[str, dict[str, float]]], pixels: Array) -> Array:
-    """By the affine part of the truth: a smooth deformation is the film's, and the same in both scans."""
+    """Camera coordinates by the affine part of the true transformation; the smooth deformation is common to both
+    scans."""
     x, y = (pixels * [0.02, -0.02]).T
     a1, a2, a3, b1, b2, b3 = (image["transformation"][name]["value"] for name in ("a1", "a2", "a3", "b1", "b2", "b3"))
     return np.stack([a1 + a2 * x + a3 * y, b1 + b2 * x + b3 * y], axis=1)

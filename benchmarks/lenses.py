@@ -1,9 +1,9 @@
-"""Lens families and bent boards: claimed against realised standard deviations, and projections beside mrcal's.
+"""Lens families and bent boards: claimed against realised standard deviations, and comparison with mrcal.
 
-    python -m benchmarks lenses [SETS]          # sets of errors a case, 200 by default; about a minute for 40
-    python -m benchmarks lenses mrcal           # the bend of a board beside mrcal 2.2 (Debian's package)
+    python -m benchmarks lenses [SETS]          # sets of errors per case, 200 by default; about a minute for 40
+    python -m benchmarks lenses mrcal           # comparison of a bent board with mrcal 2.2 (Debian's package)
 
-The images are those of the renderer, which has its own formulas, or OpenCV's; a board is bent as mrcal bends it.
+Image coordinates are computed by the renderer, which has its own formulas, or by OpenCV; boards bend as in mrcal.
 """
 
 import json
@@ -88,7 +88,8 @@ def main() -> None:
 
 
 def simulate(name: str, drawn: Drawn, true: dict[str, float], sets: int) -> None:
-    """Adjusted from one start with errors drawn anew: errors against their covariance, two-sided at 1 %."""
+    """Adjust with random errors from one start; print the errors relative to their covariance, and the two-sided 1 %
+    limits of chi-square."""
     rng = np.random.default_rng(SEED)
     start = approximate(drawn(None))
     errors, total = [], 0.0
@@ -105,7 +106,7 @@ def simulate(name: str, drawn: Drawn, true: dict[str, float], sets: int) -> None
 
 
 def lens_network(name: Family, rng: np.random.Generator | None) -> Network:
-    """Six views of a deep field, 36 mm x 24 mm, known points; c given roughly, the lens not at all."""
+    """Six views of a deep field of known points, 36 mm x 24 mm; c given approximately, the distortion unknown."""
     c, values = LENSES[name]
     camera = SceneCamera("C", (80.0, 80.0), c, POINT_MM, SceneDistortion(name, values, R0_MM))
     half = np.array([18.0, 12.0])
@@ -123,7 +124,7 @@ def lens_network(name: Family, rng: np.random.Generator | None) -> Network:
 
 
 def board_network(rng: np.random.Generator | None) -> tuple[Network, Array, Array]:
-    """Six views of a bent board by OpenCV; the board's poses as mrcal has them (v, 6), and the places (v, n, 2)."""
+    """Six views of a bent board by OpenCV: network, poses of the board in mrcal's form (v, 6), and places (v, n, 2)."""
     t, u = np.meshgrid(np.linspace(0.0, 1.0, COLUMNS), np.linspace(0.0, 1.0, ROWS))
     flat = np.stack([t.ravel() * (COLUMNS - 1), u.ravel() * (ROWS - 1), 0.0 * t.ravel()], axis=1) * SPACING_MM
     real = flat.copy()
@@ -153,7 +154,7 @@ def make_network(
     rng: np.random.Generator | None,
     boards: tuple[Board, ...] = (),
 ) -> Network:
-    """Rows: image, point, place."""
+    """Make a network. rows: image, point, place."""
     places = np.array([row[2] for row in rows])
     kinds: list[ObservationKind] = ["target"] * len(rows)
     return Network(
@@ -172,7 +173,8 @@ def make_network(
 
 
 def compare_mrcal() -> None:
-    """The same noisy views through both, with one lens: fx, fy, cx, cy, k1, k2, p1, p2 and the bends."""
+    """Calibrate the same noisy views by both programs, with fx, fy, cx, cy, k1, k2, p1, p2 and the bends as
+    unknowns."""
     pixel_mm = 0.005
     network, poses, places = board_network(np.random.default_rng(SEED))
     free = dict.fromkeys(("k1", "k2", "p1", "p2", "b1"), Prior(0.0, np.inf))

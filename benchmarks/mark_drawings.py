@@ -1,7 +1,7 @@
-"""The drawings of the camera library's marks, as camera files have them: x' right, y' up, mm about the mark's point.
+"""Drawings of the marks of the camera library, in the form of camera files: x' right, y' up, mm from the mark's point.
 
-Solid marks are drawn as on the frame's right side, x outwards, and turned with their place; where one side's mark is
-the mirror image of another's there is a drawing of each.
+Solid marks are drawn as on the frame's right side, x outwards, and rotated with their place; if the mark of one side is
+the mirror image of another, each has its own drawing.
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,7 +35,7 @@ def ring_cross(
 
 
 def solid(polarity: str, *polygons: Sequence[tuple[float, float]], mirrored: bool = False) -> str:
-    """A polygon, or several as parts, as on the right side; mirrored: with the other sign of y."""
+    """Polygon, or several as parts, as on the right side; mirrored: y with opposite sign."""
     sign = -1.0 if mirrored else 1.0
     shapes = [_listed([(x, sign * y + 0.0) for x, y in polygon]) for polygon in polygons]
     end = f'polarity = "{polarity}"\nrotate = "radial"\n'
@@ -46,14 +46,14 @@ def solid(polarity: str, *polygons: Sequence[tuple[float, float]], mirrored: boo
 
 
 def _listed(polygon: Sequence[tuple[float, float]]) -> str:
-    """Six corners a line."""
+    """Vertices as text, six per line."""
     corners = [f"[{x}, {y}]" for x, y in polygon]
     lines = [", ".join(corners[first : first + 6]) for first in range(0, len(corners), 6)]
     return "[" + ",\n               ".join(lines) + "]"
 
 
 def _pair(name: str, polarity: str, polygon: Sequence[tuple[float, float]]) -> Mapping[str, str]:
-    """A solid mark and its mirror image."""
+    """Solid mark and its mirror image."""
     return {name: solid(polarity, polygon), f"{name}-mirrored": solid(polarity, polygon, mirrored=True)}
 
 
@@ -77,7 +77,7 @@ _RMK_TRUE = (
 RMK = {"drawn": solid("dark", _RMK_BLOCK).replace("polarity", f"{_RMK_TRUE}polarity")}
 RMK_EIGHT = {"corner": cross(2.0, 0.06, 0.0, 0), "side": RMK["drawn"]}
 
-# The pinhole that the reports give is hardly ever seen: the notch beside it is drawn, about the pinhole.
+# The pinhole to which the reports refer is rarely visible: the notch next to it is drawn, relative to the pinhole.
 _FAIRCHILD_NOTCH = [
     (0.0, 2.6), (-2.98, 2.6), (-2.98, 2.1), (-4.45, 0.5), (-4.45, 0.0), (-1.5, 0.0), (-2.98, -1.75), (-2.98, -2.6),
     (0.0, -2.6),
@@ -107,7 +107,7 @@ T12_CROSS = {"drawn": cross(1.12, 0.10, 0.2, 0)}
 
 
 def _kc6a(apex_mm: float) -> list[tuple[float, float]]:
-    """The dark block in a pocket of the frame; apex_mm: of its light tooth from the reported point, outwards."""
+    """Dark block in a pocket of the frame. apex_mm: of its light tooth, outwards from the reported point."""
     block = [
         (3.5, 3.2), (-1.5, 3.2), (-1.65, 2.7), (-1.65, 1.75), (0.0, 0.05), (-2.9, 0.0), (-3.0, -0.6), (-1.65, -2.0),
         (-1.65, -3.0), (-1.4, -3.35), (3.5, -3.35),
@@ -123,7 +123,7 @@ KC6A = {
 }
 KC6A_SIDES = _sides("left", "right", "top", "bottom")
 
-# Wings that grow out of the frame's border; the point is where the axis meets the shallower half.
+# Wings connected to the frame's border; the point is the intersection of the axis with the shallower half.
 SMALL_FLAT = _pair(
     "wing", "dark", [(0.0, 0.0), (0.0, 2.95), (3.15, 5.4), (3.15, -5.13), (-1.55, -1.85), (-1.6, -1.6), (-1.6, 0.0)]
 )
@@ -141,7 +141,7 @@ CURVED_FLAT = _pair(
         (2.8, 4.85), (1.75, 3.75), (0.9, 3.1), (-0.4, 2.45), (-1.85, 2.0), (-1.95, 1.8), (-1.95, 0.0),
     ],
 )  # fmt: skip
-# Of the curved wing the halves at left and right are less deep than those at top and bottom.
+# The curved wings at left and right are less deep than those at top and bottom.
 CURVED = {
     **_pair(
         "side",
@@ -160,7 +160,7 @@ CURVED = {
         ],
     ),
 }  # fmt: skip
-# A dark band that outlines a wing, light within; a fine line along the axis.
+# Dark band that outlines a wing, light inside; a fine line along the axis.
 _HOLLOW = [(0.0, 0.0), (0.0, -4.6), (1.5, -6.0), (1.5, 0.15), (-1.45, 0.15), (-1.45, 1.6), (1.5, 4.6), (1.5, 6.5),
            (-2.95, 1.8), (-2.95, 0.0)]  # fmt: skip
 HOLLOW = _pair("wing", "dark", _HOLLOW)

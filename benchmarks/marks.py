@@ -1,9 +1,9 @@
-"""Marks measured against their truth: the Cramér-Rao bound, honesty of the standard deviations.
+"""Accuracy of measured marks against the Cramér-Rao bound, and validity of their standard deviations.
 
---marks: of every cell; 2000 for a full run. A value is rms / bound and realised / claimed; -n: lost.
+--marks: number per cell; 2000 for a full run. A value is RMS / bound and realised / claimed; -n: lost.
 
-The pictures are drawn by `synthetic_images` (exact areas, blurred before they are averaged over pixels); the bounds are
-from differences of the same pictures. What is measured with is what `reseau measure` calls:
+The images are rendered by `synthetic_images` (exact areas, blurred before averaging over the pixels); the bounds are
+from differences of the same images. The measuring functions are those of `reseau measure`:
 `measure.fiducials.mark_fit.detect_mark`, and `measure.targets.disks.fit_disk` for the ellipse.
 """
 
@@ -26,7 +26,7 @@ Noise = Callable[[int, np.random.Generator], Array]
 
 SEED = 20
 SNRS, BLURS_PX = (5.0, 10.0, 20.0, 50.0, 100.0), (0.6, 1.0, 1.6, 2.5)
-POOL, FEW = 50, 3  # different marks in a cell; where the bound of each takes seconds
+POOL, FEW = 50, 3  # different marks per cell; FEW where the bound of each takes seconds
 GRAINS_PX, GRAIN_SNR = (0.7, 1.0, 1.5), 20.0
 CLEAN_SNRS, FRAMES_KNOWN = (50.0, 200.0, 500.0), (1e-4, 5e-4, 2e-3)
 BEYOND, CLIPPED_SNR = (0.0, 0.3), 20.0
@@ -62,7 +62,7 @@ def pool(kind: Kind, blur_px: float, count: int, rng: np.random.Generator) -> li
 def cell(
     marks: Sequence[TrueMark], snr: float, count: int, rng: np.random.Generator, grain_px: float | None = None
 ) -> str:
-    """So many pictures of the marks by turns, in noise that is always new."""
+    """Measure count images of the marks in turn, each with new noise."""
     found, correlation = Cell(), None if grain_px is None else grain_correlation(grain_px)
     noise_of: Noise = white if grain_px is None else partial(_grainy, grain_px)
     for number in range(count):
@@ -77,21 +77,21 @@ def cell(
 
 
 def accuracy(kind: Kind, blur_px: float, count: int, seeds: list[int]) -> Row:
-    """White noise, by blur."""
+    """White noise, by blur and SNR."""
     rng = np.random.default_rng([*seeds, int(10 * blur_px)])
     marks = pool(kind, blur_px, min(POOL, count), rng)
     return {f"SNR {snr:g}": cell(marks, snr, count, rng) for snr in SNRS}
 
 
 def grain(kind: Kind, _part: float, count: int, seeds: list[int]) -> Row:
-    """Grain at SNR 20, blur 1, a tenth of its variance white: the bound is that of noise so correlated."""
+    """Grain at SNR 20, blur 1, a tenth of its variance white; the bound is for noise of this correlation."""
     rng = np.random.default_rng(seeds)
     marks = pool(kind, 1.0, FEW, rng)
     return {f"grain {grain_px:g} px": cell(marks, GRAIN_SNR, count, rng, grain_px) for grain_px in GRAINS_PX}
 
 
 def clean(kind: Kind, snr: float, count: int, seeds: list[int]) -> Row:
-    """Marks that lean on their frame, by SNR and by how well the frame knows rotation, scale, stretch and shear."""
+    """Marks fitted with priors from the frame, by SNR and by the sigma of rotation, scale, stretch and shear."""
     row = {}
     for known in FRAMES_KNOWN:
         rng = np.random.default_rng([*seeds, int(snr)])
@@ -100,7 +100,7 @@ def clean(kind: Kind, snr: float, count: int, seeds: list[int]) -> Row:
 
 
 def bias(kind: Kind, _part: float, count: int, seeds: list[int]) -> Row:
-    """No noise: largest error of a coordinate in px (phase, rotation, scale, gradient, polarity at random)."""
+    """No noise: largest error of a coordinate, px (random phase, rotation, scale, gradient, polarity)."""
     row, eight = {}, np.zeros(0)
     for blur_px in BLURS_PX:
         rng = np.random.default_rng([*seeds, int(10 * blur_px)])
@@ -112,7 +112,7 @@ def bias(kind: Kind, _part: float, count: int, seeds: list[int]) -> Row:
 
 
 def clean_error(mark: TrueMark, rng: np.random.Generator, full_scale: int) -> Array:
-    """The error without noise, with rotation and scale known exactly where they come from the frame."""
+    """Error without noise, with exact rotation and scale where they come from the frame."""
     contrast, ground = (CONTRAST, GROUND) if full_scale > 255 else (120.0, 60.0)
     found = measure_mark(
         mark, draw_mark(mark, rng, contrast, ground)[0], rng, full_scale, off=start_off(mark, rng, exact=True)
@@ -123,7 +123,8 @@ def clean_error(mark: TrueMark, rng: np.random.Generator, full_scale: int) -> Ar
 
 
 def clipping(kind: Kind, _part: float, count: int, seeds: list[int]) -> Row:
-    """Clipped beyond so much of the contrast, blur 1, SNR 20: largest error without noise, px; whole mark's bound."""
+    """Clipping beyond a fraction of the contrast, blur 1, SNR 20: largest error without noise, px; bound of the
+    unclipped mark."""
     rng, row = np.random.default_rng([*seeds, 7]), {}
     marks = pool(kind, 1.0, min(POOL, count), rng)
     for sign in (-1, 1):
@@ -145,7 +146,7 @@ def clipping(kind: Kind, _part: float, count: int, seeds: list[int]) -> Row:
 
 
 def jpeg(kind: Kind, _part: float, count: int, seeds: list[int]) -> Row:
-    """JPEG of 8 bit, SNR 100, blur 1: rms in px, realised / claimed; by contrast in grey values, and quality."""
+    """JPEG of 8 bit, SNR 100, blur 1: RMS, px, and realised / claimed, by contrast in grey values and quality."""
     row = {}
     for contrast in JPEG_CONTRASTS:
         for quality in QUALITIES:
@@ -167,7 +168,7 @@ def measure_jpeg(mark: TrueMark, contrast: float, quality: int, rng: np.random.G
 
 
 def compressed(grey: Array, quality: int, rng: np.random.Generator) -> tuple[Array, float]:
-    """What JPEG makes of a picture, its blocks beginning anywhere, and the step to which the file rounds."""
+    """Compress an image by JPEG, with a random offset of the blocks; returns it and the rounding step of the file."""
     top, left = rng.integers(0, 8, 2)
     stored = np.pad(np.clip(np.rint(grey), 0, 255).astype(np.uint8), ((top, 8), (left, 8)), mode="edge")
     data = cv2.imencode(".jpg", stored, (cv2.IMWRITE_JPEG_QUALITY, quality))[1]
@@ -176,7 +177,8 @@ def compressed(grey: Array, quality: int, rng: np.random.Generator) -> tuple[Arr
 
 
 def misfit(kind: Kind, _part: float, count: int, seeds: list[int]) -> Row:
-    """Claims with the cause of the model's misfit over those without; error over claim without, and with it; SNR 20."""
+    """Claimed sigmas with the cause model misfit over those without it; realised / claimed without and with it; SNR
+    20."""
     rng, row = np.random.default_rng([*seeds, 3]), {}
     marks = pool(kind, 1.0, min(POOL, count), rng)
     noises: dict[str, Noise] = {"white": white}

@@ -1,9 +1,9 @@
-"""Frames measured with their pose left open and with it set: whatever is found with the true pose set must be found
-with `pose = "auto"`, of every kind of mark.
+"""Frames measured with automatic and with given scan orientation (pose): marks found with the true pose must also be
+found with `pose = "auto"`, for all kinds of marks.
 
-Told are how many marks are found with the true pose set, with the pose that auto took set, and with auto; how many have
-another status with auto than with the true pose set; and how many are weak, and how far off by their own claims. With
---auto the poses are not set: for the study of weak marks.
+The tables give the numbers of marks found with the true pose, with the pose chosen by auto given, and with auto; of
+marks with another status under auto than under the true pose; and of weak marks, with their errors relative to the
+claimed sigmas. With --auto the poses are not given: for the study of weak marks.
 """
 
 from collections import Counter
@@ -24,10 +24,9 @@ from synthetic_images.scene import Tones
 
 Outline = tuple[tuple[float, float], ...]
 
-SAME_PX = 0.5  # two places of one mark
+SAME_PX = 0.5  # px, largest distance between two places of one mark
 EDGE_MM = FRAME_MM / 2
-# Outlines with the point at (0, 0), x outwards: of what casts a shadow, up to the frame's edge; of what lets light
-# through beside the frame, beyond it.
+# Outlines with the point at (0, 0), x outwards: dark shapes that end at the frame's edge; light notches beyond it.
 SOLID: dict[str, Outline] = {
     "half-wedge": ((0.0, 0.0), (1.8, 0.0), (1.8, 1.0)),
     "wedge": ((0.0, 0.0), (1.8, -0.8), (1.8, 0.8)),
@@ -35,17 +34,17 @@ SOLID: dict[str, Outline] = {
     "notch": ((0.0, 0.0), (-1.2, 0.9), (-1.2, -0.9)),
 }
 OVERLAP_MM = 0.2
-# Shadows of what reaches into the frame from far beyond its edge, in a border with a texture of its own.
+# Dark shapes that reach into the frame from far beyond its edge, in a border with its own texture.
 INTO_THE_FRAME: dict[str, Outline] = {
     "slanted block": ((0.0, 0.0), (2.8, 0.0), (2.8, -1.4), (0.56, -1.4)),
     "block": ((0.0, -0.7), (2.8, -0.7), (2.8, 0.7), (0.0, 0.7)),
     "wide half-wedge": ((0.0, 0.0), (2.8, 0.0), (2.8, 1.9)),
     "pointed block": ((0.0, 0.0), (0.7, -0.7), (2.8, -0.7), (2.8, 0.7), (0.7, 0.7)),
 }
-INSIDE_MM = 1.87  # of it
-UNEVEN_MM = 0.2  # at most, by which these marks' coordinates differ from those of a symmetric frame
+INSIDE_MM = 1.87  # mm, distance of their point from the frame's edge
+UNEVEN_MM = 0.2  # mm, largest difference of their coordinates from those of a symmetric frame
 SOLID_TONES = Tones(border=0.06, background=0.4, contrast=0.06, mark=0.5, dark_mark=0.06)
-DRAWN = 4  # of twelve frames: of the kinds, disturbances and symmetries of the study of the search
+DRAWN = 4  # of twelve frames, those drawn as in the study of the search
 WRONG_SIGMAS = 5.0
 
 
@@ -61,8 +60,8 @@ def case(frame: int, seed: int, pitch_um: float = PITCH_UM, auto: bool = False) 
 
 
 def some_case(seed: int, index: int, pitch_um: float) -> Case:
-    """A third of the frames as the study of the search draws them, a third with solid marks at the frame's border, and
-    a third with marks that reach into it."""
+    """Draw a frame: a third as in the study of the search, a third with solid marks at the frame's border, and a third
+    with marks that reach into it."""
     group = index // DRAWN % 3
     if group == 0:
         return draw_case(seed, index, pitch_um)
@@ -90,8 +89,8 @@ def some_case(seed: int, index: int, pitch_um: float) -> Case:
 
 
 def solid_layout(rng: np.random.Generator, outline: Outline, at_mm: float, uneven_mm: float = 0.0) -> FiducialLayout:
-    """Four marks at the middles of the sides, so far from the frame's, each turned by a quarter, or also mirrored about
-    its axis. uneven_mm: by which their coordinates differ at most from such a figure."""
+    """Four marks at the middles of the sides, each rotated by a quarter turn, in some layouts every other one mirrored.
+    at_mm: distance from the centre; uneven_mm: largest random offset of their coordinates."""
     mirrored = bool(rng.random() < 0.3)
     polarity: Polarity = "light" if max(x for x, _ in outline) == 0.0 else "dark"
     marks = []
@@ -106,7 +105,7 @@ def solid_layout(rng: np.random.Generator, outline: Outline, at_mm: float, uneve
 
 
 def compared(case: Case, only_auto: bool) -> Row:
-    """How many marks are found with the pose left open, with the true one and with the one that auto took set."""
+    """Compare the marks found with automatic pose, with the true pose, and with the pose chosen by auto given."""
     auto = measure_frame(case, "auto")
     taken = auto.pose.name if auto.pose else case.pose
     true = auto if only_auto else measure_frame(case, case.pose)
@@ -127,8 +126,8 @@ def compared(case: Case, only_auto: bool) -> Row:
 
 
 def measure_frame(case: Case, pose: str) -> FrameMeasurement:
-    """As `reseau measure` has a frame that is its camera's only one, of marks as a user would draw them: neither light
-    nor dark."""
+    """Measure a frame as `reseau measure` does the only frame of a camera, with marks of unspecified polarity, as drawn
+    by a user."""
     pitch = None if case.pitch_um is None else (case.pitch_um, case.pitch_um)
     marks = tuple(replace(mark, mark=replace(mark.mark, polarity="auto")) for mark in case.layout.marks)
     layout = replace(case.layout, marks=marks)
@@ -138,26 +137,26 @@ def measure_frame(case: Case, pose: str) -> FrameMeasurement:
 
 
 def sigmas_off(case: Case, frame: FrameMeasurement, status: str) -> list[float]:
-    """How far each mark of a status lies from the nearest mark of the camera, by its own claim."""
+    """Errors, in claimed sigmas, of the marks of a status, each from the nearest true place."""
     truth = np.array(list(case.centers_px.values()))
     return [sigmas(mark, truth) for mark in frame.marks if mark.status == status]
 
 
 def sigmas(mark: MarkMeasurement, truth: np.ndarray) -> float:
-    """How far a mark lies from the nearest of places (n, 2), in its standard deviations."""
+    """Mahalanobis distance of a mark from the nearest of places (n, 2)."""
     off = truth - mark.center_px
     inverse = np.linalg.inv(np.asarray(mark.covariance_px2))
     return round(float(np.sqrt(np.einsum("ni,ij,nj->n", off, inverse, off).min())), 2)
 
 
 def other_statuses(one: FrameMeasurement, other: FrameMeasurement) -> int:
-    """How many marks, whatever their names, are measured in one and weak or not found in the other."""
+    """Difference of the numbers of marks with one status between two results, whatever their names."""
     counts = [Counter(str(mark.status) for mark in frame.marks) for frame in (one, other)]
     return max(abs(counts[0][status] - counts[1][status]) for status in ("measured", "weak"))
 
 
 def right(case: Case, frame: FrameMeasurement) -> list[np.ndarray]:
-    """Places of the marks found that are those of marks of the camera, whatever their names."""
+    """Places of the marks found that coincide with true marks, whatever their names."""
     truth = np.array(list(case.centers_px.values()))
     measured_marks = [
         mark.center_px for mark in frame.marks if mark.status.is_observation and mark.center_px is not None
@@ -166,7 +165,7 @@ def right(case: Case, frame: FrameMeasurement) -> list[np.ndarray]:
 
 
 def lost(found: list[np.ndarray], auto: FrameMeasurement) -> int:
-    """How many of the places found are none of those that are found with the pose left open."""
+    """Number of places found that were not found with automatic pose."""
     measured_marks = [
         mark.center_px for mark in auto.marks if mark.status.is_observation and mark.center_px is not None
     ]
@@ -174,7 +173,7 @@ def lost(found: list[np.ndarray], auto: FrameMeasurement) -> int:
 
 
 def report(rows: Sequence[Row]) -> Iterator[str]:
-    """A line a kind."""
+    """Table with one line for each kind of mark."""
     columns = {"kind": "", "frames": "d", **dict.fromkeys(SUMS, "d")}
     counts = {f"{status}{off}": "d" for status in ("weak", "measured") for off in ("", f" > {WRONG_SIGMAS:g}")}
     lines = []

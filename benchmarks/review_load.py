@@ -1,13 +1,12 @@
-"""A review in a real browser: how soon the next mark is there, what the server takes, and how many keys and seconds
-deciding takes.
+"""Review in a real browser: response time to the next mark, memory of the server, keys and time per decision.
 
     python -m benchmarks review_load [FRAMES] [SIDE_PX]
     python -m benchmarks review_load --archive [SCANS] [DECIDED]
 
-Renders FRAMES (20) tiled scans of SIDE_PX (11500) with four ring-crosses each, of which one is scratched, measures
-them, and goes through all of them with one key a mark. With --archive: a store of SCANS (50000) stand-ins, each with a
-weak mark, behind which stands one large file, and a file of decisions about DECIDED (25000) of them; fifty more are
-decided. Needs Chromium.
+Renders FRAMES (20) tiled scans of SIDE_PX (11500) with four ring-crosses each, one of them scratched, measures them,
+and reviews all of them with one key per mark. With --archive: a results database of SCANS (50000) stand-ins, each with
+a weak mark and all linked to one large file, and a decisions file on DECIDED (25000) of them; fifty more are decided.
+Requires Chromium.
 """
 
 import json
@@ -33,16 +32,16 @@ TILE_PX = 256
 PITCH_UM = 20.0
 SEED = 7
 GRAIN_DN, GROUND_DN, CONTRAST_DN = 3.0, 60.0, 120.0
-DECIDED_HERE = 50  # of an archive
-LOOKED_MS = 400  # as long as a person looks at a mark at least: the next one is fetched meanwhile
-OTHER_TILES = 64  # of grain, drawn once
+DECIDED_HERE = 50  # decisions in an archive
+LOOKED_MS = 400  # ms, shortest time that a person looks at a mark; the next one is fetched meanwhile
+OTHER_TILES = 64  # different tiles of grain
 START = "from pipeline.main import main; main()"
 Tile = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class Reviewed:
-    """Seconds until the page was open, and from each key until the next mark was there."""
+    """Times of a review: until the page was open, from each key until the next mark was shown, and in total."""
 
     opened_s: float
     next_s: list[float]
@@ -106,7 +105,7 @@ def review(project: Path, most: int) -> None:
 
 
 def written(folder: Path, frames: int, side_px: int) -> Path:
-    """The project: marks in the corners of an even frame with grain, the third one of each scratched."""
+    """Write the project: marks in the corners of a uniform frame with grain, the third one scratched."""
     mm = side_px * PITCH_UM / 1000.0
     at_mm = mm / 2 - 8.0
     corners = [(at_mm, -at_mm), (-at_mm, -at_mm), (-at_mm, at_mm), (at_mm, at_mm)]
@@ -144,7 +143,7 @@ def grain_tile(rng: np.random.Generator) -> Tile:
 
 
 def tiles(own: dict[tuple[int, int], Tile], encoded: list[bytes], chosen: NDArray[np.int64]) -> Iterator[bytes]:
-    """Compressed, row by row: a scan is never in memory."""
+    """Yield compressed tiles row by row, so that no scan is in memory."""
     for place in np.ndindex(chosen.shape):
         mark = own.get((place[0], place[1]))
         yield encoded[chosen[place]] if mark is None else bytes(zlib_encode(mark.tobytes()))
@@ -158,7 +157,8 @@ def draw(
     row: float,
     is_scratched: bool,
 ) -> None:
-    """A ring-cross, each pixel its distance from the lines, softened over one, into the tiles that it touches."""
+    """Draw a ring-cross into the tiles that it touches; edges are smoothed over one pixel by the distance from the
+    lines."""
     half, scale = 60, 1000.0 / PITCH_UM
     first_col, first_row = round(col) - half, round(row) - half
     rows, cols = np.mgrid[first_row : first_row + 2 * half, first_col : first_col + 2 * half]
@@ -176,7 +176,7 @@ def draw(
 
 
 def reviewed(address: str, most: int) -> Reviewed:
-    """At most so many marks accepted, one after the other."""
+    """Accept `most` marks one after another."""
     with sync_playwright() as playwright:
         found = shutil.which("chromium") or shutil.which("chromium-browser")
         browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
@@ -194,7 +194,7 @@ def reviewed(address: str, most: int) -> Reviewed:
 
 
 def decide_next(page: Page) -> float:
-    """Seconds from a key until the next mark is there."""
+    """Press a key; returns the seconds until the next mark is shown."""
     page.wait_for_timeout(LOOKED_MS)
     title = page.inner_text("#title")
     began = time.monotonic()

@@ -1,8 +1,8 @@
-"""Methods of scikit-image in the place of the program's own, on the same pictures and points, whose truth is known.
+"""Methods of scikit-image compared with those of the program, on the same synthetic images and points.
 
 python -m benchmarks scikit_image [--only NAME] [--count 24]
 
-Each row is one method: what it is for, its figure, and that of what is used in its place.
+Each row is one method: its figure of merit, and that of the method used by the program.
 """
 
 import argparse
@@ -44,7 +44,7 @@ FILM_MM, BENT_MM, GROSS_MM, GATE_MM = 0.01, 0.1, 1.0, 0.5
 
 
 def ellipse_model(count: int) -> str:
-    """Ellipses by EllipseModel through the contour at half the contrast; by least-squares matching."""
+    """Centres of ellipses by EllipseModel through the contour at half the contrast, and by least-squares matching."""
     rng, ours, theirs = np.random.default_rng(SEED), list[Array](), list[Array]()
     for _number in range(count):
         mark = some_mark(KIND["ellipse"], 1.0, rng)
@@ -57,8 +57,7 @@ def ellipse_model(count: int) -> str:
 
 
 def contour_center(grey: Array, about_px: Array) -> Array:
-    """(2,) the centre of an ellipse through the contour half way between the ground and the mark that lies about a
-    place."""
+    """(2,) centre of an ellipse through the contour around a place, halfway between background and mark."""
     col, row = np.rint(about_px).astype(int)
     level = (np.median(grey) + grey[row - 1 : row + 2, col - 1 : col + 2].mean()) / 2
     contours = [each[:, ::-1] for each in find_contours(grey, level) if len(each) >= LEAST_CONTOUR]
@@ -68,7 +67,7 @@ def contour_center(grey: Array, about_px: Array) -> Array:
 
 
 def phase_correlation(count: int) -> str:
-    """The same mark in two scans, shifted: by phase_cross_correlation, 1/100 px; by matching the drawing in both."""
+    """Shift of a mark between two scans by phase_cross_correlation, 1/100 px, and by matching the drawing in both."""
     rng, ours, theirs = np.random.default_rng(SEED), list[Array](), list[Array]()
     for _number in range(count):
         first = some_mark(KIND["ring-cross"], 1.0, rng)
@@ -92,8 +91,8 @@ def phase_correlation(count: int) -> str:
 
 
 def blobs(_: int) -> str:
-    """Disks of 3 to 12 px radius on clouds, with streaks: what is found at first look, before any fit; of the contrast
-    that the threshold is for, and of a third of it."""
+    """Detection, before any fit, of disks of 3 to 12 px radius on a cloudy background with streaks; at the contrast for
+    which the threshold is set, and at a third of it."""
     drawn_field, centers = field(np.random.default_rng(SEED), DISKS)
     truth = np.array(centers)
     fainter = drawn_field.mean() + (drawn_field - drawn_field.mean()) / 3
@@ -102,7 +101,7 @@ def blobs(_: int) -> str:
 
 def _first_looks(picture: Array, truth: Array) -> str:
     def regions() -> Array:
-        """Cut at multiples of the picture's own noise; of regions about one place the most solid."""
+        """Regions above multiples of the image noise; of those around one place the one of largest solidity."""
         above = picture - threshold_local(picture, 4 * int(RADII_PX[1]) + 1, method="mean")
         noise, sizes = robust_scale(np.diff(picture)) / np.sqrt(2), np.pi * np.array(RADII_PX) ** 2
         found = [each for level in NOISES for each in regionprops(label(above > level * noise))]
@@ -139,8 +138,9 @@ def _count_outliers(method: Callable[[], Array], truth: Array) -> str:
 
 
 def agreeing_marks(count: int) -> str:
-    """Marks on a film that is bent by some 0.1 mm, two of eight or none of four off by 1 mm: in how many frames just
-    these are told, and in how many a true mark, by RANSAC within the gate that the search has, and one by one."""
+    """Outlier detection on a film with deformation of about 0.1 mm, with gross errors of 1 mm in two of eight or none
+    of four marks: number of frames in which exactly these are rejected, and in which a correct mark is, by RANSAC with
+    the gate of the search, and one by one."""
     return " || ".join(_outliers_told(10 * count, *case) for case in ((MARKS_MM, 2), (MARKS_MM[:4], 0)))
 
 
@@ -164,7 +164,7 @@ def _outliers_told(frames: int, marks_mm: Array, off: int) -> str:
 
 
 def corners(count: int) -> str:
-    """Crossings of a chessboard, a blur of 1 px: by corner_subpix, and by OpenCV, from a whole pixel."""
+    """Corners of a chessboard with a blur of 1 px, from a start at a whole pixel: by corner_subpix, and by OpenCV."""
     rng, ours, theirs = np.random.default_rng(SEED), list[Array](), list[Array]()
     for _number in range(4 * count):
         center = np.full(2, (CORNER_PX - 1) / 2) + rng.uniform(-0.5, 0.5, 2)
@@ -178,7 +178,7 @@ def corners(count: int) -> str:
 
 
 def morphology(count: int) -> str:
-    """Masks of damage opened: whether both are the same, and seconds for each."""
+    """Morphological opening of damage masks: number of equal results, and time of each."""
     rng = np.random.default_rng(SEED)
     masks = [cv2.GaussianBlur(rng.standard_normal((61, 61)), (0, 0), 1.2) > 0.15 for _ in range(20 * count)]
     start = time.process_time()
@@ -191,7 +191,7 @@ def morphology(count: int) -> str:
 
 
 def film(count: int) -> str:
-    """A film that is bent by a polynomial of the second order, known by eight marks to 3 um: the error all over it."""
+    """Film deformed by a second-order polynomial, measured by eight marks to 3 µm: RMS error over the frame."""
     rng = np.random.default_rng(SEED)
     inside = np.stack(np.meshgrid(*2 * [np.linspace(-100.0, 100.0, 9)]), axis=-1).reshape(-1, 2)
     errors: dict[str, list[Array]] = {"PiecewiseAffine": [], "Polynomial": [], "film transformation": []}

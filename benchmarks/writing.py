@@ -1,11 +1,11 @@
-"""The pose by what is written, in rendered frames, against their truth.
+"""Scan orientation (pose) from the writing in rendered frames, against the true pose.
 
 python -m benchmarks writing [FRAMES] [WITHOUT] [ROWS.jsonl]
 
-Frames of four marks alike, in all poses, of every background, negatives too, blurred, grainy, compressed. Titles of 6
-to 40 characters stand beside one side, among them words that are the same upside down or in a mirror; on some a plate
-beside the opposite side, and a number by hand anywhere. Three of four cameras say where they write. The frames WITHOUT
-writing are of cameras that say so too. ROWS keeps what is done: a run that is stopped goes on.
+Frames with four equal marks, in all poses, with all backgrounds, negatives included, blurred, grainy, compressed.
+Titles of 6 to 40 characters are at one side, some with words that read the same upside down or mirrored; some frames
+have a data plate at the opposite side, or a handwritten number anywhere. Three of four cameras specify where they
+write. The frames WITHOUT writing are of such cameras, too. ROWS keeps the results, so that a stopped run continues.
 """
 
 import json
@@ -45,7 +45,7 @@ Row = dict[str, Any]
 
 SEED = 63
 FRAME_MM, PITCH_UM, MARGIN_MM, AT_MM = 24.0, 40.0, 4.2, 10.6
-READABLE = 12  # characters; of those drawn, or of those read with confidence
+READABLE = 12  # characters drawn, or read with confidence, that make a frame readable
 BINS = (0.0, 1.0, 2.0, 4.0, 6.0, 7.0, 8.5)
 OPPOSITE: Mapping[Side, Side] = {"left": "right", "right": "left", "top": "bottom", "bottom": "top"}
 TURNED: Mapping[str, str] = {"0": "180", "180": "0", "90": "270", "270": "90"}
@@ -69,7 +69,7 @@ def main() -> None:
 
 
 def report(rows: list[Row]) -> None:
-    """What became of the poses, and log-odds against how often they are right."""
+    """Print the outcomes of the poses, and the rate of correct ones by log-odds."""
     known = [row for row in rows if row["places"] and row["letters"] >= READABLE]
     classes = {
         f"places known, {READABLE} and more characters": known,
@@ -93,12 +93,12 @@ def report(rows: list[Row]) -> None:
 
 
 def legible(row: Row) -> float:
-    """How many characters were read, each by its confidence."""
+    """Number of legible characters, weighted by confidence."""
     return float(sum(max(each["ways"].values()) for each in row["read"]))
 
 
 def outcome(row: Row) -> str:
-    """Of one frame."""
+    """Outcome of one frame, in words."""
     if row["found"] is None:
         return "not found"
     right = row["found"] == row["true"]
@@ -110,7 +110,7 @@ def outcome(row: Row) -> str:
 
 
 def mirror_lead(row: Row) -> tuple[float, bool]:
-    """The log-odds that the better one of mirrored or not has, and whether it is the true one."""
+    """Log-odds of the better of mirrored and not mirrored, and whether it is correct."""
     plain, mirrored = (
         max(value for pose, value in row["likelihoods"].items() if pose.endswith("m") == face) for face in (False, True)
     )
@@ -118,7 +118,8 @@ def mirror_lead(row: Row) -> tuple[float, bool]:
 
 
 def turn_lead(row: Row) -> tuple[float, bool]:
-    """The log-odds of the best of the four turns with the true mirror against the next, and whether it is true."""
+    """Log-odds of the best of the four quarter turns against the next, with the true mirroring, and whether it is
+    correct."""
     own = {p: v for p, v in row["likelihoods"].items() if p.endswith("m") == row["true"].endswith("m")}
     best, second, *_ = sorted(own, key=lambda pose: -own[pose])
     return own[best] - own[second], best == row["true"]
@@ -133,7 +134,7 @@ def table(name: str, leads: Iterable[tuple[float, bool]]) -> None:
 
 
 def make_row(index: int, written: bool) -> Row:
-    """One frame, rendered and measured."""
+    """Render and measure one frame."""
     rng = np.random.default_rng([SEED, index])
     side = SIDES[rng.integers(4)]
     way = str(rng.choice(("0", "180") if side in ("top", "bottom") else ("90", "270")))
@@ -169,7 +170,7 @@ def make_row(index: int, written: bool) -> Row:
 
 
 def titles(rng: Generator, side: Side, way: str) -> list[Writing]:
-    """6 to 40 characters in one to four lines."""
+    """Random titles: 6 to 40 characters in one to four lines."""
     requests, lines, letters = int(rng.integers(6, 41)), list[Writing](), 0
     while letters < requests and len(lines) < 4:
         text = str(rng.choice(ALIKE)) if rng.random() < 0.2 else line_text(rng)
@@ -195,7 +196,7 @@ def draw_handwriting(rng: Generator) -> list[Writing]:
 
 
 def line(rng: Generator, text: str, side: Side, way: str, slot: int, font: str | None = None) -> Writing:
-    """At one of five places beside a side: two rows of two, and one at the end."""
+    """Line of text at one of five places along a side: two rows of two, and one at the end."""
     height = float(rng.uniform(0.45, 0.75))
     height = min(height, 9.5 / (0.8 * len(text)))
     along = (-5.2, 5.2, -5.2, 5.2, 11.3)[slot]
@@ -236,7 +237,7 @@ def scene(rng: Generator, marks: tuple[LayoutMark, ...], lines: tuple[Writing, .
 
 
 def stored(rng: Generator, grey: np.ndarray[Any, np.dtype[np.uint16]]) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """In 8 bits, half of them through JPEG."""
+    """Convert to 8 bits, half of the images with JPEG compression."""
     picture = (grey >> 8).astype(np.uint8)
     if rng.random() < 0.5:
         _, packed = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(40, 95))])

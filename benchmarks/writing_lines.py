@@ -1,10 +1,10 @@
-"""Lines of writing, read alone: how often the way they read best is the right one, by how much better it reads.
+"""Orientation of single lines of writing: rate at which the best reading is correct, by its lead over the others.
 
 python -m benchmarks writing_lines [SCANS] [FIRST]
 
-Four lines a scan, one at each side, as films have them: titles, dates, heights, numbers, plates, names, words that are
-the same upside down or in a mirror; in all fonts, 8 to 30 px high, blurred, grainy, faint, compressed, light or dark,
-the scan in any pose. The table is what the log-odds of a reading are taken from.
+Four lines per scan, one at each side, as on films: titles, dates, heights, numbers, data plates, names, words that read
+the same upside down or mirrored; in all fonts, 8 to 30 px high, blurred, grainy, faint, compressed, light or dark, the
+scan in any pose. The log-odds of readings in the program are taken from this table.
 """
 
 import itertools
@@ -56,7 +56,7 @@ def main() -> None:
 
 
 def table(title: str, lead: Array) -> None:
-    """lead: by how many characters the true way reads better than the other; negative where the other does."""
+    """Print a table. lead: legible characters of the true orientation minus those of the other."""
     print(f"\n{title}\n   lead of    lines  wrong   log-odds   a character   by maximum likelihood: {slope(lead):.2f}")
     for low, high in itertools.pairwise(BINS):
         inside = lead[(np.abs(lead) >= low) & (np.abs(lead) < high)]
@@ -67,13 +67,14 @@ def table(title: str, lead: Array) -> None:
 
 
 def slope(lead: Array) -> float:
-    """The log-odds a character that make what was seen the likeliest."""
+    """Maximum-likelihood estimate of the log-odds per character."""
     trials = np.linspace(0.02, 4.0, 400)
     return float(trials[np.argmin([np.logaddexp(0.0, -each * lead).sum() for each in trials])])
 
 
 def count_turns(index: int) -> list[tuple[float, float, float]]:
-    """Of each line that was found: by how many characters the truth leads, of mirror and of turn; its legible ones."""
+    """For each line found: lead of the true orientation, in characters, for mirroring and for rotation, and the number
+    of legible characters."""
     rng = np.random.default_rng([SEED, index])
     pose = str(rng.choice(POSES))
     grey = picture(rng)
@@ -91,12 +92,13 @@ def count_turns(index: int) -> list[tuple[float, float, float]]:
 
 
 def _possible_turns(legible: dict[str, float]) -> Sequence[str]:
-    """The true way, upside down, and both mirrored: lines read upright above and below, upward at the sides."""
+    """Orientations: the true one, upside down, and both mirrored. Lines above and below read to the right, those at the
+    sides upward."""
     return ("0", "180", "0m", "180m") if "0" in legible else ("90", "270", "90m", "270m")
 
 
 def picture(rng: Generator) -> NDArray[np.uint8]:
-    """The scan as it would lie upright: its lines above and below read to the right, those at the sides upward."""
+    """Upright scan: lines above and below read to the right, those at the sides upward."""
     grey = np.zeros((SIZE_PX, SIZE_PX))
     for side in range(4):
         strip = line_picture(rng)
@@ -119,7 +121,7 @@ def picture(rng: Generator) -> NDArray[np.uint8]:
 
 
 def line_picture(rng: Generator) -> Array:
-    """A line, light on dark, on a sheet that is just large enough."""
+    """Image of a line, light on dark, in a minimal frame."""
     text, font, height = line_text(rng), str(rng.choice(FONTS)), float(rng.uniform(8.0, 30.0))
     area = written_area(text, font)
     width = min(float(np.ptp(np.concatenate(area)[:, 0])), 0.75 * SIZE_PX / height)
@@ -131,7 +133,7 @@ def line_picture(rng: Generator) -> Array:
 
 
 def line_text(rng: Generator) -> str:
-    """What films have on them."""
+    """Random line of text as on films."""
     number = int(rng.integers(1, 10 ** int(rng.integers(1, 6))))
     day, month, year = int(rng.integers(1, 32)), int(rng.integers(1, 13)), int(rng.integers(1940, 2000))
     choices = (
