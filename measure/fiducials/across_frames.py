@@ -165,7 +165,7 @@ def _add_findings(
 
 
 def _suspicion(off_mm: float) -> Reason:
-    """Reason of a weak mark that may have the gross error of its frame."""
+    """Reason why a mark is weak: it may have the gross error of its frame."""
     return Reason(f"it may be wrong, by {off_mm:.3f} mm then: its frame is bent or one mark is off", Code.BENT_FRAME)
 
 

@@ -23,7 +23,8 @@ _SHRINK = 0.1  # shrinkage of the noise covariance towards a multiple of the uni
 def choose_channels(frame: Frame) -> Frame:
     """Choose the channel weights of a colour scan.
 
-    Some marks are located in the channel with the highest correlation; the weights are then estimated from these marks.
+    Some marks are located, each in the channel (or the luminance) with the highest correlation peak. The weights are
+    then estimated from these marks.
     If no mark is drawn as light or dark, the weights also determine the polarity.
     """
     if frame.scan.channels == 1:

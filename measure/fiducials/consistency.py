@@ -157,7 +157,8 @@ class FrameMarks:
         return -0.5 * (float(np.log(self._beyond_affine.variances + film_mm**2).sum()) + self.chi_square(film_mm))
 
     def precision(self, film_mm: float) -> Array:
-        """(2n, 2n) weight matrix of off_mm, reduced by all free parameters including size, stretch and shear."""
+        """(2n, 2n) weight matrix of off_mm for a film scatter of film_mm, after elimination of all free parameters,
+        size, stretch and shear included."""
         return self._beyond_affine.precision(film_mm)
 
     def affinity(self, film_mm: float) -> tuple[Array, Array]:
@@ -187,7 +188,7 @@ class FrameMarks:
         return replace(self, given_mm=self.given_mm[index], off_mm=self.off_mm[index], covariance_mm2=covariance)
 
     def rotate(self, turn: Array) -> "FrameMarks":
-        """Rotate the axes by turn (2, 2)."""
+        """Transform to axes that are rotated, or mirrored, by turn (2, 2)."""
         every = np.kron(np.eye(len(self.given_mm)), turn)
         return replace(
             self,

@@ -30,9 +30,9 @@ _TELLING = 0.05  # standard deviation of the log blur up to which that of the pl
 # Prior standard deviation, with the weight of two marks. In three frames of ring-crosses it was 0.005 to 0.008, in four
 # of a réseau 0.014 to 0.021: this is their root mean square.
 _SIZE_SPREAD, _BEFORE = 0.014, 2
-# Prior probability that something touches a mark on one side, without and with damaged pixels cut out beside it.
+# Prior probability that something touches a mark on one side, without and with damaged pixels cut out next to it.
 _WHOLE, _DAMAGED = 0.01, 0.03
-# Specks are equally large beside large and small marks: rms displacement of the mean outline of a touched round mark,
+# Specks do not depend on the size of the mark: rms displacement of the mean outline of a touched round mark,
 # multiplied by its radius. Five touched dots of 0.15 mm had it displaced by 8 um.
 _SPECK_MM2 = 0.00125
 _TOUCHED_PX = 0.3  # rms displacement of the edges of wedges and notches that the background touches
@@ -88,7 +88,7 @@ class SharedShape:
 
     def touched(self, spread: float, is_damaged: bool) -> float:
         """Posterior probability that something touches the mark on one side, less the prior one. spread: standard
-        deviation of the figures of touched marks; is_damaged: whether damaged pixels were cut out beside it."""
+        deviation of the figures of touched marks; is_damaged: whether damaged pixels were cut out next to it."""
         share = _DAMAGED if is_damaged else _WHOLE
         touched = share * _density(self.off, np.hypot(self.sigma, spread))
         untouched = (1 - share) * _density(self.off, self.sigma)
@@ -96,7 +96,7 @@ class SharedShape:
 
 
 def unlike_others(size_ratio: float, turn_rad: float | None) -> Reason:
-    """Reason of a weak mark whose size, or also its rotation where the frame gave it, differs from the others."""
+    """Reason why a mark is weak: its size, or also its rotation where the frame gave it, differs from the others."""
     larger = f"{size_ratio:.2f} times as large as the other marks"
     if turn_rad is None:
         figure = f"it is {larger}"
@@ -106,7 +106,7 @@ def unlike_others(size_ratio: float, turn_rad: float | None) -> Reason:
 
 
 def unlike_blur(ratio: float) -> Reason:
-    """Reason of a weak mark whose blur differs from the others."""
+    """Reason why a mark is weak: its blur differs from the others."""
     return Reason(f"its blur is {ratio:.2f} times that of the other marks", Code.BLUR)
 
 

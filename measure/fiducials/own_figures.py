@@ -113,7 +113,7 @@ def check_own_figures(frames: Sequence[FrameMeasurement]) -> list[FrameMeasureme
 
 
 def _unlike_frames(kind: str, off: float) -> Reason:
-    """Reason of a mark that differs from itself in the other frames."""
+    """Reason why a mark is weak: the figure differs from that in the other frames."""
     there, covered = "in the camera's other frames", "something may cover or touch it"
     if kind == _BLUR:
         return Reason(f"its blur is {np.exp(off):.2f} times that {there}", Code.BLUR)

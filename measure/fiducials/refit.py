@@ -229,7 +229,7 @@ def _is_better(before: MarkFit, fit: MarkFit, blur: SharedBlur | None) -> bool:
 
 
 def _compare_shapes(frame: Frame) -> Frame:
-    """Mark fits with an outlying size or rotation as weak: something, dust for example, covers or touches the mark.
+    """Doubt marks with an outlying size or rotation: something, dust for example, covers or touches them.
 
     Marks whose size is estimated are compared with those of the same drawing. Marks fitted with the frame's rotation
     and scale are compared all together, by the rotation and scale that their own images show. The covariance of each

@@ -1,7 +1,7 @@
 """Scan orientation of a frame, one of eight: decided by features that break its symmetry, or reported as undecided.
 
 Each orientation assigns other names to the marks found. Under the right one, their images fit (identification dots,
-different marks), their coordinates fit (asymmetries larger than their standard deviations), and the writing beside the
+different marks), their coordinates fit (asymmetries larger than their standard deviations), and the writing around the
 frame has the direction and place known from the camera. The log-likelihoods are summed. An orientation is decided only
 if its odds against every other are a thousand to one. Among equal ones an unmirrored orientation has the higher prior.
 """
