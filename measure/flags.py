@@ -23,10 +23,10 @@ class Status(StrEnum):
 
 
 STATUS_MEANING = {
-    Status.MEASURED: "Found, fitted, and no check doubts this mark; a deformation of its frame is in its sigma.",
-    Status.WEAK: "Fitted, but damaged, faint, partly covered or not well known; its standard deviation says how well.",
+    Status.MEASURED: "Found, fitted and passed all checks; a deformation of its frame is in its standard deviation.",
+    Status.WEAK: "Fitted, but damaged, faint, partly covered or imprecise; its standard deviation allows for it.",
     Status.PREDICTED: "Not found; the coordinates are predicted from the other marks.",
-    Status.REJECTED: "Something was found and measured, but a check says that it is not this mark.",
+    Status.REJECTED: "Something was measured, but a check shows that it is not this mark.",
     Status.ABSENT: "Not found, outside the scan or unreadable.",
 }
 
@@ -81,46 +81,46 @@ class Code(StrEnum):
 
 CODE_MEANING = {
     Code.OUTSIDE: "Its place lies outside of the scan, or behind the camera.",
-    Code.DAMAGED_FILE: "The scan's file does not give the pixels there.",
-    Code.FAILED_SCAN: "The scan could not be measured at all: its failure says why.",
-    Code.UNREACHABLE: "The second pass could not reach it: the scan is gone, or the process that did it was ended.",
+    Code.DAMAGED_FILE: "The scan's file is damaged there.",
+    Code.FAILED_SCAN: "The scan could not be measured at all; its failure gives the reason.",
+    Code.UNREACHABLE: "The second pass could not read the scan, or its process was killed.",
     Code.NO_FRAME: "No frame of the camera was found in the scan.",
     Code.NOT_FOUND: "No candidate near its place.",
     Code.GROUND: "The background is as light or as dark as the mark: there is no contrast.",
     Code.COVERED: "A part of it is damaged, covered or touched by something.",
-    Code.CONTRAST: "It hardly stands out of the noise, or of the texture about it.",
-    Code.LIKENESS: "Its picture does not match its drawing.",
+    Code.CONTRAST: "Its contrast is low against the noise or the texture around it.",
+    Code.LIKENESS: "The image does not match its drawing.",
     Code.POLARITY: "It is light where the marks are dark, or the reverse.",
-    Code.SIZE: "It is larger, smaller or otherwise turned than it should be.",
+    Code.SIZE: "Its size or rotation differs from the expected one.",
     Code.SMALL: "It is so small that size, blur and dust cannot be separated.",
-    Code.BLUR: "Its blur is another than that of the other marks.",
-    Code.NO_FIT: "The fit did not converge, or went to something else.",
+    Code.BLUR: "Its blur differs from that of the other marks.",
+    Code.NO_FIT: "The fit did not converge, or converged to something else.",
     Code.IMPRECISE: "Its standard deviation is large.",
-    Code.EDGES: "The place by its edges differs from the fitted one.",
+    Code.EDGES: "Its edges give another position than the fit.",
     Code.DUST: "Dust may hide in it.",
-    Code.OFF_PLACE: "It lies elsewhere than the other marks of the scan, or its orientation, put it.",
-    Code.OFF_FRAMES: "It lies elsewhere than in the camera's other frames.",
-    Code.OFF_GIVEN: "It lies elsewhere than the given coordinates put it.",
-    Code.AMBIGUOUS: "Several things there may be it.",
-    Code.UNNAMED: "Nothing tells which point it is, or its marker was not read.",
+    Code.OFF_PLACE: "Its position contradicts the other marks of the scan, or the orientation.",
+    Code.OFF_FRAMES: "Its position contradicts the camera's other frames.",
+    Code.OFF_GIVEN: "Its position contradicts the given coordinates.",
+    Code.AMBIGUOUS: "Several candidates there may be this mark.",
+    Code.UNNAMED: "It could not be identified, or its marker was not read.",
     Code.OWN_PICTURE: "It was learned from this scan alone: nothing checks its place.",
-    Code.OTHER_SCANS: "The picture about the point, or its place, contradicts the other scans.",
+    Code.OTHER_SCANS: "The image around the point, or its position, contradicts the other scans.",
     Code.FEW_SCANS: "Too few scans agree on the point.",
     Code.POSE: "The scan orientation is ambiguous.",
     Code.CHANCE: "The frame may be a false alarm.",
-    Code.FAINT_FRAME: "The frame was found only where less about each mark was compared.",
+    Code.FAINT_FRAME: "The frame was found only with less background around each mark in the correlation.",
     Code.OTHER_FRAME: "The scan shows another frame as well.",
-    Code.BENT_FRAME: "No affine transformation takes the given coordinates to the marks of this frame.",
-    Code.BENT_SCANS: "All scans are bent alike in the scanner's axes.",
+    Code.BENT_FRAME: "No affine transformation fits the given coordinates to the marks of this frame.",
+    Code.BENT_SCANS: "All scans have the same deformation in the scanner's axes.",
     Code.PERSPECTIVE: "The film was photographed obliquely: no affine transformation fits.",
-    Code.PITCH: "The marks want another pixel pitch.",
-    Code.NO_CHECK: "There are no more marks than the transformation needs.",
+    Code.PITCH: "The marks fit another pixel pitch.",
+    Code.NO_CHECK: "There are only as many marks as the transformation needs: no redundancy.",
     Code.NO_BOARD: "The board, or a part of its markers, was not found.",
-    Code.PLATE: "The plate in the picture contradicts the camera.",
+    Code.PLATE: "The plate in the image contradicts the camera.",
     Code.FEW_TIES: "Fewer natural points were found than wanted.",
-    Code.OTHER_PART: "Another scan of its frame shows it, for that was scanned in parts.",
-    Code.SECOND_PICTURE: "Its file holds a further picture of full size, or its scan shows a further frame.",
-    Code.COPY: "The scan's file is a copy of another one, whose marks count.",
+    Code.OTHER_PART: "Another part of the same frame shows it.",
+    Code.SECOND_PICTURE: "The file holds a second image of full size, or the scan shows a second frame.",
+    Code.COPY: "The scan's file is a copy of another one, whose marks are used.",
     Code.CLICKED: "A person pointed at it, and nothing could be matched there.",
     Code.DECIDED: "A person decided so.",
 }
@@ -189,26 +189,26 @@ class Cause(StrEnum):
 
 
 CAUSE_MEANING = {
-    Cause.NOISE: "Grain of the film and noise of the scanner, as the picture shows them.",
-    Cause.ROUNDING: "The grey values are whole numbers.",
-    Cause.SECOND_ORDER: "A soft and faint mark's picture bends within the errors of its place, blur and contrast.",
-    Cause.UNLIKE_DRAWING: "At its edges the picture differs by more than noise: it is not quite as drawn.",
-    Cause.DAMAGE: "Damage that was cut out may go on about it, too faint to stand out.",
-    Cause.TEXTURE: "One side of its edges has texture that the other has not.",
-    Cause.TONE: "The curve through which light was stored as grey values is not known well enough.",
-    Cause.SHARPENING: "By how much the scan was sharpened is not known well enough.",
-    Cause.CHANGED_TONES: "A learned mark's half tones may be others than where it was learned.",
+    Cause.NOISE: "Film grain and scanner noise, estimated from the image.",
+    Cause.ROUNDING: "Quantisation of the grey values.",
+    Cause.SECOND_ORDER: "Second-order effects of position, blur and contrast for a soft and faint mark.",
+    Cause.UNLIKE_DRAWING: "Model misfit: at the edges the image differs from the drawing by more than noise.",
+    Cause.DAMAGE: "Faint damage may remain around the damaged pixels that were left out.",
+    Cause.TEXTURE: "Background texture on one side of its edges.",
+    Cause.TONE: "Uncertainty of the tone curve between light and grey values.",
+    Cause.SHARPENING: "Uncertainty of the scan's sharpening.",
+    Cause.CHANGED_TONES: "A learned mark may have other half tones than in the scans it was learned from.",
     Cause.LANDSCAPE: "The background within a notch has texture.",
-    Cause.COMPRESSION: "JPEG rounded the mark's edges away.",
-    Cause.TOUCHED: "Something may touch the mark, as its size or shape says.",
-    Cause.OWN_TURN: "Its rotation and scale were taken from the frame, not fitted.",
-    Cause.FILM: "The film was bent or stretched, as the camera's frames show.",
-    Cause.SECOND_METHOD: "Its edges put it elsewhere.",
-    Cause.GIVEN_PLACES: "It contradicts the given places.",
-    Cause.OTHER_FRAMES: "It contradicts the camera's other frames.",
-    Cause.INTERPOLATION: "Two scans have their pixels at other places, and between these no picture is sure.",
+    Cause.COMPRESSION: "Loss of the mark's edges by JPEG compression.",
+    Cause.TOUCHED: "Something may touch the mark, judging by its size or shape.",
+    Cause.OWN_TURN: "Rotation and scale are those of the frame, with its standard deviations; they were not fitted.",
+    Cause.FILM: "Film deformation, estimated from the camera's frames.",
+    Cause.SECOND_METHOD: "Disagreement with the position from its edges.",
+    Cause.GIVEN_PLACES: "Disagreement with the given coordinates.",
+    Cause.OTHER_FRAMES: "Disagreement with the camera's other frames.",
+    Cause.INTERPOLATION: "Interpolation between the pixels of two scans.",
     Cause.CLICK: "A person pointed at it, and nothing could be matched there.",
-    Cause.LENS: "The lens of the camera that photographed the film is not known better than its calibration says.",
+    Cause.LENS: "Uncertainty of the lens that photographed the film, from its calibration.",
 }
 
 
@@ -229,12 +229,12 @@ def _limit(value: float, of: str, decides: str) -> float:
 # The search for a frame.
 FRAMES_BY_CHANCE = _limit(
     0.01,
-    "expected false alarms, as frames in a scan without any, over all attempts so far, or those at its pitch",
+    "expected number of false frames, over all attempts so far, or over those at its pitch",
     "a frame found under another pitch, or by the search for faint marks, is rejected",
 )
 PLACEMENTS_BY_CHANCE = _limit(
     30.0,
-    "expected false alarms: placements as good, before the marks are matched",
+    "expected number of false placements with as high a score, before the marks are matched",
     "no frame is measured there",
 )
 FRAME_BY_CHANCE = _limit(
@@ -247,67 +247,73 @@ NO_FRAME = _limit(  # likelier than not
 )
 CAMERA_BY_CHANCE = _limit(
     0.01,
-    "expected false alarms: constellations as good",
+    "expected number of false constellations with as high a score",
     "a camera is not named unless its marks correlate half as well at wrong places",
 )
 CAMERA_BY_NOISE = _limit(
     1e-8,
-    "triples of marks that noise is expected to make look as much like themselves",
+    "expected number of triples of marks with as high a correlation in noise",
     "a camera whose marks may be false alarms is not matched there",
 )
 NOISE_LIKE_A_MARK = _limit(
-    0.05, "noise as coarse as the window's answering as strongly as the best place", "nothing is matched there"
+    0.05, "p-value of the highest correlation in the window for noise of its coarseness", "nothing is matched there"
 )
 TEXTURE_LIKE_A_FAINT_MARK = _limit(  # one in some five hundred places
-    1e-4, "texture feigning a faint mark so strongly so near to its place", "the faint mark is rejected"
+    1e-4, "p-value of a faint mark's correlation and position for background texture", "the faint mark is rejected"
 )
 FAINT_MARK_BY_NOISE = _limit(  # counted: in some four hundred places
     1e-3,
-    "noise as strong as a faint mark, as near to its place, in the search for faint marks",
-    "it has no part in the frame, which all its marks together decide",
+    "p-value of a faint mark's correlation and position for noise",
+    "it does not count for the frame, which is decided by all its marks together",
 )
 
 # The marks of a frame.
 MARK_UNLIKE_THE_OTHERS = _limit(
-    0.01, "doubting any good mark of a frame by its blur, size or turn", "the mark is weak, or not this mark"
+    0.01,
+    "probability of flagging any good mark of a frame by its blur, size or rotation",
+    "the mark is weak, or not this mark",
 )
 LARGE_ERROR = _limit(  # it leaves two of 384 such errors in 840 rendered frames of disks unflagged
-    0.0015, "an error of half a pixel in a mark that is called measured", "the mark is weak"
+    0.0015, "probability of an error of half a pixel in a mark with the status measured", "the mark is weak"
 )
 FALSE_DOUBT = _limit(
     0.01,
-    "any good mark of a camera's frames being doubted, by each check",
+    "probability of flagging any good mark of a camera's frames, for each check",
     "a mark is weak, or its frame has a problem",
 )
-RIGHT_PITCH_REFUSED = _limit(0.01, "calling a right pitch wrong", "the frame has a problem")
+RIGHT_PITCH_REFUSED = _limit(0.01, "probability of rejecting a right pitch", "the frame has a problem")
 
 # Tests of a window before a fit.
 NATURAL_END = _limit(  # there are many windows
-    1e-6, "grey values heaping up so at an end by nature", "they count as clipped"
+    1e-6, "p-value of the accumulation of grey values at an end of the range", "they count as clipped"
 )
 JPEG_GRID = _limit(
-    1e-6, "a picture without the grid of an earlier JPEG being thought to have one", "its rounding is counted"
+    1e-6, "probability of finding the grid of an earlier JPEG in an image without one", "its rounding is counted"
 )
-JPEG_STEP = _limit(0.01, "a coefficient without a step being given one, where there is a grid", "that step is counted")
+JPEG_STEP = _limit(
+    0.01, "probability of finding a quantisation step in a coefficient without one", "that step is counted"
+)
 
 # Targets and natural points.
 DISK_UNLIKE_THE_OTHERS = _limit(
-    0.01, "a right disk differing so much from the others of its scan", "the disk is weak: dust may hide in it"
+    0.01, "p-value of a right disk's difference from the others of its scan", "the disk is weak: dust may hide in it"
 )
-TARGET_OFF_PLACE = _limit(1e-3, "a right target lying farther off its place", "the target is weak")
+TARGET_OFF_PLACE = _limit(1e-3, "p-value of a right target's distance from its predicted place", "the target is weak")
 TARGET_ELSEWHERE = _limit(  # one target in a thousand fields of a thousand targets
-    1e-6, "a right target lying still farther off", "the target is rejected"
+    1e-6, "p-value of a right target's distance from its predicted place", "the target is rejected"
 )
 SHEET_POINT_OFF_PLACE = _limit(
-    0.01, "any right point of a sheet, in all pictures, lying so far off", "the point is weak"
+    0.01, "p-value of the largest distance of any right point of a sheet, over all images", "the point is weak"
 )
 SHEET_POINT_ELSEWHERE = _limit(
-    1e-4, "any right point of a sheet lying still farther off", "the point is rejected, if other pictures show it"
+    1e-4,
+    "p-value of the largest distance of any right point of a sheet",
+    "the point is rejected, if other pictures show it",
 )
 POINT_OFF_ITS_NEIGHBOURS = _limit(
-    1e-4, "a right natural point moving so differently from those about it", "it is left out"
+    1e-4, "p-value of a right tie point's deviation from its neighbours", "it is left out"
 )
-POINT_OFF_ITS_RAY = _limit(1e-4, "a right natural point lying so far off the epipolar line", "it is left out")
-POINT_REFUSED = _limit(1e-4, "a test of its pictures refusing a right natural point", "it is left out of that scan")
+POINT_OFF_ITS_RAY = _limit(1e-4, "p-value of a right tie point's distance from the epipolar line", "it is left out")
+POINT_REFUSED = _limit(1e-4, "p-value of the tests of a right tie point's image", "it is left out of that scan")
 
 LIMITS = {name: limit for name, limit in dict(globals()).items() if isinstance(limit, Limit)}
