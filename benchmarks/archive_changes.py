@@ -1,4 +1,4 @@
-"""What is measured again after what change: six small drawn frames, counted by the store's results."""
+"""Number of scans measured again after various changes: six small frames, counted by the results in the database."""
 
 import os
 import sqlite3
@@ -61,7 +61,7 @@ def cells() -> Iterator[Row]:
 
 
 def case(change: str) -> Row:
-    """All is measured, then changed, then measured twice."""
+    """Measure all, apply a change, and measure twice again."""
     with TemporaryDirectory() as place:
         folder = write_project(Path(place), NAMES).parent
         count_measured(folder)
@@ -70,7 +70,7 @@ def case(change: str) -> Row:
 
 
 def count_measured(folder: Path) -> int:
-    """How many results a call of `reseau measure` adds."""
+    """Number of results that a run of `reseau measure` adds."""
     before = results(folder)
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
         assert run(["measure", str(folder / "project.toml")]) in (0, 1)

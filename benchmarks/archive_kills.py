@@ -1,7 +1,7 @@
-"""Kills -9 of the parent and of workers at random moments of a run of 200 stand-in scans: each time it goes on.
+"""Recovery from kill -9 of the parent and of workers at random moments of a run of 200 stand-in scans.
 
-At the end the store is held against that of an undisturbed run, all but times, and scans that were begun more than once
-are counted.
+At the end the results database is compared with that of an undisturbed run, except for times, and the scans that were
+started more than once are counted.
 """
 
 import os
@@ -57,7 +57,8 @@ def report(rows: list[Row]) -> Iterator[str]:
 
 
 def measured_to_its_end(folder: Path, rng: random.Random) -> Counter[str]:
-    """Begun again after each kill of the parent, until it ends by itself; how many of whom were killed."""
+    """Run the measurement, restarted after each kill of the parent, until it ends by itself; returns the numbers of
+    kills."""
     done: Counter[str] = Counter()
     while True:
         process = started(folder)
@@ -84,7 +85,7 @@ def started(folder: Path) -> "subprocess.Popen[bytes]":
 
 
 def workers(parent: int) -> list[int]:
-    """Its processes that measure."""
+    """Process ids of the workers of a parent."""
     children = Path(f"/proc/{parent}/task/{parent}/children")
     threads = Path(f"/proc/{parent}/task").glob("*/children") if children.exists() else ()
     pids = [int(pid) for file in threads for pid in file.read_text(encoding="ascii").split()]

@@ -1,9 +1,8 @@
-"""Real measurings of many scans by `reseau measure`: scans an hour, CPU and memory a scan.
+"""Measurement of many scans by `reseau measure`: scans per hour, CPU time and memory per scan.
 
-The scans are drawn anew, each with a place and grain of its own: tiled TIFF files of grainy film with eight
-ring-crosses, some 3 MB each at 2400 px. They are drawn first, and a line tells how many there are; then the command's
-own lines tell how many are measured, and how long the others will take. Given a folder, what is there already is
-neither drawn nor measured again: a run that was stopped goes on.
+The scans are rendered, each with its own position and grain: tiled TIFF files of grainy film with eight ring-crosses,
+about 3 MB each at 2400 px. They are rendered first, with progress lines; then the command prints its own progress.
+Given a folder, existing scans and results are used again, so that a stopped run continues.
 """
 
 import sqlite3
@@ -20,7 +19,7 @@ from benchmarks.object_measuring import PITCH_UM, camera_text, drawn_frame
 from pipeline.files.camera_file import read_camera
 
 _A_FOLDER = 500
-_BEYOND_MM = 2.0  # of the marks, to the scan's edge
+_BEYOND_MM = 2.0  # mm, distance of the marks from the scan's edge
 _TOLD_S = 20.0
 COLUMNS = {
     "verdicts": "", "scans an hour": ".0f", "seconds a scan": ".2f", "CPU s a scan": ".2f", "MB of a process": ".0f"

@@ -1,8 +1,8 @@
-"""Fifty thousand scans through the archive: time, memory and files of each command, in a process of its own.
+"""Archive of fifty thousand scans: time, memory and file sizes of each command, in its own process.
 
-Stand-ins for the measuring of a scan, so that only the rest is timed; two processes. `report` follows on results of
-which every hundredth frame has lost a fiducial. `adjust` is of 10,000 frames of eight fiducials alone: these lie up to
-10 um beside their given places, every frame has an affine film and scan of its own, and marks scatter by 2 um.
+The measurement of a scan is replaced by a stand-in, so that only the rest is timed; two processes. `report` uses
+results in which every hundredth frame lacks a fiducial. `adjust` uses 10,000 frames with eight fiducials only: these
+are up to 10 µm off their given places, each frame has its own affine film transformation, and the noise is 2 µm.
 """
 
 from collections.abc import Iterator
@@ -71,7 +71,7 @@ def _row(title: str, scans: int, *arguments: object) -> Row:
 
 
 def write_comparator(folder: Path, frames: int, rng: np.random.Generator) -> Path:
-    """A project of frames that are measured already."""
+    """Write a project of measured frames."""
     (folder / "camera.toml").write_text(CAMERA, encoding="utf-8")
     (folder / "project.toml").write_text('camera = "camera.toml"\n', encoding="utf-8")
     true_mm = np.array(FIDUCIALS) + rng.uniform(-OFF_MM, OFF_MM, (len(FIDUCIALS), 2))

@@ -1,7 +1,7 @@
-"""Scans of an archive that are measured without pictures: what one of each gives, drawn by chance from its file's name.
+"""Stand-in scans of an archive, measured without images: random results, determined by the content of the file.
 
-Everything about them is as ever: files, tasks, keys, processes, the store, the judging, comparator.csv. Only the
-measuring of a scan is another function.
+All else is as usual: files, tasks, keys, processes, results database, cross-scan checks, comparator.csv. Only the
+function that measures a scan is replaced.
 """
 
 import hashlib
@@ -29,7 +29,7 @@ from pipeline.results.measured_record import MeasuredScan
 FIDUCIALS = ((-106, -106), (106, -106), (106, 106), (-106, 106), (0, -110), (110, 0), (0, 110), (-110, 0))
 _PITCH_UM = 20.0
 _SIGMA_PX = 0.02
-_LOSES = 100  # one frame in so many has lost a fiducial
+_LOSES = 100  # one frame in this number lacks a fiducial
 _COVERED = Reason("a part of it is covered", Code.COVERED)
 CAMERA = 'name = "stand-in"\nframe_mm = [228.0, 228.0]\n' + "".join(
     f'[[fiducial]]\nid = "{number}"\nxy_mm = [{x}.0, {y}.0]\nsigma_mm = 0.01\nmark = "m"\n'
@@ -39,7 +39,7 @@ PROJECT = f'camera = "camera.toml"\nscans = ["scans/**/*.tif"]\npitch_um = {_PIT
 
 
 def write_project(folder: Path, scans: int, a_folder: int = 1000) -> Path:
-    """A project of so many empty-handed scans, in boxes of a thousand: files of some bytes."""
+    """Write a project of stand-in scans, files of a few bytes, in folders of a_folder files."""
     (folder / "camera.toml").write_text(CAMERA, encoding="utf-8")
     (folder / "project.toml").write_text(PROJECT, encoding="utf-8")
     for number in range(scans):
@@ -50,8 +50,8 @@ def write_project(folder: Path, scans: int, a_folder: int = 1000) -> Path:
 
 
 def stand_in(task: ScanTask) -> MeasuredFile:
-    """Measured in the time that RESEAU_STAND_IN_S says, 0 by default; RESEAU_STAND_IN_LOG: where its begin is told;
-    RESEAU_STAND_IN_WEAK: how many of its marks are weak."""
+    """Measure a stand-in scan. Environment: RESEAU_STAND_IN_S: duration, s, 0 by default; RESEAU_STAND_IN_LOG: file to
+    which its start is logged; RESEAU_STAND_IN_WEAK: number of weak marks."""
     if result := os.environ.get("RESEAU_STAND_IN_LOG"):
         with Path(result).open("a", encoding="utf-8") as file:
             file.write(f"{task.name}\n")
@@ -78,7 +78,7 @@ def _mark(point: str, xy: tuple[int, int], matrix: np.ndarray, rng: np.random.Ge
 
 
 def keep_results(project: Project) -> None:
-    """Put results into the database as `reseau measure` would; every hundredth frame has lost a fiducial."""
+    """Store results as `reseau measure` would; every hundredth frame lacks a fiducial."""
     home = project.path.resolve().parent
     with Store(project.measurement_path) as store:
         remember_place(store, home)
@@ -104,10 +104,10 @@ def _lose_marks(scan: MeasuredScan) -> MeasuredScan:
 
 
 def use() -> None:
-    """From now on this process hands out stand-ins."""
+    """Replace the measuring function of this process by the stand-in."""
     from pipeline.archive import work
 
     vars(work)["measure_file"] = stand_in
 
 
-USE = "from benchmarks.archive_stand_ins import use; use()"  # for a process of its own
+USE = "from benchmarks.archive_stand_ins import use; use()"  # for another process

@@ -1,5 +1,5 @@
-"""The same scans measured in one process, in two shards that are merged, and by a Dask cluster of which a worker is
-killed: whether comparator.csv is the same, byte for byte.
+"""The same scans measured in one process, in two merged shards, and by a Dask cluster with one worker killed: whether
+comparator.csv is identical.
 """
 
 import os
@@ -52,7 +52,7 @@ def command(folder: Path, name: str, *more: str) -> "subprocess.Popen[bytes]":
 
 
 def kill_one(process: "subprocess.Popen[bytes]", folder: Path, after: int) -> int:
-    """Kill a worker once so many scans are kept, and say how many there were; 0 where there was none to kill."""
+    """Kill a worker once `after` scans are stored; returns the number stored, 0 if no worker was killed."""
     while process.poll() is None:
         if (kept := results(folder)) >= after and (victims := workers(process.pid)):
             os.kill(random.Random(1).choice(victims), signal.SIGKILL)

@@ -1,7 +1,7 @@
-"""Whether the tests notice: forty lines of core logic broken on purpose, one at a time, then the tests of it run.
+"""Mutation test: forty lines of core logic are broken, one at a time, and the tests concerned are run.
 
-`broken_lines.toml` has the lines. Each is broken in a copy of the project, so nothing here is touched. Tests that fail
-without it, too, have caught nothing.
+The lines are in `broken_lines.toml`. Each is broken in a copy of the project. Tests that also fail without it do not
+count as having caught it.
 """
 
 import os
@@ -25,13 +25,13 @@ COLUMNS = {"file": "", "words": "", "outcome": ""}
 
 
 def cells(word: str = "") -> Iterator[Row]:
-    """Only lines whose file's path holds the word."""
+    """Yield the lines whose file's path contains the word."""
     lines = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))["line"]
     yield from (line for line in lines if word in line["file"])
 
 
 def case(file: str, words: str, instead: str, tests: str) -> Row:
-    """Raises ValueError where the line is not there any more."""
+    """Break one line and run its tests. Raises ValueError if the line no longer exists."""
     text = (ROOT / file).read_text(encoding="utf-8")
     if words not in text:
         raise ValueError(f"{file} has no line with {words!r}: bring broken_lines.toml up to date")
@@ -47,7 +47,7 @@ def report(rows: list[Row]) -> Iterator[str]:
 
 @cache
 def exit_code(tests: str, file: str = "", text: str = "") -> int:
-    """Pytest's, in a copy of the project in which a file may have another text."""
+    """Exit code of pytest in a copy of the project, with the text of a file replaced if given."""
     with TemporaryDirectory() as place:
         copy = Path(place)
         for part in COPIED:

@@ -1,7 +1,7 @@
-"""Time and memory of the catalogue that `reseau init` makes: heads of many files, in folders of 500.
+"""Time and memory of the catalogue made by `reseau init`: headers of many files, in folders of 500.
 
-Tiled TIFF files of 64 x 64 px whose bytes differ in one tile, a tenth of them copies of others, a hundredth broken. All
-have one size, so each has to be told from all others.
+Tiled TIFF files of 64 x 64 px that differ in one tile, a tenth of them copies of others, a hundredth damaged. All have
+the same size, so that each must be distinguished from all others by content.
 """
 
 import io
@@ -40,7 +40,7 @@ def case(files: int, seed: int) -> Row:
 
 
 def write(folder: Path, files: int, seed: int) -> None:
-    """The files, from one whose pixels are changed in place."""
+    """Write the files: one file with pixels changed in place."""
     picture = np.random.default_rng(seed).integers(0, 255, (64, 64)).astype(np.uint8)
     memory = io.BytesIO()
     tifffile.imwrite(memory, picture, tile=(32, 32), resolution=(500, 500), resolutionunit="CENTIMETER")

@@ -1,10 +1,10 @@
-"""How often `adjust.quality.lens_comparison` says drift: of calibrations that are alike, and of
-ones that differ by 2, 3, 5 sigmas.
+"""Significance level and power of the drift test `adjust.quality.lens_comparison`: equal calibrations, and ones that
+differ by 2, 3, 5 sigmas.
 
     python -m benchmarks compare_power [pairs] [--series | --adjustment]
 
---series: of four calibrations whose c changes steadily. --adjustment: how often an adjustment says so of an earlier
-calibration that is an observation of it, by `pairs` of simulated networks each.
+--series: four calibrations with a linear change of c. --adjustment: the test of an adjustment against an earlier
+calibration as observations, with `pairs` of simulated networks each.
 """
 
 import sys
@@ -21,11 +21,11 @@ Array = NDArray[np.float64]
 HALF = (110.0, 110.0)
 MARKS = np.array([(-106.0, -106.0), (106.0, -106.0), (106.0, 106.0), (-106.0, 106.0)])
 NAMES = ("c", "x0", "y0", "k3", "k5", "p1", "p2")
-AT = np.array([0, 1, 2, 3, 4, 6, 7])  # in c, x0, y0, k3, k5, k7, p1, p2, p3, p4
+AT = np.array([0, 1, 2, 3, 4, 6, 7])  # positions in c, x0, y0, k3, k5, k7, p1, p2, p3, p4
 TRUE = np.array([153.0, 0.010, -0.006, -6e-8, 1e-12, 2e-7, -1e-7])
 SIGMAS = np.array([0.004, 0.003, 0.003, 8e-9, 4e-13, 6e-8, 6e-8])
 MARK_SIGMA_MM = 0.002
-TIED = {(3, 4): -0.9, (1, 5): 0.6}  # k3 and k5, x0 and p1, as in most calibrations
+TIED = {(3, 4): -0.9, (1, 5): 0.6}  # correlations of k3 and k5, x0 and p1, as in most calibrations
 LEVEL = 0.05
 YEARS = np.array([1952.0, 1958.0, 1961.0, 1970.0])
 
@@ -68,7 +68,7 @@ def main(pairs: int = 300) -> None:
 
 
 def print_series(count: int = 300) -> None:
-    """Drift as it is told, and the trend's own test; the change is that from the first to the last."""
+    """Print the rates of drift and of a significant trend; changes are from the first calibration to the last."""
     rng = np.random.default_rng(10)
     for sigmas in (0.0, 2.0, 3.0, 5.0):
         change = np.zeros(len(NAMES))

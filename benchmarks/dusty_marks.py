@@ -1,4 +1,4 @@
-"""Frames of marks, and of disks with specks of dust, measured as `reseau measure` does."""
+"""Frames of marks, and of disks with specks of dust, measured as by `reseau measure`."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,16 +21,16 @@ Mask = NDArray[np.bool_]
 Range = tuple[float, float]
 
 DUST_SNR, BLUR_PX = 20.0, 1.0
-BLUR_SPREAD = 0.05  # of the logarithms of the blurs of a frame's marks
+BLUR_SPREAD = 0.05  # sigma of the logarithms of the blurs of a frame's marks
 FRAME_MM, AT_MM, PX_PER_MM, GIVEN_MM = 230.0, 106.0, 10.0, 0.005
-PLACED_PX, PLACED = 1.0, 1e-3  # standard deviations of a frame's placement: of its middle, of turn and scale
+PLACED_PX, PLACED = 1.0, 1e-3  # standard deviations of a frame's placement: centre, px; rotation and scale
 DISKS_A_SIDE = 5
-FORM_SPREAD, CONTRAST_SPREAD, DISK_BLUR_SPREAD, DISK_OFF_PX = 0.02, 0.05, 0.1, 0.4  # against what is predicted
+FORM_SPREAD, CONTRAST_SPREAD, DISK_BLUR_SPREAD, DISK_OFF_PX = 0.02, 0.05, 0.1, 0.4  # deviations from the prediction
 
 
 @dataclass(frozen=True, eq=False)
 class DustyMark:
-    """A mark in its window grey (size, size), of which specks leave seen; found: None where no place was given."""
+    """Mark with dust. grey: (size, size) window; seen: mask of pixels without specks; found: None if not measured."""
 
     mark: TrueMark
     grey: Array
@@ -43,12 +43,13 @@ class DustyMark:
 
     @property
     def error_px(self) -> Array:
-        """(2,), nan where there is none."""
+        """(2,) error, nan if not measured."""
         return np.full(2, np.nan) if self.found is None else self.found.center_px - self.mark.place[:, 2]
 
 
 def dusty(mark: TrueMark, grey: Array, share: float, rng: np.random.Generator) -> tuple[Array, Mask]:
-    """The picture with dark specks on so much of the pixels near the mark, and which pixels they leave."""
+    """Add dark specks that cover a fraction of the pixels near the mark; returns the image and the mask of clean
+    pixels."""
     speckled, view = grey.copy(), np.ones(grey.shape, dtype=bool)
     rows, cols = np.nonzero(mark.near)
     while (mark.near & ~view).sum() < share * mark.near.sum():
@@ -67,14 +68,16 @@ def dusty(mark: TrueMark, grey: Array, share: float, rng: np.random.Generator) -
 
 
 def frame_layout(kind: Kind, count: int, at: float = AT_MM) -> FiducialLayout:
-    """The first count of four corner and four side marks of one kind, at mm from the middle along either axis."""
+    """Layout of the first count of four corner and four side marks of one kind, `at` mm from the centre along the
+    axes."""
     places = [(at, -at), (-at, -at), (-at, at), (at, at), (0.0, -at), (-at, 0.0), (0.0, at), (at, 0.0)]
     marks = [LayoutMark(str(n), place, (GIVEN_MM, GIVEN_MM), kind.shape) for n, place in enumerate(places[:count])]
     return FiducialLayout(tuple(marks), (FRAME_MM, FRAME_MM))
 
 
 def start_placement(linear: Array, middle: Array, sign: int, count: int, rng: np.random.Generator) -> Placement:
-    """Where a frame lies, (2, 2) px per mm about its middle (2,), as a search gives it; sign: of its marks."""
+    """Placement of a frame as found by a search. linear: (2, 2) px per mm; middle: (2,) centre; sign: polarity of the
+    marks."""
     scale, turn = rng.normal(0, PLACED, 2)
     about = np.array([[1 + scale, -turn], [turn, 1 + scale]]) @ linear
     pixel_from_camera = np.column_stack([about, middle + rng.normal(0, PLACED_PX, 2)])
@@ -84,8 +87,8 @@ def start_placement(linear: Array, middle: Array, sign: int, count: int, rng: np
 def frame_of_disks(
     shares: Sequence[float], half_axes_px: Range, snrs: Range, blurs_px: Range, rng: np.random.Generator
 ) -> tuple[list[DustyMark], Array]:
-    """A frame of 25 disks, all light or all dark, their contrasts alike to 5 %, their blurs to 10 %, and their forms
-    predicted to 2 % but for a common scale; and how much dust is on each (25,), one of the shares."""
+    """Measure a frame of 25 disks, all light or all dark, with contrasts equal to 5 %, blurs to 10 %, and shapes
+    predicted to 2 % except for a common scale; returns them and the fraction of dust on each (25,)."""
     tile = 81 + 2 * int(max(half_axes_px) - 4)
     snr, sign, scale = rng.uniform(*snrs), rng.choice((-1, 1)), rng.uniform(0.9, 1.1)
     blur = rng.uniform(*blurs_px)

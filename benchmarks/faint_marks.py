@@ -1,9 +1,9 @@
-"""Faint marks in frames whose other marks are plainly there, against their truth and the Cramér-Rao bound.
+"""Faint marks in frames whose other marks are clear: accuracy against the Cramér-Rao bound.
 
---frames: of every cell, each with three faint marks. Eight marks of one kind stand in a frame
-of 60 mm (10 px a mm), their blurs alike to 5 %: five have 20 times the contrast of the noise, three the SNR of a cell.
-A value is rms / bound and realised / claimed; -n: not found. The pictures and bounds are those of `marks`; what
-measures is what `reseau measure` runs, `measure.fiducials.measure_frame.measure_frame`.
+--frames: number per cell, each with three faint marks. A frame of 60 mm (10 px per mm) has eight marks of one kind with
+blurs equal to 5 %: five at SNR 20, three at the SNR of the cell. A value is RMS / bound and realised / claimed; -n: not
+found. The images and bounds are those of `marks`; the measuring function is that of `reseau measure`,
+`measure.fiducials.measure_frame.measure_frame`.
 """
 
 from collections.abc import Iterator
@@ -28,16 +28,16 @@ Array = NDArray[np.float64]
 
 PLAIN_SNR, MARKS, FAINT, AT_MM = 20.0, 8, (2, 5, 7), 30.0
 SNRS, BLURS_PX = (3.0, 5.0, 10.0), (1.0, 1.6, 2.5)
-POOL = 6  # different frames in a cell, each drawn once and measured in noise that is always new
-BESIDE_PX = 40  # of noise about a mark's window: what blank film beside a mark is taken from
+POOL = 6  # different frames per cell, each rendered once and measured with new noise
+BESIDE_PX = 40  # px, noise around a mark's window, from which blank film is sampled
 SEED = 20
 FRAMED = [kind for kind in KINDS if kind.name != "ellipse"]
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnFrame:
-    """A frame's marks in their windows, whose first pixels corners (marks, 2) give in a scan of side px squared; linear
-    (2, 2) px per mm, and middle (2,) px of the frame."""
+    """Marks of a frame in their windows. corners: first pixels of the windows in a scan of side x side px; linear:
+    (2, 2) px per mm; middle: (2,) centre of the frame, px."""
 
     layout: FiducialLayout
     marks: list[TrueMark]
@@ -48,7 +48,7 @@ class DrawnFrame:
 
 
 def drawn_frame(kind: Kind, blur_px: float, rng: np.random.Generator) -> DrawnFrame:
-    """Somewhere, of some rotation and scale."""
+    """Draw a frame with random sub-pixel place, rotation and scale."""
     layout, side = frame_layout(kind, MARKS, AT_MM), int(PX_PER_MM * AT_MM * 3) + 300
     linear = some_mark(kind, blur_px, rng, px_per_mm=PX_PER_MM).place[:, :2]
     middle = side / 2 + rng.uniform(-0.5, 0.5, 2)
@@ -63,7 +63,8 @@ def drawn_frame(kind: Kind, blur_px: float, rng: np.random.Generator) -> DrawnFr
 def measured_faint(
     frame: DrawnFrame, snr: float, rng: np.random.Generator
 ) -> Iterator[tuple[TrueMark, Found | None, Array]]:
-    """Each faint mark as it was found and the noise in its window, its contrast being 1; None where it was not."""
+    """Measure a frame; yield each faint mark, its result, None if not found, and the noise in its window in units of
+    its contrast."""
     sign = int(rng.choice((-1, 1)))
     ground = GROUND + (1 - sign) / 2 * CONTRAST
     picture = np.full((frame.side, frame.side, 1), ground, np.uint16)

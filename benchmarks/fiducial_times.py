@@ -1,8 +1,8 @@
-"""CPU seconds of measuring the eight fiducials of a frame, beside one decode of its file, and the worst error.
+"""CPU time of measuring the eight fiducials of a frame, relative to decoding its file, and the largest error.
 
 A frame of 11,500 px in 16-bit LZW tiles with marks of 105 px, and one of 2400 px, 8 bit, with ring-crosses of 138 px,
-stored through a tone curve of 2.2 which the measurement is told, or not. Both are measured once before, so that what a
-process reads and computes only once is not counted; the least of some rounds is told.
+stored with a gamma of 2.2 that is given to the measurement, or not. A first measurement, which includes initialisation,
+is not counted; the smallest time of several rounds is given.
 """
 
 import tempfile
@@ -72,7 +72,8 @@ def case(frame: str, seed: int, rounds: int = 3) -> Row:
 def draw(
     side_px: int, px_per_mm: float, mark: MarkShape, rng: np.random.Generator
 ) -> tuple[FiducialLayout, Array, Array]:
-    """A frame of clouds and grain, its light from 0 to 1, turned by half a degree, its marks on black rims."""
+    """Render a frame of clouds and grain, rotated by half a degree, with marks on black pads; returns its layout, its
+    light from 0 to 1, and the true places of the marks."""
     half_mm = 0.44 * side_px / px_per_mm
     places = [(x * half_mm, y * half_mm) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y]
     marks = [LayoutMark(str(number), xy, (0.005, 0.005), mark) for number, xy in enumerate(places)]

@@ -1,6 +1,6 @@
-"""What each heuristic brings: the same pictures measured with it, and with it switched off.
+"""Ablation of heuristics: the same images measured with each heuristic and without it.
 
-Each row is one heuristic: the figure that it is there for, with it and without.
+Each row is one heuristic: its figure of merit with and without it.
 """
 
 import time
@@ -27,7 +27,7 @@ SEED, LARGE_PX = 5, 0.5
 
 
 def faint(count: int) -> str:
-    """Marks of a frame at twice the noise, three of eight: how many are found, and their rms error."""
+    """Marks at SNR 2, three of eight in a frame: number found, and RMS error."""
     rng, errors, of = np.random.default_rng(SEED), [], 0
     for _number in range(max(count // 6, 1)):
         frame = drawn_frame(KIND["ring-cross"], 1.6, rng)
@@ -38,7 +38,7 @@ def faint(count: int) -> str:
 
 
 def dusty_disks(count: int) -> str:
-    """Small disks among dust: those called measured that lie more than half a pixel off, and good ones doubted."""
+    """Small disks with dust: number measured with errors above half a pixel, and clean ones flagged."""
     rng, wrong, doubted, of = np.random.default_rng(SEED), 0, 0, 0
     for _number in range(max(count // 3, 1)):
         found, dusts = frame_of_disks((0.0, 0.05), (1.8, 3.5), (10.0, 30.0), (0.8, 1.3), rng)
@@ -50,7 +50,7 @@ def dusty_disks(count: int) -> str:
 
 
 def one_front(count: int) -> str:
-    """A strip of images: CPU seconds of its adjustment."""
+    """CPU time of the adjustment of a strip of images."""
     scene = strip(8 * count)
     start = time.process_time()
     adjust(scene.network, scene.start)

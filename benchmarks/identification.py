@@ -1,10 +1,10 @@
-"""Marks named with no orientation, by simulated frames: how many are right, refused and wrong, and how long it takes.
+"""Identification of targets without orientation, by simulated frames: rates of correct, refused and wrong, and time.
 
 python -m benchmarks identification [--frames 50] [--points 20 100 500] [--shares 0 10 20] [--seed 1] [--unknown]
 
-Fields of 20, 100 and 500 points, in a plane (jittered lattice) and in space (at random in a box); a frame from a random
-side and distance, turned at random; 0, 10 or 20 % of the points missing and as many marks that are none; the principal
-distance wrong by 2 %, or not known at all; the lens's radial distortion not known, marks off by 0.5 px.
+Fields of 20, 100 and 500 points, planar (jittered lattice) and spatial (random in a box); frames from random directions
+and distances with random roll; 0, 10 or 20 % of the points missing and as many false marks; principal distance wrong by
+2 %, or unknown; radial distortion unknown; noise of 0.5 px.
 """
 
 import argparse
@@ -21,12 +21,13 @@ Array = NDArray[np.float64]
 
 C_MM, HALF_MM, PITCH_MM = 50.0, np.array([18.0, 12.0]), 0.006
 SIGMA_PX = 0.5
-ZOOMS = 0.52, 3.5  # of a principal distance that is not known: 0.6 to 4 of the frame's diagonal
+ZOOMS = 0.52, 3.5  # range of an unknown principal distance relative to C_MM: 0.6 to 4 frame diagonals
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """xyz, normals (n, 3): the field; xy_mm (m, 2): the marks; point (m,): which each is, -1 for none."""
+    """Simulated frame. xyz, normals: (n, 3) field; xy_mm: (m, 2) marks; point: (m,) true index of each, -1 for a false
+    mark."""
 
     xyz: Array
     normals: Array
@@ -35,7 +36,7 @@ class Frame:
 
 
 def planar(n: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """A lattice, each point moved by up to a third of a step."""
+    """Planar lattice, each point shifted by up to a third of the spacing."""
     columns = int(np.ceil(np.sqrt(1.5 * n)))
     row, column = np.divmod(np.arange(n), columns)
     xy = np.stack([column, row], axis=1) + rng.uniform(-0.33, 0.33, (n, 2))
@@ -44,14 +45,14 @@ def planar(n: int, rng: np.random.Generator) -> tuple[Array, Array]:
 
 
 def spatial(n: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Points in a box that is half as deep as wide; where they face is not known."""
+    """Random points in a box half as deep as wide, with unknown normals."""
     xyz = rng.uniform(-0.5, 0.5, (n, 3)) * (1.0, 0.7, 0.5)
     return xyz, np.full((n, 3), np.nan)
 
 
 def frame(xyz: Array, normals: Array, share: float, rng: np.random.Generator, zoom: float = 1.0) -> Frame:
-    """A picture from within 45 degrees of the z axis that the field fills more or less; zoom: by how much farther off
-    the camera stands, with as much longer a principal distance."""
+    """Simulate a frame from within 45 degrees of the z axis, roughly filled by the field. share: of missing points and
+    false marks; zoom: factor of both distance and principal distance."""
     tilt, around, roll = rng.uniform(0.0, np.pi / 4), rng.uniform(0.0, 2 * np.pi), rng.uniform(0.0, 2 * np.pi)
     sight = np.array([np.sin(tilt) * np.cos(around), np.sin(tilt) * np.sin(around), np.cos(tilt)])
     right = np.cross([np.cos(roll), np.sin(roll), 0.3], sight)
@@ -75,7 +76,8 @@ def named(one: Frame, c_mm: float | None) -> Names | str:
 
 
 def verdict(one: Frame, names: Names | str) -> str:
-    """right: most of the points seen have their names; wrong: more than one mark in fifty has another's."""
+    """Outcome: "right" if at least 80 % of the visible points are identified, "few" if fewer; "wrong" if more than one
+    identification in fifty is wrong."""
     if isinstance(names, str):
         return "refused"
     good = sum(one.point[mark] == point for point, mark in names.mark.items())

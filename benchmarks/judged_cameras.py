@@ -1,5 +1,5 @@
-"""What judging a camera's frames together finds, by simulated places: marks that are off, bent frames, given
-coordinates and scanners that are; and how often it tells what is not.
+"""Checks across the frames of a camera, by simulated places: detection rates of wrong marks, deformed frames, wrong
+given coordinates and scanner errors, and false-alarm rates.
 """
 
 from collections.abc import Callable, Iterator
@@ -27,7 +27,8 @@ def cells(cameras: int = 100) -> Iterator[Row]:
 
 
 def case(kind: str, cameras: int, seed: int) -> Row:
-    """As it should be / a good mark is weak, or another frame, or another cause, is told."""
+    """Numbers of cameras with the correct outcome, and with a false one: a good mark weak, another frame or cause
+    named."""
     _, places, sigma_mm, made = next(each for each in kinds() if each[0] == kind)
     rng, row = np.random.default_rng(seed), {}
     for count in COUNTS:
@@ -37,7 +38,7 @@ def case(kind: str, cameras: int, seed: int) -> Row:
 
 
 def kinds() -> list[tuple[str, list[tuple[float, float]], float, Made]]:
-    """What the cameras have, their marks, the standard deviation of these, and how the frames are made."""
+    """Kinds of cameras: fault, marks, standard deviation of their coordinates, and function that makes the frames."""
     return [
         ("four marks, given to 5 um, film 3 um", FOUR, 0.005, good),
         ("eight marks, given to 5 um, film 3 um", EIGHT, 0.005, good),
@@ -59,17 +60,17 @@ def kinds() -> list[tuple[str, list[tuple[float, float]], float, Made]]:
 
 
 def outcome(made: Made, layout: FiducialLayout, count: int, rng: np.random.Generator) -> tuple[bool, bool]:
-    """Whether what there is is named, and whether anything else is."""
+    """Whether exactly the fault is named, and whether anything else is."""
     frames, expected = made(layout, count, rng)
     result = check_frames(frames, layout, [(PITCH_UM, PITCH_UM)] * count)
     named = causes(result)
     if count == 1 and expected not in ("", "mark"):
-        expected = "frame"  # of one frame nobody can tell which it is
+        expected = "frame"  # a single frame does not allow to separate the causes
     return named == {expected} - {""}, bool(named - {expected})
 
 
 def causes(result: CheckedFrames) -> set[str]:
-    """The causes that are named, the first frame being the one that may be another."""
+    """Causes named in the result; the first frame is the one with a fault."""
     found = {"mark" if where == ("0", "2") else "another mark" for where in weak(result.frames)}
     for number, frame in enumerate(result.frames):
         for problem in frame.problems:

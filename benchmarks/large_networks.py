@@ -1,4 +1,4 @@
-"""Large networks to adjust: a board in many views, an aerial block and a strip, as OpenCV projects them."""
+"""Large simulated networks: a board in many views, an aerial block and a strip, projected by OpenCV."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,21 +14,21 @@ from adjust.problem.network import Approximations, Image, Network, ObjectPoint
 from adjust.problem.observations import Observations
 
 Array = NDArray[np.float64]
-Seen = tuple[NDArray[np.intp], Array]  # of an image: numbers of points, and their places (m, 2) in mm, y up
+Seen = tuple[NDArray[np.intp], Array]  # of an image: indices of points, and their places (m, 2), mm, y up
 
 SIGMA_MM = 0.005
 FOCAL_MM, FRAME_MM = 100.0, 200.0
 ESTIMATED = {"known": ("k1", "k2", "p1", "p2", "k3"), "unknown": ("k1", "k2")}
 TRUE = {"k1": -0.05, "k2": 0.02}
-FLIP = np.diag([1.0, -1.0, -1.0])  # from axes with y up, looking along -z, to OpenCV's
-POINTS_AN_IMAGE, CONTROL_EVERY = 50, 10  # of a strip: points that an image shows, images between known points
+FLIP = np.diag([1.0, -1.0, -1.0])  # from axes with y up and viewing direction -z to OpenCV's
+POINTS_AN_IMAGE, CONTROL_EVERY = 50, 10  # of a strip: points per image, images between known points
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A network to adjust, with what other programs need of it.
+    """Network to adjust, with its data for other programs.
 
-    points (p, 3); seen: per image the points' numbers and their places (m, 2) in mm, y up.
+    points: (p, 3); seen: by image, indices of the points and their places (m, 2), mm, y up.
     """
 
     network: Network
@@ -38,7 +38,7 @@ class Scene:
 
 
 def make_board(views: int, relief: float = 0.05) -> Scene:
-    """A board of 100 points with some relief, all of them in every view."""
+    """Board of 100 points with some relief, all visible in each view."""
     rng = np.random.default_rng(views)
     grid = (np.arange(10) - 4.5) * 0.1
     plan = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
@@ -50,7 +50,7 @@ def make_board(views: int, relief: float = 0.05) -> Scene:
 
 
 def unknown(images: int, points: int) -> Scene:
-    """An aerial block of 60 % overlap along and across, attitudes within some degrees, one point in a hundred known."""
+    """Aerial block of 60 % overlap along and across, attitudes within a few degrees, one point in a hundred known."""
     rng = np.random.default_rng(images)
     across = int(np.sqrt(images / 2))
     base, height = 0.4 * FRAME_MM, 1.0 * FOCAL_MM
@@ -67,7 +67,7 @@ def unknown(images: int, points: int) -> Scene:
 
 
 def strip(images: int, control: int = CONTROL_EVERY) -> Scene:
-    """A strip of 60 % overlap, fifty points an image, some known every ten images; 0: at the first two alone."""
+    """Strip of 60 % overlap, fifty points per image, with known points every `control` images; 0: only at the start."""
     rng = np.random.default_rng(images)
     base, height = 0.4 * FRAME_MM, 1.0 * FOCAL_MM
     stations = np.column_stack([base * np.arange(images), np.zeros(images), np.full(images, height)])
@@ -86,7 +86,8 @@ def strip(images: int, control: int = CONTROL_EVERY) -> Scene:
 def _scene(
     rng: np.random.Generator, points: Array, stations: Array, angles: Array, task: str, sigma: Array, error: float
 ) -> Scene:
-    """What OpenCV projects, with noise; approximations wrong by an error in object units, hundredths of it in rad."""
+    """Scene with noisy projections by OpenCV. error: sigma of the approximate values, object units; angles have a
+    hundredth of it, rad."""
     projected = _projected(rng, points, stations, angles)
     network = _network(points, sigma, ESTIMATED[task], projected)
     start = Approximations(
@@ -104,7 +105,7 @@ def _scene(
 
 
 def _projected(rng: np.random.Generator, points: Array, stations: Array, angles: Array) -> list[Seen]:
-    """What each image shows of the points that two show at least."""
+    """Project the points into each image; points in fewer than two images are left out."""
     matrix = np.diag([FOCAL_MM, FOCAL_MM, 1.0])
     lens = np.array([TRUE["k1"], TRUE["k2"], 0.0, 0.0, 0.0])
     view = []
@@ -121,7 +122,7 @@ def _projected(rng: np.random.Generator, points: Array, stations: Array, angles:
 
 
 def _network(points: Array, sigma: Array, estimated: Sequence[str], seen: Sequence[Seen]) -> Network:
-    """Points of sigma 0 are known; the others, the camera and what is estimated of its distortion are not."""
+    """Network with points of sigma 0 known; the other points, the camera and the estimated distortion are free."""
     names = [f"i{i}" for i in range(len(seen))]
     free = {name: Prior(0.0, np.inf) for name in estimated}
     free_point = Prior(FOCAL_MM, np.inf), Prior(0.0, np.inf), Prior(0.0, np.inf)

@@ -1,10 +1,10 @@
-"""What makes sigma0 too large, planted into networks of a digital camera: what is said of it.
+"""Explanations of a large sigma0: effects planted into networks of a digital camera, and whether they are named.
 
 python -m benchmarks large_sigma0 [NETWORKS] [TIMES] [KIND...]
 
-NETWORKS (20) of every kind, anew for every seed, flat boards and deep fields; the effect TIMES (3) as large as its test
-detects with a probability of 0.80 at 0.001; five times as many with nothing planted. named: the kind is named, and
-nothing else. unnamed: nothing is said. misleading: anything else is said.
+NETWORKS (20) of each kind, with new seeds, flat boards and deep fields; the effect is TIMES (3) the size that its test
+at a significance level of 0.001 detects with a power of 0.80; five times as many networks without an effect. named:
+only the effect is named; unnamed: nothing is named; misleading: anything else is named.
 """
 
 import sys
@@ -13,7 +13,7 @@ from collections import Counter
 
 from misfits import KINDS, MANY, NOTHING, describe, draw_network, outcome
 
-SOUND = 5  # times as many networks with nothing planted
+SOUND = 5  # factor of the number of networks without an effect
 
 
 def main() -> None:

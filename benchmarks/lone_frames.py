@@ -1,4 +1,4 @@
-"""One frame of a camera in its scan, as the studies of the search, tones, writing and unequal pixels set it up."""
+"""Scenes of a single frame, for the studies of search, tones, writing and unequal pixels."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -25,7 +25,7 @@ def lone_frame(
     principal_distance_mm: float = 25.0,
     **parts: Any,
 ) -> Scene:
-    """The scene of a square frame whose field has no targets; parts: scanner, film, tones and background of it."""
+    """Scene of a square frame without targets. parts: scanner, film, tones and background."""
     camera = SceneCamera(name, (frame_mm, frame_mm), principal_distance_mm, fiducials=fiducials)
     return Scene(name=name, seed=seed, camera=camera, field=DiskField((), 1.0), images=(image,), **parts)
 
@@ -33,7 +33,7 @@ def lone_frame(
 def make_image(
     pose: str, turn_deg: float, scale: Iterable[float], shear: float, height_mm: float = 100.0, **parts: Any
 ) -> SceneImage:
-    """Its only image, straight down; scale: of its film along both axes; parts: where it lies and what is beside it."""
+    """Vertical image of the frame. scale: of the film along both axes; parts: further fields of `SceneImage`."""
     x, y = scale
     return SceneImage(
         name="frame",
@@ -46,12 +46,12 @@ def make_image(
 
 
 def painted(scene: Scene, *more: Paint) -> NDArray[np.uint16]:
-    """(height, width) grey values of its scan. more: what is painted over it."""
+    """(height, width) grey values of the scan. more: further paints on top."""
     frame = make_frame(scene, 0)
     frame = replace(frame, paints=(*frame.paints, *more))
     return np.concatenate(list(grey_strips(frame, 0, scene_background(scene))))
 
 
 def make_fiducials(marks: Iterable[LayoutMark]) -> tuple[SceneFiducial, ...]:
-    """The marks of a layout as they are drawn at their given places."""
+    """Marks of a layout as scene fiducials at their given places."""
     return tuple(SceneFiducial(mark.id, mark.xy_mm, scene_mark(mark.mark)) for mark in marks)

@@ -1,4 +1,4 @@
-"""True marks drawn on a ground and measured as `reseau measure` does; cells of a table of their errors."""
+"""Synthetic marks rendered on a background and measured as by `reseau measure`; table cells of their errors."""
 
 from dataclasses import dataclass, field
 
@@ -17,12 +17,13 @@ from measure.targets.disks import fit_disk
 Array = NDArray[np.float64]
 
 GROUND, CONTRAST = 25000.0, 15000.0
-SHIFT_PX, SEARCH_PX = 1.5, 3.0  # of the start, and the radius of the search
+SHIFT_PX, SEARCH_PX = 1.5, 3.0  # px, error of the start, and radius of the search
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A place with its covariance; flagged: `weak`, or not measured at all; unlike_drawing_px2: of that cause."""
+    """Measured place with its covariance. flagged: reason if `weak` or not measured, "" otherwise; unlike_drawing_px2:
+    covariance of the cause model misfit."""
 
     center_px: Array
     covariance_px2: Array
@@ -32,8 +33,11 @@ class Found:
 
 @dataclass
 class Cell:
-    """What became of the marks of one cell: errors (2,) with the covariances claimed, and beside each the error of the
-    best linear estimate in the very same noise with its bound."""
+    """Results of the marks of one table cell.
+
+    errors, covariances: (2,) errors and claimed covariances; best, bounds: errors of the best linear estimate from the
+    same noise, and its covariance, the bound; lost: number of marks not measured.
+    """
 
     errors: list[Array] = field(default_factory=list)
     covariances: list[Array] = field(default_factory=list)
@@ -52,20 +56,21 @@ class Cell:
 
     @property
     def to_bound(self) -> float:
-        """rms over the bound.
+        """RMS error over the bound.
 
-        The mean square of an unbiased estimate's errors is the bound, and that of their difference to the best
-        estimate's, with which it does not correlate (Gauss and Markov): a few marks so show what hundreds would.
+        The mean square error of an unbiased estimate is the bound plus the mean square of its difference from the best
+        estimate, with which that difference is uncorrelated (Gauss and Markov). With this control variate a few marks
+        are as precise as hundreds.
         """
         return float(np.sqrt(1 + np.square(self._beyond).sum() / np.trace(self.bounds, axis1=1, axis2=2).sum()))
 
     @property
     def to_claimed(self) -> float:
-        """rms in units of the standard deviations claimed.
+        """RMS error in units of the claimed standard deviations.
 
-        The mean square of the best estimate's errors in units of their bound is 1: by how much that of the errors, in
-        units of what is claimed, differs in the very same noise, is what few marks show. The covariance claimed varies
-        with the noise as well, and the errors with it: a contrast that came out too high makes both smaller.
+        The mean square of the best estimate's errors in units of their bound is 1. It serves as a control variate: only
+        the difference of both mean squares in the same noise is estimated. The claimed covariance also varies with the
+        noise, and is correlated with the errors: a contrast estimated too high makes both smaller.
         """
         return float(
             np.sqrt(1 + np.mean(_squares(self.errors, self.covariances) - _squares(self.best, self.bounds)) / 2)
@@ -83,19 +88,19 @@ class Cell:
 
 
 def _squares(errors: list[Array], covariances: list[Array]) -> Array:
-    """(n,) of errors in units of their standard deviations, summed over both coordinates."""
+    """(n,) squared Mahalanobis distances of errors."""
     return np.asarray(np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors))
 
 
 def start_off(mark: TrueMark, rng: np.random.Generator, exact: bool = False) -> Array:
-    """(n,) by how much the first of `ALL_MOVES` are off with which a match begins: scale and rotation by 0.3 % and
-    3 mrad or, where the frame gives them, all four as it does, exact a tenth of that."""
+    """(n,) errors of the first of `ALL_MOVES` in the start of a match: scale and rotation with sigmas of 0.3 % and
+    3 mrad or, if they are given by the frame, all four with its sigma; exact: a tenth of that."""
     moves = len(mark.kind.unknown) if np.isfinite(mark.kind.known) else 2
     return np.asarray(rng.normal(0, min(mark.kind.known * (0.1 if exact else 1), 0.003), moves))
 
 
 def best_errors(mark: TrueMark, noise: Array, sigma: float, off: Array, correlation: Array | None = None) -> Array:
-    """(2,) of the best linear estimate from the same noise (size, size), contrast 1, and what the frame gives."""
+    """(2,) errors of the best linear estimate from the same noise (size, size), contrast 1, and the frame's priors."""
     return mark.best_errors(noise, sigma, None, correlation, off if np.isfinite(mark.kind.known) else None)
 
 
@@ -107,7 +112,8 @@ def measure_mark(
     step_dn: float = 0.0,
     off: Array | None = None,
 ) -> Found | None:
-    """The mark as the program measures it, from a start off by some px, and by off (n,), as `start_off` gives it."""
+    """Measure a mark by the program's functions, from a start with an error of up to SHIFT_PX, and off (n,) from
+    `start_off`."""
     scan = scan_of(grey, full_scale, step_dn)
     center = mark.place[:, 2] + rng.uniform(-SHIFT_PX, SHIFT_PX, 2)
     if mark.kind.name == "ellipse":
@@ -134,7 +140,8 @@ def grey_is_light(mark: TrueMark, grey: Array) -> bool:
 def draw_mark(
     mark: TrueMark, rng: np.random.Generator, contrast: float = CONTRAST, ground: float = GROUND
 ) -> tuple[Array, int]:
-    """The mark, light (1) or dark (-1), on a ground with a gradient of up to a third of its contrast."""
+    """Render a mark, light (1) or dark (-1), on a background with a gradient of up to a third of its contrast; returns
+    the image and the sign."""
     sign, direction = int(rng.choice((-1, 1))), rng.uniform(0, 2 * np.pi)
     row, col = np.mgrid[: mark.size, : mark.size] / mark.size - 0.5
     slope = contrast / 3 * rng.uniform() * (np.cos(direction) * col + np.sin(direction) * row)

@@ -1,10 +1,10 @@
-"""Claimed against realised standard deviations: reference cases adjusted with errors drawn anew, many times.
+"""Claimed against realised standard deviations: Monte Carlo simulation of reference cases.
 
 python -m benchmarks monte_carlo [RUNS]
 
-For every kind of parameter: the rms error over the rms of the a-posteriori standard deviations, on the average over the
-parameters of the kind and for the least and the most favourable of them. v'Pv against chi-square (Kolmogorov and
-Smirnov), and how often the band of the radial distortion curve holds the true curve.
+For each kind of parameter: RMS error over the RMS a-posteriori standard deviation, averaged over the parameters of the
+kind, and its smallest and largest value. v'Pv against chi-square (Kolmogorov-Smirnov), and coverage of the true radial
+distortion curve by its confidence bands.
 """
 
 import sys
@@ -26,15 +26,14 @@ CASES = {
     "i_five_images_affine_reduced": "five images, ten control points",
     "iii_selfcal_mixed": "self-calibration, known and unknown points mixed",
 }
-RADII_MM = np.arange(12.5, 140.0, 5.0)  # none of them where the distortion is zero by definition
+RADII_MM = np.arange(12.5, 140.0, 5.0)  # mm, avoiding the reference radius, where the distortion is zero by definition
 BANDS = {"68 %": 1.0, "95 %": 1.96}
 
 
 @dataclass(frozen=True)
 class Runs:
-    """Errors and claimed standard deviations (runs, unknowns) by name, v'Pv (runs,), errors of the curve over its
-    claimed standard deviations (runs, radii).
-    """
+    """Results of all runs. errors, sigmas: (runs, unknowns) errors and claimed standard deviations; vpv: (runs,);
+    curves: (runs, radii) errors of the distortion curve over its claimed standard deviations."""
 
     names: tuple[str, ...]
     errors: Array
@@ -56,7 +55,7 @@ def main() -> None:
 
 
 def many(case: Exact, r0_mm: float, count: int) -> Runs:
-    """Adjust so many realisations of a case."""
+    """Adjust count realisations of a case."""
     errors, sigmas, vpv, curves = [], [], [], []
     for run in range(count):
         result = adjust(realisation(case.network, np.random.default_rng(run)), case.start)
@@ -72,13 +71,13 @@ def many(case: Exact, r0_mm: float, count: int) -> Runs:
 
 
 def parameter_error(difference: float, name: str) -> float:
-    """An angle's within half a turn."""
+    """Error of a parameter; angles are reduced to half a turn."""
     is_angle = name.rsplit(".", 1)[1] in ("omega", "phi", "kappa")
     return float((difference + np.pi) % (2.0 * np.pi) - np.pi) if is_angle else difference
 
 
 def normalised_curve(result: Adjustment, case: Exact, r0_mm: float) -> Array:
-    """The error of the radial distortion at RADII_MM over its claimed standard deviation."""
+    """Error of the radial distortion at RADII_MM over its claimed standard deviation."""
     names = [f"IO.{CAMERA}.{name}" for name in ("k3", "k5")]
     by_parameters = np.stack([RADII_MM * (RADII_MM**n - r0_mm**n) for n in (2, 4)], axis=1)
     error = by_parameters @ [result.value(name) - case.truth[name] for name in names]
@@ -87,7 +86,7 @@ def normalised_curve(result: Adjustment, case: Exact, r0_mm: float) -> Array:
 
 
 def parameter_kind(name: str) -> str:
-    """What kind of parameter an unknown is."""
+    """Kind of parameter of an unknown."""
     owner, quantity = name.split(".")[0], name.rsplit(".", 1)[1]
     match owner:
         case "IO":
@@ -105,7 +104,7 @@ def parameter_kind(name: str) -> str:
 
 
 def print_table(runs: Runs) -> None:
-    """The figures of one case."""
+    """Print the figures of one case."""
     ratio = np.sqrt((runs.errors**2).mean(axis=0) / (runs.sigmas**2).mean(axis=0))
     mean = runs.errors.mean(axis=0) / np.sqrt((runs.sigmas**2).mean(axis=0) / len(runs.errors))
     kinds = np.array([parameter_kind(name) for name in runs.names])

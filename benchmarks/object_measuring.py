@@ -1,9 +1,9 @@
-"""What measuring a whole scan takes of a tiled TIFF file on a server, with overviews or without.
+"""Requests and bytes read from a tiled TIFF file on a server to measure a scan, with and without overviews.
 
     python -m benchmarks object_measuring [--side 11500] [--seed 1]
 
-The frame has the eight ring-crosses of an aerial camera on grainy film, in the scan's middle or so far off it that one
-is sought first; the server counts requests and bytes.
+The frame has the eight ring-crosses of an aerial camera on grainy film, at the scan's centre or so far off that a mark
+must be searched first; the server counts requests and bytes.
 """
 
 import argparse
@@ -31,11 +31,11 @@ from pipeline.measuring.scan_task import scan_tasks
 
 PITCH_UM, _EDGE_MM = 20.0, 106.0
 _GROUND_DN, _GRAIN_DN, _MARK_DN = 110.0, 5.0, 90.0
-_ROWS = 500  # of grain at a time
+_ROWS = 500  # rows of grain made at a time
 
 
 def camera_text(edge_mm: float) -> str:
-    """A camera of eight ring-crosses, that far from the middle along an axis, of a frame somewhat larger."""
+    """Camera file with eight ring-crosses, edge_mm from the centre along the axes, and a slightly larger frame."""
     edges = (-edge_mm, 0.0, edge_mm)
     places = [(x, y) for x in edges for y in edges if (x, y) != (0.0, 0.0)]
     size = 2 * edge_mm + 16.0
@@ -81,7 +81,7 @@ def main() -> None:
 
 
 def _measure(folder: Path, address: str) -> MeasuredFile:
-    """As `reseau measure` does it."""
+    """Measure as `reseau measure` does."""
     text = f'camera = "camera.toml"\nscans = ["{address}"]\npitch_um = {PITCH_UM}\n[measure]\npose = "0"\n'
     (folder / "project.toml").write_text(text, encoding="utf-8")
     project = read_project(folder / "project.toml")
@@ -90,7 +90,8 @@ def _measure(folder: Path, address: str) -> MeasuredFile:
 
 
 def drawn_frame(layout: FiducialLayout, side: int, rng: np.random.Generator, off_px: int = 0) -> NDArray[np.uint8]:
-    """A square scan of grainy film with a camera's marks, the frame's middle that far off the scan's, or 20 px more."""
+    """Square scan of grainy film with a camera's marks; the frame's centre is off the scan's by off_px and up to 20 px
+    more."""
     grey = np.full((side, side), _GROUND_DN, np.float32)
     scale, middle = 1000.0 / PITCH_UM, side / 2 + off_px + rng.uniform(-20, 20, 2)
     for mark in layout.marks:
@@ -110,7 +111,7 @@ def drawn_frame(layout: FiducialLayout, side: int, rng: np.random.Generator, off
 
 
 def _write(path: Path, grey: NDArray[np.uint8], tile_px: int, overviews: bool) -> None:
-    """Like a cloud-optimised file: tiles, and below the picture itself smaller ones by twos."""
+    """Write a tiled TIFF file with overviews reduced by factors of two, as in a cloud-optimised file."""
     smaller = [grey]
     while overviews and max(smaller[-1].shape) > tile_px:
         size = [-(-side // 2) for side in smaller[-1].shape[::-1]]

@@ -1,4 +1,4 @@
-"""Film photographed by a tilted camera with a lens, measured as projective and as affine: errors and claims."""
+"""Film photographed by a tilted camera with distortion, measured as projective and as affine: errors and sigmas."""
 
 from collections.abc import Iterator
 from itertools import product
@@ -34,7 +34,7 @@ from synthetic_images.scene import (
 )
 
 TILTS_DEG = (0.5, 1.0, 2.0, 5.0)
-K1 = (0.0, -0.1)  # of a normal lens, whose focal length is about the diagonal of the picture
+K1 = (0.0, -0.1)  # of a normal lens, whose focal length is about the diagonal of the image
 FOCAL_PX = 6000.0
 HALF_MM, PITCH_UM = 106.0, 60.0
 PLACES = [(HALF_MM * x, HALF_MM * y) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y]
@@ -72,7 +72,7 @@ def case(tilt_deg: float, k1: float, model: str, frames: int, seed: int) -> Row:
 def photographed(
     seed: int, tilt_deg: float, direction_deg: float, k1: float, model: str
 ) -> tuple[np.ndarray, np.ndarray, int, tuple[str, ...]]:
-    """Errors and standard deviations of coordinates, px, how many marks are measured, and the frame's problems."""
+    """Errors and standard deviations of coordinates, px, number of measured marks, and problems of the frame."""
     fiducials = tuple(SceneFiducial(str(k), place, CROSS) for k, place in enumerate(PLACES))
     camera = SceneCamera("film", (228.0, 228.0), 150.0, (0.0, 0.0), Distortion("torlegard", {}), fiducials)
     taken_by = TakingLens(FOCAL_PX, k1=k1)

@@ -1,8 +1,8 @@
-"""Every fiducial of the real film at hand, mark by mark: the ground on which a change of `measure` is judged.
+"""Fiducials of the available real film scans, mark by mark: regression test of changes of `measure`.
 
-Each scan is measured alone, with its orientation open, and checked as a camera of one frame. --keep writes every mark
-to a file; --against names such a file, and each mark whose status differs or whose place differs by more than 0.005 px
-is told. --tone linear takes grey values as light.
+Each scan is measured alone, with automatic pose, and checked as a camera of one frame. --keep writes all marks to a
+file; --against names such a file, and marks whose status differs or whose place differs by more than 0.005 px are
+listed. --tone linear takes grey values as light.
 """
 
 import json
@@ -38,7 +38,7 @@ COLUMNS = {"scan": "", "found": "d", "of": "d", "measured": "d", "sigma_px": ".4
 
 
 class Task(NamedTuple):
-    """A scan, the camera whose marks it shows, and its pixel pitch; None takes the file's."""
+    """Scan with its camera's marks and its pixel pitch; None: pitch of the file."""
 
     name: str
     scan: Path
@@ -66,7 +66,7 @@ def layout(camera: str, folder: Path) -> FiducialLayout:
 
 
 def reseau() -> FiducialLayout:
-    """Five by five crosses, 10 mm apart, on 70 mm film."""
+    """Layout of 5 x 5 crosses, 10 mm apart, on 70 mm film."""
     shape, index = MarkShape(cross(0.97, 0.05), "dark"), range(-2, 3)
     marks = [LayoutMark(f"{i},{j}", (10.0 * i, 10.0 * j), (0.005, 0.005), shape) for j in index for i in index]
     return FiducialLayout(tuple(marks), (53.0, 53.0))
@@ -115,7 +115,7 @@ def _mark_counts(kept: Path, scan: str) -> Row:
 
 
 def changes(before: Row, after: Row) -> list[str]:
-    """A line a mark that is measured otherwise."""
+    """Lines of the marks whose results differ."""
     lines = []
     for point in before.keys() & after.keys():
         old, new = before[point], after[point]

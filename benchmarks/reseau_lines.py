@@ -1,4 +1,5 @@
-"""Astrographic plates with a réseau of continuous lines, 13 x 13 crossings 5 mm apart, among stars exposed thrice."""
+"""Astrographic plates with a réseau of continuous lines, 13 x 13 crossings 5 mm apart, and stars exposed three
+times."""
 
 import time
 from collections import Counter
@@ -21,9 +22,9 @@ from measure.tone.curve import LINEAR
 COUNT, STEP_MM, PLATE_MM = 13, 5.0, 160.0
 LIGHT_DN, LINE_DN, BLACK_DN, NOISE_DN = 45000.0, 9000.0, 6000.0, 300.0
 BLUR_PX = 0.8
-EXPOSURES_MM = np.array([(0.0, 0.2), (-0.17, -0.1), (0.17, -0.1)])  # a triangle
-STAR_MM, BRIGHT_MM = 0.045, 0.15  # sigma of faint stars, and of bright ones on crossings
-BRIGHT, GAP_MM = 10, (5.0, 25.0)  # how many, and where one line is missing
+EXPOSURES_MM = np.array([(0.0, 0.2), (-0.17, -0.1), (0.17, -0.1)])  # mm, offsets of the three exposures, a triangle
+STAR_MM, BRIGHT_MM = 0.045, 0.15  # mm, sigma of faint stars, and of bright ones on crossings
+BRIGHT, GAP_MM = 10, (5.0, 25.0)  # number of bright stars, and range, mm, where one line is missing
 
 COLUMNS = {
     "pitch_um": "g", "stars": "d", "pose": "", "measured": "d", "weak": "d", "of": "d", "rms_px": ".3f",
@@ -64,7 +65,7 @@ def case(pitch_um: float, stars: int, pose: str, seed: int) -> Row:
 
 
 def layout(line_mm: float) -> FiducialLayout:
-    """Crosses whose arms reach half way to the next ones."""
+    """Layout of crosses whose arms reach halfway to the next ones."""
     arm = STEP_MM / 2
     cross = MarkShape((Bar((-arm, 0.0), (arm, 0.0), line_mm), Bar((0.0, -arm), (0.0, arm), line_mm)), "dark")
     marks = (LayoutMark(name, xy_mm, (0.002, 0.002), cross) for name, xy_mm in crossings().items())
@@ -77,7 +78,8 @@ def crossings() -> dict[str, tuple[float, float]]:
 
 
 def plate(seed: int, pitch_mm: float, line_mm: float, stars: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Grey values of a negative, turned by 0.3 degrees and slightly sheared, and where its crossings are."""
+    """Render a negative, rotated by 0.3 degrees and slightly sheared; returns it and the true places of its
+    crossings."""
     rng = np.random.default_rng(seed)
     size = int(PLATE_MM / pitch_mm)
     turn, middle = np.deg2rad(0.3), size / 2 + rng.uniform(-20, 20, 2)
@@ -98,7 +100,7 @@ def plate(seed: int, pitch_mm: float, line_mm: float, stars: int) -> tuple[np.nd
 
 
 def line_coverage(size: int, linear: np.ndarray, middle: np.ndarray, line_mm: float, blur_mm: float) -> np.ndarray:
-    """(size, size) of the lines; one is missing over GAP_MM."""
+    """(size, size) coverage by the lines; one is missing over GAP_MM."""
     rows, cols = np.mgrid[:size, :size].astype(np.float32)
     x, y = np.einsum("ij,jrc->irc", np.linalg.inv(linear), np.stack([cols - middle[0], middle[1] - rows]))
     reach, covered = (COUNT - 1) / 2 * STEP_MM, np.zeros((size, size))
@@ -114,7 +116,7 @@ def line_coverage(size: int, linear: np.ndarray, middle: np.ndarray, line_mm: fl
 
 
 def add_star(density: np.ndarray, place: np.ndarray, height: float, sigma_px: float) -> None:
-    """Add a Gaussian where all of it lies in the plate."""
+    """Add a Gaussian if it lies entirely within the plate."""
     half = int(5 * sigma_px) + 2
     (col, row), size = np.rint(place).astype(int), len(density)
     if half < col < size - half and half < row < size - half:

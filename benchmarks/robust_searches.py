@@ -1,11 +1,11 @@
-"""The searches for approximate orientations among gross errors, beside OpenCV's RANSAC and USAC.
+"""Robust initial values of orientations with gross errors, compared with OpenCV's RANSAC and USAC.
 
 python -m benchmarks robust_searches [--count 60]
 
-Orientations of aerial images from 12 or 40 points of which a share is somewhere else in the frame. Right is an
-orientation under which the true points lie where they were seen to 10 standard deviations (one image), or that is right
-to 0.03 rad (two). RANSAC must be told how far a point may be off: once as the noise is, and once as a lens of which
-nothing is known yet may bend the picture. The searches of `adjust` estimate it.
+Orientations of aerial images from 12 or 40 points, a fraction of which is elsewhere in the frame. Correct is an
+orientation that projects the true points to within 10 standard deviations (one image), or is correct to 0.03 rad (two).
+RANSAC requires a threshold: once it is set to the noise, and once to the distortion of an unknown lens. The searches of
+`adjust` estimate it.
 """
 
 import argparse
@@ -27,17 +27,17 @@ SEED, C_MM, HALF_MM, SIGMA_MM = 5, 150.0, 110.0, 0.005
 GATES_MM = {"3 sigma": 3 * SIGMA_MM, "0.15 mm": 0.15}
 RIGHT_RAD = 0.03
 CAMERA = np.diag([C_MM, C_MM, 1.0])
-FLIP = np.diag([1.0, -1.0, -1.0])  # between a camera that looks along -z with y up, and OpenCV's
+FLIP = np.diag([1.0, -1.0, -1.0])  # between camera axes with y up and viewing direction -z, and OpenCV's
 
 
 def pose(rng: np.random.Generator) -> Pose:
-    """About 1000 m above the field, tilted by some degrees."""
+    """Random pose about 1000 m above the field, tilted by a few degrees."""
     turn = cv2.Rodrigues(rng.normal(0.0, [0.08, 0.08, 1.0]))[0]
     return Pose(np.asarray(turn, float), np.array([*rng.normal(0.0, 100.0, 2), 1000.0]))
 
 
 def view_points(of: Pose, xyz: Array) -> Array:
-    """(n, 2) mm, y up."""
+    """(n, 2) image coordinates of points (n, 3), mm, y up."""
     u, v, w = of.rotation @ (xyz - of.center).T
     return np.stack([-C_MM * u / w, -C_MM * v / w], axis=1)
 
@@ -88,7 +88,7 @@ def essential(gate_mm: float, usac: bool, first: Array, second: Array, _rng: np.
 
 
 def from_rays(first: Array, second: Array, rng: np.random.Generator) -> Found:
-    """As `approximate` takes them: all candidates are tried in the block."""
+    """Relative poses as `approximate` uses them: all candidates, which it tries in the block."""
     one, other = (np.column_stack([each, np.full(len(each), -C_MM)]) for each in (first, second))
     return relative_poses(one, other, rng)
 
@@ -124,7 +124,7 @@ def _angle(rotation: Array) -> float:
 
 
 def main() -> None:
-    """Print the table: orientations found right of `count`, and milliseconds of CPU an orientation."""
+    """Print the table: correct orientations of `count`, and CPU time per orientation, ms."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--count", type=int, default=60)
     count = parser.parse_args().count

@@ -1,11 +1,11 @@
-"""A scanner's bend apart from films and fiducial marks: claimed against realised standard deviations, and what is told.
+"""Separation of scanner errors from film deformations and fiducials: claimed against realised standard deviations.
 
 python -m benchmarks scanner [NETWORKS]
 
-Networks simulated with errors drawn anew, each adjusted with the terms of a bend beside everything else: frames in two
-poses, in four, and convergent photographs of targets. For every setup: the rms error over the rms of the claimed
-standard deviation, over all terms and of the least and most favourable term; then how often frames that lie alike are
-told, and which terms the tests choose.
+Simulated networks, each adjusted with the terms of the scanner error in addition to all other unknowns: frames in two
+scan orientations, in four, and convergent photographs of targets. For each setup: RMS error over the RMS claimed
+standard deviation, over all terms and the extremes over terms; then how often frames in equal orientation are reported,
+and which terms the tests select.
 """
 
 import sys
@@ -73,7 +73,7 @@ def laid(
 
 @cache
 def _start(turns: tuple[float, ...]) -> Approximations:
-    """From marks that are given without errors, for finding them among such of a millimetre takes longest."""
+    """Approximate values from error-free marks; finding them with the errors of the network takes longest."""
     return approximate(films(turns, {}, {}))
 
 

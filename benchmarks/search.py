@@ -1,10 +1,10 @@
-"""Search and pose in rendered frames, against their truth.
+"""Search of marks and scan orientation (pose) in rendered frames, against the true values.
 
 python -m benchmarks search OUT.jsonl [--frames 600] [--first 0] [--seed 1]
 
-One line a frame is added to OUT.jsonl, and frames that stand there already are left out, so that a run can be
-continued; two runs, each with frames of its own, may share the file. Then the tables of all its lines are printed. With
---only INDEX one frame is told mark by mark, and its picture written beside OUT.jsonl.
+A line per frame is appended to OUT.jsonl, and frames already in it are skipped, so that a run can be continued; two
+runs with different frames may share the file. Then the tables of all its lines are printed. With --only INDEX one frame
+is printed mark by mark, and its image is written to the folder of OUT.jsonl.
 """
 
 import argparse
@@ -26,13 +26,13 @@ from measure.results import FrameMeasurement, MarkMeasurement
 Json = dict[str, Any]
 
 WRONG_SIGMAS = 5.0
-WRONG_PX = 0.5  # what is farther off, and by so many standard deviations, is no measurement of this mark
+WRONG_PX = 0.5  # px; a mark is wrong if its error exceeds this and WRONG_SIGMAS
 OUTCOMES = ("all marks", "some marks", "refused", "wrong, weak", "WRONG")
 POSE_OUTCOMES = ("right", "assumed", "WRONG", "none")
 
 
 def main() -> None:
-    """Run the frames that are missing, and print."""
+    """Measure the missing frames, and print the tables."""
     parser = argparse.ArgumentParser()
     parser.add_argument("out", type=Path)
     parser.add_argument("--frames", type=int, default=600)
@@ -52,12 +52,12 @@ def main() -> None:
 
 
 def lines(path: Path) -> list[Json]:
-    """The frames that were done."""
+    """Results of the frames done."""
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
 
 
 def judge_case(case: Case) -> Json:
-    """Measure a frame, and compare it with its truth."""
+    """Measure a frame and compare it with the true values."""
     begin = time.perf_counter()
     result = measure_case(case)
     seconds = time.perf_counter() - begin
@@ -85,7 +85,7 @@ def measure_case(case: Case) -> FrameMeasurement:
 
 
 def is_wrong(case: Case, mark: MarkMeasurement, result: FrameMeasurement) -> bool:
-    """Whether a mark lies where none of that name is; where the pose is only assumed, where there is none at all."""
+    """Whether a mark is not at the true place of its name; with an assumed pose, not at that of any mark."""
     assert mark.center_px is not None
     assert mark.covariance_px2 is not None
     counts = result.pose is not None and result.pose.decided
@@ -115,7 +115,7 @@ def pose_outcome(case: Case, result: FrameMeasurement) -> str:
 
 
 def print_tables(done: Sequence[Json]) -> None:
-    """Outcomes by the marks' kind, poses by what could tell them."""
+    """Print outcomes by kind of mark and exposure, and poses by the symmetry of the marks."""
     print(f"{len(done)} frames, median {np.median([line['seconds'] for line in done]):.2f} s a frame\n")
     print_table("marks", "kind", KINDS, "outcome", OUTCOMES, done)
     print_table("picture", "picture", sorted({line["picture"] for line in done}), "outcome", OUTCOMES, done)
@@ -129,7 +129,7 @@ def print_tables(done: Sequence[Json]) -> None:
 def print_table(
     title: str, row_key: str, rows: Sequence[str], column_key: str, columns: Sequence[str], done: Sequence[Json]
 ) -> None:
-    """How many frames of every row ended in which column."""
+    """Print the number of frames by row and outcome."""
     print(f"{title:24}" + "".join(f"{column:>13}" for column in columns) + f"{'frames':>9}")
     for row in rows:
         own = [line[column_key] for line in done if line[row_key] == row]
@@ -138,7 +138,7 @@ def print_table(
 
 
 def tell(case: Case, picture: Path) -> None:
-    """One frame, mark by mark."""
+    """Print one frame mark by mark, and write its image."""
     result = measure_case(case)
     print(f"{case.kind}, {case.symmetry}, {case.picture}; true pose {case.pose}; hidden {sorted(case.hidden)}")
     print(f"pose {result.pose}\nproblems {result.problems}")

@@ -1,8 +1,8 @@
-"""Frames that a scanner sharpened: amounts 0 to 2, radii 0.5 to 3 px, any tone curve, half of them JPEG.
+"""Frames sharpened by the scanner: amounts 0 to 2, radii 0.5 to 3 px, various tone curves, half of them JPEG.
 
-Eight marks of one kind on even film with grain, contrast over noise 20 to 80, are coded by a power of 1 to 2.4,
-sharpened by an unsharp mask, cut off and rounded to eight bits. What comes out, per group of amounts: how many marks
-are `measured`, their errors over their claims (whitened, rms), and how many frames are taken for sharpened.
+Eight marks of one kind on uniform film with grain, SNR 20 to 80, are coded with a gamma of 1 to 2.4, sharpened by an
+unsharp mask, clipped and quantised to 8 bits. Results by amount: rate of `measured` marks, RMS of their whitened errors
+(error / claimed sigma), and number of frames identified as sharpened.
 """
 
 import tempfile
@@ -31,7 +31,7 @@ SEED = 1
 KINDS = "cross", "gap cross", "réseau cross", "ring-cross", "wedge"
 PX_PER_MM, SIDE_PX, AT_MM = 10.0, 460, 15.0
 PLACES = [(x, y) for y in (-AT_MM, 0.0, AT_MM) for x in (-AT_MM, 0.0, AT_MM) if x or y]
-GROUPS = (0.0, 1e-6, 0.5, 1.0, 2.01)  # bounds of amounts: the first group is not sharpened
+GROUPS = (0.0, 1e-6, 0.5, 1.0, 2.01)  # bounds of the groups of amounts; the first group is not sharpened
 
 
 def cells(frames: int = 300) -> Iterator[Row]:
@@ -81,7 +81,7 @@ def case(frame: int, kind: str, amount: float, radius_px: float, power: float, j
 def draw(
     name: str, snr: float, blur_px: float, rng: np.random.Generator
 ) -> tuple[FiducialLayout, np.ndarray, list[np.ndarray]]:
-    """Light of a frame, its marks and where they are."""
+    """Render a frame; returns its layout, its light, and the true places of the marks."""
     kind, middle = KIND[name], SIDE_PX / 2 + rng.uniform(-0.5, 0.5, 2)
     layout = tuple(LayoutMark(str(n), place, (0.005, 0.005), kind.shape) for n, place in enumerate(PLACES))
     linear, ground = PX_PER_MM * np.diag([1.0, -1.0]), float(rng.uniform(0.25, 0.6))

@@ -1,8 +1,8 @@
-"""The trip of a scan file to a row of comparator.csv: the modules that its calls go through, each where it is first
-entered, and which are entered again from one that they have called.
+"""Call trace from a scan file to a row of comparator.csv: the modules in the order of their first call, and those that
+are re-entered from a module that they called.
 
-Run: python -m benchmarks trip. It measures a small drawn frame of four ring-crosses and a scan of nothing but grain, in
-which every way of looking is tried, and follows every call.
+Run: python -m benchmarks trip. It traces the measurement of a small frame of four ring-crosses and of a scan of pure
+grain, in which all search methods are tried.
 """
 
 import sys
@@ -20,12 +20,12 @@ import tifffile
 ROOT = Path(__file__).parents[1]
 sys.path += [str(ROOT / "tests" / "pipeline"), str(ROOT / "tests" / "measure")]
 PACKAGES = ("measure", "adjust", "pipeline")
-# What calls the functions that it is given: for each of many, as `map` does, and in each Gauss-Newton step.
+# Modules that call functions passed to them, as `map` does, or in each Gauss-Newton step: not counted.
 CALLERS = ("measure/scans/parallel.py", "measure/matching/gauss_newton.py")
 
 
 class Followed:
-    """The modules of this project that calls go through."""
+    """Profile function that records the project's modules that are called."""
 
     def __init__(self) -> None:
         self.stack: list[str] = []
@@ -60,7 +60,7 @@ class Followed:
 
 
 def followed() -> Followed:
-    cv2.setNumThreads(1)  # what other threads call is not followed
+    cv2.setNumThreads(1)  # calls in other threads are not traced
     from drawn_project import write_project
 
     from pipeline.archive import measure_archive
@@ -76,7 +76,7 @@ def followed() -> Followed:
         tifffile.imwrite(path.with_name("grain.tif"), grain.astype(np.uint16))
         project = read_project(path)
         calls = Followed()
-        vars(measure_archive)["worker_pool"] = lambda *_: nullcontext()  # nor what other processes do
+        vars(measure_archive)["worker_pool"] = lambda *_: nullcontext()  # nor those in other processes
         sys.setprofile(calls)
         try:
             with Store(project.measurement_path) as store:

@@ -1,9 +1,10 @@
-"""Four marks on bent film, one of them 1 mm off or none: what is named, flagged and claimed, by simulated places.
+"""Four marks on deformed film, one with an error of 1 mm or none: rates of detection and coverage, by simulation.
 
 python -m benchmarks wrong_marks [FRAMES] [--seed 1]
 
-Every film stretches, shears and shrinks by normal numbers of the affinity given, and is bent by a random amount within
-the range: quadratic (what moves corners across one another) or mark by mark. In one frame of a folder one mark is off.
+Each film has a random affinity of the given standard deviation, and a deformation of random size within the range:
+quadratic (opposite corners move in opposite directions) or independent by mark. In one frame of a folder one mark is
+wrong.
 """
 
 import argparse
@@ -19,11 +20,11 @@ from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 
 Array = NDArray[np.float64]
 SIGMA_PX, OFF_MM = 0.03, 1.0
-CLAIMED = 3.0  # standard deviations of a coordinate that cover an error
+CLAIMED = 3.0  # standard deviations within which an error is covered
 
 
 def main() -> None:
-    """Print a line a kind of folders."""
+    """Print a line for each kind of folder."""
     parser = argparse.ArgumentParser()
     parser.add_argument("frames", type=int, nargs="?", default=200)
     parser.add_argument("--seed", type=int, default=1)
@@ -38,7 +39,7 @@ def main() -> None:
 
 
 def kinds() -> list[tuple[tuple[float, float], float, int, float]]:
-    """Range of the bend, standard deviation of the affinity, frames, and how far the mark is off."""
+    """Range of the deformation, standard deviation of the affinity, number of frames, and error of the mark."""
     rows: list[tuple[tuple[float, float], float, int, float]] = []
     for count in (1, 3, 10, 20):
         rows += [((0.02, 0.1), affinity, count, OFF_MM) for affinity in (2e-4, 4e-4)]
@@ -49,7 +50,7 @@ def kinds() -> list[tuple[tuple[float, float], float, int, float]]:
 def outcome(
     rng: np.random.Generator, bend: str, range_mm: tuple[float, float], affinity: float, count: int, off_mm: float
 ) -> tuple[bool, bool, bool, bool]:
-    """Whether the wrong mark is named, another mark in any frame, the frame flagged, and the error covered."""
+    """Whether the wrong mark is named, another mark is named, the frame is flagged, and the error is covered."""
     frames = [bent_frame(rng, str(number), bend, rng.uniform(*range_mm), affinity) for number in range(count)]
     wrong, angle = int(rng.integers(4)), rng.uniform(0, 2 * np.pi)
     error_px = PX_PER_MM * off_mm * np.array([np.cos(angle), np.sin(angle)])
