@@ -136,7 +136,7 @@ class Pose:
     roll: str = ""
     rivals: tuple[str, ...] = ()
 
-    def is_decided_but_for(self, alike: Collection[str]) -> bool:
+    def is_unambiguous_up_to(self, alike: Collection[str]) -> bool:
         """Whether it is decided, or all its rivals are orientations under which the marks look alike."""
         return self.decided or bool(self.rivals and set(self.rivals) <= set(alike))
 

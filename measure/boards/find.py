@@ -186,8 +186,8 @@ def _part_of_chessboard(picture: Bytes, pattern: WholePattern, spec: ChessboardS
     borders = tuple(
         ended and _has_border(picture, np.rot90(pattern.grid, side)) for side, ended in enumerate(pattern.has_ended)
     )
-    sides_seen = (borders[0] or borders[2]) and (borders[1] or borders[3])
-    namings = list(_namings(picture, pattern.grid, borders, spec)) if sides_seen else []
+    has_borders = (borders[0] or borders[2]) and (borders[1] or borders[3])
+    namings = list(_namings(picture, pattern.grid, borders, spec)) if has_borders else []
     if not namings or any(not _are_alike(namings[0], naming, spec) for naming in namings):
         return FoundBoard({}, Reason(_refusal(spec, pattern), Code.NO_BOARD))
 

@@ -77,9 +77,9 @@ class Surroundings:
             return np.asarray(~np.isnan(template), np.float32)
         drawn = np.nan_to_num(np.abs(template - np.nanmedian(rim)))
         # A line far thinner than a pixel has almost no contrast left.
-        beside = (drawn < min(_DRAWN, float(drawn.max()) / 2)).astype(np.uint8)
+        background = (drawn < min(_DRAWN, float(drawn.max()) / 2)).astype(np.uint8)
         far_px = self.beside * detail_px + 1
-        near = cv2.distanceTransform(beside, cv2.DIST_L2, 5) <= far_px
+        near = cv2.distanceTransform(background, cv2.DIST_L2, 5) <= far_px
         return np.asarray(near & ~np.isnan(template), np.float32)
 
 

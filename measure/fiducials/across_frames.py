@@ -159,8 +159,8 @@ def _add_findings(
     known_um = 1000 * float(np.sqrt(max(variances.max(), film_mm**2)))  # including what the adjustment adds later
     problem = _problem(own, shared, names, suspects, known_um)
     is_known = own.hypothesis is Hypothesis.PITCH and any(Code.PITCH in each.codes for each in frame.problems)
-    said = [each for each in frame.problems if not {*each.codes} & {*problem.codes} & {Code.PERSPECTIVE}]
-    problems = (*said, problem) if problem and not is_known else frame.problems
+    other_problems = [each for each in frame.problems if not {*each.codes} & {*problem.codes} & {Code.PERSPECTIVE}]
+    problems = (*other_problems, problem) if problem and not is_known else frame.problems
     return replace(add_doubts(frame, bent), problems=problems), film_mm
 
 

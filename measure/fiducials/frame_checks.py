@@ -37,7 +37,7 @@ def pitch_problem(
     is_named = any(Code.PITCH in problem.codes for problem in frame.problems)  # unequal pixel sizes
     if frame.pixel_from_camera is None or len(marks) < _LEAST_MARKS or is_named:
         return None
-    seen_um = 1000 / np.hypot(*frame.pixel_from_camera[:, :2].T)  # film per pixel, um, across and down
+    film_um = 1000 / np.hypot(*frame.pixel_from_camera[:, :2].T)  # film per pixel, um, across and down
     places = np.array([mark.xy_mm for mark in marks])
     lever_mm = float(np.sqrt(((places - places.mean(axis=0)) ** 2).sum(axis=0)).min())  # root sum of squares, one axis
     given = float(np.median([max(mark.sigma_mm) for mark in marks]))
@@ -45,13 +45,13 @@ def pitch_problem(
         return None
     sigma = float(np.hypot(AFFINITY_SIGMA, given / lever_mm))
     limit = -float(ndtri(RIGHT_PITCH_REFUSED / 2 / 2)) * sigma
-    excess = seen_um / np.asarray(pitch_um) - 1
+    excess = film_um / np.asarray(pitch_um) - 1
     if np.abs(excess).max() <= limit:
         return None
     return Reason(
         f"{source} gives a pitch of {pitch_um[0]:.2f} x {pitch_um[1]:.2f} µm, but the marks' separations suggest "
-        f"{seen_um[0]:.2f} x {seen_um[1]:.2f} µm ({100 * excess[0]:+.1f} and {100 * excess[1]:+.1f} %, where they and "
-        f"the film allow {100 * limit:.1f} %): set pitch_um = [{seen_um[0]:.2f}, {seen_um[1]:.2f}] in the project, or "
+        f"{film_um[0]:.2f} x {film_um[1]:.2f} µm ({100 * excess[0]:+.1f} and {100 * excess[1]:+.1f} %, where they and "
+        f"the film allow {100 * limit:.1f} %): set pitch_um = [{film_um[0]:.2f}, {film_um[1]:.2f}] in the project, or "
         "check whether the camera is the right one.",
         Code.PITCH,
     )

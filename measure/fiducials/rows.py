@@ -188,7 +188,11 @@ def _weaken_assumed_name(row: MarkMeasurement, mark: LayoutMark, pose: Pose) -> 
     The point of a drawn mark does not depend on its name. The origin of a learned mark is where somebody clicked; at
     another mark that looks alike it lies elsewhere, unless the symmetry of the marks maps the origins onto each other.
     """
-    if not isinstance(mark.mark, MarkTemplate) or mark.mark.learned_mm == 0 or pose.is_decided_but_for(mark.mark.alike):
+    if (
+        not isinstance(mark.mark, MarkTemplate)
+        or mark.mark.learned_mm == 0
+        or pose.is_unambiguous_up_to(mark.mark.alike)
+    ):
         return row
     return replace(row, status=Status.WEAK, reason=_ASSUMED) if row.status is Status.MEASURED else row
 

@@ -189,10 +189,10 @@ def _partners(places_mm: Array, turn: Array, near_mm: float) -> list[int] | None
 
 def _aligned_origin(one: MarkTemplate, other: MarkTemplate, turn: Array) -> Array | None:
     """Shift (2,) mm from another mark's origin to that of a turned mark, aligned by ECC. None if they are not alike."""
-    seen, shown = _centre_origin(other), turn_by_quarters(_centre_origin(one), _FLIP @ turn @ _FLIP)
-    side = min(len(seen), len(shown))
+    image, shown = _centre_origin(other), turn_by_quarters(_centre_origin(one), _FLIP @ turn @ _FLIP)
+    side = min(len(image), len(shown))
     margin = int(np.ceil(_CORE * side))
-    within, core = _middle(seen, side), _middle(shown, side - 2 * margin)
+    within, core = _middle(image, side), _middle(shown, side - 2 * margin)
     answers = cv2.matchTemplate(within, core, cv2.TM_CCOEFF_NORMED)
     row, col = np.unravel_index(int(answers.argmax()), answers.shape)
     warp = np.array([[1, 0, col], [0, 1, row]], np.float32)

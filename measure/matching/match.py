@@ -261,8 +261,8 @@ def _sharpening_score(fit: PictureFit, linear: LinearFit, priors_dn2: Array) -> 
     """Score of the scan's sharpening. None where the background is not modelled. Pixels masked as damage are included,
     since halos are taken for damage until they are modelled."""
     model = fit.model
-    is_asked = model.options.tells_sharpening or fit.window.coding.tone.sharpening
-    if not is_asked or model.background_px is not None or model.is_chip:
+    needs_sharpening = model.options.tells_sharpening or fit.window.coding.tone.sharpening
+    if not needs_sharpening or model.background_px is not None or model.is_chip:
         return None
     drawn = model.drawn_light
     shown = fit.area & model.tells & clear_of_ends(drawn, model.grey, model.clipped, model.noise_dn)

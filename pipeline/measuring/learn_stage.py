@@ -190,7 +190,7 @@ def _is_named(frame: FrameMeasurement, start: CameraFile) -> bool:
     if pose is None or learned is None or frame.pixel_from_camera is None:
         return False
     alike = next((one.mark.alike for one in start.fiducials if isinstance(one.mark, MarkTemplate)), ())
-    return pose.is_decided_but_for(alike) or pose.name == learned.pose
+    return pose.is_unambiguous_up_to(alike) or pose.name == learned.pose
 
 
 def _averaged(
