@@ -1,1 +1,1 @@
-"""The studies that the figures of docs/ come from: `python -m benchmarks` lists them."""
+"""Benchmarks and studies, the sources of the figures in docs/: `python -m benchmarks` lists them."""

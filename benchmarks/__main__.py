@@ -1,4 +1,4 @@
-"""`python -m benchmarks NAME [OPTIONS]`; without a name, what there is."""
+"""Entry point `python -m benchmarks NAME [OPTIONS]`; lists all benchmarks without a name."""
 
 import ast
 import os

@@ -1,6 +1,6 @@
-"""Which camera `reseau cameras --scan` takes real scans for, and what the whole command takes.
+"""Camera that `reseau cameras --scan` identifies in real scans, and time and memory of the command.
 
-Without scans: the aerial and the réseau frames of the data beside the project.
+Default scans: the aerial and réseau frames of the data outside the project.
 """
 
 import json

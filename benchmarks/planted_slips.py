@@ -1,9 +1,10 @@
-"""Slips of whole networks (mirrored points, another unit, y down, another c, exchanged frames): what is said of them.
+"""Gross mistakes in whole networks (mirrored points, wrong unit, y down, wrong c, exchanged frames): how they are
+diagnosed.
 
 python -m benchmarks planted_slips [NETWORKS]
 
-Networks of four images and 14 to 30 control points of 5 cm, anew for every seed; one row a kind of slip. named: the
-slip is named, and nothing else blamed. unnamed: nothing is blamed. misleading: something else is blamed.
+Networks of four images and 14 to 30 control points of 5 cm, different for each seed; one row per kind of mistake.
+named: only the mistake is named; unnamed: nothing is named; misleading: something else is named.
 """
 
 import sys
