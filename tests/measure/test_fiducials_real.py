@@ -107,7 +107,7 @@ def test_the_crosses_of_a_reseau_on_a_landscape(number: int, steps: int) -> None
     assert len(observed) >= len(places)
     assert len(set(nearest.tolist())) == len(places)
     assert np.median(distance.min(axis=1)) < 0.5
-    assert affine_rms_px(given, observed) <= affine_rms_px(indices, places)
+    assert affine_rms_px(given, observed) <= affine_rms_px(indices, places) + 1e-3
     assert affine_rms_px(given[nearest[used]], observed[nearest[used]]) <= affine_rms_px(indices[used], places[used])
 
 
