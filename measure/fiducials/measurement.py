@@ -29,7 +29,7 @@ from measure.scans.remote import Window
 from measure.scans.scan import Scan
 
 _SET = ("set in the project.",)
-_UNSURE = Reason("none of the marks is measured without blemish: the frame may lie elsewhere.", Code.CHANCE)
+_UNSURE = Reason("No mark passed all checks: the frame may lie elsewhere.", Code.CHANCE)
 _OBLIQUE = Reason(
     "only a perspective fits its marks: the film was photographed obliquely. Set transformation = "
     '"projective" under [adjust].',

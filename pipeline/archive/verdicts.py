@@ -25,25 +25,26 @@ class Verdict(StrEnum):
 
 
 MEANING = {
-    Verdict.GOOD: "Every mark is measured, and no check contradicts any of them.",
-    Verdict.DECIDED: "Good but for what a person has decided: nothing is open.",
-    Verdict.LOOK: "Usable, but a mark is weak, missing or refused, or the frame has a problem: an assumed pose, say.",
-    Verdict.POOR: "Hardly usable: too few marks were found for an interior orientation, or for a check of it.",
-    Verdict.FAILED: "Nothing was measured: the file is missing, damaged or no scan, or its process was ended.",
+    Verdict.GOOD: "All marks are measured and passed all checks.",
+    Verdict.DECIDED: "Good after review decisions: nothing is open.",
+    Verdict.LOOK: "Usable, but a mark is weak, missing or rejected, or the frame has a problem (assumed pose, ...).",
+    Verdict.POOR: "Hardly usable: too few marks for an interior orientation, or for a check of it.",
+    Verdict.FAILED: "Nothing was measured: the file is missing, damaged or not a scan, or its process was killed.",
     Verdict.WAITING: "Not measured yet.",
-    Verdict.OLD: "Stale: the file, the options or the decisions about it are others than when it was measured.",
+    Verdict.OLD: "Stale: the file, the options or the review decisions have changed since it was measured.",
 }
 
 NEXT_STEP = {
     Verdict.GOOD: "Nothing.",
     Verdict.DECIDED: "Nothing.",
-    Verdict.LOOK: "Read the reasons in the report; decide in `reseau review`, or leave as it is: sigmas tell how well.",
-    Verdict.POOR: "Look at the scan: is it of this camera, whole, sharp? Scan it again, or name it in `exclude`.",
-    Verdict.FAILED: "Mend or replace the file, which is noticed; `--retry` after an outage; or name it in `exclude`.",
+    Verdict.LOOK: "Read the reasons in the report; decide in `reseau review`, or leave it: its sigmas allow for it.",
+    Verdict.POOR: "Is the scan of this camera, complete and sharp? Scan it again, or name it in `exclude`.",
+    Verdict.FAILED: "Repair or replace the file; `--retry` after an outage; or name it in `exclude`.",
     Verdict.WAITING: "Run `reseau measure`.",
-    Verdict.OLD: "Run `reseau measure`: it measures or checks these again, and no others.",
+    Verdict.OLD: "Run `reseau measure`: it measures or checks only these again.",
 }
 
+_COUNTED = {each: str(each) for each in Verdict} | {Verdict.LOOK: "to look at", Verdict.OLD: "stale"}  # after a number
 _MARK_VERDICTS = {status: Verdict.GOOD if status is Status.MEASURED else Verdict.LOOK for status in Status}
 _MEASURED = (Verdict.GOOD, Verdict.DECIDED, Verdict.LOOK, Verdict.POOR)
 _ANSWERED = frozenset((Code.DECIDED, Code.CLICKED))
@@ -55,7 +56,7 @@ def scan_counts(counts: Mapping[Verdict, int]) -> str:
     """Sentence with the number of measured scans and of scans of each verdict."""
     measured = sum(counts.get(verdict, 0) for verdict in _MEASURED)
     return count_sentence(
-        "measured", measured, sum(counts.values()), {str(each): counts.get(each, 0) for each in Verdict}
+        "measured", measured, sum(counts.values()), {words: counts.get(each, 0) for each, words in _COUNTED.items()}
     )
 
 

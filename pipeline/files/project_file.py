@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from pipeline.files.taking_lens import CalibratedLens
 
 ASSUMED_PITCH_UM = 5.0  # for digital cameras of unknown pitch: results are in pixels, so it cancels
+_GENERIC_NAMES = ("out", "output", "project", "reseau")  # of folders, which do not name what is in them
 DEFAULT_SCANNER = "1"  # scanner of all images that name none
 
 
@@ -123,8 +124,13 @@ class Project:
 
     @property
     def title(self) -> str:
-        """Name of the project's folder, or of the project file unless it is called project.toml."""
-        name = self.path.resolve().parent.name if self.path.stem == "project" else self.path.stem
+        """Name of the project's folder, or of the project file unless it is called project.toml.
+
+        A folder whose name says nothing is named with the one that it lies in.
+        """
+        folder = self.path.resolve().parent
+        own = folder.name if folder.name.lower() not in _GENERIC_NAMES else "/".join(folder.parts[-2:])
+        name = own if self.path.stem == "project" else self.path.stem
         return name.encode("utf-8", "replace").decode("utf-8")
 
     @property

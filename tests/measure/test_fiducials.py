@@ -137,7 +137,7 @@ def test_a_frame_without_a_mark_free_of_blemish_has_no_settled_pose(tmp_path: Pa
     assert {mark.status for mark in result.marks} == {Status.WEAK}
     assert result.pose is not None
     assert (result.pose.name, result.pose.decided) == ("90", False)
-    assert "none of the marks is measured without blemish" in result.pose.evidence[-1]
+    assert "No mark passed all checks" in result.pose.evidence[-1]
 
 
 def test_the_users_pose_is_taken(tmp_path: Path) -> None:

@@ -225,7 +225,7 @@ def test_bad_scans_have_a_verdict_and_the_others_are_measured(folder: Path, caps
     assert run(["status", str(folder / "project.toml"), "--verdict", "failed"]) == 1
     out, err = capsys.readouterr()
     assert "foreign" in out
-    assert "Mend or replace" in out.replace("\n", " ")
+    assert "Repair or replace" in out.replace("\n", " ")
     assert "Traceback" not in err
 
 

@@ -77,6 +77,15 @@ def refused(read: Callable[[Path], object], path: Path) -> str:
     return str(error.value)
 
 
+@pytest.mark.parametrize(("folder", "title"), [("roll_7", "roll_7"), ("roll_7/out", "roll_7/out")])
+def test_a_folder_whose_name_says_nothing_is_titled_with_the_one_above(tmp_path: Path, folder: str, title: str) -> None:
+    path = tmp_path / folder / "project.toml"
+    path.parent.mkdir(parents=True)
+    path.write_text('camera = "library:wild-rc10-153"\nscans = ["a.tif"]\n', encoding="utf-8")
+    (path.parent / "a.tif").touch()
+    assert read_project(path).title == title
+
+
 def test_an_astrograph_of_10_m_with_small_plates_is_a_camera(tmp_path: Path) -> None:
     for frame, distance in (("160.0, 160.0", 3437.0), ("40.0, 60.0", 10000.0)):
         path = written(

@@ -218,7 +218,7 @@ def test_scans_come_from_the_store_one_after_the_other(tmp_path: Path, is_writte
     assert run(["report", str(project)]) == 1
     report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     bad, lost, blind = (sum(map(n, range(len(scans)))) for n in (BAD.__contains__, FAILED.__contains__, is_blind))
-    counts = f"({len(scans) - bad - lost} good, {bad} look, {lost} failed)"
+    counts = f"({len(scans) - bad - lost} good, {bad} to look at, {lost} failed)"
     assert f"{len(scans) - lost} of {len(scans)} scans measured {counts}." in report
     assert f"The {bad + lost + blind} that need a look most are shown below" in report
     assert report.count('<details class="frame"') == bad + lost + blind
