@@ -14,7 +14,7 @@ from measure.detection.localisation import localise
 from measure.detection.responses import Effort
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
-from measure.fiducials.measure_frame import detect_clear_marks, detect_missing_marks
+from measure.fiducials.measure_frame import detect_frame
 from measure.fiducials.options import FiducialOptions
 from measure.fiducials.search import FrameSearch, PitchHypothesis
 from measure.flags import CAMERA_BY_CHANCE, CAMERA_BY_NOISE
@@ -67,8 +67,8 @@ def recognise_frame(scan: Scan, layout: FiducialLayout, answered: Answer, times:
             break
         enlarged = _enlarged(placement, times)
         if answered.expected <= CAMERA_BY_CHANCE or _may_be_there(scan, layout, enlarged):
-            frame = detect_clear_marks(scan, layout, enlarged, _QUICK_OPTIONS)
-            frame = frame if frame.accepted else detect_missing_marks(frame)
+            # All marks count in the score: without the missing ones, a camera of eight loses to one that has four.
+            frame = detect_frame(scan, layout, enlarged, _QUICK_OPTIONS)
             if frame.accepted:
                 return frame
     return None
