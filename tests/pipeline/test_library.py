@@ -37,19 +37,22 @@ SPREADS = {"fairchild": 0.3, "park": 0.35}  # mm, of models whose cameras differ
 ENDS = {"left to right": ("5", "6"), "top to bottom": ("7", "8"), "1 to 2": ("1", "2"), "3 to 4": ("3", "4")}
 
 
-@pytest.fixture(scope="module")
-def frame(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def render_frame(folder: Path, camera: str) -> Path:
     """The project of one rendered frame of a library camera, which it names."""
-    folder = tmp_path_factory.mktemp("library")
     start, end = SCENE.index("[camera]\n"), SCENE.index("[field]\n")
-    scene = SCENE[:start] + f'camera = "library:{RENDERED}"\n' + SCENE[end:]
+    scene = SCENE[:start] + f'camera = "library:{camera}"\n' + SCENE[end:]
     scene = scene[: scene.rindex("[[image]]")].replace("pitch_um = 45.0", "pitch_um = 100.0")
     (folder / "scene.toml").write_text(scene, encoding="utf-8")
     render_project(folder / "scene.toml", folder)
     (folder / "project.toml").write_text(
-        f'camera = "library:{RENDERED}"\nscans = ["scans/*.tif"]\n[measure]\npose = "0"\n', encoding="utf-8"
+        f'camera = "library:{camera}"\nscans = ["scans/*.tif"]\n[measure]\npose = "0"\n', encoding="utf-8"
     )
     return folder / "project.toml"
+
+
+@pytest.fixture(scope="module")
+def frame(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return render_frame(tmp_path_factory.mktemp("library"), RENDERED)
 
 
 def distance(camera: CameraFile, first: str, second: str) -> float:
@@ -289,6 +292,17 @@ def test_cameras_of_other_scans_are_tried_first_and_hide_no_other(
 
 def _parts(layout: FiducialLayout) -> list[str]:
     return [repr(mark.mark)[:60] for mark in layout.marks]
+
+
+@pytest.mark.study
+def test_a_camera_of_eight_marks_does_not_lose_to_one_that_has_four_of_them(tmp_path: Path) -> None:
+    """Also where some of its marks are found only once the others have placed the frame."""
+    eight = "zeiss-rmk-a-eight-153"
+    scan = next((render_frame(tmp_path, eight).parent / "scans").glob("*.tif"))
+    two = {name: LIBRARY[name] for name in (eight, "zeiss-rmk-a-153")}
+    (best, *_) = identify(scan, two, None, Reporter(quiet=True)).best
+    assert best.cameras == (eight,)
+    assert best.found == 8
 
 
 @pytest.mark.study
