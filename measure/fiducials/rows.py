@@ -147,8 +147,8 @@ def _stretch(scan: Scan, wide_um: float, tall_um: float, pitch_um: tuple[float, 
     else:
         given, cause = f"{pitch_um[0]:.1f} x {pitch_um[1]:.1f} µm is given", "a wrong pitch"
     return (
-        f"by the marks a pixel is {wide_um:.1f} µm wide and {tall_um:.1f} µm tall, but {given}: film is never "
-        f"stretched so much. The likely cause is {cause}: set pitch_um = [{wide_um:.2f}, {tall_um:.2f}] in the "
+        f"by the marks a pixel is {wide_um:.1f} µm wide and {tall_um:.1f} µm tall, but {given}: more than "
+        f"film deforms. The likely cause is {cause}: set pitch_um = [{wide_um:.2f}, {tall_um:.2f}] in the "
         "project. If a pixel is as given, look at the scanner and at the coordinates in the camera file."
     )
 
