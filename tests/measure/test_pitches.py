@@ -55,7 +55,7 @@ def test_wrong_resolution_tags_are_named_with_the_pitch_of_the_marks(tmp_path: P
             pitch_um = scan.pitch_um
             assert pitch_um is not None
             result = measure_fiducials(scan, ALIKE, pitch_um, STIFF)
-        (problem,) = [problem for problem in result.problems if "stretched so much" in problem]
+        (problem,) = [problem for problem in result.problems if "more than film deforms" in problem]
         assert f"the file's resolution tags say 50.0 x {down_um:.1f} µm" in problem
         assert "The likely cause is wrong resolution tags: set pitch_um = [" in problem
         wide, tall = map(float, problem.partition("pitch_um = [")[2].partition("]")[0].split(","))
