@@ -16,7 +16,8 @@ from measure.errors import MeasurementError
 from measure.scans.opening import ScanHead, open_scan, read_head
 from measure.scans.parallel import map_items
 from pipeline.files.camera_file import CameraFile
-from pipeline.measuring.camera_identification import Identification
+from pipeline.files.library import read_library
+from pipeline.measuring.camera_identification import Identification, is_solid
 from pipeline.measuring.camera_trials import identify
 from pipeline.progress import Count, Reporter
 from pipeline.text.wording import counted
@@ -100,7 +101,7 @@ class ScanGroup:
         "" where none is identified, or solid marks alone identify it although another camera has similar ones: the true
         camera may then be missing from the library.
         """
-        if self.much_alike or self.digital:
+        if self.much_alike or self.digital or self._is_form_against_pitch:
             return ""
         return max(self.cameras, key=lambda name: self._reports.get(name, 0), default="")
 
@@ -111,6 +112,15 @@ class ScanGroup:
             return ()
         others = dict.fromkeys(name for sample in self.samples for name in sample.much_alike())
         return tuple(others) if self.cameras else ()
+
+    @property
+    def _is_form_against_pitch(self) -> bool:
+        """Whether solid marks alone identify the camera, at another pitch than the file's: likely a false alarm."""
+        if self.has_telling_plate or not any(sample.against_pitch() for sample in self.samples):
+            return False
+        library = read_library()
+        layouts = [library[name].layout() for name in self.cameras if name in library]
+        return bool(layouts) and all(is_solid(mark) for layout in layouts for mark in layout.marks)
 
     @property
     def has_telling_plate(self) -> bool:
@@ -143,9 +153,10 @@ class ScanGroup:
             firsts = [trial for sample in self.samples for trial in sample.best[:1]]
             found, drawn = sum(trial.found for trial in firsts), sum(trial.drawn for trial in firsts)
             alike = " or ".join(self.much_alike[:CANDIDATES])
+            against = f"{alike} has marks much like them" if alike else "their separations contradict the file's pitch"
             return (
                 f"perhaps {' or '.join(self.candidates)}, {found} of {drawn} marks found, but that rests on the form "
-                f"of its marks alone, and {alike} has marks much like them: compare the drawings with a scan"
+                f"of its marks alone, and {against}: compare the drawings with a scan"
             )
         counts = Counter(name for names in self._named for name in names)
         if not counts:

@@ -16,7 +16,10 @@ import tifffile
 
 from measure.fiducials.camera_recognition import Answer, search_camera
 from measure.marks.shapes import FiducialLayout
+from measure.scans.metadata import Pitch
+from measure.scans.opening import ScanHead
 from measure.scans.scan import Scan
+from pipeline.archive.scan_groups import ScanGroup
 from pipeline.cli import run
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile, read_camera
@@ -368,6 +371,21 @@ def test_a_pitch_that_the_marks_contradict_is_reported() -> None:
     assert "um" not in right.sentence()
     wrong = replace(right, pitch_um=(63.5, 63.5))
     assert "only if a pixel measures 127.3 µm, not 63.5" in wrong.sentence()
+
+
+@pytest.mark.parametrize(
+    ("camera", "pixel_um", "named"),
+    [("wing-large-flat-153", 45.1, True), ("wing-large-flat-153", 210.0, False), ("wild-rc10-153", 210.0, True)],
+)
+def test_solid_marks_alone_name_no_camera_against_the_pitch_of_the_file(
+    camera: str, pixel_um: float, named: bool
+) -> None:
+    """Crosses do: then the file's pitch is wrong."""
+    best = replace(trial((camera,), 0.8), pixel_um=pixel_um)
+    sample = Identification(Path("a.tif"), (best,), pitch_um=(45.0, 45.0))
+    group = ScanGroup(Path(), ScanHead("TIFF", 9, 9, 1, 8, Pitch((45.0, 45.0))), (Path("a.tif"),), (sample,))
+    assert group.camera == (camera if named else "")
+    assert named or "contradict the file's pitch" in group.why_not()
 
 
 def test_cameras_that_come_close_are_all_named() -> None:
