@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pipeline.archive.verdicts import Verdict
-from pipeline.commands.next_steps import command_step, init_steps, print_next, summary_steps, verdict_steps
+from pipeline.commands.next_steps import command_step, init_steps, print_next, report_step, summary_steps, verdict_steps
 from pipeline.commands.shared import (
     DONE,
     LOOK,
@@ -183,10 +183,11 @@ def status(
         else:
             print_status(shown, console, every=verdict is not None)
 
-    every = archive_status(read(project))
+    given = read(project)
+    every = archive_status(given)
     shown = every.select(verdict)
     show(as_json, partial(status_json, shown), printed)
-    print_next(as_json or as_csv, *verdict_steps(project, shown.counts), command_step("run", project))
+    print_next(as_json or as_csv, *verdict_steps(project, shown.counts), report_step(project, given.report_path))
     return DONE if every.all_good else LOOK
 
 

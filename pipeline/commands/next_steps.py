@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from pipeline.summary import Summary
 
 MOST = 3
+_ALL_STAGES = "adjusts, checks and writes the report"
 
 
 def print_next(as_json: bool, *steps: str) -> None:
@@ -38,6 +39,11 @@ def page_step(path: Path) -> str:
     return f"open {shlex.quote(str(path))}"
 
 
+def report_step(project: Path, report: Path) -> str:
+    """Suggest to open a report, or the command that writes it."""
+    return page_step(report) if report.exists() else command_step("run", project, why=_ALL_STAGES)
+
+
 def summary_steps(project: Path, summary: "Summary") -> Iterator[str]:
     """Suggest steps after a stage, from its summary. project: the project file."""
     files, adjustment = summary.files, summary.adjustment
@@ -55,7 +61,7 @@ def summary_steps(project: Path, summary: "Summary") -> Iterator[str]:
     elif "check" in files:
         yield command_step("report", project)
     elif "report" not in files:
-        yield command_step("run", project, why="adjusts, checks and writes the report")
+        yield command_step("run", project, why=_ALL_STAGES)
     elif adjustment is not None and adjustment.converged:
         if any(camera.is_calibrated for camera in adjustment.cameras.values()):
             yield command_step("export", project, "opencv", "DIR", why="or colmap, metashape, micmac, ...")
@@ -84,7 +90,7 @@ def verdict_steps(project: Path, counts: Mapping[Verdict, int]) -> Iterator[str]
     failed, stale = counts.get(Verdict.FAILED, 0), counts.get(Verdict.WAITING, 0) + counts.get(Verdict.OLD, 0)
     doubtful = counts.get(Verdict.LOOK, 0) + counts.get(Verdict.POOR, 0)
     if failed:
-        why = f"{counted(failed, 'scan')} could not be measured: mend or replace the files first"
+        why = f"{counted(failed, 'scan')} could not be measured: repair or replace the files first"
         yield command_step("measure", project, "--retry", why=why)
     if stale:
         yield command_step("measure", project, why=f"{counted(stale, 'scan')} not measured yet, or stale")

@@ -30,12 +30,19 @@ from pipeline.results.covariance_file import covariance_path
 from pipeline.text.names import path_below
 from pipeline.text.table_models import read_model
 from pipeline.text.tables import Table, read_toml
+from pipeline.text.wording import nearest
 
 if TYPE_CHECKING:
     from measure.scans.scan import Scan
     from pipeline.files.taking_lens import CalibratedLens
 
 ASSUMED_PITCH_UM = 5.0  # for digital cameras of unknown pitch: results are in pixels, so it cancels
+_UNDRAWN = "camera.toml"  # name of a camera file that has yet to be drawn
+_NO_CAMERA = (
+    'is missing: no camera is known for these scans. Give camera = "camera.toml", a file that `reseau review` draws '
+    "over a scan and `reseau template camera --marks cross --square 212` begins, or one of the library (`reseau "
+    'cameras`), camera = "library:NAME".'
+)
 _GENERIC_NAMES = ("out", "output", "project", "reseau")  # of folders, which do not name what is in them
 DEFAULT_SCANNER = "1"  # scanner of all images that name none
 
@@ -250,15 +257,18 @@ def read_undrawn(path: Path, scans: Sequence[Path] = ()) -> Project:
     `read_project` does.
     """
     if not scans:
-        return _read_tables(read_toml(path), needs_camera=False)
+        given = read_toml(path).values
+        return _read_tables(Table({"camera": _UNDRAWN, **given}, path, ""), needs_camera=False)
     names = [glob.escape(os.path.relpath(scan, path.parent)) for scan in scans]
-    return _read_tables(Table({"camera": "camera.toml", "scans": names}, path, ""), needs_camera=False)
+    return _read_tables(Table({"camera": _UNDRAWN, "scans": names}, path, ""), needs_camera=False)
 
 
 def _read_tables(table: Table, needs_camera: bool = True) -> Project:
     path = table.file
     if "camera" not in table and ("fiducial" in table or "principal_distance_mm" in table):
         raise InputError(f'{path} is a camera file. Give the project file, which names it: camera = "{path.name}".')
+    if "camera" not in table and "scans" in table and not nearest("camera", table.values):
+        raise table.error("camera", _NO_CAMERA)
     given, objects = read_model(table, ProjectTable), table.table("object")
     folder = path.parent
     files = {key: getattr(given.object, key) for key in ("points", "images", "distances")}

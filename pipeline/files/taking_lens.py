@@ -74,10 +74,10 @@ class CalibratedLens:
         if size == self.size_px:
             return ""
         width, height = self.size_px
-        turned = " Turn it back, as the sensor saw it." if size == (height, width) else ""
+        turned = " Rotate it back to the sensor's orientation." if size == (height, width) else ""
         return (
             f"{scan.path}: has {size[0]} x {size[1]} px, and the lens under [scanner] was calibrated for {width} x "
-            f"{height} px: nobody knows where its axis lies in this picture.{turned or ' Give the picture uncropped.'}"
+            f"{height} px: the principal point in this image is unknown.{turned or ' Give the image uncropped.'}"
         )
 
     def _px(self, mm: Array, shape: tuple[int, ...]) -> Array:

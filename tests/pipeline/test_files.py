@@ -23,7 +23,7 @@ from pipeline.files.camera_text import camera_text
 from pipeline.files.images_file import read_images
 from pipeline.files.mark_table import picture_writer
 from pipeline.files.points_file import read_points
-from pipeline.files.project_file import Project, read_project
+from pipeline.files.project_file import Project, read_project, read_undrawn
 from pipeline.results.comparator_file import (
     comparator_from_pixel,
     mark_rows,
@@ -84,6 +84,16 @@ def test_a_folder_whose_name_says_nothing_is_titled_with_the_one_above(tmp_path:
     path.write_text('camera = "library:wild-rc10-153"\nscans = ["a.tif"]\n', encoding="utf-8")
     (path.parent / "a.tif").touch()
     assert read_project(path).title == title
+
+
+def test_a_project_whose_camera_is_unknown_yet_is_drawn_and_else_refused_with_what_to_do(tmp_path: Path) -> None:
+    path = written(tmp_path, "project.toml", 'scans = ["a.tif"]\n')
+    (tmp_path / "a.tif").touch()
+    message = refused(read_project, path)
+    assert message.startswith(f"{path}: camera: is missing: no camera is known")
+    assert "reseau template camera" in message
+    assert "rename 'camra'" in refused(read_project, written(tmp_path, "p.toml", 'camra = "c"\nscans = ["a.tif"]\n'))
+    assert read_undrawn(path).missing_camera == "camera.toml"
 
 
 def test_an_astrograph_of_10_m_with_small_plates_is_a_camera(tmp_path: Path) -> None:

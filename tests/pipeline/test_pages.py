@@ -146,7 +146,12 @@ def test_the_commands_of_the_page_of_archives_run(desk: Path) -> None:
     shutil.rmtree(desk / "out")
     page = ROOT / "docs" / "start" / "archive.md"
     with patch.object(server, "serve", lambda *_: None):
-        codes = run_all(page, lambda command: "--scan" in command)
+        codes = run_all(page, lambda command: "project.toml" in command or "--scan" in command)
+        project = desk / "project.toml"
+        text = project.read_text(encoding="utf-8")
+        assert run(["review", str(project)]) == DONE
+        project.write_text(text.replace('# camera = "camera.toml"', 'camera = "camera.toml"'), encoding="utf-8")
+        codes |= run_all(page, lambda command: "project.toml" not in command)
     assert set(codes.values()) <= {DONE, LOOK}, codes
     assert (desk / "out" / "report.html").exists()
 

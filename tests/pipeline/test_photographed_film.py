@@ -208,7 +208,7 @@ def test_a_scan_of_another_size_is_no_picture_of_the_lens(
     lens = read_lens(folder / "lens.yaml", PITCH_UM)
     with open_scan(folder / "scans" / "a.tif") as scan:
         assert not lens.misfit(scan)
-        assert "Give the picture uncropped" in replace(lens, size_px=(1000, 900)).misfit(scan)
+        assert "Give the image uncropped" in replace(lens, size_px=(1000, 900)).misfit(scan)
     path = project(folder, "projective", '[scanner]\nlens = "small.yaml"\n')
     text = (folder / "lens.yaml").read_text(encoding="utf-8")
     (folder / "small.yaml").write_text(text.replace("image_width: 1534", "image_width: 1500"), encoding="utf-8")

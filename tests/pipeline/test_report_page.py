@@ -233,6 +233,14 @@ def test_a_priori_standard_deviations_are_named(adjusted_data: ReportData) -> No
     assert text.count("Standard deviations are a priori ones") == 2  # as a note, and with the groups
 
 
+def test_the_redundancy_next_to_sigma0_is_the_one_that_it_comes_from(adjusted_data: ReportData) -> None:
+    assert adjusted_data.adjustment is not None
+    content = replace(adjusted_data.adjustment, redundancy=100, sigma0=1.0, sigma0_from=Sigma0Record(37.0, False, ()))
+    verdict = rendered(replace(adjusted_data, adjustment=content)).text.split("Camera metric")[0]
+    assert "redundancy 37" in verdict
+    assert "redundancy 100" not in verdict
+
+
 def test_an_adjustment_without_any_redundancy_is_not_called_good(adjusted_data: ReportData) -> None:
     assert adjusted_data.adjustment is not None
     nothing = Sigma0Record(0.0, True, ())
