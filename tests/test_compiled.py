@@ -15,8 +15,9 @@ from adjust.functional_model.line_of_sight import LineOfSight
 from adjust.linear_algebra import elimination, fronts
 from adjust.linear_algebra.factor import Blocks
 from adjust.linear_algebra.fronts import Fronts
-from adjust.linear_algebra.schur_complement import Pattern, SharedEquations, SparseBlocks, SparseRows, eliminated
+from adjust.linear_algebra.schur_complement import SparseBlocks, eliminated
 from adjust.linear_algebra.sparse_factor import Triangle
+from adjust.linear_algebra.sparse_rows import Pattern, SharedEquations, SparseRows
 from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
 from pipeline.cli import DONE, run

@@ -9,7 +9,7 @@ from scipy.sparse import csr_array
 
 from adjust.array_types import Indices, Mask
 from adjust.linear_algebra.fronts import Fronts, band_order, make_fronts
-from adjust.linear_algebra.schur_complement import Pattern
+from adjust.linear_algebra.sparse_rows import Pattern
 from adjust.problem.problem import ABSENT, Problem, side_by_side
 
 ELEMENTS_AT_ONCE = 2_000_000  # matrix elements of the blocks in one batch

@@ -10,8 +10,8 @@ import compiled
 from adjust.array_types import Array, Indices, Mask
 from adjust.least_squares.numbering import Numbering, Touched
 from adjust.linear_algebra.factor import Blocks
-from adjust.linear_algebra.schur_complement import SparseRows
 from adjust.linear_algebra.small_matrices import applied, inverse, lower_root, product
+from adjust.linear_algebra.sparse_rows import SparseRows
 from adjust.problem.condition_equations import Derivatives
 from adjust.problem.further_observations import FurtherObservation
 from adjust.problem.problem import ABSENT, Problem, State

@@ -8,7 +8,7 @@ from scipy.sparse import csr_array
 
 from adjust.array_types import Array, Mask
 from adjust.linear_algebra.factor import Factor
-from adjust.linear_algebra.schur_complement import spread_squares
+from adjust.linear_algebra.sparse_rows import spread_squares
 from adjust.quality.run import Run
 from adjust.quality.weighting import Weighting
 
