@@ -121,7 +121,9 @@ def test_derivatives_by_the_bends_are_differences_of_the_functions() -> None:
     network = make_network(None)
     problem = number(network, approximate(network))
     state = problem.start()
-    at = derivatives(problem, state, compute(problem, state))  # type: ignore[arg-type]
+    computed = compute(problem, state)
+    assert computed is not None
+    at = derivatives(problem, state, computed)
     for name in ("bend_x", "bend_y"):
         position = problem.unknowns.parameters.index(Parameter.board("board", name))
         step = np.zeros(len(problem.unknowns))

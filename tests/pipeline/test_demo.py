@@ -54,7 +54,9 @@ def assert_report_is_short(page: Page, folder: Path) -> None:
     page.goto((folder / "out" / "report.html").as_uri())
     assert page.evaluate("document.documentElement.scrollHeight") <= 6000
     assert len(page.inner_text("body").split()) <= 2500
-    assert page.locator("#camera").bounding_box()["y"] < 300  # type: ignore[index]
+    camera = page.locator("#camera").bounding_box()
+    assert camera is not None
+    assert camera["y"] < 300
     assert page.locator("#camera svg").count() == 2
     assert page.evaluate("document.documentElement.scrollWidth") <= 1300
 
