@@ -352,11 +352,8 @@ def _name_cameras(
     if len(given) == 1 and not given[0].is_dir():
         identification = identify(given[0], tried, pitch_um, reporter, max_pixels)
         show(as_json, identification.as_json, lambda console: print_identification(identification, console))
-        if identification.best:
-            names = (name for trial in identification.best for name in trial.cameras)
-            print_next(as_json, *(f'camera = "{PREFIX}{name}" in project.toml' for name in names))
-        else:
-            print_next(as_json, LIBRARY_STEP)
+        steps = [f'camera = "{PREFIX}{name}" in project.toml' for name in identification.names_by_plate()]
+        print_next(as_json, *(steps or [LIBRARY_STEP]))
         return DONE if identification.best else LOOK
     with reporter.stage("examined") as count:
         found = group_scans(find_scan_files(given)[0], count, max_pixels, by_folder=False)

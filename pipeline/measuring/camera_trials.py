@@ -332,7 +332,7 @@ def _each(
 ) -> dict[Names, Tried]:
     tries = dict[Names, Tried]()
     for done, (names, layout) in enumerate(layouts.items()):
-        count(f"the marks of {', '.join(names)}", done, 2 * len(layouts))
+        count(f"layouts of marks: {', '.join(names)}", done, 2 * len(layouts))
         tries[names] = tried(layout)
     return tries
 

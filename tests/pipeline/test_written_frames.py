@@ -290,8 +290,10 @@ def test_the_library_names_a_camera_by_its_plate_or_says_that_it_is_none() -> No
     assert result.sentence().endswith(
         "Its plate says Nr 13043, principal distance 152.75 mm; of these that is rc10-153."
     )
+    assert result.names_by_plate() == ["rc10-153"]
     none = replace(result, contradicted={name: ["another"] for name in trial.cameras})
     assert none.sentence().endswith("which none of them is.")
+    assert none.names_by_plate() == []
 
 
 def test_the_report_draws_lines_in_place_and_those_that_settled_it_stand_out() -> None:
