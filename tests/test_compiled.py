@@ -11,7 +11,7 @@ from reference_cases import CASES, case_approximations, case_network, load
 from simulated import field_points, simulated
 
 import compiled
-from adjust.functional_model.line_of_sight import LineOfSight
+from adjust.functional_model.projection import LineOfSight
 from adjust.linear_algebra import elimination, fronts
 from adjust.linear_algebra.factor import Blocks
 from adjust.linear_algebra.fronts import Fronts

@@ -11,10 +11,9 @@ from adjust.array_types import Array, Mask
 from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Lens
 from adjust.problem.camera import Camera
-from adjust.problem.estimates import Estimates
-from adjust.problem.images import adjusted_image, adjusted_lens
+from adjust.problem.estimates import Estimates, adjusted_image, adjusted_lens
 from adjust.problem.parameter import Parameter
-from adjust.quality.distortion_curves import distortion_curves, is_defined_over_frame
+from adjust.quality.lens_reach import distortion_curves, is_defined_over_frame
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

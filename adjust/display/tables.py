@@ -6,7 +6,7 @@ import numpy as np
 
 from adjust.problem.estimates import Estimates
 from adjust.problem.observations import Observations
-from adjust.quality.residuals import Residuals
+from adjust.quality.run import Residuals
 
 
 def data_frame(columns: dict[str, Any]) -> Any:

@@ -1,4 +1,13 @@
-"""Table of the distortion families: parameters and formulas.
+"""Table of the distortion families: parameters and formulas; and additional terms that a family may lack.
+
+With (ξ, η) the observed point relative to the principal point, in units of half the frame, and s = ξ² + η², the
+correction is
+
+    radial           r3, r5, ...:   (ξ, η) s^m
+    decentering      p1, p2, ...:   (s + 2ξ², 2ξη) s^q, (2ξη, s + 2η²) s^q
+    affinity         b1, b2:        (ξ, 0), (η, 0)
+
+All parameters are in mm at the edge of the frame. The name of a family with these terms ends in +: "opencv+".
 
 The name of a family with an order includes the order: "legendre(3)". All code that handles distortion uses this table.
 A new family needs a formula with derivatives and an entry here.
@@ -12,16 +21,81 @@ from functools import lru_cache, partial
 import numpy as np
 
 from adjust.array_types import Array
-from adjust.functional_model import fourier_sets, juhl, opencv_family, physical, polynomial_sets
-from adjust.functional_model.added_terms import ADDED_NAMES, correction_with_terms, image_without_terms
+from adjust.functional_model import opencv_family, physical, self_calibration_sets
 from adjust.functional_model.correction import (
     Correct,
+    Correction,
     Image,
+    Imaged,
+    Settings,
     ideal_point_family,
     no_correction,
     ray_family,
     undistorted,
 )
+from adjust.linear_algebra.small_matrices import columns, matrices, vectors
+
+RADIAL_DEGREES = (3, 5, 7, 9, 11, 13)
+RADIAL = tuple(f"+r{degree}" for degree in RADIAL_DEGREES)
+DECENTERING = (("+p1", "+p2"), ("+p3", "+p4"))  # lowest degree, next degree
+AFFINITY = ("+b1", "+b2")
+ADDED_NAMES = (*RADIAL, *DECENTERING[0], *DECENTERING[1], *AFFINITY)
+
+
+def correction_with_terms(correct: Correct, count: int) -> Correct:
+    """Add the terms to the correction of a family with count parameters."""
+
+    def corrected(settings: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:
+        own = correct(settings, xy, principal_point, parameters[:count])
+        added = _added(settings.half_mm[0], xy - principal_point, parameters[count:])
+        return Correction(
+            own.value + added.value,
+            own.xy_jacobian + added.xy_jacobian,
+            own.by_principal_point + added.by_principal_point,
+            np.concatenate([own.parameter_jacobian, added.parameter_jacobian], axis=2),
+        )
+
+    return corrected
+
+
+def image_without_terms(image: Image, count: int) -> Image:
+    """Pass only the first count parameters to a family's image of a ray: the added terms do not affect it."""
+
+    def imaged(settings: Settings, c: float, ray: Array, parameters: Array) -> Imaged:
+        own = image(settings, c, ray, parameters[:count])
+
+        def parameter_derivative(k: int) -> Array:
+            return own.parameter_derivative(k) if k < count else np.broadcast_to(0.0, own.value.shape)
+
+        return Imaged(own.value, own.ray_jacobian, own.by_distance, parameter_derivative)
+
+    return imaged
+
+
+def _added(unit_mm: float, reduced: Array, parameters: Array) -> Correction:
+    """Added terms and their derivatives at points (n, 2) relative to the principal point."""
+    x, y = (reduced / unit_mm).T
+    one, zero, s = np.ones_like(x), np.zeros_like(x), x**2 + y**2
+    radial = vectors(x, y), matrices((one, zero), (zero, one))
+    tangential = (
+        (vectors(s + 2.0 * x**2, 2.0 * x * y), matrices((6.0 * x, 2.0 * y), (2.0 * y, 2.0 * x))),
+        (vectors(2.0 * x * y, s + 2.0 * y**2), matrices((2.0 * y, 2.0 * x), (2.0 * x, 6.0 * y))),
+    )
+    factors = [(radial, (degree - 1) // 2) for degree in RADIAL_DEGREES]
+    factors += [(term, power) for power in range(len(DECENTERING)) for term in tangential]
+    factors += [
+        ((vectors(x, zero), matrices((one, zero), (zero, zero))), 0),
+        ((vectors(y, zero), matrices((zero, one), (zero, zero))), 0),
+    ]
+    value, by_scaled, terms = np.zeros_like(reduced), 0.0, []
+    for ((term, slope), power), parameter in zip(factors, parameters, strict=True):
+        outward = 2.0 * power * s ** max(power - 1, 0)
+        slope = slope * (s**power)[:, None, None] + term[:, :, None] * vectors(x, y)[:, None] * outward[:, None, None]
+        terms.append(term * (s**power)[:, None])
+        value, by_scaled = value + parameter * terms[-1], by_scaled + parameter * slope
+    xy_jacobian = np.asarray(by_scaled) / unit_mm
+    return Correction(value, xy_jacobian, -xy_jacobian, columns(terms))
+
 
 LEGENDRE_ORDERS = range(2, 10)  # from 2, the degree of the omitted tilts, to 9, so that an index has one digit
 FOURIER_ORDERS = range(1, 10)
@@ -62,14 +136,14 @@ class Family:
         return self.units[self.parameters.index(parameter)] if self.units else "mm"
 
 
-def _polynomials(terms: polynomial_sets.PolynomialSet) -> Family:
-    groups = polynomial_sets.degree_groups(terms)
-    return Family(terms.names, correct=partial(polynomial_sets.correct, terms), needs="half_mm", groups=groups)
+def _polynomials(terms: self_calibration_sets.PolynomialSet) -> Family:
+    groups = self_calibration_sets.degree_groups(terms)
+    return Family(terms.names, correct=partial(self_calibration_sets.correct, terms), needs="half_mm", groups=groups)
 
 
 def _fourier(order: int) -> Family:
-    names, groups = fourier_sets.fourier_names(order), fourier_sets.order_groups(order)
-    return Family(names, correct=partial(fourier_sets.fourier, order), needs="half_mm", groups=groups)
+    names, groups = self_calibration_sets.fourier_names(order), self_calibration_sets.order_groups(order)
+    return Family(names, correct=partial(self_calibration_sets.fourier, order), needs="half_mm", groups=groups)
 
 
 _BROWN_LADDER = ("k1", "k1 k2", "k1 p1 p2", "k1 k2 p1 p2", "k1 k2 k3 p1 p2")
@@ -117,12 +191,18 @@ _FAMILIES = {
         ladder=("k1", "k1 k2", "k1 k2 k3", "k1 k2 k3 k4"),
         is_pinhole_at_zero=False,
     ),
-    "juhl": Family(juhl.JUHL_NAMES, correct=juhl.juhl, units=juhl.JUHL_UNITS, needs="r0_mm", groups=juhl.JUHL_GROUPS),
-    "ebner": _polynomials(polynomial_sets.EBNER),
-    "gruen": _polynomials(polynomial_sets.GRUEN),
+    "juhl": Family(
+        physical.JUHL_NAMES,
+        correct=physical.juhl,
+        units=physical.JUHL_UNITS,
+        needs="r0_mm",
+        groups=physical.JUHL_GROUPS,
+    ),
+    "ebner": _polynomials(self_calibration_sets.EBNER),
+    "gruen": _polynomials(self_calibration_sets.GRUEN),
 }
 _WITH_ORDER: dict[str, tuple[range, Callable[[int], Family]]] = {
-    "legendre": (LEGENDRE_ORDERS, lambda order: _polynomials(polynomial_sets.legendre(order))),
+    "legendre": (LEGENDRE_ORDERS, lambda order: _polynomials(self_calibration_sets.legendre(order))),
     "fourier": (FOURIER_ORDERS, _fourier),
 }
 EXTENDED = "+"  # suffix of a family with the added terms, which test whether the family lacks any

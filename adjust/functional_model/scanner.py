@@ -23,7 +23,7 @@ import numpy as np
 from adjust.array_types import Array, Mask
 from adjust.functional_model.correction import Correction, no_correction
 from adjust.functional_model.lens import Distortion, Lens
-from adjust.functional_model.polynomial_sets import (
+from adjust.functional_model.self_calibration_sets import (
     SHEAR,
     STRETCH,
     TILT_X,

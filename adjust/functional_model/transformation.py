@@ -1,5 +1,10 @@
 """Film transformations T: comparator (x, y) to camera (x', y'), each explicit in the comparator coordinates.
 
+Parameters (..., k) go with coordinates (..., 2). The columns of a polynomial around a distant origin are nearly
+dependent. The adjustment therefore estimates centred parameters: those of the same formula in (x - center) / half, with
+the centre and half the extent of the observations in an image. `design` holds the derivatives with respect to these,
+`centred_jacobian` converts back.
+
     none           x' = x                     y' = y
     congruent      x' = a1 + cos(t) x - m sin(t) y,   y' = b1 + sin(t) x + m cos(t) y,   t the `angle` in rad
     similarity     x' = a1 + p x - m q y      y' = b1 + q x + m p y
@@ -15,20 +20,281 @@ conformal(1) is a similarity, polynomial(1) an affine transformation.
 """
 
 import re
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from math import comb
+
+import numpy as np
 
 from adjust.array_types import Array, Mask
-from adjust.functional_model.film_kinds import (
-    Congruent,
-    FilmKind,
-    Identity,
-    Projective,
-    conformal,
-    least_marks,
-    polynomial,
-    whole_polynomial,
-)
+from adjust.linear_algebra.small_matrices import applied, determinant, solved
+
+NEWTON_STEPS = 30
+NEWTON_TOLERANCE = 1e-9  # fraction of a coordinate: the remaining error is the square of the last step
+
+
+class FilmKind(ABC):
+    """Formula for x', y' in x, y and its parameters.
+
+    names: parameter names in order; a1 and b1 are the constants.
+    """
+
+    names: tuple[str, ...]
+
+    @abstractmethod
+    def apply(self, parameters: Array, xy: Array) -> Array:
+        """Compute camera coordinates (..., 2) from comparator coordinates (..., 2)."""
+
+    @abstractmethod
+    def gradient(self, parameters: Array, xy: Array) -> Array:
+        """Derivatives (..., 2, 2) of the camera coordinates with respect to the comparator coordinates."""
+
+    @abstractmethod
+    def design(self, parameters: Array, xy: Array, center: Array, half: Array) -> Array:
+        """Derivatives (..., 2, k) of the camera coordinates with respect to the centred parameters.
+
+        center (..., 2), half (...).
+        """
+
+    @abstractmethod
+    def centred_jacobian(self, parameters: Array, center: Array, half: Array) -> Array:
+        """Derivatives (..., k, k) of the parameters with respect to the centred parameters."""
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether the formula is linear in the coordinates."""
+        return False
+
+    def inverse(self, parameters: Array, camera_xy: Array, center: Array) -> tuple[Array, Mask]:
+        """Compute comparator coordinates (n, 2) from camera coordinates, and the mask of those found.
+
+        Notes
+        -----
+        Newton's method starts at center (2,) or (n, 2), a place in the middle of the image. A point is found where the
+        iteration converges and the determinant of the derivatives has the sign that it has at the centre, so that the
+        formula does not fold over.
+        """
+        steps = 1 if self.is_linear else NEWTON_STEPS
+        xy = np.broadcast_to(center, camera_xy.shape).astype(np.float64)
+        at_center = self.gradient(parameters, xy)
+        turn = np.sign(determinant(at_center))
+        found = np.zeros(len(xy), dtype=bool)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for number in range(steps):
+                gradient = self.gradient(parameters, xy) if number else at_center
+                step, regular = _solved(gradient, self.apply(parameters, xy) - camera_xy)
+                xy = xy - step
+                settled = np.abs(step).max(axis=-1) <= NEWTON_TOLERANCE * (1.0 + np.abs(xy).max(axis=-1))
+                found = regular & (settled | self.is_linear)
+                if found.all():
+                    break
+            same_side = np.sign(determinant(self.gradient(parameters, xy))) == turn
+        return xy, np.asarray(found & same_side)
+
+
+def least_marks(kind: FilmKind) -> int:
+    """Number of marks, of two coordinates each, needed to determine the parameters of a formula."""
+    return (len(kind.names) + 1) // 2
+
+
+@dataclass(frozen=True)
+class Identity(FilmKind):
+    """x' = x, y' = y."""
+
+    names: tuple[str, ...] = ()
+
+    def apply(self, parameters: Array, xy: Array) -> Array:
+        return xy
+
+    def gradient(self, parameters: Array, xy: Array) -> Array:
+        return np.broadcast_to(np.eye(2), (*xy.shape[:-1], 2, 2))
+
+    def design(self, parameters: Array, xy: Array, center: Array, half: Array) -> Array:
+        return np.zeros((*xy.shape, 0))
+
+    def centred_jacobian(self, parameters: Array, center: Array, half: Array) -> Array:
+        return np.zeros((*np.shape(half), 0, 0))
+
+    def inverse(self, parameters: Array, camera_xy: Array, center: Array) -> tuple[Array, Mask]:
+        return camera_xy.copy(), np.ones(len(camera_xy), dtype=bool)
+
+
+@dataclass(frozen=True, eq=False)
+class Polynomial(FilmKind):
+    """x' = sum of a_k x^p_k y^q_k, y' = sum of b_k x^p_k y^q_k; exponents (p_k, q_k), the constant first.
+
+    mixing (2 t, k): derivatives of the coefficients a, b of t terms with respect to the parameters, orthogonal columns.
+    """
+
+    names: tuple[str, ...]
+    exponents: tuple[tuple[int, int], ...]
+    mixing: Array
+
+    @property
+    def is_linear(self) -> bool:
+        return self._degree == 1
+
+    def apply(self, parameters: Array, xy: Array) -> Array:
+        return self._combination(parameters, self._terms(xy))
+
+    def gradient(self, parameters: Array, xy: Array) -> Array:
+        return np.stack([self._combination(parameters, self._terms(xy, by)) for by in (0, 1)], axis=-1)
+
+    def design(self, parameters: Array, xy: Array, center: Array, half: Array) -> Array:
+        terms = self._terms((xy - center) / half[..., None])
+        count = len(self.exponents)
+        design = np.zeros((*xy.shape, 2 * count), dtype=terms.dtype)
+        design[..., 0, :count] = design[..., 1, count:] = terms
+        return np.asarray(design @ self.mixing)
+
+    def centred_jacobian(self, parameters: Array, center: Array, half: Array) -> Array:
+        count = len(self.exponents)
+        result = np.zeros((*np.shape(half), 2 * count, 2 * count))
+        for j, (p, q) in enumerate(self.exponents):
+            for i, (u, v) in enumerate(self.exponents):
+                if u <= p and v <= q:
+                    shift = (-center[..., 0]) ** (p - u) * (-center[..., 1]) ** (q - v)
+                    result[..., i, j] = comb(p, u) * comb(q, v) * shift / half ** (p + q)
+        result[..., count:, count:] = result[..., :count, :count]
+        return np.asarray((self.mixing / (self.mixing**2).sum(axis=0)).T @ result @ self.mixing)
+
+    @cached_property
+    def _degree(self) -> int:
+        return max(p + q for p, q in self.exponents)
+
+    def _terms(self, xy: Array, by: int | None = None) -> Array:
+        """Monomials (..., terms), or their derivatives with respect to x (0) or y (1)."""
+        powers = [np.ones_like(xy)]
+        for _ in range(self._degree):
+            powers.append(powers[-1] * xy)
+        terms = []
+        for exponents in self.exponents:
+            lowered, factor = list(exponents), 1.0
+            if by is not None:
+                factor = float(exponents[by])
+                lowered[by] = max(exponents[by] - 1, 0)
+            terms.append(factor * powers[lowered[0]][..., 0] * powers[lowered[1]][..., 1])
+        return np.stack(terms, axis=-1)
+
+    def _combination(self, parameters: Array, terms: Array) -> Array:
+        coefficients = parameters @ self.mixing.T
+        count = len(self.exponents)
+        first, second = coefficients[..., :count], coefficients[..., count:]
+        return np.stack([(first * terms).sum(-1), (second * terms).sum(-1)], axis=-1)
+
+
+def polynomial(exponents: tuple[tuple[int, int], ...]) -> Polynomial:
+    """Make a polynomial with free coefficients."""
+    names = tuple(f"{axis}{k}" for axis in "ab" for k in range(1, len(exponents) + 1))
+    return Polynomial(names, exponents, np.eye(len(names)))
+
+
+def whole_polynomial(order: int) -> Polynomial:
+    """Make a polynomial with all terms up to a total degree."""
+    return polynomial(tuple((degree - q, q) for degree in range(order + 1) for q in range(degree + 1)))
+
+
+def conformal(order: int, mirrored: bool, names: tuple[str, ...]) -> Polynomial:
+    """x' + i y' = sum of (a_k + i b_k) (x + i m y)^(k-1), k = 1 .. order + 1; m = -1 where mirrored."""
+    exponents, turn = whole_polynomial(order).exponents, -1j if mirrored else 1j
+    powers = np.array([[comb(p + q, q) * turn**q * (p + q == k) for k in range(order + 1)] for p, q in exponents])
+    columns = np.stack([powers, 1j * powers], axis=-1).reshape(len(exponents), -1)  # by a_1, b_1, a_2, ...
+    return Polynomial(names, exponents, np.concatenate([columns.real, columns.imag]))
+
+
+@dataclass(frozen=True)
+class Congruent(FilmKind):
+    """Rotation, shift and a known mirroring: a similarity with p, q the cosine and sine of the angle."""
+
+    mirrored: bool
+    names: tuple[str, ...] = ("a1", "b1", "angle")
+
+    @property
+    def is_linear(self) -> bool:
+        return True
+
+    def apply(self, parameters: Array, xy: Array) -> Array:
+        return parameters[..., :2] + applied(self._turn(parameters), xy)
+
+    def gradient(self, parameters: Array, xy: Array) -> Array:
+        return np.broadcast_to(self._turn(parameters), (*xy.shape[:-1], 2, 2))
+
+    def design(self, parameters: Array, xy: Array, center: Array, half: Array) -> Array:
+        design = np.zeros((*xy.shape, 3), dtype=np.result_type(parameters, xy))
+        design[..., :2] = np.eye(2)
+        design[..., 2] = applied(self._turn(parameters, np.pi / 2.0), xy - center)
+        return design
+
+    def centred_jacobian(self, parameters: Array, center: Array, half: Array) -> Array:
+        result = np.broadcast_to(np.eye(3), (*np.shape(half), 3, 3)).copy()
+        result[..., :2, 2] = -applied(self._turn(parameters, np.pi / 2.0), center)
+        return result
+
+    def _turn(self, parameters: Array, further: float = 0.0) -> Array:
+        """Rotation matrix. Its derivative is the matrix of the angle plus a right angle."""
+        c, s = np.cos(parameters[..., 2] + further), np.sin(parameters[..., 2] + further)
+        m = -1.0 if self.mirrored else 1.0
+        return np.stack([np.stack([c, -m * s], axis=-1), np.stack([s, m * c], axis=-1)], axis=-2)
+
+
+@dataclass(frozen=True)
+class Projective(FilmKind):
+    """x' = (a1 + a2 x + a3 y) / d, y' = (b1 + b2 x + b3 y) / d, d = 1 + c1 x + c2 y."""
+
+    names: tuple[str, ...] = ("a1", "a2", "a3", "b1", "b2", "b3", "c1", "c2")
+
+    def apply(self, parameters: Array, xy: Array) -> Array:
+        numerators = parameters[..., [0, 3]] + applied(self._linear(parameters), xy)
+        return numerators / self._denominator(parameters, xy)[..., None]
+
+    def gradient(self, parameters: Array, xy: Array) -> Array:
+        bent = self.apply(parameters, xy)[..., :, None] * parameters[..., None, 6:]
+        return (self._linear(parameters) - bent) / self._denominator(parameters, xy)[..., None, None]
+
+    def design(self, parameters: Array, xy: Array, center: Array, half: Array) -> Array:
+        u, v = np.moveaxis((xy - center) / half[..., None], -1, 0)
+        camera_xy = self.apply(parameters, xy)
+        design = np.zeros((*xy.shape, 8), dtype=camera_xy.dtype)
+        for row in (0, 1):
+            terms = np.stack([np.ones_like(u), u, v], axis=-1)
+            design[..., row, 3 * row : 3 * row + 3] = terms
+            design[..., row, 6:] = -camera_xy[..., row, None] * terms[..., 1:]
+        centred = self._denominator(parameters, xy) / self._denominator(parameters, center)
+        return design / centred[..., None, None]
+
+    def centred_jacobian(self, parameters: Array, center: Array, half: Array) -> Array:
+        """Derivatives (..., 8, 8); the numerators differ by the factor d(center), and d(0) = 1 adds its derivative."""
+        factor = self._denominator(parameters, center)[..., None]
+        result = np.zeros((*np.shape(half), 8, 8))
+        size = half[..., None]
+        for first in (0, 3):
+            result[..., first, first] = factor[..., 0]
+            result[..., first, first + 1 : first + 3] = -factor * center / size
+            result[..., [first + 1, first + 2], [first + 1, first + 2]] = factor / size
+        result[..., [6, 7], [6, 7]] = factor / size
+        result[..., :, 6:] += parameters[..., :, None] * (factor * center / size)[..., None, :]
+        return result
+
+    def inverse(self, parameters: Array, camera_xy: Array, center: Array) -> tuple[Array, Mask]:
+        bent = camera_xy[..., :, None] * parameters[..., None, 6:]
+        solution, regular = _solved(self._linear(parameters) - bent, camera_xy - parameters[..., [0, 3]])
+        same_side = self._denominator(parameters, solution) * self._denominator(parameters, center) > 0.0
+        return solution, np.asarray(regular & same_side)  # beyond the horizon the image is upside down
+
+    def _linear(self, parameters: Array) -> Array:
+        return np.stack([parameters[..., 1:3], parameters[..., 4:6]], axis=-2)
+
+    def _denominator(self, parameters: Array, xy: Array) -> Array:
+        return np.asarray(1.0 + (parameters[..., 6:] * xy).sum(-1))
+
+
+def _solved(matrix: Array, right: Array) -> tuple[Array, Mask]:
+    """Solutions (n, 2) of 2x2 systems (n, 2, 2), and the mask (n,) of regular matrices."""
+    of = determinant(matrix)
+    regular = np.isfinite(of) & (of != 0.0)
+    return solved(matrix, right, regular, of), regular
+
 
 HIGHEST_ORDER = 5
 POSSIBLE = (

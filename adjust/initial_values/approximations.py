@@ -10,12 +10,10 @@ from adjust.errors import AdjustmentError
 from adjust.functional_model.families import family
 from adjust.functional_model.lens import Lens
 from adjust.functional_model.rotation import angles_from_rotation, angles_near
-from adjust.functional_model.sight import Sight
 from adjust.initial_values.fiducial_fit import fit_transformation
-from adjust.initial_values.frames import Frames, camera_frames
-from adjust.initial_values.joined_frames import Film, joined_frames, whole_frames
+from adjust.initial_values.frames import Film, Frames, camera_frames, joined_frames, whole_frames
 from adjust.initial_values.orientation import orient
-from adjust.initial_values.pose import KnownField, Pose
+from adjust.initial_values.pose import KnownField, Pose, Sight
 from adjust.initial_values.principal_distance import FEWEST, find_principal_distance, find_wide_distance
 from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Image, Network

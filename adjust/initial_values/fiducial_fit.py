@@ -6,8 +6,16 @@ from math import comb
 import numpy as np
 
 from adjust.array_types import Array, Indices
-from adjust.functional_model.film_kinds import Congruent, FilmKind, Identity, Projective, least_marks
-from adjust.functional_model.transformation import film_kind, marks_needed, simpler
+from adjust.functional_model.transformation import (
+    Congruent,
+    FilmKind,
+    Identity,
+    Projective,
+    film_kind,
+    least_marks,
+    marks_needed,
+    simpler,
+)
 from adjust.linear_algebra.small_matrices import applied
 from adjust.problem.network import Transformation
 

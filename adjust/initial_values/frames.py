@@ -1,15 +1,24 @@
-"""Image coordinates of the object points of a network: in the fiducial system, and corrected for the known lens."""
+"""Image coordinates in the fiducial system, of frames in one scan or in overlapping parts.
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+The parts are transformed one after the other into the comparator system of the first, by a similarity fitted to the
+points in common with the parts placed so far. All fiducial marks of the frame then determine its film transformation,
+as if it had been scanned at once. The film transformation of each part follows from it.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from adjust.array_types import Array, Indices
+from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Lens
-from adjust.functional_model.sight import Sight
 from adjust.functional_model.transformation import film_kind
-from adjust.problem.network import Network
+from adjust.initial_values.fiducial_fit import LATTICE, fit_transformation
+from adjust.initial_values.pose import Sight
+from adjust.problem.network import Image, Network
+from adjust.problem.observations import Observations
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,3 +104,134 @@ def _medians(values: Array, group: Indices, starts: Indices) -> Array:
     counts = np.diff(starts)
     middle = np.minimum([starts[:-1] + (counts - 1) // 2, starts[:-1] + counts // 2], len(values) - 1)
     return np.asarray(np.where(counts > 0, ordered[middle].mean(axis=0), 0.0))
+
+
+Film = tuple[Array, bool]  # parameters, and whether the scan is mirrored
+Mark = tuple[str, str]  # kind and point
+
+FEWEST_COMMON = 3  # common points of two parts: a mirrored similarity fits two points as well
+
+
+@dataclass(frozen=True)
+class JoinedFrame:
+    """Frame scanned in parts.
+
+    Attributes
+    ----------
+    name : name of the frame.
+    films : film transformation of each part, by its name.
+    joins : (2,) coordinates of each join point in the fiducial system, mm.
+    """
+
+    name: str
+    films: Mapping[str, Film]
+    joins: Mapping[str, Array]
+
+
+def joined_frame(network: Network, parts: Sequence[Image]) -> JoinedFrame:
+    """Determine the film transformations of the parts of one frame.
+
+    Raises AdjustmentError if the parts have too few points in common, or the frame has too few fiducial marks.
+    """
+    marks_by_part = {part.name: _marks(network, part) for part in parts}
+    first_from, place = _placed(parts[0].part_of, marks_by_part)
+    given = network.camera_by_name[parts[0].camera].fiducials
+    marks = sorted(point for kind, point in place if kind == "fiducial")
+    camera_mm = np.array([[given[mark].x_mm.value, given[mark].y_mm.value] for mark in marks]).reshape(-1, 2)
+    first_mm = np.array([place["fiducial", mark] for mark in marks]).reshape(-1, 2)
+    kind = parts[0].transformation
+    parameters, mirrored = fit_transformation(kind, first_mm, camera_mm)
+    whole = film_kind(kind, mirrored)
+    films = {}
+    for part in parts:
+        xy_mm = np.array(list(marks_by_part[part.name].values()))
+        lattice = (xy_mm.min(axis=0) + xy_mm.max(axis=0)) / 2 + np.ptp(xy_mm, axis=0) / 2 * LATTICE
+        turned, is_mirrored = first_from[part.name]
+        in_first = film_kind("similarity", is_mirrored).apply(turned, lattice)
+        films[part.name] = fit_transformation(kind, lattice, whole.apply(parameters, in_first))
+    joins = [(point, xy) for (what, point), xy in place.items() if what == "join"]
+    in_camera = whole.apply(parameters, np.array([xy for _, xy in joins]).reshape(-1, 2))
+    return JoinedFrame(parts[0].part_of, films, {point: xy for (point, _), xy in zip(joins, in_camera, strict=True)})
+
+
+def _marks(network: Network, part: Image) -> dict[Mark, Array]:
+    """Comparator coordinates of all marks of a part, sorted by kind and name."""
+    rows = np.flatnonzero(network.image_numbers == network.images.index(part))
+    observations = network.observations
+    return {
+        (observations.kind[row], observations.point[row]): network.straight_xy_mm[row]
+        for row in sorted(rows, key=lambda row: (observations.kind[row], observations.point[row]))
+    }
+
+
+def _placed(frame: str, marks_by_part: Mapping[str, Mapping[Mark, Array]]) -> tuple[dict[str, Film], dict[Mark, Array]]:
+    """Place the parts in the comparator system of the first; the part with most common points comes next.
+
+    Returns the similarity of each part, and the coordinates (2,) of all marks in the system of the first.
+    """
+    left = list(marks_by_part)
+    films: dict[str, Film] = {left[0]: (np.array([0.0, 0.0, 1.0, 0.0]), False)}
+    place = dict(marks_by_part[left.pop(0)])
+    while left:
+        name = max(left, key=lambda name: len(place.keys() & marks_by_part[name].keys()))
+        own, common = marks_by_part[name], sorted(place.keys() & marks_by_part[name].keys())
+        if len(common) < FEWEST_COMMON:
+            raise AdjustmentError(
+                f"frame {frame}: its scan {name} has {len(common)} points in common with {', '.join(films)}; joining "
+                f"them takes {FEWEST_COMMON}, and more to be checked. Scan the frame in parts that overlap, measure "
+                "crosses that both show, or leave the scan out."
+            )
+        in_part, in_first = (np.array([where[mark] for mark in common]) for where in (own, place))
+        films[name] = fit_transformation("similarity", in_part, in_first)
+        moved = film_kind("similarity", films[name][1]).apply(films[name][0], np.array(list(own.values())))
+        place |= {mark: xy for mark, xy in zip(own, moved, strict=True) if mark not in place}
+        left.remove(name)
+    return films, place
+
+
+def joined_frames(network: Network) -> Iterator[JoinedFrame]:
+    """Iterate over the frames that were scanned in parts."""
+    parts = defaultdict(list)
+    for image in network.images:
+        if image.part_of:
+            parts[image.part_of].append(image)
+    for frame in sorted(parts):
+        yield joined_frame(network, sorted(parts[frame], key=lambda image: image.name))
+
+
+def whole_frames(network: Network, films: Mapping[str, Film]) -> Network:
+    """Reduce a network to whole frames, with each point measured once and in the fiducial system.
+
+    The result holds the frames that show object points, without film transformations, join points and fiducial marks.
+    """
+    first: dict[str, Image] = {}
+    for image in network.images:
+        if image.name not in network.objectless_images:
+            first.setdefault(image.frame, image)
+    observations, xy_mm = network.observations, network.straight_xy_mm.copy()
+    for i, image in enumerate(network.images):
+        rows = network.image_numbers == i
+        parameters, mirrored = films[image.name]
+        xy_mm[rows] = film_kind(image.transformation, mirrored).apply(parameters, xy_mm[rows])
+    frame_of = {image.name: image.frame for image in network.images}
+    kept: dict[tuple[str, str], int] = {}
+    for row in np.flatnonzero(~observations.is_fiducial):
+        kept.setdefault((frame_of[observations.image[row]], observations.point[row]), int(row))
+    rows = np.array(list(kept.values()), dtype=np.intp)
+    return replace(
+        network,
+        images=tuple(Image(frame, image.camera, "none", image.exterior) for frame, image in first.items()),
+        observations=Observations(
+            tuple(frame for frame, _ in kept),
+            tuple(point for _, point in kept),
+            tuple(observations.kind[row] for row in rows),
+            xy_mm[rows],
+            observations.covariance_mm2[rows],
+        ),
+        distances=tuple(
+            replace(each, start=frame_of.get(each.start, each.start), end=frame_of.get(each.end, each.end))
+            for each in network.distances
+        ),
+        calibrations=(),
+        scanners=(),
+    )

@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from adjust.array_types import Array, Mask
 from adjust.functional_model.rotation import rotation_from_vector
-from adjust.functional_model.sight import Sight
 from adjust.initial_values.intersection import intersect
-from adjust.initial_values.pose import KnownField, Pose, image_distances
+from adjust.initial_values.pose import KnownField, Pose, Sight, image_distances
 from adjust.initial_values.resection import resect_images
 
 SAMPLES = 150

@@ -8,7 +8,6 @@ import numpy as np
 from adjust.array_types import Array
 from adjust.errors import AdjustmentError, UnorientedError
 from adjust.functional_model.rotation import rotation_from_angles
-from adjust.functional_model.sight import Sight
 from adjust.initial_values.model_formation import (
     Block,
     extend,
@@ -17,7 +16,7 @@ from adjust.initial_values.model_formation import (
     orient_free_model,
     typical_residual,
 )
-from adjust.initial_values.pose import Pose, image_distances
+from adjust.initial_values.pose import Pose, Sight, image_distances
 from adjust.initial_values.resection import resect_images
 from adjust.initial_values.vertical_block import orient_vertical_block
 from adjust.problem.network import Exterior, Network

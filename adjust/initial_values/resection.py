@@ -14,8 +14,14 @@ from typing import NamedTuple
 import numpy as np
 
 from adjust.array_types import Array, Indices, Mask
-from adjust.initial_values.p3p import triple_poses
-from adjust.initial_values.pose import KnownField, Pose, refined_distance, refined_poses, squared_residuals
+from adjust.initial_values.pose import (
+    KnownField,
+    Pose,
+    refined_distance,
+    refined_poses,
+    squared_residuals,
+    triple_poses,
+)
 
 MAX_TRIPLES = 120  # enough for one without gross errors if every third point is wrong
 FEWEST_QUICK = 16  # points of an image, half of which suffice to test whether they agree

@@ -8,8 +8,7 @@ from scipy import sparse
 
 from adjust.array_types import Array, Complex, Indices
 from adjust.functional_model.rotation import rotation_from_angles
-from adjust.functional_model.sight import Sight
-from adjust.initial_values.pose import Pose
+from adjust.initial_values.pose import Pose, Sight
 
 FEWEST_SHARED = 2
 REWEIGHTINGS = 6

@@ -16,9 +16,14 @@ import numpy as np
 from adjust.array_types import Array
 from adjust.linear_algebra.factor import BlockFactors, Blocks, DenseBlocks, Factor, column_values
 from adjust.linear_algebra.fronts import Fronts
-from adjust.linear_algebra.multifrontal import factorise_normal_equations, qr_triangle, reflected, reflections_cost
 from adjust.linear_algebra.schur_complement import eliminated
-from adjust.linear_algebra.sparse_factor import TEN_DIGITS
+from adjust.linear_algebra.sparse_factor import (
+    TEN_DIGITS,
+    factorise_normal_equations,
+    qr_triangle,
+    reflected,
+    reflections_cost,
+)
 from adjust.linear_algebra.sparse_rows import SharedEquations, SparseRows
 
 CHEAP = 1e7  # rows times columns squared of the shared unknowns, up to which Householder QR is always used

@@ -9,7 +9,7 @@ from adjust.array_types import Array, Indices
 from adjust.errors import AdjustmentError
 from adjust.functional_model.projection import ImageModel
 from adjust.initial_values.intersection import intersect
-from adjust.problem.images import adjusted_image, lifted
+from adjust.problem.estimates import adjusted_image, lifted
 from adjust.problem.network import Approximations, Network
 from adjust.problem.parameter import Kind, object_coordinate
 from adjust.problem.problem import number

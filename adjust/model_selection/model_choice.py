@@ -12,9 +12,21 @@ import numpy as np
 
 from adjust.errors import AdjustmentError
 from adjust.initial_values.approximations import approximate
-from adjust.model_selection.candidates import Candidate, Nested, nested_tests, reasons, simplest_sufficient, verdict
+from adjust.model_selection.candidates import (
+    Bends,
+    Candidate,
+    Model,
+    Nested,
+    given_model,
+    lenses,
+    nested_tests,
+    reasons,
+    remaining_bends,
+    simplest_sufficient,
+    transformations,
+    verdict,
+)
 from adjust.model_selection.cross_validation import adjusted_values, cross_validate, folds
-from adjust.model_selection.models import Bends, Model, given_model, lenses, remaining_bends, transformations
 from adjust.model_selection.scanner_choice import choose_bends
 from adjust.problem.network import Network
 from adjust.problem.parameter import description

@@ -16,11 +16,11 @@ from scipy.special import chdtrc, fdtrc
 from adjust.array_types import Array, Mask
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.scanner import carriage_terms, smooth_terms
-from adjust.problem.images import adjusted_image
+from adjust.problem.estimates import adjusted_image
 from adjust.problem.network import Network, Scanner
 from adjust.problem.parameter import Parameter
 from adjust.quality.significance import LEVEL
-from adjust.rank_defect.scanner_directions import HARDLY, scan_poses, undetermined_term_sentences
+from adjust.rank_defect.directions import HARDLY, scan_poses, undetermined_term_sentences
 from adjust.solution.result import Adjustment
 
 WEAK_MM = 0.1  # weak prior of every term in the trial, removed afterwards; it keeps terms not estimable small

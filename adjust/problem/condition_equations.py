@@ -16,8 +16,7 @@ import compiled
 from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.correction import Imaged
 from adjust.functional_model.lens import Lens
-from adjust.functional_model.line_of_sight import SightVectors, sight_vectors
-from adjust.functional_model.projection import rays
+from adjust.functional_model.projection import SightVectors, rays, sight_vectors
 from adjust.linear_algebra.small_matrices import applied, columns, cross, laid_out, product, take_members, zeros
 from adjust.problem.problem import Part, Problem, State
 

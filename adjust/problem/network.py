@@ -12,8 +12,8 @@ import numpy as np
 from adjust.array_types import Array, Indices
 from adjust.functional_model.board import board_form
 from adjust.functional_model.lens import Lens, Prior
-from adjust.functional_model.line_of_sight import STRAIGHT as STRAIGHT
-from adjust.functional_model.line_of_sight import LineOfSight as LineOfSight
+from adjust.functional_model.projection import STRAIGHT as STRAIGHT
+from adjust.functional_model.projection import LineOfSight as LineOfSight
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.scanner import Bend, is_term
 from adjust.functional_model.transformation import film_kind

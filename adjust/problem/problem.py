@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.array_types import Array, Indices, Mask
-from adjust.functional_model.film_kinds import FilmKind
 from adjust.functional_model.rotation import angles_near, rotation_from_angles, rotation_from_vector, vector_by_angles
 from adjust.functional_model.scanner import Bend
-from adjust.functional_model.transformation import film_kind
+from adjust.functional_model.transformation import FilmKind, film_kind
 from adjust.problem.further_observations import FurtherObservation, further_observations
 from adjust.problem.network import Approximations, Network, Transformation
 from adjust.problem.unknowns import Unknowns, list_unknowns

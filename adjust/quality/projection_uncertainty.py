@@ -21,12 +21,10 @@ from scipy.linalg import block_diag
 
 from adjust.array_types import Array
 from adjust.errors import AdjustmentError
-from adjust.functional_model.line_of_sight import sight_vectors
-from adjust.functional_model.projection import ImageModel, ray_by_orientation, rays
+from adjust.functional_model.projection import ImageModel, ray_by_orientation, rays, sight_vectors
 from adjust.functional_model.transformation import film_kind, film_parameter_names
 from adjust.problem.camera import Camera
-from adjust.problem.estimates import Estimates
-from adjust.problem.images import adjusted_image, adjusted_lens, adjusted_places
+from adjust.problem.estimates import Estimates, adjusted_image, adjusted_lens, adjusted_places
 from adjust.problem.parameter import Parameter
 
 MOST_IMAGES = 100  # used for the fit of the orientation, evenly chosen

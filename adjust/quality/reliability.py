@@ -11,8 +11,7 @@ import numpy as np
 from adjust.array_types import Array, Indices, Mask
 from adjust.linear_algebra.small_matrices import applied, eigen, product
 from adjust.problem.parameter import Parameter
-from adjust.problem.probabilities import Probabilities
-from adjust.problem.tested import Tested
+from adjust.problem.tested import Probabilities, Tested
 from adjust.quality.run import UNCHECKED, Run
 
 Effects = tuple[Array, Callable[[int], str]]  # effects (k, c) of errors on the cameras' parameters, and their names

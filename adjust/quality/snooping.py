@@ -15,8 +15,7 @@ from scipy import special
 
 from adjust.array_types import Array, Mask
 from adjust.linear_algebra.small_matrices import applied, eigen
-from adjust.problem.probabilities import Probabilities
-from adjust.problem.tested import Tested
+from adjust.problem.tested import Probabilities, Tested
 from adjust.quality.reliability import Reliability
 from adjust.quality.run import UNCHECKED, GrossError, Run
 from adjust.quality.weighting import robust_scale

@@ -12,7 +12,7 @@ from adjust.functional_model.rotation import angles_near, rotation_from_vector
 from adjust.problem.network import Network, ObjectPoint
 from adjust.problem.parameter import Parameter, object_coordinate
 from adjust.problem.problem import Problem, State
-from adjust.rank_defect.named_directions import DATUM_DIRECTIONS
+from adjust.rank_defect.directions import DATUM_DIRECTIONS
 
 EXACT = 1e-9  # relative motion of given quantities below which a direction is free: rounding
 FLAT = 1e-3  # the same, where relief below this fraction of the field's extent must not define a datum

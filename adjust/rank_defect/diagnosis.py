@@ -10,11 +10,18 @@ from adjust.problem.estimates import NullDirection
 from adjust.problem.parameter import Parameter, description
 from adjust.problem.problem import Problem, State
 from adjust.rank_defect.datum import free_coordinates, object_datum
+from adjust.rank_defect.directions import (
+    camera_directions,
+    datum_sentence,
+    field_geometry,
+    followers,
+    many_sentence,
+    own_sentence,
+    scanner_directions,
+    unnamed_sentence,
+)
 from adjust.rank_defect.flat_valleys import trading_off
-from adjust.rank_defect.named_directions import camera_directions, datum_sentence, field_geometry, followers
 from adjust.rank_defect.null_space import SINGULAR, BlindBlock, blind_blocks, null_space
-from adjust.rank_defect.scanner_directions import scanner_directions
-from adjust.rank_defect.unnamed_directions import many_sentence, own_sentence, unnamed_sentence
 
 WEAK = 1e-4  # relative singular value of the scaled rows below which a direction is weak
 INVOLVED = 0.01  # components of a null vector that are named, relative to the largest

@@ -7,8 +7,7 @@ import numpy as np
 
 from adjust.array_types import Array, Indices
 from adjust.linear_algebra.factor import Factor
-from adjust.linear_algebra.multifrontal import append_rows
-from adjust.linear_algebra.sparse_factor import Triangle
+from adjust.linear_algebra.sparse_factor import Triangle, append_rows
 
 SINGULAR = 1e-8  # relative singular value of the scaled rows below which the system is singular
 DENSE = 100  # shared unknowns up to which a dense SVD is used

@@ -24,10 +24,9 @@ from adjust.rank_defect.datum import (
     minimal_datum,
     object_datum,
 )
-from adjust.solution.blunder_hypotheses import blunder_sentence, stations_elsewhere
+from adjust.solution.blunder_hypotheses import Trials, blunder_sentence, stations_elsewhere
 from adjust.solution.coordinate_blunders import Slip, coordinate_slips, far_points, few_points, free_points
 from adjust.solution.left_out_images import adopt_lens, fitting, leave_out
-from adjust.solution.network_hypotheses import Trials
 from adjust.solution.options import Datum, Method, Options
 from adjust.solution.plausibility import check_plausibility
 from adjust.solution.result import Adjustment, is_fixed, run_result

@@ -3,8 +3,7 @@
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
-from adjust.problem.probabilities import Probabilities
-from adjust.problem.tested import PRIOR_GROUPS
+from adjust.problem.tested import PRIOR_GROUPS, Probabilities
 from adjust.quality.weighting import WeightFunction
 
 Datum = Literal["control", "minimal", "free"]

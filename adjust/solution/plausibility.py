@@ -14,10 +14,10 @@ from scipy.special import chdtri
 
 from adjust.array_types import Array, Indices, Mask
 from adjust.problem.camera import Camera
-from adjust.problem.images import adjusted_image
+from adjust.problem.estimates import adjusted_image
 from adjust.problem.network import Network
 from adjust.problem.parameter import Parameter
-from adjust.solution.network_hypotheses import Trials, mirrored_images, y_downward
+from adjust.solution.blunder_hypotheses import Trials, mirrored_images, y_downward
 from adjust.solution.result import Adjustment
 
 MARGIN = 0.01  # fraction of the frame that a mark may lie outside: edge of the outermost pixel, rounded frame size

@@ -16,21 +16,18 @@ from adjust.least_squares.numbering import Numbering
 from adjust.problem.camera import Camera
 from adjust.problem.estimates import Cofactor, Estimates, NullDirection, VarianceFactor
 from adjust.problem.parameter import Parameter
-from adjust.problem.probabilities import Probabilities
 from adjust.problem.problem import Problem
+from adjust.problem.tested import Probabilities
 from adjust.quality.cofactor import NoCofactor, free_cofactor, inner_cofactor
-from adjust.quality.contradiction import CalibrationTest, calibration_tests
 from adjust.quality.correlation import Correlation, correlations
 from adjust.quality.image_clusters import MOST_SHARED, cluster_covariance, prediction_errors, shared_positions
 from adjust.quality.lens_reach import LensReach, lens_reach
 from adjust.quality.projection_uncertainty import ProjectionUncertainty, only_camera, projection_uncertainty
 from adjust.quality.reliability import Reliability, reliability
-from adjust.quality.residuals import FurtherResidual, Group, Residuals, further_residuals, groups, residuals
-from adjust.quality.run import Run
-from adjust.quality.significance import SignificanceTest, significance_tests
+from adjust.quality.run import FurtherResidual, Group, Residuals, Run, further_residuals, groups, residuals
+from adjust.quality.significance import CalibrationTest, SignificanceTest, calibration_tests, significance_tests
 from adjust.quality.snooping import Snooping, Suspect
-from adjust.quality.variance_components import factor_sigmas
-from adjust.quality.variance_factor import variance_factor
+from adjust.quality.variance_components import factor_sigmas, variance_factor
 from adjust.rank_defect.flat_valleys import held_directions, inseparable
 from adjust.solution.explanations import Explained, Explanation, explain
 from adjust.solution.warnings import run_warnings

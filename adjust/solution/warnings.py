@@ -13,10 +13,9 @@ from adjust.problem.estimates import Cofactor
 from adjust.problem.observations import Observations
 from adjust.problem.parameter import description
 from adjust.problem.problem import Problem
-from adjust.quality.residuals import Residuals
-from adjust.quality.run import Run
+from adjust.quality.run import Residuals, Run
 from adjust.rank_defect.diagnosis import undetermined, weak_directions
-from adjust.rank_defect.scanner_directions import weak_term_sentences
+from adjust.rank_defect.directions import weak_term_sentences
 from adjust.solution.reweighting import ROUNDS
 
 GROSS = 20.0  # in a-priori standard deviations: a larger residual may come from a confused mark

@@ -21,7 +21,6 @@ import numpy as np
 from adjust.array_types import Array
 from adjust.initial_values.pose import Pose
 from adjust.initial_values.resection import resect
-from adjust.target_identification.naming_growth import OF_POSE, Grown, View, grow, log10_of_chance
 from adjust.target_identification.naming_hypotheses import (
     Cluster,
     Poses,
@@ -30,7 +29,7 @@ from adjust.target_identification.naming_hypotheses import (
     point_triples,
     promising,
 )
-from adjust.target_identification.unnamed_marks import Marks
+from adjust.target_identification.unnamed_marks import OF_POSE, Grown, Marks, View, grow, log10_of_chance
 
 LEAST_POINTS = 5
 MOST_LOG10_CHANCE = -6.0

@@ -10,8 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from adjust.array_types import Array, Indices, Mask
-from adjust.initial_values.p3p import triple_poses
-from adjust.initial_values.pose import refined_poses
+from adjust.initial_values.pose import refined_poses, triple_poses
 from adjust.target_identification.unnamed_marks import Marks
 
 _DIRECTIONS = 24  # viewing directions for the ranks of neighbours in the image

@@ -1,12 +1,13 @@
-"""Unidentified marks of an image: nearest neighbours and the probability of chance agreement."""
+"""Unidentified marks of an image, and the growth of a pose from a few identified ones over the whole image."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import bdtrc
 
 from adjust.array_types import Array, Indices, Mask
+from adjust.functional_model.rotation import rotation_from_vector
 
 _CELLS = 600  # cells of the look-up table along each side of the frame
 _COARSE_CELLS = 60  # cells of the density table along each side
@@ -94,3 +95,178 @@ def _centres(least: Array, greatest: Array, cells: int) -> Array:
     share = (np.arange(cells) + 0.5) / cells
     x, y = (low + share * (high - low) for low, high in zip(least, greatest, strict=True))
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+
+_ROUNDS = 25
+_GATE_SIGMAS = 3.5
+_MOST_CHANCE = 0.1  # largest probability of a random mark in a point's gate; otherwise not identified yet
+_PRIOR_RADIAL = 0.1  # standard deviation of k1: 10 % of the radius for rays at 45 degrees
+_ROBUST = 2.0  # in standard deviations, limit of Huber's weight function
+_BEFORE = -1e-6
+OF_POSE = 3  # points that agree with some pose whatever they are
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Projection: camera = R X + t; images are (1 + scale) p (1 + radial p²), p in principal distances."""
+
+    rotation: Array
+    shift: Array
+    scale: float = 0.0
+    radial: float = 0.0
+
+    def images(self, xyz: Array) -> Array:
+        """(n, 2) images of points (n, 3); nan behind the camera."""
+        p = self._ideal(xyz)
+        return np.asarray((1.0 + self.scale) * p * (1.0 + self.radial * (p**2).sum(axis=1, keepdims=True)))
+
+    def facing(self, xyz: Array, normals: Array) -> Mask:
+        """Mask of points that face the camera; True where their direction is unknown."""
+        station = -self.rotation.T @ self.shift
+        return np.asarray(~(np.einsum("ni,ni->n", normals, station - xyz) <= 0.0))
+
+    def derivatives(self, xyz: Array) -> Array:
+        """(n, 2, 8) derivatives with respect to a small rotation, a shift in the camera frame, scale and radial."""
+        camera = self._camera(xyz)
+        u, v, w = camera.T
+        p = self._ideal(xyz)
+        zero = np.zeros_like(w)
+        by_camera = np.stack([np.stack([-1 / w, zero, -p[:, 0] / w], 1), np.stack([zero, -1 / w, -p[:, 1] / w], 1)], 1)
+        turned = np.stack([np.stack([zero, w, -v], 1), np.stack([-w, zero, u], 1), np.stack([v, -u, zero], 1)], 1)
+        r2 = (p**2).sum(axis=1)
+        by_ideal = (1.0 + self.radial * r2)[:, None, None] * np.eye(2) + 2 * self.radial * p[:, :, None] * p[:, None]
+        by_pose = (1.0 + self.scale) * by_ideal @ np.concatenate([by_camera @ turned, by_camera], axis=2)
+        by_scale = p * (1.0 + self.radial * r2)[:, None]
+        by_radial = (1.0 + self.scale) * p * r2[:, None]
+        return np.concatenate([by_pose, by_scale[:, :, None], by_radial[:, :, None]], axis=2)
+
+    def stepped(self, step: Array) -> "View":
+        turn = rotation_from_vector(step[:3])
+        return View(turn @ self.rotation, turn @ self.shift + step[3:6], self.scale + step[6], self.radial + step[7])
+
+    def _camera(self, xyz: Array) -> Array:
+        camera = xyz @ self.rotation.T + self.shift
+        camera[:, 2] = np.where(camera[:, 2] < _BEFORE, camera[:, 2], np.nan)
+        return np.asarray(camera)
+
+    def _ideal(self, xyz: Array) -> Array:
+        camera = self._camera(xyz)
+        return np.asarray(camera[:, :2] / -camera[:, 2:])
+
+
+@dataclass(frozen=True, eq=False)
+class Grown:
+    """Result of growing a pose.
+
+    Attributes
+    ----------
+    view : fitted projection.
+    mark : mark of each identified point.
+    gate : largest distance of a mark from the predicted place of its point, in principal distances.
+    expected : number of points that the frame should show.
+    log10_chance : log10 of the expected number of false alarms over all possible hypotheses.
+    """
+
+    view: View
+    mark: dict[int, int] = field(default_factory=dict)
+    gate: float = 0.0
+    expected: int = 0
+    log10_chance: float = 0.0
+
+
+def grow(view: View, points: Indices, named: Indices, xyz: Array, normals: Array, marks: Marks) -> Grown:
+    """Fit and identify alternately until nothing changes, from points (k,) identified as marks named (k,).
+
+    The gates follow from the covariance of the last fit.
+    """
+    sigma = marks.sigma
+    for _ in range(_ROUNDS):
+        if len(points) <= OF_POSE:
+            return Grown(view)
+        view, sigma, covariance = _fit_view(view, xyz[points], marks.places[named], marks)
+        before = points, named
+        points, named = _near(view, xyz, normals, marks, sigma, covariance)
+        if np.array_equal(points, before[0]) and np.array_equal(named, before[1]):
+            break
+    return _significance(view, xyz, normals, marks, sigma, dict(zip(points.tolist(), named.tolist(), strict=True)))
+
+
+def _near(
+    view: View, xyz: Array, normals: Array, marks: Marks, sigma: float, covariance: Array
+) -> tuple[Indices, Indices]:
+    """Points and their marks: nearest neighbours within gates that rarely contain a mark by chance."""
+    shown = np.flatnonzero(_shown_points(view, xyz, normals, marks))
+    places, by = view.images(xyz[shown]), view.derivatives(xyz[shown])
+    predicted = np.einsum("nij,jk,nik->ni", by, covariance, by).sum(axis=1)
+    gate = _GATE_SIGMAS * np.sqrt(sigma**2 + predicted)
+    plain = marks.chance(places, gate) < _MOST_CHANCE
+    shown, places, gate = shown[plain], places[plain], gate[plain]
+    if not len(shown):
+        return shown, shown
+    distance, nearest = (np.asarray(found) for found in marks.tree.query(places))
+    order = np.argsort(distance, kind="stable")
+    _, firsts = np.unique(nearest[order], return_index=True)
+    kept = np.zeros(len(shown), bool)
+    kept[order[firsts]] = True
+    kept &= distance <= gate
+    return shown[kept], nearest[kept].astype(np.intp)
+
+
+def _shown_points(view: View, xyz: Array, normals: Array, marks: Marks) -> Mask:
+    return np.asarray(marks.inside(view.images(xyz)) & view.facing(xyz, normals))
+
+
+def _fit_view(view: View, xyz: Array, places: Array, marks: Marks) -> tuple[View, float, Array]:
+    """Fit a view by robust least squares.
+
+    Returns the view, the standard deviation of the marks and the covariance of the parameters.
+    """
+    priors = np.diag([0.0] * 6 + [marks.c_sigma**-2, _PRIOR_RADIAL**-2])
+    sigma = marks.sigma
+    normal = np.eye(8)
+    for _ in range(5):
+        residuals = places - view.images(xyz)
+        off = np.linalg.norm(np.nan_to_num(residuals, nan=1.0), axis=1)
+        redundancy = max(2 * len(xyz) - 6, 1) / (2 * len(xyz))
+        # The median of lengths of two normal coordinates is 1.18 of their standard deviation.
+        sigma = max(float(np.median(off)) / 1.1774 / np.sqrt(redundancy), marks.sigma)
+        weights = np.minimum(1.0, _ROBUST * sigma / np.maximum(off, 1e-300)) / sigma**2
+        by = np.nan_to_num(view.derivatives(xyz))
+        weighted = by * weights[:, None, None]
+        normal = np.einsum("nij,nik->jk", weighted, by) + priors
+        right = np.einsum("nij,ni->j", weighted, np.nan_to_num(residuals))
+        right -= priors @ np.array([0.0] * 6 + [view.scale, view.radial])
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-30))
+        step = scale * np.linalg.lstsq(normal * np.outer(scale, scale), scale * right, rcond=1e-13)[0]
+        view = view.stepped(step)
+        if np.abs(by @ step).max() < 0.01 * sigma:
+            break
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-30))
+    covariance = np.linalg.pinv(normal * np.outer(scale, scale), rcond=1e-13) * np.outer(scale, scale)
+    return view, sigma, covariance
+
+
+def _significance(view: View, xyz: Array, normals: Array, marks: Marks, sigma: float, mark: dict[int, int]) -> Grown:
+    """Compute the expected number of false alarms of an identification.
+
+    Any three points matched to any three marks give a pose. The others must agree, each with the probability that its
+    gate contains a mark by chance.
+    """
+    gate = _GATE_SIGMAS * sigma
+    shown = np.flatnonzero(_shown_points(view, xyz, normals, marks))
+    expected = len(shown)
+    agreeing = min(len(mark), expected)
+    if agreeing <= OF_POSE:
+        return Grown(view)
+    # A pose fitted to all points may differ by the gate from that of three points: twice the gate.
+    chance = float(marks.chance(view.images(xyz[shown]), np.full(expected, 2.0 * gate)).mean())
+    tests = (float(len(xyz)) * len(marks.places)) ** OF_POSE
+    return Grown(view, mark, gate, expected, log10_of_chance(agreeing, expected, chance, tests))
+
+
+def log10_of_chance(agreeing: int, expected: int, chance: float, tests: float) -> float:
+    """log10 of the expected number of poses with so many agreeing points under the null hypothesis.
+
+    Three of the points always agree, with up to four poses for each of the possible tests.
+    """
+    return log10_of_agreement(agreeing - OF_POSE, expected - OF_POSE, chance) + float(np.log10(4.0 * tests))

@@ -8,7 +8,7 @@ import numpy as np
 
 from adjust.functional_model.scanner import carriage_terms, smooth_terms
 from adjust.model_selection.scanner_choice import bent_network, choose_bends
-from adjust.problem.images import adjusted_image, adjusted_places
+from adjust.problem.estimates import adjusted_image, adjusted_places
 from adjust.problem.network import Network
 from adjust.solution.adjustment import Options, adjust
 from adjust.solution.result import Adjustment

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from adjust.problem.images import adjusted_image, adjusted_places
+from adjust.problem.estimates import adjusted_image, adjusted_places
 from adjust.solution.result import Adjustment
 from measure.fiducials.frame_checks import without_lost
 from measure.flags import Code, Reason, Status

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Lens, Prior
 from adjust.problem.camera import Camera, Fiducial
-from adjust.problem.images import adjusted_lens
+from adjust.problem.estimates import adjusted_lens
 from adjust.problem.network import Network
 from adjust.problem.parameter import Parameter
 from adjust.quality.reliability import OuterEffect

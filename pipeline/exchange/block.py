@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from adjust.functional_model.lens import Lens
-from adjust.functional_model.line_of_sight import LineOfSight
-from adjust.functional_model.projection import ImageModel
+from adjust.functional_model.projection import ImageModel, LineOfSight
 from adjust.functional_model.rotation import rotation_from_angles
 from pipeline.adjusting.turned_pictures import rotate_to_sensor
 from pipeline.errors import InputError

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from adjust.functional_model.line_of_sight import STRAIGHT
+from adjust.functional_model.projection import STRAIGHT
 from measure.errors import MeasurementError
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, Frame, WholeFrame

@@ -10,7 +10,7 @@ from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Prior
 from adjust.functional_model.lens_conversion import convert_lens
 from adjust.problem.camera import Camera
-from adjust.problem.images import adjusted_image, adjusted_lens, adjusted_places
+from adjust.problem.estimates import adjusted_image, adjusted_lens, adjusted_places
 from adjust.problem.network import EXTERIOR_NAMES, Approximations, Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
 from adjust.problem.parameter import Parameter

@@ -9,7 +9,7 @@ from markupsafe import Markup
 
 from adjust.functional_model.families import parameter_names
 from adjust.problem.parameter import parameter_from_text
-from adjust.quality.distortion_curves import Curves, distortion_curves, is_defined_over_frame
+from adjust.quality.lens_reach import Curves, distortion_curves, is_defined_over_frame
 from pipeline.report import fiducials, lens, vectors
 from pipeline.report.camera_values import CameraValue, camera_values
 from pipeline.report.data import ReportData

@@ -12,15 +12,14 @@ from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.problem.camera import Camera
-from adjust.problem.images import adjusted_image
+from adjust.problem.estimates import adjusted_image
 from adjust.problem.network import EXTERIOR_NAMES, Image, ObjectPoint
 from adjust.problem.parameter import Kind, Parameter
 from adjust.problem.tested import Tested
-from adjust.quality.contradiction import CalibrationTest
 from adjust.quality.projection_uncertainty import projection_uncertainty
 from adjust.quality.reliability import Reliability
-from adjust.quality.residuals import FurtherResidual
-from adjust.quality.significance import SignificanceTest
+from adjust.quality.run import FurtherResidual
+from adjust.quality.significance import CalibrationTest, SignificanceTest
 from adjust.quality.snooping import Suspect
 from adjust.solution.result import Adjustment
 from pipeline.results.adjustment_record import (

@@ -18,7 +18,7 @@ from adjust.functional_model.scanner import Bend, is_term
 from adjust.functional_model.transformation import Film, film_parameter_names
 from adjust.least_squares.iteration import Iteration
 from adjust.problem.estimates import GivenGroup
-from adjust.quality.residuals import Group
+from adjust.quality.run import Group
 from adjust.solution.explanations import Explanation
 from pipeline.results.assessment_record import (
     ContradictionRecord,

@@ -5,10 +5,9 @@ from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 
-from adjust.model_selection.candidates import Candidate
+from adjust.model_selection.candidates import Candidate, Model
 from adjust.model_selection.cross_validation import CrossValidation
 from adjust.model_selection.model_choice import Choice
-from adjust.model_selection.models import Model
 from pipeline.results.record_json import read_record
 
 

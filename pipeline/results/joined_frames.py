@@ -5,7 +5,7 @@ from collections import defaultdict
 import numpy as np
 
 from adjust.functional_model.transformation import film_parameter_names
-from adjust.problem.images import adjusted_image
+from adjust.problem.estimates import adjusted_image
 from adjust.problem.network import Image, Network
 from adjust.problem.parameter import Parameter
 from adjust.solution.result import Adjustment

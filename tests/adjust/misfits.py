@@ -16,7 +16,7 @@ from adjust.functional_model.lens import Distortion, Prior
 from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles
 from adjust.problem.camera import Camera
 from adjust.problem.network import Exterior, Network
-from adjust.problem.probabilities import Probabilities
+from adjust.problem.tested import Probabilities
 from adjust.solution.adjustment import adjust
 
 Array = NDArray[np.float64]

@@ -15,7 +15,7 @@ from adjust.initial_values.approximations import approximate
 from adjust.model_selection.model_choice import choose
 from adjust.problem.camera import Camera
 from adjust.problem.condition_equations import compute, computed_observations, derivatives
-from adjust.problem.images import adjusted_places
+from adjust.problem.estimates import adjusted_places
 from adjust.problem.network import Board, Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
 from adjust.problem.parameter import Parameter

@@ -9,7 +9,7 @@ from studies import parametrize_with_studies
 
 from adjust.errors import AdjustmentError
 from adjust.solution.adjustment import Options, adjust
-from adjust.solution.network_hypotheses import AXES
+from adjust.solution.blunder_hypotheses import AXES
 
 FAST = (
     "sign of X, approximate orientations",

@@ -14,7 +14,7 @@ from adjust.problem.camera import Fiducial
 from adjust.problem.network import Approximations, Network, Transformation
 from adjust.problem.observations import Calibration
 from adjust.problem.parameter import Parameter
-from adjust.quality.contradiction import CalibrationTest
+from adjust.quality.significance import CalibrationTest
 from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
 

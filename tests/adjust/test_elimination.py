@@ -13,7 +13,7 @@ from simulated import Truth, field_points, simulated
 from adjust.least_squares.iteration import Linearised, factorise, linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.least_squares.rows import prior_root_weights
-from adjust.linear_algebra import elimination, multifrontal, sparse_factor
+from adjust.linear_algebra import elimination, sparse_factor
 from adjust.linear_algebra.elimination import eliminate
 from adjust.linear_algebra.factor import Blocks, Factor
 from adjust.problem.network import Approximations, Network
@@ -113,14 +113,14 @@ def test_all_shared_unknowns_fixed() -> None:
 def cost(monkeypatch: pytest.MonkeyPatch) -> Callable[[Network, Approximations], float]:
     """Of an adjustment, a step: rows times columns squared of every factorisation, counted and not timed."""
     costs: list[float] = []
-    original = multifrontal.qr_triangle
+    original = sparse_factor.qr_triangle
 
     def counted(rows: Array) -> Array:
         costs.append(rows.size * rows.shape[-1])
         return original(rows)
 
     monkeypatch.setattr(elimination, "qr_triangle", counted)
-    monkeypatch.setattr(multifrontal, "qr_triangle", counted)
+    monkeypatch.setattr(sparse_factor, "qr_triangle", counted)
 
     def log_determinant(network: Network, start: Approximations) -> float:
         costs.clear()

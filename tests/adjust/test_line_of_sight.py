@@ -9,8 +9,8 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 from simulated import Truth, camera_point, field_points, simulated, start_of
 
-from adjust.functional_model.line_of_sight import EARTH_RADIUS_M, sight_vectors
-from adjust.problem.images import adjusted_image
+from adjust.functional_model.projection import EARTH_RADIUS_M, sight_vectors
+from adjust.problem.estimates import adjusted_image
 from adjust.problem.network import LineOfSight, Network
 from adjust.solution.adjustment import Options, adjust
 from adjust.solution.planning import plan

@@ -10,10 +10,9 @@ from simulated import HALF_MM, Truth, field_points, simulated
 
 from adjust.functional_model.lens import Distortion, Prior
 from adjust.initial_values.approximations import approximate
-from adjust.model_selection.candidates import Candidate, f_test, nested_tests, simplest_sufficient
+from adjust.model_selection.candidates import Candidate, Model, f_test, lenses, nested_tests, simplest_sufficient
 from adjust.model_selection.cross_validation import CrossValidation, cross_validate, folds
 from adjust.model_selection.model_choice import Choice, choose, weighted_network
-from adjust.model_selection.models import Model, lenses
 from adjust.problem.network import Network, ObjectPoint, Transformation
 from adjust.quality.weighting import WeightFunction
 from adjust.solution.adjustment import Options, adjust

@@ -17,7 +17,7 @@ from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.transformation import Film
 from adjust.initial_values.approximations import approximate
 from adjust.problem.camera import Camera
-from adjust.problem.images import adjusted_image
+from adjust.problem.estimates import adjusted_image
 from adjust.problem.network import Approximations, Network
 from adjust.solution.adjustment import adjust
 

@@ -14,7 +14,7 @@ from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Distortion, Prior
 from adjust.functional_model.rotation import rotation_from_vector
 from adjust.initial_values.approximations import approximate
-from adjust.problem.images import adjusted_image, adjusted_lens
+from adjust.problem.estimates import adjusted_image, adjusted_lens
 from adjust.problem.network import Approximations, Board
 from adjust.problem.parameter import Parameter
 from adjust.solution.adjustment import adjust

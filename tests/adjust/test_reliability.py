@@ -13,7 +13,7 @@ from adjust.functional_model.lens import Prior
 from adjust.problem.network import Approximations, Exterior, Network
 from adjust.problem.observations import Calibration
 from adjust.problem.parameter import Parameter
-from adjust.problem.probabilities import Probabilities
+from adjust.problem.tested import Probabilities
 from adjust.quality.reliability import Reliability
 from adjust.solution.adjustment import Options, adjust
 from adjust.solution.result import Adjustment

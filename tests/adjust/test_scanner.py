@@ -12,10 +12,10 @@ from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.scanner import Bend, carriage_terms, smooth_terms
 from adjust.initial_values.approximations import approximate
-from adjust.problem.images import adjusted_image
+from adjust.problem.estimates import adjusted_image
 from adjust.problem.network import Network, Scanner, Transformation
 from adjust.problem.parameter import Parameter
-from adjust.rank_defect.named_directions import NamedDirection, Reason
+from adjust.rank_defect.directions import NamedDirection, Reason
 from adjust.solution.adjustment import Options, adjust
 from adjust.solution.result import Adjustment
 

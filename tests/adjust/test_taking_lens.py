@@ -9,7 +9,7 @@ from simulated import simulated
 from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.scanner import Bend
 from adjust.model_selection.scanner_choice import network_with_terms
-from adjust.problem.images import adjusted_image
+from adjust.problem.estimates import adjusted_image
 from adjust.problem.network import Scanner
 from adjust.solution.adjustment import adjust
 

@@ -12,8 +12,7 @@ from reference_cases import load
 from scipy.stats import norm
 
 from adjust.functional_model.transformation import Film, film_parameter_names
-from adjust.problem.estimates import GivenGroup
-from adjust.problem.images import adjusted_image
+from adjust.problem.estimates import GivenGroup, adjusted_image
 from adjust.problem.network import Transformation
 from adjust.quality.fiducial_corrections import common_transformation, corrections_to_given
 from adjust.solution.adjustment import adjust

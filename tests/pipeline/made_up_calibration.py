@@ -18,8 +18,8 @@ from adjust.problem.estimates import NullDirection, VarianceFactor
 from adjust.problem.network import Exterior, Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
 from adjust.problem.parameter import Parameter
-from adjust.problem.probabilities import Probabilities
-from adjust.quality.residuals import Group, Residuals
+from adjust.problem.tested import Probabilities
+from adjust.quality.run import Group, Residuals
 from adjust.solution.result import Adjustment
 from measure.flags import Cause, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose

@@ -16,7 +16,7 @@ from two_cameras import two_cameras
 from adjust.functional_model.lens import Prior
 from adjust.problem.network import ObjectPoint
 from adjust.problem.parameter import Parameter
-from adjust.quality.residuals import Residuals
+from adjust.quality.run import Residuals
 from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
 from pipeline.errors import InputError

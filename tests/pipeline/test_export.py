@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from simulated import affine, rotation, simulated
 from studies import parametrize_with_studies
 
-from adjust.functional_model.line_of_sight import LineOfSight
+from adjust.functional_model.projection import LineOfSight
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
 from pipeline.exchange import asp_format, colmap_format, micmac_format, mmvii_format, opencv_format, pinhole
 from pipeline.exchange.block import read_block

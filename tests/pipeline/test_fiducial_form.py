@@ -11,7 +11,7 @@ from studies import parametrize_with_studies
 from adjust.functional_model.lens import Prior
 from adjust.initial_values.approximations import approximate
 from adjust.problem.camera import Camera, Fiducial
-from adjust.problem.images import adjusted_image
+from adjust.problem.estimates import adjusted_image
 from adjust.problem.network import Image, Network
 from adjust.problem.observations import ObservationKind, Observations
 from adjust.solution.adjustment import adjust

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from adjust.problem.parameter import Parameter
-from adjust.quality.distortion_curves import distortion_curves
+from adjust.quality.lens_reach import distortion_curves
 from pipeline.report.fiducials import Figure, figure_of_films, figure_plot
 from pipeline.report.lens import curves_plot, largest_effects_um, lens, lens_map
 from pipeline.report.parameters import high_correlations, parameter_rows

@@ -1,0 +1,518 @@
+"""Named null directions: joint motions of a network's unknowns, with cause and remedy."""
+
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from adjust.array_types import Array, Indices
+from adjust.functional_model.families import family
+from adjust.functional_model.lens import INTERIOR_NAMES
+from adjust.functional_model.scanner import is_left, term_degree
+from adjust.functional_model.transformation import follows_tilts
+from adjust.linear_algebra.factor import Factor
+from adjust.problem.estimates import Cofactor
+from adjust.problem.network import Image
+from adjust.problem.parameter import Kind, Parameter, enumeration
+from adjust.problem.problem import Problem, State
+
+FLAT = 0.01  # ratio of smallest and largest extent below which the field is flat
+PARALLEL_RAD = np.radians(1.0)  # largest angle between parallel axes
+FIELD = 4  # known points needed to determine more than the datum
+LEAST_BEND = 1e-6  # second-order part of a tilt, relative, below which it is an affinity (three marks)
+
+
+class Reason(NamedTuple):
+    """Why a motion is free; the prior that would fix it; other remedies."""
+
+    because: str
+    given: str
+    otherwise: str
+
+
+@dataclass(frozen=True)
+class NamedDirection:
+    """Name of a null direction.
+
+    Attributes
+    ----------
+    rank : the lowest one that applies gives the name.
+    functional : (n,) function of the unknowns that the direction changes.
+    motion : what moves, in words.
+    reason : why, and the remedy.
+    partner : another unknown, with its words, whose prior would fix the direction if it moves too.
+    by_companion : reasons where a lens ("lens") or fiducial marks ("marks") move along.
+    """
+
+    rank: int
+    functional: Array
+    motion: str
+    reason: Reason
+    partner: tuple[Parameter, str] | None = None
+    by_companion: Mapping[str, Reason] = field(default_factory=dict)
+
+    def sentence(self, moved: Iterable[Parameter]) -> tuple[str, str]:
+        """Cause and remedy, given the unknowns that move."""
+        moved = set(moved)
+        lens = any(each.kind == "interior" and each.quantity not in INTERIOR_NAMES for each in moved)
+        companion = "lens" if lens else "marks" if any(each.kind == "fiducial" for each in moved) else ""
+        because, given, otherwise = self.by_companion.get(companion, self.reason)
+        if self.partner and self.partner[0] in moved:
+            given = f"{given}, or to {self.partner[1]}"
+        cause = f"{self.motion}{followers(moved, self.motion)}{because and f': {because}'}."
+        return cause, f"Give a standard deviation to {given}{otherwise and f', or {otherwise}'}."
+
+
+# Followers of a motion: kind, quantities (empty: all), words; not mentioned if the motion contains the last text.
+FOLLOWERS: tuple[tuple[Kind, tuple[str, ...], str, str], ...] = (
+    ("fiducial", (), "the fiducial marks", "fiducial mark"),
+    ("film", (), "the film transformations", ""),
+    ("join", (), "what joins scans of a frame", ""),
+    ("interior", ("x0", "y0"), "the principal point", "principal point's"),
+    ("interior", ("c",), "the principal distance", "principal distance"),
+    ("exterior", ("X0", "Y0", "Z0"), "the stations", ""),
+    ("exterior", ("omega", "phi"), "the tilts", ""),
+    ("exterior", ("kappa",), "kappa", ""),
+    ("point", ("X", "Y"), "the object points in plan", ""),
+    ("point", ("Z",), "the heights", ""),
+)
+
+
+def followers(moved: Iterable[Parameter], motion: str = "") -> str:
+    """Words for the unknowns that move along."""
+    kinds = {(each.kind, each.quantity) for each in moved}
+    words = [
+        word
+        for kind, quantities, word, own in FOLLOWERS
+        if not (own and own in motion) and any(k == kind and (not quantities or q in quantities) for k, q in kinds)
+    ]
+    return f", followed by {enumeration(words)}" if words else ""
+
+
+# Free directions of the object space: motion, and the known coordinates that would fix it.
+DATUM_DIRECTIONS = (
+    ("can shift in X", "X of one point"),
+    ("can shift in Y", "Y of one point"),
+    ("can shift in Z", "Z of one point"),
+    ("can turn about X", "Z of three points that are not in line"),
+    ("can turn about Y", "Z of three points that are not in line"),
+    ("can turn about Z", "X and Y of two points"),
+    ("can grow or shrink", "X and Y of two points, or a distance"),
+)
+
+
+def datum_sentence(number: int) -> tuple[str, str]:
+    """Cause and remedy of one of the seven free directions of the object space."""
+    motion, known = DATUM_DIRECTIONS[number]
+    return (
+        f"The object space {motion} with all stations and points: nothing that is given fixes it.",
+        f'Give {known} with a standard deviation in points.csv, or choose the datum "minimal" or "free".',
+    )
+
+
+_X0, _Y0, _C = ("x0", "x0' (F7)"), ("y0", "y0' (F8)"), ("c", "the principal distance (F9)")
+_LEVER = "one coordinate of a fiducial mark that has a lever arm (F5, F6)"
+_TWO, _THREE = (f"x' and y' of {number} fiducial marks (F5, F6)" for number in ("two", "three"))
+_TURNED = "add images turned by 90 degrees about their axes or tilted in other directions"
+# Joint motions of all fiducial marks of a camera: rank; coefficients of dx' and dy' for 1, x and y about the mean;
+# motion; prior that fixes it; interior quantity whose prior would fix it too, if it moves along; other remedies.
+FIDUCIAL_MOTIONS = (
+    (0, (1, 0, 0), (0, 0, 0), "Shift x: {} shift together in x'", "x' of one fiducial mark (F5)", _X0, ""),
+    (0, (0, 0, 0), (1, 0, 0), "Shift y: {} shift together in y'", "y' of one fiducial mark (F6)", _Y0, ""),
+    (0, (0, 0, -1), (0, 1, 0), "Rotation: {} turn together about the principal point", _LEVER, None, ""),
+    (0, (0, 1, 0), (0, 0, 1), "Scale: {} grow together", _TWO, _C, ""),
+    (1, (0, 1, 0), (0, 0, -1), "Affinity: {} stretch in x' against y'", _THREE, None, _TURNED),
+    (1, (0, 0, 1), (0, 1, 0), "Shear: {} shear", _THREE, None, _TURNED),
+)
+
+
+def camera_directions(problem: Problem, state: State) -> list[NamedDirection]:
+    """Named directions of all cameras.
+
+    Ranks: -2 bend of a scanner (see `scanner_directions`), -1 tilt, 0 change of the camera's axes, 1 other changes of
+    its fiducials, 2 interior orientation, 3 distortion. The more a direction moves along, the lower its rank.
+    """
+    directions: list[NamedDirection] = []
+    for name, positions in problem.unknowns.camera.items():
+        directions += _fiducial_directions(problem, state, name)
+        geometry = field_geometry(problem, state, name)
+        for_point = geometry.remedy
+        if geometry.known != "points" and not geometry.flat:
+            for_point = "add images turned by 180 degrees about their axes"
+        for number, motion, given, otherwise in (
+            (1, f"The principal point's x0' of camera {name} can shift", "x0' (F7)", for_point),
+            (2, f"The principal point's y0' of camera {name} can shift", "y0' (F8)", for_point),
+            (0, f"The principal distance of camera {name} can change", "it (F9)", geometry.remedy),
+        ):
+            functional = changed(problem, positions[number], 1.0)
+            directions.append(NamedDirection(2, functional, motion, Reason(geometry.because, given, otherwise)))
+        directions += _distortion_directions(problem, name, positions[3:])
+    return directions
+
+
+def changed(problem: Problem, positions: Indices | int, values: Array | float) -> Array:
+    """(n,) functional with given values at some positions."""
+    functional = np.zeros(len(problem.unknowns))
+    functional[positions] = values
+    return functional
+
+
+def _fiducial_directions(problem: Problem, state: State, camera: str) -> Iterator[NamedDirection]:
+    """Shift, rotation, scale, affinity and shear of all fiducials of a camera, with the joins of its frames; and a tilt
+    of all images about x' or y', where every film transformation of the camera can compensate it.
+
+    A tilt moves the fiducials by t (x'², x'y'); the functional takes the part that is not an affinity.
+    """
+    images = [image for image in problem.network.images if image.camera == camera]
+    places = [positions for (owner, _), positions in problem.unknowns.fiducial.items() if owner == camera]
+    if not places:
+        return
+    frames = {image.frame for image in images}
+    marks = np.array(places + [at for (frame, _), at in problem.unknowns.join.items() if frame in frames])
+    centred = state.values[marks] - state.values[marks].mean(axis=0)
+    affine = np.column_stack([np.ones(len(centred)), centred])
+    for rank, dx, dy, motion, given, partner, otherwise in FIDUCIAL_MOTIONS:
+        functional = changed(problem, marks, affine @ np.array([dx, dy]).T)
+        words = motion.format(f"all fiducial marks of camera {camera} can")
+        with_partner = partner and (Parameter.interior(camera, partner[0]), partner[1])
+        yield NamedDirection(rank, functional, words, Reason("", given, otherwise), with_partner)
+    if not all(follows_tilts(image.transformation) for image in images):
+        return
+    given = "x' and y' of four fiducial marks (F5, F6), or to the attitude of an image"
+    for axis, other in ("xy", "yx"):
+        bend = centred[:, ["xy".index(axis)]] * centred
+        bend -= affine @ np.linalg.lstsq(affine, bend)[0]
+        if np.abs(bend).max() >= LEAST_BEND * np.abs(centred).max() ** 2:
+            motion = (
+                f"Tilt {axis}: all fiducial marks of camera {camera} can move by {axis}' times x' and y', as with one "
+                f"tilt of all cameras about {other}'"
+            )
+            reason = Reason("", given, "choose an affine transformation")
+            yield NamedDirection(-1, changed(problem, marks, bend), motion, reason)
+
+
+def _distortion_directions(problem: Problem, camera: str, positions: Indices) -> Iterator[NamedDirection]:
+    """Directions named after the distortion parameters of a camera."""
+    own_family = family(problem.network.camera_by_name[camera].distortion.family)
+    named = dict(zip(own_family.parameters, positions, strict=True))
+    free = [each for each in own_family.alike_at_zero if np.isinf(problem.unknowns.sigma[named[each]])]
+    because, remedy = "the targets do not tell it from the other unknowns", "spread the targets better over the frame"
+    if free:
+        because = f"with {', '.join(free)} free the radial numerator and denominator do the same over this image"
+        remedy = f"fix some of {', '.join(free)} at 0"
+    for name, position in named.items():
+        motion = f"The distortion parameter {name} of camera {camera} can change"
+        reason = Reason(because, name, f"fix it, or {remedy}")
+        yield NamedDirection(3, changed(problem, position, 1.0), motion, reason)
+
+
+@dataclass(frozen=True)
+class FieldGeometry:
+    """Geometry that decides whether interior and exterior orientation are separable.
+
+    known: object coordinates with priors, beyond a datum.
+    """
+
+    flat: bool
+    parallel: bool
+    known: str  # "points", "heights", "nothing"
+
+    @property
+    def because(self) -> str:
+        if self.flat:
+            axes = "the camera axes are parallel" if self.parallel else "too few images are tilted in other directions"
+            return f"the field is flat and {axes}"
+        known = {"points": "", "heights": ", and only heights are known", "nothing": ", and no object point is known"}
+        if self.parallel:
+            return f"the camera axes are parallel{known[self.known]}"
+        return "these stations and points do not tell them apart"
+
+    @property
+    def remedy(self) -> str:
+        """Remedy that separates the principal distance from the object distance in any field."""
+        relief = "points at other heights" if self.known == "points" else "known points (X, Y, Z) at different heights"
+        return f"add images tilted in different directions, or {relief}"
+
+
+def field_geometry(problem: Problem, state: State, camera: str) -> FieldGeometry:
+    """Geometry of the observed points and of the axes of a camera's images."""
+    positions = np.array(list(problem.unknowns.point.values()), dtype=np.intp).reshape(-1, 3)
+    xyz = state.values[positions]
+    extents = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False) if len(xyz) > 2 else np.zeros(3)
+    axes = state.rotations[[image.camera == camera for image in problem.network.images], 2]
+    mean = axes.mean(axis=0)
+    off = np.linalg.norm(np.cross(axes, mean / (np.linalg.norm(mean) or 1.0)), axis=1)
+    given = problem.network.points
+    heights = sum(point.Z is not None and np.isfinite(point.Z.sigma) for point in given)
+    whole = sum(all(q is not None and np.isfinite(q.sigma) for q in (point.X, point.Y, point.Z)) for point in given)
+    known = "points" if whole >= FIELD else "heights" if heights >= FIELD else "nothing"
+    return FieldGeometry(bool(extents[-1] <= FLAT * extents[0]), bool(off.max() < PARALLEL_RAD), known)
+
+
+Pose = tuple[int, bool]  # rotation of a frame in its scan, degrees, and whether it is mirrored
+
+SCANNER_RANK = -2
+ALIKE_DEG = 20.0  # rotations that differ by less count as equal
+HARDLY = 20.0  # ratio of a term's standard deviation to that with all else known, above which it is weak
+
+
+def scanner_directions(problem: Problem, state: State) -> list[NamedDirection]:
+    """Directions named after the terms of every scanner's deformation."""
+    directions = []
+    for name, positions in problem.unknowns.scanner.items():
+        poses = _scanner_poses(problem, state, name)
+        kinds = [image.transformation for image in problem.network.images if image.scanner == name]
+        for position in positions:
+            term = problem.unknowns.parameters[position].quantity
+            film = next((kind for kind in kinds if not is_left(kind, term)), "")
+            reason = term_reason(term, poses, "")
+            by_companion = {each: term_reason(term, poses, each) for each in ("lens", "marks")}
+            if film:
+                because = f"the {film} transformation of its films does the same"
+                reason, by_companion = Reason(because, "the term itself", "leave it out"), {}
+            motion = f"The term {term} of the bend of scanner {name} can change"
+            functional = changed(problem, int(position), 1.0)
+            directions.append(NamedDirection(SCANNER_RANK, functional, motion, reason, by_companion=by_companion))
+    return directions
+
+
+def term_reason(term: str, poses: Sequence[Pose], confused_with: str) -> Reason:
+    """Why a term of the deformation is not determined, and the remedies.
+
+    poses: of the scanner's frames. confused_with: what it is not separable from, "lens" or "marks"; empty where the
+    marks do not show the term at all.
+    """
+    is_odd, one_pose = term_degree(term) % 2 == 1, len(poses) == 1
+    given = "x' and y' of the fiducial marks (F5, F6), or to the term itself"
+    otherwise = "leave it out"
+    if confused_with and one_pose and not is_odd:
+        otherwise = "scan some of the frames turned by 180 degrees"
+    elif confused_with == "marks" and _are_half_turns(poses):
+        otherwise = "scan some of the frames turned by 90 degrees"
+    if not confused_with:
+        return Reason("the marks in its scans are too few, or lie too much alike, to show it", given, otherwise)
+    if confused_with == "lens":
+        as_they_lie = "however the frames lie" if is_odd or not one_pose else "in frames that all lie alike"
+        given = "the distortion, from an earlier calibration say, or to the term itself"
+        return Reason(f"the distortion of a lens does the same {as_they_lie}", given, otherwise)
+    if one_pose:
+        because = "all frames lie alike in the scanner: its bend and the fiducial marks' places are one and the same"
+    elif is_odd and _are_half_turns(poses):
+        because = (
+            "frames turned by 180 degrees tell terms of even degree from the fiducial marks, and none of odd degree"
+        )
+    else:
+        listed = ", ".join(f"{turn}{' mirrored' if mirrored else ''}" for turn, mirrored in poses)
+        because = f"it, or its sum with others, looks the same in all poses in which the frames lie ({listed} degrees)"
+    return Reason(because, given, otherwise)
+
+
+def weak_term_sentences(
+    problem: Problem, state: State, free: Indices, factor: Factor, cofactor: Cofactor
+) -> Iterator[str]:
+    """Sentences on terms that a regular network hardly separates from films, marks and lenses.
+
+    Frames never lie exactly alike, and given fiducial marks have a standard deviation: a deformation is then
+    determined, but weakly. factor: of the free unknowns; cofactor: of all.
+    """
+    unknowns = problem.unknowns
+    places = {int(position): i for i, position in enumerate(free)}
+    for name, positions in unknowns.scanner.items():
+        open_ = [int(position) for position in positions if int(position) in places]
+        ratios = np.sqrt(cofactor.variances[open_]) * factor.scale[[places[position] for position in open_]]
+        hardly = [position for position, ratio in zip(open_, ratios, strict=True) if ratio > HARDLY]
+        if not hardly:
+            continue
+        lens = [int(i) for camera in unknowns.camera.values() for i in camera[3:] if int(i) in places]
+        held = held_variances(cofactor.part(np.array([*hardly, *lens])), len(hardly))
+        scale = factor.scale[[places[position] for position in hardly]]
+        names = [unknowns.parameters[position].quantity for position in hardly]
+        by_lens = [term for term, ratio in zip(names, np.sqrt(held) * scale, strict=True) if ratio <= HARDLY]
+        yield from undetermined_term_sentences(name, names, by_lens, _scanner_poses(problem, state, name))
+
+
+def held_variances(cofactor: Array, count: int) -> Array:
+    """Conditional variances of the first quantities of a cofactor matrix (n, n), given all others."""
+    own, by_others, others = cofactor[:count, :count], cofactor[:count, count:], cofactor[count:, count:]
+    scale = np.sqrt(np.diag(others))
+    reduced = by_others / scale
+    taken = (reduced @ np.linalg.pinv(others / np.outer(scale, scale), hermitian=True) * reduced).sum(axis=1)
+    return np.asarray(np.maximum(np.diag(own) - taken, 0.0))
+
+
+def undetermined_term_sentences(
+    scanner: str, terms: Sequence[str], by_lens: Collection[str], poses: Sequence[Pose]
+) -> Iterator[str]:
+    """Sentences on terms of a scanner's deformation that are not, or hardly, separable from other unknowns.
+
+    by_lens: terms that would be determined if the distortion were known.
+    """
+    by_reason: dict[Reason, list[str]] = {}
+    for term in terms:
+        by_reason.setdefault(term_reason(term, poses, "lens" if term in by_lens else "marks"), []).append(term)
+    for (cause, given, otherwise), alike in by_reason.items():
+        yield (
+            f"The bend of scanner {scanner} is correlated with the other unknowns in its "
+            f"term{'s' * (len(alike) > 1)} {', '.join(alike)}: {cause}. Give a standard deviation to {given}, "
+            f"or {otherwise}."
+        )
+
+
+def _are_half_turns(poses: Sequence[Pose]) -> bool:
+    """Whether all frames are equal to the first up to half turns."""
+    first, mirrored = poses[0]
+    return all(abs((turn - first + 90) % 180 - 90) < ALIKE_DEG and m == mirrored for turn, m in poses)
+
+
+def _scanner_poses(problem: Problem, state: State, scanner: str) -> list[Pose]:
+    gradients = []
+    for films in problem.films:
+        of_films = films.kind.gradient(state.values[films.positions], films.center_mm)
+        own = [problem.network.images[i].scanner == scanner for i in films.images]
+        gradients += [gradient for gradient, is_own in zip(of_films, own, strict=True) if is_own]
+    return scan_poses(gradients)
+
+
+def scan_poses(gradients: Iterable[Array]) -> list[Pose]:
+    """Distinct poses of frames in their scans, from derivatives (2, 2) of camera by comparator coordinates."""
+    poses: list[Pose] = []
+    for gradient in gradients:
+        mirrored = bool(np.linalg.det(gradient) < 0.0)
+        upright = gradient * [1.0, -1.0] if mirrored else gradient
+        turn = np.degrees(np.arctan2(upright[1, 0] - upright[0, 1], upright[0, 0] + upright[1, 1]))
+        pose = round(float(turn)) % 360, mirrored
+        if not any(mirrored == m and abs((pose[0] - t + 180) % 360 - 180) < ALIKE_DEG for t, m in poses):
+            poses.append(pose)
+    return sorted(poses)
+
+
+IN_LINE = 1e-3  # width over length of collinear marks, and base over distance of coincident stations
+SHOWN = 3  # names listed one by one
+
+# Cause and remedy by the kind of the unknown that moves most.
+UNNAMED: Mapping[str, tuple[str, str]] = {
+    "exterior": (
+        "The exterior orientation of image {owner} can change ({quantity} most){followers}: too few known points, or "
+        "rays from other stations, hold it.",
+        "Measure known points in this image, take images from other stations that share its points, or give its "
+        "orientation with standard deviations in images.csv.",
+    ),
+    "point": (
+        "The object point {id} can move ({quantity} most){followers}.",
+        "Measure it in more images, give its coordinates with standard deviations, or leave it out.",
+    ),
+    "fiducial": (
+        "The fiducial mark {id} of camera {owner} can move ({quantity} most){followers}.",
+        "Give it a standard deviation (F5, F6), or measure it in more images.",
+    ),
+    "film": (
+        "The film transformation of image {owner} can change ({quantity} most){followers}.",
+        "Measure more fiducial marks in this image, or choose a transformation with fewer parameters.",
+    ),
+    "join": (
+        "Point {id}, which joins the scans of frame {owner}, can move ({quantity} most){followers}.",
+        "Measure more points that both scans show, spread over their overlap.",
+    ),
+    "scanner": (
+        "The term {quantity} of the bend of scanner {owner} can change{followers}.",
+        "Give {quantity} a standard deviation, or leave it out.",
+    ),
+    "board": (
+        "The {quantity} of board {owner} can change{followers}: no image sees the board at a slant.",
+        "Take images that are tilted against the board, or give its bend a standard deviation.",
+    ),
+    "interior": (
+        "The quantity {quantity} of camera {owner} can change{followers}.",
+        "Give {quantity} a standard deviation, or fix it.",
+    ),
+}
+
+
+def unnamed_sentence(most: Parameter, followers: str) -> tuple[str, str]:
+    """Cause and remedy of an unnamed direction, by the unknown that moves most."""
+    words = most._asdict() | {"followers": followers}
+    cause, remedy = UNNAMED[most.kind]
+    return cause.format(**words), remedy.format(**words)
+
+
+def many_sentence(count: int, followers: str) -> tuple[str, str]:
+    """Cause and remedy of many unnamed directions."""
+    return (
+        f"The network can drift and bend in {count} ways{followers}: what is known of the object is too little for it, "
+        "or too far apart.",
+        "Measure known points all over the network, those of a long strip every few images, or give stations with "
+        "standard deviations in images.csv. The standard deviations tell how far it may have drifted.",
+    )
+
+
+def own_sentence(problem: Problem, state: State, parameter: Parameter) -> tuple[str, str]:
+    """Cause and remedy of an undetermined image or point; parameter: one of its unknowns."""
+    if parameter.kind == "point":
+        return _point_sentence(problem, state, parameter.id)
+    parts = _parts(problem, parameter.owner)
+    return _parts_sentence(problem, parts) if parts else _image_sentence(problem, parameter.owner)
+
+
+def _parts(problem: Problem, frame: str) -> list[Image]:
+    """Scans of a frame that was scanned in parts; frame: its name or that of one of its scans."""
+    image = problem.network.image_by_name.get(frame)
+    frame = image.part_of if image is not None else frame
+    return [image for image in problem.network.images if image.part_of and image.part_of == frame]
+
+
+def _parts_sentence(problem: Problem, parts: Sequence[Image]) -> tuple[str, str]:
+    common = sum(frame == parts[0].part_of for frame, _ in problem.network.joins)
+    return (
+        f"The marks of frame {parts[0].part_of} do not determine its orientation and the transformations of its scans "
+        f"{_listed([part.name for part in parts])}, which {common} points join.",
+        "Measure more fiducial marks and more common points, spread over what the scans have in common, choose a "
+        "transformation with fewer parameters, or leave the frame out.",
+    )
+
+
+def _point_sentence(problem: Problem, state: State, point: str) -> tuple[str, str]:
+    position = problem.unknowns.point[point][0]
+    numbers = problem.image_numbers[(problem.places[:, 0] == position) & ~problem.is_fiducial]
+    images = _listed([problem.network.images[i].name for i in numbers])
+    stations = state.values[problem.exterior[numbers, :3]]
+    distances = np.linalg.norm(stations - state.values[problem.unknowns.point[point]], axis=1)
+    apart = np.linalg.norm(stations - stations[0], axis=1).max()
+    where = "from another station"
+    if len(numbers) == 1:
+        cause = f"Only image {images} shows point {point}: one ray does not tell where on it the point lies."
+    elif apart <= IN_LINE * distances.max():
+        cause = f"The images that show point {point} ({images}) were taken from one station: their rays are one ray."
+    else:
+        cause = (
+            f"Point {point} lies in line with the stations of the images that show it ({images}): their rays are one "
+            "ray."
+        )
+        where = "from a station off that line"
+    return cause, f"Measure it in an image {where}, give its coordinates, or leave it out."
+
+
+def _image_sentence(problem: Problem, image: str) -> tuple[str, str]:
+    xy_mm = problem.network.observations.xy_mm
+    own = np.array(problem.network.observations.image) == image
+    why = [
+        f"all its {what} lie on one line"
+        for what, rows in (("targets", own & ~problem.is_fiducial), ("fiducial marks", own & problem.is_fiducial))
+        if rows.any() and _are_collinear(xy_mm[rows])
+    ]
+    cause = f"The marks of image {image} do not determine its own orientation and transformation"
+    where = "off that line" if why else "spread over the frame"
+    return (
+        f"{cause}{': ' if why else ''}{' and '.join(why)}.",
+        f"Measure more marks in this image, {where}, give its orientation in images.csv, or leave the image out.",
+    )
+
+
+def _are_collinear(xy_mm: Array) -> bool:
+    extents = np.linalg.svd(xy_mm - xy_mm.mean(axis=0), compute_uv=False)
+    return len(extents) < 2 or bool(extents[-1] <= IN_LINE * extents[0])
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = len(names) - SHOWN
+    return ", ".join(names[:SHOWN]) + (f" and {more} more" if more > 0 else "")
