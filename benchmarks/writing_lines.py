@@ -16,8 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.annotations.detect_text import MISSING, networks
-from measure.annotations.read import read_writing
+from measure.annotations.text import MISSING, networks, read_writing
 from measure.geometry import POSES, pose_in_camera
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS

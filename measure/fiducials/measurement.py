@@ -5,9 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from measure.annotations.detect_text import networks
 from measure.annotations.fields import KnownLine, Line
-from measure.annotations.read import read_writing
+from measure.annotations.text import networks, read_writing
 from measure.array_types import Array
 from measure.fiducials.clicked_frame import clicked_frame, contradicted_pose, is_shown, place_clicked_marks
 from measure.fiducials.constellation import Placement

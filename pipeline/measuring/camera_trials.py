@@ -12,8 +12,7 @@ from scipy.spatial.distance import cdist
 
 from adjust.functional_model.transformation import film_kind
 from adjust.initial_values.fiducial_fit import fit_transformation
-from measure.annotations.detect_text import networks
-from measure.annotations.read import read_writing
+from measure.annotations.text import networks, read_writing
 from measure.fiducials.camera_recognition import Answer, likeness, recognise_frame, search_camera
 from measure.fiducials.frame import Frame
 from measure.fiducials.options import FiducialOptions

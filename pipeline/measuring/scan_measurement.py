@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from measure.annotations.detect_text import MISSING, networks
+from measure.annotations.text import MISSING, networks
 from measure.errors import MeasurementError, MissingError, TooLargeError, UnreachableError
 from measure.fiducials.frame_checks import pitch_problem, with_damage
 from measure.fiducials.measurement import measure_fiducials, second_frame

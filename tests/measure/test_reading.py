@@ -8,10 +8,9 @@ import pytest
 from brute_marks import Array, written_scan
 from studies import parametrize_with_studies
 
-from measure.annotations import detect_text as networks_module
-from measure.annotations.detect_text import Networks, networks
+from measure.annotations import text as networks_module
 from measure.annotations.fields import Line
-from measure.annotations.read import read_writing
+from measure.annotations.text import Networks, networks, read_writing
 
 SIZE_PX = 640
 TITLE, PLATE = "RUN 20 CST 7300", "Nr 13043"

@@ -9,7 +9,7 @@ import pytest
 from kept_scans import keep_scans
 from rich.console import Console
 
-from measure.annotations import detect_text as networks_module
+from measure.annotations import text as networks_module
 from measure.annotations.fields import Line, Reading
 from measure.annotations.orientation_from_text import side_in_camera, writing_likelihoods
 from measure.fiducials.options import FiducialOptions, Reads
