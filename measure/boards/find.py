@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from measure.boards.lattice import find_squares
 from measure.boards.markers import find_aruco, find_charuco, read_any_markers
-from measure.boards.saddle_points import largest_lattice, saddle_strength
 from measure.boards.specs import (
     ArucoSpec,
     CharucoSpec,
@@ -37,7 +36,6 @@ _SMOOTHED_PX = 10.0  # px, side from which on squares are sampled as means of 3 
 _MOST_LINES = 500  # limit of the lines of a board along a side
 _THOROUGHLY = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 _DRAWINGS = 3  # random seeds tried for a second board: one in twenty missed one at the edge
-_CROSSINGS_SEEN = 0.8  # fraction of the crossings of a second board that must be visible before it is searched
 _INTO_BORDER = 1.4  # in squares beyond the last crossings, where the light border is sampled
 _LIGHT_BORDER = 0.4  # fraction of the contrast by which the border may be darker than the light squares
 _MOST = 0.85  # fraction of the places along a line
@@ -322,18 +320,12 @@ def _drawn_chessboard_grid(picture: Bytes, spec: ChessboardSpec, flags: int, dra
 
 def _other_chessboards(picture: Bytes, grid: Array, spec: ChessboardSpec) -> tuple[Array, ...]:
     """Centres of further chessboards; each is painted over before the next one is searched."""
-    strength = saddle_strength(picture)
-    columns, rows = np.clip(np.round(grid).astype(int), 0, np.array(picture.shape)[::-1] - 1).reshape(-1, 2).T
-    known_strength = float(np.median(strength[rows, columns]))
-    crossings = spec.columns * spec.rows - 4  # connected crossings of a board: all but its corners
     picture, background = picture.copy(), int(np.median(picture[::4, ::4]))
     others: list[Array] = []
     while True:
-        outline = np.round(_outline(grid)).astype(np.int32)
-        cv2.fillConvexPoly(strength, outline, 0.0)
-        if largest_lattice(picture, strength, known_strength) < _CROSSINGS_SEEN * crossings:  # searching takes long
+        cv2.fillConvexPoly(picture, np.round(_outline(grid)).astype(np.int32), background)
+        if not cv2.checkChessboard(picture, (spec.columns, spec.rows)):  # searching in vain takes long
             return tuple(others)
-        cv2.fillConvexPoly(picture, outline, background)
         other = _drawn_chessboard_grid(picture, spec, _THOROUGHLY, _DRAWINGS)
         if other is None:
             return tuple(others)

@@ -30,7 +30,6 @@ from studies import parametrize_with_studies
 from measure.boards.corners import one_definition
 from measure.boards.find import is_even, whole_pattern
 from measure.boards.measure import measure_board
-from measure.boards.saddle_points import largest_lattice, saddle_strength
 from measure.boards.specs import (
     AprilGridSpec,
     ArucoSpec,
@@ -61,20 +60,6 @@ def test_a_chessboard_in_any_direction_keeps_its_names(turn_deg: float) -> None:
     assert np.sqrt(np.mean(errors**2)) < 0.012
 
 
-def test_crossings_side_by_side_are_distinguished_from_a_texture() -> None:
-    """All of a board but its four corners hang together, fainter and beside a texture too; of texture hardly any."""
-    spec = ChessboardSpec(6, 5, 24.0)
-    grey = take_picture(spec, board_from_pixel(), chessboard_dark(spec)) / 256.0
-    grains = np.random.default_rng(3).normal(0.0, 60.0, (HEIGHT, WIDTH))
-    texture = 128.0 + 60.0 / 0.14 * (cv2.GaussianBlur(grains, (0, 0), 2.0) / 60.0)
-    both = np.hstack([100.0 + 0.3 * grey, texture])
-    board, noise = (np.clip(each, 0, 255).astype(np.uint8) for each in (both, texture))
-    strength = float(np.percentile(saddle_strength(np.clip(grey, 0, 255).astype(np.uint8)), 99.9))
-    assert 26 <= largest_lattice(board, saddle_strength(board), strength) <= 30
-    assert largest_lattice(noise, saddle_strength(noise), strength) < 0.5 * 26
-
-
-@pytest.mark.study
 def test_trap_half_a_pixel_lost() -> None:
     """The mean error of a whole board is a few thousandths of a pixel, at full size and searched at a reduced one."""
     spec = ChessboardSpec(6, 5, 24.0)
