@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from drawn import drawn, scan_of
 from drawn_boards import (
-    HEIGHT,
-    WIDTH,
     board_from_pixel,
     chessboard_dark,
     circles_dark,
