@@ -22,8 +22,7 @@ from scipy.optimize import brentq
 from scipy.special import chdtri, fdtrc, logsumexp
 
 from measure.array_types import Array
-from measure.fiducials.film_model import film_terms, interleaved
-from measure.fiducials.options import AFFINITY_SIGMA, MOST_BENT_MM, SCATTER_DEGREES, SCATTER_MM
+from measure.fiducials.options import AFFINITY_SIGMA, MOST_BENT_MM, SCATTER_DEGREES, SCATTER_MM, film_terms, interleaved
 from measure.flags import FALSE_DOUBT
 
 NAMED = float(np.log(100.0))  # log-odds above which one cause is accepted against all others

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from measure.array_types import Array
-from measure.fiducials.film_model import film_terms
-from measure.fiducials.options import AFFINITY_SIGMA
+from measure.fiducials.options import AFFINITY_SIGMA, film_terms
 
 _LINEAR = [0, 1, 4, 5]  # indices of the unknowns of the affine model without the shift
 _FREE = 0.03  # fraction of the frame's radius: prior standard deviation of free stretch, shear and film terms

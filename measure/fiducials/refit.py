@@ -9,7 +9,6 @@ import numpy as np
 
 from measure.array_types import Array
 from measure.fiducials.constellation import Placement
-from measure.fiducials.film_model import film_terms, interleaved
 from measure.fiducials.frame import CLEAR_LIKENESS, WRONG_PX, Frame, orient_frame
 from measure.fiducials.mark_comparison import (
     SharedBlur,
@@ -22,6 +21,7 @@ from measure.fiducials.mark_comparison import (
     unlike_others,
 )
 from measure.fiducials.mark_fit import detect_mark, is_held_by_frame, strain_error_px
+from measure.fiducials.options import film_terms, interleaved
 from measure.flags import LARGE_ERROR, Cause
 from measure.geometry import linear_scale
 from measure.marks.rendering import extent_px, reach_px

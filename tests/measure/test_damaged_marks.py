@@ -16,7 +16,7 @@ from damaged_files import DAMAGES, measure_file, outcome, stored
 from numpy.typing import NDArray
 
 from measure.errors import MeasurementError
-from measure.fiducials.frame_checks import with_damage
+from measure.fiducials.rows import with_damage
 from measure.flags import Status
 from measure.scans.opening import open_scan
 

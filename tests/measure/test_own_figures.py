@@ -11,8 +11,7 @@ from drawn_frames import frame_picture, layout_of, measured, pixel_from_camera
 from numpy.typing import NDArray
 
 from measure.fiducials.across_frames import check_frames
-from measure.fiducials.mark_comparison import unlike_blur, unlike_others
-from measure.fiducials.own_figures import OwnFigure, check_own_figures
+from measure.fiducials.mark_comparison import OwnFigure, check_own_figures, unlike_blur, unlike_others
 from measure.flags import Cause, Code, Reason, Status
 from measure.marks.shapes import Bar, MarkShape, cross
 from measure.matching.arms import measure_arms

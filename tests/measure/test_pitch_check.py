@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from measure.fiducials.frame_checks import pitch_problem
+from measure.fiducials.rows import pitch_problem
 from measure.flags import Status
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, dot
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement

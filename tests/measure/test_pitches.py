@@ -20,10 +20,10 @@ from drawn_frames import (
 from scipy.ndimage import gaussian_filter
 
 from measure.fiducials.constellation import NARROW, Placement
-from measure.fiducials.frame_checks import pitch_problem
 from measure.fiducials.measure_frame import measure_frame
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
+from measure.fiducials.rows import pitch_problem
 from measure.fiducials.search import PitchHypothesis, slightly_longer
 from measure.fiducials.stages import _pitch_to_try
 from measure.marks.shapes import MarkShape
