@@ -30,8 +30,7 @@ from adjust.initial_values.fiducial_fit import fit_transformation
 from benchmarks.measured_marks import CONTRAST, GROUND, draw_mark, measure_mark, start_off
 from measure.boards.corners import junctions
 from measure.fiducials.consistency import FrameMarks, Scatter, gross_errors
-from measure.noise.damage import _opened
-from measure.noise.robust_estimation import robust_scale
+from measure.noise.robust_estimation import _opened, robust_scale
 from measure.targets.disk_detection import DiskSearch, disk_candidates
 
 Array = NDArray[np.float64]

@@ -16,7 +16,7 @@ from .marks.shapes import polygon as polygon
 from .marks.shapes import ring_cross as ring_cross
 from .marks.shapes import ring_dot as ring_dot
 from .matching.match import match as match
-from .matching.options import MatchOptions as MatchOptions
+from .matching.models import MatchOptions as MatchOptions
 from .matching.window import ScanWindow as ScanWindow
 from .matching.window import read_window as read_window
 from .results import FrameMeasurement as FrameMeasurement

@@ -10,9 +10,8 @@ from scipy import fft
 from scipy.special import ndtr
 
 from measure.array_types import Array, Single
-from measure.detection.correlation import WIDE, Surroundings, correlation
+from measure.detection.correlation import WIDE, Surroundings, correlation, highest_about
 from measure.detection.mark_views import detail_px
-from measure.detection.peaks import highest_about
 from measure.flags import NOISE_LIKE_A_MARK
 from measure.marks.rendering import extent_px, known_picture
 from measure.marks.shapes import Mark

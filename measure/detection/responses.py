@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.array_types import Array, Mask
-from measure.detection.correlation import WIDE, Map, Surroundings, correlation, variation
+from measure.detection.correlation import WIDE, Map, Surroundings, correlation, highest_about, local_maxima, variation
 from measure.detection.mark_views import MarkView, distinct_templates, ground_detail_px, search_reduction
-from measure.detection.peaks import highest_about, local_maxima
 from measure.matching.window import FAINT
 from measure.scans.parallel import map_in_threads
 from measure.scans.scan import SINGLE_CHANNELS, Scan

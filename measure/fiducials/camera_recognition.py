@@ -19,7 +19,7 @@ from measure.fiducials.options import FiducialOptions
 from measure.fiducials.search import FrameSearch, PitchHypothesis
 from measure.flags import CAMERA_BY_CHANCE, CAMERA_BY_NOISE
 from measure.marks.shapes import FiducialLayout
-from measure.matching.options import MatchOptions
+from measure.matching.models import MatchOptions
 from measure.results import MarkFit
 from measure.scans.scan import Scan
 

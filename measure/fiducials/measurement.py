@@ -20,8 +20,7 @@ from measure.fiducials.significance import doubt_frame
 from measure.fiducials.stages import find_frame, likeliest_pose
 from measure.flags import FRAMES_BY_CHANCE, NO_REASON, Code, Reason, Status
 from measure.geometry import up_from_camera
-from measure.marks.frame_border import limit_to_crossings, limit_to_frame
-from measure.marks.shapes import FiducialLayout
+from measure.marks.shapes import FiducialLayout, limit_to_crossings, limit_to_frame
 from measure.results import FrameMeasurement, Pose
 from measure.scans.opening import crop_scan
 from measure.scans.remote import Window

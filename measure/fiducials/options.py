@@ -9,7 +9,7 @@ from measure.annotations.fields import KnownLine
 from measure.array_types import Array
 from measure.geometry import POSES
 from measure.marks.shapes import FiducialLayout
-from measure.matching.options import MatchOptions
+from measure.matching.models import MatchOptions
 
 SCATTER_MM = 0.005  # mm, scatter of a mark along an axis by default; a project may state film_sigma_um
 AFFINITY_SIGMA = 5e-3  # relative stretch: a few parts in ten thousand by film, several thousandths by an office scanner

@@ -29,8 +29,7 @@ from measure.marks.shapes import Disk, FiducialLayout, FrameCorner, LayoutMark, 
 from measure.matching.arms import is_cross, measure_arms
 from measure.matching.frame_edge import Course, edge_along, pool_edge_tones
 from measure.matching.match import mark_window
-from measure.matching.models import PIXEL_VARIANCE_PX2, is_round
-from measure.matching.options import MatchOptions
+from measure.matching.models import PIXEL_VARIANCE_PX2, MatchOptions, is_round
 from measure.matching.window import read_window
 from measure.noise.noise_model import may_be_noise
 from measure.results import MarkFit

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.array_types import Array, Single
-from measure.marks.shapes import Bar, Disk, MarkShape, Part, Polygon, Ring
+from measure.marks.shapes import Bar, Disk, MarkShape, Part, Polygon, Ring, outline_mm
 
 Integers = NDArray[np.intp]
 
@@ -42,19 +42,6 @@ def cell_coverage(shape: MarkShape, pixel_from_mark: Array, width: int, height: 
     for pieces in _outline_pieces(shape, cell_from_mark):
         _add(covered, pieces)
     return covered
-
-
-def outline_mm(part: Part) -> Array:
-    """(n, 2) corners of a convex region that contains the part."""
-    if isinstance(part, Polygon):
-        return np.asarray(part.vertices_mm, dtype=float)
-    if isinstance(part, Bar):
-        start, end = np.asarray(part.from_mm), np.asarray(part.to_mm)
-        along = (end - start) / np.hypot(*(end - start))
-        side = np.array([-along[1], along[0]]) * part.line_mm / 2
-        return np.stack([start - side, start + side, end + side, end - side])
-    reach = part.radius_mm + (part.line_mm / 2 if isinstance(part, Ring) else 0.0)
-    return np.asarray(part.center_mm) + reach * np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0], [1.0, -1.0]])
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from measure.array_types import Array, Mask, Single
 from measure.geometry import Affine, linear_scale
 from measure.marks.coverage import CELLS, cell_coverage
-from measure.marks.frame_border import drawn_outline_mm, known_outline_mm
-from measure.marks.shapes import Mark, MarkShape, MarkTemplate
+from measure.marks.shapes import Mark, MarkShape, MarkTemplate, drawn_outline_mm, known_outline_mm
 
 Integers = NDArray[np.int_]
 

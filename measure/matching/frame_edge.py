@@ -25,8 +25,7 @@ from measure.noise.robust_estimation import gauss_newton_step, tukey_fit
 from measure.results import Covariance, MarkFit
 from measure.scans.scan import Scan
 from measure.tone.curve import Tone, ToneInformation
-from measure.tone.estimate import MarkTone
-from measure.tone.score import ToneScore, tone_score
+from measure.tone.estimate import MarkTone, ToneScore, tone_score
 
 PROFILES = 60  # profiles along an edge, each the median over its section
 _LEAST_SHARE = 0.5  # fraction of the profiles that must lie on the line; with fewer it may be a different line

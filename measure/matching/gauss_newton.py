@@ -11,11 +11,9 @@ from measure.flags import NO_REASON, Code, Reason
 from measure.marks.rendering import chip_mask, picture, true_mask
 from measure.marks.shapes import MarkTemplate
 from measure.matching.models import BENT, GREY, ROUGHLY_BENT, ROUNDING_DN, PictureModel, State
-from measure.matching.saturation import noise_scale
-from measure.matching.window import ScanWindow
-from measure.noise.damage import damage, grown
+from measure.matching.window import ScanWindow, noise_scale
 from measure.noise.noise_model import NoiseModel, combined, correlated, may_be_noise, products, steadiness, weighted
-from measure.noise.robust_estimation import robust_scale, solution, tukey_loss, tukey_weights
+from measure.noise.robust_estimation import damage, grown, robust_scale, solution, tukey_loss, tukey_weights
 
 UNSETTLED = Reason("the adjustment did not converge", Code.NO_FIT)
 UNDETERMINED = Reason("the picture does not determine the mark's place", Code.NO_FIT)

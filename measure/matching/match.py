@@ -25,15 +25,13 @@ from measure.matching.covariance import (
     sloping_place,
 )
 from measure.matching.gauss_newton import EDGE_BLURS, PictureFit
-from measure.matching.models import GREY, PictureModel, background_px, is_round
-from measure.matching.options import MatchOptions
-from measure.matching.saturation import clear_of_ends
+from measure.matching.models import GREY, MatchOptions, PictureModel, background_px, is_round
 from measure.matching.tone_information import (
     mark_tone_information,
     sharpening_score,
     tone_without_information,
 )
-from measure.matching.window import ScanWindow
+from measure.matching.window import ScanWindow, clear_of_ends
 from measure.noise.grain import blank_patches, grain_model, is_coloured
 from measure.noise.noise_model import NoiseModel, as_if_white, combined, factors, is_textured, products
 from measure.results import Covariance, MarkFit

@@ -1,6 +1,8 @@
 """Functional model of a window with a mark: `gain * picture(mark) + offset + slopes`, its state and derivatives."""
 
 from dataclasses import dataclass
+from math import inf
+from typing import Literal, get_args
 
 import cv2
 import numpy as np
@@ -11,10 +13,11 @@ from measure.flags import NO_REASON, Code, Reason
 from measure.geometry import linear_scale
 from measure.marks.rendering import Rendering, chip_steadiness, reach_px, render
 from measure.marks.shapes import Disk, Mark, MarkTemplate, Ring, thinnest_mm
-from measure.matching.options import Freedom, MatchOptions
-from measure.matching.saturation import censored, tells
-from measure.matching.window import ScanWindow
+from measure.matching.window import ScanWindow, censored, tells
 from measure.noise.noise_model import combined, factors
+
+Freedom = Literal["shift", "similarity", "affine", "ellipse"]
+FREEDOMS: tuple[Freedom, ...] = get_args(Freedom)
 
 # Changes of the mark's linear part L: (I + e G) L. Each generator G has two entries of absolute value 1.
 _GENERATORS = {
@@ -41,6 +44,56 @@ _LONGEST_SHIFT_PX, _LONGEST_CHANGE = 1.5, 0.1  # px and linear part: longest ste
 _MOST_BLURRED = 2.0  # largest factor of the blur in one step
 _LINEAR = 0.015  # in blurs: displacement up to which the design matrix is kept, exact to 1e-4 of the blur
 _CHIP_SMOOTHED_PX = 0.7  # px, smoothing of chip and window: edges as sharp as a pixel are undersampled in both
+
+
+@dataclass(frozen=True)
+class MatchOptions:
+    """Options of least-squares matching.
+
+    Attributes
+    ----------
+    freedom : parameters estimated in addition to the shift; "ellipse" is an affinity without rotation, for disks.
+    blur_px : standard deviation of the scan's blur; its initial value if estimate_blur is set.
+    blur_sigma : prior standard deviation of the logarithm of the blur, pixel included, as known from other marks.
+    estimate_blur : whether the blur is an unknown.
+    linear_sigma : prior standard deviation of rotation (rad) and scale, as known from other marks. The default only
+        regularises what the image does not determine.
+    strain_sigma : prior standard deviation of stretch and shear, likewise.
+    margin_px : grey values are used up to this distance around the mark.
+    margin_blurs : the margin in standard deviations of the blur, used where it is larger.
+    plain_px : distance beyond which grey values must not vary much more than the nearer ones, else the match fails.
+    damage_rounds : rounds of detecting and masking damage and readjusting; 0: damage stays in.
+    max_shift_px : largest distance from the initial place.
+    tells_sharpening : estimate sharpening even if the scan is not known to be sharpened.
+
+    Raises
+    ------
+    ValueError
+        Names the option whose value is invalid.
+    """
+
+    freedom: Freedom = "similarity"
+    blur_px: float = 0.8
+    blur_sigma: float = inf
+    estimate_blur: bool = True
+    linear_sigma: float = 0.3
+    strain_sigma: float = 0.3
+    margin_px: float = 6.0
+    margin_blurs: float = 4.0
+    plain_px: float = inf
+    damage_rounds: int = 3
+    max_shift_px: float = 8.0
+    tells_sharpening: bool = False
+
+    def __post_init__(self) -> None:
+        if self.freedom not in FREEDOMS:
+            raise ValueError(f"freedom is {self.freedom!r}; one of {', '.join(FREEDOMS)} is right")
+        for name in ("blur_px", "blur_sigma", "linear_sigma", "strain_sigma", "margin_px", "plain_px", "max_shift_px"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} is {getattr(self, name)}; a positive number is right")
+        for name in ("margin_blurs", "damage_rounds"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} is {getattr(self, name)}; 0 or more is right")
 
 
 def is_round(mark: Mark) -> bool:
@@ -175,7 +228,7 @@ class PictureModel:
         self._linearised = self.state, self.residuals
 
     def _censor(self) -> None:
-        """Replace the residuals of clipped grey values by deviance residuals (see `saturation`)."""
+        """Replace the residuals of clipped grey values by deviance residuals (see `censored`)."""
         if not self.is_clipped:
             return
         clipped = self.clipped != 0

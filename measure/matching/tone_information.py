@@ -10,8 +10,7 @@ from measure.matching.models import GREY
 from measure.matching.window import Coding
 from measure.noise.noise_model import combined, products
 from measure.tone.curve import Tone, ToneInformation
-from measure.tone.estimate import MarkTone
-from measure.tone.score import ToneScore, tone_score
+from measure.tone.estimate import MarkTone, ToneScore, tone_score
 from measure.tone.sharpening import SharpeningScore
 
 _PIECE_PX = 8  # px, side of the squares compared with one another, equal to the blocks of JPEG

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from measure.detection.peaks import local_maxima
+from measure.detection.correlation import local_maxima
 from measure.flags import NO_REASON, Code, Reason, Status
 from measure.marks.rendering import extent_px, picture
 from measure.marks.shapes import MarkShape, Polarity, cross, thinnest_mm

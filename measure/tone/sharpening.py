@@ -5,7 +5,7 @@ A code c is stored as c + amount (c - G c), where G is a Gaussian of a radius. I
 except where values were clipped. Marks are therefore fitted in light of unsharpened codes.
 
 Undetected sharpening is mistaken for a tone curve, for damage around a mark, and for a blur smaller than any scanner's.
-It is estimated from the edges of marks together with the tone curve, by the same score: see `measure.tone.score`.
+It is estimated from the edges of marks together with the tone curve, by the same score: see `measure.tone.estimate`.
 """
 
 from collections.abc import Sequence

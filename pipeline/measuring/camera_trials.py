@@ -18,8 +18,7 @@ from measure.fiducials.frame import Frame
 from measure.fiducials.options import FiducialOptions
 from measure.fiducials.search import Hypotheses, PitchHypothesis, longer, pitch_hypotheses
 from measure.flags import CAMERA_BY_CHANCE
-from measure.marks.frame_border import limit_to_frame
-from measure.marks.shapes import FiducialLayout, LayoutMark, thinnest_mm
+from measure.marks.shapes import FiducialLayout, LayoutMark, limit_to_frame, thinnest_mm
 from measure.scans.opening import open_scan, thumbnail
 from measure.scans.scan import Scan
 from pipeline.files.camera_file import CameraFile

@@ -14,10 +14,9 @@ from measure.detection.localisation import MarkPrediction
 from measure.fiducials.mark_fit import Detection, detect_mark
 from measure.fiducials.measure_frame import LEAST_LIKENESS
 from measure.geometry import Affine, linear_scale
-from measure.marks.frame_border import limit_to_frame
 from measure.marks.rendering import reach_px
-from measure.marks.shapes import FrameCorner, Mark, MarkShape, Point
-from measure.matching.options import MatchOptions
+from measure.marks.shapes import FrameCorner, Mark, MarkShape, Point, limit_to_frame
+from measure.matching.models import MatchOptions
 from measure.scans.scan import Scan
 from pipeline.errors import InputError
 from pipeline.files.mark_table import MARK_TABLES

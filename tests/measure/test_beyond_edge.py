@@ -12,7 +12,7 @@ from measure.fiducials.mark_fit import detect_mark
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.marks.shapes import MarkShape, cross, polygon
-from measure.matching.options import MatchOptions
+from measure.matching.models import MatchOptions
 from measure.matching.window import pixels_beyond_edge
 
 PX_PER_MM = 30.0

@@ -9,7 +9,7 @@ from true_marks import KIND, TrueMark, some_mark, whitened_rms
 from measure.detection.localisation import MarkPrediction
 from measure.fiducials.mark_fit import detect_mark
 from measure.fiducials.options import FiducialOptions
-from measure.matching.saturation import censored, clipped_sides, noise_scale
+from measure.matching.window import censored, clipped_sides, noise_scale
 from measure.results import MarkFit
 
 FULL, CONTRAST = 65535.0, 20000.0

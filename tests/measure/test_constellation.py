@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.detection.peaks import local_maxima
+from measure.detection.correlation import local_maxima
 from measure.detection.responses import ByteCache, Responses
 from measure.fiducials.constellation import Bounds, Placement, PlacementSearch, same_picture
 from measure.geometry import POSES, up_from_camera

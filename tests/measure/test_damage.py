@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from measure.noise.damage import damage
+from measure.noise.robust_estimation import damage
 
 
 def test_damage_lies_about_its_speck_on_all_sides_alike() -> None:

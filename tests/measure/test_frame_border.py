@@ -13,8 +13,15 @@ from studies import parametrize_with_studies
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.flags import Status
-from measure.marks.frame_border import known_outline_mm, limit_to_frame
-from measure.marks.shapes import FiducialLayout, MarkShape, Point, Polygon, turned_part
+from measure.marks.shapes import (
+    FiducialLayout,
+    MarkShape,
+    Point,
+    Polygon,
+    known_outline_mm,
+    limit_to_frame,
+    turned_part,
+)
 
 HALF_MM, WEDGE_MM, SIDES = 8.0, 7.0, ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 PIXEL_FROM_CAMERA = pixel_from_camera("90", turn_rad=0.03)

@@ -6,7 +6,7 @@ from drawn import Array, drawn, transformed
 
 from measure.marks.shapes import MarkShape, Polygon
 from measure.matching.match import match
-from measure.matching.options import MatchOptions
+from measure.matching.models import MatchOptions
 from measure.matching.window import ScanWindow
 from measure.results import MarkFit
 

@@ -9,8 +9,7 @@ from scipy.special import ndtr
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.flags import Status
-from measure.marks.frame_border import known_outline_mm, limit_to_crossings
-from measure.marks.shapes import Bar, Disk, FiducialLayout, LayoutMark, MarkShape
+from measure.marks.shapes import Bar, Disk, FiducialLayout, LayoutMark, MarkShape, known_outline_mm, limit_to_crossings
 from measure.tone.curve import LINEAR
 
 PX_PER_MM, LINE_MM, SIZE_PX, BLUR_PX = 20.0, 0.2, 640, 0.9

@@ -11,7 +11,7 @@ from studies import parametrize_with_studies
 from measure.marks.shapes import Mark, MarkShape, polygon, ring_cross
 from measure.matching.covariance import across_edges
 from measure.matching.match import match
-from measure.matching.options import MatchOptions
+from measure.matching.models import MatchOptions
 from measure.matching.window import ScanWindow
 from measure.results import MarkFit, SecondPlace
 from measure.targets.disks import UNIT_DISK

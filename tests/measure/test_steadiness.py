@@ -7,7 +7,7 @@ from studies import parametrize_with_studies
 from true_marks import KIND, some_mark, whitened_rms
 
 from measure.matching.match import match
-from measure.matching.options import MatchOptions
+from measure.matching.models import MatchOptions
 from measure.matching.window import read_window
 from measure.noise.noise_model import steadiness
 from measure.tone.curve import Tone, power

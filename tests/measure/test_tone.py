@@ -13,14 +13,13 @@ from measure.fiducials.mark_fit import detect_mark, options_for
 from measure.marks.shapes import MarkShape, polygon
 from measure.matching.covariance import Landscape, LinearFit
 from measure.matching.match import match
-from measure.matching.options import MatchOptions
+from measure.matching.models import MatchOptions
 from measure.matching.tone_information import mark_tone_information
 from measure.matching.window import read_window
 from measure.noise.noise_model import NoiseModel
 from measure.results import MarkFit
 from measure.tone.curve import LINEAR, Tone, ToneInformation, power, sampled_curve, srgb
-from measure.tone.estimate import FrameTone, MarkTone
-from measure.tone.score import tone_score
+from measure.tone.estimate import FrameTone, MarkTone, tone_score
 from synthetic_images.tone_curve import coded
 
 FULL = 65535.0
