@@ -7,26 +7,25 @@ that name the new one are in place.
 
 import hashlib
 import json
-import sqlite3
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from measure.flags import Code, Reason
 from measure.results import FrameMeasurement
-from pipeline.archive.results_database import MARKS, Store, places
+from pipeline.archive.results_database import Store, places
 from pipeline.archive.results_integrity import (
-    IS_JUDGING_SOUND,
+    FRAMES_DIGEST,
+    MARKS,
     DamagedError,
     check_judging,
     check_judgings,
+    checked_marks_digest,
     damaged_judging,
     is_sound,
-    marks_digest,
-    seal,
-    seal_judging,
+    row_digest,
 )
 from pipeline.archive.verdicts import scan_verdict
 from pipeline.provenance import hash_file
@@ -121,61 +120,37 @@ def judge_lots(store: Store, made_from: Mapping[str, str], input_hash: str, lots
     digest = hasher.hexdigest()
     with store.writing():
         db.execute("delete from judging where digest = ?", (digest,))
-        db.execute("update judging set digest = ? where id = ?", (digest, row))
-        seal_judging(db, row)
+        db.execute(f"update judging set digest = ?, frames_digest = {FRAMES_DIGEST} where id = ?", (digest, row))
     return digest
 
 
 def _copy_lot(store: Store, judging: int, number: int, lot: Lot) -> str:
-    """Copy a lot from an earlier judging with the same input and return the hash of its content; "" if there is
+    """Copy a sound lot from an earlier judging with the same input and return the hash of its content; "" if there is
     none."""
-    if not lot.input:
-        return ""
-    db = store.connection
+    db, of_lot = store.connection, "from judged_frame where judging = ? and lot = ?"
     found = db.execute(
         "select judging, lot, output from judged_lot join judging on judging.id = judging "
         f"where judged_lot.input = ? and not {_UNFINISHED} order by judging desc limit 1",
         (lot.input,),
     ).fetchone()
-    if found is None:
+    if not lot.input or found is None:
         return ""
     before, old, output = found
-    if not _is_lot_sound(db, before, old):
+    is_whole = f"{is_sound('judged_frame')} and (not own_marks or marks_digest is {checked_marks_digest()})"
+    if db.execute(f"select exists (select 1 {of_lot} and not ({is_whole}))", (before, old)).fetchone()[0]:
         return ""
     frame = "scan, result, name, verdict, own_marks, detail, decisions, marks_digest"
     with store.writing():
         db.execute(
-            f"insert into judged_frame (judging, lot, {frame}) select ?, ?, {frame} from judged_frame "
-            "where judging = ? and lot = ?",
+            f"insert into judged_frame (judging, lot, {frame}) select ?, ?, {frame} {of_lot}",
             (judging, number, before, old),
         )
-        db.execute(f"{seal('judged_frame')} where judging = ? and lot = ?", (judging, number))
         db.execute(
             f"insert into judged (judging, result, number, {MARKS}) select ?, result, number, {MARKS} "
-            "from judged where judging = ? and result in "
-            "(select result from judged_frame where judging = ? and lot = ? and own_marks)",
+            f"from judged where judging = ? and result in (select result {of_lot} and own_marks)",
             (judging, before, before, old),
         )
     return str(output)
-
-
-def _is_lot_sound(db: sqlite3.Connection, judging: int, lot: int) -> bool:
-    """Whether the digests of the lot's frames and of their own marks are correct."""
-    rows = db.execute(
-        f"select result, own_marks, marks_digest, {is_sound('judged_frame')} from judged_frame "
-        "where judging = ? and lot = ?",
-        (judging, lot),
-    ).fetchall()
-    return all(
-        is_whole and (not own_marks or marks_digest(_own_marks(db, judging, result)) == digest)
-        for result, own_marks, digest, is_whole in rows
-    )
-
-
-def _own_marks(db: sqlite3.Connection, judging: int, result: int) -> list[tuple[Any, ...]]:
-    """Rows of a frame's marks that the checks have stored because they differ from the measured ones."""
-    query = f"select number, {MARKS} from judged where judging = ? and result = ? order by number"
-    return db.execute(query, (judging, result)).fetchall()
 
 
 def _write_lot(store: Store, judging: int, number: int, frames: Iterable[CheckedResult]) -> str:
@@ -196,7 +171,7 @@ def drop_all_but(store: Store, digest: str) -> None:
 
 def find_judging(store: Store, digest: str) -> Judging | None:
     """Judging with that digest, None if there is none. Raises DamagedError where its row is damaged."""
-    query = f"select {IS_JUDGING_SOUND}, id, digest, made_from, input from judging where digest = ?"
+    query = f"select {is_sound('judging')}, id, digest, made_from, input from judging where digest = ?"
     found = store.connection.execute(query, (digest,)).fetchone()
     if found is None:
         return None
@@ -234,6 +209,42 @@ def latest(store: Store) -> Judging | None:
     return judging
 
 
+class CheckedFrame(NamedTuple):
+    """Frame of a judging as stored.
+
+    Attributes
+    ----------
+    measured, changed : JSON of the raw result, and of what the checks changed.
+    rows : marks after the checks.
+    is_sound : whether all of it matches its digests.
+    """
+
+    name: str
+    uri: str
+    measured: str
+    changed: str | None
+    rows: list[Sequence[Any]]
+    is_sound: bool
+
+
+def _frames(store: Store, judging: Judging, images: Collection[str] | None) -> Iterator[CheckedFrame]:
+    """Yield frames sorted by name. images: only these; None for all, after a check that none is missing."""
+    db = store.connection
+    if images is None:
+        check_judging(db, judging.row, store.path)
+    wanted = "" if images is None else "and name in (select value from json_each(?))"
+    frames = db.execute(
+        "select name, uri, measured, changed, scan, marks_digest, is_sound from checked_frame "
+        f"where judging = ? {wanted} order by name",
+        (judging.row, *([] if images is None else [json.dumps(sorted(images))])),
+    )
+    marks = f"select number, {MARKS} from checked_mark where judging = ? and scan = ? order by number"
+    for name, uri, measured, changed, scan, digest, is_whole in frames:
+        rows = db.execute(marks, (judging.row, scan)).fetchall()
+        is_whole = bool(is_whole) and row_digest(*rows) == digest
+        yield CheckedFrame(name, uri, measured, changed, [row[1:] for row in rows], is_whole)
+
+
 def checked_scans(
     store: Store, judging: Judging, folder: Path, images: Collection[str] | None = None
 ) -> Iterator[MeasuredScan]:
@@ -249,27 +260,15 @@ def checked_scans(
     DamagedError
         The list of frames is damaged.
     """
-    db = store.connection
-    if images is None:
-        check_judging(db, judging.row, store.path)
-    wanted = "" if images is None else "and f.name in (select value from json_each(?))"
-    frames = db.execute(
-        f"select f.name, f.result, own_marks, f.detail, uri, f.marks_digest, {is_sound('judged_frame', 'f')} and "
-        f"{is_sound('scan')} from judged_frame f left join scan on scan.id = f.scan where judging = ? {wanted} "
-        "order by f.name",
-        (judging.row, *([] if images is None else [json.dumps(sorted(images))])),
-    )
-    for name, result, own_marks, changed, uri, digest, is_whole in frames:
-        own = _own_marks(db, judging.row, result) if own_marks else []
+    for one in _frames(store, judging, images):
         try:
-            if not is_whole or (own_marks and marks_digest(own) != digest):
-                raise DamagedError.from_image(name, store.path)
-            detail = json.loads(store.detail(result)) | (json.loads(changed) if changed else {})
-            rows = [row for _, *row in own] if own_marks else store.mark_rows(result)
-            yield read_scan(name, detail, list(map(read_mark_row, rows)), scan_location(uri, folder))
-        except (DamagedError, ValueError, TypeError, KeyError):
-            sentence = str(DamagedError.from_image(name, store.path))
-            frame = FrameMeasurement(name, (), problems=(Reason(sentence, Code.FAILED_SCAN),))
+            if not one.is_sound:
+                raise ValueError
+            detail = json.loads(one.measured) | json.loads(one.changed or "{}")
+            yield read_scan(one.name, detail, list(map(read_mark_row, one.rows)), scan_location(one.uri, folder))
+        except (ValueError, TypeError, KeyError):
+            sentence = str(DamagedError.from_image(one.name, store.path))
+            frame = FrameMeasurement(one.name, (), problems=(Reason(sentence, Code.FAILED_SCAN),))
             yield MeasuredScan.failed("", frame, Failure(FailureCode.DAMAGED, sentence))
 
 
@@ -292,24 +291,12 @@ def checked_marks(store: Store, judging: Judging, images: Collection[str] | None
 
     images: only these; None for all. Raises DamagedError where a frame is damaged.
     """
-    db = store.connection
-    check_judging(db, judging.row, store.path)
-    as_measured = f"select number, {MARKS} from mark where result = ? order by number"
-    frames = db.execute(
-        "select f.name, f.result, own_marks, case when own_marks then f.marks_digest else result.marks_digest end, "
-        f"{is_sound('judged_frame', 'f')} and {is_sound('result')} from judged_frame f "
-        "left join result on result.id = f.result where judging = ? order by f.name",
-        (judging.row,),
-    )
-    for name, result, own_marks, digest, is_whole in frames:
-        if images is not None and name not in images:
-            continue
-        rows = _own_marks(db, judging.row, result) if own_marks else db.execute(as_measured, (result,)).fetchall()
-        if not is_whole or marks_digest(rows) != digest:
-            raise DamagedError.from_image(name, store.path)
-        for _, point, kind, col, row, *spread, causes, status, _, reason, _ in rows:
+    for one in _frames(store, judging, images):
+        if not one.is_sound:
+            raise DamagedError.from_image(one.name, store.path)
+        for point, kind, col, row, *spread, causes, status, _, reason, _ in one.rows:
             center = None if col is None else (col, row)
-            yield MarkRow(name, point, kind, center, _covariance(spread, causes), status, reason)
+            yield MarkRow(one.name, point, kind, center, _covariance(spread, causes), status, reason)
 
 
 def _covariance(spread: Sequence[float | None], causes: str | None) -> tuple[float, float, float] | None:
@@ -344,8 +331,8 @@ def _write_frame(store: Store, judging: int, lot: int, frame: CheckedResult) -> 
         f"insert into judged (judging, result, number, {MARKS}) values ({places(15)})",
         ((judging, frame.result, number, *row) for number, row in enumerate(rows)),
     )
-    digest = marks_digest(_own_marks(db, judging, frame.result) if own_marks else [])
-    where = "where judging = ? and scan = ?"
-    db.execute(f"update judged_frame set marks_digest = ? {where}", (digest, judging, scan))
-    db.execute(f"{seal('judged_frame')} {where}", (judging, scan))
+    db.execute(
+        f"update judged_frame set marks_digest = {checked_marks_digest()} where judging = ? and scan = ?",
+        (judging, scan),
+    )
     return json.dumps([name, key, detail, rows]).encode()

@@ -8,6 +8,7 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,13 +49,14 @@ def read_inputs(path: Path, digest: str) -> Mapping[str, str] | None:
     return None if judging is None else judging.made_from
 
 
+def _frame_values(store: Store, digest: str, columns: str) -> list[tuple[Any, ...]]:
+    """Columns of checked_frame, for all frames of a judging."""
+    return store.connection.execute(f"select {columns} from checked_frame where digest = ?", (digest,)).fetchall()
+
+
 def pitches(store: Store, digest: str) -> dict[str, tuple[float, float]]:
     """{image: pixel pitch across and down, µm}; NaN where it is unknown."""
-    rows = store.connection.execute(
-        "select judged_frame.name, pitch_x_um, pitch_y_um from judged_frame join result on result.id = result "
-        "join judging on judging.id = judging where judging.digest = ?",
-        (digest,),
-    )
+    rows = _frame_values(store, digest, "name, pitch_x_um, pitch_y_um")
     unknown = (math.nan, math.nan)
     return {name: unknown if across is None else (across, down) for name, across, down in rows}
 
@@ -63,51 +65,33 @@ def picture_sizes_mm(path: Path, digest: str) -> dict[str, tuple[float, float]]:
     """{image: width and height of the scan, mm}; scans of unknown pitch are left out."""
     if not digest or not path.exists():
         return {}
-    query = (
-        "select judged_frame.name, width_px * result.pitch_x_um / 1000.0, height_px * result.pitch_y_um / 1000.0 "
-        "from judged_frame join scan on scan.id = judged_frame.scan join result on result.id = judged_frame.result "
-        "join judging on judging.id = judging where judging.digest = ?"
-    )
     with Store(path) as store:
-        rows = store.connection.execute(query, (digest,)).fetchall()
+        rows = _frame_values(store, digest, "name, width_px * pitch_x_um / 1000.0, height_px * pitch_y_um / 1000.0")
     return {name: (width, height) for name, width, height in rows if width and height}
 
 
 def count_decisions(store: Store, digest: str) -> dict[CameraPerson, int]:
     """Number of decisions in a judging, by camera and person."""
     counts = Counter[CameraPerson]()
-    rows = store.connection.execute(
-        "select camera, judged_frame.detail ->> '$.decided_by' as told from judged_frame join scan on scan.id = scan "
-        "join judging on judging.id = judging where judging.digest = ? and told is not null",
-        (digest,),
-    )
-    for camera, counts_json in rows:
-        counts.update({(camera, who): count for who, count in json.loads(counts_json).items()})
+    for camera, counts_json in _frame_values(store, digest, "camera, changed ->> '$.decided_by'"):
+        counts.update({(camera, who): count for who, count in json.loads(counts_json or "{}").items()})
     return dict(sorted(counts.items()))
 
 
 def written_scans(store: Store, digest: str) -> Iterator[MeasuredScan]:
     """Scans of a judging on which writing was found."""
-    rows = store.connection.execute(
-        "select judged_frame.name, result from judged_frame join judging on judging.id = judging "
-        "where judging.digest = ?",
-        (digest,),
-    ).fetchall()
     written = store.written()
-    return measured_scans(store.path, digest, {name for name, result in rows if result in written})
+    names = {name for name, result in _frame_values(store, digest, "name, result") if result in written}
+    return measured_scans(store.path, digest, names)
 
 
 def read_fingerprints(path: Path, digest: str, images: Collection[str]) -> dict[str, str]:
     """{image: fingerprint of its result} for some images of a judging; empty where there is no such judging."""
     if not digest or not path.exists():
         return {}
-    query = (
-        "select fingerprint from judged_frame join result on result.id = result join judging on judging.id = judging "
-        "where judging.digest = ? and judged_frame.name = ?"
-    )
     with Store(path) as store:
-        found = {image: store.connection.execute(query, (digest, image)).fetchone() for image in images}
-    return {image: row[0] for image, row in found.items() if row is not None}
+        found = dict(_frame_values(store, digest, "name, fingerprint"))
+    return {image: found[image] for image in images if image in found}
 
 
 def remember_place(store: Store, project_folder: Path) -> None:
@@ -183,8 +167,7 @@ class StoredMarks:
     def names(self) -> frozenset[str]:
         """Names of all frames."""
         with Store(self._path) as store:
-            query = "select name from judged_frame where judging = ?"
-            return frozenset(name for (name,) in store.connection.execute(query, (self._judging.row,)))
+            return frozenset(name for (name,) in _frame_values(store, self._judging.digest, "name"))
 
     def rows(self, images: Collection[str]) -> list[ComparatorPoint]:
         """Marks of some images, as in comparator.csv."""
@@ -223,11 +206,10 @@ class StoredMarks:
 
 
 _PLAIN = """
-select f.name, scan.uri, f.result from judged_frame f join scan on scan.id = f.scan
-where f.judging = ?1 and f.verdict = ?2 and f.result not in (
+select name, uri, result from checked_frame where judging = ?1 and verdict = ?2 and result not in (
     select result from checked_mark where judging = ?1 and kind <> 'fiducial'
     group by result having not sum(status in ('measured', 'weak'))
-) order by f.name
+) order by name
 """
 _MARKS = """
 select result, kind, status, col_px, row_px from checked_mark where judging = ? and verdict = ?

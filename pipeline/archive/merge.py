@@ -5,15 +5,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.archive.results_database import MARKS, Store, seal_result
-from pipeline.archive.results_integrity import damaged_results, is_sound, seal
+from pipeline.archive.results_database import Store
+from pipeline.archive.results_integrity import COLUMNS, MARKS, is_result_sound, is_sound, measured_marks_digest
 from pipeline.errors import InputError
 
-_SCAN = (
-    "uri, bytes, mtime_ns, etag, identity_hash, content_hash, width_px, height_px, bits, pitch_x_um, pitch_y_um, camera"
-)
-_RESULT = "pose, pose_decided, a, b, c, d, e, f, pitch_x_um, pitch_y_um, verdict, seconds, bytes_read, finished, detail"
+_SCAN = [name for name in COLUMNS["scan"][2:] if name not in ("result", "is_current", "duplicate_of", "asked")]
+_RESULT = COLUMNS["result"][5:-1]
 _MARK = f"number, {MARKS}"
+_SOUND = is_result_sound("r", "other.mark")
 
 
 @dataclass(frozen=True)
@@ -46,42 +45,37 @@ def merge(store: Store, others: Sequence[Path]) -> list[Merged]:
 
 def _merge_store(store: Store, path: Path) -> Merged:
     db = store.connection
-    with Store(path) as other:
-        damaged = damaged_results(other.connection)
-    db.execute("create temp table if not exists damaged (result integer)")
-    db.execute("delete from damaged")
-    db.executemany("insert into damaged values (?)", ((row,) for row in damaged))
     db.execute("attach ? as other", (str(path),))
     try:
-        results = db.execute("select count(*) from other.result").fetchone()[0]
+        results, sound = db.execute(f"select count(*), total({_SOUND}) from other.result r").fetchone()
         with store.writing():
             new = _insert(db)
     finally:
         db.execute("detach other")
-    return Merged(path, results, new, len(damaged))
+    return Merged(path, results, new, results - int(sound))
 
 
 def _insert(db: sqlite3.Connection) -> int:
     """Insert the rows of all tables in the order of their references; existing rows stay."""
     before = db.execute("select coalesce(max(id), 0) from main.result").fetchone()[0]
+    columns = ", ".join(_SCAN)
     db.execute(
-        f"insert into main.scan ({_SCAN}, name) select {_SCAN}, null from other.scan where {is_sound('scan')} "
+        f"insert into main.scan ({columns}, name) select {columns}, null from other.scan where {is_sound('scan')} "
         "on conflict (uri) do update set bytes = excluded.bytes, mtime_ns = excluded.mtime_ns, etag = excluded.etag, "
         "identity_hash = excluded.identity_hash, content_hash = excluded.content_hash "
         "where excluded.mtime_ns > mtime_ns"  # a file that was changed in between
     )
     for table, columns in (("program", "version, measure_revision, python, libraries"), ("options", "hash, json")):
         db.execute(f"insert or ignore into main.{table} ({columns}) select {columns} from other.{table}")
-    columns = ", ".join(f"r.{column.strip()}" for column in _RESULT.split(","))
     db.execute(
-        f"insert or ignore into main.result (scan, fingerprint, program, options, {_RESULT}) "
-        f"select scan.id, r.fingerprint, program.id, options.id, {columns} from other.result r "
-        "join other.scan s on s.id = r.scan join main.scan scan on scan.uri = s.uri "
+        f"insert or ignore into main.result (scan, fingerprint, program, options, {', '.join(_RESULT)}) "
+        f"select scan.id, r.fingerprint, program.id, options.id, {', '.join(f'r.{name}' for name in _RESULT)} "
+        "from other.result r join other.scan s on s.id = r.scan join main.scan scan on scan.uri = s.uri "
         "join other.program p on p.id = r.program join main.program program on (program.version, "
         "program.measure_revision, program.python, program.libraries) = "
         "(p.version, p.measure_revision, p.python, p.libraries) "
         "join other.options o on o.id = r.options join main.options options on options.hash = o.hash "
-        f"where r.id not in (select result from damaged) and {is_sound('scan', 's')} order by r.id"
+        f"where {_SOUND} and {is_sound('scan', 's')} order by r.id"
     )
     db.execute(
         f"insert into main.mark (result, {_MARK}) select result.id, {_MARK} from main.result result "
@@ -89,10 +83,7 @@ def _insert(db: sqlite3.Connection) -> int:
         "where result.id > ?",
         (before,),
     )
+    new = f"update main.result set marks_digest = {measured_marks_digest(marks='main.mark')} where id > ?"
     sound = f"from other.kept where {is_sound('kept')}"
-    db.execute(f"insert or ignore into main.kept (key, value, digest) select key, value, digest {sound}")
-    new = db.execute("select id from main.result where id > ?", (before,)).fetchall()
-    for (result,) in new:
-        seal_result(db, result)
-    db.execute(seal("scan"))
-    return len(new)
+    db.execute(f"insert or ignore into main.kept (key, value) select key, value {sound}")
+    return db.execute(new, (before,)).rowcount

@@ -5,30 +5,27 @@ One process writes, each scan in its own transaction; other processes may read m
 
 import json
 import platform
-import sqlite3
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from measure.results import MEASURE_REVISION
 from pipeline.archive.results_integrity import (
-    IS_JUDGING_SOUND,
+    MARKS,
     DamagedError,
-    damaged_results,
+    is_result_sound,
     is_sound,
-    marks_digest,
-    seal,
+    measured_marks_digest,
+    row_digest,
 )
-from pipeline.archive.schema import STORE_ERRORS, opened, store_error
+from pipeline.archive.schema import Database, forget
 from pipeline.archive.verdicts import Verdict, scan_verdict
 from pipeline.provenance import FileState, Identity, options_hash, result_key
 from pipeline.results.measured_record import (
-    MARK_COLUMNS,
     MeasuredScan,
     finite_or_none,
     mark_row,
@@ -38,7 +35,6 @@ from pipeline.results.measured_record import (
     scan_location,
 )
 
-MARKS = ", ".join(MARK_COLUMNS)
 _LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "tifffile", "imagecodecs")
 
 
@@ -66,56 +62,42 @@ class Kept:
         return result_key(self.identity, options_hash(self.options_json))
 
 
-class Store:
+class Store(Database):
     """Open results database of a project; closed at the end of the `with` block."""
-
-    def __init__(self, path: Path) -> None:
-        """Open or create a store. Raises InputError for a file that is no such store."""
-        self.path = path
-        self._db = opened(path)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        """Close the store. Raises InputError for errors of SQLite in the block, since any read of a damaged file may
-        cause one."""
-        self.close()
-        if isinstance(error, STORE_ERRORS):
-            raise store_error(self.path, "measurements", error) from error
-
-    def close(self) -> None:
-        self._db.close()
 
     # --- scans
 
     def identities(self) -> dict[str, Identity]:
         """{uri: identity at its last measurement} of every scan ever measured."""
-        rows = self._db.execute(f"select uri, bytes, mtime_ns, etag, identity_hash from scan where {is_sound('scan')}")
+        rows = self.connection.execute(
+            f"select uri, bytes, mtime_ns, etag, identity_hash from scan where {is_sound('scan')}"
+        )
         return {uri: Identity(FileState(uri, *state), parts) for uri, *state, parts in rows}
 
     def fingerprints(self) -> dict[str, int]:
         """{fingerprint: row} of every sound result, read from the table itself and not from an index, which may be
         damaged."""
-        return dict(self._db.execute(f"select fingerprint, id from result not indexed where {is_sound('result')}"))
+        return dict(
+            self.connection.execute(f"select fingerprint, id from result not indexed where {is_sound('result')}")
+        )
 
     def set_project(self, names: Mapping[str, str]) -> None:
         """Set the project's current images. names: {uri: image}. No scan counts as current until `set_current`."""
         with self.writing():
-            self._db.execute("update scan set name = null, is_current = 0")
-            self._db.executemany("update scan set name = ? where uri = ?", ((n, uri) for uri, n in names.items()))
-            self._db.execute(seal("scan"))
+            self.connection.execute("update scan set name = null, is_current = 0")
+            self.connection.executemany(
+                "update scan set name = ? where uri = ?", ((n, uri) for uri, n in names.items())
+            )
 
     def set_current(self, results: Mapping[int, str]) -> None:
         """Mark results as current: they match their scans' present file and options. results: {row: hash of the
         request}."""
         with self.writing():
-            self._db.executemany(
+            self.connection.executemany(
                 "update scan set result = ?1, is_current = 1, asked = ?2 "
                 "where id = (select scan from result where id = ?1)",
                 results.items(),
             )
-            self._db.execute(seal("scan"))
 
     # --- results
 
@@ -134,8 +116,7 @@ class Store:
             result = self._result(kept, scan)
             if current:
                 values = (result, asked, scan)
-                self._db.execute("update scan set result = ?, is_current = 1, asked = ? where id = ?", values)
-            self._db.execute(f"{seal('scan')} where id = ?", (scan,))
+                self.connection.execute("update scan set result = ?, is_current = 1, asked = ? where id = ?", values)
             return result
 
     def scan(self, result: int, image: str, folder: Path, with_marks: bool = True) -> MeasuredScan:
@@ -150,25 +131,25 @@ class Store:
 
     def mark_rows(self, result: int) -> list[tuple[Any, ...]]:
         """Rows of the marks of a result. Raises DamagedError where they are damaged."""
-        rows = self._db.execute(f"select number, {MARKS} from mark where result = ? order by number", (result,))
+        rows = self.connection.execute(f"select number, {MARKS} from mark where result = ? order by number", (result,))
         numbered = rows.fetchall()
-        digest = self._db.execute(
+        digest = self.connection.execute(
             f"select marks_digest from result where id = ? and {is_sound('result')}", (result,)
         ).fetchone()
-        if digest is None or marks_digest(numbered) != digest[0]:
+        if digest is None or row_digest(*numbered) != digest[0]:
             raise self._damaged(result)
         return [tuple(row) for _, *row in numbered]
 
     def detail(self, result: int) -> str:
         """JSON of the remaining content of a result. Raises DamagedError where it is damaged."""
         query = f"select detail from result where id = ? and {is_sound('result')}"
-        found = self._db.execute(query, (result,)).fetchone()
+        found = self.connection.execute(query, (result,)).fetchone()
         if found is None:
             raise self._damaged(result)
         return str(found[0])
 
     def _damaged(self, result: int) -> DamagedError:
-        found = self._db.execute(
+        found = self.connection.execute(
             "select coalesce(name, uri) from scan where result = ?1 or id = (select scan from result where id = ?1)",
             (result,),
         ).fetchone()
@@ -176,49 +157,32 @@ class Store:
 
     def has_damaged_rows(self) -> bool:
         """Whether a row of a scan, result, judging or value kept for other scans is damaged; marks are not checked."""
-        tables = ("scan", "result", "kept")
+        tables = ("scan", "result", "kept", "judging")
         found = [f"exists (select 1 from {table} not indexed where not {is_sound(table)})" for table in tables]
-        found += [f"exists (select 1 from judging where digest not like 'unfinished%' and not {IS_JUDGING_SOUND})"]
-        return bool(self._db.execute(f"select {' or '.join(found)}").fetchone()[0])
+        found[-1] = found[-1].replace("where", "where digest not like 'unfinished%' and")
+        return bool(self.connection.execute(f"select {' or '.join(found)}").fetchone()[0])
 
     def forget_damaged(self) -> int:
         """Delete damaged results and scans and everything derived from them, so that they are measured again; return
         their number. Raises sqlite3.Error where the file itself is damaged."""
         with self.writing():
-            lost = damaged_results(self._db)
-            scans = self._db.execute(f"select id from scan where not {is_sound('scan')}").fetchall()
-            for (scan,) in scans:
-                lost |= {row for (row,) in self._db.execute("select id from result where scan = ?", (scan,))}
-            for table in ("judged", "judged_frame", "judged_lot", "judging"):  # including those of a missing judging
-                self._db.execute(f"delete from {table}")
-            rows = [(row,) for row in sorted(lost)]
-            self._db.executemany("delete from mark where result = ?", rows)
-            self._db.executemany("update scan set result = null, is_current = 0 where result = ?", rows)
-            self._db.executemany("delete from result where id = ?", rows)
-            self._db.executemany("update scan set duplicate_of = null where duplicate_of = ?", scans)
-            self._db.executemany("delete from scan where id = ?", scans)
-            self._db.execute(f"delete from kept where not {is_sound('kept')}")
-            self._db.execute(seal("scan"))
-        return len(lost)
+            self.connection.execute(f"delete from kept where not {is_sound('kept')}")
+            results = self._rows(f"select id from result not indexed where not {is_result_sound()}")
+            return forget(self.connection, results, self._rows(f"select id from scan where not {is_sound('scan')}"))
 
     def written(self) -> set[int]:
         """Rows of results of scans on which writing was found."""
-        rows = self._db.execute("select id from result where coalesce(detail ->> '$.writing', '[]') <> '[]'")
-        return {row for (row,) in rows}
+        return {*self._rows("select id from result where coalesce(detail ->> '$.writing', '[]') <> '[]'")}
 
     def forget_failed(self) -> int:
         """Delete failed results, so that the scans are measured again; return their number."""
         with self.writing():
-            self._db.execute("delete from judging")
-            failed = f"select id from result where verdict = '{Verdict.FAILED}'"
-            self._db.execute(f"delete from mark where result in ({failed})")
-            self._db.execute(f"update scan set result = null, is_current = 0 where result in ({failed})")
-            self._db.execute(seal("scan"))
-            return self._db.execute(f"delete from result where id in ({failed})").rowcount
+            failed = self._rows("select id from result where verdict = ?", str(Verdict.FAILED))
+            return forget(self.connection, failed)
 
     def failures(self) -> list[tuple[str, str, str]] | None:
         """(name, file, reason) of every scan of the project if all failed; None where one was measured."""
-        rows = self._db.execute(
+        rows = self.connection.execute(
             "select verdict, name, detail from scan join result on result.id = scan.result where is_current "
             f"order by verdict = '{Verdict.FAILED}', name"
         )
@@ -234,25 +198,22 @@ class Store:
 
     def content_hashes(self) -> dict[str, str]:
         """{uri: SHA-256 of the whole file} where it is known."""
-        return dict(self._db.execute("select uri, content_hash from scan where content_hash <> ''"))
+        return dict(self.connection.execute("select uri, content_hash from scan where content_hash <> ''"))
 
     def set_content_hashes(self, hashes: Mapping[str, str]) -> None:
         with self.writing():
-            self._db.executemany(
+            self.connection.executemany(
                 "update scan set content_hash = ? where uri = ?", ((hash, uri) for uri, hash in hashes.items())
             )
-            self._db.executemany(f"{seal('scan')} where uri = ?", ((uri,) for uri in hashes))
 
     def set_copies(self, copies: Mapping[str, str]) -> None:
         """Set which scans are copies. copies: {uri: image whose file it is a copy of}; no other scan is a copy."""
         with self.writing():
-            before = self._db.execute("select uri from scan where duplicate_of is not null").fetchall()
-            self._db.execute("update scan set duplicate_of = null where duplicate_of is not null")
-            self._db.executemany(
+            self.connection.execute("update scan set duplicate_of = null where duplicate_of is not null")
+            self.connection.executemany(
                 "update scan set duplicate_of = (select id from scan where name = ?) where uri = ?",
                 ((name, uri) for uri, name in copies.items()),
             )
-            self._db.executemany(f"{seal('scan')} where uri = ?", (*before, *((uri,) for uri in copies)))
 
     def move(self, uri: str, identity: Identity) -> dict[str, str]:
         """Re-key the results of a scan whose file was moved or touched with unchanged content; return {old fingerprint:
@@ -260,42 +221,29 @@ class Store:
         state = identity.state
         with self.writing():
             if uri != state.uri:  # the earlier scan at that place is gone, and its results cannot be requested any more
-                self._forget(state.uri)
-            self._db.execute(
+                forget(self.connection, (), self._rows("select id from scan where uri = ?", state.uri))
+            self.connection.execute(
                 "update scan set uri = ?, bytes = ?, mtime_ns = ?, etag = ?, identity_hash = ? where uri = ?",
                 (state.uri, state.bytes, state.mtime_ns, state.etag, identity.parts_hash, uri),
             )
-            results = self._db.execute(
+            results = self.connection.execute(
                 "select result.fingerprint, hash, measure_revision from result join scan on scan.id = result.scan "
                 "join options on options.id = result.options join program on program.id = result.program "
                 "where uri = ?",
                 (state.uri,),
             ).fetchall()
             keys = {before: result_key(identity, hashed, revision) for before, hashed, revision in results}
-            self._db.executemany(
+            self.connection.executemany(
                 "update result set fingerprint = ? where fingerprint = ?",
                 ((now, before) for before, now in keys.items()),
             )
-            own = "where scan = (select id from scan where uri = ?)"
-            self._db.execute(f"{seal('result')} {own}", (state.uri,))
-            self._db.execute(seal("scan"))
         return keys
-
-    def _forget(self, uri: str) -> None:
-        self._db.execute("delete from judging")
-        own = "select result.id from result join scan on scan.id = result.scan where uri = ?"
-        self._db.execute(
-            "update scan set duplicate_of = null where duplicate_of = (select id from scan where uri = ?)", (uri,)
-        )
-        self._db.execute(f"delete from mark where result in ({own})", (uri,))
-        self._db.execute(f"delete from result where id in ({own})", (uri,))
-        self._db.execute("delete from scan where uri = ?", (uri,))
 
     # --- what scans of a project contribute to others
 
     def recall(self, key: str) -> Mapping[str, Any] | None:
         """Value stored by `remember`, None if there is none. Raises DamagedError where it is damaged."""
-        row = self._db.execute(f"select value, {is_sound('kept')} from kept where key = ?", (key,)).fetchone()
+        row = self.connection.execute(f"select value, {is_sound('kept')} from kept where key = ?", (key,)).fetchone()
         if row is not None and not row[1]:
             raise DamagedError(
                 f"{self.path}: what is stored of {key.partition(' ')[0]} is not as it was written: the file was "
@@ -306,53 +254,32 @@ class Store:
     def remember(self, key: str, value: Mapping[str, object]) -> None:
         """Store what scans of the project contribute to others."""
         with self.writing():
-            self._db.execute("insert or replace into kept (key, value) values (?, ?)", (key, json.dumps(value)))
-            self._db.execute(f"{seal('kept')} where key = ?", (key,))
-
-    @property
-    def connection(self) -> sqlite3.Connection:
-        return self._db
-
-    @contextmanager
-    def writing(self) -> Iterator[None]:
-        self._db.execute("begin immediate")
-        try:
-            yield
-            self._db.execute("commit")
-        except BaseException:
-            if self._db.in_transaction:  # on a full disk SQLite itself has rolled back
-                self._db.execute("rollback")
-            raise
+            self.connection.execute("insert or replace into kept (key, value) values (?, ?)", (key, json.dumps(value)))
 
     def pose_name(self, result: int) -> str | None:
         """Name of the pose under which the marks of a result are named."""
-        found = self._db.execute("select pose from result where id = ?", (result,)).fetchone()
+        found = self.connection.execute("select pose from result where id = ?", (result,)).fetchone()
         return None if found is None else found[0]
 
     # --- implementation
 
+    def _rows(self, query: str, *parameters: object) -> list[int]:
+        return [row for (row,) in self.connection.execute(query, parameters)]
+
     def _scan(self, kept: Kept, name: str | None) -> int:
         state, scan = kept.identity.state, kept.scan
         if name is not None:  # another scan may have had the name
-            self._db.execute("update scan set name = null where name = ? and uri <> ?", (name, state.uri))
+            self.connection.execute("update scan set name = null where name = ? and uri <> ?", (name, state.uri))
         values = (
             name, state.uri, state.bytes, state.mtime_ns, state.etag, kept.identity.parts_hash,
             scan.width_px, scan.height_px, *map(finite_or_none, scan.pitch_um), kept.camera,
         )  # fmt: skip
         columns = (
-            "bytes",
-            "mtime_ns",
-            "etag",
-            "identity_hash",
-            "width_px",
-            "height_px",
-            "pitch_x_um",
-            "pitch_y_um",
-            "camera",
-        )
+            "bytes", "mtime_ns", "etag", "identity_hash", "width_px", "height_px", "pitch_x_um", "pitch_y_um", "camera",
+        )  # fmt: skip
         names = ", ".join(columns)
         updates = ", ".join(f"{column} = excluded.{column}" for column in columns)
-        row = self._db.execute(
+        row = self.connection.execute(
             f"insert into scan (name, uri, {names}) values ({places(len(values))}) on conflict (uri) do update set "
             "name = coalesce(excluded.name, name), content_hash = case when (bytes, mtime_ns, etag, identity_hash) = "
             "(excluded.bytes, excluded.mtime_ns, excluded.etag, excluded.identity_hash) then content_hash else '' end, "
@@ -362,7 +289,7 @@ class Store:
         return int(row[0])
 
     def _result(self, kept: Kept, scan: int) -> int:
-        known = self._db.execute("select id from result where fingerprint = ?", (kept.fingerprint,)).fetchone()
+        known = self.connection.execute("select id from result where fingerprint = ?", (kept.fingerprint,)).fetchone()
         if known is not None:
             return int(known[0])
         measured, pose = kept.scan, kept.scan.frame.pose
@@ -375,31 +302,31 @@ class Store:
             *map(finite_or_none, measured.pitch_um), str(scan_verdict(measured)), measured.seconds, kept.bytes_read,
             datetime.now(UTC).isoformat(timespec="seconds"), json.dumps(scan_detail(measured, uri), ensure_ascii=False),
         )  # fmt: skip
-        result = self._db.execute(
+        result = self.connection.execute(
             "insert into result (scan, fingerprint, program, options, pose, pose_decided, a, b, c, d, e, f, "
             f"pitch_x_um, pitch_y_um, verdict, seconds, bytes_read, finished, detail) values ({places(19)})",
             values,
         ).lastrowid
         assert result is not None
         rows = ((result, number, *mark_row(mark)) for number, mark in enumerate(measured.frame.marks))
-        self._db.executemany(f"insert into mark (result, number, {MARKS}) values ({places(14)})", rows)
-        seal_result(self._db, result)
+        self.connection.executemany(f"insert into mark (result, number, {MARKS}) values ({places(14)})", rows)
+        self.connection.execute(f"update result set marks_digest = {measured_marks_digest()} where id = ?", (result,))
         return result
 
     def _options(self, options_json: str) -> int:
         hashed = options_hash(options_json)
-        self._db.execute("insert or ignore into options (hash, json) values (?, ?)", (hashed, options_json))
-        return int(self._db.execute("select id from options where hash = ?", (hashed,)).fetchone()[0])
+        self.connection.execute("insert or ignore into options (hash, json) values (?, ?)", (hashed, options_json))
+        return int(self.connection.execute("select id from options where hash = ?", (hashed,)).fetchone()[0])
 
     @cached_property
     def _program(self) -> int:
         libraries = ", ".join(f"{name} {version(name)}" for name in _LIBRARIES)
         versions = (version("reseau"), MEASURE_REVISION, platform.python_version(), libraries)
-        self._db.execute(
+        self.connection.execute(
             "insert or ignore into program (version, measure_revision, python, libraries) values (?, ?, ?, ?)", versions
         )
         where = "version = ? and measure_revision = ? and python = ? and libraries = ?"
-        return int(self._db.execute(f"select id from program where {where}", versions).fetchone()[0])
+        return int(self.connection.execute(f"select id from program where {where}", versions).fetchone()[0])
 
 
 def known_identities(path: Path) -> dict[str, Identity]:
@@ -408,13 +335,6 @@ def known_identities(path: Path) -> dict[str, Identity]:
         return {}
     with Store(path) as store:
         return store.identities()
-
-
-def seal_result(db: sqlite3.Connection, result: int) -> None:
-    """Set the digests of a result and its marks."""
-    rows = db.execute(f"select number, {MARKS} from mark where result = ? order by number", (result,))
-    db.execute("update result set marks_digest = ? where id = ?", (marks_digest(rows), result))
-    db.execute(f"{seal('result')} where id = ?", (result,))
 
 
 def places(count: int) -> str:

@@ -4,14 +4,18 @@ The file holds its version number (`pragma user_version`). A change of the table
 entries are never changed.
 """
 
+import json
 import math
 import os
 import sqlite3
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 from measure.scans.remote import public_address
-from pipeline.archive.results_integrity import add_digests, row_digest
+from pipeline.archive.results_integrity import add_digests, add_functions, add_triggers, is_sound
 from pipeline.errors import InputError, what_to_do_about_store
 
 STORE_ERRORS = (sqlite3.Error, UnicodeDecodeError)  # damaged files: even SQLite's message may be undecodable
@@ -149,6 +153,17 @@ where judging = (select max(id) from judging where digest not like 'unfinished%'
 MIGRATIONS: tuple[str, ...] = (_FIRST, _LOTS, _ASKED, _DIGESTS, _CHECKED_MARKS)
 VERSION = len(MIGRATIONS)
 
+# Frames of every judging with their scan and raw result. marks_digest: of the marks that checked_mark shows.
+_CHECKED_FRAMES = f"""
+create temp view checked_frame as
+select f.judging, judging.digest, f.lot, f.name, f.verdict, f.decisions, f.detail as changed, f.scan, scan.uri,
+    scan.width_px, scan.height_px, scan.camera, f.result, result.fingerprint, result.pitch_x_um, result.pitch_y_um,
+    result.detail as measured, iif(f.own_marks, f.marks_digest, result.marks_digest) as marks_digest,
+    {is_sound("judged_frame", "f")} and {is_sound("result")} and {is_sound("scan")} as is_sound
+from judged_frame f join judging on judging.id = f.judging
+left join result on result.id = f.result left join scan on scan.id = f.scan
+"""
+
 
 @dataclass(frozen=True)
 class Schema:
@@ -158,6 +173,42 @@ class Schema:
     application: int
     migrations: tuple[str, ...]
     what: str
+
+
+class Database:
+    """Open SQLite file of a project; closed at the end of the `with` block."""
+
+    schema: Schema | None = None  # None: that of measurements
+
+    def __init__(self, path: Path) -> None:
+        """Open or create a file. Raises InputError for a file that is no such database."""
+        self.path = path
+        self.connection = opened(path, self.schema)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        """Close the file. Raises InputError for errors of SQLite in the block, since any read of a damaged file may
+        cause one."""
+        self.close()
+        if isinstance(error, STORE_ERRORS):
+            raise store_error(self.path, (self.schema or _measurements()).what, error) from error
+
+    def close(self) -> None:
+        self.connection.close()
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Transaction: all of the block is written, or nothing."""
+        self.connection.execute("begin immediate")
+        try:
+            yield
+            self.connection.execute("commit")
+        except BaseException:
+            if self.connection.in_transaction:  # on a full disk SQLite itself has rolled back
+                self.connection.execute("rollback")
+            raise
 
 
 def opened(path: Path, schema: Schema | None = None) -> sqlite3.Connection:
@@ -171,11 +222,14 @@ def opened(path: Path, schema: Schema | None = None) -> sqlite3.Connection:
     try:
         _check(connection, path, schema)
         connection.create_function("sqrt", 1, _sqrt, deterministic=True)  # not every SQLite is built with it
-        connection.create_function("row_digest", -1, row_digest, deterministic=True)
+        add_functions(connection)
         connection.execute("pragma journal_mode = wal")
         connection.execute("pragma synchronous = normal")
         connection.execute("pragma foreign_keys = on")
         migrate(connection, schema)
+        if schema.application == APPLICATION:
+            add_triggers(connection)
+            connection.execute(_CHECKED_FRAMES)
     except STORE_ERRORS as error:
         connection.close()
         raise store_error(path, schema.what, error) from error
@@ -196,9 +250,8 @@ def _connection(path: Path) -> sqlite3.Connection:
     return sqlite3.connect(name, timeout=60.0, isolation_level=None, uri=is_address)
 
 
-def migrate(connection: sqlite3.Connection, schema: Schema | None = None) -> None:
+def migrate(connection: sqlite3.Connection, schema: Schema) -> None:
     """Migrate from any earlier version to this one, each step completely or not at all."""
-    schema = schema or _measurements()
     version = connection.execute("pragma user_version").fetchone()[0]
     for number, script in enumerate(schema.migrations[version:], version + 1):
         marks = f"pragma application_id = {schema.application}; pragma user_version = {number}"
@@ -218,14 +271,25 @@ def _forget_secrets(connection: sqlite3.Connection) -> None:
     """Delete scans that an earlier version stored under addresses with passwords or signatures, which are not used as
     keys any more."""
     rows = connection.execute("select id, uri from scan where uri like '%://%'").fetchall()
-    secret = [(row,) for row, uri in rows if public_address(uri) != uri]
-    if secret:
+    if secret := [row for row, uri in rows if public_address(uri) != uri]:
         connection.execute("pragma secure_delete = on")
-        connection.execute("delete from judging")
-        connection.executemany("update scan set duplicate_of = null where duplicate_of = ?", secret)
-        connection.executemany("delete from mark where result in (select id from result where scan = ?)", secret)
-        connection.executemany("delete from result where scan = ?", secret)
-        connection.executemany("delete from scan where id = ?", secret)
+        forget(connection, (), secret)
+
+
+def forget(connection: sqlite3.Connection, results: Collection[int], scans: Collection[int] = ()) -> int:
+    """Delete results, scans with all of theirs, and all judgings; return the number of results."""
+    listed, own = "in (select value from json_each(?))", (json.dumps(list(scans)),)
+    of_scans = connection.execute(f"select id from result where scan {listed}", own)
+    lost = {*results, *(row for (row,) in of_scans)}
+    for table in ("judged", "judged_frame", "judged_lot", "judging"):  # including those of a missing judging
+        connection.execute(f"delete from {table}")
+    rows = (json.dumps(list(lost)),)
+    connection.execute(f"delete from mark where result {listed}", rows)
+    connection.execute(f"update scan set result = null, is_current = 0 where result {listed}", rows)
+    connection.execute(f"delete from result where id {listed}", rows)
+    connection.execute(f"update scan set duplicate_of = null where duplicate_of {listed}", own)
+    connection.execute(f"delete from scan where id {listed}", own)
+    return len(lost)
 
 
 def _measurements() -> Schema:

@@ -15,7 +15,7 @@ from measure.results import MarkMeasurement
 from measure.scans.opening import open_scan
 from measure.scans.remote import scan_path
 from measure.scans.scan import Scan
-from pipeline.archive.schema import STORE_ERRORS, Schema, opened, store_error
+from pipeline.archive.schema import STORE_ERRORS, Database, Schema
 from pipeline.errors import InputError
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.results.thumbnail import StoredThumbnail, Thumbnail, cut
@@ -37,45 +37,30 @@ _COLUMNS = "point, kind, col_px, row_px, step_px, jpeg"
 _OFF_MIDDLE = 0.25  # fraction of a thumbnail's width: a mark farther off its middle was measured again since
 
 
-class ThumbnailStore:
+class ThumbnailStore(Database):
     """Open store of thumbnails beside a results database; closed at the end of the `with` block."""
 
-    def __init__(self, path: Path) -> None:
-        """Open a store. Raises InputError for a file that is no such store."""
-        self._path, self._db = path, opened(path, _SCHEMA)
+    schema = _SCHEMA
 
     @classmethod
     def open(cls, measurement: Path) -> "ThumbnailStore":
         """Open the thumbnails of a results database."""
         return cls(thumbnails_path(measurement))
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        """Close the store. Raises InputError for errors of SQLite in the block."""
-        self.close()
-        if isinstance(error, STORE_ERRORS):
-            raise store_error(self._path, "thumbnails", error) from error
-
-    def close(self) -> None:
-        self._db.close()
-
     def keep(self, fingerprint: str, thumbnails: Sequence[StoredThumbnail]) -> None:
         """Store the thumbnails of one result, all or none."""
-        self._db.execute("begin immediate")
-        self._db.executemany(
-            f"insert or replace into thumbnail (fingerprint, {_COLUMNS}) values (?, ?, ?, ?, ?, ?, ?)",
-            ((fingerprint, one.point, one.kind, *one.origin_px, one.step_px, one.jpeg) for one in thumbnails),
-        )
-        self._db.execute(f"update thumbnail set digest = {_DIGEST} where fingerprint = ?", (fingerprint,))
-        self._db.execute("commit")
+        with self.writing():
+            self.connection.executemany(
+                f"insert or replace into thumbnail (fingerprint, {_COLUMNS}) values (?, ?, ?, ?, ?, ?, ?)",
+                ((fingerprint, one.point, one.kind, *one.origin_px, one.step_px, one.jpeg) for one in thumbnails),
+            )
+            self.connection.execute(f"update thumbnail set digest = {_DIGEST} where fingerprint = ?", (fingerprint,))
 
     def get(self, fingerprint: str, point: str = "", kind: str = "frame") -> StoredThumbnail | None:
         """Thumbnail of a mark, or of the whole scan; None where it is missing or damaged."""
         where = f"fingerprint = ? and point = ? and kind = ? and digest is {_DIGEST}"
         try:
-            found = self._db.execute(
+            found = self.connection.execute(
                 f"select {_COLUMNS} from thumbnail where {where}", (fingerprint, point, kind)
             ).fetchone()
         except STORE_ERRORS:  # fall back to the scan itself
@@ -87,21 +72,22 @@ class ThumbnailStore:
 
     def rekey(self, keys: Mapping[str, str]) -> None:
         """Replace fingerprints of results. keys: {old: new}."""
-        self._db.execute("begin immediate")
-        self._db.executemany(
-            "update or ignore thumbnail set fingerprint = ? where fingerprint = ?",
-            ((new, old) for old, new in keys.items()),
-        )
-        self._db.execute("commit")
+        with self.writing():
+            self.connection.executemany(
+                "update or ignore thumbnail set fingerprint = ? where fingerprint = ?",
+                ((new, old) for old, new in keys.items()),
+            )
 
     def take(self, measurements: Sequence[Path]) -> None:
         """Import the thumbnails of other results databases that have some."""
         for path in filter(Path.is_file, map(thumbnails_path, measurements)):
-            opened(path, _SCHEMA).close()
-            self._db.execute("attach ? as other", (str(path),))
+            ThumbnailStore(path).close()
+            self.connection.execute("attach ? as other", (str(path),))
             columns = f"fingerprint, {_COLUMNS}, digest"
-            self._db.execute(f"insert or ignore into thumbnail ({columns}) select {columns} from other.thumbnail")
-            self._db.execute("detach other")
+            self.connection.execute(
+                f"insert or ignore into thumbnail ({columns}) select {columns} from other.thumbnail"
+            )
+            self.connection.execute("detach other")
 
 
 def thumbnails_path(measurement: Path) -> Path:

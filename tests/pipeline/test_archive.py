@@ -24,7 +24,7 @@ from measure.marks.shapes import MarkShape, polygon
 from measure.results import Pose
 from pipeline.archive.measurement import picture_sizes_mm
 from pipeline.archive.results_integrity import add_digests
-from pipeline.archive.schema import opened
+from pipeline.archive.schema import Schema, opened
 from pipeline.archive.status import archive_status
 from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict
 from pipeline.cli import run
@@ -287,13 +287,13 @@ def test_a_full_disk_is_reported_and_costs_nothing_that_was_measured(
     before = marks(folder)
     one_more(folder)
 
-    def full(path: Path) -> sqlite3.Connection:
-        store = opened(path)
+    def full(path: Path, schema: Schema | None = None) -> sqlite3.Connection:
+        store = opened(path, schema)
         store.execute("pragma max_page_count = 1")  # no page more than there are
         return store
 
     with monkeypatch.context() as patched:
-        patched.setattr("pipeline.archive.results_database.opened", full)
+        patched.setattr("pipeline.archive.schema.opened", full)
         assert measure(folder) == 2
     message = capsys.readouterr().err
     assert "is full). Make room there" in message
