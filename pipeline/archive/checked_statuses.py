@@ -233,14 +233,16 @@ def _frames(store: Store, judging: Judging, images: Collection[str] | None) -> I
     if images is None:
         check_judging(db, judging.row, store.path)
     wanted = "" if images is None else "and name in (select value from json_each(?))"
-    frames = db.execute(
-        "select name, uri, measured, changed, scan, marks_digest, is_sound from checked_frame "
-        f"where judging = ? {wanted} order by name",
+    found = db.execute(
+        f"select scan from judged_frame where judging = ? {wanted} order by name",
         (judging.row, *([] if images is None else [json.dumps(sorted(images))])),
-    )
+    ).fetchall()
+    columns = "name, uri, measured, changed, marks_digest, is_sound"
+    frame = f"select {columns} from checked_frame where judging = ? and scan = ?"
     marks = f"select number, {MARKS} from checked_mark where judging = ? and scan = ? order by number"
-    for name, uri, measured, changed, scan, digest, is_whole in frames:
+    for (scan,) in found:
         rows = db.execute(marks, (judging.row, scan)).fetchall()
+        name, uri, measured, changed, digest, is_whole = db.execute(frame, (judging.row, scan)).fetchone()
         is_whole = bool(is_whole) and row_digest(*rows) == digest
         yield CheckedFrame(name, uri, measured, changed, [row[1:] for row in rows], is_whole)
 
