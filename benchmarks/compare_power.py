@@ -83,7 +83,7 @@ def print_series(count: int = 300) -> None:
 
 def print_adjustments(pairs: int = 200) -> None:
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "adjust"))
-    from test_earlier_calibrations import contradicted
+    from test_lens_comparison import contradicted
 
     for sigmas in (0.0, 2.0, 3.0, 5.0):
         print(f"c changed by {sigmas:g} joint sigmas: {contradicted(sigmas, pairs, LEVEL):.3f}", flush=True)

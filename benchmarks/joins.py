@@ -22,7 +22,7 @@ from measure.tie_points.joins import measure_joins
 from pipeline.cli import run
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "adjust"))
-from halves import Halves, halves
+from networks import Halves, halves
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ import sys
 import time
 from collections import Counter
 
-from misfits import KINDS, MANY, NOTHING, describe, draw_network, outcome
+from faults import MANY, MISFITS, NOTHING, draw_network, misfit_outcome, misfit_sentences
 
 SOUND = 5  # factor of the number of networks without an effect
 
@@ -21,14 +21,14 @@ def main() -> None:
     networks = int(sys.argv[1]) if len(sys.argv) > 1 else 20
     many = float(sys.argv[2]) if len(sys.argv) > 2 else MANY
     print(f"{'planted':28} {'named':>6} {'unnamed':>8} {'misleading':>11} {'sigma0':>18} {'CPU s each':>11}")
-    for name in sys.argv[3:] or KINDS:
+    for name in sys.argv[3:] or MISFITS:
         count, sizes, spent = Counter[str](), [], 0.0
         for seed in range(networks * (SOUND if name == NOTHING else 1)):
             network = draw_network(name, seed, many)
             begun = time.process_time()
-            sentences, sigma0 = describe(network)
+            sentences, sigma0 = misfit_sentences(network)
             spent += time.process_time() - begun
-            found = outcome(name, sentences)
+            found = misfit_outcome(name, sentences)
             count[found] += 1
             sizes.append(sigma0)
             if found != "named":

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from realisations import Exact, exact, realisation
-from reference_cases import CAMERA, load
+from reference_cases import CAMERA, Exact, exact, load, realisation
 from scipy import stats
 
 from adjust.solution.adjustment import adjust

@@ -11,17 +11,17 @@ import sys
 import time
 from collections import Counter
 
-from planted import KINDS, describe, network, outcome
+from faults import BLUNDERS, blunder_network, blunder_outcome, blunder_sentences
 
 
 def main() -> None:
     """Print the table."""
     networks = int(sys.argv[1]) if len(sys.argv) > 1 else 20
     print(f"{'slip':58} {'named':>6} {'unnamed':>8} {'misleading':>11} {'CPU s each':>11}")
-    for name, kind in KINDS.items():
+    for name, kind in BLUNDERS.items():
         begun, count = time.process_time(), Counter[str]()
         for seed in range(networks):
-            count[outcome(kind, describe(kind.spoil(network(seed, kind.oriented))))] += 1
+            count[blunder_outcome(kind, blunder_sentences(kind.spoil(blunder_network(seed, kind.oriented))))] += 1
         spent = (time.process_time() - begun) / networks
         print(
             f"{name:58} {count['named']:6d} {count['unnamed']:8d} {count['misleading']:11d} {spent:11.1f}", flush=True

@@ -14,9 +14,8 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 
 import numpy as np
-from bent_scans import MIDDLE_MM, bend_in_scanner, films
+from networks import SCAN_MIDDLE_MM, Truth, bend_in_scanner, bent_films, field_points, simulated
 from numpy.typing import NDArray
-from simulated import Truth, field_points, simulated
 
 from adjust.functional_model.lens import Prior
 from adjust.initial_values.approximations import approximate
@@ -68,18 +67,18 @@ def main() -> None:
 def laid(
     turns: tuple[float, ...], terms: Sequence[str], rng: np.random.Generator, free: Mapping[str, Prior]
 ) -> tuple[Network, Approximations]:
-    return films(turns, {name: BEND_MM[name] for name in terms}, free, rng), _start(turns)
+    return bent_films(turns, {name: BEND_MM[name] for name in terms}, free, rng), _start(turns)
 
 
 @cache
 def _start(turns: tuple[float, ...]) -> Approximations:
     """Approximate values from error-free marks; finding them with the errors of the network takes longest."""
-    return approximate(films(turns, {}, {}))
+    return approximate(bent_films(turns, {}, {}))
 
 
 def photographs(rng: np.random.Generator, free: Mapping[str, Prior]) -> tuple[Network, Approximations]:
     points = field_points(np.random.default_rng(5), 40)
-    network, start = simulated(rng, Truth(middle_mm=MIDDLE_MM), points=points)
+    network, start = simulated(rng, Truth(middle_mm=SCAN_MIDDLE_MM), points=points)
     return bend_in_scanner(network, BEND_MM, free), start
 
 
@@ -107,7 +106,7 @@ def _names_bend(result: Adjustment) -> bool:
 
 def _chosen(truth: Mapping[str, float], seed: int) -> tuple[str, ...]:
     turns = QUARTERS * 2
-    network = films(turns, truth, {}, np.random.default_rng(seed))
+    network = bent_films(turns, truth, {}, np.random.default_rng(seed))
     choice = choose_bends(network, partial(adjust, approximations=_start(turns)))
     return tuple(choice.network.scanners[0].terms)
 

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from networks import field_points, simulated
 from numpy.typing import NDArray
 from plain_environment import NO_COMPILER
 from reference_cases import CASES, case_approximations, case_network, load
-from simulated import field_points, simulated
 
 import compiled
 from adjust.functional_model.projection import LineOfSight

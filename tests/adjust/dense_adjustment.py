@@ -7,10 +7,10 @@ all functions F1 to F9 with their priors stand in one full system.
 from dataclasses import dataclass
 
 import numpy as np
+from networks import camera_of_film
 from numpy.typing import NDArray
-from simulated import camera_of_film
 
-from adjust.functional_model.lens import Prior
+from adjust import Prior
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.problem.network import EXTERIOR_NAMES, Network
 

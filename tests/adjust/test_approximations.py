@@ -1,26 +1,35 @@
-"""Initial values without any approximation from the user: against OpenCV's projections and the reference cases."""
+"""Initial values without any approximation from the user, and what poor ones lead to."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from networks import (
+    CONVERGENT_STATIONS,
+    PROJECTED_C_MM,
+    SIX_MARKS_MM,
+    VERTICAL_STATIONS,
+    Projected,
+    Truth,
+    field_points,
+    project_field,
+    relief_field,
+    simulated,
+)
 from numpy.typing import NDArray
-from projected import C_MM, CONVERGENT, MARKS_MM, VERTICAL, Truth, field, simulated
-from reference_cases import case_network, load
+from reference_cases import case_approximations, case_network, load, own_name
 from scipy.spatial.transform import Rotation
+from studies import parametrize_with_studies
 
-from adjust.errors import AdjustmentError
-from adjust.functional_model.lens import Distortion, Prior
-from adjust.initial_values.approximations import approximate
+from adjust import AdjustmentError, Distortion, Observations, Options, Prior, adjust, approximate
+from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles, rotation_from_vector
 from adjust.problem.network import EXTERIOR_NAMES, Approximations, Exterior, Network, ObjectPoint, Transformation
-from adjust.problem.observations import Observations
-from adjust.solution.adjustment import adjust
 
 Array = NDArray[np.float64]
 
 
-def assert_near(found: Approximations, truth: Truth, meters: float, radians: float) -> None:
+def assert_near(found: Approximations, truth: Projected, meters: float, radians: float) -> None:
     for image, center in truth.centers.items():
         assert np.linalg.norm(found.exterior[image][:3] - center) < meters
         rotation = Rotation.from_euler("XYZ", found.exterior[image][3:]).as_matrix().T
@@ -31,12 +40,16 @@ def assert_near(found: Approximations, truth: Truth, meters: float, radians: flo
 
 
 @pytest.mark.parametrize("relief_m", [0.0, 30.0, 300.0], ids=["flat", "hilly", "deep"])
-@pytest.mark.parametrize("stations", [CONVERGENT, VERTICAL, VERTICAL[:1]], ids=["convergent", "vertical", "single"])
+@pytest.mark.parametrize(
+    "stations",
+    [CONVERGENT_STATIONS, VERTICAL_STATIONS, VERTICAL_STATIONS[:1]],
+    ids=["convergent", "vertical", "single"],
+)
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_known_points_noise_and_gross_errors(
     relief_m: float, stations: list[tuple[float, float, float, float, float, float]], mirrored: bool
 ) -> None:
-    truth = simulated(field(relief_m), stations, mirrored=mirrored, outliers=0.05)
+    truth = project_field(relief_field(relief_m), stations, mirrored=mirrored, outliers=0.05)
     found = approximate(truth.network)
     assert_near(found, truth, meters=2.0, radians=2e-3)
     assert found.mirrored == (frozenset(truth.centers) if mirrored else frozenset())
@@ -45,27 +58,27 @@ def test_known_points_noise_and_gross_errors(
 @pytest.mark.parametrize("kind", ["none", "congruent", "similarity", "affine"])
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_every_film_transformation(kind: Transformation, mirrored: bool) -> None:
-    truth = simulated(field(300.0), CONVERGENT, kind=kind, mirrored=mirrored, noise_mm=0.0)
+    truth = project_field(relief_field(300.0), CONVERGENT_STATIONS, kind=kind, mirrored=mirrored, noise_mm=0.0)
     found = approximate(truth.network)
     assert_near(found, truth, meters=1e-2, radians=1e-5)
     assert found.mirrored == (frozenset(truth.centers) if mirrored and kind != "none" else frozenset())
 
 
 def test_distortion_known_beforehand_is_taken_off() -> None:
-    truth = simulated(field(300.0), CONVERGENT, noise_mm=0.0, distortion=(-0.25, 0.13, 1e-3, -5e-4))
+    truth = project_field(relief_field(300.0), CONVERGENT_STATIONS, noise_mm=0.0, distortion=(-0.25, 0.13, 1e-3, -5e-4))
     assert_near(approximate(truth.network), truth, meters=1e-2, radians=1e-5)
 
 
 def test_unknown_distortion_leaves_a_usable_start() -> None:
-    truth = simulated(field(300.0), CONVERGENT, distortion=(-0.2, 0.05, 0.0, 0.0))
+    truth = project_field(relief_field(300.0), CONVERGENT_STATIONS, distortion=(-0.2, 0.05, 0.0, 0.0))
     camera = replace(truth.network.cameras[0], distortion=Distortion("opencv", {"k1": Prior(0.0, np.inf)}))
     assert_near(approximate(replace(truth.network, cameras=(camera,))), truth, meters=100.0, radians=0.05)
 
 
 def test_unknown_principal_distance_from_a_deep_field() -> None:
-    truth = simulated(field(300.0), CONVERGENT, outliers=0.05)
+    truth = project_field(relief_field(300.0), CONVERGENT_STATIONS, outliers=0.05)
     found = approximate(drop_interior(truth.network))
-    assert abs(found.interior["rc20"][0] - C_MM) < 0.3
+    assert abs(found.interior["rc20"][0] - PROJECTED_C_MM) < 0.3
     assert_near(found, truth, meters=5.0, radians=5e-3)
 
 
@@ -77,16 +90,16 @@ def test_unknown_principal_distance_from_twenty_boards() -> None:
         direction = Rotation.from_euler("XYZ", [*rng.uniform(-0.6, 0.6, 2), rng.uniform(-3, 3)])
         center = direction.apply([0.0, 0.0, rng.uniform(900.0, 1300.0)])
         stations.append((*center, *direction.as_euler("XYZ")))
-    truth = simulated(board, stations, kind="none", outliers=0.05, distortion=(-0.05, 0.01, 0.0, 0.0))
+    truth = project_field(board, stations, kind="none", outliers=0.05, distortion=(-0.05, 0.01, 0.0, 0.0))
     camera = replace(truth.network.cameras[0], distortion=Distortion("opencv", {"k1": Prior(0.0, np.inf)}))
     found = approximate(replace(drop_interior(truth.network), cameras=(replace(camera, principal_distance_mm=None),)))
-    assert abs(found.interior["rc20"][0] / C_MM - 1) < 0.05
+    assert abs(found.interior["rc20"][0] / PROJECTED_C_MM - 1) < 0.05
     assert_near(found, truth, meters=80.0, radians=0.05)
 
 
 def test_a_principal_distance_that_nothing_shows_is_requested() -> None:
     station = [(0.0, 0.0, 1500.0, 0.0, 0.0, 0.3)]
-    truth = simulated(field(0.0), station)
+    truth = project_field(relief_field(0.0), station)
     with pytest.raises(
         AdjustmentError, match=r"principal distance of camera rc20 cannot be found .* give principal_distance_mm"
     ):
@@ -99,7 +112,7 @@ def drop_interior(network: Network) -> Network:
 
 
 def test_unknown_points_and_images_that_see_few_known_ones() -> None:
-    truth = simulated(field(300.0, n=60), CONVERGENT)
+    truth = project_field(relief_field(300.0, n=60), CONVERGENT_STATIONS)
     known_by_first_two = {f"t{k}" for k in range(8)}
     network = free_points(truth.network, {p for p in truth.points if p not in known_by_first_two})
     rows = [
@@ -109,11 +122,11 @@ def test_unknown_points_and_images_that_see_few_known_ones() -> None:
     ]
     found = approximate(replace(network, observations=subset(network.observations, rows)))
     assert_near(found, truth, meters=3.0, radians=3e-3)
-    assert set(found.points) >= set(truth.network.observations.point) - set(MARKS_MM)
+    assert set(found.points) >= set(truth.network.observations.point) - set(SIX_MARKS_MM)
 
 
 def test_given_orientations_are_kept_where_points_do_not_contradict_them() -> None:
-    truth = simulated(field(300.0), CONVERGENT)
+    truth = project_field(relief_field(300.0), CONVERGENT_STATIONS)
     wrong = np.array([50.0, 50.0, 50.0, 0.1, 0.1, 0.1])
     exact = {name: true_exterior(truth, name) for name in truth.centers}
     images = tuple(
@@ -128,14 +141,14 @@ def test_given_orientations_are_kept_where_points_do_not_contradict_them() -> No
     np.testing.assert_allclose(found.exterior["f2"], exact["f2"] + wrong, rtol=0, atol=1e-9)
 
 
-def true_exterior(truth: Truth, image: str) -> Array:
+def true_exterior(truth: Projected, image: str) -> Array:
     angles = Rotation.from_matrix(truth.rotations[image].T).as_euler("XYZ")
     return np.concatenate([truth.centers[image], angles])
 
 
 @pytest.mark.study
 def test_the_order_of_things_does_not_matter() -> None:
-    truth = simulated(field(30.0), CONVERGENT[:3], outliers=0.05)
+    truth = project_field(relief_field(30.0), CONVERGENT_STATIONS[:3], outliers=0.05)
     network = drop_interior(truth.network)
     rng = np.random.default_rng(0)
     shuffled = replace(
@@ -150,7 +163,7 @@ def test_the_order_of_things_does_not_matter() -> None:
 
 
 def test_too_few_known_points_are_named() -> None:
-    truth = simulated(field(300.0), CONVERGENT[:1])
+    truth = project_field(relief_field(300.0), CONVERGENT_STATIONS[:1])
     network = free_points(truth.network, {f"t{k}" for k in range(2, 40)})
     observed = sum(point in {"t0", "t1"} for point in network.observations.point)
     with pytest.raises(AdjustmentError, match=f"image f1 sees {observed} known points, no other image"):
@@ -158,7 +171,7 @@ def test_too_few_known_points_are_named() -> None:
 
 
 def test_an_image_that_the_others_do_not_help_is_named() -> None:
-    truth = simulated(field(300.0), CONVERGENT)
+    truth = project_field(relief_field(300.0), CONVERGENT_STATIONS)
     observations = truth.network.observations
     observed = zip(observations.image, observations.point, observations.kind, strict=True)
     of_f3 = sorted(point for image, point, kind in observed if image == "f3" and kind == "target")
@@ -173,7 +186,7 @@ def test_an_image_that_the_others_do_not_help_is_named() -> None:
 
 
 def test_misnumbered_points_are_not_believed() -> None:
-    truth = simulated(field(300.0), CONVERGENT[:1])
+    truth = project_field(relief_field(300.0), CONVERGENT_STATIONS[:1])
     points = truth.network.observations.point
     targets = [i for i, kind in enumerate(truth.network.observations.kind) if kind == "target"]
     mixed = list(points)
@@ -185,7 +198,7 @@ def test_misnumbered_points_are_not_believed() -> None:
 
 
 def test_a_point_viewed_once_and_too_few_marks_are_named() -> None:
-    truth = simulated(field(300.0), CONVERGENT)
+    truth = project_field(relief_field(300.0), CONVERGENT_STATIONS)
     network = free_points(truth.network, {"t0"})
     rows = [i for i, point in enumerate(network.observations.point) if point != "t0"]
     once = network.observations.point.index("t0")
@@ -212,13 +225,13 @@ def subset(observations: Observations, rows: Sequence[int]) -> Observations:
 
 
 def test_heights_alone_and_two_points_orient_vertical_frames() -> None:
-    truth = simulated(field(20.0, n=60), VERTICAL)
+    truth = project_field(relief_field(20.0, n=60), VERTICAL_STATIONS)
     found = approximate(heights_only(truth.network, planimetry={"t3", "t7"}))
     assert_near(found, truth, meters=120.0, radians=0.08)
 
 
 def test_heights_alone_orient_vertical_frames_to_a_scale() -> None:
-    truth = simulated(field(0.0, n=60), VERTICAL)
+    truth = project_field(relief_field(0.0, n=60), VERTICAL_STATIONS)
     found = approximate(heights_only(truth.network, planimetry=set()))
     stations = np.array([found.exterior[image][:3] for image in truth.centers])
     expected = np.array(list(truth.centers.values()))
@@ -275,3 +288,159 @@ def from_observations_alone(network: Network) -> Network:
         for p in network.points
     )
     return replace(network, points=tuple(points))
+
+
+TILT = 0.14  # rad
+AROUND = [2 * np.pi * i / 8 for i in range(8)]
+TILTED = Truth(
+    stations=tuple((200 * np.cos(a), 200 * np.sin(a), 1500.0 if i % 2 else 1125.0) for i, a in enumerate(AROUND)),
+    attitudes=tuple((-TILT * np.sin(a), TILT * np.cos(a), i * np.pi / 2) for i, a in enumerate(AROUND)),
+    mirrored=8 * (False,),
+)
+
+
+def make_heights_network(seed: int) -> Network:
+    """100 points of a field with 8 m of relief, their heights known to 2 cm, and a camera of which little is known."""
+    rng = np.random.default_rng(seed)
+    free = dict.fromkeys(TILTED.distortion, np.inf)
+    network, _ = simulated(rng, TILTED, points=field_points(rng, 100, relief=8.0), free=free)
+    points = tuple(ObjectPoint(p.id, None, None, replace(p.Z, sigma=0.02)) for p in network.points if p.Z is not None)
+    camera = network.cameras[0]
+    distortion = replace(camera.distortion, parameters={name: Prior(0.0, np.inf) for name in TILTED.distortion})
+    interior = replace(
+        camera,
+        principal_distance_mm=Prior(152.6, np.inf),
+        x0_mm=Prior(0.0, np.inf),
+        y0_mm=Prior(0.0, np.inf),
+        distortion=distortion,
+    )
+    return replace(network, points=points, cameras=(interior,))
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("seed", [1, 2])
+def test_tilted_frames_are_oriented_and_calibrate_the_camera(seed: int) -> None:
+    """They start as if they looked straight down, where heights do not tell the principal distance."""
+    network = make_heights_network(seed)
+    result = adjust(network, approximate(network), Options(datum="minimal"))
+    assert result.converged
+    assert result.sigma0 < 1.1
+    c, sigma = result.value("IO.K.c"), result.sigma("IO.K.c")
+    assert abs(c - TILTED.c) < 4 * sigma < 4.0
+
+
+POINTS = 14
+
+
+def exchanged(network: Network, image: str, first: str, second: str) -> Network:
+    observations = network.observations
+    other = {(image, first): second, (image, second): first}
+    rows = zip(observations.image, observations.point, observations.kind, strict=True)
+    points = tuple(point if kind == "fiducial" else other.get((name, point), point) for name, point, kind in rows)
+    return replace(network, observations=replace(observations, point=points))
+
+
+@pytest.mark.study
+@pytest.mark.parametrize(("seed", "known"), [(8, POINTS), (7, 7)])
+def test_exchanged_numbers_are_named_whether_the_adjustment_ends_or_not(seed: int, known: int) -> None:
+    rng = np.random.default_rng(seed)
+    network, _ = simulated(rng, points=field_points(rng, POINTS), free={"k3": np.inf})
+    points = tuple(
+        point if int(point.id) < known else ObjectPoint(point.id, None, None, None) for point in network.points
+    )
+    image, pair = f"f{rng.integers(4)}", sorted(map(str, rng.choice(POINTS, 2, replace=False)))
+    network = exchanged(replace(network, points=points), image, *pair)
+    result = adjust(network, approximate(network))
+    named = [warning for warning in result.warnings if "swapped" in warning]
+    assert named == [
+        f"The points {pair[0]} and {pair[1]} of image {image} each lie where the other is expected: their numbers may "
+        f"be swapped."
+    ]
+
+
+@pytest.mark.study
+def test_an_image_that_starts_upside_down_has_no_swapped_numbers() -> None:
+    rng = np.random.default_rng(1)
+    network, start = simulated(rng, points=field_points(rng, POINTS))
+    exterior = {name: elements.copy() for name, elements in start.exterior.items()}
+    exterior["f1"][5] += np.pi
+    result = adjust(network, replace(start, exterior=exterior))
+    assert not [warning for warning in result.warnings if "swapped" in warning]
+
+
+ANGLE = np.deg2rad(30.0)
+SHARE = 0.2
+
+
+def spoilt(start: Approximations, distance: float, rng: np.random.Generator) -> Approximations:
+    exterior = {}
+    for name, values in start.exterior.items():
+        axis, way = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+        rotation = rotation_from_vector(ANGLE * axis) @ rotation_from_angles(values[3:])
+        exterior[name] = np.concatenate([values[:3] + SHARE * distance * way, angles_from_rotation(rotation)])
+    return replace(start, exterior=exterior)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_five_images_on_control(seed: int) -> None:
+    case = load("i_five_images_affine_reduced")
+    start = case_approximations(case, case["input"]["initial_approximations"])
+    result = adjust(case_network(case), spoilt(start, 1500.0, np.random.default_rng(seed)))
+    assert result.converged
+    for name, row in case["result"]["parameters"].items():
+        difference = result.value(own_name(name)) - row["value"]
+        if name.endswith(("omega", "phi", "kappa")):
+            difference = float(np.angle(np.exp(1j * difference)))  # a whole turn is no difference
+        assert abs(difference) < 1e-6 * row["std_apriori"]
+
+
+def only_heights() -> tuple[Network, Approximations]:
+    """Three frames crosswise over relief of which the heights are known to 5 cm: c goes with the scale, in a valley."""
+    rng = np.random.default_rng(5)
+    stations = ((0.0, 0.0, 1500.0), (400.0, 30.0, 1480.0), (30.0, 420.0, 1520.0))
+    attitudes = ((0.01, -0.02, 0.0), (-0.02, 0.01, 1.5), (0.02, 0.02, 3.0))
+    truth = Truth(distortion={}, stations=stations, attitudes=attitudes, mirrored=(False,) * 3)
+    network, start = simulated(rng, truth, points=field_points(rng, 25))
+    points = tuple(
+        ObjectPoint(each.id, *(None, None), Prior(each.Z.value, 0.05)) for each in network.points if each.Z is not None
+    )
+    return replace(network, points=points), start
+
+
+@pytest.mark.study
+def test_a_curved_valley_is_followed() -> None:
+    """Nine of ten starts reach the minimum; before steps were bent along the valley, one of six did."""
+    network, start = only_heights()
+    options = Options(datum="minimal")
+    right = adjust(network, start, options)
+    assert right.converged
+    reached = 0
+    for seed in range(4):
+        result = adjust(network, spoilt(start, 1500.0, np.random.default_rng(seed)), options)
+        reached += result.converged and result.vpv == pytest.approx(right.vpv, rel=1e-6)
+        assert result.converged or result.warnings
+    assert reached >= 3
+
+
+def test_the_history_tells_what_was_done() -> None:
+    network, start = only_heights()
+    result = adjust(network, spoilt(start, 1500.0, np.random.default_rng(0)), Options(datum="minimal"))
+    sums = [step.vpv for step in result.history]
+    assert sums == sorted(sums, reverse=True) or max(np.diff(sums)) < 1e-6 * sums[-1]
+    assert any(step.damping > 0.0 and step.attempts > 1 for step in result.history)
+    assert result.history[-1].damping == 0.0
+
+
+@parametrize_with_studies("sigma", [2.0, np.inf], quick=(1,))
+def test_a_principal_distance_that_is_a_guess_is_found_from_the_images(sigma: float) -> None:
+    """Twice the true one, and known no better than that: it is sought where the iteration does not come to rest."""
+    rng = np.random.default_rng(1)
+    network, _ = simulated(rng, points=field_points(rng, 40))
+    camera = network.cameras[0]
+    assert camera.principal_distance_mm is not None
+    guess = 2.0 * camera.principal_distance_mm.value
+    for known, converges in ((sigma * guess, True), (0.05 * guess, False)):
+        guessed = replace(camera, principal_distance_mm=Prior(guess, known))
+        result = adjust(replace(network, cameras=(guessed,)), options=Options(iteration_limit=7))
+        assert result.converged == converges
+        assert any("repeated with approximations" in remark for remark in result.remarks) == converges

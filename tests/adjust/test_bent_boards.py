@@ -8,20 +8,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from adjust.errors import AdjustmentError
+from adjust import Adjustment, AdjustmentError, Camera, Distortion, Parameter, Prior, adjust, approximate
 from adjust.functional_model.board import board_form
-from adjust.functional_model.lens import Distortion, Prior
-from adjust.initial_values.approximations import approximate
 from adjust.model_selection.model_choice import choose
-from adjust.problem.camera import Camera
 from adjust.problem.condition_equations import compute, computed_observations, derivatives
 from adjust.problem.estimates import adjusted_places
 from adjust.problem.network import Board, Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
-from adjust.problem.parameter import Parameter
 from adjust.problem.problem import number
-from adjust.solution.adjustment import adjust
-from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 

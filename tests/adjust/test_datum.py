@@ -4,20 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from networks import Truth, rotation, simulated
 from numpy.typing import NDArray
 from reference_cases import case_approximations, case_network, load
-from simulated import Truth, rotation, simulated
 
-from adjust.errors import AdjustmentError
-from adjust.functional_model.lens import Prior
+from adjust import Adjustment, AdjustmentError, Fiducial, Prior, approximate
 from adjust.functional_model.rotation import angles_from_rotation
-from adjust.initial_values.approximations import approximate
-from adjust.problem.camera import Fiducial
 from adjust.problem.network import EXTERIOR_NAMES, Exterior, Image, Network, ObjectPoint
 from adjust.problem.problem import number
 from adjust.rank_defect.datum import object_datum
 from adjust.solution.adjustment import Datum, Options, adjust
-from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 

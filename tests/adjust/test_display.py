@@ -7,16 +7,12 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 import pytest
-from board_pictures import board_network
 from matplotlib.axes import Axes
 from matplotlib.quiver import Quiver
-from simulated import HALF_MM, Truth, field_points, simulated
+from networks import HALF_MM, Truth, board_network, field_points, simulated
 
+from adjust import Adjustment, AdjustmentError, Parameter, adjust
 from adjust.display.camera_plots import contour_levels, distance_text
-from adjust.errors import AdjustmentError
-from adjust.problem.parameter import Parameter
-from adjust.solution.adjustment import adjust
-from adjust.solution.result import Adjustment
 
 PIXEL_MM = 0.005
 

@@ -1,91 +1,401 @@
-"""The families of industrial bundles, Zhang's skew and OpenCV's fisheye, against the renderer's own projections."""
+"""Distortion families against OpenCV and published formulas, and what sets are orthogonal to."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
-from lens_networks import LENSES, R0_MM, make_network
-from studies import parametrize_with_studies
+from networks import Truth, camera_point, digital_network, field_points, simulated
+from numpy.typing import NDArray
 
-from adjust.functional_model.families import family, parameter_names
-from adjust.functional_model.lens import Distortion, Lens
-from adjust.initial_values.approximations import approximate
-from adjust.solution.adjustment import adjust
+from adjust import AdjustmentError, Approximations, Camera, Network, adjust, approximate
+from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens import Distortion, Lens, Prior
+from adjust.functional_model.projection import ImageModel
+from adjust.functional_model.rotation import rotation_from_angles
+from adjust.functional_model.transformation import Film
+from adjust.problem.estimates import adjusted_image
 
+Array = NDArray[np.float64]
 
-@pytest.mark.parametrize("name", list(LENSES))
-def test_a_lens_is_found_from_exact_images(name: str) -> None:
-    """From start values that the points give, with nothing known of the lens."""
-    network = make_network(name)
-    found = adjust(network, approximate(network))
-    assert found.converged
-    assert found.vpv < 1e-10
-    c, values = LENSES[name]
-    for each, value in (values | {"c": c, "x0": 0.12, "y0": -0.07}).items():
-        assert abs(found.value(f"IO.L.{each}") - value) < 1e-4 * found.sigma(f"IO.L.{each}") / found.sigma0, each
-
-
-@parametrize_with_studies("name", list(LENSES))
-def test_nothing_but_the_points_has_to_be_known(name: str) -> None:
-    """Neither c nor the principal point; of the fisheye points up to 80 degrees off the axis."""
-    network = make_network(name, np.random.default_rng(1))
-    camera = replace(network.cameras[0], principal_distance_mm=None, x0_mm=None, y0_mm=None)
-    network = replace(network, cameras=(camera,))
-    start = approximate(network)
-    assert start.interior["L"][0] == pytest.approx(LENSES[name][0], rel=0.1)
-    found = adjust(network, start)
-    assert found.converged
-    assert 0.9 < found.sigma0 < 1.1
-    assert abs(found.value("IO.L.c") - LENSES[name][0]) < 4.0 * found.sigma("IO.L.c")
+PIXEL_MM = 0.005
+SIZE_PX = np.array([4000.0, 3000.0])
+FX, FY, CX, CY = 4810.0, 4800.0, 2010.0, 1490.0
+SKEW = 7.0
+FISHEYE = np.array([0.03, -0.02, 0.004, -0.001])
+LENS = [-0.12, 0.09, 0.0012, -0.0008, -0.03, 0.02, -0.01, 0.004, 0.0011, -0.0007, 0.0005, 0.0009]
+TILT = [0.02, -0.015]
+DISTORTION = np.array([*LENS, *TILT])
+NAMES = parameter_names("opencv")[:14]
+FLIP = np.diag([1.0, -1.0, -1.0])  # from the camera's axes, y up and z backward, to OpenCV's
 
 
-@parametrize_with_studies("name", list(LENSES), quick=(3,))
-def test_claimed_sigmas_are_realised(name: str) -> None:
-    """Twelve sets of errors, pooled over the parameters: chi-square per degree of freedom within three sigmas of 1."""
-    rng = np.random.default_rng(5)
-    first = make_network(name)
-    c, values = LENSES[name]
-    true = values | {"c": c, "x0": 0.12, "y0": -0.07}
-    start = approximate(first)
-    squares = []
-    for _ in range(12):
-        found = adjust(make_network(name, rng), start)
-        names = [f"IO.L.{each}" for each in true]
-        errors = np.array([found.value(each) for each in names]) - list(true.values())
-        squares.append(errors @ np.linalg.solve(found.cofactor_of(names), errors))
-    count = len(true) * len(squares)
-    assert abs(np.sum(squares) / count - 1.0) < 3.0 * np.sqrt(2.0 / count)
+def opencv_pixels(angles: Array, station: Array, xyz: Array) -> Array:
+    """Pixels (n, 2) by OpenCV."""
+    rotation = FLIP @ rotation_from_angles(angles)
+    rvec, _ = cv2.Rodrigues(rotation)
+    matrix = np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]])
+    pixels, _ = cv2.projectPoints(xyz, rvec, -rotation @ station, matrix, DISTORTION)
+    return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
 
-def test_r0_balances_the_ideal_point_and_not_the_observed_one() -> None:
-    """On the circle r0 about the principal point the ideal point stays; aicon adds what torlegard subtracts."""
-    turn = np.linspace(0.0, 2.0 * np.pi, 7)
-    rays = R0_MM / 30.0 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    interior, values = np.array([30.0, 0.5, -0.2]), np.array([-1e-4, 1e-7, 0.0, 0.0, 0.0, 0.0, 0.0])
-    balanced = Distortion("aicon", r0_mm=R0_MM)
-    projected, found = Lens(balanced, interior, values).camera_from_ray(rays)
+def mm(pixels: Array) -> Array:
+    """Comparator coordinates: x right, y up, origin at the centre of the top-left pixel."""
+    return np.asarray(pixels * np.array([PIXEL_MM, -PIXEL_MM]))
+
+
+def camera(free: bool) -> Camera:
+    """The camera; its denominator is fixed, from which a numerator in the same powers can hardly be told."""
+    sigma = np.inf if free else 0.0
+    values = [*DISTORTION, FX / FY - 1.0, 0.0]
+    parameters = {
+        name: Prior(value, 0.0 if name in ("k4", "k5", "k6") else sigma)
+        for name, value in zip(parameter_names("opencv"), values, strict=True)
+    }
+    c, x0, y0 = FY * PIXEL_MM, CX * PIXEL_MM, -CY * PIXEL_MM
+    return Camera("D", Prior(c, sigma), Prior(x0, sigma), Prior(y0, sigma), Distortion("opencv", parameters))
+
+
+def numbered(xyz: Array) -> dict[str, Array]:
+    return {str(j): each for j, each in enumerate(xyz)}
+
+
+def board() -> Array:
+    x, y = np.meshgrid(np.arange(-6.0, 7.0), np.arange(-5.0, 6.0))
+    return np.stack([x.ravel() * 100, y.ravel() * 100, np.zeros(x.size)], axis=1)
+
+
+def test_projection_is_opencvs() -> None:
+    angles, station = np.array([0.2, -0.3, 0.5]), np.array([300.0, -200.0, 1500.0])
+    xyz = np.random.default_rng(2).uniform(-400, 400, (50, 3))
+    interior = np.array([FY * PIXEL_MM, CX * PIXEL_MM, -CY * PIXEL_MM])
+    lens = Lens(camera(False).distortion, interior, camera(False).distortion.values)
+    image = ImageModel(lens, rotation_from_angles(angles), station, Film("none", np.empty(0), np.zeros(2)))
+    projected, visible = image.comparator_from_object(xyz)
+    assert visible.all()
+    np.testing.assert_allclose(projected, mm(opencv_pixels(angles, station, xyz)), atol=1e-11)
+
+
+def skewed(rays: Array) -> Array:
+    """Pixels (n, 2) of rays in the camera's axes, y up, by OpenCV's distortion and a matrix with skew, as Zhang's."""
+    directions = np.column_stack([rays * [1.0, -1.0], np.ones(len(rays))])
+    distorted, _ = cv2.projectPoints(directions, np.zeros(3), np.zeros(3), np.eye(3), DISTORTION)
+    return np.asarray(np.reshape(distorted, (-1, 2)) @ np.array([[FX, SKEW], [0.0, FY]]).T + [CX, CY])
+
+
+def fisheye(rays: Array) -> Array:
+    """The same by OpenCV's fisheye, whose skew is alpha fx."""
+    directions = np.column_stack([rays * [1.0, -1.0], np.ones(len(rays))])[:, None]
+    matrix = np.array([[FX, 0.0, CX], [0.0, FY, CY], [0.0, 0.0, 1.0]])
+    pixels, _ = cv2.fisheye.projectPoints(directions, np.zeros(3), np.zeros(3), matrix, FISHEYE, alpha=SKEW / FX)
+    return np.asarray(np.reshape(pixels, (-1, 2)))
+
+
+@pytest.mark.parametrize(
+    ("family", "lens", "pixels", "largest"),
+    [("opencv", DISTORTION, skewed, 0.5), ("opencv_fisheye", FISHEYE, fisheye, 3.0)],
+)
+def test_skew_and_fisheye_are_opencvs(
+    family: str, lens: Array, pixels: Callable[[Array], Array], largest: float
+) -> None:
+    """Up to 72 degrees off the axis for the fisheye; the middle too; and back again."""
+    rays = np.vstack([np.random.default_rng(3).uniform(-largest, largest, (60, 2)) / np.sqrt(2.0), np.zeros(2)])
+    interior = np.array([FY, CX, -CY]) * PIXEL_MM
+    values = np.array([*lens, FX / FY - 1.0, SKEW / FY])
+    projected, found = Lens(Distortion(family), interior, values).camera_from_ray(rays)
     assert found.all()
-    np.testing.assert_allclose(projected, interior[1:] + 30.0 * rays, atol=1e-13)
-    inner, _ = Lens(balanced, interior, values).camera_from_ray(0.5 * rays)
-    half = R0_MM / 2.0
-    expected = half * (1.0 - 1e-4 * (half**2 - R0_MM**2) + 1e-7 * (half**4 - R0_MM**4))
-    np.testing.assert_allclose(np.linalg.norm(inner - interior[1:], axis=1), expected, rtol=1e-13)
-
-
-def test_a_fisheye_without_parameters_is_equidistant() -> None:
-    """All parameters 0 are no pinhole; what no ray below 90 degrees makes is told."""
-    interior, zero = np.array([10.0, 0.0, 0.0]), np.zeros(len(parameter_names("opencv_fisheye")))
-    angles = np.radians([0.0, 30.0, 60.0, 85.0])
-    at = np.column_stack([10.0 * angles, np.zeros(4)])
-    ideal, found = Lens(Distortion("opencv_fisheye"), interior, zero).ideal_from_observed(at)
+    np.testing.assert_allclose(projected, mm(pixels(rays)), atol=1e-11)
+    ideal, found = Lens(Distortion(family), interior, values).ideal_from_observed(projected)
     assert found.all()
-    np.testing.assert_allclose(ideal[:, 0], 10.0 * np.tan(angles), rtol=1e-12)
-    beyond = np.array([[16.0, 0.0], [3.0, 0.0]])
-    assert list(Lens(Distortion("opencv_fisheye"), interior, zero).folded_over(beyond)) == [True, False]
+    np.testing.assert_allclose((ideal - interior[1:]) / interior[0], rays, atol=1e-12)
 
 
-def test_every_parameter_has_its_unit_and_a_ladder_names_only_parameters() -> None:
-    for name in ("torlegard", "brown", "australis", "aicon", "opencv", "opencv_fisheye", "juhl", "ebner"):
-        of = family(name)
-        assert all(of.unit(each) for each in of.parameters)
-        assert {each for rung in of.ladder for each in rung.split()} <= set(of.parameters)
+def test_corrected_points_are_opencvs_undistorted_points() -> None:
+    rng = np.random.default_rng(4)
+    pixels = rng.uniform([0, 0], SIZE_PX, (40, 2))
+    values = np.array([*DISTORTION, FX / FY - 1.0, 0.0])
+    interior = np.array([FY, CX, -CY]) * PIXEL_MM
+    ideal, found = Lens(Distortion("opencv"), interior, values).ideal_from_observed(mm(pixels))
+    matrix = np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]])
+    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 500, 1e-14)
+    normal = cv2.undistortPoints(pixels[:, None], matrix, DISTORTION, R=np.eye(3), P=np.eye(3), criteria=criteria)
+    expected = np.asarray(normal).reshape(-1, 2) * [1, -1] * interior[0] + interior[1:]
+    assert found.all()
+    np.testing.assert_allclose(ideal, expected, atol=1e-9)
+
+
+def test_adjustment_recovers_opencvs_parameters() -> None:
+    """Exact images by OpenCV, its parameters and fx/fy free: estimated as they went in."""
+    rng = np.random.default_rng(6)
+    relief = board()
+    relief[:, 2] = 150 * np.sin(relief[:, 0] / 70)
+    tilts = [(0.0, 0.0, 0.0), (0.4, 0.1, 1.5), (-0.4, 0.2, 3.0), (0.1, 0.45, -1.5), (-0.1, -0.4, 0.7)]
+    poses = [(np.array(tilt), np.array([1200 * tilt[1], -1200 * tilt[0], 1150.0])) for tilt in tilts]
+    rows = [
+        (f"i{i}", str(j), xy) for i, pose in enumerate(poses) for j, xy in enumerate(mm(opencv_pixels(*pose, relief)))
+    ]
+    c, x0, y0 = FY * PIXEL_MM, CX * PIXEL_MM, -CY * PIXEL_MM
+    start = Approximations(
+        {"D": np.array([c * 1.01, x0 + 0.1, y0 - 0.1])},
+        {f"i{i}": np.concatenate([s + rng.uniform(-10, 10, 3), a + rng.uniform(-0.02, 0.02, 3)])
+         for i, (a, s) in enumerate(poses)},
+        {}, {},
+    )  # fmt: skip
+    result = adjust(digital_network(camera(True), rows, numbered(relief), 0.0005), start)
+    assert result.converged
+    assert result.vpv < 1e-12
+    expected = dict(zip(NAMES, DISTORTION, strict=True)) | {"c": c, "x0": x0, "y0": y0, "b1": FX / FY - 1}
+    for name, value in expected.items():
+        i = result.index(f"IO.D.{name}")
+        assert result.values[i] == pytest.approx(value, abs=1e-3 * np.sqrt(result.cofactor.variances[i]))
+
+
+def test_torlegard_is_inverted() -> None:
+    truth = Truth()
+    xyz = field_points(np.random.default_rng(1), 30)
+    angles, station = np.array(truth.attitudes[1]), np.array(truth.stations[1])
+    model = ImageModel(
+        Lens(
+            Distortion("torlegard"),
+            np.array([truth.c, truth.x0, truth.y0]),
+            np.array([truth.distortion.get(name, 0.0) for name in parameter_names("torlegard")]),
+        ),
+        rotation_from_angles(angles),
+        station,
+        Film("none", np.empty(0), np.zeros(2)),
+    )
+    observed, visible = model.camera_from_object(xyz)
+    assert visible.all()
+    expected = camera_point(truth, 1, xyz)
+    np.testing.assert_allclose(observed, expected, atol=1e-10)
+    ideal, found = model.lens.ideal_from_observed(observed)
+    u, v, w = model.rotation @ (xyz - station).T
+    assert found.all()
+    np.testing.assert_allclose(
+        ideal, np.stack([truth.x0 - truth.c * u / w, truth.y0 - truth.c * v / w], axis=1), atol=1e-10
+    )
+
+
+def test_what_has_no_image_is_reported() -> None:
+    """Behind the camera, and beyond the radius where a polynomial folds the image over."""
+    fold = Distortion("torlegard")
+    parameters = np.array([4e-5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])  # x - k3 x³ turns back at 91 mm
+    _, found = Lens(fold, np.array([100.0, 0.0, 0.0]), parameters).camera_from_ray(np.array([[0.3, 0.0], [2.0, 0.0]]))
+    assert list(found) == [True, False]
+    barrel = np.array([-0.3] + [0.0] * 15)  # OpenCV's k1: the image of a ray turns back at a slope of 1.05
+    _, found = Lens(Distortion("opencv"), np.array([100.0, 0.0, 0.0]), barrel).camera_from_ray(
+        np.array([[0.9, 0], [1.2, 0]])
+    )
+    assert list(found) == [True, False]
+    model = ImageModel(
+        Lens(Distortion(), np.array([100.0, 0.0, 0.0]), np.empty(0)),
+        np.eye(3),
+        np.zeros(3),
+        Film("none", np.empty(0), np.zeros(2)),
+    )
+    _, visible = model.comparator_from_object(np.array([[0.0, 0.0, -5.0], [0.0, 0.0, 5.0], [1.0, 0.0, 0.0]]))
+    assert list(visible) == [True, False, False]
+
+
+def test_adjusted_image_predicts_its_observations() -> None:
+    xyz = field_points(np.random.default_rng(1), 12)
+    network, start = simulated(np.random.default_rng(9), points=xyz, noise=False)
+    result = adjust(network, start)
+    predicted, visible = adjusted_image(result, "f2").comparator_from_object(xyz)
+    observations = network.observations
+    keys = zip(observations.image, observations.kind, strict=True)
+    rows = [row for row, key in enumerate(keys) if key == ("f2", "target")]
+    assert visible.all()
+    np.testing.assert_allclose(predicted, observations.xy_mm[rows], atol=1e-8)
+
+
+RATIONAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+WIDE = np.array([8.0, 3.0, 0.0002, -0.0001, 0.1, 8.4, 5.0, 0.6])
+WIDE_FX = 2500.0
+
+
+def wide_network(seed: int, lens: Array = WIDE) -> Network:
+    """A board in five images of a wide lens, distorted by OpenCV's rational model, all of which begins at 0."""
+    noise_mm = 0.0002
+    rng = np.random.default_rng(seed)
+    x, y = np.meshgrid(np.arange(-6.0, 7.0), np.arange(-6.0, 7.0))
+    xyz = np.stack([x.ravel() * 160, y.ravel() * 160, np.zeros(x.size)], axis=1)
+    matrix = np.array([[WIDE_FX, 0, CX], [0, WIDE_FX, CY], [0, 0, 1]])
+    rows = []
+    for i in range(5):
+        to_camera = rotation_from_angles(np.array([*rng.uniform(-0.5, 0.5, 2), rng.uniform(-3.0, 3.0)]))
+        station = to_camera.T @ np.array([*rng.uniform(-150.0, 150.0, 2), rng.uniform(900.0, 1200.0)])
+        rvec, _ = cv2.Rodrigues(FLIP @ to_camera)
+        pixels, _ = cv2.projectPoints(xyz, rvec, -FLIP @ to_camera @ station, matrix, lens)
+        pixels = pixels.reshape(-1, 2)
+        shown = np.flatnonzero(((pixels > 0.0) & (pixels < SIZE_PX)).all(axis=1))
+        rows += [(f"i{i}", str(j), mm(pixels[j]) + rng.normal(0.0, noise_mm, 2)) for j in shown]
+    c, x0, y0 = (Prior(value * PIXEL_MM, np.inf) for value in (WIDE_FX, CX, -CY))
+    wide = Camera("D", c, x0, y0, Distortion("opencv", {name: Prior(0.0, np.inf) for name in RATIONAL}))
+    found = {row[1] for row in rows}
+    return digital_network(wide, rows, {k: v for k, v in numbered(xyz).items() if k in found}, noise_mm)
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_rational_distortion_begins_at_zero(seed: int) -> None:
+    """Where its numerator and its denominator do the same: the solution is regular, and it is found."""
+    network = wide_network(seed)
+    result = adjust(network, approximate(network))
+    assert result.converged
+    assert result.sigma0 == pytest.approx(1.0, abs=0.05)
+    for name, true in zip(("c", "x0", "y0"), (WIDE_FX, CX, -CY), strict=True):
+        assert abs(result.value(f"IO.D.{name}") - true * PIXEL_MM) < 4.0 * result.sigma(f"IO.D.{name}")
+
+
+def test_a_denominator_that_nothing_asks_for_is_a_note() -> None:
+    """A lens without distortion: numerator and denominator do the same exactly, and yet there is a solution."""
+    network = wide_network(0, 0.0 * WIDE)
+    result = adjust(network, approximate(network))
+    assert result.converged
+    assert not result.warnings
+    (note,) = result.notes
+    assert note.startswith("k1, k2, k3, k4, k5 and k6 of camera D cannot be separated")
+    c = WIDE_FX * PIXEL_MM
+    assert abs(result.value("IO.D.c") - c) < 4.0 * result.sigma("IO.D.c")
+
+
+@pytest.mark.parametrize(("family", "parameters"), [("torlegard", {"k3": 1e-4}), ("opencv", {"k1": -4.0})])
+def test_a_distortion_that_folds_the_image_over_is_named(family: str, parameters: dict[str, float]) -> None:
+    network, _ = simulated(np.random.default_rng(5), points=field_points(np.random.default_rng(6), 15))
+    folding = Distortion(family, {name: Prior(value, np.inf) for name, value in parameters.items()})
+    folded = replace(network, cameras=(replace(network.cameras[0], distortion=folding),))
+    with pytest.raises(AdjustmentError, match=r"camera K: the distortion that is given \(k. = \S+\) folds the image"):
+        approximate(folded)
+
+
+B = 90.0
+C = 152.0
+
+
+def columns(family: str, xy_mm: Array, half_mm: tuple[float, float] = (B, B)) -> Array:
+    """(n, 2, k): what a unit of every parameter takes off observed points, the principal point at (0.3, -0.2)."""
+    names = parameter_names(family)
+    interior = np.array([C, 0.3, -0.2])
+    observed = xy_mm + interior[1:]
+    at = Lens(Distortion(family, half_mm=half_mm), interior, np.zeros(len(names))).equations(observed, xy_mm / C)
+    return -at.parameter_jacobian
+
+
+def grid(points: Array, half_mm: tuple[float, float] = (B, B)) -> Array:
+    x, y = np.meshgrid(points * half_mm[0], points * half_mm[1])
+    return np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+def orientation(xy_mm: Array) -> Array:
+    """(n, 2, 6): shifts, rotation, scale and tilts of an image of a plane, by what they are in a picture."""
+    x, y = xy_mm.T
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    pairs = [(one, zero), (zero, one), (-y, x), (x, y), (C + x**2 / C, x * y / C), (x * y / C, C + y**2 / C)]
+    return np.stack([np.stack(pair, axis=1) for pair in pairs], axis=2)
+
+
+def largest_cosine(first: Array, second: Array) -> float:
+    """Between columns (n, 2, k) and (n, 2, l)."""
+    a, b = (each.reshape(-1, each.shape[2]) / np.linalg.norm(each, axis=(0, 1)) for each in (first, second))
+    return float(np.abs(a.T @ b).max())
+
+
+def are_orthogonal(each: Array) -> bool:
+    flat = each.reshape(-1, each.shape[2]) / np.linalg.norm(each, axis=(0, 1))
+    return bool(np.allclose(flat.T @ flat, np.eye(flat.shape[1]), atol=1e-12))
+
+
+def test_ebners_formula_as_published() -> None:
+    """In mm and in b: his coefficient of a product of degree m is ours over b to that power."""
+    xy = np.random.default_rng(1).uniform(-100, 100, (9, 2))
+    x, y = xy.T
+    u, v = x**2 - 2 * B**2 / 3, y**2 - 2 * B**2 / 3
+    zero = np.zeros_like(x)
+    dx = [x, y, -2 * u, x * y, v, zero, x * v, zero, u * y, zero, u * v, zero]
+    dy = [-y, x, x * y, -2 * v, zero, u, zero, u * y, zero, x * v, zero, u * v]
+    degrees = np.array([1, 1, 2, 2, 2, 2, 3, 3, 3, 3, 4, 4])
+    expected = np.stack([np.stack(dx, axis=1), np.stack(dy, axis=1)], axis=1) / B**degrees
+    assert parameter_names("ebner") == tuple(f"b{i}" for i in range(1, 13))
+    np.testing.assert_allclose(columns("ebner", xy), expected, atol=1e-13)
+
+
+def test_gruens_formula_as_published() -> None:
+    """With b = 1: k, l of degree 2, x p, y q of degree 3, r, s of degree 4, as his table has them."""
+    xy = np.random.default_rng(2).uniform(-1, 1, (9, 2))
+    x, y = xy.T
+    k, l_ = x**2 - 1 / 2, y**2 - 1 / 2
+    p, q = x**2 - 17 / 20, y**2 - 17 / 20
+    r, s = x**2 * (x**2 - 31 / 28) + 9 / 70, y**2 * (y**2 - 31 / 28) + 9 / 70
+    by_x, by_y = [np.ones_like(x), x, k, x * p, r], [np.ones_like(x), y, l_, y * q, s]
+    zero = np.zeros_like(x)
+    expected = {"a12": (x, -y), "a21": (y, x), "a22": (x * y, -10 / 7 * l_), "b22": (-10 / 7 * k, x * y)}
+    for i in range(1, 6):
+        for j in range(1, 6):
+            product = by_y[i - 1] * by_x[j - 1]
+            if (i, j) not in {(1, 1), (1, 2), (2, 1), (2, 2), (1, 3)}:
+                expected[f"a{i}{j}"] = (product, zero)
+            if (i, j) not in {(1, 1), (1, 2), (2, 1), (2, 2), (3, 1)}:
+                expected[f"b{i}{j}"] = (zero, product)
+    found = dict(zip(parameter_names("gruen"), np.moveaxis(columns("gruen", xy, (1.0, 1.0)), 2, 0), strict=True))
+    assert found.keys() == expected.keys()
+    assert len(found) == 44
+    for name, pair in expected.items():
+        np.testing.assert_allclose(found[name], np.stack(pair, axis=1), atol=1e-14, err_msg=name)
+
+
+@pytest.mark.parametrize("half_mm", [(B, B), (115.0, 80.0)])
+@pytest.mark.parametrize(
+    ("family", "points"), [("ebner", np.linspace(-1, 1, 3)), ("gruen", np.linspace(-1, 1, 5))]
+)  # fmt: skip
+def test_on_their_grid_the_parameters_are_orthogonal_and_free_of_the_orientation(
+    family: str, points: Array, half_mm: tuple[float, float]
+) -> None:
+    xy = grid(points, half_mm)
+    found = columns(family, xy, half_mm)
+    assert are_orthogonal(found)
+    assert largest_cosine(found, orientation(xy)) < 1e-12
+
+
+@pytest.mark.parametrize(("family", "count"), [("legendre(2)", 12), ("legendre(3)", 26), ("legendre(5)", 66)])
+def test_legendres_are_orthogonal_over_the_frame_and_free_of_the_orientation(family: str, count: int) -> None:
+    half_mm = (115.0, 80.0)
+    points, weights = np.polynomial.legendre.leggauss(8)
+    xy = grid(points, half_mm)
+    root = np.sqrt(np.outer(weights, weights).ravel())[:, None, None]
+    found = columns(family, xy, half_mm)
+    assert found.shape[2] == count
+    assert are_orthogonal(root * found)
+    assert largest_cosine(root * found, root * orientation(xy)) < 1e-12
+
+
+@pytest.mark.parametrize(("order", "count"), [(1, 16), (2, 48), (3, 96)])
+def test_fouriers_are_orthogonal_over_the_frame_and_to_a_shift(order: int, count: int) -> None:
+    half_mm = (115.0, 80.0)
+    xy = grid(-1 + 2 * np.arange(12) / 12, half_mm)
+    found = columns(f"fourier({order})", xy, half_mm)
+    assert found.shape[2] == count
+    assert are_orthogonal(found)
+    assert largest_cosine(found, orientation(xy)[..., :2]) < 1e-12
+
+
+def test_a_fourier_term_by_its_name() -> None:
+    xy = np.array([[20.0, -35.0]])
+    named = dict(zip(parameter_names("fourier(2)"), columns("fourier(2)", xy)[0].T, strict=True))
+    angle = np.pi / B * (1 * 20.0 - 2 * -35.0)
+    np.testing.assert_allclose(named["a1m2"], [np.cos(angle), 0.0], atol=1e-14)
+    np.testing.assert_allclose(named["d1m2"], [0.0, np.sin(angle)], atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("family", "words"),
+    [
+        ("legendre(1)", r"the order of legendre must be 2 to 9, not 1"),
+        ("fourier(10)", r"the order of fourier must be 1 to 9, not 10"),
+        ("legendre", r"one of none, .*legendre\(n\), fourier\(n\), not legendre"),
+        ("ebner(3)", "must be one of"),
+    ],
+)
+def test_a_wrong_order_is_refused(family: str, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        Distortion(family)

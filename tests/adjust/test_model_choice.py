@@ -4,18 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bent_scans import MARKS_MM, films
+from networks import EIGHT_MARKS_MM, HALF_MM, Truth, bent_films, field_points, simulated
 from numpy.typing import NDArray
-from simulated import HALF_MM, Truth, field_points, simulated
 
-from adjust.functional_model.lens import Distortion, Prior
-from adjust.initial_values.approximations import approximate
+from adjust import Distortion, Options, Prior, adjust, approximate
 from adjust.model_selection.candidates import Candidate, Model, f_test, lenses, nested_tests, simplest_sufficient
 from adjust.model_selection.cross_validation import CrossValidation, cross_validate, folds
 from adjust.model_selection.model_choice import Choice, choose, weighted_network
 from adjust.problem.network import Network, ObjectPoint, Transformation
 from adjust.quality.weighting import WeightFunction
-from adjust.solution.adjustment import Options, adjust
 
 Array = NDArray[np.float64]
 
@@ -77,8 +74,8 @@ def test_the_true_lens_is_chosen_and_the_simpler_ones_are_reported_to_be_too_sim
 def test_a_scanners_bend_is_chosen_and_not_taken_for_a_richer_film() -> None:
     """Frames of marks alone, in all four quarters: the terms that bend, beside films that are affine."""
     bend = {"a20": 0.02, "b11": -0.015}
-    network = films([0.0, 90.0, 180.0, 270.0], bend, {}, np.random.default_rng(1))
-    choice = choose(adjust(network, approximate(films([0.0, 90.0, 180.0, 270.0], {}, {}))))
+    network = bent_films([0.0, 90.0, 180.0, 270.0], bend, {}, np.random.default_rng(1))
+    choice = choose(adjust(network, approximate(bent_films([0.0, 90.0, 180.0, 270.0], {}, {}))))
     assert choice.chosen is not None
     assert choice.chosen.model == Model("affine", bends=(("S", ("a20", "b11")),))
     assert choice.chosen.sigma0 == pytest.approx(1.0, abs=0.3)
@@ -88,9 +85,9 @@ def test_a_scanners_bend_is_chosen_and_not_taken_for_a_richer_film() -> None:
 
 @pytest.mark.study
 def test_a_straight_scanner_gets_no_bend_and_what_is_not_reported_is_stated() -> None:
-    few = {name: MARKS_MM[name] for name in "1234"}
-    network = films([0.0] * 3, {}, {}, np.random.default_rng(2), marks_mm=few)
-    choice = choose(adjust(network, approximate(films([0.0] * 3, {}, {}, marks_mm=few))))
+    few = {name: EIGHT_MARKS_MM[name] for name in "1234"}
+    network = bent_films([0.0] * 3, {}, {}, np.random.default_rng(2), marks_mm=few)
+    choice = choose(adjust(network, approximate(bent_films([0.0] * 3, {}, {}, marks_mm=few))))
     assert choice.chosen is not None
     assert choice.chosen.model.bends == ()
     assert any("all frames lie alike in the scanner" in reason for reason in choice.reasons)

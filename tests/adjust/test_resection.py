@@ -1,11 +1,18 @@
-"""Resection against cv2.projectPoints: flat and deep fields, any attitude, gross errors, one image and many."""
+"""Resection and model formation against OpenCV and chosen poses; images whose resection fails."""
+
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
+from networks import digital_network
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from studies import parametrize_with_studies
 
+from adjust import AdjustmentError, Camera, Distortion, Network, Options, Prior, adjust, approximate
+from adjust.initial_values.intersection import intersect
+from adjust.initial_values.model_formation import absolute_orientation, relative_poses
 from adjust.initial_values.pose import KnownField, Pose, image_distances
 from adjust.initial_values.principal_distance import find_principal_distance
 from adjust.initial_values.resection import resect, resect_images, resections, three_point_poses
@@ -137,3 +144,245 @@ def test_the_principal_distance_of_a_lens_that_is_not_known(relief: float, gross
 def test_a_plane_parallel_to_the_images_does_not_tell_the_principal_distance() -> None:
     given, _ = known_fields([40] * 12, 0.0, 0.0, SIGMA_MM)
     assert find_principal_distance(given) is None
+
+
+NOISE_RAD = 3e-5  # 4.5 um at 150 mm
+
+
+def pair(relief: float, tilt_rad: float, n: int, rng: np.random.Generator) -> tuple[Pose, Array, Array]:
+    """A second camera about 0.5 away from a first that looks down at a field 1.5 below, and rays to the same points."""
+    points = np.column_stack([rng.uniform(-0.7, 0.9, (n, 2)), -1.5 + relief * rng.uniform(-1.0, 1.0, n)])
+    center = np.array([0.5, 0.1, 0.05])
+    center /= np.linalg.norm(center)
+    rotation = (
+        Rotation.from_euler("XYZ", [rng.uniform(-tilt_rad, tilt_rad), tilt_rad, rng.uniform(-3, 3)]).as_matrix().T
+    )
+    second = (points * 2 - center) @ rotation.T
+    first = points * 2
+    noisy = [rays[:, :2] / -rays[:, 2:] + rng.normal(0.0, NOISE_RAD, (n, 2)) for rays in (first, second)]
+    rays = [np.column_stack([xy, -np.ones(n)]) for xy in noisy]
+    return Pose(rotation, center), rays[0], rays[1]
+
+
+@pytest.mark.parametrize("relief", [0.0, 0.05, 0.3], ids=["flat", "hilly", "deep"])
+@pytest.mark.parametrize("tilt_rad", [0.02, 0.35], ids=["parallel", "convergent"])
+@pytest.mark.parametrize("wrong", [0, 6], ids=["clean", "gross errors"])
+def test_relative_orientation_is_among_the_poses(relief: float, tilt_rad: float, wrong: int) -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(3):
+        pose, first, second = pair(relief, tilt_rad, 40, rng)
+        second[:wrong, :2] += rng.uniform(0.05, 0.3, (wrong, 2))
+        poses = relative_poses(first, second, np.random.default_rng(0))
+        turns = [np.linalg.norm(found.rotation - pose.rotation) for found in poses]
+        best = poses[int(np.argmin(turns))]
+        assert min(turns) < 0.02
+        assert np.linalg.norm(best.center - pose.center) < 0.05
+        assert all(np.linalg.det(found.rotation) == pytest.approx(1.0) for found in poses)
+
+
+def test_relative_orientation_from_exact_rays_is_exact_and_first() -> None:
+    rng = np.random.default_rng(2)
+    pose, first, _ = pair(0.3, 0.3, 12, rng)
+    points = first / -first[:, 2:] * rng.uniform(2.0, 4.0, (12, 1))
+    exact = (points - pose.center) @ pose.rotation.T
+    found = relative_poses(points, exact, np.random.default_rng(0))[0]
+    np.testing.assert_allclose(found.rotation, pose.rotation, atol=1e-6)
+    np.testing.assert_allclose(found.center, pose.center, atol=1e-6)
+
+
+def model_in_space(rng: np.random.Generator) -> tuple[Array, Array, Array, Array]:
+    """Model points and stations, and the same in the object space, the cameras above."""
+    points = rng.uniform(-1.0, 1.0, (12, 3)) * [900.0, 900.0, 200.0] + [5e4, 2e4, 300.0]
+    stations = np.array([[5e4, 2e4, 1800.0], [5.05e4, 2e4, 1750.0]])
+    turn = Rotation.from_quat(rng.normal(size=4)).as_matrix()
+    shift = rng.uniform(-3.0, 3.0, 3)
+    return (
+        (points - points[0]) @ turn.T / 700.0 + shift,
+        (stations - points[0]) @ turn.T / 700.0 + shift,
+        points,
+        stations,
+    )
+
+
+@parametrize_with_studies("datum", ["all", "minimal", "planimetry and three heights"], quick=(1,))
+def test_absolute_orientation_recovers_the_object_space(datum: str) -> None:
+    rng = np.random.default_rng(6)
+    for _ in range(4):
+        model, model_stations, points, stations = model_in_space(rng)
+        known = np.full_like(points, np.nan)
+        if datum == "all":
+            known = points
+        elif datum == "minimal":
+            known[0], known[1], known[2, 2] = points[0], points[1], points[2, 2]
+        else:
+            known[[0, 1], :2], known[[2, 3, 4], 2] = points[[0, 1], :2], points[[2, 3, 4], 2]
+        similarity = absolute_orientation(model, known, model_stations)
+        assert similarity is not None
+        np.testing.assert_allclose(similarity.apply(model), points, atol=0.05)
+        np.testing.assert_allclose(similarity.apply(model_stations), stations, atol=0.05)
+
+
+def test_absolute_orientation_needs_seven_values_that_determine_it() -> None:
+    model, model_stations, points, _ = model_in_space(np.random.default_rng(1))
+    known = np.full_like(points, np.nan)
+    known[:2] = points[:2]
+    assert absolute_orientation(model, known, model_stations) is None
+    known[2] = points[2]
+    line = model.copy()
+    line[2] = (model[0] + model[1]) / 2
+    known[2] = (points[0] + points[1]) / 2
+    assert absolute_orientation(line, known, model_stations) is None
+
+
+def test_rays_meet_in_their_points_and_one_gross_error_does_no_harm() -> None:
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-1.0, 1.0, (20, 3))
+    centers = rng.uniform(-1.0, 1.0, (5, 3)) + np.array([0.0, 0.0, 5.0])
+    number = np.repeat(np.arange(20), 5)
+    origin = np.tile(centers, (20, 1))
+    rays = points[number] - origin
+    exact, determination = intersect(origin, rays, number, np.full((20, 3), np.nan))
+    np.testing.assert_allclose(exact, points, atol=1e-9)
+    assert (determination > 1e-3).all()
+    rays[::5, 0] += 0.5
+    robust, _ = intersect(origin, rays, number, np.full((20, 3), np.nan))
+    assert np.abs(robust - points).max() < 1e-3
+
+
+def test_given_coordinates_are_kept_and_one_ray_is_enough_for_the_rest() -> None:
+    known = np.array([[np.nan, np.nan, 0.5], [1.0, 2.0, np.nan]])
+    centers = np.array([[0.0, 0.0, 5.0], [0.0, 0.0, 5.0]])
+    rays = np.array([[0.3, 0.6, -4.5], [1.0, 2.0, -4.0]]) * 2.0
+    points, _ = intersect(centers, rays, np.array([0, 1]), known)
+    np.testing.assert_allclose(points, [[0.3, 0.6, 0.5], [1.0, 2.0, 1.0]], atol=1e-9)
+
+
+def test_parallel_rays_and_points_behind_the_camera_give_none() -> None:
+    centers = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    rays = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, -1.0], [-0.5, 0.0, 1.0], [0.5, 0.0, 1.0]])
+    points, determination = intersect(centers, rays, np.array([0, 0, 1, 1]), np.full((2, 3), np.nan))
+    assert np.isnan(points).all()
+    assert (determination == 0.0).all()
+
+
+MARK_SIGMA_MM = 0.001
+C, LENS = 10.0, np.array([-0.25, 0.035, 1e-4, -1e-4, 0.0])
+MATRIX = np.array([[C, 0.0, 0.0], [0.0, C, 0.0], [0.0, 0.0, 1.0]])
+ROWS, COLUMNS = 6, 9
+BOARD = np.array([[25.0 * (i - 4), 25.0 * (j - 2.5), 0.0] for j in range(ROWS) for i in range(COLUMNS)])
+
+EIGHTEEN = list(range(0, 54, 3))
+
+
+def view_points(turn: Array, shift: Array) -> Array:
+    return np.asarray(cv2.projectPoints(BOARD, turn, shift, MATRIX, LENS)[0].reshape(-1, 2) * [1.0, -1.0])
+
+
+def good_images(count: int, rng: np.random.Generator, nearest: float = 350.0) -> dict[str, Array]:
+    images = {}
+    for i in range(count):
+        azimuth, tilt = 2.4 * i, np.radians(rng.uniform(15.0, 35.0))
+        turn = np.array([np.cos(azimuth) * tilt, np.sin(azimuth) * tilt, 0.1 * rng.normal()])
+        images[f"good{i}"] = view_points(
+            turn, np.array([*rng.uniform(-40.0, 40.0, 2), nearest * rng.uniform(1.0, 1.4)])
+        )
+    return images
+
+
+def make_network(
+    images: dict[str, Array], rng: np.random.Generator, points: dict[str, list[int]] | None = None
+) -> Network:
+    """points: of some images, the corners that they show; all 54 of the others."""
+    rows = [
+        (name, f"c{k}", xy[k] + rng.normal(0.0, MARK_SIGMA_MM, 2))
+        for name, xy in images.items()
+        for k in (points or {}).get(name, range(len(BOARD)))
+    ]
+    free = {name: Prior(0.0, np.inf) for name in ("k1", "k2", "p1", "p2")}
+    camera = Camera("cam", Prior(1.03 * C, np.inf), Prior(0.0, np.inf), Prior(0.0, np.inf), Distortion("opencv", free))
+    return digital_network(camera, rows, {f"c{k}": xyz for k, xyz in enumerate(BOARD)}, MARK_SIGMA_MM)
+
+
+@parametrize_with_studies("robust", [False, True], quick=(1,))
+def test_an_image_with_wrong_names_is_left_out(robust: bool) -> None:
+    rng = np.random.default_rng(1)
+    images = good_images(8, rng)
+    network = make_network({**images, "shuffled": rng.permutation(images["good0"])}, rng, {"shuffled": EIGHTEEN})
+    with pytest.raises(AdjustmentError, match="image shuffled sees 18 known points, but no orientation"):
+        approximate(network)
+    result = adjust(network, options=Options(robust=robust))
+    assert result.converged
+    assert list(result.left_out) == ["shuffled"]
+    (warning,) = [each for each in result.warnings if "shuffled" in each]
+    assert warning.startswith("Left out of the adjustment: image shuffled sees 18 known points")
+    alone = adjust(make_network(images, np.random.default_rng(1)))
+    assert {image.name for image in result.network.images} == set(images)
+    assert abs(result.value("IO.cam.c") - C) < 4.0 * result.sigma("IO.cam.c")
+    assert result.redundancy == alone.redundancy
+
+
+def test_an_image_whose_points_lie_on_a_line_is_left_out() -> None:
+    rng = np.random.default_rng(2)
+    images = good_images(6, rng)
+    network = make_network({**images, "line": images["good0"]}, rng, {"line": [0, 2, 5, 8]})
+    result = adjust(network)
+    assert result.converged
+    assert list(result.left_out) == ["line"]
+
+
+def test_an_image_of_the_lens_far_outside_comes_in_with_the_adjusted_lens() -> None:
+    """Taken for a pinhole's it leaves more than a twentieth of the principal distance."""
+    rng = np.random.default_rng(3)
+    images = good_images(8, rng, nearest=120.0)
+    wide = view_points(np.array([0.1, 0.0, 0.0]), np.array([0.0, 0.0, 60.0]))
+    network = make_network({**images, "wide": wide}, rng)
+    with pytest.raises(AdjustmentError, match="image wide sees"):
+        approximate(network)
+    result = adjust(network)
+    assert result.converged
+    assert not result.left_out
+    assert not result.warnings
+    assert {image.name for image in result.network.images} == {*images, "wide"}
+    assert 0.9 < result.sigma0 < 1.1
+
+
+@pytest.mark.study
+def test_where_half_of_the_images_fail_it_is_no_single_one() -> None:
+    rng = np.random.default_rng(4)
+    images = good_images(2, rng)
+    bad = {f"bad{i}": rng.permutation(images["good0"]) for i in range(2)}
+    network = make_network({**images, **bad}, rng, dict.fromkeys(bad, EIGHTEEN))
+    with pytest.raises(AdjustmentError, match="image bad0 sees 18 known points"):
+        adjust(network)
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("robust", [False, True])
+def test_an_image_with_a_point_behind_its_camera_is_left_out(robust: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One number of 55 is wrong: its point, in sight of all others, lies behind that one camera."""
+    monkeypatch.setitem(globals(), "BOARD", np.vstack([BOARD, [10.0, 5.0, -170.0]]))
+    rng = np.random.default_rng(6)
+    images = good_images(8, rng)
+    near = view_points(np.array([0.1, 0.0, 0.0]), np.array([0.0, 0.0, 120.0]))
+    near[-1] = 0.5, 0.3
+    result = adjust(make_network({**images, "near": near}, rng), options=Options(robust=robust))
+    assert result.converged
+    assert result.left_out["near"].startswith("point c54 lies behind the camera in image near.")
+    assert list(result.left_out) == ["near"]
+    assert any(each.startswith("Left out of the adjustment: point c54 lies behind") for each in result.warnings)
+    assert {image.name for image in result.network.images} == set(images)
+    assert abs(result.value("IO.cam.c") - C) < 4.0 * result.sigma("IO.cam.c")
+    assert 0.9 < result.sigma0 < 1.1
+
+
+def test_points_that_only_a_left_out_image_shows_go_with_it() -> None:
+    rng = np.random.default_rng(5)
+    images = good_images(6, rng)
+    network = make_network(
+        {**images, "shuffled": rng.permutation(images["good0"])}, rng, {f"good{i}": list(range(45)) for i in range(6)}
+    )
+    unknown = tuple(replace(each, X=None, Y=None, Z=None) if each.id == "c50" else each for each in network.points)
+    result = adjust(replace(network, points=unknown))
+    assert result.converged
+    assert list(result.left_out) == ["shuffled"]
+    assert not {"c50", "c51"} & {point.id for point in result.network.points}

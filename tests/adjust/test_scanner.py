@@ -1,23 +1,34 @@
-"""The scanner apart from the film: derivatives, the truth given back, what tells it from fiducials, what not."""
+"""The scanner apart from the film: derivatives, recovered truth, the terms chosen, a camera's lens as scanner."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
+import cv2
 import numpy as np
 import pytest
-from bent_scans import HALF_MM, MIDDLE_MM, RESEAU_MM, bend_in_scanner, bent, displacement, films
+from networks import (
+    RESEAU_MM,
+    SCAN_HALF_MM,
+    SCAN_MIDDLE_MM,
+    STATIONS,
+    Truth,
+    bend_in_scanner,
+    bent,
+    bent_films,
+    displacement,
+    field_points,
+    simulated,
+)
 from numpy.typing import NDArray
-from simulated import Truth, field_points, simulated
 
-from adjust.errors import AdjustmentError
-from adjust.functional_model.lens import Prior
+from adjust import Adjustment, AdjustmentError, Options, Parameter, adjust, approximate
+from adjust.functional_model.lens import Distortion, Lens, Prior
 from adjust.functional_model.scanner import Bend, carriage_terms, smooth_terms
-from adjust.initial_values.approximations import approximate
+from adjust.model_selection.scanner_choice import bent_network, choose_bends, network_with_terms
 from adjust.problem.estimates import adjusted_image
-from adjust.problem.network import Network, Scanner, Transformation
-from adjust.problem.parameter import Parameter
+from adjust.problem.network import Approximations, Network, Scanner, Transformation
 from adjust.rank_defect.directions import NamedDirection, Reason
-from adjust.solution.adjustment import Options, adjust
-from adjust.solution.result import Adjustment
 
 Array = NDArray[np.float64]
 
@@ -42,14 +53,14 @@ def free(*names: str) -> dict[str, Prior]:
 
 
 def test_every_term_is_the_one_that_is_printed() -> None:
-    bend = Bend(EVERY, MIDDLE_MM, HALF_MM)
+    bend = Bend(EVERY, SCAN_MIDDLE_MM, SCAN_HALF_MM)
     for k, name in enumerate(EVERY):
         found = bend.displacement(np.eye(len(EVERY))[k], PLACES_MM).value
         np.testing.assert_allclose(found, displacement({name: 1.0}, PLACES_MM), atol=1e-13, err_msg=name)
 
 
 def test_derivatives_by_complex_steps() -> None:
-    bend, parameters = Bend(EVERY, MIDDLE_MM, HALF_MM), 0.02 * np.cos(np.arange(len(EVERY)))
+    bend, parameters = Bend(EVERY, SCAN_MIDDLE_MM, SCAN_HALF_MM), 0.02 * np.cos(np.arange(len(EVERY)))
     at = bend.displacement(parameters, PLACES_MM)
     for axis in (0, 1):
         stepped = bend.apply(parameters, PLACES_MM + 1j * STEP * np.eye(2)[axis]).imag / STEP
@@ -60,11 +71,13 @@ def test_derivatives_by_complex_steps() -> None:
 
 
 def test_a_bend_there_and_back() -> None:
-    bend, parameters = Bend(EVERY, MIDDLE_MM, HALF_MM), 0.02 * np.cos(np.arange(len(EVERY)))
+    bend, parameters = Bend(EVERY, SCAN_MIDDLE_MM, SCAN_HALF_MM), 0.02 * np.cos(np.arange(len(EVERY)))
     scan_mm, found = bend.inverse(parameters, bend.apply(parameters, PLACES_MM))
     assert found.all()
     np.testing.assert_allclose(scan_mm, PLACES_MM, atol=1e-11)
-    _, found = Bend(("a20",), MIDDLE_MM, HALF_MM).inverse(np.array([-200.0]), PLACES_MM - np.array([300.0, 0.0]))
+    _, found = Bend(("a20",), SCAN_MIDDLE_MM, SCAN_HALF_MM).inverse(
+        np.array([-200.0]), PLACES_MM - np.array([300.0, 0.0])
+    )
     assert not found.any()
 
 
@@ -90,7 +103,7 @@ def test_only_terms_that_no_film_transformation_takes(kind: Transformation, left
 def test_what_is_left_no_film_transformation_can_make_up(kind: Transformation) -> None:
     """Films in one pose, their marks known: the terms are determined beside the films' own parameters."""
     names = smooth_terms([kind])
-    result = solved(films([0.0], {}, free(*names), kind=kind, sigma_given_mm=1e-3, marks_mm=RESEAU_MM))
+    result = solved(bent_films([0.0], {}, free(*names), kind=kind, sigma_given_mm=1e-3, marks_mm=RESEAU_MM))
     assert result.converged
     assert max(result.sigma(f"SC.S.{name}") for name in names) / result.sigma0 < 0.02
 
@@ -104,7 +117,7 @@ def test_carriages_have_terms_along_one_axis_up_to_degree_6() -> None:
 @pytest.mark.parametrize("method", ["combined", "elements"])
 def test_perfect_data_give_the_bend_back(method: str) -> None:
     """Targets and fiducials in four convergent frames, one of them mirrored: nothing is left, the truth comes out."""
-    truth = Truth(mirrored=(False, True, False, False), middle_mm=MIDDLE_MM)
+    truth = Truth(mirrored=(False, True, False, False), middle_mm=SCAN_MIDDLE_MM)
     points = field_points(np.random.default_rng(5), 40)
     straight, _ = simulated(np.random.default_rng(4), truth, points=points, noise=False)
     network = bend_in_scanner(straight, BEND_MM, free(*BEND_MM))
@@ -126,7 +139,7 @@ def test_perfect_data_give_the_bend_back(method: str) -> None:
 
 
 def test_the_derivatives_of_an_image_through_scanner_and_film() -> None:
-    network = films([0.0, 90.0, 180.0, 270.0], BEND_MM, free(*EVEN, *ODD))
+    network = bent_films([0.0, 90.0, 180.0, 270.0], BEND_MM, free(*EVEN, *ODD))
     image = adjusted_image(solved(network), "f1")
     for axis in (0, 1):
         step = 1e-3 * np.eye(2)[axis]
@@ -147,7 +160,7 @@ def test_the_derivatives_of_an_image_through_scanner_and_film() -> None:
 def test_frames_in_two_poses_tell_a_bend_from_the_fiducials(
     turns: list[float], terms: tuple[str, ...], lost: tuple[str, ...]
 ) -> None:
-    result = solved(films(turns, {}, free(*terms), sigma_given_mm=np.inf, scatter=0.0))
+    result = solved(bent_films(turns, {}, free(*terms), sigma_given_mm=np.inf, scatter=0.0))
     scanner = [each for each in result.singular if "bend of scanner S" in each.cause]
     assert {each.cause.split()[2] for each in scanner} == set(lost)
     assert not [
@@ -158,19 +171,19 @@ def test_frames_in_two_poses_tell_a_bend_from_the_fiducials(
 
 
 def test_frames_that_lie_alike_are_reported() -> None:
-    result = solved(films([0.0] * 4, BEND_MM, free("a20")))
+    result = solved(bent_films([0.0] * 4, BEND_MM, free("a20")))
     (warning,) = [text for text in result.warnings if "bend of scanner S" in text]
     assert "in its term a20: " in warning
     assert "all frames lie alike in the scanner" in warning
     assert "turned by 180 degrees" in warning
-    halves = solved(films([0.0, 180.0] * 2, BEND_MM, free("a20", "a21")))
+    halves = solved(bent_films([0.0, 180.0] * 2, BEND_MM, free("a20", "a21")))
     (warning,) = [text for text in halves.warnings if "bend of scanner S" in text]
     assert "in its term a21: " in warning
     assert "turned by 90 degrees" in warning
 
 
 def test_given_fiducials_separate_the_scanner_in_one_pose_too() -> None:
-    result = solved(films([0.0] * 4, {"a20": 0.02}, free("a20"), sigma_given_mm=1e-3))
+    result = solved(bent_films([0.0] * 4, {"a20": 0.02}, free("a20"), sigma_given_mm=1e-3))
     assert result.converged
     assert result.warnings == ()
     assert abs(result.value("SC.S.a20") - 0.02) < 1e-5
@@ -178,7 +191,7 @@ def test_given_fiducials_separate_the_scanner_in_one_pose_too() -> None:
 
 
 def test_a_prior_makes_a_bend_regular_and_is_stated_to_be_all() -> None:
-    result = solved(films([0.0] * 4, {}, {"a20": Prior(0.0, 0.01)}, sigma_given_mm=np.inf))
+    result = solved(bent_films([0.0] * 4, {}, {"a20": Prior(0.0, 0.01)}, sigma_given_mm=np.inf))
     assert "SC.S.a20" not in [moved.text for each in result.singular for moved in each.parameters]
 
 
@@ -186,9 +199,9 @@ def test_claimed_sigmas_are_realised() -> None:
     """Frames in four poses, marks nobody knows: the bend's errors over its standard deviations."""
     names = ("a20", "a11", "b02", "a30", "b21")
     truth = {name: BEND_MM[name] for name in names}
-    errors, sigmas, start = [], [], approximate(films([0.0, 90.0, 180.0, 270.0], {}, {}))
+    errors, sigmas, start = [], [], approximate(bent_films([0.0, 90.0, 180.0, 270.0], {}, {}))
     for seed in range(14):
-        network = films([0.0, 90.0, 180.0, 270.0], truth, free(*names), np.random.default_rng(seed))
+        network = bent_films([0.0, 90.0, 180.0, 270.0], truth, free(*names), np.random.default_rng(seed))
         result = adjust(network, start)
         errors.append([result.value(f"SC.S.{name}") - truth[name] for name in names])
         sigmas.append([result.sigma(f"SC.S.{name}") for name in names])
@@ -197,7 +210,7 @@ def test_claimed_sigmas_are_realised() -> None:
 
 
 def test_the_bend_is_tested_for_significance() -> None:
-    network = films([0.0, 90.0, 180.0, 270.0], {"a20": 0.02}, free("a20", "b02"), np.random.default_rng(2))
+    network = bent_films([0.0, 90.0, 180.0, 270.0], {"a20": 0.02}, free("a20", "b02"), np.random.default_rng(2))
     result = solved(network)
     tests = {test.name: test for test in result.significance["scanner", network.scanners[0].name]}
     assert tests["a20"].p < 1e-6
@@ -211,9 +224,9 @@ def test_the_bend_is_tested_for_significance() -> None:
 def test_approximations_know_a_bend_that_is_given() -> None:
     """A bend of a millimetre, far more than films do: the fiducials agree only when it is taken out."""
     truth = {"a20": 1.0, "b11": -0.8}
-    network = films([0.0, 90.0], truth, {name: Prior(value) for name, value in truth.items()})
+    network = bent_films([0.0, 90.0], truth, {name: Prior(value) for name, value in truth.items()})
     np.testing.assert_allclose(bent(truth, network.straight_xy_mm), network.observations.xy_mm, atol=1e-9)
-    straight = approximate(films([0.0, 90.0], {}, {}))
+    straight = approximate(bent_films([0.0, 90.0], {}, {}))
     for name, film in approximate(network).transformation.items():
         np.testing.assert_allclose(film, straight.transformation[name], atol=1e-9)
     result = solved(network)
@@ -226,7 +239,7 @@ def test_what_is_wrong_with_a_scanner_is_stated() -> None:
         Scanner("S", free("a10"))
     with pytest.raises(ValueError, match="two positive lengths"):
         Scanner("S", free("a20"), half_mm=(0.0, 1.0))
-    network = films([0.0], {}, free("a20"))
+    network = bent_films([0.0], {}, free("a20"))
     with pytest.raises(AdjustmentError, match="scanner S, which is not given"):
         solved(Network(network.cameras, network.images, (), network.observations))
 
@@ -235,7 +248,7 @@ def test_a_bend_that_a_lens_makes_too_is_laid_to_the_lens() -> None:
     """Radial distortion of the third degree and the bend (r² x, r² y) look alike however the frames lie."""
     points = field_points(np.random.default_rng(5), 40)
     attitudes = tuple((0.0, 0.0, np.radians(90.0 * i)) for i in range(4))
-    truth = Truth(attitudes=attitudes, distortion={"k3": 0.0}, middle_mm=MIDDLE_MM, x0=0.0, y0=0.0)
+    truth = Truth(attitudes=attitudes, distortion={"k3": 0.0}, middle_mm=SCAN_MIDDLE_MM, x0=0.0, y0=0.0)
     network, start = simulated(np.random.default_rng(4), truth, points=points, free={"k3": np.inf})
     radial = ("a30", "a12", "b21", "b03")
     result = adjust(bend_in_scanner(network, {}, free(*radial)), start)
@@ -251,13 +264,13 @@ def test_a_bend_that_a_lens_makes_too_is_laid_to_the_lens() -> None:
 def test_a_bend_that_no_mark_shows_is_laid_to_the_marks() -> None:
     """Four marks on the corners of a square: all six terms of degree 2 but two sums are constant or linear there."""
     corners = {str(i): (106.0 * x, 106.0 * y) for i, (x, y) in enumerate(((1, 1), (-1, 1), (-1, -1), (1, -1)))}
-    result = solved(films([0.0, 180.0], {}, free("a20"), sigma_given_mm=0.0, marks_mm=corners, scatter=0.0))
+    result = solved(bent_films([0.0, 180.0], {}, free("a20"), sigma_given_mm=0.0, marks_mm=corners, scatter=0.0))
     (direction,) = result.singular
     assert "too few, or lie too much alike" in direction.cause
 
 
 def test_a_bend_that_the_films_make_too_is_laid_to_the_films() -> None:
-    network = films([0.0, 90.0], {}, free("a11"), kind="polynomial(2)", sigma_given_mm=0.0, scatter=0.0)
+    network = bent_films([0.0, 90.0], {}, free("a11"), kind="polynomial(2)", sigma_given_mm=0.0, scatter=0.0)
     (direction,) = solved(network).singular
     assert "the polynomial(2) transformation of its films does the same" in direction.cause
     assert direction.remedy.endswith("or leave it out.")
@@ -274,3 +287,149 @@ def test_a_direction_is_explained_by_what_moves_along() -> None:
         ((mark, k3), "lens do"),
     ):
         assert because in bend.sentence(moved)[0]
+
+
+QUARTERS = [0.0, 90.0, 180.0, 270.0]
+
+
+def adjust_network(network: Network) -> Adjustment:
+    return adjust(network, approximate(network))
+
+
+def laid_in_quarters(network: Network) -> Adjustment:
+    """From marks without errors: to find those of films among marks a millimetre off takes longest."""
+    return adjust(network, _start())
+
+
+@cache
+def _start() -> Approximations:
+    return approximate(bent_films(QUARTERS, {}, {}))
+
+
+def chosen(network: Network, by: Callable[[Network], Adjustment] = adjust_network) -> set[str]:
+    return set(choose_bends(network, by).network.scanners[0].terms)
+
+
+def test_the_terms_that_are_there_are_chosen() -> None:
+    truth = {"a20": 0.02, "b11": -0.015, "b02": 0.01}
+    network = bent_films(QUARTERS * 2, truth, {}, np.random.default_rng(1))
+    choice = choose_bends(network, adjust_network)
+    # over the extent of the marks, which is not that of the truth, products of degree 2 take parts of degree 1 and 0
+    assert set(choice.network.scanners[0].terms) == set(truth)
+    result = adjust_network(choice.network)
+    assert result.sigma0 == pytest.approx(1.0, abs=0.2)
+    assert result.value("SC.S.a20") == pytest.approx(0.02, rel=0.15)
+
+
+def test_a_carriage_that_wavers_is_found_by_a_reseau() -> None:
+    truth = {"a04": 0.02, "b05": -0.02}
+    found = chosen(
+        bent_films([0.0, 90.0], truth, {}, np.random.default_rng(2), sigma_given_mm=1e-3, marks_mm=RESEAU_MM)
+    )
+    assert {"a04", "b05"} <= found
+    assert all(term[1] == "0" or term[2] == "0" for term in found)
+
+
+def test_where_nothing_bends_nothing_is_chosen() -> None:
+    """At one percent for all candidates together: none in 10 networks."""
+    networks = [bent_films(QUARTERS, {}, {}, np.random.default_rng(seed)) for seed in range(10)]
+    found = [chosen(network, laid_in_quarters) for network in networks]
+    assert not any(found)
+
+
+def test_frames_that_lie_alike_get_no_bend_and_a_sentence() -> None:
+    choice = choose_bends(bent_films([0.0] * 4, {"a20": 0.05}, {}, np.random.default_rng(3)), adjust_network)
+    assert not choice.network.scanners[0].terms
+    even, odd = choice.remarks
+    assert "a20, a11, a02, b20, b11, b02: all frames lie alike in the scanner" in even
+    assert even.endswith("turned by 180 degrees.")
+    assert odd.endswith("turned by 90 degrees.")
+
+
+def test_targets_tell_the_bend_of_frames_that_lie_alike() -> None:
+    """Known points and a lens without distortion, as a calibrated camera has it."""
+    truth = Truth(distortion={})
+    points = field_points(np.random.default_rng(5), 60)
+    network, _ = simulated(np.random.default_rng(4), truth, points=points)
+    bent = bend_in_scanner(network, {"a20": 0.05}, {})
+    assert len(chosen(bent)) > 0
+
+
+def test_two_photographs_are_enough_for_terms_that_they_tell() -> None:
+    """Their trial has far more terms than they tell, which are held by no more than its prior."""
+    truth = Truth(stations=STATIONS[:2], attitudes=((0.0, 0.0, 0.0), (-0.05, 0.36, 1.6)), middle_mm=SCAN_MIDDLE_MM)
+    points = field_points(np.random.default_rng(5), 30)
+    network, _ = simulated(np.random.default_rng(4), truth, points=points, free={"k3": np.inf, "k5": np.inf})
+    choice = choose_bends(bend_in_scanner(network, {"a20": 0.04, "b11": -0.03}, {}), adjust_network)
+    assert {"a20", "b11"} <= set(choice.network.scanners[0].terms)
+    assert not any("No bend of the scanner was estimated" in text for text in choice.remarks)
+
+
+def test_a_bend_of_given_terms_over_the_extent_of_the_scans() -> None:
+    network = bent_films(QUARTERS, {}, {})
+    (scanner,) = bent_network(network, ("a20", "b02"), 0.01).scanners
+    assert {name: prior.sigma for name, prior in scanner.terms.items()} == {"a20": 0.01, "b02": 0.01}
+    xy_mm = network.observations.xy_mm
+    np.testing.assert_allclose(np.array(scanner.center_mm) - scanner.half_mm, xy_mm.min(axis=0))
+    assert len(bent_network(network).scanners[0].terms) == 14
+
+
+MM = 0.05
+F, CX, CY = 3000.0, 1010.0, 760.0
+COEFFICIENTS = (-0.12, 0.05, 1e-3, -5e-4, 0.0)
+LENS = Lens(
+    Distortion("opencv"),
+    np.array([F * MM, CX * MM, -CY * MM]),
+    np.array([*COEFFICIENTS, *np.zeros(11)]),
+)
+PX = np.random.default_rng(3).uniform((0.0, 0.0), (2000.0, 1500.0), (40, 2))
+MATRIX = np.array([[F, 0.0, CX], [0.0, F, CY], [0.0, 0.0, 1.0]])
+
+
+def test_a_bend_takes_the_taking_lens_out_as_opencv_does_and_then_bends() -> None:
+    scan_mm = PX * (MM, -MM)
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-14)
+    ideal = cv2.undistortPoints(PX[:, None], MATRIX, np.array(COEFFICIENTS), R=np.eye(3), P=MATRIX, criteria=stop)[:, 0]
+    lens = Bend(lens=LENS)
+    np.testing.assert_allclose(lens.apply(np.empty(0), scan_mm), ideal * (MM, -MM), atol=1e-7)
+    bend = Bend(("a20", "b11"), (50.0, -37.0), (50.0, 38.0))
+    both, values = replace(bend, lens=LENS), np.array([0.02, -0.03])
+    np.testing.assert_allclose(
+        both.apply(values, scan_mm), bend.apply(values, lens.apply(np.empty(0), scan_mm)), atol=1e-10
+    )
+    back, found = both.inverse(values, both.apply(values, scan_mm))
+    assert found.all()
+    np.testing.assert_allclose(back, scan_mm, atol=1e-9)
+    step = 1e-4
+    for axis, shift in enumerate(step * np.eye(2)):
+        slope = (both.apply(values, scan_mm + shift) - both.apply(values, scan_mm - shift)) / (2 * step)
+        np.testing.assert_allclose(both.gradient(values, scan_mm)[:, :, axis], slope, atol=1e-6)
+
+
+def test_scans_through_a_lens_adjust_as_those_without() -> None:
+    network, start = simulated(np.random.default_rng(5))
+    straight = network.observations.xy_mm
+    lens = replace(LENS, interior=np.array([600.0, 3.0, -5.0]))
+    rays = np.column_stack([(straight - lens.interior[1:]) * (1.0, -1.0) / 600.0, np.ones(len(straight))])
+    ideal = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.eye(3), np.array(COEFFICIENTS))[0][:, 0]
+    pictured = ideal * (600.0, -600.0) + lens.interior[1:]
+    assert np.abs(pictured - straight).max() > 0.2
+    through = replace(
+        network,
+        observations=replace(network.observations, xy_mm=pictured),
+        images=tuple(replace(image, scanner="photo") for image in network.images),
+        scanners=(Scanner("photo", lens=lens),),
+    )
+    without, with_lens = adjust(network, start), adjust(through, start)
+    assert with_lens.converged
+    assert abs(with_lens.sigma0 / without.sigma0 - 1.0) < 0.01  # standard deviations are those in the picture
+    for name in ("IO.K.c", "IO.K.x0", "IO.K.y0"):
+        assert abs(with_lens.value(name) - without.value(name)) < 0.02 * without.sigma(name)
+    model = adjusted_image(with_lens, "f0")
+    np.testing.assert_allclose(
+        model.camera_from_comparator(pictured[:5]),
+        adjusted_image(without, "f0").camera_from_comparator(straight[:5]),
+        atol=2e-4,
+    )
+    (bent,) = network_with_terms(through, {"photo": ("a30",)}).scanners
+    assert bent.lens is lens

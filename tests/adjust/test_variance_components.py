@@ -1,24 +1,232 @@
-"""Variance components of all groups and their standard deviations, against dense formulas and simulation."""
+"""Standard deviations, sigma0 and variance components against dense formulas and simulation."""
 
+from collections import defaultdict
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from networks import (
+    FILM_CAMERA,
+    FRAME_NOISE_MM,
+    DrawnFrames,
+    Truth,
+    draw_frames,
+    field_points,
+    row_of,
+    simulated,
+    unknown_errors,
+    with_covariance,
+    with_errors,
+)
 from numpy.typing import NDArray
-from simulated import field_points, simulated, with_errors
+from reference_cases import exact, load, realisation
+from scipy.stats import chi2, norm
 from studies import parametrize_with_studies
 
+from adjust import Adjustment, Camera, Fiducial, Options, Prior, adjust
 from adjust.functional_model.rotation import rotation_from_angles
+from adjust.functional_model.transformation import Film, film_parameter_names
 from adjust.least_squares.iteration import linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.least_squares.rows import prior_root_weights
 from adjust.problem.condition_equations import compute, derivatives
-from adjust.problem.network import Approximations, Network
+from adjust.problem.estimates import GivenGroup, adjusted_image
+from adjust.problem.network import EXTERIOR_NAMES, Approximations, Exterior, Network, Transformation
 from adjust.problem.problem import State, number
-from adjust.solution.adjustment import Options, adjust
-from adjust.solution.result import Adjustment
+from adjust.quality.fiducial_corrections import common_transformation, corrections_to_given
+from adjust.quality.weighting import robust_weights
 
 Array = NDArray[np.float64]
+
+ROBUST = Options(robust=True)
+
+
+def monte_carlo(runs: int) -> tuple[Array, Array]:
+    """Normalised errors (runs, unknowns) of c, x0', y0', fiducials, k3 and exteriors, and v'Pv of every run."""
+    truth = Truth()
+    points = field_points(np.random.default_rng(0), 12)
+    exact, _ = simulated(np.random.default_rng(0), truth, points=points, noise=False)
+    camera = exact.cameras[0]
+    expected = {"IO.K.c": truth.c, "IO.K.x0": truth.x0, "IO.K.y0": truth.y0, "IO.K.k3": truth.distortion["k3"]}
+    expected |= {f"FID.K.{id_}.x": mark.x_mm.value for id_, mark in camera.fiducials.items()}
+    expected |= {
+        f"EO.f{i}.{name}": value
+        for i in range(4)
+        for name, value in zip(EXTERIOR_NAMES, (*truth.stations[i], *truth.attitudes[i]), strict=True)
+    }
+    errors, vpv = [], []
+    for run in range(runs):
+        network, start = simulated(np.random.default_rng(100 + run), truth, points=points, free={"k3": np.inf})
+        result = adjust(network, start)
+        assert result.converged
+        sigmas = np.sqrt(result.cofactor.variances)
+        errors.append([(result.value(n) - value) / sigmas[result.index(n)] for n, value in expected.items()])
+        vpv.append(result.vpv / result.redundancy)
+    return np.array(errors), np.array(vpv)
+
+
+def check_monte_carlo(runs: int) -> None:
+    errors, variance = monte_carlo(runs)
+    low, high = np.sqrt(chi2.ppf([1e-5, 1 - 1e-5], runs) / runs)
+    rms = np.sqrt((errors**2).mean(axis=0))
+    assert (rms > low).all()
+    assert (rms < high).all()
+    assert np.abs(errors.mean(axis=0)).max() < 4.5 / np.sqrt(runs)
+    assert variance.mean() == pytest.approx(1.0, abs=6.0 * variance.std() / np.sqrt(runs))
+
+
+@pytest.mark.study
+def test_claimed_standard_deviations_are_realised() -> None:
+    check_monte_carlo(40)
+
+
+@pytest.mark.study
+def test_claimed_standard_deviations_are_realised_closely() -> None:
+    check_monte_carlo(3000)
+
+
+def test_a_point_covariance_is_not_conditional_on_everything_else() -> None:
+    """With everything else held fixed, an intersected point looks far better than it is."""
+    network, start = simulated(np.random.default_rng(1), point_sigma=np.inf)
+    result = adjust(network, start, Options(datum="minimal"))
+    is_point = np.char.startswith(result.names, "PT.")
+    points = np.flatnonzero(is_point & (result.cofactor.variances > 0.0))
+    weight = np.linalg.inv(result.cofactor.part(points))
+    conditional = 1.0 / np.diag(weight)
+    claimed = result.cofactor.variances[points]
+    assert (claimed > conditional).all()
+    assert np.median(claimed / conditional) > 4.0
+
+
+def test_a_weight_is_the_inverse_of_a_variance() -> None:
+    """Halving a mark's sigma lowers its share of a contradiction; a covariance taken for a weight raises it."""
+    network, start = simulated(np.random.default_rng(2), noise=False)
+    row = row_of(network, "target", "f1", "4")
+    network = with_errors(network, {row: np.array([0.02, 0.0])})
+    covariance = network.observations.covariance_mm2.copy()
+    covariance[row] /= 4.0
+    plain, halved = adjust(network, start), adjust(with_covariance(network, covariance), start)
+    assert abs(halved.residuals.v_mm[row, 0]) < 0.95 * abs(plain.residuals.v_mm[row, 0])
+    assert halved.residuals.redundancy[row, 0] < plain.residuals.redundancy[row, 0]
+
+
+def test_redundancy_is_what_a_residual_shows_of_an_error() -> None:
+    """An error in one coordinate appears in its residual times minus the redundancy number, correlations included."""
+    network, start = simulated(np.random.default_rng(3), noise=False)
+    row = row_of(network, "target", "f2", "7")
+    covariance = network.observations.covariance_mm2.copy()
+    covariance[row] = 0.004**2 * np.array([[1.0, 0.6], [0.6, 2.0]])
+    for axis in (0, 1):
+        spoilt = with_errors(with_covariance(network, covariance), {row: 1e-4 * np.eye(2)[axis]})
+        result = adjust(spoilt, start)
+        shown = -result.residuals.v_mm[row, axis] / 1e-4
+        assert shown == pytest.approx(result.residuals.redundancy[row, axis], rel=1e-4)
+
+
+def test_standardised_residuals_are_standard() -> None:
+    runs = [simulated(np.random.default_rng(50 + seed)) for seed in range(8)]
+    w = np.concatenate([adjust(*each).residuals.w.ravel() for each in runs])
+    assert np.sqrt((w**2).mean()) == pytest.approx(1.0, abs=0.06)
+    assert abs(w.mean()) < 0.1
+
+
+def test_rms_is_per_axis() -> None:
+    """Per point it would be larger by the root of two."""
+    network, start = simulated(np.random.default_rng(4))
+    result = adjust(network, start)
+    targets = np.array([kind == "target" for kind in network.observations.kind])
+    v_um = 1000.0 * result.residuals.v_mm[targets]
+    group = result.groups["target"]
+    assert group.rms_x_um == pytest.approx(np.sqrt((v_um[:, 0] ** 2).mean()))
+    per_point = np.sqrt((v_um**2).sum(axis=1).mean())
+    assert np.hypot(group.rms_x_um, group.rms_y_um) == pytest.approx(per_point)
+
+
+def test_units_do_not_matter() -> None:
+    """Object space in millimetres instead of metres: the same camera."""
+    points = field_points(np.random.default_rng(5), 12)
+    network, start = simulated(np.random.default_rng(5), points=points)
+    large = Truth(stations=tuple((1000 * x, 1000 * y, 1000 * z) for x, y, z in Truth().stations))
+    other, other_start = simulated(np.random.default_rng(5), large, points=1000.0 * points)
+    first, second = adjust(network, start), adjust(other, other_start)
+    scale = np.sqrt(first.cofactor.variances[first.index("IO.K.c")])
+    assert second.value("IO.K.c") == pytest.approx(first.value("IO.K.c"), abs=1e-6 * scale)
+    assert second.sigma("EO.f1.Z0") == pytest.approx(1000.0 * first.sigma("EO.f1.Z0"), rel=1e-6)
+
+
+@pytest.mark.study
+def test_robust_estimation_withstands_gross_errors() -> None:
+    """Five gross errors of 50 to 100 um."""
+    rng = np.random.default_rng(6)
+    network, start = simulated(rng, points=field_points(rng, 20))
+    targets = [i for i, kind in enumerate(network.observations.kind) if kind == "target"]
+    wrong = [int(i) for i in rng.choice(targets, 5, replace=False)]
+    errors = rng.choice([-1.0, 1.0], (5, 2)) * rng.uniform(0.05, 0.1, (5, 2))
+    dirty = with_errors(network, dict(zip(wrong, errors, strict=True)))
+    clean, plain, robust = (adjust(*each) for each in ((network, start), (dirty, start), (dirty, start, ROBUST)))
+    names = [name for name in clean.names if name.startswith(("EO.", "IO.")) and clean.sigma(name) > 0.0]
+    sigma = np.sqrt(np.diag(clean.cofactor_of(names)))
+    off = [
+        np.sqrt(np.mean(((each.values_of(names) - clean.values_of(names)) / sigma) ** 2)) for each in (plain, robust)
+    ]
+    assert robust.converged
+    assert off[1] < 0.35 * off[0]
+    assert (robust.weights[wrong] < 0.25).all()
+    assert np.median(np.delete(robust.weights, wrong)) == 1.0
+    assert set(np.argsort(-np.abs(robust.residuals.w).max(axis=1))[:5]) == set(wrong)
+
+
+def test_variance_components_find_the_variances() -> None:
+    """Targets twice as bad as claimed, fiducials half as bad; 1 is what a right claim gives."""
+    rng = np.random.default_rng(8)
+    network, start = simulated(rng, points=field_points(rng, 40))
+    fiducial = np.array([kind == "fiducial" for kind in network.observations.kind])
+    claimed = network.observations.covariance_mm2 * np.where(fiducial, 4.0, 0.25)[:, None, None]
+    result = adjust(with_covariance(network, claimed), start, Options(variance_components=True))
+    assert result.converged
+    assert result.variance_factors["target"] == pytest.approx(4.0, rel=0.3)
+    assert result.variance_factors["fiducial"] == pytest.approx(0.25, rel=0.6)
+    assert result.groups["target"].sigma0 == pytest.approx(1.0, abs=2e-3)
+    assert result.groups["fiducial"].sigma0 == pytest.approx(1.0, abs=2e-3)
+
+
+def test_an_affine_on_three_marks_has_no_check() -> None:
+    """Its residuals are 0 because they must be: the redundancy says so, and neither sigma0 nor w pretend otherwise."""
+    truth = Truth()
+    network, start = simulated(np.random.default_rng(10), truth, points=np.zeros((0, 3)))
+    camera = network.cameras[0]
+    marks = {
+        id_: Fiducial(Prior(m.x_mm.value), Prior(m.y_mm.value)) for id_, m in camera.fiducials.items() if id_ in "123"
+    }
+    known = Camera("K", Prior(truth.c), Prior(truth.x0), Prior(truth.y0), camera.distortion, marks)
+    rows = network.observations
+    three = rows.only(np.flatnonzero([point in marks for point in rows.point]))
+    images = tuple(
+        replace(image, exterior=Exterior(np.array([*station, *attitude]), np.zeros(6)))
+        for image, station, attitude in zip(network.images, truth.stations, truth.attitudes, strict=True)
+    )
+    result = adjust(replace(network, cameras=(known,), images=images, observations=three), start)
+    assert result.converged
+    assert result.redundancy == 0
+    assert result.sigma0 == 1.0
+    group = result.groups["fiducial"]
+    assert group.redundancy == pytest.approx(0.0, abs=1e-9)
+    assert group.rms_x_um == pytest.approx(0.0, abs=1e-6)
+    assert group.sigma0 == 0.0
+    assert (result.residuals.w == 0.0).all()
+
+
+def test_the_redescending_weights_are_the_published_ones() -> None:
+    """Yang, Song and Xu 2002, k = 2 and K = 4.5: 1, then k / t ((K - t) / (K - k))², then none. t of an observation is
+    over the scale that the median gives: of a pair of normally distributed errors that is sqrt(ln 2)."""
+    t = np.array([0.5, 1.9, 2.5, 3.25, 4.4, 6.0])
+    ordinary = np.full(101, np.log(2.0))
+    weights = robust_weights(2.0 * np.array([*ordinary, *t**2]), np.full(107, 2), 107, "igg3")[101:]
+    expected = [1.0, 1.0, 0.8 * 0.64, 2.0 / 3.25 * 0.25, 2.0 / 4.4 * 0.0016, 0.0]
+    np.testing.assert_allclose(weights, expected, rtol=1e-9, atol=1e-11)
+    huber = robust_weights(2.0 * np.array([*ordinary, *t**2]), np.full(107, 2), 107, "huber")[101:]
+    np.testing.assert_allclose(huber, [1.0, 1.0, 0.8, 2.0 / 3.25, 2.0 / 4.4, 1.0 / 3.0], rtol=1e-9)
+
 
 GROUPS = ("target", "fiducial", "control", "datum")
 
@@ -99,3 +307,139 @@ def test_the_factors_scatter_as_claimed() -> None:
         claimed = np.sqrt(np.mean([(run.variance_sigmas[group] / run.variance_factors[group]) ** 2 for run in runs]))
         assert factors.mean() == pytest.approx(1.0, abs=4.0 * claimed / np.sqrt(300))
         assert factors.std() == pytest.approx(claimed, rel=0.15)
+
+
+def adjust_network(truth: DrawnFrames) -> Adjustment:
+    return adjust(truth.network, truth.start)
+
+
+def test_a_single_frame_whose_marks_only_place_the_datum_has_a_priori_sigmas() -> None:
+    """Of the shift by hand: the design matrix, and the two standard deviations of a mark."""
+    truth = draw_frames("affine", 1, 8, 1.0, 0.01, np.random.default_rng(1))
+    result = adjust_network(truth)
+    assert result.redundancy == 10
+    assert result.variance.is_a_priori
+    assert result.sigma0 == 1.0
+    assert result.groups["fiducial"].sigma0 == 0.0
+    design = np.column_stack([np.ones(8), truth.network.observations.xy_mm])
+    cofactor = np.linalg.inv(design.T @ design) * (1.0 + FRAME_NOISE_MM**2)
+    sigmas = [result.sigma(f"T.f0.a{k}") for k in (1, 2, 3)]
+    np.testing.assert_allclose(sigmas, np.sqrt(np.diag(cofactor)), rtol=1e-3)
+
+
+@pytest.mark.parametrize("count", [2, 5])
+def test_sigma0_of_affine_frames_is_what_their_figures_leave(count: int) -> None:
+    """The figure of all frames together has rank 2 about its means (Tomasi and Kanade 1992): the rest is noise."""
+    truth = draw_frames("affine", count, 8, 1.0, 0.01, np.random.default_rng(2))
+    result = adjust_network(truth)
+    figures = truth.network.observations.xy_mm.reshape(count, 8, 2).transpose(0, 2, 1).reshape(2 * count, 8)
+    left = np.linalg.svd(figures - figures.mean(axis=1, keepdims=True), compute_uv=False)[2:]
+    redundancy = 10 * (count - 1)
+    assert result.variance.left_out == (GivenGroup("datum", FILM_CAMERA),)
+    assert result.variance.redundancy == pytest.approx(redundancy, abs=1e-3)
+    assert result.sigma0 == pytest.approx(np.sqrt((left**2).sum() / redundancy) / FRAME_NOISE_MM, rel=2e-3)
+
+
+def test_sigma0_multiplies_the_noise_of_marks_and_not_the_datum() -> None:
+    calm, loud = (
+        adjust_network(draw_frames("affine", 5, 8, 1.0, 0.01, np.random.default_rng(3), noise)) for noise in (1.0, 4.0)
+    )
+    assert loud.sigma0 == pytest.approx(4.0 * calm.sigma0, rel=1e-2)
+    assert loud.sigma("T.f0.a1") == pytest.approx(calm.sigma("T.f0.a1"), rel=1e-3)
+    assert loud.sigma("T.f0.a1") == pytest.approx(1.0 / np.sqrt(8), rel=0.01)
+    of_noise = [np.sqrt(np.diag(corrections_covariance(each))) for each in (calm, loud)]
+    np.testing.assert_allclose(of_noise[1], 4.0 * of_noise[0], rtol=0.02)
+
+
+def corrections_covariance(result: Adjustment) -> Array:
+    fiducials = result.network.cameras[0].fiducials
+    names = [f"FID.{FILM_CAMERA}.{id_}.{axis}" for id_ in fiducials for axis in "xy"]
+    places = np.array([result.value(name) for name in names]).reshape(-1, 2)
+    given = np.array([(mark.x_mm.value, mark.y_mm.value) for mark in fiducials.values()])
+    films = [adjusted_image(result, image.name).film for image in result.network.images]
+    found = corrections_to_given(films, places, given)
+    assert found
+    names += [f"T.f0.{name}" for name in film_parameter_names(films[0].transformation)]
+    return np.asarray(found.by_unknowns @ (result.sigma0**2 * result.cofactor_of(names)) @ found.by_unknowns.T)
+
+
+def test_a_certificate_tells_sigma0_of_a_single_frame() -> None:
+    """Marks and certificate of the same sigma: v'Pv of the affine fit over its redundancy of 10."""
+    truth = draw_frames("affine", 1, 8, FRAME_NOISE_MM, FRAME_NOISE_MM, np.random.default_rng(4))
+    result = adjust_network(truth)
+    assert not result.variance.left_out
+    assert result.variance.redundancy == result.redundancy == 10
+    assert result.sigma0 == pytest.approx(np.sqrt(result.vpv / 10))
+
+
+def test_given_values_that_are_too_good_are_left_out_of_a_whole_network_too() -> None:
+    """Five images with targets: given fiducials right to a hundredth of their sigma; drawn from it, they take part."""
+    case = exact(load("i_five_images_affine_reduced"))
+    drawn = realisation(case.network, np.random.default_rng(0))
+    fiducials = case.network.cameras[0].fiducials
+    right = replace(drawn, cameras=(replace(drawn.cameras[0], fiducials=fiducials),))
+    whole, without = adjust(drawn, case.start), adjust(right, case.start)
+    assert not whole.variance.left_out
+    assert whole.sigma0 == np.sqrt(whole.vpv / whole.redundancy)
+    assert without.variance.left_out == (GivenGroup("datum", FILM_CAMERA),)
+    assert without.variance.redundancy == pytest.approx(without.redundancy - without.groups["datum"].redundancy)
+    assert without.sigma("FID.K.1.x") == pytest.approx(whole.sigma("FID.K.1.x") / whole.sigma0, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("kinds", "common"),
+    [
+        (["affine", "affine"], "affine"),
+        (["affine", "congruent"], "congruent"),
+        (["affine", "none"], "none"),
+        (["conformal(3)", "conformal(2)"], "conformal(2)"),
+        (["conformal(3)", "similarity"], "similarity"),
+        (["conformal(3)", "projective"], "similarity"),
+        (["projective", "bilinear"], "affine"),
+        (["polynomial(3)", "polynomial(2)"], "polynomial(2)"),
+    ],
+)
+def test_what_films_of_several_kinds_take_up(kinds: list[str], common: str) -> None:
+    assert common_transformation(kinds) == common
+
+
+def test_corrections_are_the_residuals_of_a_least_squares_fit() -> None:
+    """By hand, of places that an affine film has moved by a tenth of a degree and 1 mm, mirrored film or not."""
+    rng = np.random.default_rng(5)
+    given = draw_frames("affine", 1, 8, 1.0, 1.0, rng).places_mm
+    true = given + rng.normal(0.0, 0.01, given.shape)
+    design = np.column_stack([np.ones(8), true])
+    left = design @ np.linalg.lstsq(design, given)[0] - given
+    moved = true @ np.array([[1.001, 0.02], [-0.03, 0.999]]) + 1.0
+    for film in (Film("affine", np.array([3.0, -1.0, 0.01, 2.0, 0.02, 1.0]), np.zeros(2)),):
+        found = corrections_to_given([film], moved, given)
+        assert found
+        np.testing.assert_allclose(found.corrections_mm, left, atol=1e-9)
+    assert corrections_to_given([film], moved[:3], given[:3]) is None
+
+
+@pytest.mark.study
+@pytest.mark.parametrize(
+    ("kind", "marks", "count"),
+    [
+        ("affine", 4, 1),
+        ("affine", 4, 2),
+        ("projective", 8, 2),
+        ("bilinear", 8, 2),
+        ("congruent", 4, 2),
+        ("conformal(2)", 8, 5),
+        ("polynomial(2)", 8, 5),
+    ],
+)
+def test_every_sigma_holds_against_realisations(kind: Transformation, marks: int, count: int) -> None:
+    """Given coordinates wrong by their 1 mm, drawn anew each time: the whole standard deviation, datum and all."""
+    squares: dict[str, list[float]] = defaultdict(list)
+    for seed in range(30):
+        truth = draw_frames(kind, count, marks, 1.0, 1.0, np.random.default_rng(seed))
+        trial: dict[str, list[float]] = defaultdict(list)
+        for name, error, sigma in unknown_errors(adjust_network(truth), truth):
+            trial[name].append((error / sigma) ** 2)
+        for name, normalised in trial.items():
+            squares[name].append(float(np.mean(normalised)) - 1.0)
+    off = [np.mean(each) / (np.std(each, ddof=1) / np.sqrt(len(each))) for each in squares.values()]
+    assert np.abs(off).max() < norm.isf(1e-3 / len(off))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from simulated import Truth, simulated
+from networks import Truth, simulated
 from simulated_project import write_project
 
 from adjust.problem.network import Network

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import tifffile
+from networks import Truth, affine, camera_point, rotation, simulated, torlegard
 from numpy.typing import NDArray
-from simulated import Truth, affine, camera_point, rotation, simulated, torlegard
 from simulated_project import write_project
 
 from adjust.problem.network import Network

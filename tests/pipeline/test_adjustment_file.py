@@ -10,8 +10,7 @@ from typing import Any, NoReturn
 import made_up_calibration
 import numpy as np
 import pytest
-from setups import Setup, vertical
-from two_cameras import two_cameras
+from networks import Setup, two_cameras, vertical
 
 from adjust.functional_model.lens import Prior
 from adjust.problem.network import ObjectPoint

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import tifffile
 from exported_project import IMAGES, PITCH_MM, POINTS, TRUTH, camera_mm, ideal_mm, scan_px
+from networks import FIDUCIALS, affine, rotation
 from numpy.typing import NDArray
-from simulated import FIDUCIALS, affine, rotation
 
 from adjust.functional_model.lens import Distortion, Prior
 from adjust.functional_model.transformation import Film

@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from lens_networks import LENSES, make_network
+from networks import LENSES, lens_network
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from studies import parametrize_with_studies
@@ -262,7 +262,7 @@ def test_a_strong_lens_agrees_by_way_of_the_same_model(family: str) -> None:
 @parametrize_with_studies("skew", [True, False], ids=["skew", "no skew"])
 def test_a_fisheye_agrees_with_opencvs_fisheye(skew: bool) -> None:
     """Which estimates both focal lengths or none: one of them free here is two for the comparison."""
-    network = make_network("opencv_fisheye", np.random.default_rng(2))
+    network = lens_network("opencv_fisheye", np.random.default_rng(2))
     if not skew:
         camera = network.cameras[0]
         lens = {"k1": Prior(0.0, FREE), "k2": Prior(0.0, FREE), "b2": Prior(LENSES["opencv_fisheye"][1]["b2"], 0.0)}

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from simulated import Truth, field_points, simulated
+from networks import Truth, field_points, simulated
 from simulated_project import write_project
 from studies import parametrize_with_studies
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from lens_networks import make_network
+from networks import lens_network
 from simulated_project import write_project
 
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
@@ -47,7 +47,7 @@ def test_a_camera_file_becomes_opencvs(tmp_path: Path, capsys: pytest.CaptureFix
 
 def test_an_adjustment_keeps_its_covariance(tmp_path: Path) -> None:
     """The converted file compares with its source as no drift, and comes back to it when converted back."""
-    project = write_project(make_network("australis", np.random.default_rng(7)), tmp_path)
+    project = write_project(lens_network("australis", np.random.default_rng(7)), tmp_path)
     run(["adjust", str(project)])
     first = tmp_path / "out" / "adjustment.json"
     there, back = tmp_path / "brown", tmp_path / "back"
@@ -74,7 +74,7 @@ def test_an_adjustment_keeps_its_covariance(tmp_path: Path) -> None:
 
 @pytest.mark.study
 def test_a_converted_calibration_is_taken_in(tmp_path: Path) -> None:
-    project = write_project(make_network("australis", np.random.default_rng(7)), tmp_path)
+    project = write_project(lens_network("australis", np.random.default_rng(7)), tmp_path)
     run(["adjust", str(project)])
     assert run(["convert", str(tmp_path / "out" / "adjustment.json"), "brown", str(tmp_path / "brown")]) == DONE
     text = (tmp_path / "camera.toml").read_text(encoding="utf-8").replace('"australis"', '"brown"')

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
-from lens_networks import make_network
+from networks import lens_network
 from numpy.typing import NDArray
 from simulated_project import write_project
 
@@ -25,7 +25,7 @@ POINTS = np.random.default_rng(2).uniform(-1.0, 1.0, (60, 3)) * [2.0, 2.0, 0.3]
 
 def fisheye_project(folder: Path) -> Path:
     """Digital, 36 mm x 24 mm, exact images; its comparator begins at the first pixel."""
-    network = make_network("opencv_fisheye")
+    network = lens_network("opencv_fisheye")
     shift = np.array([18.0, -12.0])
     observations = replace(network.observations, xy_mm=network.observations.xy_mm + shift)
     middle = {"x0_mm": Prior(18.0, np.inf), "y0_mm": Prior(-12.0, np.inf)}

@@ -29,8 +29,8 @@ from exported_project import (
     scan_px,
 )
 from foreign_readers import asp_px, colmap_px, metashape_mm, micmac_affine, micmac_px, opencv_px, values
+from networks import affine, rotation, simulated
 from numpy.typing import NDArray
-from simulated import affine, rotation, simulated
 from studies import parametrize_with_studies
 
 from adjust.functional_model.projection import LineOfSight
@@ -246,7 +246,7 @@ def test_footprints_hold_what_the_frames_show(tmp_path: Path) -> None:
         assert ring[0].tolist() == ring[-1].tolist()
         x, y = ring[:-1].T
         assert (x * np.roll(y, -1) - np.roll(x, -1) * y).sum() > 0.0
-        from simulated import camera_point
+        from networks import camera_point
 
         ground = np.column_stack([ring[:-1], np.full(len(x), feature["properties"]["ground"])])
         projected = camera_point(upright, i, ground)

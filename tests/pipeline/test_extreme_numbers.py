@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from simulated import simulated
+from networks import simulated
 from simulated_project import write_project
 
 from pipeline.cli import WRONG_INPUT, run

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from lens_networks import LENSES, make_network
-from simulated import Truth, field_points, simulated
+from networks import LENSES, Truth, field_points, lens_network, simulated
 from simulated_project import write_project
 from studies import parametrize_with_studies
 
@@ -41,7 +40,7 @@ def test_ebners_set_from_the_camera_file_to_the_report(tmp_path: Path) -> None:
 @parametrize_with_studies("name", list(LENSES), quick=(2,))
 def test_a_lens_from_the_camera_file_to_the_report(name: str, tmp_path: Path) -> None:
     """Noisy images, nothing known of the lens; what OpenCV can and cannot compare is said."""
-    project = write_project(make_network(name, np.random.default_rng(4)), tmp_path)
+    project = write_project(lens_network(name, np.random.default_rng(4)), tmp_path)
     assert run(["run", str(project)]) in (DONE, LOOK)
     result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
     distortion = result["cameras"]["L"]["distortion"]

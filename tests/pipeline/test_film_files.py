@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from simulated import Truth, field_points, film_parameters, simulated
+from networks import Truth, field_points, film_parameters, simulated
 from studies import parametrize_with_studies
 
 from adjust.functional_model.transformation import film_parameter_names

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from networks import field_points, simulated
 from reference_cases import CASES
-from simulated import field_points, simulated
 from simulated_project import write_project as write_network
 from studies import parametrize_with_studies
 from test_cases import write_project

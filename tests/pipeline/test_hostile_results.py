@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from exported_project import POINTS, TRUTH, make_project
-from simulated import simulated
+from networks import simulated
 
 from pipeline.cli import run
 

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 from exported_project import PITCH_MM, TRUTH, adjusted_project, camera_mm
+from networks import FIDUCIALS
 from numpy.typing import NDArray
-from simulated import FIDUCIALS
 from studies import parametrize_with_studies
 
 from adjust.functional_model.lens import Lens, Prior

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from board_pictures import board_network
+from networks import board_network
 
 from adjust.solution.adjustment import adjust
 from pipeline.calibration import lens_choice

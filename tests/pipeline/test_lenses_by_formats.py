@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from exported_project import IMAGES, MIRRORED, PITCH_MM, TRUTH, frame_px, make_project
 from foreign_readers import asp_px, colmap_px, metashape_mm, micmac_px, opencv_px
+from networks import affine, comparator_point, simulated
 from numpy.typing import NDArray
-from simulated import affine, comparator_point, simulated
 from studies import parametrize_with_studies
 
 from adjust.functional_model.families import parameter_names

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_pictures import FRAME_MM, TRUTH, board_network
+from networks import BOARD_FRAME_MM, BOARD_TRUTH, board_network
 
 from adjust.problem.parameter import Parameter
 from adjust.solution.result import Adjustment
@@ -44,11 +44,11 @@ def test_a_digital_camera_comes_from_pixels_alone(tmp_path: Path, line: str, pit
     result = adjust_network(written(tmp_path, project=line))
     for name in ("c", "x0", "y0"):
         key = Parameter.interior("desk", name)
-        assert abs(result.value(key) / pitch_mm - TRUTH[name] / DRAWN_MM) < 4.0 * result.sigma(key) / pitch_mm
+        assert abs(result.value(key) / pitch_mm - BOARD_TRUTH[name] / DRAWN_MM) < 4.0 * result.sigma(key) / pitch_mm
     assert any("5 µm are assumed" in note for note in result.unused) == (not line)
 
 
 def test_a_camera_file_in_mm_needs_the_size_of_a_pixel(tmp_path: Path) -> None:
-    path = written(tmp_path, camera=f"frame_mm = [{FRAME_MM[0]}, {FRAME_MM[1]}]\n")
+    path = written(tmp_path, camera=f"frame_mm = [{BOARD_FRAME_MM[0]}, {BOARD_FRAME_MM[1]}]\n")
     with pytest.raises(InputError, match="Set pitch_um in"):
         adjust_network(path)

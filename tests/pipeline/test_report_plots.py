@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from simulated import Truth, field_points, simulated
+from networks import Truth, field_points, simulated
 from simulated_project import write_project
 
 from adjust.initial_values.approximations import approximate

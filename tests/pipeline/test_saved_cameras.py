@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from simulated_project import write_project
-from test_earlier_calibrations import two_networks
+from test_lens_comparison import two_networks
 
 from pipeline.cli import run
 from pipeline.errors import InputError

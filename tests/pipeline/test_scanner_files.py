@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bent_scans import films
+from networks import bent_films
 from simulated_project import write_project
 from small_scene import OBLIQUE, SCANNER, scene
 
@@ -45,7 +45,7 @@ def stored(folder: Path) -> dict[str, Any]:
 
 
 def test_two_scanners_of_images_csv_are_adjusted_and_shown(tmp_path: Path) -> None:
-    network = films(QUARTERS, TRUTH, {}, np.random.default_rng(1))
+    network = bent_films(QUARTERS, TRUTH, {}, np.random.default_rng(1))
     path = project(tmp_path, network, '["a20", "b11", "b02"]\nscanner_sigma_um = 50.0')
     assert run(["run", str(path)]) == DONE
     scanners = stored(tmp_path)["scanners"]
@@ -69,7 +69,7 @@ def test_two_scanners_of_images_csv_are_adjusted_and_shown(tmp_path: Path) -> No
 
 def test_the_field_of_the_report_has_the_band_of_its_terms(tmp_path: Path) -> None:
     """At the corner of the extent a Legendre polynomial is 1: the field there is the sum of the terms."""
-    network = films(QUARTERS, TRUTH, {}, np.random.default_rng(1))
+    network = bent_films(QUARTERS, TRUTH, {}, np.random.default_rng(1))
     assert run(["adjust", str(project(tmp_path, network, '["a20", "a02"]'))]) == LOOK  # b11 is missing, sigma0 says
     path = tmp_path / "out" / "adjustment.json"
     scanner, covariance = read_adjustment(path).scanners["1"], read_covariance(path)
@@ -83,7 +83,7 @@ def test_the_field_of_the_report_has_the_band_of_its_terms(tmp_path: Path) -> No
 
 
 def test_without_the_key_there_is_no_scanner(tmp_path: Path) -> None:
-    network = films(QUARTERS, {}, {}, np.random.default_rng(1))
+    network = bent_films(QUARTERS, {}, {}, np.random.default_rng(1))
     path = project(tmp_path, network, '"none"')
     assert run(["run", str(path)]) == DONE
     assert stored(tmp_path)["scanners"] == {}
@@ -91,7 +91,7 @@ def test_without_the_key_there_is_no_scanner(tmp_path: Path) -> None:
 
 
 def test_frames_that_lie_alike_end_in_a_question(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    network = films([0.0] * 4, TRUTH, {}, np.random.default_rng(1))
+    network = bent_films([0.0] * 4, TRUTH, {}, np.random.default_rng(1))
     assert run(["adjust", str(project(tmp_path, network, '"auto"'))]) == LOOK
     assert "all frames lie alike in the scanner" in " ".join(capsys.readouterr().out.split())
     assert not any(scanner["terms"] for scanner in stored(tmp_path)["scanners"].values())
@@ -108,12 +108,12 @@ def test_frames_that_lie_alike_end_in_a_question(tmp_path: Path, capsys: pytest.
     ],
 )
 def test_what_is_wrong_is_stated(tmp_path: Path, capsys: pytest.CaptureFixture[str], setting: str, words: str) -> None:
-    assert run(["adjust", str(project(tmp_path, films([0.0], {}, {}), setting))]) == WRONG_INPUT
+    assert run(["adjust", str(project(tmp_path, bent_films([0.0], {}, {}), setting))]) == WRONG_INPUT
     assert words in capsys.readouterr().err
 
 
 def test_a_digital_camera_has_no_scanner(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = project(tmp_path, films([0.0], {}, {}), '"bend"')
+    path = project(tmp_path, bent_films([0.0], {}, {}), '"bend"')
     text = path.read_text(encoding="utf-8").replace('transformation = "affine"', 'transformation = "none"')
     path.write_text(text, encoding="utf-8")
     assert run(["adjust", str(path)]) == WRONG_INPUT
@@ -132,7 +132,7 @@ def test_a_rendered_scanner_is_the_one_that_is_adjusted() -> None:
     bend = scanner_bend(made)
     scanner = Scanner("S", dict.fromkeys(bend_um, Prior(0.0, np.inf)), bend.center_mm, (bend.size_mm / 2,) * 2)
     network = replace(
-        films([0.0] * len(poses), {}, {}, marks_mm=marks_mm, sigma_given_mm=0.0),
+        bent_films([0.0] * len(poses), {}, {}, marks_mm=marks_mm, sigma_given_mm=0.0),
         scanners=(scanner,),
     )
     network = replace(network, observations=replace(network.observations, xy_mm=pixels * [0.04, -0.04]))

@@ -1,0 +1,730 @@
+"""Networks with faults: the catalogue of null directions, mishaps, blunders, and models that lack something."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from math import pi
+
+import numpy as np
+from networks import (
+    CONVERGENT,
+    FREE,
+    HEIGHT,
+    HEIGHTS,
+    KNOWN,
+    LEVEL_STATIONS,
+    STATIONS,
+    TILTED,
+    UNKNOWN,
+    Setup,
+    Triple,
+    Truth,
+    digital_network,
+    field_points,
+    give_values,
+    quarters,
+    simulated,
+    vertical,
+)
+from numpy.typing import NDArray
+
+from adjust import Adjustment, AdjustmentError, Camera, Distortion, Fiducial, Options, Prior, adjust
+from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles
+from adjust.problem.network import Approximations, Exterior, Network, ObjectPoint
+from adjust.problem.tested import Probabilities
+
+AXES = ("Shift x", "Shift y", "Rotation", "Scale")
+DEFORMATIONS = ("Affinity", "Shear")
+POINT = ("principal point's x0'", "principal point's y0'")
+DISTANCE = ("principal distance of camera K can change",)
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A network, what it is in words, the words of its null directions in order, and what mends which of them."""
+
+    title: str
+    setup: Setup
+    words: tuple[str, ...]
+    mended: Mapping[str, tuple[Setup, tuple[str, ...]]]
+    datum: str = "minimal"
+
+    @property
+    def options(self) -> Options:
+        return Options(datum="minimal" if self.datum == "minimal" else "control")
+
+
+def _more(setup: Setup, *attitudes: Triple) -> Setup:
+    """With further images, taken from stations of their own."""
+    further = ((-150.0, -520.0, 1450.0), (350.0, -380.0, 1550.0))[: len(attitudes)]
+    return replace(setup, stations=setup.stations + further, attitudes=setup.attitudes + attitudes)
+
+
+TILTS = ((0.3, 0.0, 0.4), (0.0, 0.33, -0.2))  # images tilted in different directions
+
+_flat = Setup(vertical(0.1, 1.6, 3.0, -1.5), relief=0.0)
+_tilted = Setup((TILTED,) * 4, relief=0.0)
+_two = Setup(((0.1, -0.3, 0.2), (-0.05, 0.35, 0.1)), STATIONS[:2], relief=0.0)
+_parallel = Setup(vertical(0.0, 0.0, 0.0, 0.0), sigma=UNKNOWN)
+_half_turned = Setup(vertical(0.0, pi, 0.0, pi), sigma=UNKNOWN)
+_turned = Setup(quarters(), sigma=UNKNOWN)
+_crosswise = Setup(quarters(), LEVEL_STATIONS, relief=0.0, sigma=HEIGHTS)
+_heights_parallel = Setup(vertical(0.0, 0.0, 0.0, 0.0), LEVEL_STATIONS, relief=0.0, sigma=HEIGHTS)
+_heights_relief = Setup(quarters(), sigma=HEIGHTS)
+_plane = Setup(CONVERGENT, relief=0.0, sigma=UNKNOWN)
+_pair = Setup(CONVERGENT[:2], STATIONS[:2], sigma=UNKNOWN)
+
+CATALOGUE: dict[str, Failure] = {
+    "known-flat-vertical": Failure(
+        "Known points, flat field, vertical images, any kappa",
+        _flat,
+        (*AXES, *POINT, *DISTANCE),
+        {
+            "add images tilted in different directions": (_more(_flat, *TILTS), POINT + DISTANCE),
+            "points at other heights": (replace(_flat, relief=200.0), POINT + DISTANCE),
+        },
+    ),
+    "known-flat-tilted": Failure(
+        "Known points, flat field, one tilted attitude for all images",
+        _tilted,
+        (*AXES, *DEFORMATIONS, *DISTANCE),
+        {
+            "images turned by 90 degrees about their axes": (
+                replace(_tilted, attitudes=quarters(*TILTED)),
+                DEFORMATIONS + DISTANCE,
+            ),
+            "tilted in different directions": (_more(_tilted, *TILTS), DEFORMATIONS + DISTANCE),
+            "points at other heights": (replace(_tilted, relief=200.0), DISTANCE),
+        },
+    ),
+    "known-flat-two": Failure(
+        "Known points, flat field, two convergent images",
+        _two,
+        (*AXES, "Affinity"),
+        {
+            "images turned by 90 degrees about their axes": (_more(_two, (-0.05, 0.35, 0.1 + pi / 2)), DEFORMATIONS),
+            "tilted in other directions": (_more(_two, TILTS[0]), DEFORMATIONS),
+        },
+    ),
+    "known-relief": Failure(
+        "Known points, three-dimensional field, even vertical images of one kappa",
+        Setup(vertical(0, 0, 0, 0)),
+        AXES,
+        {},
+    ),
+    "unknown-convergent": Failure("Unknown points, convergent images", Setup(CONVERGENT, sigma=UNKNOWN), AXES, {}),
+    "unknown-parallel": Failure(
+        "Unknown points, parallel axes, equal kappa",
+        _parallel,
+        (*AXES, *DEFORMATIONS, *POINT, *DISTANCE),
+        {
+            "images turned by 180 degrees about their axes": (
+                replace(_parallel, attitudes=vertical(0, pi, 0, 0)),
+                POINT,
+            ),
+            "images turned by 90 degrees about their axes": (
+                replace(_parallel, attitudes=vertical(0, pi / 2, 0, 0)),
+                DEFORMATIONS,
+            ),
+            "tilted in different directions": (_more(_parallel, *TILTS), DEFORMATIONS + POINT + DISTANCE),
+            "known points (X, Y, Z) at different heights": (
+                replace(_parallel, sigma=KNOWN),
+                DEFORMATIONS + POINT + DISTANCE,
+            ),
+        },
+    ),
+    "unknown-half-turned": Failure(
+        "Unknown points, parallel axes, kappa 0 and 180 degrees",
+        _half_turned,
+        (*AXES, *DEFORMATIONS, *DISTANCE),
+        {
+            "images turned by 90 degrees about their axes": (
+                replace(_half_turned, attitudes=vertical(0, pi, pi / 2, pi)),
+                DEFORMATIONS,
+            ),
+            "tilted in different directions": (_more(_half_turned, *TILTS), DEFORMATIONS + DISTANCE),
+        },
+    ),
+    "unknown-turned": Failure(
+        "Unknown points, vertical images, kappa spread, three-dimensional field",
+        _turned,
+        (*AXES, *DISTANCE),
+        {
+            "tilted in different directions": (_more(_turned, *TILTS), DISTANCE),
+            "known points (X, Y, Z) at different heights": (replace(_turned, sigma=KNOWN), DISTANCE),
+        },
+    ),
+    "heights-flat-crosswise": Failure(
+        "Only heights known, flat field, vertical images crosswise (Juhl)",
+        _crosswise,
+        (*AXES, *POINT, *DISTANCE),
+        {
+            "tilted in different directions": (_more(_crosswise, *TILTS), POINT + DISTANCE),
+            "known points (X, Y, Z) at different heights": (
+                replace(_crosswise, sigma=KNOWN, relief=200.0),
+                POINT + DISTANCE,
+            ),
+        },
+    ),
+    "heights-flat-parallel": Failure(
+        "Only heights known, flat field, parallel axes, equal kappa",
+        _heights_parallel,
+        (*AXES, *DEFORMATIONS, *POINT, *DISTANCE),
+        {
+            "images turned by 90 degrees about their axes": (
+                replace(_heights_parallel, attitudes=vertical(0, pi / 2, 0, 0)),
+                DEFORMATIONS,
+            ),
+            "tilted in different directions": (_more(_heights_parallel, *TILTS), POINT + DISTANCE),
+        },
+    ),
+    "heights-relief-crosswise": Failure(
+        "Only heights known, field with relief, vertical images crosswise",
+        _heights_relief,
+        (*AXES, *DISTANCE),
+        {
+            "tilted in different directions": (_more(_heights_relief, *TILTS), DISTANCE),
+            "known points (X, Y, Z) at different heights": (replace(_heights_relief, sigma=KNOWN), DISTANCE),
+        },
+    ),
+    "unknown-plane": Failure(
+        "Unknown points of a plane, four convergent images",
+        _plane,
+        (*AXES, "Affinity"),
+        {"tilted in other directions": (_more(_plane, (0.33, -0.2, 0.8)), DEFORMATIONS)},
+    ),
+    "unknown-pair": Failure(
+        "Unknown points, one convergent pair",
+        _pair,
+        (*AXES, *DEFORMATIONS, *DISTANCE),
+        {"tilted in different directions": (_more(_pair, TILTS[0]), DEFORMATIONS + DISTANCE)},
+    ),
+}
+
+
+def sentences(result: Adjustment) -> list[str]:
+    """All that a result says: null directions, warnings, correlations, each with its cause and its remedy."""
+    return [
+        *(f"{each.cause} {each.remedy}" for each in result.singular),
+        *result.warnings,
+        *(f"{each.cause} {each.remedy}" for each in result.correlations),
+    ]
+
+
+@dataclass(frozen=True)
+class Mishap:
+    """A network with another fault, and the words of what the program says of it, in order, correlations last."""
+
+    title: str
+    network: Callable[[], tuple[Network, Approximations]]
+    words: tuple[str, ...]
+    options: Options = field(default_factory=Options)
+
+
+_good = Setup(CONVERGENT, prior=1.0, noise=True)
+_near = Setup(
+    ((0.0, 0.0, 0.0), (1e-5, 0.0, 1.5), (0.0, 1e-5, 3.1), (0.0, 0.0, -1.5)), LEVEL_STATIONS, relief=0.02, noise=True
+)
+_all_unknown = replace(_good, sigma=UNKNOWN)
+_line = np.stack([np.linspace(-700.0, 700.0, 9), np.linspace(-300.0, 300.0, 9), np.zeros(9)], axis=1)
+_deformed = Setup(
+    vertical(0.1, 1.6, 3.0, -1.5), relief=20.0, prior=1.0, distortion={"k3": FREE, "k5": FREE}, noise=True
+)
+
+
+_narrow = Setup(
+    vertical(0.0, 0.0, 0.0, 0.0),
+    ((0.0, 0.0, HEIGHT), (100.0, 20.0, HEIGHT), (-100.0, 0.0, 1400.0), (20.0, -80.0, 1450.0)),
+    prior=10.0,
+    points=np.random.default_rng(4).uniform(-1.0, 1.0, (20, 3)) * [150.0, 150.0, 300.0],
+    distortion={"k3": FREE, "p1": FREE, "p2": FREE},
+    noise=True,
+)
+
+
+def _collinear_stations() -> tuple[Network, Approximations]:
+    """All targets of image f3 on a line, those of the others not."""
+    points = np.vstack([field_points(np.random.default_rng(1), 9), _line])
+    network, start = replace(_good, points=points).network()
+    return _keep(network, lambda image, point, kind: not (image == "f3" and kind == "target" and int(point) < 9)), start
+
+
+def _one_ray() -> tuple[Network, Approximations]:
+    network, start = _all_unknown.network()
+    return _keep(network, lambda image, point, kind: point != "3" or kind == "fiducial" or image == "f1"), start
+
+
+def _line_of_sight() -> tuple[Network, Approximations]:
+    """Point 0 in line with the two stations that show it."""
+    points = field_points(np.random.default_rng(1), 14)
+    first, second = np.array(STATIONS[0]), np.array([120.0, 40.0, 500.0])
+    points[0] = first + (second - first) * (first[2] - 30.0) / (first[2] - second[2])
+    setup = replace(_all_unknown, points=points, stations=(STATIONS[0], tuple(second), *STATIONS[2:]), noise=False)
+    setup = replace(setup, attitudes=((0.0, 0.0, 0.1), (0.0, 0.0, 1.6), *CONVERGENT[2:]))
+    network, start = setup.network()
+    return _keep(network, lambda image, point, kind: point != "0" or kind == "fiducial" or image < "f2"), start
+
+
+def _three_targets() -> tuple[Network, Approximations]:
+    network, start = _good.network()
+    return _keep(
+        network, lambda image, point, kind: not (image == "f3" and kind == "target" and point not in ("0", "1", "2"))
+    ), start
+
+
+def _swapped() -> tuple[Network, Approximations]:
+    network, start = _good.network()
+    rows = network.observations
+    other = {"3": "7", "7": "3"}
+    points = tuple(
+        other.get(point, point) if image == "f1" and kind == "target" else point
+        for image, point, kind in zip(rows.image, rows.point, rows.kind, strict=True)
+    )
+    return replace(network, observations=replace(rows, point=points)), start
+
+
+def _keep(network: Network, keep: Callable[[str, str, str], bool]) -> Network:
+    """The network with some of its observations."""
+    rows = network.observations
+    kept = [i for i, row in enumerate(zip(rows.image, rows.point, rows.kind, strict=True)) if keep(*row)]
+    return replace(network, observations=rows.only(np.array(kept)))
+
+
+MISHAPS: dict[str, Mishap] = {
+    "no-datum": Mishap(
+        "All points unknown, and nothing that fixes the object space",
+        _all_unknown.network,
+        tuple(
+            f"The object space can {motion}"
+            for motion in (
+                "shift in X",
+                "shift in Y",
+                "shift in Z",
+                "turn about X",
+                "turn about Y",
+                "turn about Z",
+                "grow",
+            )
+        ),
+    ),
+    "congruent": Mishap(
+        "Congruent transformations: one direction less, for the scale is the comparator's",
+        Setup(CONVERGENT, kind="congruent").network,
+        ("Shift x", "Shift y", "Rotation"),
+    ),
+    "projective": Mishap(
+        "Projective transformations: the tilts too",
+        Setup(CONVERGENT, kind="projective").network,
+        ("Shift x", "Shift y", "Rotation", "Scale", "Tilt x", "Tilt y"),
+    ),
+    "targets-on-a-line": Mishap(
+        "One image whose targets all lie on a line", _collinear_stations, ("all its targets lie on one line",)
+    ),
+    "one-ray": Mishap(
+        "An unknown point in one image only", _one_ray, ("Only image f1 shows point 3",), Options(datum="minimal")
+    ),
+    "in-line": Mishap(
+        "An unknown point in line with its stations",
+        _line_of_sight,
+        ("lies in line with the stations",),
+        Options(datum="minimal"),
+    ),
+    "one-station": Mishap(
+        "Unknown points, two images from one station",
+        Setup(((0.0, 0.1, 0.0), (0.1, -0.2, 1.0)), ((0.0, 0.0, HEIGHT),) * 2, sigma=UNKNOWN, prior=1.0).network,
+        ("were taken from one station",) * 11 + ("The exterior orientation of image",) * 2,
+        Options(datum="minimal"),
+    ),
+    "single-flat": Mishap(
+        "One vertical image of a flat field, priors of 1 mm",
+        Setup(vertical(0.1), STATIONS[:1], relief=0.0, prior=1.0, noise=True).network,
+        ("The observations say nothing about c, x0 and y0 of camera K", "", "", ""),
+    ),
+    "nearly-flat": Mishap(
+        "Relief of 2 cm under 1500 m, vertical to 0.00001 rad, c and principal point without priors",
+        lambda: (give_values(_near.network()[0], {"x": 1.0, "y": 1.0}), _near.network()[1]),
+        ("did not stand still", "principal point's x0'", "principal point's y0'", "principal distance of camera K can"),
+        Options(iteration_limit=5),
+    ),
+    "low-relief": Mishap(
+        "Relief of 20 m under 1500 m, vertical images: regular, and highly correlated",
+        _deformed.network,
+        ("c of camera K and Z0 of all images", "", ""),
+    ),
+    "narrow-field": Mishap(
+        "A narrow field of view, with decentering: 20 points within 6 degrees, priors of 10 mm",
+        _narrow.network,
+        (
+            "x0' of camera K and phi",
+            "y0' of camera K and omega",
+            "c of camera K",
+            "p1 of camera K and phi",
+            "x0' and p1",
+        ),
+    ),
+    "three-targets": Mishap(
+        "An image with three targets", _three_targets, ("Nothing checks the orientation of image f3", "c of camera K")
+    ),
+    "swapped": Mishap(
+        "Two point numbers swapped in one image",
+        _swapped,
+        ("The points 3 and 7 of image f1", "c of camera K"),
+    ),
+}
+
+
+Array = NDArray[np.float64]
+
+EXACT = np.array([0.05, 0.05, 0.05, 1e-4, 1e-4, 1e-4])  # of observed stations (m) and attitudes (rad)
+APPROXIMATE = np.full(6, np.inf)
+MIRRORS = "The points are mirrored: the sign of X, Y or Z of all of them is wrong, or two axes are exchanged"
+
+
+def blunder_network(seed: int, oriented: Array | None = None, relief: float = 200.0) -> Network:
+    """Four images of a field of 14 to 30 points known to 5 cm, taken anew for every seed; their orientations, if asked
+    for, as they are observed, or roughly where no sigmas are."""
+    rng = np.random.default_rng([7, seed])
+    truth = Truth()
+    moved = tuple(tuple(each) for each in np.array(truth.stations) + rng.normal(0.0, 60.0, (4, 3)))
+    turns = rng.normal(0.0, [0.05, 0.05, 1.5], (4, 3))
+    tilted = tuple(tuple(each) for each in np.array(truth.attitudes) + turns)
+    truth = replace(truth, stations=moved, attitudes=tilted, distortion={"k3": 2e-8, "p1": 2e-8})
+    points = field_points(rng, int(rng.integers(14, 31)), relief)
+    made, _ = simulated(rng, truth, points=points, fiducial_sigma=0.01, point_sigma=0.05)
+    camera = replace(made.cameras[0], principal_distance_mm=Prior(truth.c, 0.0))
+    made = replace(made, cameras=(camera,))
+    if oriented is None:
+        return made
+    errors = np.where(np.isfinite(oriented), oriented, [20.0, 20.0, 20.0, 0.03, 0.03, 0.03])
+    exteriors = [
+        Exterior(np.array([*station, *attitude]) + errors * rng.normal(size=6), oriented)
+        for station, attitude in zip(truth.stations, truth.attitudes, strict=True)
+    ]
+    images = zip(made.images, exteriors, strict=True)
+    return replace(made, images=tuple(replace(image, exterior=each) for image, each in images))
+
+
+def change_points(given: Network, changed: Callable[[Array], Array], sigma: float = 1.0) -> Network:
+    points = []
+    for point in given.points:
+        priors = [prior for prior in (point.X, point.Y, point.Z) if prior]
+        xyz = changed(np.array([prior.value for prior in priors]))
+        of_axes = zip(xyz, priors, strict=True)
+        points.append(ObjectPoint(point.id, *(Prior(float(value), sigma * prior.sigma) for value, prior in of_axes)))
+    return replace(given, points=tuple(points))
+
+
+def y_down(given: Network) -> Network:
+    camera = given.cameras[0]
+    marks = {id: Fiducial(mark.x_mm, Prior(-mark.y_mm.value, mark.y_mm.sigma)) for id, mark in camera.fiducials.items()}
+    return replace(given, cameras=(replace(camera, fiducials=marks),))
+
+
+def other_c(given: Network, off_mm: float = 10.0) -> Network:
+    camera = given.cameras[0]
+    assert camera.principal_distance_mm is not None
+    c = Prior(camera.principal_distance_mm.value + off_mm, camera.principal_distance_mm.sigma)
+    return replace(given, cameras=(replace(camera, principal_distance_mm=c),))
+
+
+def exchanged(given: Network, with_fiducials: bool = False) -> Network:
+    """The targets of f1 and f3, or all their marks, under each other's name."""
+    other = {"f1": "f3", "f3": "f1"}
+    observations = given.observations
+    rows = zip(observations.image, observations.kind, strict=True)
+    image = tuple(other.get(name, name) if with_fiducials or kind == "target" else name for name, kind in rows)
+    return replace(given, observations=replace(observations, image=image))
+
+
+def one_point(given: Network) -> Network:
+    first, *others = given.points
+    assert first.X is not None
+    return replace(given, points=(replace(first, X=Prior(first.X.value + 200.0, first.X.sigma)), *others))
+
+
+@dataclass(frozen=True)
+class Blunder:
+    """A slip: how the network is otherwise given, how it is spoilt, and what has to be said of it."""
+
+    oriented: Array | None
+    spoil: Callable[[Network], Network]
+    words: tuple[str, ...]
+
+
+BLUNDERS = {
+    "sign of X": Blunder(None, lambda n: change_points(n, lambda p: p * [-1, 1, 1]), (MIRRORS,)),
+    "sign of Z": Blunder(None, lambda n: change_points(n, lambda p: p * [1, 1, -1]), (MIRRORS,)),
+    "X and Y exchanged": Blunder(None, lambda n: change_points(n, lambda p: p[[1, 0, 2]]), (MIRRORS,)),
+    "sign of X, approximate orientations": Blunder(
+        APPROXIMATE, lambda n: change_points(n, lambda p: p * [-1, 1, 1]), ("The sign of X of all points is wrong. ",)
+    ),
+    "X and Y exchanged, approximate orientations": Blunder(
+        APPROXIMATE, lambda n: change_points(n, lambda p: p[[1, 0, 2]]), ("X and Y of all points are exchanged. ",)
+    ),
+    "sign of Z, observed orientations": Blunder(
+        EXACT, lambda n: change_points(n, lambda p: p * [1, 1, -1]), ("The sign of Z of all points is wrong. ",)
+    ),
+    "y of the camera down": Blunder(None, y_down, ("y' axis of the camera's fiducial marks points down",)),
+    "y of the camera down, approximate orientations": Blunder(
+        APPROXIMATE, y_down, ("The y' axis of the camera's fiducial marks points down",)
+    ),
+    "c 10 mm too long": Blunder(None, other_c, ("principal distance of camera K is not the 163 mm",)),
+    "targets of two frames exchanged": Blunder(None, exchanged, ("targets of the frames f1 and f3 are exchanged",)),
+    "mm for m, approximate orientations": Blunder(
+        APPROXIMATE, lambda n: change_points(n, lambda p: 1000.0 * p, 1000.0), ("points are 1000 times too large",)
+    ),
+    "mm for m, observed orientations": Blunder(
+        EXACT, lambda n: change_points(n, lambda p: 1000.0 * p, 1000.0), ("points are 1000 times too large",)
+    ),
+    "names of two frames exchanged, approximate orientations": Blunder(
+        APPROXIMATE, lambda n: exchanged(n, with_fiducials=True), ("their names are exchanged",)
+    ),
+    "one point": Blunder(None, one_point, ("Control point 0 is not where it is given",)),
+    "nothing": Blunder(None, lambda n: n, ()),
+    "nothing, approximate orientations": Blunder(APPROXIMATE, lambda n: n, ()),
+}  # fmt: skip
+
+
+def blunder_sentences(spoilt: Network) -> list[str]:
+    """What a user is told: the message, or the warnings and what is called suspect."""
+    try:
+        result = adjust(spoilt)
+    except AdjustmentError as error:
+        return [str(error)]
+    return [*result.warnings, *(f"{each.tested.name} is suspect" for each in result.suspects)]
+
+
+WHOLE = ("exchanged", "wrong", "points down", "times too", "principal distance of camera")
+SINGLE = ("is suspect", "is not where", "swapped")
+
+
+def blunder_outcome(kind: Blunder, sentences: list[str]) -> str:
+    """named: what is to be said, and nothing that blames anything else; misleading: something else is blamed.
+
+    Beside a point that is named, tests of single observations may tell of its neighbours; no other slip's blame may
+    stand there.
+    """
+    is_single = any(words in named for words in SINGLE for named in kind.words)
+    others = WHOLE if is_single else WHOLE + SINGLE
+    named = [each for each in sentences if any(words in each for words in kind.words)]
+    if any(words in each for words in others for each in sentences if each not in named):
+        return "misleading"
+    return "named" if named or not kind.words else "unnamed"
+
+
+C_MM, HALF_MM, SIGMA_MM = 10.0, np.array([6.4, 4.8]), 0.001
+MIDDLE_MM = np.array([6.4, -4.8])  # of the picture, in the comparator
+NOTHING, NOISE = "nothing", "noise too small"
+MANY = 3.0  # times what a test detects
+LENS = {"k1": -0.22, "k2": 0.11, "p1": 4e-4, "p2": -3e-4, "k3": -0.02}
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a network is projected from: points (p, 3), stations and rotations; groups (m,): the images that differ."""
+
+    points: Array
+    rotations: Array
+    stations: Array
+    point_mm: Array
+    groups: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Effects:
+    """What the pictures have and the model does not, in the unit of each."""
+
+    b1: float = 0.0
+    radial: float = 0.0
+    tangential: float = 0.0
+    zoom: float = 0.0
+    crop: float = 0.0
+    scale: float = 0.0
+    bend: float = 0.0
+    noise: float = 1.0
+    pitch: float = 1.0
+    object_unit: float = 1.0
+    mirrored: bool = False
+    y_down: bool = False
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """A misfit: its effect of size 1, the free parameters of the lens, how many unknowns its test has, the words.
+
+    boards, fields: which of them; sized: whether it has a size; c_given, stations_given, frame_given: what else the
+    network knows.
+    """
+
+    effect: Callable[[float], Effects]
+    words: tuple[str, ...]
+    free: tuple[str, ...] = ("k1", "k2", "p1", "p2", "k3")
+    lens: dict[str, float] = field(default_factory=lambda: LENS)
+    size: int = 1
+    boards: bool = True
+    fields: bool = True
+    sized: bool = True
+    c_given: bool = False
+    stations_given: bool = False
+    frame_given: bool = False
+
+
+def scene(seed: int, flat: bool) -> Scene:
+    rng = np.random.default_rng([36, seed])
+    count = int(rng.integers(6, 11))
+    if flat:
+        columns, rows = int(rng.integers(6, 10)), int(rng.integers(5, 8))
+        x, y = np.meshgrid(np.arange(columns) * 25.0, np.arange(rows) * 25.0)
+        points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    else:
+        points = rng.uniform(-1.0, 1.0, (40, 3)) * [120.0, 90.0, 80.0]
+    middle = points.mean(axis=0)
+    angles = np.column_stack([rng.uniform(-0.5, 0.5, (count, 2)), rng.uniform(-np.pi, np.pi, count)])
+    rotations = rotation_from_angles(angles)
+    extent = np.linalg.norm(np.ptp(points[:, :2], axis=0))
+    distance = rng.uniform(1.0, 1.6, count) * extent * C_MM / (2.0 * HALF_MM[1])
+    aim = middle + rng.uniform(-0.12, 0.12, (count, 3)) * extent
+    stations = aim + distance[:, None] * np.einsum("nji,j->ni", rotations, [0.0, 0.0, 1.0])
+    groups = np.zeros(count, dtype=bool)
+    groups[rng.permutation(count)[: max(2, count // 3)]] = True
+    return Scene(points, rotations, stations, MIDDLE_MM + rng.normal(0.0, 0.1, 2), groups)
+
+
+def misfit_network(made: Scene, effects: Effects, kind: Misfit, rng: np.random.Generator | None) -> Network:
+    """The network as it is given: square pixels, one c, one size, the lens of `kind.free`; rng None: no noise."""
+    names, places = [], []
+    for i, (rotation, station) in enumerate(zip(made.rotations, made.stations, strict=True)):
+        projected = _projected(made, effects, kind, i, rotation, station)
+        inside = np.flatnonzero((np.abs(projected - MIDDLE_MM) < HALF_MM).all(axis=1))
+        names += [(f"im{i:02d}", f"p{k}") for k in inside]
+        places.append(projected[inside])
+    xy_mm = np.concatenate(places)
+    if rng is not None:
+        xy_mm = xy_mm + rng.normal(0.0, SIGMA_MM * effects.noise, xy_mm.shape)
+    xy_mm = effects.pitch * xy_mm * [1.0, -1.0 if effects.y_down else 1.0]
+    given = {name: Prior(0.0, np.inf) for name in kind.free}
+    middle = effects.pitch * MIDDLE_MM * [1.0, -1.0 if effects.y_down else 1.0]
+    c = Prior(C_MM, 0.005) if kind.c_given else None
+    frame = (float(2.0 * HALF_MM[0]), float(2.0 * HALF_MM[1])) if kind.frame_given else (0.0, 0.0)
+    camera = Camera("cam", c, None, None, Distortion("opencv", given), {}, (float(middle[0]), float(middle[1])), frame)
+    exterior = _exteriors(made) if kind.stations_given else {}
+    rows = [(*name, xy) for name, xy in zip(names, xy_mm, strict=True)]
+    points = {f"p{k}": effects.object_unit * xyz for k, xyz in enumerate(made.points)}
+    given_network = digital_network(camera, rows, points, effects.pitch * SIGMA_MM)
+    images = tuple(replace(image, exterior=exterior.get(image.name)) for image in given_network.images)
+    return replace(given_network, images=images)
+
+
+def _exteriors(made: Scene) -> dict[str, Exterior]:
+    """Stations and attitudes as they are known beforehand, roughly."""
+    rows = zip(made.stations, made.rotations, strict=True)
+    return {
+        f"im{i:02d}": Exterior(np.concatenate([station + 10.0, angles_from_rotation(rotation) + 0.02]))
+        for i, (station, rotation) in enumerate(rows)
+    }
+
+
+def _projected(made: Scene, effects: Effects, kind: Misfit, image: int, rotation: Array, station: Array) -> Array:
+    """Comparator coordinates (p, 2) in mm, y up; the lens is OpenCV's, y down."""
+    points = made.points.copy()
+    low, high = points.min(axis=0), points.max(axis=0)
+    relative = (2.0 * points - low - high)[:, :2] / (high - low)[:2]
+    points[:, 2] += effects.bend * (1.0 - relative[:, 0] ** 2)
+    u, v, w = rotation @ (points - station).T
+    x, y = -u / w, v / w
+    lens = dict.fromkeys(("k1", "k2", "p1", "p2", "k3"), 0.0) | kind.lens
+    r2 = x**2 + y**2
+    radial = 1.0 + lens["k1"] * r2 + lens["k2"] * r2**2 + lens["k3"] * r2**3 + effects.radial * r2**2
+    p1, p2 = lens["p1"] + effects.tangential, lens["p2"] - effects.tangential
+    xd = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x**2)
+    yd = y * radial + p1 * (r2 + 2.0 * y**2) + 2.0 * p2 * x * y
+    c, own = C_MM, float(made.groups[image])
+    c += own * effects.zoom
+    at = np.stack([c * xd * (1.0 + effects.b1), -c * yd], axis=1) + made.point_mm
+    at[:, 0] += own * effects.crop
+    at[:, 1] += 0.7 * own * effects.crop
+    if effects.mirrored and image == int(np.argmax(made.groups)):
+        at[:, 0] = 2.0 * MIDDLE_MM[0] - at[:, 0]
+    return np.asarray(at * (1.0 + own * effects.scale))
+
+
+MISFITS = {
+    NOTHING: Misfit(lambda e: Effects(), ()),
+    "pixels not square": Misfit(lambda e: Effects(b1=1e-3 * e), ("pixels of camera cam are not square",)),
+    "two principal distances": Misfit(lambda e: Effects(zoom=0.05 * e), ("another principal distance",)),
+    "sizes: scaled": Misfit(lambda e: Effects(scale=0.01 * e), ("images of different sizes in one camera (scaled)",)),
+    "sizes: cropped": Misfit(
+        lambda e: Effects(crop=0.05 * e), ("images of different sizes in one camera (cropped)",), size=2
+    ),
+    "lens: no radial term": Misfit(
+        lambda e: Effects(radial=0.01 * e), ("have a radial pattern",), free=(), lens={}, size=2
+    ),
+    "lens: k1 alone": Misfit(
+        lambda e: Effects(radial=0.05 * e), ("have a radial pattern",), free=("k1", "p1", "p2"),
+        lens={"k1": -0.2, "p1": 4e-4}, size=2
+    ),
+    "lens: no decentering": Misfit(
+        lambda e: Effects(tangential=5e-4 * e), ("have a tangential pattern",), free=("k1", "k2"),
+        lens={"k1": -0.2, "k2": 0.1}, size=2
+    ),
+    "board bent": Misfit(lambda e: Effects(bend=0.5 * e), ("is not flat",), size=2, fields=False),
+    "pitch ten times too large": Misfit(
+        lambda e: Effects(pitch=10.0), ("principal distance of camera cam is not the 10 mm",), sized=False, c_given=True
+    ),
+    "mm for m, stations in m": Misfit(
+        lambda e: Effects(object_unit=1000.0), ("points are 1000 times too large",), sized=False, stations_given=True
+    ),
+    "one image mirrored": Misfit(lambda e: Effects(mirrored=True), ("is mirrored",), sized=False),
+    "one image mirrored, frame_mm": Misfit(
+        lambda e: Effects(mirrored=True), ("is mirrored",), sized=False, frame_given=True
+    ),
+    "y downward, frame_mm": Misfit(
+        lambda e: Effects(y_down=True), ("points down",), sized=False, frame_given=True
+    ),
+    NOISE: Misfit(lambda e: Effects(noise=1.0 + 0.5 * e), ("too small everywhere",)),
+}  # fmt: skip
+
+
+def draw_network(name: str, seed: int, many: float = MANY) -> Network:
+    """A network of a kind, its effect so many times what its test detects, with either sign."""
+    kind = MISFITS[name]
+    flat = kind.boards and (seed % 2 == 0 or not kind.fields)
+    made = scene(seed, flat)
+    rng = np.random.default_rng([37, seed])
+    sign = 1.0 if rng.random() < 0.5 else -1.0
+    return misfit_network(
+        made, kind.effect((sign if name != NOISE else 1.0) * _size(name, kind, made, many)), kind, rng
+    )
+
+
+def _size(name: str, kind: Misfit, made: Scene, many: float) -> float:
+    if name == NOTHING or not kind.sized:
+        return 1.0
+    wanted = float((many * Probabilities().noncentrality(kind.size)) ** 2)
+    if name == NOISE:
+        count = 2 * len(misfit_network(made, Effects(), kind, None).observations)
+        return 2.0 * float(np.sqrt(1.0 + many * 4.13 * np.sqrt(2.0 / count)) - 1.0)  # of the test of v'Pv
+    size = 1.0
+    for _ in range(2):
+        result = adjust(misfit_network(made, kind.effect(size), kind, None))
+        size *= float(np.sqrt(wanted / result.vpv))
+    return size
+
+
+def misfit_sentences(given: Network) -> tuple[list[str], float]:
+    """What a user is told to look at, and sigma0; nan where nothing is adjusted."""
+    try:
+        result = adjust(given)
+    except AdjustmentError as error:
+        return [str(error)], np.nan
+    causes = [each.cause for each in result.explanations]
+    suspects = [f"{each.tested.name} is suspect" for each in result.suspects]
+    return [*causes, *result.warnings, *suspects], result.sigma0
+
+
+def misfit_outcome(name: str, sentences: list[str]) -> str:
+    """named: what is wrong, and nothing else; misleading: anything else; unnamed: nothing."""
+    words = MISFITS[name].words
+    wrong = [each for each in sentences if not any(word in each for word in words)]
+    if wrong:
+        return "misleading"
+    return "named" if sentences or not words else "unnamed"

@@ -1,0 +1,435 @@
+"""The adjustment against an independent, dense implementation with complex-step derivatives."""
+
+import random
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from dense_adjustment import solve_densely
+from networks import Truth, field_points, join_observations, simulated
+from numpy.typing import NDArray
+from reference_cases import CAMERA, Case, case_approximations, case_network, load, own_name
+from studies import parametrize_with_studies
+
+from adjust import Adjustment, Camera, Distortion, Prior
+from adjust.functional_model.rotation import rotation_from_angles
+from adjust.problem.network import Approximations, Exterior, Image, LineOfSight, Network, ObjectPoint, Transformation
+from adjust.problem.reduction import Reduction
+from adjust.solution.adjustment import Datum, Options, adjust
+
+CASES = (
+    "i_five_images_affine_reduced",
+    "i_five_images_affine_paper_noisefree",
+    "i_five_images_similarity_reduced",
+    "ii_juhl_3photos",
+    "iii_selfcal_mixed",
+    "iii_selfcal_all_unknown_datum_A",
+    "iv_planar_board",
+)
+
+
+def adjust_network(case: Case, network: Network | None = None) -> Adjustment:
+    network = network or case_network(case)
+    return adjust(network, case_approximations(case, case["input"]["initial_approximations"]), Options())
+
+
+def differences(case: Case, result: Adjustment) -> np.ndarray:
+    """Estimates less the reference's, in the reference's a-priori standard deviations."""
+    parameters = case["result"]["parameters"]
+    return np.array(
+        [(result.value(own_name(name)) - row["value"]) / row["std_apriori"] for name, row in parameters.items()]
+    )
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_reference_case(name: str) -> None:
+    case = load(name)
+    reference = case["result"]
+    result = adjust_network(case)
+
+    assert result.converged
+    counts = (result.conditions, result.unknowns, result.redundancy)
+    assert counts == (reference["conditions"], reference["unknowns"], reference["redundancy"])
+    assert np.abs(differences(case, result)).max() < 1e-8
+    sigmas = np.array(
+        [np.sqrt(result.cofactor.variances[i]) for i in map(result.index, map(own_name, reference["parameters"]))]
+    )
+    expected = np.array([row["std_apriori"] for row in reference["parameters"].values()])
+    np.testing.assert_allclose(sigmas, expected, rtol=1e-9)
+    if reference["vpv"] > 1e-12:
+        posterior = [row["std_aposteriori"] for row in reference["parameters"].values()]
+        np.testing.assert_allclose([result.sigma(own_name(n)) for n in reference["parameters"]], posterior, rtol=1e-9)
+    assert result.vpv == pytest.approx(reference["vpv"], rel=1e-8, abs=1e-15)
+    v = np.array(reference["residuals_obs"] + reference["residuals_fobs"])
+    np.testing.assert_allclose(result.residuals.v_mm, v, rtol=0, atol=1e-11)
+    redundancy = reference["redundancy_numbers"][: v.size]
+    np.testing.assert_allclose(result.residuals.redundancy.ravel(), redundancy, rtol=0, atol=1e-9)
+    assert sum(group.redundancy for group in result.groups.values()) == pytest.approx(result.redundancy)
+
+
+def test_juhls_table_of_standard_deviations() -> None:
+    """The paper's own figures, to the digits that it prints; its simulated points are others than the case's."""
+    case = load("ii_juhl_3photos")
+    result = adjust_network(case)
+    for name, printed_um in case["paper_table_rmse_um"].items():
+        assert result.sigma(f"IO.{CAMERA}.{name}") == pytest.approx(printed_um, rel=0.2)
+
+
+@pytest.mark.parametrize("name", ["i_five_images_affine_reduced", "iii_selfcal_mixed"])
+def test_the_order_of_inputs_does_not_matter(name: str) -> None:
+    case = load(name)
+    network = case_network(case)
+    order = list(range(len(network.observations)))
+    random.Random(7).shuffle(order)
+    shuffled = Network(
+        network.cameras,
+        network.images[::-1],
+        tuple(sorted(network.points, key=lambda point: point.id[::-1])),
+        network.observations.only(np.array(order)),
+    )
+    plain, other = adjust_network(case), adjust_network(case, shuffled)
+    for i, unknown in enumerate(plain.names):
+        sigma = max(np.sqrt(plain.cofactor.variances[i]), 1e-30)
+        assert abs(plain.values[i] - other.value(unknown)) <= 1e-9 * sigma
+    np.testing.assert_allclose(other.residuals.w, plain.residuals.w[order], atol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_poor_approximations_lead_to_the_same_result(seed: int) -> None:
+    """Stations wrong by a tenth of the flying height, attitudes by 10 degrees, film by millimetres."""
+    case = load("i_five_images_affine_reduced")
+    rng = np.random.default_rng(seed)
+    start = {}
+    for name, value in case["input"]["initial_approximations"].items():
+        owner, quantity = name.split(".")
+        if owner.startswith("EO"):
+            size = 150.0 if quantity in ("X0", "Y0", "Z0") else 0.17
+        elif owner.startswith("T"):
+            size = 3.0 if quantity in ("a1", "b1") else 0.02
+        else:
+            size = 0.0
+        start[name] = value + rng.uniform(-size, size)
+    result = adjust(case_network(case), case_approximations(case, start))
+    assert result.converged
+    assert np.abs(differences(case, result)).max() < 1e-7
+    assert result.iterations < 20
+
+
+def test_elements_are_the_combined_model_when_axes_are_parallel_and_distortion_small() -> None:
+    """Torlegård's special case, A near I, as good as true of this case's 0.1 mm of distortion and 5 um of noise."""
+    case = load("i_five_images_affine_reduced")
+    start = case_approximations(case, case["input"]["initial_approximations"])
+    result = adjust(case_network(case), start, Options(method="elements"))
+    assert result.converged
+    assert np.abs(differences(case, result)).max() < 0.05
+    assert result.vpv == pytest.approx(case["result"]["vpv"], rel=0.01)
+
+
+def test_history_ends_at_the_result() -> None:
+    case = load("i_five_images_affine_reduced")
+    result = adjust_network(case)
+    assert len(result.history) == result.iterations
+    assert result.history[-1][0] == pytest.approx(result.vpv)
+    assert result.history[-1][1] < 1e-6
+
+
+def test_an_iteration_limit_is_reported() -> None:
+    case = load("i_five_images_affine_reduced")
+    start = case_approximations(case, case["input"]["initial_approximations"])
+    result = adjust(case_network(case), start, Options(iteration_limit=2))
+    assert result.termination == "iteration limit"
+    assert not result.converged
+    assert "not final" in " ".join(result.warnings)
+
+
+def set_distortion(network: Network, distortion: Distortion) -> Network:
+    return replace(network, cameras=(replace(network.cameras[0], distortion=distortion),))
+
+
+def test_brown_is_torlegards_without_r0() -> None:
+    """The planar board with the same polynomial under Brown's names: the reference's result again."""
+    case = load("iv_planar_board")
+    names = {"k1": "k3", "k2": "k5", "k3": "k7", "p1": "p1", "p2": "p2"}
+    network = case_network(case)
+    given = network.cameras[0].distortion.parameters
+    result = adjust_network(
+        case, set_distortion(network, Distortion("brown", {brown: given[name] for brown, name in names.items()}))
+    )
+    assert result.vpv == pytest.approx(case["result"]["vpv"], rel=1e-9)
+    for brown, name in names.items():
+        reference = case["result"]["parameters"][f"IO.{name}"]
+        position = result.index(f"IO.{CAMERA}.{brown}")
+        assert result.values[position] == pytest.approx(reference["value"], abs=1e-7 * reference["std_apriori"])
+        assert np.sqrt(result.cofactor.variances[position]) == pytest.approx(reference["std_apriori"], rel=1e-7)
+
+
+def test_opencvs_own_calibration_of_the_planar_board() -> None:
+    """The `opencv` family on OpenCV's observations: its parameters, its standard deviations, its rms per point."""
+    case = load("iv_planar_board")
+    opencv, pixel_mm = case["opencv"], case["pixels"]["pixel_mm"]
+    names = ("k1", "k2", "p1", "p2", "k3")
+    free = {name: Prior(0.0, np.inf) for name in names}
+    result = adjust_network(case, set_distortion(case_network(case), Distortion("opencv", free)))
+    assert result.converged
+
+    half_width, half_height = (case["pixels"]["width"] - 1) / 2, (case["pixels"]["height"] - 1) / 2
+    expected = {
+        "c": (opencv["fx"] * pixel_mm, opencv["std"]["f"] * pixel_mm),
+        "x0": ((opencv["cx"] - half_width) * pixel_mm, opencv["std"]["cx"] * pixel_mm),
+        "y0": (-(opencv["cy"] - half_height) * pixel_mm, opencv["std"]["cy"] * pixel_mm),
+    }
+    expected |= dict(zip(names, zip(opencv["k1k2p1p2k3"], opencv["std"]["k1k2p1p2k3"], strict=True), strict=True))
+    for name, (value, sigma) in expected.items():
+        assert result.value(f"IO.{CAMERA}.{name}") == pytest.approx(value, abs=1e-3 * sigma)
+        assert result.sigma(f"IO.{CAMERA}.{name}") == pytest.approx(sigma, rel=1e-3)
+    rms_px = np.sqrt((result.residuals.v_mm**2).sum(axis=1).mean()) / pixel_mm
+    assert rms_px == pytest.approx(opencv["rms_px"], rel=1e-6)
+
+
+Variant = tuple[Network, Approximations]
+
+STEEP = ((0.02, -1.55, 0.1), (-0.03, 1.53, 3.1), (-1.6, 0.05, 3.139), (0.02, -0.03, -3.141))
+
+
+def all_free_of_torlegard() -> Variant:
+    """Every parameter of the family, the decentering terms as printed, r0, and three kinds of scans."""
+    truth = Truth(decentering="paper", mirrored=(True, False, True, False))
+    free = {"k3": np.inf, "k5": 1e-11, "k7": 1e-15, "p1": np.inf, "p2": 1e-5, "p3": 1e-5, "p4": 1e-9}
+    truth = replace(truth, distortion={**truth.distortion, "k7": 1e-17, "p3": 1e-6, "p4": -1e-10})
+    return simulated(np.random.default_rng(1), truth, "affine", point_sigma=0.02, free=free)
+
+
+def mirrored_similarity() -> Variant:
+    truth = Truth(mirrored=(True, True, False, True))
+    return simulated(np.random.default_rng(2), truth, "similarity", free={"k3": np.inf})
+
+
+def mirrored_congruent() -> Variant:
+    truth = Truth(mirrored=(False, True, True, False))
+    return simulated(np.random.default_rng(3), truth, "congruent", free={"p1": np.inf, "p2": np.inf})
+
+
+def steep_angles() -> Variant:
+    """A level camera that looks along +-X (phi near +-90), one upside down (omega beyond 90), kappa past 180."""
+    stations = ((-1500.0, 20.0, 30.0), (1500.0, -30.0, 10.0), (40.0, 1500.0, 60.0), (10.0, -20.0, 1500.0))
+    truth = Truth(stations=stations, attitudes=STEEP)
+    return simulated(
+        np.random.default_rng(4), truth, "affine", points=field_points(np.random.default_rng(4), 12, 700.0)
+    )
+
+
+def observed_orientations() -> Variant:
+    """Every element observed, one image's angles fixed, one with a free element; unknown points."""
+    network, start = simulated(np.random.default_rng(5), point_sigma=np.inf, free={"k3": np.inf})
+    rng = np.random.default_rng(50)
+    images = []
+    for i, image in enumerate(network.images):
+        values = start.exterior[image.name].copy()
+        sigmas = np.array([2.0, 2.0, 2.0, 0.01, 0.01, 0.01])
+        if i == 1:
+            sigmas[3:] = 0.0
+            values[3:] = Truth().attitudes[1]
+        if i == 2:
+            sigmas[[2, 5]] = np.inf
+        values[:3] = Truth().stations[i] + rng.normal(0, 2.0, 3)
+        values[5] += 2 * np.pi * (i == 3)  # a whole turn more is the same angle
+        images.append(replace(image, exterior=Exterior(values, sigmas)))
+    return replace(network, images=tuple(images)), start
+
+
+def heights_and_mixtures() -> Variant:
+    """Points known, known in height, known in plan, roughly known, unknown."""
+    network, start = simulated(np.random.default_rng(6), free={"k3": np.inf})
+    rng = np.random.default_rng(60)
+    kinds = [(0, 0, 0), (None, None, 0.01), (0.01, 0.01, None), (0.05, 0.02, 0.1), (None,) * 3]
+    points = []
+    for i, point in enumerate(network.points):
+        sigmas = kinds[i % 5] if i > 2 else (0, 0, 0)
+        given = [
+            None if sigma is None else Prior(value + rng.normal(0, sigma or 1e-12), float(sigma))
+            for sigma, value in zip(sigmas, start.points[point.id], strict=True)
+        ]
+        points.append(ObjectPoint(point.id, *given))
+    return replace(network, points=tuple(points)), start
+
+
+def two_cameras() -> Variant:
+    """A film camera and a digital one with Brown's lens, that share the points; correlated observations."""
+    film, start = simulated(np.random.default_rng(7), free={"k3": np.inf, "p1": np.inf})
+    truth = Truth(
+        c=80.0,
+        x0=0.1,
+        y0=0.2,
+        distortion={"k3": 3e-7},
+        stations=Truth().stations[::-1],
+        attitudes=Truth().attitudes[::-1],
+    )
+    xyz = np.array([start.points[point.id] for point in film.points])
+    other, begin = simulated(np.random.default_rng(70), truth, "none", points=xyz)
+    lens = Distortion("brown", {"k1": Prior(3e-7, np.inf), "b1": Prior(0.0, 1e-3), "b2": Prior(0.0, np.inf)})
+    camera = Camera("D", Prior(80.5, np.inf), Prior(0.0, 1.0), Prior(0.0, 1.0), lens)
+    names = {image.name: f"d{image.name}" for image in other.images}
+    rows, turned = other.observations, np.array([[1.0, 0.6], [0.6, 1.5]]) * 0.004**2
+    renamed = tuple(names[name] for name in rows.image)
+    rows = replace(rows, image=renamed, covariance_mm2=np.tile(turned, (len(rows), 1, 1)))
+    observations = join_observations(film.observations, rows)
+    images = (*film.images, *(Image(name, "D", "none") for name in names.values()))
+    both = Network((*film.cameras, camera), images, film.points, observations)
+    return both, Approximations(
+        interior={**start.interior, "D": np.array([80.5, 0.0, 0.0])},
+        exterior={**start.exterior, **{names[name]: values for name, values in begin.exterior.items()}},
+        transformation={**start.transformation, **{name: np.empty(0) for name in names.values()}},
+        points=start.points,
+    )
+
+
+def fiducials_fixed_free_and_given() -> Variant:
+    """Two marks fixed, one free, the others with priors of their own; a mark that one image shows alone."""
+    network, start = simulated(np.random.default_rng(8), free={"k3": np.inf}, fiducial_sigma=0.002)
+    (camera,) = network.cameras
+    marks = dict(camera.fiducials)
+    for id_, sigma in {"1": 0.0, "2": 0.0, "3": np.inf, "5": 0.01}.items():
+        marks[id_] = replace(
+            marks[id_], x_mm=Prior(marks[id_].x_mm.value, sigma), y_mm=Prior(marks[id_].y_mm.value, 2 * sigma)
+        )
+    return replace(network, cameras=(replace(camera, fiducials=marks),)), start
+
+
+def bent_films(kind: Transformation) -> Variant:
+    """Scans far from the comparator's origin, one mirrored."""
+    truth = Truth(middle_mm=(120.0, -115.0), mirrored=(False, True, False, False))
+    points = field_points(np.random.default_rng(7), 12)
+    return simulated(np.random.default_rng(6), truth, kind, points, free={"k3": np.inf})
+
+
+VARIANTS = (
+    all_free_of_torlegard,
+    mirrored_similarity,
+    mirrored_congruent,
+    steep_angles,
+    observed_orientations,
+    heights_and_mixtures,
+    two_cameras,
+    fiducials_fixed_free_and_given,
+    *(partial(bent_films, kind) for kind in ("projective", "conformal(2)")),
+    *(
+        pytest.param(partial(bent_films, kind), marks=pytest.mark.study)
+        for kind in ("bilinear", "conformal(3)", "polynomial(2)", "polynomial(3)")
+    ),
+)
+
+
+@parametrize_with_studies("case", VARIANTS, quick=(2, 3, 5, 7))
+def test_variant(case: Callable[[], Variant]) -> None:
+    network, start = case()
+    result = adjust(network, start)
+    assert result.converged
+    dense = solve_densely(network, dict(zip(result.names, result.values.tolist(), strict=True)), result.mirrored)
+    assert result.redundancy == dense.redundancy
+    assert result.vpv == pytest.approx(dense.vpv, rel=1e-8)
+    cofactor = result.cofactor_of(list(dense.sigmas)).diagonal()
+    for (name, sigma), variance in zip(dense.sigmas.items(), cofactor, strict=True):
+        assert abs(result.value(name) - dense.values[name]) < 1e-6 * sigma, name
+        assert np.sqrt(variance) == pytest.approx(sigma, rel=1e-6), name
+
+
+def test_steep_angles_are_the_true_ones() -> None:
+    """Whatever the triple, it is the true rotation to the noise."""
+    network, start = steep_angles()
+    result = adjust(network, start)
+    for i, image in enumerate(network.images):
+        found = rotation_from_angles(
+            np.array([result.value(f"EO.{image.name}.{each}") for each in ("omega", "phi", "kappa")])
+        )
+        assert np.abs(found - rotation_from_angles(np.array(STEEP[i]))).max() < 2e-3
+
+
+Array = NDArray[np.float64]
+
+FAR = np.array([500_000.0, 5_400_000.0, 300.0])
+GRID = 2.0**-20  # coordinates that are a multiple of it lose no digit beside FAR
+
+
+def small_network(sigma: float = 0.0) -> tuple[Network, Approximations]:
+    """A field of 1.6 m at 1.5 m, whose stations are known to some hundredths of a millimetre."""
+    stations = tuple((0.001 * x, 0.001 * y, 0.001 * z) for x, y, z in Truth().stations)
+    points = GRID * np.round(field_points(np.random.default_rng(2), 20) * 0.001 / GRID)
+    free = {"k3": np.inf, "k5": np.inf}
+    return simulated(np.random.default_rng(3), Truth(stations=stations), points=points, point_sigma=sigma, free=free)
+
+
+def round_network(network: Network) -> Network:
+    return replace(network, points=tuple(shifted_point(point, np.zeros(3)) for point in network.points))
+
+
+def shifted_point(point: ObjectPoint, shift: Array) -> ObjectPoint:
+    priors = zip((point.X, point.Y, point.Z), shift, strict=True)
+    return ObjectPoint(
+        point.id,
+        *(each and Prior(GRID * round(each.value / GRID) + float(off), each.sigma) for each, off in priors),
+    )
+
+
+def shifted(network: Network, shift: Array) -> Network:
+    return replace(network, points=tuple(shifted_point(point, shift) for point in network.points))
+
+
+def sigmas_apart(here: Adjustment, there: Adjustment) -> float:
+    """The largest difference of what does not move with the object, in standard deviations."""
+    sigma = np.sqrt(here.cofactor.variances)
+    still = [i for i, name in enumerate(here.names) if name.rsplit(".", 1)[1] not in ("X", "Y", "Z", "X0", "Y0", "Z0")]
+    free = [i for i in still if sigma[i] > 0.0]
+    assert np.sqrt(there.cofactor.variances[free]) == pytest.approx(sigma[free], rel=1e-6)
+    return float(np.abs((there.values - here.values)[free] / sigma[free]).max())
+
+
+@parametrize_with_studies(("sigma", "datum"), [(0.0, "control"), (0.0005, "control"), (np.inf, "free")])
+def test_a_network_with_seven_digits_comes_to_the_same_result(sigma: float, datum: Datum) -> None:
+    network = round_network(small_network(sigma)[0])
+    here = adjust(network, options=Options(datum=datum))
+    there = adjust(shifted(network, FAR), options=Options(datum=datum))
+    assert here.converged
+    assert (there.termination, there.iterations) == ("converged", here.iterations)
+    assert sigmas_apart(here, there) < 1e-6
+    for name in ("PT.3.X", "EO.f1.X0", "EO.f2.Y0"):
+        axis = "XYZ".index(name.rsplit(".", 1)[1][0])
+        assert there.value(name) - FAR[axis] == pytest.approx(here.value(name), abs=2e-9)
+
+
+def test_given_approximations_are_reduced_too() -> None:
+    network, start = small_network()
+    network, start = round_network(network), raised(start)
+    here = adjust(network, start)
+    there = adjust(shifted(network, FAR), Reduction(-FAR).approximations(start))
+    assert here.converged
+    assert (there.termination, there.iterations) == ("converged", here.iterations)
+
+
+def raised(start: Approximations) -> Approximations:
+    """With stations some centimetres off."""
+    exterior = {name: values + np.array([0.02, 0.0, 1.5, 0.0, 0.0, 0.0]) for name, values in start.exterior.items()}
+    return replace(start, exterior=exterior)
+
+
+def test_fixed_coordinates_come_back_as_they_were_given() -> None:
+    network = shifted(small_network()[0], FAR + np.array([0.1, 0.2, 0.3]))
+    there = adjust(network)
+    given = [prior.value for point in network.points for prior in (point.X, point.Y, point.Z) if prior]
+    assert [there.value(f"PT.{point.id}.{axis}") for point in network.points for axis in "XYZ"] == given
+    assert there.network is network
+
+
+def test_a_field_about_the_origin_is_left_as_it_is() -> None:
+    network = small_network()[0]
+    assert Reduction.to_centroid(network).is_none
+    assert Reduction.to_centroid(network).network(network) is network
+
+
+def test_heights_stay_where_the_line_of_sight_depends_on_them() -> None:
+    network = shifted(small_network()[0], np.array([5e5, 5.4e6, 2500.0]))
+    assert Reduction.to_centroid(network).origin[2] != 0.0
+    bent = replace(network, line_of_sight=LineOfSight(curvature=True))
+    assert Reduction.to_centroid(bent).origin[2] == 0.0
+    assert (Reduction.to_centroid(bent).origin[:2] != 0.0).all()

@@ -1,0 +1,383 @@
+"""Distances between fiducial marks, and frames scanned in two overlapping halves."""
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from networks import (
+    FILM_CAMERA,
+    FRAME_NOISE_MM,
+    JOIN_SIGMA,
+    NOMINAL_MM,
+    DrawnFrames,
+    Halves,
+    draw_frames,
+    drop_images,
+    halves,
+)
+from numpy.typing import NDArray
+from scipy.optimize import approx_fprime
+from studies import parametrize_with_studies
+
+from adjust import Adjustment, AdjustmentError, Network, Options, Parameter, Prior, adjust
+from adjust.problem.camera import Fiducial, FiducialDistance
+from adjust.solution.planning import plan
+
+Array = NDArray[np.float64]
+SIGMA_MM = 0.004
+
+
+def observe_distances(
+    drawn: DrawnFrames, rng: np.random.Generator, noise: float = 1.0, sigma_mm: float = np.inf
+) -> DrawnFrames:
+    """Frames whose marks are given with a standard deviation, and all distances between them."""
+    camera = drawn.network.cameras[0]
+    pairs = combinations(range(len(drawn.places_mm)), 2)
+    distances = tuple(
+        FiducialDistance(
+            str(i + 1),
+            str(j + 1),
+            float(np.linalg.norm(drawn.places_mm[j] - drawn.places_mm[i]) + noise * SIGMA_MM * rng.standard_normal()),
+            SIGMA_MM,
+        )
+        for i, j in pairs
+    )
+    marks = {
+        id_: Fiducial(Prior(mark.x_mm.value, sigma_mm), Prior(mark.y_mm.value, sigma_mm))
+        for id_, mark in camera.fiducials.items()
+    }
+    cameras = (replace(camera, fiducials=marks, distances=distances),)
+    return replace(drawn, network=replace(drawn.network, cameras=cameras))
+
+
+def hold_marks(marks: int) -> list[int]:
+    """Which of all coordinates the distances leave open, as a frame of four corners or eight marks has them: both of
+    the first of the two marks farthest apart, and the one across of the other."""
+    first, last = max(
+        combinations(range(marks), 2), key=lambda pair: np.linalg.norm(np.diff(NOMINAL_MM[list(pair)], axis=0))
+    )
+    along = np.abs(NOMINAL_MM[last] - NOMINAL_MM[first])
+    return [2 * first, 2 * first + 1, 2 * last + (1 if along[0] >= along[1] else 0)]
+
+
+def written_out(drawn: DrawnFrames, similar: bool) -> tuple[Array, Array, float]:
+    """Places (m, 2), their standard deviations and v'Pv: each comparator coordinate is a similarity or an affinity of
+    the place, each distance that of two places."""
+    network, marks = drawn.network, len(drawn.places_mm)
+    observed = network.observations.xy_mm.reshape(-1, marks, 2)
+    distances = network.cameras[0].distances
+    pairs = np.array([(int(each.start) - 1, int(each.end) - 1) for each in distances])
+    free = np.setdiff1d(np.arange(2 * marks), hold_marks(marks))
+    of_film = 4 if similar else 6
+
+    def split_places(x: Array) -> Array:
+        places = NOMINAL_MM[:marks].ravel().copy()
+        places[free] = x[: len(free)]
+        return places.reshape(-1, 2)
+
+    def weighted(x: Array) -> Array:
+        places, rows = split_places(x), []
+        for own, p in zip(observed, x[len(free) :].reshape(len(observed), of_film), strict=True):
+            matrix = np.array([[p[2], -p[3]], [p[3], p[2]]]) if similar else p[2:].reshape(2, 2)
+            rows.append(((places @ matrix.T + p[:2]) - own).ravel() / FRAME_NOISE_MM)
+        lengths = np.linalg.norm(places[pairs[:, 1]] - places[pairs[:, 0]], axis=1)
+        rows.append((lengths - [each.value_mm for each in distances]) / SIGMA_MM)
+        return np.concatenate(rows)
+
+    film = [0.0, 0.0, 1.0, 0.0] if similar else [0.0, 0.0, 1.0, 0.0, 0.0, 1.0]
+    x = np.concatenate([NOMINAL_MM[:marks].ravel()[free], *[film] * len(observed)])
+    for _ in range(6):
+        jacobian = approx_fprime(x, weighted, 1e-6)
+        x = x - np.linalg.lstsq(jacobian, weighted(x))[0]
+    covariance = np.linalg.inv(jacobian.T @ jacobian)
+    sigmas = np.zeros(2 * marks)
+    sigmas[free] = np.sqrt(np.diag(covariance))[: len(free)]
+    return split_places(x), sigmas.reshape(-1, 2), float(weighted(x) @ weighted(x))
+
+
+def places(result: Adjustment, marks: int) -> tuple[Array, Array]:
+    names = [[f"FID.{FILM_CAMERA}.{i + 1}.{axis}" for axis in "xy"] for i in range(marks)]
+    values = np.array([[result.value(name) for name in pair] for pair in names])
+    sigmas = np.array([[result.sigma(name) for name in pair] for pair in names])
+    return values, sigmas
+
+
+@pytest.mark.parametrize(("marks", "kind"), [(4, "affine"), (8, "affine"), (4, "similarity"), (8, "similarity")])
+def test_places_by_distances_are_those_of_the_adjustment_written_out(marks: int, kind: str) -> None:
+    rng = np.random.default_rng(marks)
+    drawn = observe_distances(draw_frames(kind, 3, marks, 1.0, 0.05, rng), rng)
+    result = adjust(drawn.network, drawn.start)
+    assert result.converged
+    expected, sigmas, vpv = written_out(drawn, kind == "similarity")
+    values, claimed = places(result, marks)
+    np.testing.assert_allclose(values, expected, atol=2e-7)
+    np.testing.assert_allclose(claimed, result.sigma0 * sigmas, rtol=1e-4, atol=1e-9)
+    unknowns = 2 * marks - 3 + 3 * (4 if kind == "similarity" else 6)
+    redundancy = 3 * 2 * marks + marks * (marks - 1) // 2 - unknowns
+    assert sum(group.redundancy for group in result.groups.values()) == pytest.approx(redundancy, abs=1e-6)
+    assert result.sigma0**2 * redundancy == pytest.approx(vpv, rel=1e-5)
+    assert result.groups["fiducial distance"].redundancy == pytest.approx(
+        sum(row.redundancy for row in result.further if row.group == "fiducial distance")
+    )
+
+
+def shift_datum(true: Array) -> Array:
+    """True places (m, 2) moved to where the held coordinates have them."""
+    first, last = hold_marks(len(true))[0] // 2, hold_marks(len(true))[2] // 2
+    axis = hold_marks(len(true))[2] % 2
+    off = true - true[first]
+    radius, wanted = np.linalg.norm(off[last]), (NOMINAL_MM[last] - NOMINAL_MM[first])[axis]
+    direction = np.arcsin(wanted / radius) if axis else np.arccos(wanted / radius)
+    now = np.arctan2(off[last, 1], off[last, 0])
+    near = min((direction, np.pi - direction, -direction), key=lambda a: abs(np.angle(np.exp(1j * (a - now)))))
+    c, s = np.cos(near - now), np.sin(near - now)
+    return np.asarray(NOMINAL_MM[first] + off @ np.array([[c, s], [-s, c]]))
+
+
+@parametrize_with_studies("count", (16, 1000))
+def test_claimed_standard_deviations_hold(count: int) -> None:
+    rng = np.random.default_rng(5)
+    normalised, sigma0 = [], []
+    for _ in range(count):
+        drawn = observe_distances(draw_frames("affine", 2, 4, 1.0, 0.05, rng), rng)
+        result = adjust(drawn.network, drawn.start)
+        values, claimed = places(result, 4)
+        free = claimed > 0.0
+        errors = (values - shift_datum(drawn.places_mm))[free]
+        normalised += list(errors / claimed[free] * result.sigma0)
+        sigma0.append(result.sigma0**2)
+    chance = 3.0 / np.sqrt(2.0 * count)  # the coordinates of one network are correlated
+    assert np.sqrt(np.mean(np.square(normalised))) == pytest.approx(1.0, abs=chance)
+    assert np.mean(sigma0) == pytest.approx(1.0, abs=chance)
+
+
+def test_given_coordinates_and_distances_weigh_together() -> None:
+    """Coordinates to 1 mm place the marks, distances to 4 um give their form."""
+    rng = np.random.default_rng(6)
+    drawn = observe_distances(draw_frames("affine", 3, 4, 1.0, 0.3, rng), rng, sigma_mm=1.0)
+    result = adjust(drawn.network, drawn.start)
+    values, _ = places(result, 4)
+    for i, j in combinations(range(4), 2):
+        true_mm = np.linalg.norm(drawn.places_mm[j] - drawn.places_mm[i])
+        assert np.linalg.norm(values[j] - values[i]) == pytest.approx(true_mm, abs=4.0 * SIGMA_MM)
+    moved = values - NOMINAL_MM[:4]
+    assert np.linalg.norm(moved.mean(axis=0)) < 1e-3  # of the datum nothing but the given coordinates speaks
+
+
+def test_a_plan_expects_the_form_of_the_distances_and_the_datum_of_the_coordinates() -> None:
+    rng = np.random.default_rng(10)
+    drawn = observe_distances(draw_frames("affine", 3, 4, 1.0, 0.0, rng, 0.0), rng, 0.0, sigma_mm=1.0)
+    planned, result = plan(drawn.network, drawn.start), adjust(drawn.network, drawn.start)
+    parameters = [Parameter.fiducial(FILM_CAMERA, str(i + 1), axis) for i in range(4) for axis in "xy"]
+    form = np.array([[1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0]])  # x of the first less that of the second
+    assert planned.sigmas(parameters, form)[0] == pytest.approx(SIGMA_MM * np.sqrt(3.0 / 4.0), rel=0.35)
+    datum = np.sqrt(3.0 / 8.0)  # mm: two shifts and a turn of eight coordinates known to 1 mm
+    np.testing.assert_allclose([planned.sigma(each) for each in parameters], datum, rtol=1e-3)
+    redundancy = {row.name: row.redundancy for row in planned.adjustment.further}
+    np.testing.assert_allclose(list(redundancy.values()), [row.redundancy for row in result.further], atol=1e-4)
+
+
+def test_a_wrong_distance_is_reported() -> None:
+    rng = np.random.default_rng(7)
+    drawn = observe_distances(draw_frames("affine", 3, 8, 1.0, 0.05, rng), rng)
+    camera = drawn.network.cameras[0]
+    wrong = replace(camera.distances[5], value_mm=camera.distances[5].value_mm + 0.05)
+    distances = (*camera.distances[:5], wrong, *camera.distances[6:])
+    result = adjust(replace(drawn.network, cameras=(replace(camera, distances=distances),)), drawn.start)
+    rows = [row for row in result.further if row.group == "fiducial distance"]
+    worst = max(rows, key=lambda row: abs(row.w))
+    assert worst.name == f"{wrong.name} of camera {FILM_CAMERA}"
+    assert worst.v == pytest.approx(-0.05 * worst.redundancy, abs=3.0 * SIGMA_MM)
+    assert worst.detectable < 0.05
+
+
+def test_a_distance_to_a_mark_that_no_image_shows_says_nothing() -> None:
+    rng = np.random.default_rng(8)
+    drawn = observe_distances(draw_frames("affine", 2, 4, 1.0, 0.05, rng), rng)
+    camera = drawn.network.cameras[0]
+    unseen = replace(camera, fiducials={**camera.fiducials, "5": Fiducial(Prior(0.0, np.inf), Prior(112.0, np.inf))})
+    farther = replace(unseen, distances=(*camera.distances, FiducialDistance("1", "5", 100.0, SIGMA_MM)))
+    alone, result = (adjust(replace(drawn.network, cameras=(one,)), drawn.start) for one in (camera, farther))
+    np.testing.assert_allclose(places(result, 4)[0], places(alone, 4)[0], atol=1e-9)
+    assert len(result.further) == len(alone.further)
+
+
+@pytest.mark.parametrize(
+    ("distance", "words"),
+    [
+        (FiducialDistance("1", "9", 150.0, 0.01), "has no fiducial 9"),
+        (FiducialDistance("1", "1", 150.0, 0.01), "same point at both ends"),
+        (FiducialDistance("1", "2", -150.0, 0.01), "must be a positive number"),
+        (FiducialDistance("1", "2", 150.0, 0.0), "needs a positive standard deviation"),
+    ],
+)
+def test_what_is_no_distance_is_refused(distance: FiducialDistance, words: str) -> None:
+    drawn = draw_frames("affine", 1, 4, 1.0, 0.05, np.random.default_rng(9))
+    camera = replace(drawn.network.cameras[0], distances=(distance,))
+    with pytest.raises(AdjustmentError, match=words):
+        adjust(replace(drawn.network, cameras=(camera,)), drawn.start)
+
+
+def errors(halves: Halves, adjustment: Adjustment) -> dict[str, np.ndarray]:
+    """Errors over standard deviations of the joins, the films at their fiducials, and the orientations."""
+    found: dict[str, list[float]] = {"joins": [], "orientations": []}
+    for (frame, point), xy in halves.joins.items():
+        for axis, true in zip("xy", xy, strict=True):
+            name = f"JOIN.{frame}.{point}.{axis}"
+            found["joins"].append((adjustment.value(name) - true) / adjustment.sigma(name))
+    if adjustment.network.observed_points:
+        for i in range(4):
+            true = [*halves.truth.stations[i], *halves.truth.attitudes[i]]
+            for element, value in zip(("X0", "Y0", "Z0", "omega", "phi", "kappa"), true, strict=True):
+                name = f"EO.f{i}.{element}"
+                found["orientations"].append((adjustment.value(name) - value) / adjustment.sigma(name))
+    return {name: np.array(each) for name, each in found.items() if each}
+
+
+@pytest.mark.study
+def test_errors_are_as_large_as_the_standard_deviations_say() -> None:
+    collected: dict[str, list[np.ndarray]] = {}
+    for seed in range(16):
+        simulated = halves(np.random.default_rng(seed), join_count=12, turned=seed % 2 == 1)
+        adjustment = adjust(simulated.network)
+        assert adjustment.converged
+        for name, each in errors(simulated, adjustment).items():
+            collected.setdefault(name, []).append(each)
+    joins, orientations = (np.sqrt(np.mean(np.concatenate(each) ** 2)) for each in collected.values())
+    assert 0.93 < joins < 1.07
+    assert 0.85 < orientations < 1.15  # the elements of one network have the same c and principal point in them
+
+
+def test_half_the_marks_in_each_scan_suffice_where_joins_say_how_they_lie() -> None:
+    """Two corner marks in either half determine no affine film by themselves."""
+    simulated = halves(np.random.default_rng(3), join_count=25)
+    shown = {
+        image.name: sum(
+            name == image.name and kind == "fiducial"
+            for name, kind in zip(
+                simulated.network.observations.image, simulated.network.observations.kind, strict=True
+            )
+        )
+        for image in simulated.network.images
+    }
+    assert set(shown.values()) == {3}  # two corners, and the mark in the middle of a side that both show
+    adjustment = adjust(simulated.network)
+    for image in simulated.network.images:
+        for id_, mark in simulated.network.camera_by_name["K"].fiducials.items():
+            film, true = (
+                np.array([adjustment.value(f"T.{image.name}.{name}") for name in ("a1", "a2", "a3", "b1", "b2", "b3")]),
+                simulated.films[image.name],
+            )
+            xy = np.array([mark.x_mm.value, mark.y_mm.value])
+            place = np.linalg.solve(np.array([true[1:3], true[4:]]), xy - true[[0, 3]])
+            off = np.array([film[1:3], film[4:]]) @ place + film[[0, 3]] - xy
+            assert np.linalg.norm(off) < 0.05, (image.name, id_)
+
+
+def test_frames_without_any_target_are_joined_too() -> None:
+    simulated = halves(np.random.default_rng(4))
+    adjustment = adjust(replace(drop_images(simulated.network, "target"), points=()))
+    assert adjustment.converged
+    assert adjustment.groups["join"].redundancy > 50.0
+    assert 0.8 < np.sqrt(np.mean(errors(simulated, adjustment)["joins"] ** 2)) < 1.2
+
+
+def test_points_as_blocks_give_what_frames_as_blocks_give() -> None:
+    """With many unknown points these are eliminated first, and the frames' unknowns are what they share."""
+    simulated = halves(np.random.default_rng(5), join_count=5, targets=120)
+    points = tuple(
+        point if i < 6 else replace(point, **{axis: replace(getattr(point, axis), sigma=np.inf) for axis in "XYZ"})
+        for i, point in enumerate(simulated.network.points)
+    )
+    network = replace(simulated.network, points=points)
+    adjustment = adjust(network)
+    assert 0.9 < np.sqrt(np.mean(errors(simulated, adjustment)["joins"] ** 2)) < 1.25
+    assert 0.9 < adjustment.sigma0 < 1.1
+    # A weight that hardly binds leaves known points what they are, and frames are the blocks.
+    loose = replace(
+        network,
+        points=tuple(
+            replace(p, **{a: replace(getattr(p, a), sigma=0.0) for a in "XYZ"}) if i < 6 else p
+            for i, p in enumerate(points)
+        ),
+    )
+    assert adjust(loose).value("T.f0.left.a2") == pytest.approx(adjustment.value("T.f0.left.a2"), abs=1e-9)
+
+
+def test_the_order_of_scans_and_marks_changes_nothing() -> None:
+    simulated = halves(np.random.default_rng(6))
+    network = simulated.network
+    order = np.random.default_rng(0).permutation(len(network.observations))
+    shuffled = replace(network, images=network.images[::-1], observations=network.observations.only(order))
+    first, second = adjust(network), adjust(shuffled)
+    for name in ("IO.K.c", "EO.f1.Z0", "JOIN.f2.j3.x", "T.f3.right.a3"):
+        assert second.value(name) == pytest.approx(first.value(name), rel=1e-8, abs=1e-8)
+        assert second.sigma(name) == pytest.approx(first.sigma(name), rel=1e-6)
+
+
+def test_a_gross_error_of_a_join_is_found_and_named() -> None:
+    simulated = halves(np.random.default_rng(7))
+    network = simulated.network
+    xy_mm = network.observations.xy_mm.copy()
+    row = next(
+        row
+        for row, key in enumerate(zip(network.observations.image, network.observations.point, strict=True))
+        if key == ("f1.right", "j4")
+    )
+    xy_mm[row] += 20.0 * JOIN_SIGMA
+    adjustment = adjust(
+        replace(network, observations=replace(network.observations, xy_mm=xy_mm)), options=Options(snooping=True)
+    )
+    (found,) = adjustment.suspects
+    assert found.tested.name in ("join j4 in image f1.right", "join j4 in image f1.left")
+
+
+def test_joins_have_a_variance_component_of_their_own() -> None:
+    simulated = halves(np.random.default_rng(8), join_count=40)
+    observations = simulated.network.observations
+    loose = np.array([16.0 if kind == "join" else 1.0 for kind in observations.kind])[:, None, None]
+    network = replace(
+        simulated.network,
+        observations=replace(observations, covariance_mm2=observations.covariance_mm2 * loose),
+    )
+    factors = adjust(network, options=Options(variance_components=True)).variance_factors
+    assert factors["join"] == pytest.approx(1.0 / 16.0, rel=0.3)
+
+
+def part(network: Network, keep: "np.ndarray[tuple[int], np.dtype[np.bool_]]") -> Network:
+    return replace(network, observations=network.observations.only(np.flatnonzero(keep)))
+
+
+def test_scans_without_anything_in_common_are_refused() -> None:
+    network = drop_images(halves(np.random.default_rng(9)).network, "join")
+    shared = np.array([point == "5" for point in network.observations.point])  # the mark that both halves show
+    targets = np.array([kind == "target" for kind in network.observations.kind])
+    with pytest.raises(AdjustmentError, match=r"frame f0: its scan f0.right has 0 points in common with f0.left"):
+        adjust(part(network, ~shared & ~targets))
+
+
+def test_a_join_of_one_scan_is_refused() -> None:
+    network = halves(np.random.default_rng(10)).network
+    keys = zip(network.observations.image, network.observations.point, strict=True)
+    with pytest.raises(AdjustmentError, match=r"join j3 is observed in one scan of frame f0 only"):
+        adjust(part(network, np.array([key != ("f0.left", "j3") for key in keys])))
+
+
+def test_halves_of_different_cameras_are_refused() -> None:
+    network = halves(np.random.default_rng(11)).network
+    images = (replace(network.images[0], transformation="projective"), *network.images[1:])
+    with pytest.raises(AdjustmentError, match=r"frame f0: its scans f0.left and f0.right differ"):
+        adjust(replace(network, images=images))
+
+
+def test_a_film_that_nothing_determines_is_named_with_its_frame() -> None:
+    """All joins on one line, no mark in the right half: it can stretch across the line."""
+    simulated = halves(np.random.default_rng(13), join_count=8, overlap_mm=1e-12, join_sigma=1e-12)
+    network = drop_images(simulated.network, "target")
+    observations = network.observations
+    rows = zip(observations.image, observations.kind, strict=True)
+    few = part(network, np.array([not (kind == "fiducial" and image == "f0.right") for image, kind in rows]))
+    adjustment = adjust(replace(few, points=()))
+    assert not adjustment.converged
+    assert any("f0" in each.cause and "scans" in each.cause for each in adjustment.singular), adjustment.singular

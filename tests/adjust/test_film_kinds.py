@@ -1,0 +1,328 @@
+"""The film transformations: formulas, derivatives, inverses, fits from marks, and networks of every kind."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from networks import KINDS, Truth, camera_of_film, field_points, film_parameters, simulated
+from numpy.typing import NDArray
+
+from adjust import AdjustmentError, adjust, approximate
+from adjust.functional_model.transformation import (
+    HIGHEST_ORDER,
+    Film,
+    fewest_marks,
+    film_kind,
+    film_parameter_names,
+    marks_needed,
+)
+from adjust.initial_values.fiducial_fit import fit_transformation
+from adjust.problem.network import Image, Network, Transformation
+
+Array = NDArray[np.float64]
+
+STEP = 1e-30
+ONE = np.ones(())
+MIDDLE_MM = np.array([120.0, -110.0])
+PLACES_MM = MIDDLE_MM + np.random.default_rng(1).uniform(-110.0, 110.0, (6, 2))
+mirrors = pytest.mark.parametrize("mirrored", [False, True])
+all_kinds = pytest.mark.parametrize("kind", KINDS)
+
+
+def make_parameters(kind: Transformation, mirrored: bool) -> Array:
+    return film_parameters(Truth(middle_mm=(120.0, -110.0), mirrored=4 * (mirrored,)), 1, kind)
+
+
+@mirrors
+@all_kinds
+def test_the_formulas(kind: Transformation, mirrored: bool) -> None:
+    parameters = make_parameters(kind, mirrored)
+    expected = np.stack(camera_of_film(kind, parameters, mirrored, *PLACES_MM.T), axis=1)
+    np.testing.assert_allclose(film_kind(kind, mirrored).apply(parameters, PLACES_MM), expected, rtol=1e-13)
+
+
+@mirrors
+@all_kinds
+def test_derivatives_by_complex_steps(kind: Transformation, mirrored: bool) -> None:
+    formula, parameters = film_kind(kind, mirrored), make_parameters(kind, mirrored)
+    gradient = formula.gradient(parameters, PLACES_MM)
+    design = formula.design(parameters, PLACES_MM, np.zeros(2), ONE)
+    for axis in (0, 1):
+        stepped = formula.apply(parameters, PLACES_MM + 1j * STEP * np.eye(2)[axis]).imag / STEP
+        np.testing.assert_allclose(gradient[..., axis], stepped, rtol=0, atol=1e-13)
+    for k in range(len(parameters)):
+        stepped = formula.apply(parameters + 1j * STEP * np.eye(len(parameters))[k], PLACES_MM).imag / STEP
+        np.testing.assert_allclose(design[..., k], stepped, rtol=0, atol=1e-13 * np.abs(stepped).max())
+
+
+@mirrors
+@pytest.mark.parametrize("kind", [*KINDS, f"conformal({HIGHEST_ORDER})", f"polynomial({HIGHEST_ORDER})"])
+def test_centred_parameters_are_those_of_the_formula_about_the_middle(kind: Transformation, mirrored: bool) -> None:
+    """What they move, through the parameters as reported, is their own design; and that design is well conditioned."""
+    formula = film_kind(kind, mirrored)
+    rng = np.random.default_rng(2)
+    parameters = rng.uniform(-1.0, 1.0, len(formula.names)) * 1e-3
+    half = np.asarray(110.0)
+    places = MIDDLE_MM + rng.uniform(-110.0, 110.0, (60, 2))
+    centred = formula.design(parameters, places, MIDDLE_MM, half)
+    back = formula.centred_jacobian(parameters, MIDDLE_MM, half)
+    raw = formula.design(parameters, places, np.zeros(2), ONE)
+    np.testing.assert_allclose(raw @ back, centred, rtol=0, atol=1e-10)
+    if parameters.size and kind != "projective":
+        flat = centred.reshape(-1, len(parameters))
+        assert np.linalg.cond(flat / np.linalg.norm(flat, axis=0)) < 100.0
+
+
+@mirrors
+@all_kinds
+def test_the_inverse_leads_back(kind: Transformation, mirrored: bool) -> None:
+    film = Film(kind, make_parameters(kind, mirrored), MIDDLE_MM, mirrored)
+    back, found = film.comparator_from_camera(film.camera_from_comparator(PLACES_MM))
+    assert found.all()
+    np.testing.assert_allclose(back, PLACES_MM, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters", "camera", "found"),
+    [
+        ("projective", [0, 1, 0, 0, 0, 1, 1e-3, 0], [[500, 0], [1500, 0]], [True, False]),  # x' nears 1000 mm, no more
+        ("bilinear", [0, 1, 0, 0, 0, 0, 1, 5e-3], [[-50, 1], [-300, 1]], [True, False]),  # y' = y (1 + x / 200)
+        ("polynomial(2)", [0, 1, 0, -2e-3, 0, 0, 0, 0, 1, 0, 0, 0], [[100, 5], [130, 5]], [True, False]),  # x' < 125
+        ("conformal(2)", [0, 0, 1, 0, -2e-3, 0], [[100, 0], [-100, 0]], [True, True]),
+        ("affine", [0, 1, 2, 0, 2, 4], [[1, 2]], [False]),
+    ],
+)
+def test_what_folds_over_is_not_found(
+    kind: Transformation, parameters: list[float], camera: list[list[float]], found: list[bool]
+) -> None:
+    film = Film(kind, np.array(parameters, dtype=float), np.zeros(2))
+    xy, regular = film.comparator_from_camera(np.array(camera, dtype=float))
+    assert regular.tolist() == found
+    np.testing.assert_allclose(film.camera_from_comparator(xy)[regular], np.array(camera)[regular], atol=1e-9)
+
+
+def test_numbers_of_parameters_and_marks() -> None:
+    counts = {kind: (len(film_parameter_names(kind)), marks_needed(kind), fewest_marks(kind)) for kind in KINDS}
+    assert counts == {
+        "none": (0, 0, 0),
+        "congruent": (3, 2, 2),
+        "similarity": (4, 2, 2),
+        "affine": (6, 3, 3),
+        "projective": (8, 4, 3),
+        "bilinear": (8, 4, 3),
+        "conformal(1)": (4, 2, 2),
+        "conformal(2)": (6, 3, 2),
+        "conformal(3)": (8, 4, 2),
+        "polynomial(1)": (6, 3, 3),
+        "polynomial(2)": (12, 6, 3),
+        "polynomial(3)": (20, 10, 3),
+    }
+    assert film_parameter_names("projective") == ("a1", "a2", "a3", "b1", "b2", "b3", "c1", "c2")
+
+
+@pytest.mark.parametrize(
+    ("spelling", "words"),
+    [
+        ("helmert", ['no transformation "helmert"']),
+        ("conformal", ["lacks its order", '"conformal(2)"']),
+        ("polynomial(6)", ["order must be from 1 to 5"]),
+        ("polynomial(0)", ["order must be from 1 to 5"]),
+        ("bilinear(2)", ['no transformation "bilinear(2)"']),
+    ],
+)
+def test_a_wrong_spelling_is_reported_what_is_possible(spelling: str, words: list[str]) -> None:
+    with pytest.raises(ValueError, match=r"possible are none, congruent, .* projective, bilinear, conformal") as caught:
+        Image("f1", "K", spelling)
+    assert all(word in str(caught.value) for word in words)
+
+
+MARKS_MM = 106.0 * np.array([(1, -1), (-1, -1), (-1, 1), (1, 1), (0, -1), (-1, 0), (0, 1), (1, 0)])
+RESEAU_MM = 50.0 * np.array([(x, y) for x in range(-2, 3) for y in range(-2, 3)])
+
+
+def view_marks(kind: Transformation, mirrored: bool, marks_mm: Array) -> tuple[Array, Array, Array]:
+    """The transformation's parameters, marks in a scan about (120, -110) mm, and where they are in the camera."""
+    parameters = film_parameters(Truth(middle_mm=(120.0, -110.0), mirrored=4 * (mirrored,)), 1, kind)
+    comparator = [120.0, -110.0] + marks_mm[:, ::-1] + np.random.default_rng(1).uniform(-1.0, 1.0, marks_mm.shape)
+    return parameters, comparator, np.stack(camera_of_film(kind, parameters, mirrored, *comparator.T), axis=1)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["congruent", "similarity", "affine", "projective", "bilinear", "conformal(2)", "conformal(3)", "polynomial(2)"],
+)
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("wrong", [(), (2,), (1, 6)], ids=["clean", "one gross error", "two exchanged"])
+def test_the_applied_transformation_is_found(kind: Transformation, mirrored: bool, wrong: tuple[int, ...]) -> None:
+    """Eight marks can tell two wrong ones from eight parameters; twenty-five from twelve."""
+    parameters, comparator, camera = view_marks(kind, mirrored, RESEAU_MM if kind == "polynomial(2)" else MARKS_MM)
+    if wrong:
+        camera[list(wrong)] = camera[list(reversed(wrong))] if len(wrong) > 1 else camera[list(wrong)] + 20.0
+    found, is_mirrored = fit_transformation(kind, comparator, camera)
+    np.testing.assert_allclose(found, parameters, rtol=1e-9, atol=1e-7)
+    fitted = film_kind(kind, is_mirrored).apply(found, comparator)
+    right = [i for i in range(len(comparator)) if i not in wrong]
+    np.testing.assert_allclose(fitted[right], camera[right], atol=1e-9)
+    assert is_mirrored == mirrored
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize(
+    ("kind", "simpler", "count"),
+    [
+        ("projective", "affine", 3),
+        ("bilinear", "affine", 3),
+        ("conformal(3)", "conformal(2)", 3),
+        ("polynomial(3)", "polynomial(2)", 8),
+        ("polynomial(3)", "affine", 4),
+    ],
+)
+def test_few_marks_give_the_simpler_transformation(
+    kind: Transformation, simpler: Transformation, count: int, mirrored: bool
+) -> None:
+    """In the parameters of the one that was asked for."""
+    _, comparator, camera = view_marks(simpler, mirrored, MARKS_MM[:count])
+    found, is_mirrored = fit_transformation(kind, comparator, camera)
+    np.testing.assert_allclose(film_kind(kind, is_mirrored).apply(found, comparator), camera, atol=1e-9)
+    plain, _ = fit_transformation(simpler, comparator, camera)
+    far = comparator + 200.0
+    expected = film_kind(simpler, mirrored).apply(plain, far)
+    np.testing.assert_allclose(film_kind(kind, is_mirrored).apply(found, far), expected, atol=1e-8)
+    assert is_mirrored == mirrored
+
+
+def test_marks_in_bad_places_give_a_tame_transformation() -> None:
+    """Four marks on the axes tell nothing of the bilinear term in xy."""
+    comparator = 113.0 * np.array([(0.0, -1.0), (-1.0, 0.0), (0.0, 1.0), (1.0, 0.0)])
+    found, _ = fit_transformation("bilinear", comparator, comparator + 5.0)
+    np.testing.assert_allclose(found, [5, 1, 0, 0, 5, 0, 1, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_marks_on_a_line_do_not_tell_a_mirror(seed: int) -> None:
+    comparator = np.array([(-106.0, 0.0), (0.0, 0.0), (106.0, 0.0)])
+    camera = comparator + 5.0 + np.random.default_rng(seed).normal(0.0, 0.004, (3, 2))
+    found, mirrored = fit_transformation("similarity", comparator, camera)
+    assert not mirrored
+    np.testing.assert_allclose(found, [5.0, 5.0, 1.0, 0.0], atol=0.02)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_film_that_shrank_unevenly_is_distinguished_from_a_mirror(mirrored: bool) -> None:
+    """By three tenths of a per cent, as no similarity fits, upright or mirrored, and with a mark 0.08 mm off."""
+    camera = MARKS_MM @ [[1.003, 0.0], [0.0, 1.0]] + np.random.default_rng(3).normal(0.0, 0.005, MARKS_MM.shape)
+    camera[4, 0] += 0.08
+    comparator = [120.0, -110.0] + MARKS_MM * ((-1.0, 1.0) if mirrored else (1.0, 1.0))
+    assert fit_transformation("affine", comparator, camera)[1] == mirrored
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_bent_line_of_marks_does_not_tell_a_mirror(seed: int) -> None:
+    """Along it film differs from a similarity by more than marks do, across it there is but noise."""
+    generator = np.random.default_rng(seed)
+    along = np.linspace(-100.0, 100.0, 8)
+    comparator = np.stack([along, generator.normal(0.0, 0.01, 8)], axis=1)
+    camera = np.stack([along + 0.1 * (along / 100.0) ** 3, generator.normal(0.0, 0.01, 8)], axis=1)
+    assert not fit_transformation("affine", comparator, camera)[1]
+
+
+def test_small_residuals_are_no_gross_errors() -> None:
+    rng = np.random.default_rng(2)
+    comparator = MARKS_MM + rng.normal(0.0, 0.005, MARKS_MM.shape)
+    found, _ = fit_transformation("affine", comparator, MARKS_MM)
+    design = np.column_stack([np.ones(8), comparator])
+    least_squares = np.linalg.lstsq(design, MARKS_MM)[0]
+    np.testing.assert_allclose(found, [*least_squares[:, 0], *least_squares[:, 1]], atol=1e-9)
+
+
+def test_none_has_no_parameters() -> None:
+    found, mirrored = fit_transformation("none", np.zeros((0, 2)), np.zeros((0, 2)))
+    assert found.shape == (0,)
+    assert not mirrored
+
+
+BENT = ["projective", "bilinear", "conformal(2)", "conformal(3)", "polynomial(2)", "polynomial(3)"]
+SCANS = Truth(middle_mm=(120.0, -115.0), mirrored=(False, True, False, False))
+
+
+@pytest.mark.parametrize("kind", BENT)
+def test_perfect_data_leave_nothing_and_give_the_truth_back(kind: Transformation) -> None:
+    """Comparator coordinates from 5 to 235 mm, one scan mirrored; three marks more make eight."""
+    network, _ = simulated(
+        np.random.default_rng(4), SCANS, kind, field_points(np.random.default_rng(5), 25), noise=False
+    )
+    result = adjust(network, approximate(network))
+    assert result.converged
+    assert result.vpv < 1e-12
+    assert np.abs(result.residuals.v_mm).max() < 1e-9
+    for i in range(4):
+        expected = film_parameters(SCANS, i, kind)
+        names = [name for name in result.names if name.startswith(f"T.f{i}.")]
+        off = [abs(result.value(name) - value) for name, value in zip(names, expected, strict=True)]
+        assert np.all(off <= np.array([1e-5 * result.sigma(name) / result.sigma0 for name in names]))
+    assert result.mirrored == {"f1"}
+
+
+@pytest.mark.parametrize("kind", [pytest.param("polynomial(3)", marks=pytest.mark.study), "polynomial(5)"])
+def test_the_origin_of_the_comparator_does_not_matter(kind: Transformation) -> None:
+    """A metre and a half off, as on a film strip; with exact observations, which are moved without a rounding."""
+    network, _ = simulated(
+        np.random.default_rng(4), Truth(), "polynomial(3)", field_points(np.random.default_rng(5), 40), noise=False
+    )
+    network = replace(network, images=tuple(replace(image, transformation=kind) for image in network.images))
+    results = [adjust(each, approximate(each)) for each in (network, moved_origin(network, 1500.0))]
+    for result in results:
+        assert result.converged
+        assert np.abs(result.residuals.v_mm).max() < 1e-10
+    for name in ("IO.K.c", "IO.K.x0", "FID.K.3.y", "EO.f2.omega"):
+        near, far = (result.sigma(name) / result.sigma0 for result in results)
+        assert far == pytest.approx(near, rel=1e-9)
+
+
+def moved_origin(network: Network, off_mm: float) -> Network:
+    observations = network.observations
+    return replace(network, observations=replace(observations, xy_mm=observations.xy_mm + off_mm))
+
+
+@pytest.mark.parametrize(("kind", "marks"), [("projective", 3), ("bilinear", 3), ("conformal(3)", 2)])
+def test_targets_determine_what_too_few_marks_leave_open(kind: Transformation, marks: int) -> None:
+    network, _ = simulated(
+        np.random.default_rng(4), Truth(), kind, field_points(np.random.default_rng(5), 25), noise=False
+    )
+    network = add_marks(network, marks)
+    result = adjust(network, approximate(network))
+    assert result.converged
+    assert result.vpv < 1e-12
+    assert result.warnings == (
+        f"Image f0 shows {marks} fiducial marks, and its {kind} transformation takes 4 of its own: the targets "
+        f"determine the rest of it. 3 more images are alike.",
+    )
+
+
+def add_marks(network: Network, count: int, images_of_marks_alone: tuple[str, ...] = ()) -> Network:
+    """The network with the first marks only, and some images without targets."""
+    rows = network.observations
+    keep = [
+        i
+        for i, (image, point, what) in enumerate(zip(rows.image, rows.point, rows.kind, strict=True))
+        if (int(point) <= count if what == "fiducial" else image not in images_of_marks_alone)
+    ]
+    return replace(network, observations=rows.only(np.array(keep)))
+
+
+def test_an_image_without_targets_needs_all_marks_of_its_own() -> None:
+    network, _ = simulated(np.random.default_rng(4), Truth(), "projective", noise=False)
+    with pytest.raises(AdjustmentError, match=r"image f2 shows 3 fiducial marks; its projective .* needs 4\. Measure"):
+        approximate(add_marks(network, 3, ("f2",)))
+    result = adjust(enough := add_marks(network, 4, ("f2",)), approximate(enough))
+    assert result.converged
+
+
+def test_a_film_that_folds_over_is_reported() -> None:
+    network, start = simulated(np.random.default_rng(4), Truth(), "polynomial(2)", noise=False)
+    folded = start.transformation["f1"].copy()
+    folded[3] = 0.02  # x' turns back at some 15 mm from the middle
+    with pytest.raises(
+        AdjustmentError, match=r"cannot start: .* polynomial\(2\) transformation of image f1 folds over"
+    ):
+        adjust(network, replace(start, transformation=dict(start.transformation) | {"f1": folded}))

@@ -1,0 +1,330 @@
+"""Singular networks: their null directions, each named with cause and remedy."""
+
+import copy
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from faults import AXES, CATALOGUE, DEFORMATIONS, DISTANCE, MISHAPS, POINT, sentences
+from networks import CONVERGENT, UNKNOWN, Array, Setup, field_points, give_values, simulated, vertical
+from reference_cases import CAUSES, DROPPED, Case, case_approximations, case_network, load
+
+from adjust import Adjustment, Prior
+from adjust.linear_algebra.factor import BlockFactors, DenseBlocks, Factor
+from adjust.linear_algebra.fronts import Fronts
+from adjust.linear_algebra.sparse_factor import Triangle
+from adjust.problem.network import Approximations, Exterior, Network, Transformation
+from adjust.rank_defect import null_space
+from adjust.solution.adjustment import Datum, Options, adjust
+
+GIVEN: dict[str, list[tuple[str, Callable[[Network], Network]]]] = {
+    "Shift x": [
+        ("x' of one fiducial mark (F5)", lambda network: give_values(network, {"x": 1.0}, 1)),
+        ("x0' (F7)", lambda network: give_values(network, {"x0": 1.0})),
+    ],
+    "Shift y": [
+        ("y' of one fiducial mark (F6)", lambda network: give_values(network, {"y": 1.0}, 1)),
+        ("y0' (F8)", lambda network: give_values(network, {"y0": 1.0})),
+    ],
+    "Rotation": [("one coordinate of a fiducial mark", lambda network: give_values(network, {"y": 1.0}, 1))],
+    "Scale": [("the principal distance (F9)", lambda network: give_values(network, {"c": 1.0}))],
+    "principal point's x0'": [("x0' (F7)", lambda network: give_values(network, {"x0": 1.0}))],
+    "principal point's y0'": [("y0' (F8)", lambda network: give_values(network, {"y0": 1.0}))],
+    "principal distance of camera K can change": [("it (F9)", lambda network: give_values(network, {"c": 1.0}))],
+}
+
+DEAR = ("nearly-flat", "swapped")
+
+
+@pytest.mark.parametrize("name", list(CATALOGUE))
+def test_number_words_and_changes_of_the_network_that_mend_it(name: str) -> None:
+    failure = CATALOGUE[name]
+    result = adjust(*failure.setup.network(), failure.options)
+    assert result.termination == "singular"
+    assert len(result.singular) == len(failure.words)
+    for direction, words in zip(result.singular, failure.words, strict=True):
+        assert words in direction.cause
+        assert direction.remedy.startswith("Give a standard deviation to ")
+        assert direction.parameters
+
+    advised = " ".join(direction.remedy for direction in result.singular)
+    for words, (setup, gone) in failure.mended.items():
+        assert words in advised
+        mended = adjust(*setup.network(), failure.options)
+        assert not causes(mended, gone), words
+        assert len(mended.singular) < len(failure.words)
+
+
+@pytest.mark.parametrize("name", list(CATALOGUE))
+def test_each_prior_that_is_requested_ends_one_direction(name: str) -> None:
+    """The four of the camera's axes in two networks, all others in theirs."""
+    failure = CATALOGUE[name]
+    network, start = failure.setup.network()
+    alike = () if name in ("known-relief", "known-flat-vertical") else AXES
+    for direction in adjust(network, start, failure.options).singular:
+        if direction.cause.startswith(alike):
+            continue
+        for words, remedy in next((v for k, v in GIVEN.items() if k in direction.cause), []):
+            assert words in direction.remedy
+            mended = adjust(remedy(network), start, failure.options)
+            assert len(mended.singular) == len(failure.words) - 1, f"{words} against {direction.cause}"
+
+
+@pytest.mark.parametrize("name", ["known-relief", "known-flat-tilted", "known-flat-two"])
+def test_fiducials_with_priors_end_what_they_are_to_end(name: str) -> None:
+    """Two marks: shifts, rotation and scale; three: affinity and shear too."""
+    failure = CATALOGUE[name]
+    network, start = failure.setup.network()
+    for marks, gone in ((2, AXES), (3, AXES + DEFORMATIONS)):
+        mended = adjust(give_values(network, {"x": 1.0, "y": 1.0}, marks), start, failure.options)
+        assert not causes(mended, gone)
+
+
+@pytest.mark.parametrize("name", [n if n not in DEAR else pytest.param(n, marks=pytest.mark.study) for n in MISHAPS])
+def test_other_mishaps_are_reported_in_words(name: str) -> None:
+    mishap = MISHAPS[name]
+    text = sentences(adjust(*mishap.network(), mishap.options))
+    assert len(text) == len(mishap.words)
+    for sentence, words in zip(text, mishap.words, strict=True):
+        assert words in sentence
+
+
+@pytest.mark.parametrize("kind", ["affine", "similarity", "congruent", "projective", "bilinear", "conformal(2)"])
+def test_priors_that_are_dropped_leave_the_directions_that_they_end(kind: Transformation) -> None:
+    """F5..F9 dropped, F5..F8, F5 and F6, F5, F6 and F9, F7..F9, none."""
+    network, start = Setup(CONVERGENT, kind=kind).network()
+    tilts = ("Tilt x", "Tilt y") if kind == "projective" else ()
+    scale = () if kind == "congruent" else ("Scale",)
+    marks, c, point = {"x": 1.0, "y": 1.0}, {"c": 1.0}, {"x0": 1.0, "y0": 1.0}
+    for kept, words in (
+        ({}, (*AXES[:3], *scale, *tilts)),
+        (c, (*AXES[:3], *tilts)),
+        ({**c, **point}, ("Rotation", *tilts)),
+        (point, ("Rotation", *scale, *tilts)),
+        (marks, ()),
+        ({**marks, **c, **point}, ()),
+    ):
+        singular = adjust(give_values(network, kept), start).singular
+        assert tuple(each.cause.split(":")[0] for each in singular) == words
+
+
+@pytest.mark.parametrize(
+    ("known", "gone"),
+    [
+        (("7.X",), ("shift in X",)),
+        (("7.Y",), ("shift in Y",)),
+        (("7.Z",), ("shift in Z",)),
+        (("0.Z", "1.Z", "2.Z"), ("shift in Z", "turn about X", "turn about Y")),
+        (("0.X", "0.Y", "1.X", "1.Y"), ("shift in X", "shift in Y", "turn about Z", "grow or shrink")),
+    ],
+)
+def test_coordinates_that_are_requested_end_their_part_of_the_datum(
+    known: tuple[str, ...], gone: tuple[str, ...]
+) -> None:
+    """Point 7 lies in the middle: a coordinate of a far point ends a turn or the scale as well as a shift."""
+    network, start = MISHAPS["no-datum"].network()
+    left = [each.cause for each in adjust(fix_stations(network, start, known), start).singular]
+    assert len(left) == 7 - len(gone)
+    assert not [cause for cause in left if any(words in cause for words in gone)]
+
+
+def test_images_and_points_are_mended_as_advised() -> None:
+    network, start = MISHAPS["one-ray"].network()
+    known = tuple(f"{point}.{axis}" for point in "0123" for axis in "XYZ")
+    assert adjust(fix_stations(network, start, known), start).converged
+    network, start = MISHAPS["targets-on-a-line"].network()
+    oriented = tuple(
+        replace(image, exterior=Exterior(start.exterior["f3"], np.array([1.0] * 3 + [1e-3] * 3)))
+        if image.name == "f3"
+        else image
+        for image in network.images
+    )
+    assert adjust(replace(network, images=oriented), start).converged
+
+
+def fix_stations(network: Network, start: Approximations, names: tuple[str, ...]) -> Network:
+    """The network with some coordinates given as they are, with a standard deviation of a centimetre."""
+    points = []
+    for point in network.points:
+        of_point = {axis: Prior(float(start.points[point.id][i]), 0.01) for i, axis in enumerate("XYZ")}
+        x, y, z = (of_point[axis] if f"{point.id}.{axis}" in names else None for axis in "XYZ")
+        points.append(replace(point, X=x or point.X, Y=y or point.Y, Z=z or point.Z))
+    return replace(network, points=tuple(points))
+
+
+def test_a_singular_network_tells_too_what_is_nearly_singular() -> None:
+    """Axes parallel within half a degree: c is not quite undetermined, but to mend the rest alone is no use."""
+    setup = replace(
+        CATALOGUE["known-flat-vertical"].setup,
+        attitudes=((0.004, 0, 0.1), (0, 0.003, 1.6), (-0.004, 0, 3), (0, -0.003, -1.5)),
+    )
+    result = adjust(*setup.network())
+    assert len(result.singular) == 4
+    assert [("Practically singular" in warning, DISTANCE[0] in warning) for warning in result.warnings] == [
+        (True, True)
+    ]
+    for name in ("known-flat-vertical", "known-flat-two", "unknown-pair"):
+        assert adjust(*CATALOGUE[name].setup.network(), CATALOGUE[name].options).warnings == ()
+
+
+def causes(result: Adjustment, words: tuple[str, ...]) -> list[str]:
+    """The causes that a result still tells, of those with some words."""
+    return [direction.cause for direction in result.singular if any(word in direction.cause for word in words)]
+
+
+def triangle(rng: np.random.Generator, singular: Array) -> Array:
+    """A triangle with some singular values."""
+    count = len(singular)
+    left, right = (np.linalg.qr(rng.normal(size=(count, count)))[0] for _ in range(2))
+    return np.asarray(np.linalg.qr(left @ np.diag(singular) @ right, mode="r"))
+
+
+def factorise(shared: Array, *blocks: BlockFactors) -> Factor:
+    count = len(shared) + sum(block.own.size for block in blocks)
+    dense = Triangle(Fronts.single(len(shared)), (shared,), (np.zeros((len(shared), 0)),))
+    return Factor(DenseBlocks(blocks), dense, np.zeros(len(shared)), np.ones(count))
+
+
+@pytest.mark.parametrize("below", [null_space.SINGULAR, 1e-4])
+@pytest.mark.parametrize(
+    "small", [(), (1e-16,) * 9, (1e-17, 1e-16, 1e-6, 3e-5, 9e-5), tuple(np.geomspace(1e-6, 1e-3, 60))]
+)
+def test_small_singular_values_are_found_one_and_all(small: tuple[float, ...], below: float) -> None:
+    """Also more of them than are iterated at first, and next to others that are hardly larger."""
+    rng = np.random.default_rng(1)
+    count = 2 * null_space.DENSE
+    singular = np.array([*small, *np.geomspace(2e-3, 1.0, count - len(small))])
+    shared = triangle(rng, singular)
+    vectors, view = null_space.null_space(factorise(shared), [], below)
+    expected = np.sort(singular[singular <= below])
+    assert len(view) == len(expected)
+    np.testing.assert_allclose(np.sort(view), expected, rtol=0.02, atol=1e-14)
+    np.testing.assert_allclose(vectors.T @ vectors, np.eye(len(view)), atol=1e-12)
+    assert np.linalg.norm(shared @ vectors, axis=0).max(initial=0.0) <= below
+
+
+def test_a_block_without_its_own_determination_lends_its_rows_to_the_shared() -> None:
+    """One unknown of the block is seen by no row; the row it leaves over then determines the first shared unknown."""
+    shared = np.diag([0.0, 1.0])
+    own = np.array([[1.0, 0.0], [0.0, 0.0]])
+    border = np.array([[0.0, 0.5], [0.7, 0.0]])
+    block = BlockFactors(np.array([[2, 3]]), np.array([[0, 1]]), own[None], border[None], np.zeros((1, 2)))
+    found = null_space.null_vectors(factorise(shared, block))
+    np.testing.assert_allclose(np.abs(found), [[0.0], [0.0], [0.0], [1.0]], atol=1e-12)
+
+
+def test_a_network_of_many_images_is_named_like_a_small_one() -> None:
+    """Sixteen parallel images of a hundred unknown points: 205 shared unknowns, nine null directions as with four."""
+    rng = np.random.default_rng(2)
+    stations = tuple((300.0 * (i % 4) - 450.0, 300.0 * (i // 4) - 450.0, 1500.0 + 10.0 * i) for i in range(16))
+    setup = Setup(vertical(*[0.0] * 16), stations, points=field_points(rng, 100), sigma=UNKNOWN)
+    result = adjust(*setup.network(), Options(datum="minimal"))
+    words = (*AXES, *DEFORMATIONS, *POINT, *DISTANCE)
+    assert len(result.singular) == len(words)
+    assert all(word in each.cause for word, each in zip(words, result.singular, strict=True))
+
+
+SINGULAR = ("K2D_vert0", "K3D_conv", "U3D_vert0", "H2D_vertcross")
+
+
+def dropped(case: Case, functions: set[int]) -> Case:
+    """The case with priors of 1 mm, but for the pseudo-observations that are dropped."""
+    case = copy.deepcopy(case)
+    sigma = {number: None if number in functions else 1.0 for number in range(5, 10)}
+    case["input"]["fid_sigma"] = [[sigma[5], sigma[6]]] * len(case["input"]["fid_obs"])
+    case["input"]["io_sigma"][:3] = [sigma[7], sigma[8], sigma[9]]
+    return case
+
+
+def adjust_network(case: Case, options: Options | None = None) -> Adjustment:
+    return adjust(case_network(case), case_approximations(case, case["state"]), options)
+
+
+@pytest.mark.parametrize("priors", list(DROPPED))
+@pytest.mark.parametrize("name", SINGULAR)
+def test_null_directions_are_counted_and_named(name: str, priors: str) -> None:
+    case = load(f"v_singular_{name}_affine")
+    expected = case["expected_defects_by_dropped_pseudo_observations"][priors]
+    result = adjust_network(dropped(case, DROPPED[priors]))
+
+    assert len(result.singular) == expected["total_defect"]
+    assert result.termination == ("singular" if expected["total_defect"] else "converged")
+    datum, camera = np.split(np.array(result.singular, dtype=object), [expected["object_datum_defect"]])
+    assert all("object space" in direction.cause for direction in datum)
+    for direction, row in zip(camera, expected["directions"], strict=True):
+        assert CAUSES[row["lead"]] in direction.cause
+        assert direction.remedy
+        named = {"T" if each.kind == "film" else kind(each.text) for each in direction.parameters}
+        assert named - {"FID"} <= set(row["involved"]) | {"IO.x0", "IO.y0", "IO.c"}
+
+
+def kind(name: str) -> str:
+    """`EO.3.X0` is of the kind EO.X0, a fiducial of the kind FID."""
+    owner, quantity = name.split(".")[0], name.rsplit(".", 1)[1]
+    return "FID" if owner == "FID" else f"{owner}.{quantity}"
+
+
+def test_a_singular_result_keeps_the_approximations() -> None:
+    case = load("v_singular_K3D_conv_affine")
+    result = adjust_network(dropped(case, {5, 6, 7, 8, 9}))
+    assert result.value("EO.2.X0") == case["state"]["EO2.X0"]
+    assert not result.converged
+    assert result.history == ()
+
+
+@pytest.mark.parametrize("datum", ["minimal", "free"])
+def test_a_datum_for_the_object_leaves_the_camera_directions(datum: Datum) -> None:
+    case = load("v_singular_U3D_vert0_affine")
+    result = adjust_network(dropped(case, {9}), Options(datum=datum))
+    assert [CAUSES["IO.c"] in direction.cause for direction in result.singular] == [True]
+
+
+def test_a_flat_field_of_heights_needs_four_datum_values() -> None:
+    """With noisy heights too, which make the equations formally regular with three."""
+    case = dropped(load("v_singular_H2D_vertcross_affine"), set())
+    rng = np.random.default_rng(1)
+    for row, sigma in zip(case["input"]["pts_obs"], case["input"]["pts_sigma"], strict=True):
+        row[2] += rng.normal(0.0, 0.02)
+        sigma[2] = 0.02
+    result = adjust_network(case, Options(datum="minimal"))
+    assert result.converged
+    fixed = [name for name in result.names if name.startswith("PT.") and result.sigma(name) == 0.0]
+    assert sorted(name[-1] for name in fixed) == ["X", "X", "Y", "Y"]
+
+
+def test_a_good_network_has_no_warning() -> None:
+    network, start = simulated(np.random.default_rng(2), free={"k3": np.inf, "p1": np.inf})
+    assert adjust(network, start).warnings == ()
+
+
+@pytest.mark.parametrize("count", [9, 40])
+def test_a_point_in_one_image_only_is_named(count: int) -> None:
+    """Whether images or points are eliminated first: four images have 48 unknowns, nine points 27, forty 120."""
+    rng = np.random.default_rng(6)
+    network, start = simulated(rng, points=field_points(rng, count), point_sigma=np.inf, noise=False)
+    rows = network.observations
+    lonely = [(image, "3", "target") for image in ("f0", "f1", "f2")]
+    keys = list(zip(rows.image, rows.point, rows.kind, strict=True))
+    result = adjust(
+        keep_points(network, [i for i, key in enumerate(keys) if key not in lonely]), start, Options(datum="minimal")
+    )
+    assert result.termination == "singular"
+    (direction,) = result.singular
+    assert {(each.kind, each.id) for each in direction.parameters} == {("point", "3")}
+
+
+def keep_points(network: Network, keep: list[int]) -> Network:
+    """The network with some of its observations."""
+    return replace(network, observations=network.observations.only(np.array(keep)))
+
+
+def test_what_no_image_shows_is_reported() -> None:
+    network, start = simulated(np.random.default_rng(4))
+    rows = network.observations
+    keep = [
+        i for i, (point, kind) in enumerate(zip(rows.point, rows.kind, strict=True)) if (point, kind) != ("3", "target")
+    ]
+    result = adjust(keep_points(network, keep), start)
+    assert result.converged
+    assert result.warnings == ("No image shows the object points 3: they take no part.",)
