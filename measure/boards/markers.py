@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import chain, product
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import cv2
 import numpy as np
@@ -28,8 +28,6 @@ Markers = Mapping[int, Array]  # the corners (4, 2) of each on its board, by num
 Changes = dict[str, Any]
 Layout = TypeVar("Layout", ArucoSpec, CharucoSpec)
 _OFF_SQUARES = 0.25  # in squares, largest distance of a corner from the place given by the adjacent markers
-_NO_LEGACY: tuple[Changes, ...] = ({},)
-_LEGACIES: tuple[Changes, ...] = ({"legacy": False}, {"legacy": True})  # OpenCV's two layouts of ChArUco boards
 _COMMON_DICTIONARIES = ("4X4_250", "5X5_250", "6X6_250", "7X7_250", "ARUCO_ORIGINAL", "APRILTAG_36h11")
 _FEWEST_CORNERS = 4  # points needed for a homography
 
@@ -217,7 +215,8 @@ def _read_board(picture: Bytes, spec: Layout) -> tuple[ReadMarkers, Layout]:
     """Read a board's markers. Returns them with the layout, the specified one or a variant, with which most of them
     agree."""
     touched = isinstance(spec, AprilGridSpec)
-    borders = (spec.border_modules, 1) if isinstance(spec, AprilGridSpec) else (1,)
+    is_tag = spec.dictionary.upper().removeprefix("DICT_").startswith("APRILTAG")
+    borders = (AprilGridSpec.border_modules, 1) if is_tag else (1,)
     dictionary = aruco_dictionary(spec.dictionary)
     readings: MarkerReadings = max(
         (read_markers(picture, dictionary, border, touched) for border in borders),
@@ -225,7 +224,7 @@ def _read_board(picture: Bytes, spec: Layout) -> tuple[ReadMarkers, Layout]:
     )
     best, layout = placed_markers(readings, _markers(spec)), spec
     # Programs that print AprilTags differ in which of a tag's corners is the first.
-    turned = [readings.quarter_turned(turns) for turns in range(4 if isinstance(spec, AprilGridSpec) else 1)]
+    turned = [readings.quarter_turned(turns) for turns in range(4 if is_tag else 1)]
     layouts: Iterator[Layout] = chain((spec,), _other_layouts(spec, readings))
     for other, read in product(layouts, turned):
         if best.agreeing == len(readings.outlines_px):
@@ -237,15 +236,28 @@ def _read_board(picture: Bytes, spec: Layout) -> tuple[ReadMarkers, Layout]:
 
 
 def _other_layouts(spec: Layout, read: MarkerReadings) -> Iterator[Layout]:
-    """Variants of a specification that may be confused with it: swapped counts, other first numbers, other layout."""
+    """Variants of a specification that may be confused with it: the other layout, swapped counts, other first numbers,
+    and all of these at once, those with few changes first."""
     is_aruco = isinstance(spec, ArucoSpec)
     first_key: str = "first_marker" if is_aruco else "first_id"
-    legacies = _NO_LEGACY if is_aruco else _LEGACIES
     firsts: list[int] = other_first_numbers(read, getattr(spec, first_key), len(_markers(spec)))
-    changes: list[Changes] = [{}, {"columns": spec.rows, "rows": spec.columns}, *({first_key: one} for one in firsts)]
-    given: Changes = {key: bool(getattr(spec, key)) for key in legacies[0]}
-    others = (replace(spec, **change, **legacy) for change in changes for legacy in legacies)
-    yield from (other for other in others if other != replace(spec, **given))
+    layouts = spec, _other_layout(spec)
+    swapped: Changes = {"columns": spec.rows, "rows": spec.columns}
+    numbered: list[Changes] = [{first_key: first} for first in firsts]
+    groups: tuple[list[Changes], ...] = [{}], [swapped], numbered, [swapped | each for each in numbered]
+    for changes in groups:
+        yield from (
+            replace(layout, **change) for change, layout in product(changes, layouts) if change or layout != spec
+        )
+
+
+def _other_layout(spec: Layout) -> Layout:
+    """The same counts in the other of two common layouts: OpenCV's of ChArUco boards, markers counted from below."""
+    if isinstance(spec, CharucoSpec):
+        change: Changes = {"legacy": not spec.legacy}
+        return replace(spec, **change)
+    kind: type[Any] = ArucoSpec if isinstance(spec, AprilGridSpec) else AprilGridSpec
+    return cast(Layout, kind(**vars(spec)))
 
 
 def _other_layout_board(spec: ArucoSpec | CharucoSpec, other: ArucoSpec | CharucoSpec) -> FoundBoard:
@@ -254,8 +266,13 @@ def _other_layout_board(spec: ArucoSpec | CharucoSpec, other: ArucoSpec | Charuc
     differing = [key for key in keys if getattr(spec, key, None) != getattr(other, key, None)]
     if not getattr(other, "legacy", None):
         differing = [key for key in differing if key != "legacy" or getattr(spec, key)]
-    words = {"first_marker": "first_id"} if isinstance(spec, AprilGridSpec) else {}  # names used in [targets]
-    fitting = ", ".join(f"{words.get(key, key)} = {str(getattr(other, key)).lower()}" for key in differing)
+    words = {"first_marker": "first_id"} if isinstance(other, AprilGridSpec) else {}  # names used in [targets]
+    changes = [f"{words.get(key, key)} = {str(getattr(other, key)).lower()}" for key in differing]
+    if isinstance(other, ArucoSpec) and type(other) is not type(spec):
+        is_grid = isinstance(other, AprilGridSpec)
+        gap = f"spacing = {other.gap_mm / other.marker_mm:.4g}" if is_grid else f"gap_mm = {other.gap_mm:.6g}"
+        changes = [f'kind = "{"aprilgrid" if is_grid else "aruco"}", {gap}', *changes]
+    fitting = ", ".join(changes)
     message = f"the markers that were read do not lie as on the board that is described, but as with {fitting}"
     return FoundBoard({}, Reason(f"{message}. Set that, if it is the board's", Code.NO_BOARD))
 

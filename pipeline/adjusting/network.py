@@ -89,9 +89,11 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
     """
     used = rotate_to_sensor(project, [mark for mark in marks if mark.status.is_observation])
     if not used:
+        reasons = Counter(mark.reason for mark in marks if mark.reason).most_common(1)
+        why = "".join(f" Most have this reason ({number} of {len(marks)}): {reason}." for reason, number in reasons)
         raise InputError(
-            f"{project.comparator}: holds no observation: no mark has the status measured or weak. "
-            "See the reasons in its last column."
+            f"{project.comparator}: holds no observation: no mark has the status measured or weak.{why} "
+            "The reasons of all stand in its last column."
         )
     check_fiducials(project, used)
     _check_points(project, used)

@@ -132,6 +132,9 @@ class FiducialRecord:
         return None if x is None or y is None else (x.value, y.value)
 
 
+_UNKNOWN = 0.1  # standard deviation over the radius from which nothing is known of the distortion
+
+
 @dataclass(frozen=True, slots=True)
 class LensReachRecord:
     """Extent of the observations of a lens (see `LensReach`). share: radius_mm as a fraction of corner_mm."""
@@ -145,8 +148,9 @@ class LensReachRecord:
 
     def sentence(self, camera: str, unit: ImageUnit = FILM_UNIT) -> str:
         """State the radius up to which the distortion is known, and its precision within and beyond."""
-        inside, corner = (f"{um * unit.per_um:.2g} {unit.short_name}" for um in (self.sigma_um, self.corner_sigma_um))
-        is_known = math.isfinite(self.corner_sigma_um)
+        sizes = (float(f"{um * unit.per_um:.2g}") for um in (self.sigma_um, self.corner_sigma_um))
+        inside, corner = (f"{size:.9g} {unit.short_name}" for size in sizes)
+        is_known = self.corner_sigma_um < 1000.0 * _UNKNOWN * self.corner_mm
         beyond = f"there its standard deviation is {corner}" if is_known else "the lens shows nothing there"
         within = f", with a standard deviation of up to {inside}" if math.isfinite(self.sigma_um) else ""
         return (

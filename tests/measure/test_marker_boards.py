@@ -20,7 +20,7 @@ from drawn_boards import (
 from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
-from measure.boards.markers import ReadMarkers, off_corners
+from measure.boards.markers import ReadMarkers, charuco_board, find_aruco, find_charuco, off_corners
 from measure.boards.measure import BoardMeasurement, measure_board
 from measure.boards.specs import (
     AprilGridSpec,
@@ -64,6 +64,61 @@ def test_trap_charuco_corners_of_the_older_layout_have_their_neighbours_names() 
     assert {mark.status for mark in refused.marks} == {Status.ABSENT}
     present = charuco_picture(replace(OLDER, legacy=False), homography)
     assert "but as with legacy = false" in measure_board(scan_of(present), OLDER).reason
+
+
+def generated(spec: CharucoSpec) -> NDArray[np.uint8]:
+    """OpenCV's own picture of a board, 20 px a square, with a margin of one square."""
+    size = (20 * (spec.columns + 2), 20 * (spec.rows + 2))
+    picture = charuco_board(spec).generateImage(size, marginSize=20)
+    return np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.7), np.uint8)
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_the_markers_tell_the_layout_of_a_charuco_board(legacy: bool) -> None:
+    """Without a given layout each corner has the name of its place; a layout that the markers contradict is refused."""
+    spec = CharucoSpec("4X4_50", 6, 4, 32.0, 24.0, legacy=legacy)
+    picture = generated(spec)
+    found = find_charuco(picture, replace(spec, legacy=None)).corners
+    assert len(found) == 15
+    for name, corner in found.items():
+        row, column = divmod(int(name[1:]), 5)
+        np.testing.assert_allclose(corner.center_px, (39.5 + 20 * column, 39.5 + 20 * row), atol=0.5)
+    refused = find_charuco(picture, replace(spec, legacy=not legacy))
+    assert not refused.corners
+    assert f"but as with legacy = {str(legacy).lower()}" in refused.reason
+
+
+def test_exchanged_counts_and_another_first_number_at_once() -> None:
+    """Each alone does not make the markers agree; both together are named."""
+    spec = CharucoSpec("4X4_50", 6, 5, 32.0, 24.0, first_id=9)
+    board = find_charuco(generated(spec), replace(spec, columns=5, rows=6, first_id=0))
+    assert not board.corners
+    assert "but as with columns = 6, rows = 5, first_id = 9." in board.reason
+    aruco = ArucoSpec("4X4_50", 4, 3, 20.0, 8.0, first_marker=5)
+    picture = cv2.aruco.GridBoard((4, 3), 20.0, 8.0, aruco_dictionary("4X4_50"), np.arange(5, 17))
+    drawing = np.asarray(picture.generateImage((344, 264), marginSize=20), np.uint8)
+    read = find_aruco(drawing, replace(aruco, columns=3, rows=4, first_marker=0))
+    assert "but as with columns = 4, rows = 3, first_marker = 5." in read.reason
+    assert len(find_aruco(drawing, aruco).corners) == 48
+
+
+@pytest.mark.parametrize("first", [0, 5])
+def test_markers_counted_from_below_are_those_of_an_aprilgrid(first: int) -> None:
+    """And the other way round: the kind that fits is named, with its own keys."""
+    grid = AprilGridSpec("APRILTAG_36h11", 4, 3, 40.0, 12.0, first_marker=first)
+    above = ArucoSpec("APRILTAG_36h11", 4, 3, 40.0, 12.0, first_marker=first)
+    for drawn, taken, words in (
+        (grid, above, 'but as with kind = "aprilgrid", spacing = 0.3.'),
+        (above, grid, 'but as with kind = "aruco", gap_mm = 12.'),
+    ):
+        picture = np.full((3 * 52 + 40, 4 * 52 + 40), 255, np.uint8)
+        for row, column in np.ndindex(3, 4):
+            marker = cv2.aruco.generateImageMarker(aruco_dictionary(drawn.dictionary), drawn.marker(row, column), 40)
+            picture[20 + 52 * row : 60 + 52 * row, 20 + 52 * column : 60 + 52 * column] = marker
+        board = find_aruco(picture, taken)
+        assert not board.corners
+        assert words in board.reason
+        assert len(find_aruco(picture, drawn).corners) == 48
 
 
 def test_charuco_numbers_that_begin_later() -> None:

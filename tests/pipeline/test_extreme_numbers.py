@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from networks import simulated
 from simulated_project import write_project
 
 from pipeline.cli import WRONG_INPUT, run
+from pipeline.results.adjustment_record import LensReachRecord
 
 Spoil = Callable[[list[str]], None]
 
@@ -56,6 +58,27 @@ def test_each_ends_with_one_message(
     message = capsys.readouterr().err
     assert re.search(words, message)
     assert message.count("reseau: ") == 1
+
+
+def test_marks_that_were_all_refused_end_with_their_commonest_reason(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    network, _ = simulated(np.random.default_rng(1))
+    project = write_project(network, tmp_path)
+    head, *rows = (tmp_path / "comparator.csv").read_text(encoding="utf-8").splitlines()
+    assert not head.endswith("reason")
+    rows = [f"{row},absent,{'one of 6 x 5 is' if number else 'covered'}" for number, row in enumerate(rows)]
+    (tmp_path / "comparator.csv").write_text("\n".join([f"{head},status,reason", *rows]) + "\n", encoding="utf-8")
+    assert run(["adjust", str(project)]) == WRONG_INPUT
+    assert f"Most have this reason ({len(rows) - 1} of {len(rows)}): one of 6 x 5 is." in capsys.readouterr().err
+
+
+def test_sizes_have_no_exponent_and_what_nothing_shows_has_no_size() -> None:
+    reach = LensReachRecord(1.5, 6.4, 1.1, 617.0, None, 0.24)
+    assert "with a standard deviation of up to 1.1 µm" in reach.sentence("K")
+    assert reach.sentence("K").endswith("there its standard deviation is 620 µm.")
+    unknown = replace(reach, corner_sigma_um=2500.0)
+    assert unknown.sentence("K").endswith("the lens shows nothing there.")
 
 
 @pytest.mark.parametrize(("sigma", "is_wrong"), [("1e-12", True), ("0", False)])
