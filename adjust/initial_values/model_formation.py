@@ -203,7 +203,7 @@ def absolute_orientation(model: Array, known: Array, stations: Array) -> Similar
     )
 
 
-def levelled(model: Array, heights: Array, stations: Array) -> Similarity | None:
+def levelled(model: Array, heights: Array, stations: Array, principal_distance_mm: float) -> Similarity | None:
     """Level and scale a model by heights alone, robustly; origin and azimuth of X and Y are arbitrary.
 
     Parameters
@@ -212,29 +212,32 @@ def levelled(model: Array, heights: Array, stations: Array) -> Similarity | None
     heights : (n,) their heights.
     stations : (k, 3) projection centres in the model, above the points.
 
+    principal_distance_mm : height of the stations in object units where equal heights leave the scale open.
+
     Returns
     -------
-    The similarity; None where the heights do not determine the scale: they are equal (flat field), or decrease where
-    the model rises (poor model).
+    The similarity; None where the heights decrease where the model rises (poor model).
     """
     weights = np.ones(len(model))
     for _ in range(REWEIGHTINGS):
         middle, height = np.average(model, axis=0, weights=weights), float(np.average(heights, weights=weights))
         offsets, relief = model - middle, heights - height
         squares = float((weights * relief**2).sum())
-        if squares == 0.0:
-            return None
-        rise = (weights * relief) @ offsets / squares
+        rise = (weights * relief) @ offsets / squares if squares else np.zeros(3)
         left = offsets - np.outer(relief, rise)
         up = np.linalg.svd(np.sqrt(weights)[:, np.newaxis] * left, full_matrices=False)[2][2]
         distance = np.abs(left @ up)
         weights = 1.0 / np.maximum(distance, 0.1 * np.median(distance) + np.finfo(float).tiny)
-    up = up if np.mean((stations - middle) @ up) > 0 else -up
-    if rise @ up <= 0.0:
+    above = float(np.mean((stations - middle) @ up))
+    up = up if above > 0.0 else -up
+    upward = (
+        float(rise @ up) if squares else abs(above) / principal_distance_mm
+    )  # height in the model of an object unit
+    if upward <= 0.0:
         return None
     right = np.cross(np.eye(3)[np.argmin(np.abs(up))], up)
     right /= np.linalg.norm(right)
-    scale, rotation = 1.0 / float(rise @ up), np.stack([right, np.cross(up, right), up])
+    scale, rotation = 1.0 / upward, np.stack([right, np.cross(up, right), up])
     return Similarity(scale, rotation, np.array([0.0, 0.0, height]) - scale * rotation @ middle)
 
 
@@ -357,7 +360,8 @@ def orient_free_model(sights: Mapping[str, Sight], known: Mapping[str, Array]) -
     stations = np.array([best.poses[image].center for image in sorted(best.poses)])
     with_height = ~np.isnan(xyz[:, 2])
     if np.isnan(xyz[:, :2]).all() and with_height.sum() > FEWEST_SHARED:
-        similarity = levelled(model[with_height], xyz[with_height, 2], stations)
+        distance = min(sight.principal_distance_mm for sight in sights.values())
+        similarity = levelled(model[with_height], xyz[with_height, 2], stations, distance)
     else:
         similarity = absolute_orientation(model, xyz, stations)
     if similarity is None:

@@ -1,7 +1,6 @@
 """Initial exterior orientations and object points: given, from known points, or from the images alone."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -14,15 +13,12 @@ from adjust.initial_values.model_formation import (
     intersected,
     known_field,
     orient_free_model,
-    typical_residual,
 )
 from adjust.initial_values.pose import Pose, Sight, image_distances
 from adjust.initial_values.resection import resect_images
-from adjust.initial_values.vertical_block import orient_vertical_block
 from adjust.problem.network import Exterior, Network
 from adjust.problem.observations import Distance
 
-TILTED = 0.005  # in principal distances: median residual of a block computed as vertical, if tilted by three degrees
 CLEARLY_WORSE = 5.0  # ratio of the median residuals above which a resection replaces a given orientation
 
 
@@ -42,7 +38,7 @@ def orient(network: Network, sights: Mapping[str, Sight]) -> tuple[dict[str, Pos
             block.poses[image.name] = _given_or_resected(image.exterior, block, image.name)
     extend(block)
     if sights and not block.poses:
-        block.poses.update(_oriented_by_images(block))
+        block.poses.update(orient_free_model(sights, block.firm))
         extend(block)
         if all(np.isnan(xyz).all() for xyz in block.rough.values()):
             _scale_by_distances(block, network.distances)
@@ -50,29 +46,6 @@ def orient(network: Network, sights: Mapping[str, Sight]) -> tuple[dict[str, Pos
     if missing:
         raise UnorientedError({name: _why_not_oriented(block, name) for name in missing})
     return block.poses, _all_points(block)
-
-
-def _oriented_by_images(block: Block) -> dict[str, Pose]:
-    """Orient images with too few known points for resection.
-
-    The images are first treated as a vertical block. If its residuals are those of tilted images, a spatial model is
-    formed and taken if its residuals are smaller.
-    """
-    vertical = orient_vertical_block(block.sights, block.firm)
-    left = _relative_residual(block, vertical)
-    if left < TILTED:
-        return vertical
-    model = orient_free_model(block.sights, block.firm)
-    return model if _relative_residual(block, model) < left or not vertical else vertical
-
-
-def _relative_residual(block: Block, poses: Mapping[str, Pose]) -> float:
-    """Median residual of images in these poses, in principal distances; infinite without poses."""
-    if not poses:
-        return np.inf
-    trial = replace(block, poses=dict(poses), points={})
-    extend(trial)
-    return typical_residual(trial) / min(sight.principal_distance_mm for sight in block.sights.values())
 
 
 def _coordinates(network: Network, firm: bool) -> dict[str, Array]:
