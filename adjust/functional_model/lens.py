@@ -87,17 +87,11 @@ class ImageEquations:
 
     The derivatives are with respect to the observed point xy (n, 2, 2), the ray (n, 2, 2), the interior orientation c,
     x0', y0' (n, 2, 3) and the family's parameters (n, 2, k).
-
-    Attributes
-    ----------
-    value : (n, 2) misclosures in mm.
-    imaged : images of the rays.
-    correction : corrections of the observed points.
     """
 
-    value: Array
-    imaged: Imaged
-    correction: Correction
+    value: Array  # (n, 2) misclosures in mm
+    imaged: Imaged  # images of the rays
+    correction: Correction  # corrections of the observed points
 
     @property
     def xy_jacobian(self) -> Array:
@@ -129,18 +123,12 @@ class ImageEquations:
 
 @dataclass(frozen=True)
 class Displacement:
-    """Distortion of n points: observed minus ideal place.
+    """Distortion of n points: observed minus ideal place."""
 
-    Attributes
-    ----------
-    value_um : (n, 2) distortion in µm; nan where the point has no ray.
-    by_unknowns_um : (n, 2, 1 + k) derivatives with respect to c and the parameters; 0 where the point has no ray.
-    imaged : (n,) mask of the points that have a ray.
-    """
-
-    value_um: Array
+    value_um: Array  # (n, 2) distortion in µm; nan where the point has no ray
+    # (n, 2, 1 + k) derivatives with respect to c and the parameters; 0 where the point has no ray
     by_unknowns_um: Array
-    imaged: Mask
+    imaged: Mask  # (n,) mask of the points that have a ray
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,19 +24,12 @@ _RELATED = 1e-6  # fraction of a source parameter's effect in the image: a param
 
 @dataclass(frozen=True)
 class ConvertedLens:
-    """Result of a conversion.
+    """Result of a conversion."""
 
-    Attributes
-    ----------
-    lens : lens in the target family, its covariance propagated from the source; exact for equivalent families.
-    estimated : names of the fitted parameters.
-    by_source : (3 + k, 3 + m) derivatives of the lens's values with respect to those of the source.
-    largest_mm, rms_mm : largest and rms residual of a point over the frame.
-    """
-
-    lens: Lens
-    estimated: tuple[str, ...]
-    by_source: Array
+    lens: Lens  # lens in the target family, its covariance propagated from the source; exact for equivalent families
+    estimated: tuple[str, ...]  # names of the fitted parameters
+    by_source: Array  # (3 + k, 3 + m) derivatives of the lens's values with respect to those of the source
+    # largest_mm, rms_mm: largest and rms residual of a point over the frame
     largest_mm: float
     rms_mm: float
 

@@ -97,18 +97,13 @@ def is_term(name: str) -> bool:
 
 @dataclass(frozen=True)
 class Bend:
-    """Scanner deformation S. Without terms and lens it is the identity.
+    """Scanner deformation S. Without terms and lens it is the identity."""
 
-    Attributes
-    ----------
-    terms : names of the terms in order.
-    center_mm, half_mm : centre and half extent of the scan in x and y.
-    lens : lens of the digital camera that took the scan, interior orientation in the comparator; None for a scanner.
-    """
-
-    terms: tuple[str, ...] = ()
+    terms: tuple[str, ...] = ()  # names of the terms in order
+    # center_mm, half_mm: centre and half extent of the scan in x and y
     center_mm: tuple[float, float] = (0.0, 0.0)
     half_mm: tuple[float, float] = (1.0, 1.0)
+    # lens of the digital camera that took the scan, interior orientation in the comparator; None for a scanner
     lens: Lens | None = None
 
     @property

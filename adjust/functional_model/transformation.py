@@ -382,20 +382,12 @@ def follows_tilts(spelling: str) -> bool:
 
 @dataclass(frozen=True)
 class Film:
-    """Film transformation of one image.
+    """Film transformation of one image."""
 
-    Attributes
-    ----------
-    transformation : name of the transformation.
-    parameters : (k,) in the order of `film_parameter_names`.
-    center_mm : (2,) comparator coordinates of a place in the middle of the image.
-    mirrored : whether the scan is mirrored.
-    """
-
-    transformation: str
-    parameters: Array
-    center_mm: Array
-    mirrored: bool = False
+    transformation: str  # name of the transformation
+    parameters: Array  # (k,) in the order of `film_parameter_names`
+    center_mm: Array  # (2,) comparator coordinates of a place in the middle of the image
+    mirrored: bool = False  # whether the scan is mirrored
 
     def camera_from_comparator(self, xy_mm: Array) -> Array:
         """Compute camera coordinates (n, 2) from comparator coordinates (n, 2), mm."""

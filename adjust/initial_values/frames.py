@@ -23,21 +23,13 @@ from adjust.problem.observations import Observations
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """Object points of all images in the fiducial system, image by image, sorted by point name within each.
-
-    Attributes
-    ----------
-    rows : (n,) numbers of the observations.
-    xy_mm : (n, 2) image coordinates.
-    starts : (images + 1,) index of the first point of each image; the last is n.
-    sigma_mm : (images,) median standard deviation of an image coordinate; 0 for an image without points.
-    """
+    """Object points of all images in the fiducial system, image by image, sorted by point name within each."""
 
     network: Network
-    rows: Indices
-    xy_mm: Array
-    starts: Indices
-    sigma_mm: Array
+    rows: Indices  # (n,) numbers of the observations
+    xy_mm: Array  # (n, 2) image coordinates
+    starts: Indices  # (images + 1,) index of the first point of each image; the last is n
+    sigma_mm: Array  # (images,) median standard deviation of an image coordinate; 0 for an image without points
 
     def part(self, image: int) -> slice:
         return slice(int(self.starts[image]), int(self.starts[image + 1]))
@@ -114,18 +106,11 @@ FEWEST_COMMON = 3  # common points of two parts: a mirrored similarity fits two 
 
 @dataclass(frozen=True)
 class JoinedFrame:
-    """Frame scanned in parts.
+    """Frame scanned in parts."""
 
-    Attributes
-    ----------
-    name : name of the frame.
-    films : film transformation of each part, by its name.
-    joins : (2,) coordinates of each join point in the fiducial system, mm.
-    """
-
-    name: str
-    films: Mapping[str, Film]
-    joins: Mapping[str, Array]
+    name: str  # name of the frame
+    films: Mapping[str, Film]  # film transformation of each part, by its name
+    joins: Mapping[str, Array]  # (2,) coordinates of each join point in the fiducial system, mm
 
 
 def joined_frame(network: Network, parts: Sequence[Image]) -> JoinedFrame:

@@ -14,20 +14,12 @@ from adjust.functional_model.rotation import rotation_from_vector
 
 @dataclass(frozen=True)
 class Sight:
-    """Points of one image, in the order of their ids.
+    """Points of one image, in the order of their ids."""
 
-    Attributes
-    ----------
-    points : (n,) ids.
-    xy_mm : (n, 2) ideal coordinates relative to the principal point, y up.
-    principal_distance_mm : principal distance.
-    sigma_mm : typical standard deviation of one coordinate.
-    """
-
-    points: tuple[str, ...]
-    xy_mm: Array
-    principal_distance_mm: float
-    sigma_mm: float
+    points: tuple[str, ...]  # (n,) ids
+    xy_mm: Array  # (n, 2) ideal coordinates relative to the principal point, y up
+    principal_distance_mm: float  # principal distance
+    sigma_mm: float  # typical standard deviation of one coordinate
 
     @property
     def rays(self) -> Array:

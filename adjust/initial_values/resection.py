@@ -37,20 +37,12 @@ POINTS_AT_ONCE = 20_000
 
 
 class Effort(NamedTuple):
-    """Effort of a resection.
+    """Effort of a resection."""
 
-    Attributes
-    ----------
-    triples : triples of points per image.
-    points : largest number of points on which poses are tested.
-    refined : poses refined per image; must include both minima of a flat field.
-    rounds : number of refinements.
-    """
-
-    triples: int
-    points: int
-    refined: int
-    rounds: int
+    triples: int  # triples of points per image
+    points: int  # largest number of points on which poses are tested
+    refined: int  # poses refined per image; must include both minima of a flat field
+    rounds: int  # number of refinements
 
 
 QUICK, THOROUGH = Effort(5, 30, 2, 1), Effort(MAX_TRIPLES, 200, 16, 2)
@@ -186,25 +178,16 @@ def distance_together(
 
 @dataclass(frozen=True, eq=False)
 class _Fields:
-    """Padded arrays of the known points in k images.
+    """Padded arrays of the known points in k images."""
 
-    Attributes
-    ----------
-    points : (k, n, 3), reduced to their mean and divided by their extent.
-    tangents : (k, n, 2) image coordinates over c.
-    present : (k, n) mask of the points that exist, the padding last.
-    origin, size : (k, 3) mean and (k,) extent of the points.
-    c : (k,) principal distances, mm.
-    floor : (k,) lower bounds of the standard deviation of a tangent.
-    """
-
-    points: Array
-    tangents: Array
-    present: Mask
+    points: Array  # (k, n, 3), reduced to their mean and divided by their extent
+    tangents: Array  # (k, n, 2) image coordinates over c
+    present: Mask  # (k, n) mask of the points that exist, the padding last
+    # origin, size: (k, 3) mean and (k,) extent of the points
     origin: Array
     size: Array
-    c: Array
-    floor: Array
+    c: Array  # (k,) principal distances, mm
+    floor: Array  # (k,) lower bounds of the standard deviation of a tangent
 
     @classmethod
     def from_fields(cls, fields: Sequence[KnownField], c: Array) -> "_Fields":

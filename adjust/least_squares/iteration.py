@@ -33,40 +33,25 @@ LARGEST_STRETCH = 10.0  # largest ratio of an accelerated step to the plain one
 
 
 class Iteration(NamedTuple):
-    """Record of a step of the iteration.
+    """Record of a step of the iteration."""
 
-    Attributes
-    ----------
-    vpv : v'Pv after the step.
-    largest_step_sigmas : length of the step: the largest change of any function of the unknowns, in its sigmas.
-    damping : 0 for an undamped Gauss-Newton step.
-    attempts : trials, each with more damping, until v'Pv did not increase and every point had an image.
-    """
-
-    vpv: float
-    largest_step_sigmas: float
-    damping: float
-    attempts: int
+    vpv: float  # v'Pv after the step
+    largest_step_sigmas: float  # length of the step: the largest change of any function of the unknowns, in its sigmas
+    damping: float  # 0 for an undamped Gauss-Newton step
+    attempts: int  # trials, each with more damping, until v'Pv did not increase and every point had an image
 
 
 @dataclass(frozen=True)
 class Linearised:
-    """Observation equations linearised at a state.
-
-    Attributes
-    ----------
-    computed_mm, v_mm : (n, 2) computed observations and residuals.
-    by_observation : (n, 2, 2) A, derivatives of the condition equations with respect to the observations.
-    rows : whitened rows.
-    vpv : v'Pv.
-    """
+    """Observation equations linearised at a state."""
 
     state: State
+    # computed_mm, v_mm: (n, 2) computed observations and residuals
     computed_mm: Array
     v_mm: Array
-    by_observation: Array
-    rows: WhitenedRows
-    vpv: float
+    by_observation: Array  # (n, 2, 2) A, derivatives of the condition equations with respect to the observations
+    rows: WhitenedRows  # whitened rows
+    vpv: float  # v'Pv
 
     @cached_property
     def factor(self) -> Factor:
@@ -176,24 +161,16 @@ def _eased(damping: float, gain: float) -> float:
 
 @dataclass(frozen=True)
 class _Moved:
-    """Accepted step.
+    """Accepted step."""
 
-    Attributes
-    ----------
-    end : equations after the step.
-    sigmas : length of the step, in standard deviations.
-    damping, gain, attempts : damping, ratio of the actual to the predicted decrease of v'Pv, number of trials.
-    solution : (n,) solution of the linear equations.
-    taken : (n,) the step taken: this solution, or the corrected or accelerated one.
-    """
-
-    end: Linearised
-    sigmas: float
+    end: Linearised  # equations after the step
+    sigmas: float  # length of the step, in standard deviations
+    # damping, gain, attempts: damping, ratio of the actual to the predicted decrease of v'Pv, number of trials
     damping: float
     gain: float
     attempts: int
-    solution: Array
-    taken: Array
+    solution: Array  # (n,) solution of the linear equations
+    taken: Array  # (n,) the step taken: this solution, or the corrected or accelerated one
 
 
 def _step(

@@ -17,19 +17,14 @@ ELEMENTS_AT_ONCE = 2_000_000  # matrix elements of the blocks in one batch
 
 @dataclass(frozen=True)
 class Touched:
-    """Unknowns of b blocks of equal shape, and the columns of their derivatives.
+    """Unknowns of b blocks of equal shape, and the columns of their derivatives."""
 
-    Attributes
-    ----------
-    rows : (b, m) observations of each block.
-    own, shared : (b, o), (b, s) numbers of the free unknowns.
-    columns : (b, m, k) column of each derivative, own unknowns first; the column after the last for fixed or absent
-        quantities. b or m is 1 where all blocks or all observations agree.
-    """
-
-    rows: Indices
+    rows: Indices  # (b, m) observations of each block
+    # own, shared: (b, o), (b, s) numbers of the free unknowns
     own: Indices
     shared: Indices
+    # (b, m, k) column of each derivative, own unknowns first; the column after the last for fixed or absent quantities.
+    # b or m is 1 where all blocks or all observations agree.
     columns: Indices
 
 

@@ -19,21 +19,13 @@ from adjust.problem.problem import ABSENT, Problem, State
 
 @dataclass(frozen=True)
 class WhitenedRows:
-    """Rows of unit weight; iterates over the blocks of `Numbering.touched`, formed on demand, and of `further`.
-
-    Attributes
-    ----------
-    root : (n, 2, 2) Cholesky factor L of A C A' = L L'.
-    matrix : (n, 2, k) derivatives with respect to the unknowns at `Problem.columns`.
-    right : (n, 2) right sides.
-    further : one block for each further observation.
-    """
+    """Rows of unit weight; iterates over the blocks of `Numbering.touched`, formed on demand, and of `further`."""
 
     numbering: Numbering
-    root: Array
-    matrix: Array
-    right: Array
-    further: tuple[Blocks, ...]
+    root: Array  # (n, 2, 2) Cholesky factor L of A C A' = L L'
+    matrix: Array  # (n, 2, k) derivatives with respect to the unknowns at `Problem.columns`
+    right: Array  # (n, 2) right sides
+    further: tuple[Blocks, ...]  # one block for each further observation
 
     def __iter__(self) -> Iterator[Blocks]:
         for touched in self.numbering.touched:

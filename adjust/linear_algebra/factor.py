@@ -18,20 +18,12 @@ Number = TypeVar("Number", bound=np.generic)
 
 @dataclass(frozen=True)
 class Blocks:
-    """Observation equations of unit weight of b blocks of equal shape.
+    """Observation equations of unit weight of b blocks of equal shape."""
 
-    Attributes
-    ----------
-    own : (b, o) numbers of each block's own unknowns.
-    shared : (b, s) numbers of the shared unknowns that it involves.
-    matrix : (b, m, o + s) design matrices.
-    right : (b, m) right sides.
-    """
-
-    own: Indices
-    shared: Indices
-    matrix: Array
-    right: Array
+    own: Indices  # (b, o) numbers of each block's own unknowns
+    shared: Indices  # (b, s) numbers of the shared unknowns that it involves
+    matrix: Array  # (b, m, o + s) design matrices
+    right: Array  # (b, m) right sides
 
 
 @dataclass(frozen=True)
@@ -102,20 +94,14 @@ class ReducedRows:
 
 @dataclass(frozen=True)
 class Factor:
-    """Square root of the normal equations: the triangles of the blocks, and that of the s shared unknowns.
+    """Square root of the normal equations: the triangles of the blocks, and that of the s shared unknowns."""
 
-    Attributes
-    ----------
-    eliminated : blocks, with their own unknowns eliminated.
-    triangle, right : factor and right side (s,) of the shared unknowns, which are the first s.
-    scale : (n,) norms of the columns, priors included; the scaled unknowns are the unknowns times scale.
-    steady : the inverses of the triangles are small, so that no singular value of the design matrix is near 0.
-    """
-
-    eliminated: Eliminated
+    eliminated: Eliminated  # blocks, with their own unknowns eliminated
+    # triangle, right: factor and right side (s,) of the shared unknowns, which are the first s
     triangle: Triangle
     right: Array
-    scale: Array
+    scale: Array  # (n,) norms of the columns, priors included; the scaled unknowns are the unknowns times scale
+    # the inverses of the triangles are small, so that no singular value of the design matrix is near 0
     steady: bool = False
 
     @property

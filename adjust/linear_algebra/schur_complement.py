@@ -152,25 +152,15 @@ def _orthonormal(by_block: csr_array, of: Indices, columns: Array, by_prior: Arr
 
 @dataclass(frozen=True)
 class SparseBlocks:
-    """Blocks after elimination: triangle own + border shared = right, for the unscaled unknowns.
-
-    Attributes
-    ----------
-    triangle : (b, o, o).
-    parts : (m, o, w) border in the groups, for the pairs of rows `Pattern.order`.
-    alone : (b, o, t) border in the single unknowns.
-    right : (b, o).
-    orthonormal : (o, 2, m) orthonormalised columns of the own unknowns.
-    scale : (n,) as in `Factor`.
-    """
+    """Blocks after elimination: triangle own + border shared = right, for the unscaled unknowns."""
 
     rows: SparseRows
-    triangle: Array
-    parts: Array
-    alone: Array
-    right: Array
-    orthonormal: Array
-    scale: Array
+    triangle: Array  # (b, o, o)
+    parts: Array  # (m, o, w) border in the groups, for the pairs of rows `Pattern.order`
+    alone: Array  # (b, o, t) border in the single unknowns
+    right: Array  # (b, o)
+    orthonormal: Array  # (o, 2, m) orthonormalised columns of the own unknowns
+    scale: Array  # (n,) as in `Factor`
 
     @property
     def own(self) -> Indices:

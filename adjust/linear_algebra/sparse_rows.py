@@ -18,23 +18,18 @@ ROWS_AT_ONCE = 20_000  # pairs of rows in one batch, which then fits the process
 
 @dataclass(frozen=True)
 class Pattern:
-    """Sparsity pattern of n pairs of rows: unknowns of one of b blocks, of one of g groups, and single ones.
+    """Sparsity pattern of n pairs of rows: unknowns of one of b blocks, of one of g groups, and single ones."""
 
-    Attributes
-    ----------
-    columns : own (o,), group (w,), single (c,) columns of the derivatives with respect to these unknowns.
-    block, group : (n,) block and group of each pair; b and g for none.
-    own, members, single : (b + 1, o), (g + 1, w), (n, c) numbers of the unknowns, -1 for none.
-    count : number of shared unknowns: those of the groups, and the single ones.
-    """
-
+    # own (o,), group (w,), single (c,) columns of the derivatives with respect to these unknowns
     columns: tuple[Indices, Indices, Indices]
+    # block, group: (n,) block and group of each pair; b and g for none
     block: Indices
     group: Indices
+    # own, members, single: (b + 1, o), (g + 1, w), (n, c) numbers of the unknowns, -1 for none
     own: Indices
     members: Indices
     single: Indices
-    count: int
+    count: int  # number of shared unknowns: those of the groups, and the single ones
 
     @cached_property
     def singles(self) -> Indices:
@@ -104,21 +99,13 @@ class Pattern:
 
 @dataclass(frozen=True)
 class SparseRows:
-    """Observation equations in pairs of rows of unit weight, with a sparsity pattern.
-
-    Attributes
-    ----------
-    matrix : (n, 2, k) derivatives with respect to the unknowns in the pattern.
-    right : (n, 2) right sides.
-    further : additional rows in shared unknowns only.
-    arranged : returns all rows as dense blocks, for rare uses.
-    """
+    """Observation equations in pairs of rows of unit weight, with a sparsity pattern."""
 
     pattern: Pattern
-    matrix: Array
-    right: Array
-    further: tuple[Blocks, ...]
-    arranged: Arranged
+    matrix: Array  # (n, 2, k) derivatives with respect to the unknowns in the pattern
+    right: Array  # (n, 2) right sides
+    further: tuple[Blocks, ...]  # additional rows in shared unknowns only
+    arranged: Arranged  # returns all rows as dense blocks, for rare uses
 
     def equations(self, fronts: Fronts) -> "SharedEquations":
         """Normal equations of all rows in the shared unknowns, before the own ones are eliminated."""
@@ -171,17 +158,11 @@ class SparseRows:
 
 @dataclass(frozen=True)
 class SharedEquations:
-    """Normal equations of the shared unknowns.
-
-    Attributes
-    ----------
-    values : normal matrices (k + a, k + a) of all fronts, one after the other; the lower triangles count.
-    right : (s,) right side.
-    """
+    """Normal equations of the shared unknowns."""
 
     fronts: Fronts
-    values: Array
-    right: Array
+    values: Array  # normal matrices (k + a, k + a) of all fronts, one after the other; the lower triangles count
+    right: Array  # (s,) right side
 
     @staticmethod
     def zeros(fronts: Fronts) -> "SharedEquations":

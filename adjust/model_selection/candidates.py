@@ -44,19 +44,13 @@ SETS = {"ebner": ("b1", "b2"), "legendre(3)": ("a10", "a01")}  # their parameter
 
 @dataclass(frozen=True)
 class Model:
-    """Model of a network.
+    """Model of a network."""
 
-    Attributes
-    ----------
-    transformation : of all images that have one.
-    family, parameters : distortion family and estimated parameters of every camera.
-    bends : scanner terms.
-    """
-
-    transformation: Transformation
+    transformation: Transformation  # of all images that have one
+    # family, parameters: distortion family and estimated parameters of every camera
     family: str = "none"
     parameters: tuple[str, ...] = ()
-    bends: Bends = ()
+    bends: Bends = ()  # scanner terms
 
     @property
     def name(self) -> str:

@@ -26,19 +26,13 @@ UM_PER_MM = 1000.0
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """Prediction errors of the rays (image points) of left-out points.
+    """Prediction errors of the rays (image points) of left-out points."""
 
-    Attributes
-    ----------
-    rms_um : rms per axis, in the comparator.
-    sigmas : the same in standard deviations of the observations; 1 for a perfect model, apart from the errors of the
-        prediction itself.
-    rays : number of predicted rays.
-    """
-
-    rms_um: float
+    rms_um: float  # rms per axis, in the comparator
+    # the same in standard deviations of the observations; 1 for a perfect model, apart from the errors of the
+    # prediction itself
     sigmas: float
-    rays: int
+    rays: int  # number of predicted rays
 
 
 def folds(network: Network, options: Options) -> tuple[frozenset[str], ...]:

@@ -107,20 +107,14 @@ def _scanners(network: Network) -> list[str]:
 
 @dataclass(frozen=True)
 class _Equations:
-    """Normal equations of the terms of one scanner, all other unknowns eliminated.
+    """Normal equations of the terms of one scanner, all other unknowns eliminated."""
 
-    Attributes
-    ----------
-    terms : names.
-    normal, right : (k, k), (k,).
-    known : (k,) diagonal of `normal` if everything else were known.
-    vpv, redundancy : of the adjustment without a term.
-    """
-
-    terms: tuple[str, ...]
+    terms: tuple[str, ...]  # names
+    # normal, right: (k, k), (k,)
     normal: Array
     right: Array
-    known: Array
+    known: Array  # (k,) diagonal of `normal` if everything else were known
+    # vpv, redundancy: of the adjustment without a term
     vpv: float
     redundancy: int
 

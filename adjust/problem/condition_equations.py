@@ -38,22 +38,13 @@ class Derivatives:
 
 @dataclass(frozen=True)
 class TargetImages:
-    """Images of the targets of one camera for a state.
+    """Images of the targets of one camera for a state."""
 
-    Attributes
-    ----------
-    camera : name.
-    rows : rows of the observations.
-    ray : (n, 2) rays.
-    in_camera : (n, 3) vectors to the points in the camera frame.
-    imaged : images of the rays.
-    """
-
-    camera: str
-    rows: Rows
-    ray: Array
-    in_camera: Array
-    imaged: Imaged
+    camera: str  # name
+    rows: Rows  # rows of the observations
+    ray: Array  # (n, 2) rays
+    in_camera: Array  # (n, 3) vectors to the points in the camera frame
+    imaged: Imaged  # images of the rays
 
 
 @dataclass(frozen=True)
@@ -250,20 +241,12 @@ def _camera_axes_derivative(ray_jacobian: Array, shown: TargetImages) -> Array:
 
 @dataclass(frozen=True)
 class _FilmDerivatives:
-    """Camera coordinates and their derivatives.
+    """Camera coordinates and their derivatives."""
 
-    Attributes
-    ----------
-    camera_xy : (n, 2) camera coordinates.
-    xy_jacobian : (n, 2, 2) with respect to the comparator coordinates.
-    parameter_jacobian : (n, 2, k) with respect to the films' centred parameters.
-    by_scanner : (n, 2, s) with respect to the scanners' parameters.
-    """
-
-    camera_xy: Array
-    xy_jacobian: Array
-    parameter_jacobian: Array
-    by_scanner: Array
+    camera_xy: Array  # (n, 2) camera coordinates
+    xy_jacobian: Array  # (n, 2, 2) with respect to the comparator coordinates
+    parameter_jacobian: Array  # (n, 2, k) with respect to the films' centred parameters
+    by_scanner: Array  # (n, 2, s) with respect to the scanners' parameters
 
 
 def _film_derivatives(problem: Problem, state: State, xy_mm: Array) -> _FilmDerivatives:

@@ -39,21 +39,14 @@ class GivenGroup(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class VarianceFactor:
-    """sigma0, the square root of the variance factor, and its source.
+    """sigma0, the square root of the variance factor, and its source."""
 
-    Attributes
-    ----------
-    sigma0 : 1 without sufficient redundancy; standard deviations are then a priori.
-    redundancy : redundancy of the observations used; 0 where none have enough.
-    left_out : given values that only define the datum or agree better than their standard deviations allow. They are
-        not used for sigma0 and not multiplied by it.
-    positions : (k,) positions of these unknowns.
-    """
-
-    sigma0: float
-    redundancy: float
+    sigma0: float  # 1 without sufficient redundancy; standard deviations are then a priori
+    redundancy: float  # redundancy of the observations used; 0 where none have enough
+    # given values that only define the datum or agree better than their standard deviations allow. They are not used
+    # for sigma0 and not multiplied by it.
     left_out: tuple[GivenGroup, ...] = ()
-    positions: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
+    positions: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))  # (k,) positions of these unknowns
 
     @property
     def is_a_priori(self) -> bool:

@@ -19,23 +19,15 @@ from adjust.problem.unknowns import Unknowns
 
 @dataclass(frozen=True)
 class FurtherObservation:
-    """Correlated observations (m,) of functions of some unknowns; in this base class of the unknowns themselves.
+    """Correlated observations (m,) of functions of some unknowns; in this base class of the unknowns themselves."""
 
-    Attributes
-    ----------
-    group : name of the group in the result.
-    names, labels : (m,) names in files and in messages.
-    positions : (k,) positions of the unknowns.
-    observed : (m,) in the units of the unknowns.
-    covariance : (m, m).
-    """
-
-    group: str
+    group: str  # name of the group in the result
+    # names, labels: (m,) names in files and in messages
     names: tuple[str, ...]
     labels: tuple[str, ...]
-    positions: Indices
-    observed: Array
-    covariance: Array
+    positions: Indices  # (k,) positions of the unknowns
+    observed: Array  # (m,) in the units of the unknowns
+    covariance: Array  # (m, m)
 
     def computed(self, values: Array) -> Array:
         """Compute the functions (m,) from the values (n,) of all unknowns."""

@@ -44,25 +44,16 @@ class State:
 
 @dataclass(frozen=True)
 class Films:
-    """Images with one kind of film transformation, and their observations.
+    """Images with one kind of film transformation, and their observations."""
 
-    Attributes
-    ----------
-    kind : formula.
-    images : (m,) numbers of the images.
-    positions : (m, k) positions of their parameters.
-    center_mm, half_mm : (m, 2), (m,) centre and half size of their extents.
-    rows : (n,) rows of their observations.
-    of : (n,) index of each observation's image among the m.
-    """
-
-    kind: FilmKind
-    images: Indices
-    positions: Indices
+    kind: FilmKind  # formula
+    images: Indices  # (m,) numbers of the images
+    positions: Indices  # (m, k) positions of their parameters
+    # center_mm, half_mm: (m, 2), (m,) centre and half size of their extents
     center_mm: Array
     half_mm: Array
-    rows: Indices
-    of: Indices
+    rows: Indices  # (n,) rows of their observations
+    of: Indices  # (n,) index of each observation's image among the m
 
     @cached_property
     def centers_mm(self) -> Array:
@@ -114,23 +105,16 @@ class Parts(NamedTuple):
 
 @dataclass(frozen=True)
 class Problem:
-    """Network with its list of unknowns.
+    """Network with its list of unknowns."""
 
-    Attributes
-    ----------
-    network : the network.
-    unknowns : all quantities, numbered.
-    mirrored : names of the images whose scan is mirrored.
-    by_elements : evaluate the distortion at the observed camera point instead of the adjusted one, so that every
-        observation is an explicit function of the unknowns (adjustment by elements, of indirect observations).
-    pseudo_observed : standard deviations of pseudo-observations that hold free unknowns near their given values, by
-        position (see `rank_defect.flat_valleys`). They are not observations and do not appear in the result.
-    """
-
-    network: Network
-    unknowns: Unknowns
-    mirrored: frozenset[str]
+    network: Network  # the network
+    unknowns: Unknowns  # all quantities, numbered
+    mirrored: frozenset[str]  # names of the images whose scan is mirrored
+    # evaluate the distortion at the observed camera point instead of the adjusted one, so that every observation is an
+    # explicit function of the unknowns (adjustment by elements, of indirect observations)
     by_elements: bool = False
+    # standard deviations of pseudo-observations that hold free unknowns near their given values, by position (see
+    # `rank_defect.flat_valleys`). They are not observations and do not appear in the result.
     pseudo_observed: Mapping[int, float] = field(default_factory=dict)
 
     @cached_property

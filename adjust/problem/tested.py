@@ -72,21 +72,14 @@ PRIOR_GROUPS = ("datum", "control", "interior", "scanner", "board", "exterior")
 
 @dataclass(frozen=True)
 class Tested:
-    """Unit of a test: one image point or one given quantity, rejected as a whole.
+    """Unit of a test: one image point or one given quantity, rejected as a whole."""
 
-    Attributes
-    ----------
-    group : "target", "tie", "fiducial" or "join" in an image; "datum" (given place of a fiducial), "control" (given
-        object coordinate), "interior", "scanner", "board" or "exterior" (given element).
-    owner : image, camera, scanner or board; empty for object points.
-    point : id; empty for the elements.
-    coordinates : x and y if tested jointly, else a single one.
-    """
-
+    # "target", "tie", "fiducial" or "join" in an image; "datum" (given place of a fiducial), "control" (given object
+    # coordinate), "interior", "scanner", "board" or "exterior" (given element)
     group: str
-    owner: str
-    point: str
-    coordinates: tuple[str, ...]
+    owner: str  # image, camera, scanner or board; empty for object points
+    point: str  # id; empty for the elements
+    coordinates: tuple[str, ...]  # x and y if tested jointly, else a single one
 
     @property
     def name(self) -> str:

@@ -86,22 +86,15 @@ REACH_RADII = 8  # at which the standard deviation of the distortion is evaluate
 
 @dataclass(frozen=True)
 class LensReach:
-    """Extent of the observations of a lens.
+    """Extent of the observations of a lens."""
 
-    Attributes
-    ----------
-    radius_mm : from the principal point to the outermost target.
-    corner_mm : from the principal point to the farthest corner of the frame; nan if the frame is unknown.
-    sigma_um, corner_sigma_um : largest standard deviation of the distortion within the radius, and at the corner; nan
-        where the lens forms no image.
-    frame_mm : lower left and upper right corner of the frame; None if unknown.
-    """
-
-    radius_mm: float
-    corner_mm: float
+    radius_mm: float  # from the principal point to the outermost target
+    corner_mm: float  # from the principal point to the farthest corner of the frame; nan if the frame is unknown
+    # sigma_um, corner_sigma_um: largest standard deviation of the distortion within the radius, and at the corner; nan
+    # where the lens forms no image
     sigma_um: float
     corner_sigma_um: float
-    frame_mm: Corners | None
+    frame_mm: Corners | None  # lower left and upper right corner of the frame; None if unknown
 
     @property
     def share(self) -> float:

@@ -88,24 +88,16 @@ class UnitRows:
 
 @dataclass(frozen=True)
 class Run:
-    """One adjustment with given weights, and its end.
+    """One adjustment with given weights, and its end."""
 
-    Attributes
-    ----------
-    problem : as given; `numbering` holds it with the weights applied to the priors.
-    singular : null directions at the end, with or without a solution.
-    settled : whether reweighting has converged.
-    removed : gross errors removed by data snooping.
-    """
-
-    problem: Problem
+    problem: Problem  # as given; `numbering` holds it with the weights applied to the priors
     numbering: Numbering
     weighting: Weighting
     solution: Solution
-    singular: tuple[NullDirection, ...]
+    singular: tuple[NullDirection, ...]  # null directions at the end, with or without a solution
     factor: Factor
-    settled: bool = True
-    removed: tuple[GrossError, ...] = ()
+    settled: bool = True  # whether reweighting has converged
+    removed: tuple[GrossError, ...] = ()  # gross errors removed by data snooping
 
     @property
     def end(self) -> Linearised:

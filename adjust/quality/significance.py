@@ -146,24 +146,17 @@ UNSEEN = 1e-6  # least redundancy of a direction that the other observations det
 
 @dataclass(frozen=True, eq=False)
 class CalibrationTest:
-    """Compatibility test of the images with correlated observations.
-
-    Attributes
-    ----------
-    parameters : (m,).
-    difference, sigma : (m,) value from the images minus observed value, and its a-posteriori standard deviation; nan
-        and inf where the images do not determine it.
-    statistic : of all together, F with `freedom` and the redundancy of the other observations.
-    probability : p-value.
-    """
+    """Compatibility test of the images with correlated observations."""
 
     group: str
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[Parameter, ...]  # (m,)
+    # difference, sigma: (m,) value from the images minus observed value, and its a-posteriori standard deviation; nan
+    # and inf where the images do not determine it
     difference: Array
     sigma: Array
-    statistic: float
+    statistic: float  # of all together, F with `freedom` and the redundancy of the other observations
     freedom: int
-    probability: float
+    probability: float  # p-value
 
     @property
     def direction(self) -> tuple[int, ...]:

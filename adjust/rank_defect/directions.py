@@ -33,23 +33,15 @@ class Reason(NamedTuple):
 
 @dataclass(frozen=True)
 class NamedDirection:
-    """Name of a null direction.
+    """Name of a null direction."""
 
-    Attributes
-    ----------
-    rank : the lowest one that applies gives the name.
-    functional : (n,) function of the unknowns that the direction changes.
-    motion : what moves, in words.
-    reason : why, and the remedy.
-    partner : another unknown, with its words, whose prior would fix the direction if it moves too.
-    by_companion : reasons where a lens ("lens") or fiducial marks ("marks") move along.
-    """
-
-    rank: int
-    functional: Array
-    motion: str
-    reason: Reason
+    rank: int  # the lowest one that applies gives the name
+    functional: Array  # (n,) function of the unknowns that the direction changes
+    motion: str  # what moves, in words
+    reason: Reason  # why, and the remedy
+    # another unknown, with its words, whose prior would fix the direction if it moves too
     partner: tuple[Parameter, str] | None = None
+    # reasons where a lens ("lens") or fiducial marks ("marks") move along
     by_companion: Mapping[str, Reason] = field(default_factory=dict)
 
     def sentence(self, moved: Iterable[Parameter]) -> tuple[str, str]:

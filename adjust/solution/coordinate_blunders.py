@@ -25,22 +25,14 @@ ENOUGH = 5  # points needed to identify a wrong one: the resection without it is
 
 @dataclass(frozen=True)
 class FarPoint:
-    """Given point whose rays meet elsewhere.
+    """Given point whose rays meet elsewhere."""
 
-    Attributes
-    ----------
-    name : id of the point.
-    images : number of images that show it.
-    place : (3,) intersection of its rays, in object units.
-    miss_mm : median distance in the images of its marks from the projected given coordinates; inf behind the cameras.
-    others_mm : largest such distance of the other given points.
-    """
-
-    name: str
-    images: int
-    place: Array
+    name: str  # id of the point
+    images: int  # number of images that show it
+    place: Array  # (3,) intersection of its rays, in object units
+    # median distance in the images of its marks from the projected given coordinates; inf behind the cameras
     miss_mm: float
-    others_mm: float
+    others_mm: float  # largest such distance of the other given points
 
 
 def far_points(problem: Problem, family: float) -> list[FarPoint]:
@@ -130,22 +122,13 @@ def _sights(problem: Problem) -> dict[str, Sight]:
 
 @dataclass(frozen=True)
 class Slip:
-    """Given point that contradicts all other information significantly.
+    """Given point that contradicts all other information significantly."""
 
-    Attributes
-    ----------
-    far : the point.
-    place : (3,) its place in an adjustment without its given coordinates.
-    sigma : largest standard deviation of that place.
-    off : (3,) given coordinates minus place.
-    explained : sentence on the clerical error that would explain it; may be empty.
-    """
-
-    far: FarPoint
-    place: Array
-    sigma: float
-    off: Array
-    explained: str
+    far: FarPoint  # the point
+    place: Array  # (3,) its place in an adjustment without its given coordinates
+    sigma: float  # largest standard deviation of that place
+    off: Array  # (3,) given coordinates minus place
+    explained: str  # sentence on the clerical error that would explain it; may be empty
 
     @property
     def sentence(self) -> str:

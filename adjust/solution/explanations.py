@@ -46,20 +46,12 @@ UM_PER_MM = 1000.0
 
 @dataclass(frozen=True)
 class AddedNoise:
-    """Noise added to marks.
+    """Noise added to marks."""
 
-    Attributes
-    ----------
-    marks : "marks", "targets" or "fiducials".
-    sigma_mm : added standard deviation.
-    covariance_mm2 : (n, 2, 2) given covariances of the marks.
-    run : adjustment with the added noise.
-    """
-
-    marks: str
-    sigma_mm: float
-    covariance_mm2: Array
-    run: Run
+    marks: str  # "marks", "targets" or "fiducials"
+    sigma_mm: float  # added standard deviation
+    covariance_mm2: Array  # (n, 2, 2) given covariances of the marks
+    run: Run  # adjustment with the added noise
 
     @property
     def words(self) -> tuple[str, str]:

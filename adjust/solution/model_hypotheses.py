@@ -143,24 +143,14 @@ Words = Callable[[Run, Indices, float], tuple[str, str]]
 
 @dataclass(frozen=True)
 class ModelHypothesis:
-    """Model with additional unknowns.
+    """Model with additional unknowns."""
 
-    Attributes
-    ----------
-    kind : "radial", "decentering", "pixels", "groups" or "board".
-    words : returns cause (with figures) and remedy.
-    problem : problem that starts where the simpler model ended.
-    added : (k,) positions of the additional unknowns.
-    choices : natural logarithm of the number of models it was selected from.
-    contrasts : number of unknowns that all of these models would have together.
-    """
-
-    kind: str
-    words: Words
-    problem: Problem
-    added: Indices
-    choices: float = 0.0
-    contrasts: int = 0
+    kind: str  # "radial", "decentering", "pixels", "groups" or "board"
+    words: Words  # returns cause (with figures) and remedy
+    problem: Problem  # problem that starts where the simpler model ended
+    added: Indices  # (k,) positions of the additional unknowns
+    choices: float = 0.0  # natural logarithm of the number of models it was selected from
+    contrasts: int = 0  # number of unknowns that all of these models would have together
 
 
 def model_hypotheses(run: Run) -> Iterator[ModelHypothesis]:

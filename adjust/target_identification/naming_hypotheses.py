@@ -32,19 +32,14 @@ _CHUNK = 20_000  # hypotheses tested at a time, to limit memory
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Poses, camera = R X + t, best first.
+    """Poses, camera = R X + t, best first."""
 
-    Attributes
-    ----------
-    rotations, shifts : (k, 3, 3), (k, 3).
-    named : for each pose the agreeing points around the cluster (indices) and their marks.
-    tried : number of poses tested.
-    """
-
+    # rotations, shifts: (k, 3, 3), (k, 3)
     rotations: Array
     shifts: Array
+    # for each pose the agreeing points around the cluster (indices) and their marks
     named: list[tuple[Indices, Indices]]
-    tried: int
+    tried: int  # number of poses tested
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,26 +16,17 @@ _CROWD = 6  # nearest marks from which the local density is estimated
 
 @dataclass(frozen=True, eq=False)
 class Marks:
-    """Marks of an image; all lengths in principal distances.
+    """Marks of an image; all lengths in principal distances."""
 
-    Attributes
-    ----------
-    places : (m, 2) ideal image coordinates relative to the principal point, y up.
-    least, greatest : (2,) corners of the searched area.
-    sigma : standard deviation of one coordinate.
-    c : principal distance, mm.
-    c_sigma : its relative standard deviation.
-    tree : of the places.
-    nearest_of_cell, density_of_cell : look-up tables of the nearest mark and of the density of marks.
-    """
-
-    places: Array
+    places: Array  # (m, 2) ideal image coordinates relative to the principal point, y up
+    # least, greatest: (2,) corners of the searched area
     least: Array
     greatest: Array
-    sigma: float
-    c: float
-    c_sigma: float
-    tree: cKDTree
+    sigma: float  # standard deviation of one coordinate
+    c: float  # principal distance, mm
+    c_sigma: float  # its relative standard deviation
+    tree: cKDTree  # of the places
+    # nearest_of_cell, density_of_cell: look-up tables of the nearest mark and of the density of marks
     nearest_of_cell: Indices
     density_of_cell: Array
 
@@ -156,22 +147,13 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Grown:
-    """Result of growing a pose.
+    """Result of growing a pose."""
 
-    Attributes
-    ----------
-    view : fitted projection.
-    mark : mark of each identified point.
-    gate : largest distance of a mark from the predicted place of its point, in principal distances.
-    expected : number of points that the frame should show.
-    log10_chance : log10 of the expected number of false alarms over all possible hypotheses.
-    """
-
-    view: View
-    mark: dict[int, int] = field(default_factory=dict)
-    gate: float = 0.0
-    expected: int = 0
-    log10_chance: float = 0.0
+    view: View  # fitted projection
+    mark: dict[int, int] = field(default_factory=dict)  # mark of each identified point
+    gate: float = 0.0  # largest distance of a mark from the predicted place of its point, in principal distances
+    expected: int = 0  # number of points that the frame should show
+    log10_chance: float = 0.0  # log10 of the expected number of false alarms over all possible hypotheses
 
 
 def grow(view: View, points: Indices, named: Indices, xyz: Array, normals: Array, marks: Marks) -> Grown:
