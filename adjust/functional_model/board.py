@@ -54,10 +54,8 @@ def board_form(xyz: Array) -> BoardForm:
 
 
 def _to_sides(places: Array) -> Array:
-    """(2, 2) rotation by at most 45 degrees that aligns points (n, 2) with the smallest rectangle around them.
-
-    One side of that rectangle is an edge of the convex hull.
-    """
+    """(2, 2) rotation by at most 45 degrees that aligns points (n, 2) with the smallest rectangle around them."""
+    # One side of that rectangle is an edge of the convex hull.
     from scipy.spatial import ConvexHull  # slow import: longer than the adjustment of most boards
 
     corners = places[ConvexHull(places).vertices]

@@ -87,10 +87,8 @@ def opencv_fisheye(ray: Array, parameters: Array) -> DistortedRay:
 
 
 def _camera_axes(lens: DistortedRay, b1: float, b2: float, first: int) -> DistortedRay:
-    """Apply affinity and shear to distorted rays in OpenCV's axes and convert them to the camera's axes.
-
-    first: index of b1 among the parameters; b2 is the next.
-    """
+    """Apply affinity and shear to distorted rays in OpenCV's axes and convert them to the camera's axes."""
+    # first: index of b1 among the parameters; b2 is the next.
     scale = np.array([1.0 + b1, -1.0]) + 0.0 * b2  # complex where b1 or b2 is
 
     def camera_axes(straight: Array) -> Array:
@@ -159,10 +157,8 @@ def _lens(ray: Array, parameters: Array) -> DistortedRay:
 
 
 def _tilt(point: Array, tau_x: float, tau_y: float) -> DistortedRay:
-    """Project points onto a sensor that is tilted around its axes: R33 (r1 p / r3 p, r2 p / r3 p) - (R13, R23).
-
-    r1, r2, r3 are the rows of R = Ry(tau_y) Rx(tau_x), p = (x, y, 1).
-    """
+    """Project points onto a sensor that is tilted around its axes: R33 (r1 p / r3 p, r2 p / r3 p) - (R13, R23)."""
+    # r1, r2, r3 are the rows of R = Ry(tau_y) Rx(tau_x), p = (x, y, 1).
     (rx, rx_by_angle), (ry, ry_by_angle) = _turn(tau_x, 0), _turn(tau_y, 1)
     rotation, by_angles = ry @ rx, (ry @ rx_by_angle, ry_by_angle @ rx)
     *over, depth = _turned(rotation, point)

@@ -163,11 +163,9 @@ class Bend:
 
 
 def _remove_distortion(lens: Lens, scan_mm: Array) -> tuple[Array, Array]:
-    """Distortion-free image points (n, 2), and their derivatives (n, 2, 2) with respect to the observed ones.
-
-    The derivatives follow from the lens's condition equations by the implicit function theorem. Points are nan where
-    the lens folds over.
-    """
+    """Distortion-free image points (n, 2), and their derivatives (n, 2, 2) with respect to the observed ones."""
+    # The derivatives follow from the lens's condition equations by the implicit function theorem. Points are nan where
+    # the lens folds over.
     straight_mm, found = lens.ideal_from_observed(scan_mm)
     at = lens.equations(scan_mm, (straight_mm - lens.interior[1:]) / lens.interior[0])
     by_scan = lens.interior[0] * np.linalg.solve(-at.ray_jacobian, at.xy_jacobian)

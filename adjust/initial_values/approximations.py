@@ -164,10 +164,8 @@ def _known_place(network: Network, name: str) -> tuple[float, float, float]:
 
 
 def _sights(camera: Camera, frames: Frames, interior: Array) -> dict[str, Sight]:
-    """Correct the image coordinates of a camera for its prior distortion.
-
-    Raises AdjustmentError where this distortion is not invertible within an image (it folds the image over).
-    """
+    """Correct the image coordinates of a camera for its prior distortion."""
+    # Raises AdjustmentError where this distortion is not invertible within an image (it folds the image over).
     known = camera.distortion.parameters
     lens = Lens(camera.distortion, interior, camera.distortion.values)
     images = frames.camera_images(camera.name)

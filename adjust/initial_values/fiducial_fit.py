@@ -72,10 +72,8 @@ def _is_mirrored(comparator_mm: Array, camera_mm: Array) -> bool:
 
 
 def _determinant_where_marks_agree(comparator_mm: Array, camera_mm: Array) -> float | None:
-    """Determinant of the affine transformation on which all marks agree, negative for a mirrored scan.
-
-    None if the marks do not agree, are too few for a check, or are nearly collinear.
-    """
+    """Determinant of the affine transformation on which all marks agree, negative for a mirrored scan."""
+    # None if the marks do not agree, are too few for a check, or are nearly collinear.
     affine = film_kind("affine", False)
     if (
         len(comparator_mm) <= least_marks(affine)

@@ -150,10 +150,8 @@ def _marks(network: Network, part: Image) -> dict[Mark, Array]:
 
 
 def _placed(frame: str, marks_by_part: Mapping[str, Mapping[Mark, Array]]) -> tuple[dict[str, Film], dict[Mark, Array]]:
-    """Place the parts in the comparator system of the first; the part with most common points comes next.
-
-    Returns the similarity of each part, and the coordinates (2,) of all marks in the system of the first.
-    """
+    """Place the parts in the comparator system of the first; the part with most common points comes next."""
+    # Returns the similarity of each part, and the coordinates (2,) of all marks in the system of the first.
     left = list(marks_by_part)
     films: dict[str, Film] = {left[0]: (np.array([0.0, 0.0, 1.0, 0.0]), False)}
     place = dict(marks_by_part[left.pop(0)])

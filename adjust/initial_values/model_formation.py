@@ -92,10 +92,8 @@ def _essential_matrices(first: Array, second: Array) -> Array:
 
 
 def _constraint_coefficients(null: Array) -> Array:
-    """Coefficients (m, 10, 20) of det E = 0 and 2 E E' E - tr(E E') E = 0, E = x N1 + y N2 + z N3 + N4.
-
-    By interpolation: the constraints are evaluated at twenty points and the system of monomials is solved.
-    """
+    """Coefficients (m, 10, 20) of det E = 0 and 2 E E' E - tr(E E') E = 0, E = x N1 + y N2 + z N3 + N4."""
+    # By interpolation: the constraints are evaluated at twenty points and the system of monomials is solved.
     places = np.random.default_rng(0).uniform(-1.0, 1.0, (20, 3))
     monomials = (places[:, None, :] ** POWERS).prod(axis=2)
     weights = np.column_stack([places, np.ones(20)])

@@ -165,11 +165,9 @@ def _camera_coordinates(rotations: Array, shifts: Array, points: Array) -> Array
 def _normal_equations(
     rotations: Array, shifts: Array, points: Array, tangents: Array, weights: Array, by_bend: Array | None = None
 ) -> tuple[Array, Array]:
-    """Normal equations J'WJ (k, 6, 6) and J'Wr (k, 6) for a small rotation of the camera and a shift in its axes.
-
-    by_bend (k, n, 2): derivatives of the tangents with respect to distortion; adds two unknowns, the logarithm of the
-    principal distance and the distortion parameter.
-    """
+    """Normal equations J'WJ (k, 6, 6) and J'Wr (k, 6) for a small rotation of the camera and a shift in its axes."""
+    # by_bend (k, n, 2): derivatives of the tangents with respect to distortion; adds two unknowns, the logarithm of the
+    # principal distance and the distortion parameter.
     u, v, w = _camera_coordinates(rotations, shifts, points)
     inverse = -1.0 / np.minimum(w, -1e-9)
     p, q = u * inverse, v * inverse

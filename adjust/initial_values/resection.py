@@ -299,10 +299,8 @@ def _trimmed_counts(counts: Indices) -> Indices:
 
 
 def _robust_sigmas(squared: Array, counts: Indices) -> Array:
-    """Standard deviations (k,) of a coordinate from the smaller half of chi-square (2) distributed squares (k, n).
-
-    counts (k,): numbers of existing points; the squares of the padding are infinite.
-    """
+    """Standard deviations (k,) of a coordinate from the smaller half of chi-square (2) distributed squares (k, n)."""
+    # counts (k,): numbers of existing points; the squares of the padding are infinite.
     half = _trimmed_counts(counts)
     left_out = 1 - half / counts
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -176,10 +176,8 @@ class _Moved:
 def _step(
     numbering: Numbering, covariance_mm2: Array, at: Linearised, damping: float, lately: float, before: _Moved | None
 ) -> _Moved | None:
-    """Take the first step that decreases v'Pv, with increasing damping; None if there is none.
-
-    lately: damping of the last successful damped step, tried first where damping is needed. before: the step before.
-    """
+    """Take the first step that decreases v'Pv, with increasing damping; None if there is none."""
+    # lately: damping of the last successful damped step, tried first where damping is needed. before: the step before.
     problem = numbering.problem
     attempts = 0
     if damping == 0.0 and before is not None and before.damping == 0.0:
@@ -210,12 +208,10 @@ def _step(
 
 
 def _accelerated(numbering: Numbering, covariance_mm2: Array, at: Linearised, before: _Moved) -> _Moved | None:
-    """Accelerate an undamped step by the one before; None if that is not possible or no better.
-
-    In weakly determined directions, the second derivatives neglected with large residuals make Gauss-Newton steps
-    shrink slowly, or overshoot. The combination of the last two steps of least length replaces the step (Anderson 1965,
-    Iterative procedures for nonlinear integral equations; depth one).
-    """
+    """Accelerate an undamped step by the one before; None if that is not possible or no better."""
+    # In weakly determined directions, the second derivatives neglected with large residuals make Gauss-Newton steps
+    # shrink slowly, or overshoot. The combination of the last two steps of least length replaces the step (Anderson
+    # 1965, Iterative procedures for nonlinear integral equations; depth one).
     problem, factor = numbering.problem, at.factor
     step = np.zeros(len(problem.unknowns))
     step[numbering.free] = factor.solution
@@ -235,11 +231,9 @@ def _accelerated(numbering: Numbering, covariance_mm2: Array, at: Linearised, be
 
 
 def _bent(numbering: Numbering, at: Linearised, damping: float, step: Array) -> Array | None:
-    """Add the second-order correction to a damped step; None if it is too large or cannot be computed.
-
-    Geodesic acceleration (Transtrum and Sethna 2012, Improvements to the Levenberg-Marquardt algorithm): the second
-    derivative of the observations along the step, by a difference quotient, is added to the discrepancies.
-    """
+    """Add the second-order correction to a damped step; None if it is too large or cannot be computed."""
+    # Geodesic acceleration (Transtrum and Sethna 2012, Improvements to the Levenberg-Marquardt algorithm): the second
+    # derivative of the observations along the step, by a difference quotient, is added to the discrepancies.
     problem = numbering.problem
     ahead = computed_observations(problem, problem.step_state(at.state, PROBE * step))
     if ahead is None:

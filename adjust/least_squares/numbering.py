@@ -233,10 +233,8 @@ class _Blocks:
 
 
 def _arranged(derivatives: Indices, blocks: _Blocks, numbers: Indices) -> Iterator[Touched]:
-    """Group blocks by shape.
-
-    derivatives (n, k): numbers of the unknowns of each derivative; numbers: number of each unknown by position.
-    """
+    """Group blocks by shape."""
+    # derivatives (n, k): numbers of the unknowns of each derivative; numbers: number of each unknown by position.
     owned = numbers[blocks.owned]
     count, owns = int(numbers.max(initial=ABSENT)) + 1, owned != ABSENT
     first_own = count - int(owns.sum())

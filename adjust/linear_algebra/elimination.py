@@ -121,10 +121,8 @@ def _eliminate_blocks(blocks: Blocks, scale: Array, priors: tuple[Array, Array])
 def _eliminate_normally(
     rows: SparseRows, scale: Array, priors: tuple[Array, Array], equations: SharedEquations, lift: float
 ) -> Factor | None:
-    """Factorise with reduced normal equations of the shared unknowns; None if these are not positive definite.
-
-    lift: its square is added to the diagonal of the scaled normal equations.
-    """
+    """Factorise with reduced normal equations of the shared unknowns; None if these are not positive definite."""
+    # lift: its square is added to the diagonal of the scaled normal equations.
     fronts, squares = equations.fronts, equations.squares
     root_weight, prior_right = (prior[: fronts.count] for prior in priors)
     blocks = eliminated(rows, *priors, scale, equations)

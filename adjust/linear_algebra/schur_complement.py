@@ -130,10 +130,8 @@ def _eliminate(blocks: "SparseBlocks", weight: Array, prior: Array) -> None:
 
 
 def _orthonormal(by_block: csr_array, of: Indices, columns: Array, by_prior: Array) -> Array:
-    """Orthonormalise columns (o, 2, m), with rows (o, b, o) of priors below, in place by modified Gram-Schmidt.
-
-    by_block (b, m): sums over the blocks; of (m,): block of each pair. Returns the triangles (b, o, o).
-    """
+    """Orthonormalise columns (o, 2, m), with rows (o, b, o) of priors below, in place by modified Gram-Schmidt."""
+    # by_block (b, m): sums over the blocks; of (m,): block of each pair. Returns the triangles (b, o, o).
     count = len(columns)
     triangle = np.zeros((by_prior.shape[1], count, count))
     for i in range(count):

@@ -100,11 +100,9 @@ def choose(
 
 
 def _chosen(fits: "_Fits", given: Model, with_sets: bool) -> tuple[Candidate | None, tuple[str, ...]]:
-    """Select distortion, scanner terms and transformation in turn until none changes.
-
-    Also returns remarks on scanner terms that are not estimable. The scanner terms come before the transformation,
-    since a richer transformation could absorb them.
-    """
+    """Select distortion, scanner terms and transformation in turn until none changes."""
+    # Also returns remarks on scanner terms that are not estimable. The scanner terms come before the transformation,
+    # since a richer transformation could absorb them.
     film, bends = given.transformation, Bends()
     chosen: Candidate | None = None
     untold: tuple[str, ...] = ()

@@ -127,11 +127,9 @@ def inner_cofactor(
 
 
 def _reported(problem: Problem, state: State) -> csr_array:
-    """(n, n) derivatives of the reported quantities by the unknowns of the iteration.
-
-    These are omega, phi, kappa by rotation vectors, and film parameters by centred ones. Where phi is +-90 degrees,
-    only the sum or difference of omega and kappa is determined (pseudo-inverse).
-    """
+    """(n, n) derivatives of the reported quantities by the unknowns of the iteration."""
+    # These are omega, phi, kappa by rotation vectors, and film parameters by centred ones. Where phi is +-90 degrees,
+    # only the sum or difference of omega and kappa is determined (pseudo-inverse).
     count = len(problem.unknowns)
     angles = np.unique(problem.exterior[~problem.keeps_angles, 3:], axis=0)  # scans of one frame have one attitude
     by_vector = np.linalg.pinv(vector_by_angles(state.values[angles]))

@@ -151,10 +151,8 @@ def _figure(estimates: Estimates, marks: Sequence[Parameter]) -> Array:
 
 
 def _hold_figure(cofactor: Array, count: int, figure: Array) -> Array:
-    """Conditional cofactor matrix of the quantities, given the figure (k, m) of the m that follow the first `count`.
-
-    For functions f x that are held: Q - Q f' (f Q f')^-1 f Q; for a vague datum this is Baarda's S-transformation.
-    """
+    """Conditional cofactor matrix of the quantities, given the figure (k, m) of the m that follow the first `count`."""
+    # For functions f x that are held: Q - Q f' (f Q f')^-1 f Q; for a vague datum this is Baarda's S-transformation.
     size = figure.shape[1]
     keep = np.r_[:count, count + size : len(cofactor)]
     by_figure = figure @ cofactor[count : count + size]

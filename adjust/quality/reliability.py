@@ -122,10 +122,8 @@ def _over(shift: float, variance: Array, checked: Mask) -> Array:
 
 
 def _outer_effects(run: Run, errors: Array, tested: tuple[Tested, ...], shift: float) -> tuple[OuterEffect, ...]:
-    """Largest effect of single errors on every free camera parameter.
-
-    The errors are those of units (N, 2), and those of further observations that shift their test by `shift`.
-    """
+    """Largest effect of single errors on every free camera parameter."""
+    # The errors are those of units (N, 2), and those of further observations that shift their test by `shift`.
     unknowns, factor = run.numbering.problem.unknowns, run.factor
     cameras = np.concatenate([*unknowns.camera.values(), *unknowns.fiducial.values()]).astype(np.intp)
     free = run.numbering.free[: factor.shared_count]

@@ -198,11 +198,9 @@ def calibration_tests(run: Run, sigma0: float, redundancy: float) -> Iterator[Ca
 
 
 def _as_marks_show(along: Array, unseen: Mask, parameters: Sequence[Parameter]) -> Array:
-    """Combine changes (n, m) of the quantities with undetermined ones such that the fiducial marks move least.
-
-    The frame of the marks can shift, rotate and scale together with the camera. As in a comparison of two calibrations,
-    the reported change of c is then the one relative to the marks.
-    """
+    """Combine changes (n, m) of the quantities with undetermined ones such that the fiducial marks move least."""
+    # The frame of the marks can shift, rotate and scale together with the camera. As in a comparison of two
+    # calibrations, the reported change of c is then the one relative to the marks.
     is_mark = np.array([each.kind == "fiducial" for each in parameters])
     by_marks = np.linalg.pinv(along[:, unseen] * is_mark[:, None], rcond=UNSEEN)
     return np.asarray(along - along[:, unseen] @ (by_marks @ along))

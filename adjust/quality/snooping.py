@@ -181,11 +181,9 @@ class Snooping:
         return chosen
 
     def _hidden_pair(self, chosen: Sequence[int], limits: Array) -> list[int]:
-        """Two units that mask each other: each is significant without the other, and both are together.
-
-        Searched only if the test of v'Pv still fails, among the PAIRED worst units. In large networks no unit has such
-        an influence on another's residual, and the search is left out.
-        """
+        """Two units that mask each other: each is significant without the other, and both are together."""
+        # Searched only if the test of v'Pv still fails, among the PAIRED worst units. In large networks no unit has
+        # such an influence on another's residual, and the search is left out.
         if len(limits) > MOST_PAIRED:
             return []
         finite = np.isfinite(limits)

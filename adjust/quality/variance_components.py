@@ -169,11 +169,9 @@ def factor_sigmas(run: Run) -> dict[str, float]:
 
 
 def _traces(run: Run, members: Sequence[Mask]) -> Array:
-    """(g, g) squared norms of the parts of the hat matrix between groups.
-
-    Rows of one block share the block's own unknowns. Different blocks are connected only by the shared unknowns, for
-    which the normal matrices of the groups are summed first.
-    """
+    """(g, g) squared norms of the parts of the hat matrix between groups."""
+    # Rows of one block share the block's own unknowns. Different blocks are connected only by the shared unknowns, for
+    # which the normal matrices of the groups are summed first.
     factor = run.factor
     within = np.zeros((len(members), len(members)))
     normals = [csr_array((factor.shared_count, factor.shared_count)) for _ in members]

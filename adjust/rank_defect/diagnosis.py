@@ -187,10 +187,8 @@ def _sentence_without_name(
 def _datum_part(
     problem: Problem, state: State, free: Indices, factor: Factor, blind: Sequence[BlindBlock], null: Array
 ) -> tuple[Array, list[tuple[str, str]], Array]:
-    """Split off the object datum: its vectors (n, k) in a null space, their sentences, and the rest (n, d - k).
-
-    All vectors are free of the blocks' own null directions.
-    """
+    """Split off the object datum: its vectors (n, k) in a null space, their sentences, and the rest (n, d - k)."""
+    # All vectors are free of the blocks' own null directions.
     datum = object_datum(problem, state)
     motion = (datum.generators @ datum.free)[free] * factor.scale[:, None]
     for block in blind:
@@ -206,10 +204,8 @@ def _datum_part(
 
 
 def _object_fixed(parameters: Sequence[Parameter], vectors: Array, ranks: Indices) -> Array:
-    """Combine vectors (n, d) of rank 0 with the others such that stations and points stay in place.
-
-    A common shift of fiducials and principal point, which does not involve the object, is then reported as such.
-    """
+    """Combine vectors (n, d) of rank 0 with the others such that stations and points stay in place."""
+    # A common shift of fiducials and principal point, which does not involve the object, is then reported as such.
     placed = np.array([each.quantity in OBJECT_AXES for each in parameters], dtype=bool)
     first, others = vectors[:, ranks == 0], vectors[:, ranks > 0]
     result = vectors.copy()
@@ -230,10 +226,8 @@ def _axes_projector(motions: Array, vectors: Array, part: float) -> Array:
 
 
 def _independent_rows(rows: Array, part: float, ranks: Indices, axes: Array | None = None) -> list[int]:
-    """Select up to d independent rows of (m, d): by rank, then by the size of the independent component.
-
-    axes: projector (d, d) that is applied to rows of rank 0.
-    """
+    """Select up to d independent rows of (m, d): by rank, then by the size of the independent component."""
+    # axes: projector (d, d) that is applied to rows of rank 0.
     chosen: list[int] = []
     rest = rows.copy()
     if axes is not None:

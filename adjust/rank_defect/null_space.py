@@ -97,11 +97,9 @@ def _smallest(triangle: Triangle, below: float) -> tuple[Array, Array]:
 
 
 def _inverse_iteration(triangle: Triangle, count: int, limit: float) -> tuple[Array, Array]:
-    """Smallest singular values (count,) and right vectors (s, count) by inverse orthogonal iteration.
-
-    Values above the limit need not have converged, and none if all are below it, since more vectors are then needed.
-    Source: Golub and Van Loan, Matrix Computations, section 8.2.
-    """
+    """Smallest singular values (count,) and right vectors (s, count) by inverse orthogonal iteration."""
+    # Values above the limit need not have converged, and none if all are below it, since more vectors are then needed.
+    # Source: Golub and Van Loan, Matrix Computations, section 8.2.
     vectors = np.linalg.qr(np.random.default_rng(0).normal(size=(len(triangle), count)))[0]
     before = np.full(count, np.inf)
     for _ in range(ITERATIONS):

@@ -246,11 +246,9 @@ class _Solver:
         return result.converged and bool(chance)
 
     def _start_robustly(self, network: Network, start: Approximations) -> Adjustment | None:
-        """Start robust estimation or data snooping without the given points that are blunders.
-
-        Returns None without such points or without convergence. From an adjustment that includes a blunder neither
-        method recovers: the linearised equations do not hold for errors so large.
-        """
+        """Start robust estimation or data snooping without the given points that are blunders."""
+        # Returns None without such points or without convergence. From an adjustment that includes a blunder neither
+        # method recovers: the linearised equations do not hold for errors so large.
         slips = self._slips(network, start) if self.options.robust or self.options.snooping else []
         if not slips:
             return None
@@ -274,11 +272,9 @@ class _Solver:
             return []
 
     def _begin_anew(self, network: Network, start: Approximations, stopped: Adjustment) -> Adjustment:
-        """Adjust again from the network's own approximations; return `stopped` where these are no better.
-
-        The first attempt ignores poorly known principal distances, since images of known points determine them better;
-        the second one uses them.
-        """
+        """Adjust again from the network's own approximations; return `stopped` where these are no better."""
+        # The first attempt ignores poorly known principal distances, since images of known points determine them
+        # better; the second one uses them.
         cameras = tuple(
             replace(camera, principal_distance_mm=None)
             if (c := camera.principal_distance_mm) is not None and c.sigma > GUESSED * abs(c.value)

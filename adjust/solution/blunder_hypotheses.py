@@ -159,10 +159,8 @@ def _mirrored_images(network: Network, given: Adjustment | None, trials: Trials)
 
 
 def _mirrored_image(network: Network, name: str, rest: Adjustment) -> Network:
-    """Mirror one image of a network.
-
-    Where the image centre is unknown, the image gets its own principal point, with the lens of the other images.
-    """
+    """Mirror one image of a network."""
+    # Where the image centre is unknown, the image gets its own principal point, with the lens of the other images.
     turned = mirrored_images(network, [name])
     camera = network.camera_by_name[network.image_by_name[name].camera]
     if camera.frame_mm[0]:
@@ -241,10 +239,8 @@ def _exchanged_frames(network: Network, given: Adjustment | None) -> Iterator[Ne
 
 
 def _worst_images(network: Network, given: Adjustment | None, films: bool) -> dict[str, float]:
-    """Sums of squared residuals by image, largest first, of films or of digital images with object points.
-
-    The sums are 0 without an adjustment.
-    """
+    """Sums of squared residuals by image, largest first, of films or of digital images with object points."""
+    # The sums are 0 without an adjustment.
     v_mm = np.zeros((len(network.image_numbers), 2)) if given is None else given.residuals.v_mm
     sums = np.bincount(network.image_numbers, (v_mm**2).sum(axis=1), len(network.images))
     images = [

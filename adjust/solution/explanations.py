@@ -315,10 +315,8 @@ class _Model:
 
 
 def _best(model: _Model) -> tuple[list[_Model], bool]:
-    """Models with the best significant hypotheses, several where these are not distinguished.
-
-    Also returns whether gross errors of single observations explain the residuals as well.
-    """
+    """Models with the best significant hypotheses, several where these are not distinguished."""
+    # Also returns whether gross errors of single observations explain the residuals as well.
     falls = [(_first_order_fall(model.run, each), each) for each in model_hypotheses(model.run)]
     level = LEVEL / max(len(falls), 1)
     worth = WORTH * max((fall for fall, _ in falls), default=0.0)

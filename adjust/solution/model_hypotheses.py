@@ -283,10 +283,8 @@ def separate_lenses(run: Run) -> Problem | None:
 
 
 def _continued(run: Run, network: Network, like: dict[str, str] | None = None) -> Problem:
-    """Number a network with additional unknowns; start where an adjustment ended, in its datum.
-
-    like: cameras that share distortion and fiducial marks with another one and start with its interior orientation.
-    """
+    """Number a network with additional unknowns; start where an adjustment ended, in its datum."""
+    # like: cameras that share distortion and fiducial marks with another one and start with its interior orientation.
     old, values, like, count = run.problem.unknowns, run.end.state.values, like or {}, len(INTERIOR_NAMES)
     interior = {name: values[at[:count]] for name, at in old.camera.items()}
     state = Approximations(
@@ -398,11 +396,9 @@ def _misfit(difference: Array, covariance: Array, along: Array) -> float:
 
 
 def _estimate(run: Run, positions: Indices) -> tuple[Array, Array]:
-    """Values (k,) of unknowns and their covariance matrix (k, k).
-
-    Scaled by the variance factor of the extended model where that exceeds 1: what it leaves unexplained is noise to its
-    unknowns.
-    """
+    """Values (k,) of unknowns and their covariance matrix (k, k)."""
+    # Scaled by the variance factor of the extended model where that exceeds 1: what it leaves unexplained is noise to
+    # its unknowns.
     cofactor = free_cofactor(run.numbering, run.end.state, run.factor)
     vpv, redundancy = run.group_sums(run.weighting.used)
     variance = max(vpv / redundancy, 1.0) if redundancy >= 1.0 else 1.0

@@ -98,10 +98,8 @@ def _computed_problem(problem: Problem) -> Problem:
 
 
 def _regularised(problem: Problem) -> tuple[list[int], Array]:
-    """Positions of unknowns that make a singular problem regular when held, and its null vectors (n, d).
-
-    The pivots of the null vectors are held, one for each: minimal constraints of the free unknowns.
-    """
+    """Positions of unknowns that make a singular problem regular when held, and its null vectors (n, d)."""
+    # The pivots of the null vectors are held, one for each: minimal constraints of the free unknowns.
     held: list[int] = []
     null = np.zeros((len(problem.unknowns), 0))
     while True:

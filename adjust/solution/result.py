@@ -323,10 +323,8 @@ def run_result(given: Problem, last: Run, members: Indices | None, probabilities
 
 
 def _scaled_run(last: Run, variance: VarianceFactor) -> Run:
-    """Divide the standard deviations of the given values excluded from sigma0 by sigma0.
-
-    sigma0 times their cofactors then gives their standard deviations as given.
-    """
+    """Divide the standard deviations of the given values excluded from sigma0 by sigma0."""
+    # sigma0 times their cofactors then gives their standard deviations as given.
     if not len(variance.positions):
         return last
     unknowns = last.numbering.problem.unknowns

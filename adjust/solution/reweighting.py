@@ -54,11 +54,9 @@ def run(problem: Problem, options: Options, doubted: Collection[int] = ()) -> Ru
 
 
 def _settle(last: Run, options: Options, doubted: Sequence[int] = ()) -> Run:
-    """Adjust until robust estimation and variance components no longer change the weights.
-
-    doubted: units that start with no weight until the redescending function takes over: the small weight that Huber's
-    function gives to an error of many thousand sigma would still distort the network.
-    """
+    """Adjust until robust estimation and variance components no longer change the weights."""
+    # doubted: units that start with no weight until the redescending function takes over: the small weight that Huber's
+    # function gives to an error of many thousand sigma would still distort the network.
     limit = min(options.iteration_limit, ITERATIONS_A_ROUND) if options.robust else options.iteration_limit
     for function in options.weight_functions or (None,):
         for _ in range(ROUNDS):
@@ -115,27 +113,20 @@ def _snoop_rounds(last: Run, options: Options) -> Run:
 
 
 def _run(problem: Problem, weighting: Weighting, state: State, limit: int) -> Run:
-    """Iterate from a state.
-
-    Where the network is singular at this state and only there, some parameters of the cameras are held first and then
-    released. The original run is returned where that ends singular, too.
-    """
+    """Iterate from a state; where only distortion parameters of 0 make it singular, hold them first, then release."""
     last = _iterate(problem, weighting, state, limit)
     alike = [at for positions in _alike_at_zero(problem, state).values() for at in positions]
-    for held in (alike, _free_of_cameras(problem)):
-        if held and last.singular and not last.solution.history:
-            begun = _run(replace(problem, unknowns=problem.unknowns.fixed(held)), weighting, state, limit)
-            if begun.converged:
-                freed = _release_cameras(problem, weighting, begun, limit)
-                last = last if freed.singular else freed
+    if alike and last.singular and not last.solution.history:
+        begun = _iterate(replace(problem, unknowns=problem.unknowns.fixed(alike)), weighting, state, limit)
+        if begun.converged:
+            freed = _release_cameras(problem, weighting, begun, limit)
+            last = last if freed.singular else freed
     return last
 
 
 def _release_cameras(problem: Problem, weighting: Weighting, begun: Run, limit: int) -> Run:
-    """Release all parameters, starting from the end of a run that held some.
-
-    Where the observations do not separate distortion parameters, these get pseudo-observations, as weak as possible.
-    """
+    """Release all parameters, starting from the end of a run that held some."""
+    # Where the observations do not separate distortion parameters, these get pseudo-observations, as weak as possible.
     state, start = begun.end.state, _apart(problem, begun.end.state)
     at = _linearise(problem, weighting, state)
     motions = edge_motions(problem, at) if at is not None else {}
@@ -178,16 +169,6 @@ def _apart(problem: Problem, state: State) -> State:
         apart = family(problem.network.camera_by_name[camera].distortion.family).apart(values[at])
         values[at] = np.where(np.isinf(unknowns.sigma[at]), apart, values[at])
     return State(values, state.rotations)
-
-
-def _free_of_cameras(problem: Problem) -> list[int]:
-    """All free parameters of cameras.
-
-    Approximations without known planimetry look straight down: with parallel axes, heights never determine a principal
-    distance, but with the axes of tilted images they do.
-    """
-    unknowns = problem.unknowns
-    return [int(at) for positions in unknowns.camera.values() for at in positions if np.isinf(unknowns.sigma[at])]
 
 
 def _iterate(problem: Problem, weighting: Weighting, state: State, limit: int) -> Run:

@@ -108,11 +108,9 @@ def _is_gross(observations: Observations, v_mm: Array) -> Mask:
 
 
 def _swapped_numbers(run: Run, residuals: Residuals) -> list[str]:
-    """Find pairs of marks that each lie where the other is expected, unless most marks of the image do.
-
-    The residuals at the start of the adjustment are used, since those orientations follow the majority of the marks. At
-    the end the adjustment has been distorted to fit the wrong ones.
-    """
+    """Find pairs of marks that each lie where the other is expected, unless most marks of the image do."""
+    # The residuals at the start of the adjustment are used, since those orientations follow the majority of the marks.
+    # At the end the adjustment has been distorted to fit the wrong ones.
     problem, observations = run.problem, run.problem.network.observations
     if run.converged and not _is_gross(observations, residuals.v_mm).any():
         return []

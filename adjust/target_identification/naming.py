@@ -234,20 +234,16 @@ def _searches(
 
 
 def _is_alike(other: Grown, best: Grown) -> bool:
-    """Whether another identification explains about as many marks about as closely.
-
-    The number of marks alone does not decide: for a grid shifted by one step, the points lost at one end may be as many
-    as those missed by chance.
-    """
+    """Whether another identification explains about as many marks about as closely."""
+    # The number of marks alone does not decide: for a grid shifted by one step, the points lost at one end may be as
+    # many as those missed by chance.
     closer = 2 * len(other.mark) * np.log10(other.gate / best.gate)  # likelihood of two coordinates each
     return len(other.mark) >= ALIKE_SHARE * len(best.mark) and bool(closer < TOLD_LOG10)
 
 
 def _first(searches: Sequence[_Search]) -> tuple[_Search, Grown | None]:
-    """Return the first accepted identification, the most significant one of several principal distances.
-
-    The clusters that need the fewest trials come first.
-    """
+    """Return the first accepted identification, the most significant one of several principal distances."""
+    # The clusters that need the fewest trials come first.
     most = MOST_LOG10_CHANCE - np.log10(len(searches))
     tried = 0
     for cluster in searches[0].clusters:

@@ -199,10 +199,8 @@ def _shown_points(view: View, xyz: Array, normals: Array, marks: Marks) -> Mask:
 
 
 def _fit_view(view: View, xyz: Array, places: Array, marks: Marks) -> tuple[View, float, Array]:
-    """Fit a view by robust least squares.
-
-    Returns the view, the standard deviation of the marks and the covariance of the parameters.
-    """
+    """Fit a view by robust least squares."""
+    # Returns the view, the standard deviation of the marks and the covariance of the parameters.
     priors = np.diag([0.0] * 6 + [marks.c_sigma**-2, _PRIOR_RADIAL**-2])
     sigma = marks.sigma
     normal = np.eye(8)
@@ -229,11 +227,9 @@ def _fit_view(view: View, xyz: Array, places: Array, marks: Marks) -> tuple[View
 
 
 def _significance(view: View, xyz: Array, normals: Array, marks: Marks, sigma: float, mark: dict[int, int]) -> Grown:
-    """Compute the expected number of false alarms of an identification.
-
-    Any three points matched to any three marks give a pose. The others must agree, each with the probability that its
-    gate contains a mark by chance.
-    """
+    """Compute the expected number of false alarms of an identification."""
+    # Any three points matched to any three marks give a pose. The others must agree, each with the probability that its
+    # gate contains a mark by chance.
     gate = _GATE_SIGMAS * sigma
     shown = np.flatnonzero(_shown_points(view, xyz, normals, marks))
     expected = len(shown)
