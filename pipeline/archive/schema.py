@@ -157,8 +157,8 @@ VERSION = len(MIGRATIONS)
 _CHECKED_FRAMES = f"""
 create temp view checked_frame as
 select f.judging, judging.digest, f.lot, f.name, f.verdict, f.decisions, f.detail as changed, f.scan, scan.uri,
-    scan.width_px, scan.height_px, scan.camera, f.result, result.fingerprint, result.pitch_x_um, result.pitch_y_um,
-    result.detail as measured, iif(f.own_marks, f.marks_digest, result.marks_digest) as marks_digest,
+    scan.width_px, scan.height_px, scan.camera, scan.duplicate_of, f.result, result.fingerprint, result.pitch_x_um,
+    result.pitch_y_um, result.detail as measured, iif(f.own_marks, f.marks_digest, result.marks_digest) as marks_digest,
     {is_sound("judged_frame", "f")} and {is_sound("result")} and {is_sound("scan")} as is_sound
 from judged_frame f join judging on judging.id = f.judging
 left join result on result.id = f.result left join scan on scan.id = f.scan

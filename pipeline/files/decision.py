@@ -44,7 +44,6 @@ MEANING = {
     Choice.UNDO: "The last decision about this mark, or this pose, is taken back.",
 }
 About = tuple[str, str, str]  # image, point, kind; of a pose: image, "", ""; of marks to be learned: image, "", LEARNED
-OF_SCANS = (Choice.POSE, Choice.LEARN, Choice.UNDO)  # may concern a whole scan
 _NO_PLACES: Mapping[str, tuple[float, float]] = {}
 
 

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from measure.fiducials.clicked_frame import LEAST_CLICKS, are_collinear
@@ -24,6 +23,7 @@ from pipeline.files.camera_file import CameraFile, parse_camera, read_camera
 from pipeline.files.camera_tables import DEFAULT_SIGMA_MM
 from pipeline.files.camera_text import camera_text
 from pipeline.files.mark_table import SavePicture, picture_writer, template_lines
+from pipeline.review.requests import parse_values
 from pipeline.text.atomic import write_atomically
 from pipeline.text.tables import Table
 from pipeline.text.wording import listed, table_lines
@@ -122,11 +122,7 @@ class FramePlacement:
 
 def parse_drawing(given: Any) -> CameraDrawing:
     """Parse the drawing of a request. Raises InputError for invalid content."""
-    try:
-        drawing: CameraDrawing = TypeAdapter(CameraDrawing).validate_python(given)
-    except ValidationError as error:
-        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-        raise InputError(f"the drawing's {'.'.join(map(str, first['loc']))}: {first['msg']}.") from None
+    drawing = parse_values(CameraDrawing, given, "the drawing")
     ids = [one.id for one in drawing.marks]
     if drawing.pose not in POSES:
         raise InputError(f"{drawing.pose!r} is no pose; {', '.join(POSES)} are.")

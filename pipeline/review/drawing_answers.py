@@ -5,7 +5,6 @@ from typing import Any
 
 from measure.errors import MeasurementError
 from measure.marks.shapes import MarkShape, Point
-from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.mark_table import Clicks
 from pipeline.review.camera_drawing import (
@@ -20,9 +19,9 @@ from pipeline.review.camera_drawing import (
     save_learned,
 )
 from pipeline.review.drawing_view import drawing_json, drawn_mark, take_step
-from pipeline.review.frame_view import camera_as_shown
+from pipeline.review.frame_view import camera_as_shown, check_clicks
 from pipeline.review.pictures import Pictures
-from pipeline.review.query import Query, parse_places
+from pipeline.review.requests import DrawnCamera, Query, ShownMarks, parse_values
 from pipeline.review.session import Session
 
 _WIDEST_PX = 2000  # px, largest half width of the window around a mark
@@ -36,8 +35,9 @@ class DrawingAnswers:
 
     def draw(self, query: Query, body: Any) -> Any:
         """Apply a step to the drawing; returns the drawing as shown."""
-        drawing, placement = self._placed(_part(body, "drawing"))
-        if step := body.get("step"):
+        given = parse_values(DrawnCamera, body)
+        drawing, placement = self._placed(given.drawing)
+        if step := given.step:
             scan = self._session.scan_location(drawing.image)
             drawing = self._pictures.compute(scan, lambda file: take_step(drawing, placement, step, file))
             placement = self._placement(drawing)
@@ -56,8 +56,9 @@ class DrawingAnswers:
 
     def save(self, query: Query, body: Any) -> Any:
         """Write the camera file; returns a message with the next step."""
-        drawing, placement = self._placed(_part(body, "drawing"))
-        project, path = self._session.project, camera_path(self._session.folder, str(body.get("file", "")))
+        given = parse_values(DrawnCamera, body)
+        drawing, placement = self._placed(given.drawing)
+        project, path = self._session.project, camera_path(self._session.folder, given.file)
         if drawing.mark.get("kind") == "learned" and drawing.marks:
             camera = drawn_camera(drawing, placement, path)
             camera.layout()
@@ -70,15 +71,13 @@ class DrawingAnswers:
 
     def save_learned(self, query: Query, body: Any) -> Any:
         """Write a camera of the project with marks learned at clicked places of one scan."""
-        image, path = str(_part(body, "image")), camera_path(self._session.folder, str(body.get("file", "")))
-        self._session.scan_location(image)  # raises KeyError for an unknown image
-        px = parse_places(_part(body, "px"))
-        project = self._session.project
-        camera = project.image_camera(image)
-        if missing := [one.id for one in camera.learned if one.id not in px]:
-            raise InputError(f"{image}: click {', '.join(missing)}, too.")
-        learned = camera_as_shown(project, camera, Clicks(image, px, who=self._session.who))
-        return self._saved(save_learned(learned, learned_remarks(image), path))
+        given = parse_values(ShownMarks, body)
+        path, project = camera_path(self._session.folder, given.file), self._session.project
+        self._session.scan_location(given.image)  # raises KeyError for an unknown image
+        camera = project.image_camera(given.image)
+        check_clicks(camera, given.image, given.px)
+        learned = camera_as_shown(project, camera, Clicks(given.image, given.px, who=self._session.who))
+        return self._saved(save_learned(learned, learned_remarks(given.image), path))
 
     def _saved(self, camera: CameraFile) -> Any:
         file, project = camera.path.name, self._session.project
@@ -97,9 +96,3 @@ class DrawingAnswers:
         return place_frame(
             drawing, size_px, known_um, "as the project says" if project.pitch_um else "as the file says"
         )
-
-
-def _part(body: Any, name: str) -> Any:
-    if not isinstance(body, dict) or name not in body:
-        raise InputError(f"{name} is missing.")
-    return body[name]

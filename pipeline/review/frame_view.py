@@ -192,25 +192,22 @@ class Looking:
         """Frames for comparison: nearby frames of the same camera in which the mark was measured."""
         with Store(self._store) as store:
             sql_parameters = (image, _NEAR, point, kind, _OTHERS)
-            rows = store.connection.execute(_BESIDE, sql_parameters).fetchall()
+            rows = store.connection.execute(_NEARBY, sql_parameters).fetchall()
         return [name for (name,) in rows]
 
 
-_ONE = """
-select f.verdict, r.fingerprint from judged_frame f join result r on r.id = f.result where f.name = ? and f.judging = ?
-"""
+_ONE = "select verdict, fingerprint from checked_frame where name = ? and judging = ?"
 
-_BESIDE = """
+_NEARBY = """
 with own as (
-    select s.camera, s.id from judged_frame f join scan s on s.id = f.scan
-    where f.name = ?1 and f.judging = (select max(id) from judging)
+    select judging, scan, camera from checked_frame
+    where name = ?1 and judging = (select max(id) from judging)
 )
-select f.name from own join scan s on s.id between own.id - ?2 and own.id + ?2 and s.camera = own.camera
-join judged_frame f on f.scan = s.id
+select f.name from own join checked_frame f
+on f.judging = own.judging and f.scan between own.scan - ?2 and own.scan + ?2
 join mark m on m.result = f.result
-where f.judging = (select max(id) from judging) and f.name <> ?1 and m.point = ?3 and m.kind = ?4
-    and m.status = 'measured'
-order by abs(s.id - own.id) limit ?5
+where f.camera = own.camera and f.name <> ?1 and m.point = ?3 and m.kind = ?4 and m.status = 'measured'
+order by abs(f.scan - own.scan) limit ?5
 """
 
 
@@ -272,12 +269,16 @@ def measured_as_shown(project: Project, shown: str, px: Mapping[str, tuple[float
         If a mark was not clicked.
     """
     camera = project.image_camera(shown)
-    missing = [one.id for one in camera.learned if one.id not in px]
-    if missing:
-        raise InputError(f"{shown}: click {', '.join(missing)}, too.")
+    check_clicks(camera, shown, px)
     start = camera_as_shown(project, camera, Clicks(shown, px))
     own = {name: start if one.path == camera.path else one for name, one in project.cameras.items()}
     return _tried(scan_tasks(replace(project, cameras=own), [image])[0])
+
+
+def check_clicks(camera: CameraFile, image: str, px: Mapping[str, object]) -> None:
+    """Raise InputError where a mark to be learned was not clicked."""
+    if missing := [one.id for one in camera.learned if one.id not in px]:
+        raise InputError(f"{image}: click {', '.join(missing)}, too.")
 
 
 def camera_as_shown(project: Project, camera: CameraFile, clicks: Clicks) -> CameraFile:

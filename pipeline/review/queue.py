@@ -120,11 +120,9 @@ class _Frame:
 
 
 _FRAMES = """
-select f.name, f.result, r.fingerprint, coalesce(s.camera, ''), f.verdict,
-    coalesce(json_extract(f.detail, '$.pose'), json_extract(r.detail, '$.pose')),
-    coalesce(json_extract(f.detail, '$.problems[0]'), json_extract(r.detail, '$.problems[0]'), '')
-from judged_frame f join result r on r.id = f.result join scan s on s.id = f.scan
-where f.judging = ? and f.verdict <> 'failed' and s.duplicate_of is null
+select name, result, fingerprint, coalesce(camera, ''), verdict, coalesce(changed -> '$.pose', measured -> '$.pose'),
+    coalesce(changed ->> '$.problems[0]', measured ->> '$.problems[0]', '')
+from checked_frame where judging = ? and verdict <> 'failed' and duplicate_of is null
 """
 
 _MARKS = f"""

@@ -1,11 +1,12 @@
 """Local web server of the review page: routes and answers."""
 
 import getpass
+import json
 import secrets
 import socket
 import sys
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from importlib import resources
 from typing import Any
@@ -21,7 +22,7 @@ from measure.errors import MeasurementError
 from measure.fiducials.options import Click
 from measure.geometry import POSES
 from pipeline.errors import InputError
-from pipeline.files.decision import KINDS, LEARNED, MEANING, OF_SCANS, Choice, Decision
+from pipeline.files.decision import MEANING, Decision, LineError, decisions_of_lines
 from pipeline.files.mark_table import MARK_TABLES
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_task import sample_names
@@ -29,7 +30,7 @@ from pipeline.results.measured_record import MeasuredScan
 from pipeline.review.drawing_answers import DrawingAnswers
 from pipeline.review.frame_view import mark_json, measured_as_shown, measured_from_clicks
 from pipeline.review.pictures import Pictures
-from pipeline.review.query import Query, parse_json, parse_pixels, parse_places
+from pipeline.review.requests import Decide, MeasureFrame, Query, ShownMarks, parse_json, parse_values
 from pipeline.review.safety import Guard
 from pipeline.review.session import Filters, Session
 
@@ -215,58 +216,34 @@ class _Answers:
         return self._pictures.posed(self._scan(query), pose)
 
     def decide(self, query: Query, body: Any) -> Any:
-        given = body.get("decisions") if isinstance(body, dict) else None
-        if not isinstance(given, list) or not given:
-            raise InputError("decisions are missing.")
-        self._session.decide([_decision(one) for one in given], str(body.get("key", "")))
+        given = parse_values(Decide, body)
+        self._session.decide(list(map(_decision, given.decisions)), given.key)
         return self.queue(query, None)
 
     def measure(self, query: Query, body: Any) -> Any:
-        if not isinstance(body, dict):
-            raise InputError("clicks are missing.")
-        image, clicks = str(body.get("image", "")), body.get("clicks")
-        self._session.looking.view(image)  # raises KeyError for an unknown image
-        if not isinstance(clicks, list) or len(clicks) < 3:
-            raise InputError("three clicks on named marks or more are needed.")
-        if not all(isinstance(one, dict) and {"point", "col_px", "row_px"} <= set(one) for one in clicks):
-            raise InputError("a click has point, col_px and row_px.")
-        given = [Click(str(one["point"]), parse_pixels(one["col_px"]), parse_pixels(one["row_px"])) for one in clicks]
-        return _trial_json(measured_from_clicks(self._session.learned, image, given))
+        given = parse_values(MeasureFrame, body)
+        self._session.looking.view(given.image)  # raises KeyError for an unknown image
+        clicks = [Click(one.point, one.col_px, one.row_px) for one in given.clicks]
+        return _trial_json(measured_from_clicks(self._session.learned, given.image, clicks))
 
     def learn(self, query: Query, body: Any) -> Any:
         """Measure a scan with templates learned from another scan or itself."""
-        if not isinstance(body, dict) or not isinstance(body.get("px"), dict):
-            raise InputError("clicks are missing.")
-        shown, image = str(body.get("image", "")), str(body.get("of", ""))
-        for name in (shown, image):
+        given = parse_values(ShownMarks, body)
+        for name in (given.image, given.of):
             self._session.scan_location(name)  # raises KeyError for an unknown image
-        return _trial_json(measured_as_shown(self._session.project, shown, parse_places(body["px"]), image))
+        return _trial_json(measured_as_shown(self._session.project, given.image, given.px, given.of))
 
     def _scan(self, query: Query) -> str:
         return self._session.scan_location(query.text("image"))
 
 
-def _decision(given: Any) -> Decision:
-    if not isinstance(given, dict):
-        raise InputError("a decision is an object.")
-    texts = {
-        name: given.get(name, "") for name in ("image", "point", "kind", "pose", "note", "fingerprint", "decision")
-    }
-    if not all(isinstance(value, str) and len(value) < 4000 for value in texts.values()):
-        raise InputError("names of a decision are text.")
-    kinds = KINDS if texts["point"] else ("", LEARNED)
-    if texts["decision"] not in list(Choice) or texts["kind"] not in kinds:
-        raise InputError(f"{texts['decision']!r} about {texts['kind']!r} is no decision.")
-    choice = Choice(texts.pop("decision"))
-    if not texts["point"] and choice not in OF_SCANS:
-        raise InputError("a decision about a mark needs its name.")
-    if (texts["kind"] == LEARNED) != (choice is Choice.LEARN) and choice is not Choice.UNDO:
-        raise InputError("how marks look is learned.")
-    px = parse_places(given.get("px")) if choice is Choice.LEARN else {}
-    numbers: Any = {name: given.get(name) for name in ("col_px", "row_px")} if choice is Choice.PLACE else {}
-    if not all(isinstance(one, int | float) and abs(one) < 1e7 for one in numbers.values()):
-        raise InputError("place needs col_px and row_px.")
-    return Decision(decision=choice, window=_four(given.get("window")), px=px, **texts, **numbers)
+def _decision(given: Mapping[str, Any]) -> Decision:
+    """Check a decision like a line of decisions.jsonl."""
+    try:
+        (decision,) = decisions_of_lines([(0, json.dumps(given).encode())])
+    except LineError as error:
+        raise InputError(f"the decision{error}") from None
+    return decision
 
 
 def _trial_json(scan: MeasuredScan) -> Any:
@@ -278,15 +255,6 @@ def _trial_json(scan: MeasuredScan) -> Any:
         "pose": pose and f"{pose.name}{'' if pose.decided else ' (assumed)'}",
         "problems": [failure] if failure else list(map(str, scan.frame.problems)),
     }
-
-
-def _four(window: Any) -> tuple[float, float, float, float] | None:
-    if window is None:
-        return None
-    if not isinstance(window, list) or len(window) != 4:
-        raise InputError("window is four numbers.")
-    col, row, width, height = map(parse_pixels, window)
-    return col, row, width, height
 
 
 def _static(name: str) -> Callable[[Request], Response]:

@@ -2,100 +2,28 @@
 
 import threading
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from itertools import chain
-from pathlib import Path
+from itertools import islice
 from typing import Any
 
-from measure.geometry import POSES
 from measure.scans.remote import fetch_location
 from pipeline.archive.results_database import Store
 from pipeline.errors import InputError
-from pipeline.files.decision import LEARNED, About, Choice, Decision
-from pipeline.files.decisions_file import (
-    append_decisions,
-    decisions_bytes,
-    learned_from,
-    parse_decisions,
-    push_decision,
-)
+from pipeline.files.decision import LEARNED, Choice, Decision
+from pipeline.files.decisions_file import append_decisions, learned_from, read_decisions, standing
 from pipeline.files.project_file import Project, reload_decisions
 from pipeline.measuring.first_pictures import digest
 from pipeline.measuring.learn_stage import add_learned_marks
+from pipeline.provenance import FileState, file_state
 from pipeline.review.frame_view import Looking
 from pipeline.review.queue import Entry, Question, build_queue
 
-_COMPARED = 4096  # bytes before the new part, compared to recognise a file that was only appended to
 Json = dict[str, Any]
 
 _NONE = -1  # no cross-scan checks yet
 PAGE = 100  # entries sent at a time
-
-
-class Ledger:
-    """Decisions in force. Only new lines are read from a decisions file that was appended to."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._seen: tuple[int, int, int] | None = None  # inode, size and modification time
-        self._forget()
-
-    def update(self) -> frozenset[str] | None:
-        """Read new decisions. Returns the images concerned; None if the file was replaced and read again."""
-        before, self._seen = self._seen, _state(self._path)
-        if self._seen == before:
-            return frozenset()
-        more = self._more() if before and self._seen and before[0] == self._seen[0] else None
-        if more is None:
-            self._forget()
-            self._take(decisions_bytes(self._path))
-            return None
-        return self._take(more)
-
-    def get(self, about: About) -> Decision | None:
-        stack = self._stacks.get(about)
-        return stack[-1] if stack else None
-
-    def image_decisions(self, image: str) -> Iterable[Decision]:
-        """Decisions in force on the marks and the pose of an image, in the order of the first decision on each."""
-        return (one for about in self._abouts.get(image, ()) if (one := self.get(about)) and about[2] != LEARNED)
-
-    def learned(self, images: Collection[str]) -> Decision | None:
-        """Decision from which the marks of the camera of these images are learned."""
-        return learned_from(self._learned, images)
-
-    def _forget(self) -> None:
-        self._stacks: dict[About, list[Decision]] = {}
-        self._abouts: dict[str, dict[About, None]] = defaultdict(dict)
-        self._learned: list[Decision] = []
-        self._end, self._lines, self._tail = 0, 0, b""
-
-    def _more(self) -> bytes | None:
-        """Bytes appended to the file; None if the part already read has changed."""
-        if not self._tail.endswith(b"\n"):
-            return None
-        data = decisions_bytes(self._path, self._end - len(self._tail))
-        return data[len(self._tail) :] if data.startswith(self._tail) else None
-
-    def _take(self, data: bytes) -> frozenset[str]:
-        new = parse_decisions(self._path, data, self._lines + 1)
-        for one in new:
-            push_decision(self._stacks, one)
-            self._abouts[one.image][one.subject] = None
-        self._learned += [one for one in new if one.subject[2] == LEARNED]
-        self._end, self._lines = self._end + len(data), self._lines + data.count(b"\n")
-        self._tail = (self._tail + data)[-_COMPARED:]
-        return frozenset(one.image for one in new)
-
-
-def _state(path: Path) -> tuple[int, int, int] | None:
-    try:
-        found = path.stat()
-    except OSError:
-        return None
-    return found.st_ino, found.st_size, found.st_mtime_ns
 
 
 @dataclass(frozen=True)
@@ -122,23 +50,6 @@ class Filters:
         )
 
 
-@dataclass(frozen=True)
-class _Shown:
-    """Questions that pass the filters, their keys, and the keys of those that need an answer."""
-
-    filters: Filters
-    entries: tuple[Entry, ...]
-    keys: tuple[str, ...]
-    open_keys: frozenset[str]
-
-    @classmethod
-    def from_queue(cls, filters: Filters, queue: Sequence[Entry]) -> "_Shown":
-        entries = tuple(filter(filters.lets_through, queue))
-        keys = tuple(entry.key for entry in entries)
-        open_keys = (key for key, entry in zip(keys, entries, strict=True) if entry.is_left)
-        return cls(filters, entries, keys, frozenset(open_keys))
-
-
 class Session:
     """Review of a project. Thread-safe."""
 
@@ -149,11 +60,9 @@ class Session:
         self.looking = Looking(project.measurement_path, self.folder, lambda image: self.learned.image_camera(image))
         self._lock = threading.RLock()
         self._judging: int | None = None
-        self._ledger = Ledger(project.decisions_path)
-        self._answers: dict[str, Decision] = {}
-        self._shown: _Shown | None = None
+        self._file_state: FileState | None = None  # of the decisions when they were read
         self.refresh()
-        if self._judging == _NONE and not self._queue and not project.scans:
+        if self._judging == _NONE and not self._by_key and not project.scans:
             raise InputError(
                 f"{project.measurement_path}: no scan in it passed the cross-scan checks. Run `reseau measure` first."
             )
@@ -163,19 +72,21 @@ class Session:
         with self._lock:
             judging = self.looking.judging()
             row = _NONE if judging is None else judging.row
-            changed = self._ledger.update()
+            path = self.project.decisions_path
+            before, self._file_state = self._file_state, file_state(path, self.folder)
             if row != self._judging:
                 self._take_queue(row)
-                changed = None
-            if changed is None:
-                self._answers, self._left = {}, Counter(entry.question for entry in self._queue if entry.is_left)
-                self._total = self._left.total()
-            for entry in self._queue if changed is None else self._image_entries(changed):
-                before, now = self._answers.pop(entry.key, None), self._find_answer(entry)
-                if now is not None:
-                    self._answers[entry.key] = now
-                if entry.is_left:
-                    self._left[entry.question] += (before is not None) - (now is not None)
+            elif self._file_state == before:
+                return
+            decisions = read_decisions(path)
+            self._standing = standing(decisions)
+            self._learned = [one for one in decisions if one.subject[2] == LEARNED]
+            self._of_image = defaultdict[str, list[Decision]](list)
+            for one in self._standing.values():
+                self._of_image[one.image].append(one)
+            self._answers = {
+                key: answer for key, entry in self._by_key.items() if (answer := self._find_answer(entry)) is not None
+            }
 
     def decide(self, decisions: Sequence[Decision], key: str = "") -> None:
         """Append decisions to the file, all or none. key: of a question about several frames; the decisions then apply
@@ -196,34 +107,32 @@ class Session:
         """Numbers of open questions, and PAGE of the questions that pass the filters, from start on."""
         self.refresh()
         with self._lock:
-            if self._shown is None or self._shown.filters != filters:
-                self._shown = _Shown.from_queue(filters, self._queue)
-            shown = self._shown
-            order = chain(range(start, len(shown.keys)), range(min(start, len(shown.keys))))
+            shown = {key: entry for key, entry in self._by_key.items() if filters.lets_through(entry)}
+            open_places = [at for at, (key, entry) in enumerate(shown.items()) if self._is_open(key, entry)]
+            left = Counter(entry.question for key, entry in self._by_key.items() if self._is_open(key, entry))
             return {
                 "judging": self._judging,
-                "total": self._total,
-                "left": {"all": self._left.total(), **{str(question): self._left[question] for question in Question}},
-                "shown": len(shown.entries),
-                "shown_left": len(shown.open_keys - self._answers.keys()),
-                "next_left": next((at for at in order if self._asks(shown, at)), -1),
+                "total": sum(entry.is_left for entry in self._by_key.values()),
+                "left": {"all": left.total(), **{str(question): left[question] for question in Question}},
+                "shown": len(shown),
+                "shown_left": len(open_places),
+                "next_left": next((at for at in open_places if at >= start), next(iter(open_places), -1)),
                 "start": start,
-                "entries": [self.entry_json(entry) for entry in shown.entries[start : start + PAGE]],
+                "entries": [self.entry_json(entry) for entry in islice(shown.values(), start, start + PAGE)],
             }
 
-    def _asks(self, shown: _Shown, at: int) -> bool:
-        key = shown.keys[at]
-        return key in shown.open_keys and key not in self._answers
+    def _is_open(self, key: str, entry: Entry) -> bool:
+        return entry.is_left and key not in self._answers
 
     def choices(self) -> Json:
         """Possible values of the filters."""
         return {
             "questions": [str(question) for question in Question],
-            "verdicts": sorted({entry.verdict for entry in self._queue if entry.verdict}),
-            "statuses": sorted({entry.status for entry in self._queue if entry.status}),
-            "codes": sorted({code for entry in self._queue for code in entry.code.split()}),
-            "cameras": sorted({entry.camera for entry in self._queue}),
-            "folders": sorted({entry.folder for entry in self._queue if entry.folder}),
+            "verdicts": sorted({entry.verdict for entry in self._by_key.values() if entry.verdict}),
+            "statuses": sorted({entry.status for entry in self._by_key.values() if entry.status}),
+            "codes": sorted({code for entry in self._by_key.values() for code in entry.code.split()}),
+            "cameras": sorted({entry.camera for entry in self._by_key.values()}),
+            "folders": sorted({entry.folder for entry in self._by_key.values() if entry.folder}),
         }
 
     @property
@@ -264,25 +173,21 @@ class Session:
     def image_decisions(self, image: str) -> list[Json]:
         """JSON of the decisions in force on a frame."""
         with self._lock:
-            return [_answer_json(one) for one in self._ledger.image_decisions(image)]
+            return [_answer_json(one) for one in self._scan_decisions(image)]
+
+    def _scan_decisions(self, image: str) -> list[Decision]:
+        """Decisions in force on the marks and the pose of an image."""
+        return [one for one in self._of_image.get(image, ()) if one.subject[2] != LEARNED]
 
     def _take_queue(self, judging: int) -> None:
         self.project = self.learned = reload_decisions(self.project)
         if judging == _NONE:
-            self._queue = build_queue(self.project, None, judging)
+            queue = build_queue(self.project, None, judging)
         else:
             with Store(self.project.measurement_path) as store:
                 self.learned = add_learned_marks(self.project, store)
-                self._queue = build_queue(self.project, store.connection, judging)
-        self._by_key = {entry.key: entry for entry in self._queue}
-        of_image = defaultdict[str, list[Entry]](list)
-        for entry in self._queue:
-            for image in entry.images:
-                of_image[image].append(entry)
-        self._of_image, self._judging, self._shown = of_image, judging, None
-
-    def _image_entries(self, images: Collection[str]) -> Collection[Entry]:
-        return {entry.key: entry for image in images for entry in self._of_image.get(image, ())}.values()
+                queue = build_queue(self.project, store.connection, judging)
+        self._by_key, self._judging = {entry.key: entry for entry in queue}, judging
 
     def _find_answer(self, entry: Entry) -> Decision | None:
         """Decision that answers a question; None if it is open.
@@ -290,23 +195,21 @@ class Session:
         A question about several frames needs decisions on all of them. Any decision on a frame answers the question
         about a frame without marks. A changed pose answers the questions about marks, since it renames them.
         """
+        if entry.question is not Question.CAMERA and entry.images[0] not in self._of_image:
+            return None
         match entry.question:
             case Question.CAMERA:
-                return self._ledger.learned(frozenset(entry.images))
+                return learned_from(self._learned, frozenset(entry.images))
             case Question.FRAME:
-                made = [
-                    one
-                    for one in self._ledger.image_decisions(entry.images[0])
-                    if _names_result(one, entry.fingerprints[0])
-                ]
-                return made[-1] if made else None
-        if entry.question is Question.MARK:
-            pose = self._ledger.get((entry.images[0], "", ""))
-            if pose is not None and _names_result(pose, entry.fingerprints[0]) and pose.pose != entry.pose:
-                return pose  # the mark will have another name
+                made = self._scan_decisions(entry.images[0])
+                return next((one for one in reversed(made) if _names_result(one, entry.fingerprints[0])), None)
+            case Question.MARK:
+                pose = self._standing.get((entry.images[0], "", ""))
+                if pose is not None and _names_result(pose, entry.fingerprints[0]) and pose.pose != entry.pose:
+                    return pose  # the mark will have another name
         first = None
         for image, fingerprint in zip(entry.images, entry.fingerprints, strict=True):
-            one = self._ledger.get((image, entry.point, entry.kind))
+            one = self._standing.get((image, entry.point, entry.kind))
             if one is None or not _names_result(one, fingerprint):
                 return None
             first = first or one
@@ -316,7 +219,7 @@ class Session:
         """JSON of a decision on an earlier result; None if there is none."""
         if entry.question in (Question.CAMERA, Question.FRAME):
             return None
-        one = self._ledger.get((entry.images[0], entry.point, entry.kind))
+        one = self._standing.get((entry.images[0], entry.point, entry.kind))
         return None if one is None or _names_result(one, entry.fingerprints[0]) else _answer_json(one)
 
     def _add_fingerprint(self, one: Decision) -> Decision:
@@ -338,8 +241,6 @@ class Session:
             raise InputError(
                 f"{one.image}, {one.point}: nothing was measured that could be {one.decision}ed. Place it with a click."
             )
-        if one.decision is Choice.POSE and one.pose not in POSES:
-            raise InputError(f"{one.pose!r} is no pose; {', '.join(POSES)} are.")
 
     def _check_learned(self, one: Decision) -> None:
         if one.image not in self.project.scans:

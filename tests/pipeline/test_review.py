@@ -118,11 +118,11 @@ def test_images_and_marks_are_names_and_never_paths(path: str, server: Served) -
         ({"image": "../good", "point": "1", "kind": "fiducial", "decision": "accept"}, "no image or mark '../good'"),
         ({"image": GOOD, "point": "9", "kind": "fiducial", "decision": "accept"}, "no image or mark '9'"),
         ({"image": BARE, "point": "3", "kind": "fiducial", "decision": "accept"}, "nothing was measured"),
-        ({"image": GOOD, "point": "1", "kind": "fiducial", "decision": "keep"}, "no decision"),
-        ({"image": GOOD, "decision": "accept"}, "needs its name"),
+        ({"image": GOOD, "point": "1", "kind": "fiducial", "decision": "keep"}, "must be one of accept"),
+        ({"image": GOOD, "decision": "accept"}, "point: is missing"),
         ({"image": GOOD, "point": "1", "kind": "fiducial", "decision": "place"}, "col_px"),
-        ({"image": GOOD, "decision": "pose", "pose": "45"}, "no pose"),
-        ("accept", "object"),
+        ({"image": GOOD, "decision": "pose", "pose": "45"}, "pose: must be one of 0"),
+        ("accept", "dictionary"),
     ],
 )
 def test_what_cannot_be_settled_is_refused_and_nothing_is_written(

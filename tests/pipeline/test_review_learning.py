@@ -22,7 +22,7 @@ from pipeline.files.decisions_file import append_decisions
 from pipeline.files.project_file import read_project
 from pipeline.review.drawing_answers import DrawingAnswers
 from pipeline.review.pictures import Pictures
-from pipeline.review.query import Query
+from pipeline.review.requests import Query
 from pipeline.review.session import Session
 
 NAMES = ("a", "b", "c")
