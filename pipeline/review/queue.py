@@ -3,6 +3,7 @@
 The order is: first cameras whose marks have no drawing or template, since nothing is found without them. Then scan
 orientations (poses), on which the names of all marks of a frame depend; asked once for all frames of a roll. Then
 frames without any mark found. Then marks, those of frames with few others first, since a decision changes more there.
+Natural points are no questions: hundreds are found, and a doubtful one is left out at no cost.
 """
 
 import json
@@ -127,7 +128,7 @@ from checked_frame where judging = ? and verdict <> 'failed' and duplicate_of is
 
 _MARKS = f"""
 select result, point, kind, status, reason_code, reason from checked_mark
-where judging = ? and status <> 'measured' and reason_code not like '{Code.DECIDED}%'
+where judging = ? and status <> 'measured' and kind <> 'tie' and reason_code not like '{Code.DECIDED}%'
     and reason_code not like '{Code.CLICKED}%' order by result, number
 """
 

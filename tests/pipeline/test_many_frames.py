@@ -24,6 +24,7 @@ from pipeline.report.many_frames import MOST_FRAMES, frame_counts, reduced
 from pipeline.report.page import render_frame_page
 from pipeline.results.comparator_file import ComparatorPoint, mark_rows, read_measurement_hash, write_comparator
 from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan
+from pipeline.review.session import Filters, Session
 
 FRAMES, MARKS = 2100, 8  # more of them are bad than a report shows
 BAD, FAILED = range(0, FRAMES, 10), range(5, FRAMES, 100)
@@ -198,6 +199,17 @@ def stored(folder: Path) -> tuple[Path, list[MeasuredScan]]:
     pitches = {each.frame.image: each.pitch_um for each in scans}
     write_comparator(folder / "comparator.csv", mark_rows([each.frame for each in scans]), pitches, digest)
     return project, scans
+
+
+def test_natural_points_are_no_questions_to_a_reviewer(tmp_path: Path) -> None:
+    project, (first, *_) = stored(tmp_path)
+    doubtful = replace(first.frame.marks[1], status=Status.REJECTED, reason=Reason("it is faint", Code.COVERED))
+    marks = (doubtful, replace(doubtful, point="tie1", kind="tie"), *first.frame.marks[2:-2])
+    digest = keep_scans(tmp_path / "out" / "measurement.db", [replace(first, frame=replace(first.frame, marks=marks))])
+    frames = {first.frame.image: first.pitch_um}
+    write_comparator(tmp_path / "comparator.csv", mark_rows([replace(first.frame, marks=marks)]), frames, digest)
+    asked = Session(read_project(project), "bob").page(Filters())["entries"]
+    assert [(one["point"], one["kind"]) for one in asked] == [("m1", "fiducial")]
 
 
 def as_written(folder: Path) -> None:
