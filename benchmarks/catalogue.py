@@ -15,7 +15,7 @@ import numpy as np
 import tifffile
 
 from benchmarks.harness import Row
-from pipeline.archive.catalogue import catalogue
+from pipeline.archive.scan_groups import catalogue
 
 OWN_PROCESS = True
 A_FOLDER = 500

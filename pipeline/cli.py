@@ -9,7 +9,7 @@ from typer.core import TyperGroup
 
 from adjust.errors import AdjustmentError
 from measure.errors import MeasurementError
-from pipeline.commands import adjusting, calibrating, exchanging, measuring
+from pipeline.commands import adjusting, exchanging, measuring
 from pipeline.commands.shared import DONE, INTERNAL_ERROR, INTERRUPTED, LOOK, WRONG_INPUT
 from pipeline.errors import InputError, what_to_do, what_to_do_about_store
 from pipeline.terminal import plain, spell_out_missing_letters
@@ -25,7 +25,7 @@ GROUPS: dict[str, dict[str, Callable[..., int]]] = {  # by purpose, as listed in
         "report": measuring.report,
     },
     "Calibrate": {
-        "calibrate": calibrating.calibrate,
+        "calibrate": adjusting.calibrate,
         "adjust": adjusting.adjust,
         "check": adjusting.check,
         "choose": adjusting.choose,

@@ -32,8 +32,7 @@ from pipeline.archive.measurement import (
     remember_place,
     written_scans,
 )
-from pipeline.archive.merge import Merged, merge
-from pipeline.archive.results_database import Store
+from pipeline.archive.results_database import Merged, Store, merge
 from pipeline.archive.results_integrity import DamagedError
 from pipeline.archive.thumbnails import ThumbnailStore
 from pipeline.errors import InputError, WriteError

@@ -27,9 +27,9 @@ from pipeline.archive.verdicts import Verdict
 from pipeline.errors import InputError
 from pipeline.results.comparator_file import CameraPerson, ComparatorPoint, comparator_points, read_measurement_hash
 from pipeline.results.measured_record import MeasuredScan
+from pipeline.types import Array
 
 _PLACE = "project folder"
-Array = NDArray[np.float64]
 
 _AT_A_TIME = 50_000  # rows fetched at once
 

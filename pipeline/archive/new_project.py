@@ -13,8 +13,15 @@ from rich.console import Console
 from measure.errors import MeasurementError
 from measure.scans.opening import ScanHead
 from measure.scans.remote import Address, is_address, scan_path
-from pipeline.archive.catalogue import Catalogue, catalogue
-from pipeline.archive.scan_groups import CANDIDATES, GroupedScans, ScanGroup, name_cameras, trial_of_cameras
+from pipeline.archive.scan_groups import (
+    CANDIDATES,
+    Catalogue,
+    GroupedScans,
+    ScanGroup,
+    catalogue,
+    name_cameras,
+    trial_of_cameras,
+)
 from pipeline.errors import InputError
 from pipeline.files.camera_file import read_camera
 from pipeline.files.library import PREFIX, camera_words, library_path, read_library

@@ -6,7 +6,6 @@ from typing import Annotated
 
 import typer
 
-from pipeline.commands.next_steps import command_step, print_next
 from pipeline.commands.shared import (
     DONE,
     LOOK,
@@ -17,7 +16,9 @@ from pipeline.commands.shared import (
     ProjectFile,
     SceneFile,
     choices_help,
+    command_step,
     pitch_option,
+    print_next,
     read,
     say,
     show,

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pipeline.archive.verdicts import Verdict
-from pipeline.commands.next_steps import command_step, init_steps, print_next, report_step, summary_steps, verdict_steps
 from pipeline.commands.shared import (
     DONE,
     LOOK,
@@ -19,12 +18,18 @@ from pipeline.commands.shared import (
     MaxPixels,
     ProjectFile,
     Quiet,
+    command_step,
     finish,
+    init_steps,
     pitch_option,
+    print_next,
     read,
+    report_step,
     run_stage,
     say,
     show,
+    summary_steps,
+    verdict_steps,
 )
 from pipeline.errors import InputError, missing_extra
 from pipeline.terminal import PlainConsole, plain
@@ -259,7 +264,7 @@ def review(
         from pipeline.review.server import serve
     except ModuleNotFoundError:
         raise missing_extra("reseau review", "Starlette and Uvicorn", "review") from None
-    from pipeline.archive.catalogue import find_scan_files
+    from pipeline.archive.scan_groups import find_scan_files
     from pipeline.files.project_file import read_undrawn
 
     file = project / "project.toml" if project.is_dir() else project
@@ -340,8 +345,7 @@ def _name_cameras(
     given: Sequence[Path], project: "Project | None", pitch_um: float | None, max_pixels: int | None, as_json: bool
 ) -> int:
     """Identify the cameras of scans: all trials of a single scan, or some scans of each group."""
-    from pipeline.archive.catalogue import find_scan_files
-    from pipeline.archive.scan_groups import group_scans, name_cameras, print_groups, trial_of_cameras
+    from pipeline.archive.scan_groups import find_scan_files, group_scans, name_cameras, print_groups, trial_of_cameras
     from pipeline.files.library import PREFIX, read_library
     from pipeline.measuring.camera_identification import print_identification
     from pipeline.measuring.camera_trials import identify

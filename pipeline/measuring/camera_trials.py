@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from adjust.functional_model.transformation import film_kind
@@ -33,6 +32,7 @@ from pipeline.measuring.camera_identification import (
     parse_plate,
 )
 from pipeline.progress import Count, Reporter
+from pipeline.types import Array
 
 _LARGEST_PX = 1600  # px, size of the searched image: for aerial film 1/7 mm per pixel, about the width of fine lines
 _COARSE_PX = 1024  # px, while the pitch is unknown: fine lines are then half a pixel wide
@@ -45,7 +45,6 @@ _BOLD = 4  # smallest number of marks to search
 _ENOUGH = 12  # marks to measure: of layouts with more, such as réseaux, only every second mark is measured
 _SAME_FIGURE = 0.06  # fraction of the rms distance of the marks from their centroid
 _STRETCH = (1.08, 0.93)  # x and y scale of the null layout: no film is so deformed, so all its marks are false alarms
-Array = NDArray[np.float64]
 Names = tuple[str, ...]
 
 _PICTURE_PX = 2400  # px, size of the measured image: for aerial film 0.1 mm per pixel, enough to read plates

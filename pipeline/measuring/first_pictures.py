@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from measure.detection.recurrence import Recurrence, Window, about, recurrence
 from measure.errors import MeasurementError
@@ -26,8 +25,8 @@ from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.mark_table import Clicks, LearnedFrom
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
+from pipeline.types import Array
 
-Array = NDArray[np.float64]
 Places = Mapping[str, Array]  # (2,) px by fiducial
 
 _CLICK_MM = 0.3  # mm, standard deviation of a click

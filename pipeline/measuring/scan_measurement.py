@@ -23,10 +23,10 @@ from measure.scans.remote import TRAFFIC, ScanPart, Window, public_text, scan_pa
 from measure.scans.scan import Scan
 from pipeline.errors import InputError, what_to_do
 from pipeline.files.taking_lens import CalibratedLens
+from pipeline.measuring.learn_stage import tone_before
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
 from pipeline.measuring.target_identification import misplaced_principal_point
 from pipeline.measuring.target_stage import measure_targets
-from pipeline.measuring.tone_stage import tone_before
 from pipeline.provenance import parts_hash
 from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan
 from pipeline.results.thumbnail import StoredThumbnail, TakenThumbnails

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_vector
@@ -20,8 +19,7 @@ from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
 from pipeline.results.comparator_file import pixel_from_comparator
 from pipeline.results.measured_record import MeasuredScan
-
-Array = NDArray[np.float64]
+from pipeline.types import Array, Mask
 
 _ANGLES = np.arange(8) * np.pi / 4.0
 _CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)  # enough to sample the lens distortion within a target
@@ -84,7 +82,7 @@ def _centre_of_gravity(outline: Array) -> Array:
 
 def disk_images(
     model: ImageModel, pitch_um: tuple[float, float], centers: Array, normals: Array, radius: float
-) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+) -> tuple[Array, Array, Array, Mask]:
     """Predict the images of disks.
 
     Returns
@@ -109,7 +107,7 @@ def disk_images(
 
 def disk_normals(
     ids: Sequence[str], coordinates: Array, given: Mapping[str, Array], plane: Array | None, station: Array
-) -> tuple[Array, NDArray[np.bool_]]:
+) -> tuple[Array, Mask]:
     """Unit normals (n, 3) of disks at coordinates (n, 3), and a mask of the known ones.
 
     Given normals are known, and those of a flat field: the normal of its plane. Other disks are assumed to face the

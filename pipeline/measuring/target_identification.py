@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from math import comb
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
@@ -24,9 +23,7 @@ from pipeline.measuring.target_field import (
 )
 from pipeline.results.comparator_file import comparator_from_pixel, pixel_from_comparator
 from pipeline.results.measured_record import MeasuredScan
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
+from pipeline.types import Array, Indices, Mask
 
 _PAIRS = 60  # distant pairs of targets that generate hypotheses on the placement
 _TESTED = 400  # hypotheses that are tested on all targets
@@ -183,10 +180,10 @@ def _most_agreed(similarities: Array, predicted: Array, found: Array) -> Array:
     return chosen
 
 
-def _support(matrix: Array, predicted: Array, tree: cKDTree, tolerance_px: float) -> NDArray[np.bool_]:
+def _support(matrix: Array, predicted: Array, tree: cKDTree, tolerance_px: float) -> Mask:
     """Mask of the targets with a candidate within the tolerance; each candidate counts once."""
     distances, nearest = _nearest(tree, _mapped(matrix, predicted))
-    supported: NDArray[np.bool_] = distances <= tolerance_px
+    supported: Mask = distances <= tolerance_px
     order = np.argsort(distances, kind="stable")
     _, firsts = np.unique(nearest[order], return_index=True)
     once = np.zeros(len(predicted), dtype=bool)

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from adjust.functional_model.projection import ImageModel
@@ -40,13 +39,13 @@ from pipeline.measuring.target_identification import (
 )
 from pipeline.results.comparator_file import comparator_from_pixel
 from pipeline.results.measured_record import MeasuredScan
+from pipeline.types import Array
 
 _MIRRORED = (
     "The board is mirrored: in a mirror, from its back, or the picture is flipped. Its points are named as on the "
     "board. If that is meant, write transparent = true under [targets]; else flip the picture."
 )
 LEAST_PAIRS = 4  # pairs of points and marks needed to identify an image's targets
-Array = NDArray[np.float64]
 
 _GATE_SHARE = 0.01  # fraction of the scan's diagonal: residuals of an affine placement due to tilt and relief
 _SLACK_PX = 3.0  # a mark within this plus _SLACK_SIGMAS of the resection is the target predicted there

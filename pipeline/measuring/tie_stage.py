@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import NewType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from measure.flags import Code, Reason, Status
 from measure.results import MarkMeasurement
@@ -18,12 +17,11 @@ from measure.tie_points.joins import measure_joins
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TieSettings
-from pipeline.measuring.sheet_check import check_sheet
+from pipeline.measuring.coded_targets import check_sheet
 from pipeline.progress import Count, Reporter
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.wording import capitalised
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 _LEAST_MARK_PX = 20.0  # px, assumed for a mark without a recorded size
 _CHECKED = 3  # fiducials that check one another: fewer fit any frame

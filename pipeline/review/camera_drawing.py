@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from measure.fiducials.clicked_frame import LEAST_CLICKS, are_collinear
@@ -27,8 +26,7 @@ from pipeline.review.requests import parse_values
 from pipeline.text.atomic import write_atomically
 from pipeline.text.tables import Table
 from pipeline.text.wording import listed, table_lines
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 MARK = "drawn"  # NAME of the table [mark.NAME]
 _DRAWN_BY = f"# Drawn on the review page by reseau {version('reseau')}"

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from measure.fiducials.options import Click
 from measure.flags import CAUSE_MEANING
@@ -24,8 +23,7 @@ from pipeline.measuring.first_pictures import first_pictures
 from pipeline.measuring.scan_measurement import measured_scan
 from pipeline.measuring.scan_task import ScanTask, scan_tasks
 from pipeline.results.measured_record import FailureCode, MeasuredScan
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 _STEPS = 48  # vertices of a circle
 Json = dict[str, Any]

@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from measure.marks.shapes import Point
 from pipeline.errors import InputError
+from pipeline.types import Array
 
-Array = NDArray[np.float64]
 MarkJson = Mapping[str, Any]
 
 _DECIMALS = 4  # of values in mm: 0.1 µm

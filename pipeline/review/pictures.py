@@ -14,8 +14,8 @@ from measure.marks.rendering import picture
 from measure.marks.shapes import Mark
 from measure.scans.opening import open_scan
 from measure.scans.scan import Scan
+from pipeline.types import Array
 
-Array = NDArray[np.float64]
 Result = TypeVar("Result")
 
 _OPEN = 4  # scans kept open

@@ -27,7 +27,7 @@ from pipeline.files.mark_table import MARK_TABLES
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_task import sample_names
 from pipeline.results.measured_record import MeasuredScan
-from pipeline.review.drawing_answers import DrawingAnswers
+from pipeline.review.drawing_view import DrawingAnswers
 from pipeline.review.frame_view import mark_json, measured_as_shown, measured_from_clicks
 from pipeline.review.pictures import Pictures
 from pipeline.review.requests import Decide, MeasureFrame, Query, ShownMarks, parse_json, parse_values

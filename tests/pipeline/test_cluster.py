@@ -11,10 +11,9 @@ from typing import Any
 import pytest
 from range_server import range_server
 
-from pipeline.archive import cluster
-from pipeline.archive.cluster import SubmittedAgain, cluster_executor
+from pipeline import workers
 from pipeline.errors import InputError
-from pipeline.workers import WorkerKilled
+from pipeline.workers import SubmittedAgain, WorkerKilled, cluster_executor
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # Dask's own, of what it closes
 
@@ -48,7 +47,7 @@ def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_scheduler_that_does_not_answer_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "_ANSWER_S", 0.5)
+    monkeypatch.setattr(workers, "_ANSWER_S", 0.5)
     with pytest.raises(InputError, match="no scheduler answers there"), cluster_executor("tcp://127.0.0.1:9", []):
         pass
 
@@ -67,9 +66,9 @@ class Answers:
 
 
 def test_workers_are_requested_their_versions_and_their_way_to_the_scans() -> None:
-    same = cluster.versions()
+    same = workers.versions()
     good = (same, list[tuple[str, str]]())
-    cluster._check_workers(Answers({"a": good}), "x", [])
+    workers._check_workers(Answers({"a": good}), "x", [])
     other = ({**same, "numpy": "1.0"}, list[tuple[str, str]]())
     cases = {
         "b: has numpy 1.0, here": other,
@@ -82,7 +81,7 @@ def test_workers_are_requested_their_versions_and_their_way_to_the_scans() -> No
     }
     for words, answer in cases.items():
         with pytest.raises(InputError, match=words):
-            cluster._check_workers(Answers({"a": good, "b": answer}), "x", [])
+            workers._check_workers(Answers({"a": good, "b": answer}), "x", [])
 
 
 def test_one_scan_a_folder_is_inspected_for(tmp_path: Path) -> None:
@@ -91,7 +90,7 @@ def test_one_scan_a_folder_is_inspected_for(tmp_path: Path) -> None:
         for name in "12":
             (tmp_path / folder / name).write_bytes(b"1")
     scans = [str(tmp_path / place) for place in ("a/0", "a/1", "a/2", "b/1", "c/1")]
-    assert cluster._one_a_folder([*scans, ""]) == [str(tmp_path / "a/1"), str(tmp_path / "b/1")]
+    assert workers._one_a_folder([*scans, ""]) == [str(tmp_path / "a/1"), str(tmp_path / "b/1")]
 
 
 def test_addresses_are_inspected_for_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -101,8 +100,8 @@ def test_addresses_are_inspected_for_too(tmp_path: Path, monkeypatch: pytest.Mon
         (tmp_path / name).write_bytes(b"1")
     with range_server(tmp_path) as server:
         scans = [f"{server.url}/{name}" for name in ("closed/1.tif", "a/1.tif", "closed/2.tif", "a/2.tif")]
-        assert cluster._one_a_folder(scans) == [f"{server.url}/a/1.tif"]
-        _, missing = cluster._versions_and_unreachable(scans[:2])
+        assert workers._one_a_folder(scans) == [f"{server.url}/a/1.tif"]
+        _, missing = workers._versions_and_unreachable(scans[:2])
         ((scan, why),) = missing
     assert scan == scans[0]
     assert "forbids to read it (403)" in why

@@ -12,8 +12,7 @@ import tifffile
 from range_server import range_server
 
 from pipeline.archive import new_project
-from pipeline.archive.catalogue import catalogue
-from pipeline.archive.scan_groups import GroupedScans, Sample, ScanGroup, group_scans, name_cameras
+from pipeline.archive.scan_groups import GroupedScans, Sample, ScanGroup, catalogue, group_scans, name_cameras
 from pipeline.cli import run
 from pipeline.files.library import read_library
 from pipeline.files.project_file import read_project

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from pipeline.archive.verdicts import Verdict
-from pipeline.commands.next_steps import command_step, print_next, summary_steps
+from pipeline.commands.shared import command_step, print_next, summary_steps
 
 PROJECT = Path("my project.toml")
 

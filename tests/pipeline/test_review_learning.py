@@ -20,7 +20,7 @@ from pipeline.errors import InputError
 from pipeline.files.decision import Choice, Decision
 from pipeline.files.decisions_file import append_decisions
 from pipeline.files.project_file import read_project
-from pipeline.review.drawing_answers import DrawingAnswers
+from pipeline.review.drawing_view import DrawingAnswers
 from pipeline.review.pictures import Pictures
 from pipeline.review.requests import Query
 from pipeline.review.session import Session

@@ -15,8 +15,7 @@ from measure.boards.find import recognise_board
 from measure.scans.opening import open_scan, read_head
 from pipeline import stages
 from pipeline.archive import new_project
-from pipeline.archive.catalogue import catalogue
-from pipeline.archive.scan_groups import GroupedScans, Sample, group_scans, name_cameras, trial_of_cameras
+from pipeline.archive.scan_groups import GroupedScans, Sample, catalogue, group_scans, name_cameras, trial_of_cameras
 from pipeline.cli import run
 from pipeline.files import library
 from pipeline.files.library import read_library

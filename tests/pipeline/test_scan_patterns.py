@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.archive.catalogue import catalogue
+from pipeline.archive.scan_groups import catalogue
 from pipeline.files.scan_files import find_scans, found_names
 from pipeline.text.tables import Table
 

@@ -12,7 +12,7 @@ from single_scans import measure_scan
 from measure.flags import Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement
 from pipeline.files.project_file import Project, read_project
-from pipeline.measuring.sheet_check import check_sheet
+from pipeline.measuring.coded_targets import check_sheet
 from pipeline.results.measured_record import MeasuredScan
 
 Array = NDArray[np.float64]

@@ -29,8 +29,7 @@ from pipeline.archive.checked_statuses import (
     judge_lots,
     latest,
 )
-from pipeline.archive.merge import merge
-from pipeline.archive.results_database import Store
+from pipeline.archive.results_database import Store, merge
 from pipeline.archive.schema import MIGRATIONS, VERSION, opened
 from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict, scan_verdict
 from pipeline.errors import InputError
