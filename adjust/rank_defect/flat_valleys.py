@@ -78,21 +78,22 @@ def held_directions(problem: Problem, variances: Array) -> int:
     return round(sum(float(variances[i]) / sigma**2 for i, sigma in problem.pseudo_observed.items()))
 
 
-def inseparable(problem: Problem, state: State, variances: Array) -> list[str]:
-    """One sentence for each camera with inseparable parameters."""
+def inseparable(problem: Problem, state: State, variances: Array) -> dict[str, tuple[list[str], str]]:
+    """Inseparable parameters of each camera that has some, and a sentence on them."""
     inseparable_positions = set(unresolved(problem.pseudo_observed, variances))
-    sentences = []
+    found = {}
     for name, positions in problem.unknowns.camera.items():
         of = family(problem.network.camera_by_name[name].distortion.family)
         names = [each for each, i in zip(of.parameters, positions[3:], strict=True) if int(i) in inseparable_positions]
         if names:
             radius_mm = observed_radius_mm(problem, state, name)
-            sentences.append(
+            sentence = (
                 f"{enumeration(names)} of camera {name} cannot be separated: up to {radius_mm:.3g} mm from the "
                 "principal point, as far as targets were observed, they do the same. The distortion itself is known "
                 "there. Use its parameters together, not one by one, or estimate fewer of them."
             )
-    return sentences
+            found[name] = names, sentence
+    return found
 
 
 def _largest_motion_mm(problem: Problem, at: Linearised, rows: Indices, position: int) -> float:

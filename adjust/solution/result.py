@@ -240,9 +240,16 @@ class Adjustment(Estimates, PlottedResult):
     @cached_property
     def notes(self) -> tuple[str, ...]:
         """Notes that need no action."""
+        return (*self.unused, *(sentence for _, sentence in self._inseparable.values()))
+
+    def inseparable(self, camera: str) -> list[str]:
+        """Distortion parameters of a camera that the observations do not separate."""
+        return self._inseparable.get(camera, ([], ""))[0]
+
+    @cached_property
+    def _inseparable(self) -> dict[str, tuple[list[str], str]]:
         run = self.run
-        found = inseparable(run.problem, run.end.state, self.cofactor.variances) if run.converged else ()
-        return (*self.unused, *found)
+        return inseparable(run.problem, run.end.state, self.cofactor.variances) if run.converged else {}
 
     @cached_property
     def _explanation_run(self) -> Explained:

@@ -113,14 +113,18 @@ def _snoop_rounds(last: Run, options: Options) -> Run:
 
 
 def _run(problem: Problem, weighting: Weighting, state: State, limit: int) -> Run:
-    """Iterate from a state; where only distortion parameters of 0 make it singular, hold them first, then release."""
+    """Iterate from a state; where the cameras' parameters lead nowhere, hold them first, then release them."""
+    # Those of a denominator are like others where they are 0, and mislead the iteration where they are not; principal
+    # point, decentering and prism are alike at the start of boards that are seen from little tilts.
     last = _iterate(problem, weighting, state, limit)
-    alike = [at for positions in _alike_at_zero(problem, state).values() for at in positions]
-    if alike and last.singular and not last.solution.history:
-        begun = _iterate(replace(problem, unknowns=problem.unknowns.fixed(alike)), weighting, state, limit)
-        if begun.converged:
-            freed = _release_cameras(problem, weighting, begun, limit)
-            last = last if freed.singular else freed
+    is_lost = not last.converged and bool(last.solution.history)
+    alike = [at for positions in _alike_at_zero(problem, state, is_lost).values() for at in positions]
+    for held in (alike,) if is_lost else (alike, _free_of_cameras(problem)):
+        if held and (is_lost or (last.singular and not last.solution.history)):
+            begun = _run(replace(problem, unknowns=problem.unknowns.fixed(held)), weighting, state, limit)
+            if begun.converged:
+                freed = _release_cameras(problem, weighting, begun, limit)
+                last = freed if freed.converged or not (is_lost or freed.singular) else last
     return last
 
 
@@ -151,13 +155,15 @@ def _linearise(problem: Problem, weighting: Weighting, state: State) -> Linearis
     return linearise(Numbering(weighted), covariance, state)
 
 
-def _alike_at_zero(problem: Problem, state: State) -> dict[str, list[int]]:
-    """Free distortion parameters by camera that are 0 and then have the derivatives of other parameters."""
+def _alike_at_zero(problem: Problem, state: State, with_others: bool = False) -> dict[str, list[int]]:
+    """Free distortion parameters by camera that are 0, and then have the derivatives of other parameters. with_others:
+    those too that could be and are not."""
     unknowns, found = problem.unknowns, {}
     for camera, positions in unknowns.camera.items():
         of = family(problem.network.camera_by_name[camera].distortion.family)
         alike = [int(positions[3 + of.parameters.index(each)]) for each in of.alike_at_zero]
-        found[camera] = [at for at in alike if np.isinf(unknowns.sigma[at]) and state.values[at] == 0.0]
+        free = [at for at in alike if np.isinf(unknowns.sigma[at])]
+        found[camera] = [at for at in free if with_others or state.values[at] == 0.0]
     return found
 
 
@@ -169,6 +175,12 @@ def _apart(problem: Problem, state: State) -> State:
         apart = family(problem.network.camera_by_name[camera].distortion.family).apart(values[at])
         values[at] = np.where(np.isinf(unknowns.sigma[at]), apart, values[at])
     return State(values, state.rotations)
+
+
+def _free_of_cameras(problem: Problem) -> list[int]:
+    """All free parameters of cameras."""
+    unknowns = problem.unknowns
+    return [int(at) for positions in unknowns.camera.values() for at in positions if np.isinf(unknowns.sigma[at])]
 
 
 def _iterate(problem: Problem, weighting: Weighting, state: State, limit: int) -> Run:

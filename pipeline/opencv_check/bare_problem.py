@@ -220,6 +220,10 @@ def converted(problem: BareProblem, solved: Adjustment) -> Converted:
     family = camera.distortion.family
     lens = adjusted_lens(solved, camera.name)
     own = [Parameter.interior(camera.name, each) for each in lens.quantities]
+    if family == FISHEYE or (family == "opencv" and lens.parameters[-1] == 0.0):  # without shear: OpenCV's own model
+        parameters, by_lens = opencv_values(lens)
+        variances = np.diag(by_lens @ solved.cofactor_of(own) @ by_lens.T)
+        return Converted(parameters, np.sqrt(np.maximum(variances, 0.0)), 0.0)
     observed = problem.network.observations.xy_mm
     corners_mm = np.array([observed.min(axis=0), observed.max(axis=0)])
     whole = to_opencv_model(lens, corners_mm, _whole(family))

@@ -16,7 +16,7 @@ import numpy as np
 
 from adjust.errors import AdjustmentError
 from adjust.problem.camera import Camera
-from adjust.problem.parameter import Parameter, description
+from adjust.problem.parameter import Parameter, description, enumeration
 from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
 from pipeline.opencv_check.bare_problem import (
@@ -30,7 +30,7 @@ from pipeline.opencv_check.bare_problem import (
 )
 from pipeline.opencv_check.opencv_calibration import OpenCvCalibration, calibrate, calibrate_fisheye
 from pipeline.opencv_check.opencv_corners import BoardPictures, compare_corners
-from pipeline.opencv_check.opencv_model import FISHEYE, INTERIOR, NAMES, Freedom, model_names
+from pipeline.opencv_check.opencv_model import FISHEYE, INTERIOR, NAMES, OPENCV_RADIAL, Freedom, model_names
 from pipeline.results.check_file import CameraCheck, Check, Estimate, Row, Verdict
 
 LARGEST_DIFFERENCE = 1.0  # sigmas; about 0.1 is usual, since the two models differ slightly
@@ -159,6 +159,9 @@ def _compare(
     sigmas_tell = rms_um > ROUNDINGS * opencv.rounding_um
     names = model_names(problem.network.cameras[0].distortion.family)
     rows = _rows(names, problem.freedom, conversion, solved.sigma0 if sigmas_tell else 1.0, opencv)
+    camera = problem.network.cameras[0]
+    together = solved.inseparable(camera.name)
+    rows = tuple(row for row in rows if not together or row.name not in OPENCV_RADIAL)
     known |= {"rms_opencv_um": opencv.rms_um, "rows": rows}
     if pictures is not None and _is_digital(adjustment, problem):
         known["corners_px"] = compare_corners(problem.images, pictures, calibrated)
@@ -167,7 +170,8 @@ def _compare(
             f"OpenCV ends in a worse solution, {opencv.rms_um:.2f} µm a point against {rms_um:.2f} µm: it begins every "
             "image by itself and did not come to the minimum."
         )
-    verdict, reason = _agreement(rows, sigmas_tell)
+    # Pseudo-observations along the valley, which OpenCV has not, make the other standard deviations smaller.
+    verdict, reason = _agreement(rows, sigmas_tell and not together)
     if verdict == "differs" and _same_model_agrees(problem, conversion, opencv):
         verdict = "agrees"
         reason = (
@@ -175,7 +179,9 @@ def _compare(
             f"leaves {refit_um:.3f} µm, which {known['points']} points notice. {reason}"
         )
     if verdict == "agrees" and sigmas_tell:
-        verdict, reason = _judge_departure(reason, _departures(adjustment, solved, problem.network.cameras[0]))
+        verdict, reason = _judge_departure(reason, _departures(adjustment, solved, camera))
+    if together:
+        reason += f" {enumeration(together)} cannot be separated: the radial terms are not compared one by one."
     rms = f"The residuals are {opencv.rms_um:.2f} µm rms a point in OpenCV, {rms_um:.2f} µm here."
     return verdict, f"{reason} {rms} {_notes(problem, opencv, sigmas_tell)}"
 
@@ -246,7 +252,7 @@ def _departures(adjustment: Adjustment, solved: Adjustment, camera: Camera) -> d
     return {
         each.quantity: abs(adjustment.value(each) - solved.value(each)) / solved.sigma(each)
         for each in (Parameter.interior(camera.name, name) for name in sorted(free_parameters(camera)))
-        if solved.sigma(each) > 0
+        if solved.sigma(each) > 0 and not (solved.inseparable(camera.name) and each.quantity in OPENCV_RADIAL)
     }
 
 

@@ -19,6 +19,7 @@ INTERIOR = ("fx", "fy", "cx", "cy")
 NAMES = (
     *INTERIOR, "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y",
 )  # fmt: skip
+OPENCV_RADIAL = ("k1", "k2", "k3", "k4", "k5", "k6")  # numerator and denominator
 FISHEYE = "opencv_fisheye"  # name of this model's family in the adjustment
 FISHEYE_NAMES = (*INTERIOR, "k1", "k2", "k3", "k4", "alpha")
 Y_UP = np.array([1.0, -1.0])

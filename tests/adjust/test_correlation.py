@@ -191,6 +191,23 @@ def test_an_ordinary_board_gives_a_rational_lens(seed: int, free: tuple[str, ...
     assert result.sigma("IO.cam.k4") > 0.3
 
 
+@parametrize_with_studies("start", [(2.0, 5.0, 10.0), (0.3, 0.1, 0.05), (-0.3, 0.0, 0.0)], quick=(0,))
+def test_a_denominator_that_does_not_begin_at_zero_gives_a_rational_lens(start: tuple[float, float, float]) -> None:
+    """Among the first of these values the iteration is lost; held at first, they lead to the same images."""
+    network = board_network(1, EIGHT)
+    given = {name: Prior(0.0, np.inf) for name in EIGHT}
+    given |= {name: Prior(value, np.inf) for name, value in zip(("k4", "k5", "k6"), start, strict=True)}
+    camera = replace(network.cameras[0], distortion=Distortion("opencv", given))
+    result = adjust(replace(network, cameras=(camera,)))
+    assert result.converged
+    assert "of camera cam cannot be separated" in result.notes[-1]
+    assert abs(result.sigma0 - adjust(network).sigma0) < 0.01
+    assert abs(result.value("IO.cam.c") - C) < 4.0 * result.sigma("IO.cam.c")
+    for radius_mm in (1.0, 2.0):
+        errors, sigma = distortion_errors(result, radius_mm)
+        assert (np.abs(errors) < 4.0 * sigma).all()
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_distortion_itself_is_known(seed: int) -> None:
     """To a fifth of a pixel, though no parameter is known to a tenth of what it could be."""

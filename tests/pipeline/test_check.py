@@ -402,3 +402,17 @@ def test_json_has_the_documented_keys_and_no_nan() -> None:
     }  # fmt: skip
     assert set(camera["rows"][0]) == {"name", "unit", "reseau", "opencv", "difference_sigmas"}
     assert set(camera["rows"][0]["reseau"]) == {"value", "sigma"}
+
+
+def test_parameters_that_cannot_be_separated_are_not_compared_one_by_one() -> None:
+    """A lens without a denominator, which is free: both programs have the same images, and other k1 to k6."""
+    network = lens_network("opencv", np.random.default_rng(3))
+    middle = np.flatnonzero(np.linalg.norm(network.observations.xy_mm, axis=1) < 9.0)
+    network = replace(network, observations=network.observations.only(middle))
+    names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    free = Distortion("opencv", {name: Prior(0.0, np.inf) for name in names})
+    network = replace(network, cameras=(replace(network.cameras[0], distortion=free),))
+    check = check_against_opencv(adjust(network)).cameras["L"]
+    assert check.verdict == "agrees"
+    assert {row.name for row in check.rows} == {"fx", "cx", "cy", "p1", "p2"}
+    assert "cannot be separated: the radial terms are not compared one by one" in check.reason
