@@ -69,6 +69,7 @@ def followed() -> Followed:
     from pipeline.files.project_file import read_project
     from pipeline.progress import Reporter
     from pipeline.results.comparator_file import mark_rows, write_comparator
+    from pipeline.workers import WorkOptions
 
     with TemporaryDirectory() as place:
         path = write_project(Path(place), ["frame"])
@@ -80,7 +81,7 @@ def followed() -> Followed:
         sys.setprofile(calls)
         try:
             with Store(project.measurement_path) as store:
-                measure_archive.measure_archive(project, store, dict, Path(place) / "learned", Reporter())
+                measure_archive.measure_archive(project, store, Path(place) / "learned", Reporter(), WorkOptions())
             scans = read_measurement(project.measurement_path)
             pitch_um = {scan.frame.image: scan.pitch_um for scan in scans}
             write_comparator(project.comparator, mark_rows([scan.frame for scan in scans]), pitch_um)

@@ -11,10 +11,10 @@ from rich.text import Text
 from adjust.model_selection.candidates import Candidate
 from adjust.model_selection.model_choice import Choice, choose
 from pipeline.adjusting.adjust_stage import adjust_marks, adjustment_options, name_scanners
+from pipeline.archive.made_from import adjusted_from
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
-from pipeline.publishing.made_from import adjusted_from
-from pipeline.publishing.publishing import unpublished
+from pipeline.publishing import unpublished
 from pipeline.results.choice_file import ChoiceRecord, choice_record
 from pipeline.results.comparator_file import read_comparator
 from pipeline.results.record_json import write_record

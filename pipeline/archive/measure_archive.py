@@ -1,217 +1,32 @@
-"""Measure a project's scans into its results database: what is missing or changed; and check all of them together."""
+"""Measure a project's scans into its results database: only what is missing or changed."""
 
-import hashlib
-import json
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
-from dataclasses import replace
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 
 from measure.errors import MeasurementError
-from measure.flags import Code, Reason, Status
-from measure.results import MEASURE_REVISION
 from measure.scans.remote import fetch_location, scan_path
-from pipeline.archive.checked_statuses import CheckedResult, Lot, judge_lots, latest
+from pipeline.archive.checked_statuses import judge_lots, latest
+from pipeline.archive.cross_scan_checks import check_lots, find_copies, hash_inputs
+from pipeline.archive.made_from import measured_from
 from pipeline.archive.results_database import Store
 from pipeline.archive.review_decisions import tell_inapplicable
 from pipeline.archive.thumbnails import ThumbnailStore
 from pipeline.archive.work import Work
 from pipeline.errors import InputError
-from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.files.scan_files import as_named
-from pipeline.measuring.camera_identification import add_plates
 from pipeline.measuring.learn_stage import collect_tones, learn_marks
-from pipeline.measuring.roll import CheckedScan, add_known_lines, build_roll, check_scans, note_same_frames
+from pipeline.measuring.roll import add_known_lines
 from pipeline.measuring.scan_task import ScanTask, scan_tasks
 from pipeline.measuring.tie_stage import check_tie_names, tie_scans
 from pipeline.progress import Reporter
-from pipeline.provenance import FileStates, Identity, content_hash, fingerprint, parts_hash, shard_number
-from pipeline.results.measured_record import MeasuredScan
+from pipeline.provenance import FileStates, Identity, content_hash, parts_hash, shard_number
 from pipeline.text.wording import counted, gathered
 from pipeline.workers import WorkOptions, cluster_executor, worker_pool
-
-_TOGETHER = 2000  # most frames of a camera that are checked together, to limit memory
-OfCamera = tuple[CameraFile, Sequence[ScanTask]]
-Remarks = Mapping[str, tuple[tuple[Reason, ...], tuple[str, ...]]]  # problems and notes by image
-
-
-def check_lots(
-    project: Project,
-    tasks: Sequence[ScanTask],
-    work: Work,
-    copies: Mapping[str, str],
-    share: Callable[[Sequence[MeasuredScan]], Iterable[MeasuredScan]],
-    input_hash: str,
-) -> Iterator[Lot]:
-    """Check all scans together, in lots: a lot whose scans are unchanged need not be checked again.
-
-    Parameters
-    ----------
-    project : with its learned marks.
-    tasks : of all scans.
-    work : access to the results.
-    copies : {image: image whose file its own is a copy of}.
-    share : third step of the measurement: targets and natural points shared between scans.
-    input_hash : `hash_inputs` of all scans.
-
-    Yields
-    ------
-    Lots; one is held in memory at a time.
-    """
-    own = [task for task in tasks if task.name not in copies]
-    keys, remarks = work.keys(), _writing_remarks(project, own, work)
-
-    def lot(some: Sequence[ScanTask], depends_on: object, scans: Callable[[], Iterable[MeasuredScan]]) -> Lot:
-        results = [
-            [task.name, keys[task.name], work.counting(task.name), *filter(None, [work.decisions_hash(task.name)])]
-            for task in some
-        ]
-        made_by = [version("reseau"), MEASURE_REVISION]
-        return Lot(
-            fingerprint([results, depends_on, made_by]), lambda: (_checked_result(scan, work) for scan in scans())
-        )
-
-    def checked_lot(of_cameras: Sequence[OfCamera]) -> Iterable[MeasuredScan]:
-        scans = [scan for each in of_cameras for scan in _check_camera(project, *each, work)]
-        return share([_add_remarks(scan, remarks) for scan in scans])
-
-    for of_cameras in _lots(project, own):
-        some = [task for _, each in of_cameras for task in each]
-        of_writing = [remarks[task.name] for task in some if task.name in remarks]
-        cameras = [camera for camera, _ in of_cameras]
-        depends_on = [cameras, project.film, of_writing, _project_inputs(project, some, input_hash)]
-        yield lot(some, depends_on, partial(checked_lot, of_cameras))
-    if copies:
-        again = sorted(copies.items())
-        yield lot(
-            [task for task in tasks if task.name in copies],
-            again,
-            lambda: [_copy(work.read(name), original) for name, original in again],
-        )
-
-
-def find_copies(store: Store, tasks: Sequence[ScanTask], work: Work) -> dict[str, str]:
-    """Return {image: first image, by name, with the same file content}.
-
-    Whole files are read only where size and the hash of parts agree.
-    """
-    groups = defaultdict[tuple[int, str], list[ScanTask]](list)
-    identities = store.identities()
-    for task in tasks:
-        known = identities.get(work.state(task).uri)
-        if known is not None and known.state.bytes > 0 and known.parts_hash:
-            groups[known.state.bytes, known.parts_hash].append(task)
-    hashes = store.content_hashes()
-    originals, copies = dict[str, str](), dict[str, str]()
-    for group in groups.values():
-        originals.clear()
-        for task in sorted(group, key=lambda task: task.name) if len(group) > 1 else ():
-            content = hashes.get(work.state(task).uri) or content_hash(scan_path(task.scan))
-            hashes[work.state(task).uri] = content
-            if content and originals.setdefault(content, task.name) != task.name:
-                copies[task.name] = originals[content]
-    store.set_content_hashes(hashes)
-    store.set_copies({work.state(task).uri: copies[task.name] for task in tasks if task.name in copies})
-    return copies
-
-
-def hash_inputs(tasks: Sequence[ScanTask], work: Work, copies: Mapping[str, str], made_from: Mapping[str, str]) -> str:
-    """SHA-256 of all inputs of the cross-scan checks: the results and the project's own inputs."""
-    keys = work.keys()
-    results = [[task.name, keys[task.name]] for task in tasks]
-    made_by = [version("reseau"), MEASURE_REVISION]
-    content = json.dumps([results, sorted(copies.items()), dict(made_from), made_by], sort_keys=True)
-    return hashlib.sha256(content.encode()).hexdigest()
-
-
-def _lots(project: Project, tasks: Sequence[ScanTask]) -> Sequence[Sequence[OfCamera]]:
-    """Scans that are checked together, by camera. Natural points may link any scans, so they need one lot; targets on a
-    sheet and parts of frames are checked in one lot only in small projects."""
-    of_cameras = _camera_lots(project, tasks)
-    are_few = len(tasks) <= _TOGETHER and (project.targets is not None or project.has_parts)
-    return [of_cameras] if project.ties is not None or are_few else [[each] for each in of_cameras]
-
-
-def _project_inputs(project: Project, tasks: Sequence[ScanTask], input_hash: str) -> object:
-    """Inputs of the third step from the project, in addition to the scans."""
-    if project.ties is not None:
-        return input_hash
-    points = None if project.targets is None else project.object_points
-    return [
-        project.targets,
-        points,
-        [project.scanned_frame(task.name) for task in tasks] if project.has_parts else None,
-    ]
-
-
-def _camera_lots(project: Project, tasks: Sequence[ScanTask]) -> list[OfCamera]:
-    """Split the scans of each camera into lots.
-
-    All scans of a camera form one lot up to `_TOGETHER`; more are split by a hash of the frame's name, so that a new
-    scan changes a single lot. Parts of one frame are in one lot.
-    """
-    found = list[OfCamera]()
-    for camera in project.cameras.values():
-        own = [task for task in tasks if project.image_camera(task.name) is camera]
-        lots = 1
-        while len(own) > lots * _TOGETHER:
-            lots *= 2
-        some = defaultdict[int, list[ScanTask]](list)
-        for task in own:
-            some[shard_number(project.scanned_frame(task.name) or task.name, lots)].append(task)
-        found += [(camera, some[lot]) for lot in sorted(some)]
-    return found
-
-
-def _check_camera(
-    project: Project, camera: CameraFile, tasks: Sequence[ScanTask], work: Work
-) -> tuple[CheckedScan, ...]:
-    """Second step of the measurement. Scans whose marks are renamed by the comparison with others are measured
-    again."""
-    scans = [work.read(task.name) for task in tasks]
-    roll = build_roll(tasks, scans, camera.writing)
-    again = list(work.measure(roll.tasks)) if roll.tasks else []
-    return check_scans(camera, scans, roll, again, project.film)
-
-
-def _writing_remarks(project: Project, tasks: Sequence[ScanTask], work: Work) -> Remarks:
-    """Remarks from the writing on scans about other scans: plates of other cameras, frames scanned twice. Only the
-    writing of the scans is held in memory."""
-    names = work.written([task.name for task in tasks])
-    bare = dict[str, MeasuredScan]()
-    for camera in project.cameras.values():
-        own = [work.read_writing(name) for name in names if project.image_camera(name) is camera]
-        bare |= {scan.frame.image: scan for scan in add_plates(camera, own, project.cameras)}
-    noted = note_same_frames([bare[name] for name in names], project.scanned_frame)
-    return {scan.frame.image: (scan.frame.problems, scan.notes) for scan in noted if scan.frame.problems or scan.notes}
-
-
-def _add_remarks(scan: MeasuredScan, remarks: Remarks) -> MeasuredScan:
-    problems, notes = remarks.get(scan.frame.image, ((), ()))
-    frame = replace(scan.frame, problems=(*scan.frame.problems, *problems))
-    return replace(scan, frame=frame, notes=(*scan.notes, *notes))
-
-
-def _checked_result(scan: MeasuredScan, work: Work) -> CheckedResult:
-    name = scan.frame.image
-    return CheckedResult(work.results[name], work.apply_decisions(scan), work.decisions_hash(name))
-
-
-def _copy(scan: MeasuredScan, original: str) -> MeasuredScan:
-    """Scan with all observations rejected, since they count in the scan of which its file is a copy."""
-    reason = Reason(f"its file is a copy of that of {original}, which counts", Code.COPY)
-    marks = [
-        replace(mark, status=Status.REJECTED, reason=reason) if mark.status.is_observation else mark
-        for mark in scan.frame.marks
-    ]
-    sentence = f"its file is byte for byte that of {original}: its marks count once. Name one of both in `exclude`."
-    problem = Reason(sentence, Code.COPY)
-    return replace(scan, frame=replace(scan.frame, marks=tuple(marks), problems=(*scan.frame.problems, problem)))
 
 
 def check_measurable(project: Project) -> tuple[str, ...]:
@@ -296,17 +111,15 @@ def hash_contents(store: Store, tasks: Sequence[ScanTask], work: Work, reporter:
 def measure_archive(
     project: Project,
     store: Store,
-    made_from: Callable[[], Mapping[str, str]],
     learned_folder: Path,
     reporter: Reporter,
-    options: WorkOptions | None = None,
+    options: WorkOptions,
 ) -> str:
     """Measure the missing scans of a project and check all of them together, unless nothing has changed.
 
     Parameters
     ----------
     project, store : project and its results database.
-    made_from : function that returns {name: fingerprint} of the inputs of the checks, called after the measurement.
     learned_folder : folder for the learned marks.
     reporter, options : progress, and how the work is done.
 
@@ -321,7 +134,6 @@ def measure_archive(
     MeasurementError
         No scan could be measured; single failures are results.
     """
-    options = options or WorkOptions()
     names = check_measurable(project)
     with open_executor(project, options) as executor, ThumbnailStore.open(store.path) as thumbnails:
         # After all checks that could prevent a new measurement.
@@ -346,7 +158,7 @@ def measure_archive(
             hash_contents(store, tasks, work, reporter)
         _check_any(store)
         copies = find_copies(store, tasks, work)
-        made = made_from()
+        made = measured_from(project)
         input_hash = hash_inputs(tasks, work, copies, made)
         before = latest(store)
         if before is not None and before.input == input_hash:

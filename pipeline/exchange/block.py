@@ -11,11 +11,11 @@ from adjust.functional_model.lens import Lens
 from adjust.functional_model.projection import ImageModel, LineOfSight
 from adjust.functional_model.rotation import rotation_from_angles
 from pipeline.adjusting.turned_pictures import rotate_to_sensor
+from pipeline.archive.made_from import adjusted_from, differing
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.files.project_tables import UNITS_MM
-from pipeline.publishing.made_from import adjusted_from, differing
 from pipeline.resampling.canvas import FrameChain, image_chain
 from pipeline.results.adjustment_file import read_adjustment
 from pipeline.results.adjustment_record import AdjustmentRecord

@@ -5,14 +5,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from pipeline.archive.measurement import StoredMarks, measured_scans, read_inputs
-from pipeline.archive.results_database import Store
-from pipeline.archive.review_decisions import inapplicable
-from pipeline.errors import InputError
-from pipeline.files.camera_file import CameraFile
-from pipeline.files.project_file import Project
-from pipeline.provenance import hash_file
-from pipeline.publishing.made_from import (
+from pipeline.archive.made_from import (
     CAMERA,
     DECISIONS,
     PLACES,
@@ -22,7 +15,14 @@ from pipeline.publishing.made_from import (
     differing,
     measured_from,
 )
-from pipeline.publishing.publishing import outside_note
+from pipeline.archive.measurement import StoredMarks, measured_scans, read_inputs
+from pipeline.archive.results_database import Store
+from pipeline.archive.review_decisions import inapplicable
+from pipeline.errors import InputError
+from pipeline.files.camera_file import CameraFile
+from pipeline.files.project_file import Project
+from pipeline.provenance import hash_file
+from pipeline.publishing import outside_note
 from pipeline.report.data import Problem, ReportData
 from pipeline.report.many_frames import MOST_FRAMES, reduced
 from pipeline.results.adjustment_file import read_adjustment

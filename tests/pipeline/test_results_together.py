@@ -22,11 +22,11 @@ from measure.errors import MeasurementError
 from measure.flags import Status
 from pipeline import stages
 from pipeline.adjusting import second_visit
+from pipeline.archive.made_from import measured_from
 from pipeline.archive.measurement import read_measurement
 from pipeline.cli import run
 from pipeline.files.project_file import read_project
 from pipeline.provenance import fingerprint, scan_fingerprint
-from pipeline.publishing.made_from import measured_from
 from pipeline.report.load import adjusted_data
 from pipeline.results.comparator_file import mark_rows, read_comparator, write_comparator
 from pipeline.results.measured_record import MeasuredScan
@@ -316,7 +316,7 @@ def test_a_place_that_cannot_be_taken_is_named_with_those_that_were(
             raise PermissionError(errno.EACCES, "held by another program")
         whole(source, target)
 
-    monkeypatch.setattr("pipeline.publishing.publishing.os.replace", refuse)
+    monkeypatch.setattr("pipeline.publishing.os.replace", refuse)
     assert run(["adjust", str(project / "project.toml")]) == 2
     message = capsys.readouterr().err
     assert "adjustment.npz: cannot be written (held by another program)" in message

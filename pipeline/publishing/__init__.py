@@ -1,1 +1,0 @@
-"""Provenance of results, and joint replacement of earlier results by those of a command."""
