@@ -7,9 +7,7 @@ import signal
 import sys
 
 _INTERRUPTED = 130
-_OBJECTS = (  # allocations per garbage collection: each one rescans an archive's many long-lived objects
-    10_000  # allocations between garbage collections, which rescan an archive's many long-lived objects each time
-)
+_OBJECTS = 10_000  # allocations between garbage collections, each of which rescans an archive's many lasting objects
 
 
 def main() -> None:

@@ -3,7 +3,7 @@
 A single mark gives false peaks on every film: the constellation decides.
 """
 
-from collections import OrderedDict
+from collections import OrderedDict, defaultdict
 from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -218,14 +218,16 @@ class Dilation:
 class ResponseMap:
     """Responses to one template, with derived quantities shared by all orientations and hypotheses."""
 
-    def __init__(self, responses: "Responses", key: Key) -> None:
-        self._responses, self._key = responses, key
+    def __init__(
+        self, maps: Mapping[Key, Map], key: Key, cache: ByteCache[Dilation], origin: NDArray[np.int_]
+    ) -> None:
+        # No reference to the `Responses` that hold this map: in a cycle their large maps would outlive the search.
+        self._maps, self._key, self._cache, self.origin = maps, key, cache, origin
         self._own = object()  # identifies this map in the cache; self would create a reference cycle
-        self.origin = np.zeros(2, dtype=int) if responses.origins is None else responses.origins[key[0]]
 
     @property
     def map(self) -> Map:
-        return self._responses.maps[self._key]
+        return self._maps[self._key]
 
     @cached_property
     def candidates(self) -> Array:
@@ -234,11 +236,11 @@ class ResponseMap:
 
     def dilated(self, radius_px: float) -> Dilation:
         """Dilate the map by a radius, rounded to whole pixels."""
-        key, cache = (self._own, round(radius_px)), self._responses.cache
-        dilation = cache.get(key)
+        key = self._own, round(radius_px)
+        dilation = self._cache.get(key)
         if dilation is None:
             dilation = Dilation(self.map, self.origin, radius_px)
-            cache.put(key, dilation, dilation.map.nbytes)
+            self._cache.put(key, dilation, dilation.map.nbytes)
         return dilation
 
     def highest_about(self, places: Array, radius_px: float) -> tuple[Array, Array]:
@@ -273,7 +275,8 @@ class Responses:
     @cached_property
     def by_key(self) -> dict[Key, ResponseMap]:
         """Response maps by kind of template and sign."""
-        return {key: ResponseMap(self, key) for key in self.maps}
+        origins = defaultdict(lambda: np.zeros(2, dtype=int)) if self.origins is None else self.origins
+        return {key: ResponseMap(self.maps, key, self.cache, origins[key[0]]) for key in self.maps}
 
     def reduced_px(self, scan_px: Array) -> Array:
         """Convert scan pixels (..., 2) to pixels of the reduced scan."""

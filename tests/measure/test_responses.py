@@ -1,5 +1,7 @@
 """Responses of a reduced scan to marks: maps of which a part is cached, and the shares of places that answer so."""
 
+import gc
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +55,18 @@ def test_only_the_dilations_used_last_are_cached() -> None:
     assert layers[0].dilated(4.0) is not first
     np.testing.assert_array_equal(layers[0].dilated(4.0).map, first.map)
     assert layers[2].dilated(4.0) is not third
+
+
+def test_responses_are_freed_with_the_search_and_not_by_the_next_garbage_collection() -> None:
+    responses = Responses({(0, 1): MAP}, (0,), 1, ByteCache[Dilation](1 << 30))
+    assert responses.by_key[0, 1].dilated(2.0).map.shape == MAP.shape
+    alive = weakref.ref(responses)
+    gc.disable()
+    try:
+        del responses
+        assert alive() is None
+    finally:
+        gc.enable()
 
 
 RNG = np.random.default_rng(4)
