@@ -218,9 +218,7 @@ class Dilation:
 class ResponseMap:
     """Responses to one template, with derived quantities shared by all orientations and hypotheses."""
 
-    def __init__(
-        self, maps: Mapping[Key, Map], key: Key, cache: ByteCache[Dilation], origin: NDArray[np.int_]
-    ) -> None:
+    def __init__(self, maps: Mapping[Key, Map], key: Key, cache: ByteCache[Dilation], origin: NDArray[np.int_]) -> None:
         # No reference to the `Responses` that hold this map: in a cycle their large maps would outlive the search.
         self._maps, self._key, self._cache, self.origin = maps, key, cache, origin
         self._own = object()  # identifies this map in the cache; self would create a reference cycle
