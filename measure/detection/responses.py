@@ -3,7 +3,7 @@
 A single mark gives false peaks on every film: the constellation decides.
 """
 
-from collections import OrderedDict, defaultdict
+from collections import OrderedDict
 from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -273,7 +273,7 @@ class Responses:
     @cached_property
     def by_key(self) -> dict[Key, ResponseMap]:
         """Response maps by kind of template and sign."""
-        origins = defaultdict(lambda: np.zeros(2, dtype=int)) if self.origins is None else self.origins
+        origins = np.zeros((len(self.maps), 2), dtype=int) if self.origins is None else self.origins
         return {key: ResponseMap(self.maps, key, self.cache, origins[key[0]]) for key in self.maps}
 
     def reduced_px(self, scan_px: Array) -> Array:
