@@ -246,7 +246,7 @@ def adjusted_camera_plots(
         vectors_mm=np.concatenate(moved),
         is_fiducial=np.concatenate(is_fiducial),
         images=len(images),
-        corners_mm=np.array(camera.frame_corners() or (observed.min(axis=0), observed.max(axis=0))),
+        corners_mm=np.array(camera.frame_corners(observed) or (observed.min(axis=0), observed.max(axis=0))),
         uncertainty=uncertainty,
         pixel_mm=pixel_mm,
     )

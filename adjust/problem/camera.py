@@ -6,6 +6,9 @@ Lengths in mm. A standard deviation of 0 fixes a quantity, inf frees it.
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
+from adjust.array_types import Array
 from adjust.functional_model.lens import Distortion, Prior
 
 Corners = tuple[tuple[float, float], tuple[float, float]]
@@ -63,14 +66,18 @@ class Camera:
     frame_mm: tuple[float, float] = (0.0, 0.0)
     distances: tuple[FiducialDistance, ...] = ()
 
-    def frame_corners(self, frame_mm: tuple[float, float] | None = None) -> Corners | None:
+    def frame_corners(self, xy_mm: Array, frame_mm: tuple[float, float] | None = None) -> Corners | None:
         """Lower left and upper right corner of the image in the camera frame; None where its size is unknown.
 
-        frame_mm: size of the image, if not the camera's own. The image is centred on 0 with fiducial marks; otherwise
-        it extends right and down from the first pixel of the scan.
+        xy_mm (n, 2): places of marks in the camera frame; frame_mm: size of the image, if not the camera's own. The
+        image is centred on 0 with fiducial marks, and where all marks lie inside then and not inside otherwise; else it
+        extends right and down from the first pixel of the scan.
         """
         width, height = frame_mm or self.frame_mm
         if not width or not height:
             return None
-        left, top = (-width / 2.0, height / 2.0) if self.fiducials else (0.0, 0.0)
+        half = np.array([width, height]) / 2.0
+        inside_centred, inside = ((np.abs(xy_mm - middle) <= half).all() for middle in ((0.0, 0.0), half * [1.0, -1.0]))
+        centred = self.fiducials or (inside_centred and not inside)
+        left, top = (-width / 2.0, height / 2.0) if centred else (0.0, 0.0)
         return (left, top - height), (left + width, top)

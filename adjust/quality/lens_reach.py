@@ -102,23 +102,21 @@ class LensReach:
 
 
 def lens_reach(estimates: Estimates, camera: Camera, frame_mm: tuple[float, float] | None) -> LensReach | None:
-    """Find the extent of the observations of a lens; None without observations. frame_mm: width and height, centred on
-    the origin if there are fiducial marks, else from the top left corner of the scan.
-    """
+    """Find the extent of the observations of a lens; None without observations. frame_mm: width and height."""
     network = estimates.network
     observations = network.observations
-    farthest = [0.0]
+    places = [np.zeros((0, 2))]
     principal_point = np.array([estimates.value(Parameter.interior(camera.name, each)) for each in ("x0", "y0")])
     of_image = np.array(observations.image)
     for image in network.images:
         rows = np.flatnonzero((of_image == image.name) & ~observations.is_fiducial)
         if image.camera == camera.name and len(rows):
-            camera_mm = adjusted_image(estimates, image.name).camera_from_comparator(observations.xy_mm[rows])
-            farthest.append(float(np.linalg.norm(camera_mm - principal_point, axis=1).max()))
-    radius_mm = max(farthest)
-    if radius_mm == 0.0:
+            places.append(adjusted_image(estimates, image.name).camera_from_comparator(observations.xy_mm[rows]))
+    observed = np.concatenate(places)
+    if not len(observed):
         return None
-    corner_mm, corners = np.nan, None if frame_mm is None else camera.frame_corners(frame_mm)
+    radius_mm = float(np.linalg.norm(observed - principal_point, axis=1).max())
+    corner_mm, corners = np.nan, None if frame_mm is None else camera.frame_corners(observed, frame_mm)
     if corners is not None:
         corner_mm = float(np.linalg.norm(np.abs(np.array(corners) - principal_point).max(axis=0)))
     within = max(_sigma_um(estimates, camera, radius) for radius in np.linspace(0.0, radius_mm, REACH_RADII + 1)[1:])

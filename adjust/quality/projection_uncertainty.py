@@ -159,7 +159,7 @@ class ProjectionField:
         self._by_films = -self._orientation @ np.concatenate(by_films, axis=1)
         self.median_distance = float(np.median(np.concatenate(distances)))
         observed = np.concatenate(places)
-        self.corners_mm = self.camera.frame_corners() or np.array([observed.min(axis=0), observed.max(axis=0)])
+        self.corners_mm = self.camera.frame_corners(observed) or np.array([observed.min(axis=0), observed.max(axis=0)])
 
     def covariance_mm2(self, covariance: Array, places_mm: Array, distance: float) -> Array:
         """(n, 2, 2) covariance of points at places (n, 2); nan where there is no image.

@@ -39,6 +39,7 @@ A_PRIORI = (
 )
 CONTRADICTED = 0.01  # significance level of the test against an earlier calibration
 ON_FRAMES = ("target", "fiducial", "tie")  # groups of marks
+GIVEN = ("datum", "interior")  # groups of values that the camera's file gives
 MOST_QUANTITIES = 3  # largest number of contradicted quantities named
 LEAST_SHARE = 0.5  # fraction of the corner radius up to which a lens must be observed
 CONFIDENCE = 0.99  # of the global test, and family-wise confidence of the tests of residuals
@@ -131,10 +132,15 @@ def _suspects(adjustment: AdjustmentRecord) -> Iterator[Problem]:
     rows = adjustment.suspects
     kept, removed = ([_suspect(row) for row in rows if row.removed is removed] for removed in (False, True))
     if kept:
+        on_cameras = [row.group in GIVEN for row in rows if not row.removed]
+        remedy = (
+            "Look at the picture: reject a disturbed mark or a wrong number in comparator.csv, or correct the given "
+            "coordinate. snooping = true under [adjust] leaves them out."
+        )
+        of_camera = "Correct the given value in the camera's file, or give it the standard deviation that it has."
         yield Problem(
             f"{counted(len(kept), 'gross error')} suspected: {listed(kept)}.",
-            "Look at the picture: reject a disturbed mark or a wrong number in comparator.csv, or correct the given "
-            "coordinate. snooping = true under [adjust] leaves them out.",
+            f"{'' if all(on_cameras) else remedy} {of_camera if any(on_cameras) else ''}".strip(),
             marks=_suspect_marks(rows, False),
             section="reliability",
         )

@@ -270,6 +270,25 @@ def test_how_far_out_the_lens_is_known() -> None:
     assert np.isnan(unknown.corner_mm)
 
 
+def test_coordinates_that_count_from_the_middle_of_the_picture_have_its_corners_about_it() -> None:
+    """They were taken to begin at the first pixel: the lens seemed to be known half as far."""
+    network = board_network(0, EIGHT[:5])
+    camera = network.cameras[0]
+    moved_mm = network.observations.xy_mm - FRAME_MM / 2.0 * [1.0, -1.0]
+    zero = Prior(0.0, np.inf)
+    centred = replace(
+        network,
+        cameras=(replace(camera, x0_mm=zero, y0_mm=zero),),
+        observations=replace(network.observations, xy_mm=moved_mm),
+    )
+    frame_mm = (float(FRAME_MM[0]), float(FRAME_MM[1]))
+    one, other = (adjust(each).lens_reach(each.cameras[0], frame_mm) for each in (network, centred))
+    assert one is not None
+    assert other is not None
+    assert other.share == pytest.approx(one.share, rel=1e-6)
+    assert other.frame_mm == ((-6.4, -4.8), (6.4, 4.8))
+
+
 ESTIMATED = dict.fromkeys(("k3", "k5", "p1", "p2"), np.inf)
 
 

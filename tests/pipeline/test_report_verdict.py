@@ -92,6 +92,16 @@ def test_a_gross_error_is_named_with_its_image(adjusted_data: ReportData) -> Non
     assert "snooping = true" in text
 
 
+def test_a_given_value_that_is_suspect_is_no_mark_in_a_picture(adjusted_data: ReportData) -> None:
+    given = suspect(name="given c (camera RC 20)", group="interior")
+    text = describe(changed(adjusted_data, suspects=given))
+    assert "Correct the given value in the camera's file" in text
+    assert "Look at the picture" not in text
+    both = describe(changed(adjusted_data, suspects=(*given, *suspect())))
+    assert "Look at the picture" in both
+    assert "Correct the given value in the camera's file" in both
+
+
 def test_what_could_as_well_be_wrong_is_named_too(adjusted_data: ReportData) -> None:
     text = describe(changed(adjusted_data, suspects=suspect(alike=("control point 1 Z",))))
     assert "target 1 in image f2 (w = −9.3; not distinguishable from control point 1 Z)." in text
