@@ -23,6 +23,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 from scipy.optimize import brentq
@@ -32,9 +33,10 @@ from adjust.problem.camera import FiducialDistance
 from measure.marks.shapes import Point
 from pipeline.exchange.formats import Convention
 from pipeline.exchange.incoming import ImportOptions, Incoming
-from pipeline.files.camera_file import CameraFile, GivenFiducial, read_fiducial_distances
-from pipeline.files.camera_tables import DEFAULT_SIGMA_MM
-from pipeline.text.tables import Table, read_toml
+from pipeline.files.camera_file import CameraFile, GivenFiducial, fiducial_distances
+from pipeline.files.camera_tables import DEFAULT_SIGMA_MM, FiducialDistanceTable, FiducialTable
+from pipeline.text.table_models import Key, Positive, WrongKey, numbers, read_model, table_model
+from pipeline.text.tables import read_toml
 from pipeline.types import Array
 
 CONVENTION = Convention(
@@ -45,6 +47,7 @@ CONVENTION = Convention(
 POWERS = (3, 5, 7)
 _ROUNDED_UM = 1.0 / np.sqrt(12.0)  # standard deviation of values rounded to 1 µm
 _CURVE = 400  # samples of the curve whose extremes are balanced
+NUMBERS = Key("list of numbers", numbers)
 
 
 @dataclass(frozen=True)
@@ -105,70 +108,79 @@ def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
     return Incoming(cameras=tuple(_camera(*pair) for pair in pairs), notes=notes, tables=tables)
 
 
+@table_model
+class CertificateTable:
+    """Keys of a certificate's file: the distortions at angles or at radii, and one principal point or two."""
+
+    name: str | None = None
+    refers_to: Literal["calibrated", "equivalent"] = "calibrated"
+    calibrated_principal_distance_mm: Positive | None = None
+    equivalent_principal_distance_mm: Positive | None = None
+    radial_um: Annotated[tuple[float, ...], NUMBERS]
+    angle_deg: Annotated[tuple[float, ...] | None, NUMBERS] = None
+    radius_mm: Annotated[tuple[float, ...] | None, NUMBERS] = None
+    sigma_um: Positive = float(_ROUNDED_UM)
+    principal_point_mm: Point | None = None
+    autocollimation_mm: Point | None = None
+    symmetry_mm: Point | None = None
+    fiducial: tuple[FiducialTable, ...] = ()
+    fiducial_distance: tuple[FiducialDistanceTable, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Raises WrongKey for keys that are missing or contradict each other."""
+        if self.distance_mm is None:
+            key = f"{self.refers_to}_principal_distance_mm"
+            raise WrongKey(key, f"is missing: the table refers to the {self.refers_to} principal distance.")
+        if (self.angle_deg is None) == (self.radius_mm is None):
+            raise WrongKey("angle_deg", "or radius_mm is needed: where the distortions are, one of both.")
+        key, places = ("angle_deg", self.angle_deg) if self.angle_deg else ("radius_mm", self.radius_mm or ())
+        count = len(self.radial_um)
+        if len(places) != count or count < 2 or min(places) <= 0.0 or len(set(places)) < count:
+            raise WrongKey(key, f"must be {count} different positive places, one a value of radial_um.")
+        if self.angle_deg and max(self.angle_deg) >= 90.0:
+            raise WrongKey(key, "must lie below 90 degrees.")
+        has_two = self.autocollimation_mm is not None or self.symmetry_mm is not None
+        if self.principal_point_mm is not None and has_two:
+            raise WrongKey(
+                "principal_point_mm", "is one point, autocollimation_mm and symmetry_mm are two. Give either."
+            )
+        if self.symmetry_mm is not None and self.autocollimation_mm is None:
+            raise WrongKey(
+                "symmetry_mm", "needs autocollimation_mm. Give the only point that there is as principal_point_mm."
+            )
+
+    @property
+    def distance_mm(self) -> float | None:
+        """Principal distance to which the distortions refer."""
+        is_equivalent = self.refers_to == "equivalent"
+        return self.equivalent_principal_distance_mm if is_equivalent else self.calibrated_principal_distance_mm
+
+
 def read_certificate(path: Path) -> Certificate:
     """Read a certificate. Raises InputError, with the key, for a missing principal distance, for both or none of angles
     and radii, and for lists of different lengths."""
     table = read_toml(path)
-    both = ("calibrated_principal_distance_mm", "equivalent_principal_distance_mm")
-    refers = table.text("refers_to", "calibrated", ("calibrated", "equivalent"))
-    distances = {key: table.number(key, above=0.0) for key in both if key in table}
-    key = f"{refers}_principal_distance_mm"
-    if key not in distances:
-        raise table.error(key, f"is missing: the table refers to the {refers} principal distance.")
-    distance = distances[key]
-    radial_um = np.array(table.numbers("radial_um"))
-    places = [key for key in ("angle_deg", "radius_mm") if key in table]
-    if len(places) != 1:
-        raise table.error("angle_deg", "or radius_mm is needed: where the distortions are, one of both.")
-    at = np.array(table.numbers(places[0]))
-    if at.shape != radial_um.shape or at.size < 2 or (at <= 0.0).any() or len(set(at.tolist())) < at.size:
-        raise table.error(places[0], f"must be {radial_um.size} different positive places, one a value of radial_um.")
-    if places[0] == "angle_deg":
-        if (at >= 90.0).any():
-            raise table.error("angle_deg", "must lie below 90 degrees.")
-        tangent = np.tan(np.radians(at))
+    given = read_model(table, CertificateTable)
+    distance, radial_um = given.distance_mm or 0.0, np.array(given.radial_um, dtype=float)
+    if given.angle_deg is not None:
+        tangent = np.tan(np.radians(given.angle_deg))
         radius_mm = distance * tangent + radial_um / 1000.0
     else:
-        radius_mm, tangent = at, (at - radial_um / 1000.0) / distance
-    certificate = Certificate(
-        table.text("name", path.stem),
+        radius_mm = np.array(given.radius_mm, dtype=float)
+        tangent = (radius_mm - radial_um / 1000.0) / distance
+    entries, ids = table.tables("fiducial_distance"), [each.id for each in given.fiducial]
+    return Certificate(
+        given.name or path.stem,
         distance,
-        *_principal_points(table),
-        *_fiducials(table),
+        given.principal_point_mm or given.autocollimation_mm,
+        given.symmetry_mm,
+        tuple(GivenFiducial(each.id, each.xy_mm, each.sigma_mm, None) for each in given.fiducial),
+        fiducial_distances(entries, given.fiducial_distance, ids),
         radius_mm,
         tangent,
         radial_um,
-        table.number("sigma_um", float(_ROUNDED_UM), above=0.0),
+        given.sigma_um,
     )
-    table.done()
-    return certificate
-
-
-def _principal_points(table: Table) -> tuple[Point | None, Point | None]:
-    """Principal points of autocollimation and of best symmetry; the latter None where the certificate gives one
-    point."""
-    keys = ("principal_point_mm", "autocollimation_mm", "symmetry_mm")
-    one, autocollimation, symmetry = (table.pair(key) if key in table else None for key in keys)
-    if one is not None and (autocollimation is not None or symmetry is not None):
-        raise table.error(
-            "principal_point_mm", "is one point, autocollimation_mm and symmetry_mm are two. Give either."
-        )
-    if symmetry is not None and autocollimation is None:
-        raise table.error(
-            "symmetry_mm", "needs autocollimation_mm. Give the only point that there is as principal_point_mm."
-        )
-    return one or autocollimation, symmetry
-
-
-def _fiducials(table: Table) -> tuple[tuple[GivenFiducial, ...], tuple[FiducialDistance, ...]]:
-    """Read [[fiducial]] with id and xy_mm, and the [[fiducial_distance]] between them."""
-    fiducials = []
-    for entry in table.tables("fiducial") if "fiducial" in table else ():
-        sigma_mm = entry.sigma_pair("sigma_mm", (DEFAULT_SIGMA_MM, DEFAULT_SIGMA_MM))
-        fiducials.append(GivenFiducial(entry.text("id"), entry.pair("xy_mm"), sigma_mm, None))
-        entry.done()
-    distances = read_fiducial_distances(table, [each.id for each in fiducials])
-    return tuple(fiducials), distances
 
 
 def fit(certificate: Certificate) -> FittedTable:

@@ -119,7 +119,7 @@ def _save(calibrations: Sequence[_Calibration], path: Path) -> SavedCamera:
     archives = listed([one.project.title for one in calibrations])
     text = f"adjusted from {counted(frames, 'frame')} of {counted(scanners, 'scanner')} in {archives}"
     labels = {one.label_in_camera: value for one, value in spread.items()}
-    source = Source(text, frames=frames, scanners=scanners, archives=len(calibrations), spread_mm=labels)
+    source = Source(text=text, frames=frames, scanners=scanners, archives=len(calibrations), spread_mm=labels)
     earlier = path.with_name(f"{path.stem}-calibration.json")
     _write_calibration(first, record, values, covariance, earlier)
     camera = _adjusted_camera(first, record.cameras[first.camera.name], earlier, path, source)

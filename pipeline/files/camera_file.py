@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,13 +14,12 @@ from adjust.problem.camera import Camera, Fiducial, FiducialDistance
 from measure.marks import shapes
 from measure.marks.rendering import extent_px
 from pipeline.errors import InputError
-from pipeline.files.camera_tables import DEFAULT_SIGMA_MM, CameraTable, DistortionTable, Source
+from pipeline.files.camera_tables import DEFAULT_SIGMA_MM, CameraTable, ClicksTable, FiducialDistanceTable, Source
 from pipeline.files.earlier_calibration import EarlierCalibration, read_calibration
-from pipeline.files.mark_table import Clicks, LearnedFrom, read_clicks
-from pipeline.text.table_models import (
-    read_model,
-)
-from pipeline.text.tables import Table, read_toml
+from pipeline.files.mark_table import Clicks, Drawing, LearnedFrom, read_marks
+from pipeline.text.names import image_name
+from pipeline.text.table_models import read_model
+from pipeline.text.tables import Table, list_words, read_toml
 from pipeline.text.text_file import SMALLEST_SIGMA
 from pipeline.text.wording import did_you_mean
 
@@ -212,7 +211,7 @@ def parse_camera(table: Table) -> CameraFile:
         )
     given = read_model(table, CameraTable)
     entries = table.tables("fiducial")
-    fiducials = _fiducials(entries, given)
+    fiducials = _fiducials(entries, given, read_marks(table.table("mark")))
     default_sigma = DEFAULT_SIGMA_MM if fiducials else math.inf
     point, point_sigma = _default_principal_point(fiducials)
     if given.principal_point_mm is not None:
@@ -222,6 +221,7 @@ def parse_camera(table: Table) -> CameraFile:
         check_units(table, given.frame_mm, given.principal_distance_mm, marks)
     learned = [one.id for one in fiducials if isinstance(one.mark, shapes.LearnedMark)]
     distance_sigma = given.sigma.principal_distance_mm
+    distances = table.tables("fiducial_distance")
     camera = CameraFile(
         path=table.file,
         name=table.file.stem if given.name is None else given.name,
@@ -235,21 +235,25 @@ def parse_camera(table: Table) -> CameraFile:
         number=given.number,
         writing=given.writing,
         source=given.source,
-        clicks=read_clicks(table.table("clicks"), learned) if given.clicks is not None else None,
+        clicks=_clicks(table.table("clicks"), given.clicks, learned) if given.clicks is not None else None,
         learned_from=given.learned_from,
-        distances=read_fiducial_distances(table, [one.id for one in fiducials]),
+        distances=fiducial_distances(distances, given.fiducial_distance, [one.id for one in fiducials]),
     )
-    return replace(camera, calibration=read_calibration(table.table("sigma"), camera.camera()))
+    return replace(camera, calibration=read_calibration(table.table("sigma"), given.sigma, camera.camera()))
 
 
-def _fiducials(entries: Sequence[Table], given: CameraTable) -> tuple[GivenFiducial, ...]:
+def _fiducials(
+    entries: Sequence[Table], given: CameraTable, drawings: Mapping[str, Drawing]
+) -> tuple[GivenFiducial, ...]:
     """Fiducials with their drawings. Raises InputError where two share a name or place, or a drawing is missing."""
     fiducials: dict[str, GivenFiducial] = {}
+    words = (*drawings, NO_MARK)
     for entry, one in zip(entries, given.fiducial, strict=True):
         if one.id in fiducials:
             raise entry.error("id", f"fiducial {one.id!r} is given twice. Every mark has an id of its own.")
-        if one.mark is not None:
-            entry.text("mark", choices=(*given.mark, NO_MARK))
+        if one.mark is not None and one.mark not in words:
+            possible = f"possible are {list_words(words)}.{did_you_mean(one.mark, words)}"
+            raise entry.error("mark", f"is {one.mark!r}; {possible}")
         if any(0.0 < sigma < SMALLEST_SIGMA for sigma in one.sigma_mm):
             raise entry.error(
                 "sigma_mm", f"nothing is known to {min(one.sigma_mm):g} mm. Write 0 for what is to be fixed."
@@ -257,7 +261,7 @@ def _fiducials(entries: Sequence[Table], given: CameraTable) -> tuple[GivenFiduc
         other = next((other for other in fiducials.values() if other.xy_mm == one.xy_mm), None)
         if other is not None:
             raise entry.error("xy_mm", f"fiducial {other.id!r} has the same place. Every mark has one of its own.")
-        drawing = given.mark.get(one.mark or "")
+        drawing = drawings.get(one.mark or "")
         drawn = None if drawing is None else _placed(drawing.mark, drawing.is_radial, one.xy_mm)
         fiducials[one.id] = GivenFiducial(
             one.id, one.xy_mm, one.sigma_mm, drawn, one.mark == NO_MARK and drawn is None, one.seen_mm
@@ -265,20 +269,29 @@ def _fiducials(entries: Sequence[Table], given: CameraTable) -> tuple[GivenFiduc
     return tuple(fiducials.values())
 
 
-def read_fiducial_distances(table: Table, ids: Sequence[str]) -> tuple[FiducialDistance, ...]:
-    """Distances of the tables [[fiducial_distance]]: from and to (ids of fiducials), mm and sigma_mm."""
-    distances = []
-    for entry in table.tables("fiducial_distance") if "fiducial_distance" in table else ():
-        start, end = (entry.text(key) for key in ("from", "to"))
-        for key, id_ in (("from", start), ("to", end)):
+def _clicks(table: Table, given: ClicksTable, learned: Sequence[str]) -> Clicks:
+    """Clicks on learned marks. Raises InputError where some of them are not clicked, or others are."""
+    if unknown := table.table("px").unknown_keys(learned):
+        raise InputError("\n".join(unknown))
+    missing = [id for id in learned if id not in given.px]
+    if missing or not given.px:
+        raise table.error(
+            "px", f"says nothing of {', '.join(missing) or 'any mark'}. Click all learned marks, or none."
+        )
+    return Clicks(image_name(given.scan), given.px)
+
+
+def fiducial_distances(
+    entries: Sequence[Table], given: Sequence[FiducialDistanceTable], ids: Sequence[str]
+) -> tuple[FiducialDistance, ...]:
+    """Distances between fiducials of these ids. Raises InputError, with the key, for other ids."""
+    for entry, one in zip(entries, given, strict=True):
+        for key, id_ in (("from", one.start), ("to", one.end)):
             if id_ not in ids:
                 raise entry.error(key, f"there is no fiducial {id_!r}.{did_you_mean(id_, ids)}")
-        if start == end:
+        if one.start == one.end:
             raise entry.error("to", "is the same as from: a distance has two ends.")
-        length, sigma = (entry.number(key, above=0.0) for key in ("mm", "sigma_mm"))
-        distances.append(FiducialDistance(start, end, length, sigma))
-        entry.done()
-    return tuple(distances)
+    return tuple(FiducialDistance(one.start, one.end, one.mm, one.sigma_mm) for one in given)
 
 
 def _placed(
@@ -311,33 +324,21 @@ def _default_principal_point(fiducials: Sequence[GivenFiducial]) -> tuple[tuple[
 
 def _distortion(table: Table, camera: CameraTable) -> Distortion:
     given = camera.distortion
-    name, needs_half = given.family, family(given.family).needs == "half_mm"
-    in_dm = name == "juhl"  # Juhl uses decimetres
-    for key, is_wrong in (("r0_mm", in_dm), ("r0_dm", not in_dm), ("half_mm", not needs_half)):
-        if is_wrong and key in table:
-            raise table.error(key, f"is no key of this table where the family is {name}. Take it out.")
-    r0_mm = 100.0 * table.number("r0_dm", above=0.0) if in_dm else given.r0_mm
-    half_mm = _half(table, given, camera.frame_mm) if needs_half else (0.0, 0.0)
-    values, sigmas = table.table("value"), table.table("sigma")
-    every = sigmas.sigma("all", 0.0)  # default for all: a set of 44 parameters is not listed one by one
-    known = parameter_names(name)
-    parameters = {each: Prior(values.number(each, 0.0), sigmas.sigma(each, every)) for each in known}
-    values.done()
-    sigmas.done()
-    named = {each: prior for each, prior in parameters.items() if each in values or each in sigmas or every > 0.0}
-    return Distortion(name, named, given.decentering, r0_mm, half_mm)
-
-
-def _half(table: Table, given: DistortionTable, frame_mm: shapes.Point | None) -> shapes.Point:
-    """Half the frame: unit of length of a self-calibration set, mm."""
-    if given.half_mm is not None:
-        if min(given.half_mm) <= 0.0:
-            raise table.error("half_mm", f"must be positive, not {list(given.half_mm)}.")
-        return given.half_mm
-    if frame_mm is None:
-        raise table.error(
-            "family",
-            f"{given.family} counts in halves of the frame, and its size is not known. Give the camera's frame_mm, or "
-            "half_mm in this table.",
-        )
-    return (frame_mm[0] / 2.0, frame_mm[1] / 2.0)
+    known = parameter_names(given.family)
+    half_mm = given.half_mm or (0.0, 0.0)
+    if family(given.family).needs == "half_mm" and given.half_mm is None:
+        if camera.frame_mm is None:
+            raise table.error(
+                "family",
+                f"{given.family} counts in halves of the frame, and its size is not known. Give the camera's "
+                "frame_mm, or half_mm in this table.",
+            )
+        half_mm = (camera.frame_mm[0] / 2.0, camera.frame_mm[1] / 2.0)
+    for key, others in (("value", ()), ("sigma", ("all",))):
+        if unknown := table.table(key).unknown_keys((*known, *others)):
+            raise InputError("\n".join(unknown))
+    every = given.sigma.get("all", 0.0)  # default for all: a set of 44 parameters is not listed one by one
+    named = [each for each in known if each in given.value or each in given.sigma or every > 0.0]
+    parameters = {each: Prior(given.value.get(each, 0.0), given.sigma.get(each, every)) for each in named}
+    r0_mm = given.r0_mm if given.r0_dm is None else 100.0 * given.r0_dm
+    return Distortion(given.family, parameters, given.decentering, r0_mm, half_mm)

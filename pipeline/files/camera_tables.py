@@ -2,33 +2,30 @@
 
 import re
 from collections.abc import Mapping
-from typing import Annotated, cast, get_args
+from dataclasses import field
+from typing import Annotated, Any, cast, get_args
 
 from pydantic import Field
-from pydantic.dataclasses import dataclass
 
 from adjust.functional_model.families import FAMILY_NAMES, family
 from adjust.functional_model.lens import Decentering
 from measure.marks import shapes
-from pipeline.files.mark_table import Drawing, LearnedFrom, read_marks
+from pipeline.files.mark_table import LearnedFrom
 from pipeline.text.table_models import (
-    FLAG,
-    NOT_NEGATIVE,
-    NUMBER_OR_PAIR,
-    PAIR,
-    PATH,
-    POSITIVE,
-    SIGMA,
-    SIGMA_PAIR,
-    TABLE,
-    TEXT,
+    FilePath,
     Key,
-    choice,
-    subtable,
-    subtables,
-    whole,
+    NotNegative,
+    NumberOrPair,
+    Positive,
+    Sigma,
+    SigmaPair,
+    Values,
+    WrongKey,
+    pair,
+    table_model,
+    text,
+    texts,
 )
-from pipeline.text.tables import Table
 from pipeline.text.wording import did_you_mean
 
 DEFAULT_SIGMA_MM = 1.0  # Torlegård's a-priori standard deviation for a prior that only fixes the datum
@@ -38,151 +35,28 @@ _WRITTEN = re.compile(
 )
 
 
-@dataclass(frozen=True, config=TABLE)
-class Source:
-    """[source] of a camera file: where its numbers come from, and the number of calibration reports or frames behind
-    them."""
-
-    text: Annotated[str, TEXT] = Field(description="Where the numbers come from.")
-    reports: Annotated[int, whole()] = Field(default=0, description="How many calibration reports.")
-    frames: Annotated[int, whole()] = Field(default=0, description="How many frames were adjusted.")
-    scanners: Annotated[int, whole()] = Field(default=0, description="Of how many scanners.")
-    archives: Annotated[int, whole()] = Field(default=0, description="In how many projects.")
-    spread_mm: Annotated[
-        Mapping[str, float], Key("numbers by quantity", lambda table, key: _numbers(table.table(key)))
-    ] = Field(default_factory=dict, description="Standard deviation between archives, beyond their own.")
+def _frame(value: Any) -> shapes.Point:
+    width, height = pair(value)
+    if min(width, height) <= 0.0:
+        raise ValueError(f"must be two positive lengths, [width, height], not {[width, height]}.")
+    return width, height
 
 
-def _numbers(table: Table) -> dict[str, float]:
-    return {name: table.number(name, least=0.0) for name in table.names()}
+def _number(value: Any) -> str:
+    if text(value) and not value.isdigit():
+        raise ValueError(f'must be digits in quotes, as the plate has them: "13182", not {value!r}.')
+    return str(value)
 
 
-@dataclass(frozen=True, kw_only=True, config=TABLE)
-class SigmaTable:
-    """[sigma] of a camera file."""
-
-    principal_distance_mm: Annotated[float | None, SIGMA] = Field(
-        default=None, description="Absent: 1 with fiducials, else free."
-    )
-    principal_point_mm: Annotated[shapes.Point | None, SIGMA_PAIR] = Field(
-        default=None, description="Absent: as the principal distance."
-    )
-    calibration: Annotated[str | None, PATH] = Field(
-        default=None, description="adjustment.json of an earlier calibration, with its covariance."
-    )
-    calibration_fiducials: Annotated[bool, FLAG] = Field(
-        default=True, description="Whether the earlier calibration says where the fiducials are."
-    )
-
-
-@dataclass(frozen=True, kw_only=True, config=TABLE)
-class DistortionTable:
-    """[distortion] of a camera file."""
-
-    family: Annotated[str, Key("name of a family", lambda table, key: _family(table))] = Field(
-        default="none", description="Distortion model."
-    )
-    decentering: Annotated[Decentering, choice("reduced", "paper")] = Field(
-        default="reduced", description="Decentering terms of torlegard."
-    )
-    r0_mm: Annotated[float, NOT_NEGATIVE] = Field(default=0.0, description="Radius of no distortion.")
-    r0_dm: Annotated[float | None, POSITIVE] = Field(default=None, description="The same of juhl.")
-    half_mm: Annotated[shapes.Point | None, NUMBER_OR_PAIR] = Field(
-        default=None, description="Unit of length of self-calibration sets; absent: half of frame_mm."
-    )
-    value: Annotated[object, Key("numbers by parameter", Table.table)] = Field(
-        default=None, description="Values of the parameters; absent: 0."
-    )
-    sigma: Annotated[object, Key("standard deviations by parameter", Table.table)] = Field(
-        default=None, description="Of the parameters; absent: fixed; all: of every parameter."
-    )
-
-
-@dataclass(frozen=True, kw_only=True, config=TABLE)
-class FiducialTable:
-    """[[fiducial]] of a camera file."""
-
-    id: Annotated[str, Key("text", lambda table, key: _fiducial_id(table))] = Field(description="Name of the mark.")
-    xy_mm: Annotated[shapes.Point, PAIR] = Field(description="Given coordinates.")
-    sigma_mm: Annotated[shapes.Point, SIGMA_PAIR] = Field(
-        default=(DEFAULT_SIGMA_MM, DEFAULT_SIGMA_MM), description="Of the given coordinates."
-    )
-    mark: Annotated[str | None, TEXT] = Field(
-        default=None, description='Name of a table [mark.NAME], or "none" to pass it over.'
-    )
-    seen_mm: Annotated[shapes.Point | None, PAIR] = Field(
-        default=None, description="Of a learned mark: where its template has its origin."
-    )
-
-
-@dataclass(frozen=True, kw_only=True, config=TABLE)
-class CameraTable:
-    """camera.toml."""
-
-    name: Annotated[str | None, TEXT] = Field(default=None, description="Absent: as the file.")
-    frame_mm: Annotated[shapes.Point | None, Key("[width, height]", lambda table, key: _frame(table))] = Field(
-        default=None, description="Of the exposed frame."
-    )
-    principal_distance_mm: Annotated[float | None, POSITIVE] = Field(
-        default=None, description="Absent: found from the points."
-    )
-    principal_point_mm: Annotated[shapes.Point | None, PAIR] = Field(
-        default=None, description="Absent: the origin, where fiducials lie about it."
-    )
-    number: Annotated[str, Key("digits", lambda table, key: _number(table))] = Field(
-        default="", description="Of the camera or its cone, as its plate has it."
-    )
-    writing: Annotated[tuple[shapes.WrittenPlace, ...], Key("list of places", lambda table, key: _writing(table))] = (
-        Field(default=(), description='Where the camera writes on its film, as "left: reads upward".')
-    )
-    sigma: Annotated[SigmaTable, subtable(SigmaTable)] = Field(
-        default=SigmaTable(), description="Prior standard deviations."
-    )
-    distortion: Annotated[DistortionTable, subtable(DistortionTable)] = Field(
-        default=DistortionTable(), description="Distortion of the lens."
-    )
-    fiducial: Annotated[tuple[FiducialTable, ...], subtables(FiducialTable)] = Field(
-        default=(), description="Fiducial marks, one table each."
-    )
-    fiducial_distance: Annotated[object, Key("tables", Table.tables)] = Field(
-        default=(), description="Measured distances between fiducials: from, to, mm, sigma_mm."
-    )
-    mark: Annotated[Mapping[str, Drawing], Key("tables by name", lambda table, key: read_marks(table.table(key)))] = (
-        Field(default_factory=dict, description="Drawings of the marks.")
-    )
-    source: Annotated[Source | None, subtable(Source)] = Field(default=None, description="Where the numbers come from.")
-    clicks: Annotated[object, Key("table", Table.table)] = Field(
-        default=None, description="scan and px, columns and rows by fiducial, of marks to be learned."
-    )
-    learned_from: Annotated[LearnedFrom | None, subtable(LearnedFrom)] = Field(
-        default=None, description="As the program writes it with learned marks."
-    )
-
-
-def _frame(table: Table) -> shapes.Point:
-    frame = table.pair("frame_mm")
-    if min(frame) <= 0.0:
-        raise table.error("frame_mm", f"must be two positive lengths, [width, height], not {list(frame)}.")
-    return frame
-
-
-def _number(table: Table) -> str:
-    number = table.text("number")
-    if number and not number.isdigit():
-        raise table.error("number", f'must be digits in quotes, as the plate has them: "13182", not {number!r}.')
-    return number
-
-
-def _writing(table: Table) -> tuple[shapes.WrittenPlace, ...]:
+def _writing(value: Any) -> tuple[shapes.WrittenPlace, ...]:
     """Places such as "left: reads upward", "right: plate reads downward", or "left" where the direction is unknown."""
     places = []
-    for text in table.texts("writing"):
-        match = _WRITTEN.fullmatch(text.strip())
+    for place in texts(value):
+        match = _WRITTEN.fullmatch(place.strip())
         if match is None:
-            raise table.error(
-                "writing",
-                f"has {text!r}. A place is a side of the frame (left, right, top, bottom), or one with the direction "
-                '(rightward, upward, leftward, downward), as "left: reads upward", or "right: plate reads downward".',
+            raise ValueError(
+                f"has {place!r}. A place is a side of the frame (left, right, top, bottom), or one with the direction "
+                '(rightward, upward, leftward, downward), as "left: reads upward", or "right: plate reads downward".'
             )
         pose = READS[match["reads"]] if match["reads"] else None
         places.append(shapes.WrittenPlace(cast(shapes.Side, match["side"]), pose, bool(match["plate"])))
@@ -196,17 +70,122 @@ def written_place_text(place: shapes.WrittenPlace) -> str:
     return f"{place.side}: {' '.join(parts)}" if parts else place.side
 
 
-def _fiducial_id(table: Table) -> str:
-    id = table.text("id")
-    if not id or id != id.strip() or not id.isprintable():
-        raise table.error("id", f"must be text on one line without blanks at its ends, not {id!r}.")
-    return id
+def _fiducial_id(value: Any) -> str:
+    if not text(value) or value != value.strip() or not value.isprintable():
+        raise ValueError(f"must be text on one line without blanks at its ends, not {value!r}.")
+    return str(value)
 
 
-def _family(table: Table) -> str:
-    name = table.text("family")
+def _family(value: Any) -> str:
     try:
-        family(name)
+        family(text(value))
     except ValueError as error:
-        raise table.error("family", f"{error}.{did_you_mean(name, FAMILY_NAMES)}") from None
-    return name
+        raise ValueError(f"{error}.{did_you_mean(value, FAMILY_NAMES)}") from None
+    return str(value)
+
+
+@table_model
+class Source:
+    """[source] of a camera file: where its numbers come from, and the number of calibration reports or frames behind
+    them."""
+
+    text: Annotated[str, "Where the numbers come from."]
+    reports: Annotated[int, "How many calibration reports."] = 0
+    frames: Annotated[int, "How many frames were adjusted."] = 0
+    scanners: Annotated[int, "Of how many scanners."] = 0
+    archives: Annotated[int, "In how many projects."] = 0
+    spread_mm: Annotated[Mapping[str, NotNegative], "Standard deviation between archives, beyond their own."] = field(
+        default_factory=dict
+    )
+
+
+@table_model
+class SigmaTable:
+    """[sigma] of a camera file."""
+
+    principal_distance_mm: Annotated[Sigma | None, "Absent: 1 with fiducials, else free."] = None
+    principal_point_mm: Annotated[SigmaPair | None, "Absent: as the principal distance."] = None
+    calibration: Annotated[FilePath | None, "adjustment.json of an earlier calibration, with its covariance."] = None
+    calibration_fiducials: Annotated[bool, "Whether the earlier calibration says where the fiducials are."] = True
+
+
+@table_model
+class DistortionTable:
+    """[distortion] of a camera file."""
+
+    family: Annotated[str, Key("name of a family", _family), "Distortion model."] = "none"
+    decentering: Annotated[Decentering, "Decentering terms of torlegard."] = "reduced"
+    r0_mm: Annotated[NotNegative, "Radius of no distortion."] = 0.0
+    r0_dm: Annotated[Positive | None, "The same of juhl."] = None
+    half_mm: Annotated[NumberOrPair | None, "Unit of length of self-calibration sets; absent: half of frame_mm."] = None
+    value: Annotated[Mapping[str, float], "Values of the parameters; absent: 0."] = field(default_factory=dict)
+    sigma: Annotated[Mapping[str, Sigma], "Of the parameters; absent: fixed; all: of every parameter."] = field(
+        default_factory=dict
+    )
+
+    def __post_init__(self) -> None:
+        """Raises WrongKey for settings that the family does not have, or that are not positive."""
+        in_dm = self.family == "juhl"  # Juhl uses decimetres
+        has_half = family(self.family).needs == "half_mm"
+        for key, is_wrong in (("r0_mm", in_dm), ("r0_dm", not in_dm), ("half_mm", not has_half)):
+            if is_wrong and getattr(self, key):
+                raise WrongKey(key, f"is no key of this table where the family is {self.family}. Take it out.")
+        if in_dm and self.r0_dm is None:
+            raise WrongKey("r0_dm", "is missing. Add it.")
+        if self.half_mm is not None and min(self.half_mm) <= 0.0:
+            raise WrongKey("half_mm", f"must be positive, not {list(self.half_mm)}.")
+
+
+@table_model
+class FiducialTable:
+    """[[fiducial]] of a camera file."""
+
+    id: Annotated[str, Key("text", _fiducial_id), "Name of the mark."]
+    xy_mm: Annotated[shapes.Point, "Given coordinates."]
+    sigma_mm: Annotated[SigmaPair, "Of the given coordinates."] = (DEFAULT_SIGMA_MM, DEFAULT_SIGMA_MM)
+    mark: Annotated[str | None, 'Name of a table [mark.NAME], or "none" to pass it over.'] = None
+    seen_mm: Annotated[shapes.Point | None, "Of a learned mark: where its template has its origin."] = None
+
+
+@table_model
+class FiducialDistanceTable:
+    """[[fiducial_distance]] of a camera file."""
+
+    start: Annotated[str, Field(alias="from"), "Name of a mark."]
+    end: Annotated[str, Field(alias="to"), "Name of another."]
+    mm: Annotated[Positive, "Distance between them."]
+    sigma_mm: Annotated[Positive, "Its standard deviation."]
+
+
+@table_model
+class ClicksTable:
+    """[clicks] of a camera file."""
+
+    scan: Annotated[str, "Name of the scan."]
+    px: Annotated[Mapping[str, tuple[float, float]], "Columns and rows by fiducial."]
+
+
+@table_model
+class CameraTable:
+    """camera.toml."""
+
+    name: Annotated[str | None, "Absent: as the file."] = None
+    frame_mm: Annotated[shapes.Point | None, Key("[width, height]", _frame), "Of the exposed frame."] = None
+    principal_distance_mm: Annotated[Positive | None, "Absent: found from the points."] = None
+    principal_point_mm: Annotated[shapes.Point | None, "Absent: the origin, where fiducials lie about it."] = None
+    number: Annotated[str, Key("digits", _number), "Of the camera or its cone, as its plate has it."] = ""
+    writing: Annotated[
+        tuple[shapes.WrittenPlace, ...],
+        Key("list of places", _writing),
+        'Where the camera writes on its film, as "left: reads upward".',
+    ] = ()
+    sigma: Annotated[SigmaTable, "Prior standard deviations."] = SigmaTable()
+    distortion: Annotated[DistortionTable, "Distortion of the lens."] = DistortionTable()
+    fiducial: Annotated[tuple[FiducialTable, ...], "Fiducial marks, one table each."] = ()
+    fiducial_distance: Annotated[
+        tuple[FiducialDistanceTable, ...], "Measured distances between fiducials: from, to, mm, sigma_mm."
+    ] = ()
+    mark: Annotated[Values, "Drawings of the marks."] = field(default_factory=dict)
+    source: Annotated[Source | None, "Where the numbers come from."] = None
+    clicks: Annotated[ClicksTable | None, "Clicked places of marks to be learned."] = None
+    learned_from: Annotated[LearnedFrom | None, "As the program writes it with learned marks."] = None

@@ -14,6 +14,7 @@ from adjust.functional_model.lens import Distortion, Prior
 from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.observations import Calibration
 from adjust.problem.parameter import Parameter
+from pipeline.files.camera_tables import SigmaTable
 from pipeline.results.adjustment_file import read_adjustment
 from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, DistortionRecord, Quantity
 from pipeline.results.covariance_file import Covariance, covariance_path, read_covariance
@@ -84,22 +85,21 @@ class EarlierCalibration:
         return free, Calibration(here, self.values, self.covariance)
 
 
-def read_calibration(sigma: Table, camera: Camera) -> EarlierCalibration | None:
+def read_calibration(sigma: Table, given: SigmaTable, camera: Camera) -> EarlierCalibration | None:
     """Earlier calibration that the table [sigma] of a camera file names; None where it names none.
 
     Raises InputError where the file has no calibration of this camera, or another lens model.
     """
-    fiducials = sigma.flag("calibration_fiducials", True)
-    if "calibration" not in sigma:
+    if given.calibration is None:
         return None
-    path = sigma.file.parent / sigma.text("calibration")
+    path = sigma.file.parent / given.calibration
     content, covariance = read_adjustment(path), read_covariance(path)
     if not content.converged:
         raise sigma.error("calibration", f"{path} holds no calibration: its adjustment did not converge.")
     name = _find_camera(sigma, path, content, camera.name)
     distortion = content.cameras[name].distortion
     _check_family(sigma, path, distortion, camera.distortion)
-    earlier = _calibration(path, distortion, covariance, name, camera, fiducials)
+    earlier = _calibration(path, distortion, covariance, name, camera, given.calibration_fiducials)
     if not np.isfinite(earlier.values).all():
         raise sigma.error("calibration", f"{path} holds no interior orientation: it was made without object points.")
     _check_agreement(sigma, path, name, content.cameras[name], covariance)

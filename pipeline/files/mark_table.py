@@ -3,59 +3,61 @@
 import dataclasses
 import io
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
-from pydantic.dataclasses import dataclass
 
 from measure.errors import MeasurementError
 from measure.geometry import POSES
 from measure.marks import shapes
 from measure.marks.shapes import MarkTemplate, Point
 from pipeline.text.atomic import write_atomically
-from pipeline.text.names import image_name
 from pipeline.text.table_models import (
-    FLAG,
-    NOT_NEGATIVE,
-    NUMBER,
-    PAIR,
-    POSITIVE,
-    TABLE,
-    TEXT,
-    TEXTS,
+    Entries,
+    FilePath,
     Key,
+    NotNegative,
+    Positive,
+    WrongKey,
     choice,
-    read_model,
-    subtable,
+    points,
+    read_kind,
+    table_model,
 )
 from pipeline.text.tables import Table
 from pipeline.text.wording import numbers, quoted
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint16]
-Picture01 = Array | None  # pixels of a template, values between 0 and 1
 SavePicture = Callable[[str, Picture], str]
 
 _FULL = 65535
 _ANY_CORNER = (-1.0, -1.0)  # placeholder: the fiducial's place determines the quadrant
 
 
-def _vertices(table: Table, key: str) -> tuple[Point, ...]:
-    vertices = table.pairs(key)
+def _vertices(value: Any) -> tuple[Point, ...]:
+    vertices = points(value)
     if len(vertices) < 3:
-        raise table.error(key, f"a polygon needs at least three vertices, not {len(vertices)}.")
+        raise ValueError(f"a polygon needs at least three vertices, not {len(vertices)}.")
     x, y = np.transpose(vertices)
     if np.isclose(x @ np.roll(y, 1), y @ np.roll(x, 1), rtol=1e-9, atol=0.0):
-        raise table.error(key, "the polygon encloses no area. Give its corners in the order of its outline.")
+        raise ValueError("the polygon encloses no area. Give its corners in the order of its outline.")
     return vertices
 
 
-VERTICES = Key("list of [x, y]", _vertices)
+def _true_mm(value: Any) -> tuple[Point, ...]:
+    corners = points(value)
+    if len(corners) != 2 or not np.all(np.less(*corners)):
+        corner = "[[least x, least y], [greatest x, greatest y]]"
+        raise ValueError(f"must be two corners of the rectangle in which the drawing is true, {corner}.")
+    return corners
+
+
+Vertices = Annotated[tuple[Point, ...], Key("list of [x, y]", _vertices), "Corners in the order of the outline."]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +78,7 @@ class Clicks:
     who: str = ""
 
 
-@dataclass(frozen=True, config=TABLE)
+@table_model
 class LearnedFrom:
     """[learned_from] of a camera file.
 
@@ -90,11 +92,11 @@ class LearnedFrom:
         place.
     """
 
-    scan: Annotated[str, TEXT]
-    sha256: Annotated[str, TEXT]
+    scan: str
+    sha256: str
     pose: Annotated[str, choice(*POSES)]
-    clicked: Annotated[bool, FLAG] = False
-    alike: Annotated[tuple[str, ...], TEXTS] = ()
+    clicked: bool = False
+    alike: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,21 +105,6 @@ class Drawing:
 
     mark: shapes.Mark | shapes.LearnedMark
     is_radial: bool
-
-
-def read_clicks(table: Table, learned: Sequence[str]) -> Clicks:
-    """Read clicks on learned marks. Raises InputError where some of them are not clicked."""
-    scan = image_name(table.text("scan"))
-    places = table.table("px")
-    px = {id: places.pair(id) for id in learned if id in places}
-    places.done()
-    table.done()
-    missing = [id for id in learned if id not in px]
-    if missing or not px:
-        raise table.error(
-            "px", f"says nothing of {', '.join(missing) or 'any mark'}. Click all learned marks, or none."
-        )
-    return Clicks(scan, px)
 
 
 # Template of a mark in a camera file, with its images in files beside it: `[mark.NAME]` of kind "template".
@@ -175,28 +162,23 @@ def _picture(shares: NDArray[np.float64] | NDArray[np.bool_]) -> Picture:
     return np.asarray(np.rint(np.asarray(shares, float) * _FULL), np.uint16)
 
 
-def read_template(table: Table) -> MarkTemplate:
-    """Read a template. Raises InputError with the key that is wrong."""
-    return read_model(table, TemplateTable).mark(table)
-
-
 def read_marks(table: Table) -> dict[str, Drawing]:
     """Read all drawn marks by name. Raises InputError with the key that is wrong."""
     marks = {}
-    for name in table.names():
+    for name in table.values:
         entry = table.table(name)
-        given = read_model(entry, MARK_TABLES[entry.text("kind", choices=tuple(MARK_TABLES))])
+        given = read_kind(entry, MARK_TABLES)
         marks[name] = Drawing(given.mark(entry), given.rotate == "radial")
     return marks
 
 
-@dataclass(frozen=True, kw_only=True, config=TABLE)
+@table_model
 class MarkTable(ABC):
     """Keys of every table [mark.NAME]."""
 
-    kind: Annotated[str, TEXT] = Field(description="Shape of the mark.")
-    rotate: Annotated[str, choice("none", "radial")] = Field(
-        default="none", description="radial: drawn as on the positive x axis, turned with its place."
+    kind: Annotated[str, "Shape of the mark."]
+    rotate: Annotated[Literal["none", "radial"], "radial: drawn as on the positive x axis, turned with its place."] = (
+        "none"
     )
 
     @abstractmethod
@@ -204,33 +186,29 @@ class MarkTable(ABC):
         """Mark of the table. table: for messages."""
 
 
-@dataclass(frozen=True, kw_only=True, config=TABLE)
+@table_model
 class LearnedTable(MarkTable):
     """Mark to be learned from the scans."""
 
-    size_mm: Annotated[float, POSITIVE] = Field(description="Width of the template.")
+    size_mm: Annotated[Positive, "Width of the template."]
 
     def mark(self, table: Table) -> shapes.LearnedMark:
         return shapes.LearnedMark(self.size_mm)
 
 
-@dataclass(frozen=True, kw_only=True, config=TABLE)
+@table_model
 class PaintedTable(MarkTable):
     """Mark that is lighter or darker than its background."""
 
-    polarity: Annotated[shapes.Polarity, choice("auto", "light", "dark")] = Field(
-        default="auto", description="Whether the mark is lighter than its background."
-    )
+    polarity: Annotated[shapes.Polarity, "Whether the mark is lighter than its background."] = "auto"
 
 
-@dataclass(frozen=True, kw_only=True, config=TABLE)
+@table_model
 class FrameCornerTable(PaintedTable):
     """Corner of the exposed frame."""
 
-    reach_mm: Annotated[float, NOT_NEGATIVE] = Field(
-        default=0.0, description="How far along its edges it is measured; 0: a sixth of half the frame."
-    )
-    radius_mm: Annotated[float, NOT_NEGATIVE] = Field(default=0.0, description="Of a rounded corner.")
+    reach_mm: Annotated[NotNegative, "How far along its edges it is measured; 0: a sixth of half the frame."] = 0.0
+    radius_mm: Annotated[NotNegative, "Of a rounded corner."] = 0.0
 
     def mark(self, table: Table) -> shapes.Mark:
         if self.radius_mm and self.reach_mm and self.radius_mm >= self.reach_mm:
@@ -240,75 +218,70 @@ class FrameCornerTable(PaintedTable):
         return shapes.frame_corner(_ANY_CORNER, self.reach_mm, self.radius_mm, self.polarity)
 
 
-@dataclass(frozen=True, kw_only=True, config=TABLE)
+@table_model
 class LearnedPicture:
     """[mark.NAME.learned]: properties of a template estimated from scans, as the program writes them."""
 
-    size_mm: Annotated[float, POSITIVE]
-    range_dn: Annotated[float, POSITIVE]
-    noise_dn: Annotated[float, NOT_NEGATIVE]
-    slope_noise_dn: Annotated[float, NOT_NEGATIVE] = 0.0
-    alike: Annotated[tuple[str, ...], TEXTS] = ()
-    steadiness: Annotated[Picture01, Key("path", lambda table, key: _image(table, key) / _FULL)] = None
-    steady: Annotated[Picture01, Key("path", lambda table, key: _image(table, key) / _FULL)] = None
-    shares: Annotated[Mapping[str, float], Key("numbers by scan", lambda table, key: _shares(table.table(key)))] = (
-        Field(default_factory=dict)
-    )
+    size_mm: Positive
+    range_dn: Positive
+    noise_dn: NotNegative
+    slope_noise_dn: NotNegative = 0.0
+    alike: tuple[str, ...] = ()
+    steadiness: FilePath | None = None
+    steady: FilePath | None = None
+    shares: Mapping[str, Positive] = dataclasses.field(default_factory=dict)
 
     def applied(self, template: MarkTemplate, table: Table) -> MarkTemplate:
         """Template with its learned properties."""
-        for key, values in (("steadiness", self.steadiness), ("steady", self.steady)):
+        pictures = {key: _image(table, key) / _FULL if key in table else None for key in ("steadiness", "steady")}
+        for key, values in pictures.items():
             if values is not None and values.shape != template.image.shape:
                 px = template.image.shape[::-1]
                 raise table.error(key, f"is a picture of {values.shape[::-1]} px, and the template has {px}.")
+        steady = pictures["steady"]
         return replace(
             template,
             image=template.image * (self.range_dn / float(np.ptp(template.image))),
             noise_dn=self.noise_dn,
             slope_noise_dn=self.slope_noise_dn,
             shares=self.shares,
-            steadiness=self.steadiness,
-            steady=None if self.steady is None else self.steady > 0.5,
+            steadiness=pictures["steadiness"],
+            steady=None if steady is None else steady > 0.5,
             learned_mm=self.size_mm,
             alike=self.alike,
         )
-
-
-def _shares(table: Table) -> dict[str, float]:
-    return {scan: table.number(scan, above=0.0) for scan in table.names()}
 
 
 def _image(table: Table, key: str) -> Array:
     from measure.scans.opening import open_scan
 
     try:
-        with open_scan(table.path_value(key)) as chip:
+        with open_scan(table.file.parent / table.values[key]) as chip:
             return chip.window(0, 0, chip.width_px, chip.height_px).astype(np.float64)
     except MeasurementError as error:
         raise table.error(key, str(error)) from error
 
 
-@dataclass(frozen=True, kw_only=True, config=TABLE)
+@table_model
 class TemplateTable(PaintedTable):
     """Chip cut from a scan."""
 
-    image: Annotated[Array, Key("path", _image)] = Field(description="The chip.")
-    pitch_um: Annotated[float, POSITIVE] = Field(description="Of its pixels.")
-    origin_px: Annotated[Point, PAIR] = Field(description="Column and row of the point that is measured.")
-    turn_deg: Annotated[float, NUMBER] = Field(default=0.0, description="By which the chip is turned.")
-    detail_mm: Annotated[float, NOT_NEGATIVE] = Field(default=0.0, description="Size of its finest detail.")
-    learned: Annotated[LearnedPicture | None, subtable(LearnedPicture)] = Field(
-        default=None, description="As the program writes it."
-    )
+    image: Annotated[FilePath, "The chip."]
+    pitch_um: Annotated[Positive, "Of its pixels."]
+    origin_px: Annotated[Point, "Column and row of the point that is measured."]
+    turn_deg: Annotated[float, "By which the chip is turned."] = 0.0
+    detail_mm: Annotated[NotNegative, "Size of its finest detail."] = 0.0
+    learned: Annotated[LearnedPicture | None, "As the program writes it."] = None
 
     def mark(self, table: Table) -> MarkTemplate:
-        if np.ptp(self.image) == 0.0:
-            path = table.path_value("image")
+        image = _image(table, "image")
+        if np.ptp(image) == 0.0:
+            path = table.file.parent / self.image
             raise table.error(
                 "image", f"{path} shows nothing: all its pixels are alike. Cut out the mark with its background."
             )
         template = MarkTemplate(
-            self.image,
+            image,
             self.pitch_um,
             self.origin_px,
             polarity=self.polarity,
@@ -318,13 +291,15 @@ class TemplateTable(PaintedTable):
         return self.learned.applied(template, table.table("learned")) if self.learned else template
 
 
-@dataclass(frozen=True, kw_only=True, config=TABLE)
+@table_model
 class DrawnTable(PaintedTable):
     """Mark drawn by its dimensions."""
 
-    true_mm: Annotated[tuple[Point, Point] | None, Key("[[x, y], [x, y]]", lambda table, key: _true_mm(table))] = Field(
-        default=None, description="Corners of the rectangle in which the drawing is true; absent: everywhere."
-    )
+    true_mm: Annotated[
+        tuple[Point, Point] | None,
+        Key("[[x, y], [x, y]]", _true_mm),
+        "Corners of the rectangle in which the drawing is true; absent: everywhere.",
+    ] = None
 
     def mark(self, table: Table) -> shapes.MarkShape:
         return shapes.MarkShape(self.parts(table), self.polarity, true_mm=self.true_mm)
@@ -334,33 +309,25 @@ class DrawnTable(PaintedTable):
         """Primitive shapes of the mark. table: for messages."""
 
 
-def _true_mm(table: Table) -> tuple[Point, Point]:
-    corners = table.pairs("true_mm")
-    if len(corners) != 2 or not np.all(np.less(*corners)):
-        corner = "[[least x, least y], [greatest x, greatest y]]"
-        raise table.error("true_mm", f"must be two corners of the rectangle in which the drawing is true, {corner}.")
-    return corners[0], corners[1]
-
-
-@dataclass(frozen=True, kw_only=True, config=TABLE)
+@table_model
 class DotTable(DrawnTable):
     """Disk."""
 
-    radius_mm: Annotated[float, POSITIVE] = Field(description="Of the disk.")
+    radius_mm: Annotated[Positive, "Of the disk."]
 
     def parts(self, table: Table) -> tuple[shapes.Part, ...]:
         return shapes.dot(self.radius_mm)
 
 
-@dataclass(frozen=True, kw_only=True, config=TABLE)
+@table_model
 class RingTable(DrawnTable):
     """Mark with a ring."""
 
-    ring_mm: Annotated[float, POSITIVE] = Field(description="Mean radius of the ring.")
-    ring_line_mm: Annotated[float, POSITIVE] = Field(description="Width of the ring.")
+    ring_mm: Annotated[Positive, "Mean radius of the ring."]
+    ring_line_mm: Annotated[Positive, "Width of the ring."]
 
 
-@dataclass(frozen=True, kw_only=True, config=TABLE)
+@table_model
 class RingDotTable(RingTable, DotTable):
     """Disk in a ring."""
 
@@ -368,54 +335,54 @@ class RingDotTable(RingTable, DotTable):
         return shapes.ring_dot(self.ring_mm, self.ring_line_mm, self.radius_mm)
 
 
-@dataclass(frozen=True, kw_only=True, config=TABLE)
+@table_model
 class CrossTable(DrawnTable):
     """Cross."""
 
-    arm_mm: Annotated[float, POSITIVE] = Field(description="Half its length.")
-    line_mm: Annotated[float, POSITIVE] = Field(description="Width of its bars.")
-    gap_mm: Annotated[float, NOT_NEGATIVE] = Field(default=0.0, description="Half the gap in its middle.")
-    angle_deg: Annotated[float, NUMBER] = Field(default=0.0, description="0 upright, 45 diagonal.")
+    arm_mm: Annotated[Positive, "Half its length."]
+    line_mm: Annotated[Positive, "Width of its bars."]
+    gap_mm: Annotated[NotNegative, "Half the gap in its middle."] = 0.0
+    angle_deg: Annotated[float, "0 upright, 45 diagonal."] = 0.0
 
-    def parts(self, table: Table) -> tuple[shapes.Part, ...]:
-        return shapes.cross(*self.sizes(table))
-
-    def sizes(self, table: Table) -> tuple[float, float, float, float]:
-        """Arm, line width, gap (mm) and angle (deg). table: for messages."""
+    def __post_init__(self) -> None:
+        """Raises WrongKey for a gap that leaves no arm."""
         if self.gap_mm >= self.arm_mm:
             message = f"must be smaller than arm_mm ({self.arm_mm:g}), not {self.gap_mm:g}: no arm would be left."
-            raise table.error("gap_mm", message)
-        return self.arm_mm, self.line_mm, self.gap_mm, self.angle_deg
+            raise WrongKey("gap_mm", message)
+
+    def parts(self, table: Table) -> tuple[shapes.Part, ...]:
+        return shapes.cross(self.arm_mm, self.line_mm, self.gap_mm, self.angle_deg)
 
 
-@dataclass(frozen=True, kw_only=True, config=TABLE)
+@table_model
 class RingCrossTable(RingTable, CrossTable):
     """Cross in a ring."""
 
     def parts(self, table: Table) -> tuple[shapes.Part, ...]:
-        return shapes.ring_cross(self.ring_mm, self.ring_line_mm, *self.sizes(table))
+        sizes = self.arm_mm, self.line_mm, self.gap_mm, self.angle_deg
+        return shapes.ring_cross(self.ring_mm, self.ring_line_mm, *sizes)
 
 
-@dataclass(frozen=True, kw_only=True, config=TABLE)
+@table_model
 class PolygonTable(DrawnTable):
     """Wedge, notch or wing."""
 
-    vertices_mm: Annotated[tuple[Point, ...], VERTICES] = Field(description="Corners in the order of the outline.")
+    vertices_mm: Vertices
 
     def parts(self, table: Table) -> tuple[shapes.Part, ...]:
         return shapes.polygon(self.vertices_mm)
 
 
-@dataclass(frozen=True, kw_only=True, config=TABLE)
+@table_model
 class PartsTable(DrawnTable):
     """Combination of disks, rings, bars and polygons."""
 
-    part: Annotated[tuple[shapes.Part, ...], Key("tables", lambda table, key: _parts(table))] = Field(
-        description="The simple shapes, one table each."
-    )
+    part: Annotated[Entries, "The simple shapes, one table each."]
 
     def parts(self, table: Table) -> tuple[shapes.Part, ...]:
-        return self.part
+        if not self.part:
+            raise table.error("part", f"a mark of kind 'parts' needs at least one [[{table.place}.part]].")
+        return tuple(_part(part) for part in table.tables("part"))
 
 
 MARK_TABLES: Mapping[str, type[MarkTable]] = {
@@ -431,26 +398,42 @@ MARK_TABLES: Mapping[str, type[MarkTable]] = {
 }
 
 
-def _parts(table: Table) -> tuple[shapes.Part, ...]:
-    parts = tuple(_part(part) for part in table.tables("part"))
-    if not parts:
-        raise table.error("part", f"a mark of kind 'parts' needs at least one [[{table.place}.part]].")
-    return parts
+@table_model
+class _Disk(shapes.Disk):
+    shape: str
+    radius_mm: Positive
+    center_mm: Point = (0.0, 0.0)
+
+
+@table_model
+class _Ring(shapes.Ring):
+    shape: str
+    radius_mm: Positive
+    line_mm: Positive
+    center_mm: Point = (0.0, 0.0)
+
+
+@table_model
+class _Bar(shapes.Bar):
+    shape: str
+    line_mm: Positive
+
+    def __post_init__(self) -> None:
+        if self.from_mm == self.to_mm:
+            raise WrongKey("to_mm", "is the same as from_mm: a bar needs two different ends.")
+
+
+@table_model
+class _Polygon(shapes.Polygon):
+    shape: str
+    vertices_mm: Vertices
+
+
+_PARTS = {"disk": _Disk, "ring": _Ring, "bar": _Bar, "polygon": _Polygon}
 
 
 def _part(table: Table) -> shapes.Part:
-    shape = table.text("shape", choices=("disk", "ring", "bar", "polygon"))
-    part: shapes.Part
-    if shape == "disk":
-        part = shapes.Disk(table.pair("center_mm", (0.0, 0.0)), table.number("radius_mm", above=0.0))
-    elif shape == "ring":
-        center, radius = table.pair("center_mm", (0.0, 0.0)), table.number("radius_mm", above=0.0)
-        part = shapes.Ring(center, radius, table.number("line_mm", above=0.0))
-    elif shape == "bar":
-        part = shapes.Bar(table.pair("from_mm"), table.pair("to_mm"), table.number("line_mm", above=0.0))
-        if part.from_mm == part.to_mm:
-            raise table.error("to_mm", "is the same as from_mm: a bar needs two different ends.")
-    else:
-        part = shapes.Polygon(_vertices(table, "vertices_mm"))
-    table.done()
-    return part
+    """Read a part as the class of `shapes` from which its model is derived."""
+    given: Any = read_kind(table, _PARTS, "shape")
+    plain: type[shapes.Part] = type(given).__bases__[0]
+    return plain(**{field.name: getattr(given, field.name) for field in dataclasses.fields(plain)})

@@ -24,7 +24,7 @@ from pipeline.files.mark_table import Clicks
 from pipeline.files.points_file import GivenDistance, GivenPoints, read_distances, read_points
 from pipeline.files.project_tables import UNITS_MM, ProjectTable
 from pipeline.files.scan_files import FoundScans, add_cuts, as_named, find_scans
-from pipeline.files.target_table import TargetSettings, TieSettings
+from pipeline.files.target_table import TargetSettings, TieSettings, read_targets, read_ties
 from pipeline.provenance import hash_content
 from pipeline.results.covariance_file import covariance_path
 from pipeline.text.names import path_below
@@ -293,8 +293,8 @@ def _read_tables(table: Table, needs_camera: bool = True) -> Project:
         output=folder / given.output,
         pose=given.measure.pose,
         tone=given.measure.tone,
-        targets=given.targets,
-        ties=given.ties,
+        targets=None if given.targets is None else read_targets(table.table("targets")),
+        ties=None if given.ties is None else read_ties(table.table("ties")),
         given_points=read_points(named["points"]) if "points" in named else None,
         given_images=images,
         given_distances=read_distances(named["distances"]) if "distances" in named else (),

@@ -1,116 +1,100 @@
 """Tables of project.toml, and all keys for the documentation."""
 
 import math
-from typing import Annotated, get_args
-
-from pydantic import Field
-from pydantic.dataclasses import dataclass
+from typing import Annotated, Any
 
 from measure.fiducials.options import Reads
 from measure.geometry import POSES
-from pipeline.files.adjust_table import AdjustSettings, read_adjust
+from pipeline.files.adjust_table import AdjustSettings
 from pipeline.files.camera_tables import CameraTable, DistortionTable, FiducialTable, SigmaTable, Source
 from pipeline.files.mark_table import MARK_TABLES
-from pipeline.files.target_table import TARGET_TABLES, TargetSettings, TieSettings, TieTable, read_targets, read_ties
-from pipeline.text.table_models import FLAG, PATH, PATHS, SIGMA, TABLE, TEXT, TRIPLE, Key, choice, key_rows, subtable
-from pipeline.text.tables import Table
+from pipeline.files.target_table import TARGET_TABLES, TieTable
+from pipeline.text.table_models import (
+    FilePath,
+    FilePaths,
+    Key,
+    Sigma,
+    Values,
+    choice,
+    key_rows,
+    number_or_pair,
+    number_or_word,
+    table_model,
+)
 from pipeline.text.text_file import FINEST_PITCH_UM
 
 _COARSEST_PITCH_UM = 1e4  # larger values were probably meant as nm: at this pitch no mark is visible
 TONES = ("linear", "srgb")  # in addition to auto and an exponent
-_ADJUST = Key("table", lambda table, key: read_adjust(table.table(key)), AdjustSettings)
-_TONE = Key(
-    '"auto", "linear", "srgb" or a power',
-    lambda table, key: table.number_or_text(key, "auto", ("auto", *TONES), above=0.0),
-)
 UNITS_MM = {"m": 1000.0, "dm": 100.0, "cm": 10.0, "mm": 1.0}
 
 
-@dataclass(frozen=True, kw_only=True, config=TABLE)
+def _pitch(value: Any) -> tuple[float, float]:
+    pitch = number_or_pair(value)
+    if not all(0.0 < each < math.inf for each in pitch):
+        raise ValueError(f"must be positive, not {list(pitch)}.")
+    if min(pitch) < FINEST_PITCH_UM:
+        raise ValueError(f"{min(pitch):g} µm is finer than any scanner. Give µm: 20.0, not 0.02.")
+    if max(pitch) > _COARSEST_PITCH_UM:
+        raise ValueError(f"{max(pitch):g} µm is coarser than any scan. Give µm: 20.0, not 20000.")
+    return pitch
+
+
+@table_model
 class MeasureTable:
     """The table [measure]."""
 
-    pose: Annotated[str, choice("auto", *POSES)] = Field(
-        default="auto", description="Scan orientation: counter-clockwise turn of the scan, then m if mirrored."
-    )
-    writing: Annotated[Reads, choice(*get_args(Reads))] = Field(
-        default="pose", description="In which scans the writing about the frame is read."
-    )
-    tone: Annotated[float | str, _TONE] = Field(default="auto", description="How grey values grow with light.")
+    pose: Annotated[
+        str, choice("auto", *POSES), "Scan orientation: counter-clockwise turn of the scan, then m if mirrored."
+    ] = "auto"
+    writing: Annotated[Reads, "In which scans the writing about the frame is read."] = "pose"
+    tone: Annotated[float | str, number_or_word("auto", *TONES), "How grey values grow with light."] = "auto"
 
 
-@dataclass(frozen=True, kw_only=True, config=TABLE)
+@table_model
 class ScannerTable:
     """The table [scanner]."""
 
-    lens: Annotated[str | None, PATH] = Field(
-        default=None, description="camera.yaml of the digital camera that photographed the film; goes with pitch_um."
-    )
+    lens: Annotated[
+        FilePath | None, "camera.yaml of the digital camera that photographed the film; goes with pitch_um."
+    ] = None
 
 
-@dataclass(frozen=True, kw_only=True, config=TABLE)
+@table_model
 class ObjectTable:
     """The table [object]."""
 
-    points: Annotated[str | None, PATH] = Field(default=None, description="points.csv: object points.")
-    images: Annotated[str | None, PATH] = Field(
-        default=None, description="images.csv: exterior orientations; absent: found."
-    )
-    distances: Annotated[str | None, PATH] = Field(default=None, description="distances.csv: measured distances.")
-    unit: Annotated[str, choice(*UNITS_MM)] = Field(default="m", description="Unit of the object coordinates.")
-    crs: Annotated[str, TEXT] = Field(default="", description='Coordinate reference system, such as "EPSG:25832".')
-    board_bend: Annotated[float, SIGMA] = Field(
-        default=0.0, description="Of the board's middle off its plane, object units."
-    )
-    transparent: Annotated[bool, FLAG] = Field(
-        default=False, description="Whether a flat field is visible from both sides."
-    )
-    antenna_offset: Annotated[tuple[float, float, float], TRIPLE] = Field(
-        default=(0.0, 0.0, 0.0), description="Of the observed stations from the projection centres; goes with images."
-    )
+    points: Annotated[FilePath | None, "points.csv: object points."] = None
+    images: Annotated[FilePath | None, "images.csv: exterior orientations; absent: found."] = None
+    distances: Annotated[FilePath | None, "distances.csv: measured distances."] = None
+    unit: Annotated[str, choice(*UNITS_MM), "Unit of the object coordinates."] = "m"
+    crs: Annotated[str, 'Coordinate reference system, such as "EPSG:25832".'] = ""
+    board_bend: Annotated[Sigma, "Of the board's middle off its plane, object units."] = 0.0
+    transparent: Annotated[bool, "Whether a flat field is visible from both sides."] = False
+    antenna_offset: Annotated[
+        tuple[float, float, float], "Of the observed stations from the projection centres; goes with images."
+    ] = (0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True, kw_only=True, config=TABLE)
+@table_model
 class ProjectTable:
     """project.toml."""
 
-    camera: Annotated[str, PATH] = Field(description='Camera file, or "library:NAME".')
-    scans: Annotated[tuple[str, ...] | None, PATHS] = Field(
-        default=None, description="Scans, by names and patterns; absent: comparator.csv is given."
-    )
-    exclude: Annotated[tuple[str, ...], PATHS] = Field(default=(), description="Patterns of scans to leave out.")
-    comparator: Annotated[str, PATH] = Field(
-        default="comparator.csv", description="Read where there are no scans, written otherwise."
-    )
-    pitch_um: Annotated[tuple[float, float] | None, Key("number or [x, y]", lambda table, key: _pitch(table))] = Field(
-        default=None, description="Of a pixel of the scans; absent: by the files' resolution tags, or the marks."
-    )
-    output: Annotated[str, PATH] = Field(default="out", description="Folder of the results.")
-    measure: Annotated[MeasureTable, subtable(MeasureTable)] = Field(
-        default=MeasureTable(), description="How to measure."
-    )
-    scanner: Annotated[ScannerTable, subtable(ScannerTable)] = Field(
-        default=ScannerTable(), description="What took the scans."
-    )
-    targets: Annotated[TargetSettings | None, Key("table", lambda table, key: read_targets(table.table(key)))] = Field(
-        default=None, description="What the targets are; absent: only fiducials are measured."
-    )
-    ties: Annotated[TieSettings | None, Key("table", lambda table, key: read_ties(table.table(key)))] = Field(
-        default=None, description="Natural points; absent: none are sought."
-    )
-    object: Annotated[ObjectTable, subtable(ObjectTable)] = Field(default=ObjectTable(), description="Object space.")
-    adjust: Annotated[AdjustSettings, _ADJUST] = Field(default=AdjustSettings(), description="How to adjust.")
-
-
-def _pitch(table: Table) -> tuple[float, float]:
-    pitch = table.number_or_pair("pitch_um")
-    if not all(0.0 < value < math.inf for value in pitch):
-        raise table.error("pitch_um", f"must be positive, not {list(pitch)}.")
-    if min(pitch) < FINEST_PITCH_UM:
-        raise table.error("pitch_um", f"{min(pitch):g} µm is finer than any scanner. Give µm: 20.0, not 0.02.")
-    if max(pitch) > _COARSEST_PITCH_UM:
-        raise table.error("pitch_um", f"{max(pitch):g} µm is coarser than any scan. Give µm: 20.0, not 20000.")
-    return pitch
+    camera: Annotated[FilePath, 'Camera file, or "library:NAME".']
+    scans: Annotated[FilePaths | None, "Scans, by names and patterns; absent: comparator.csv is given."] = None
+    exclude: Annotated[FilePaths, "Patterns of scans to leave out."] = ()
+    comparator: Annotated[FilePath, "Read where there are no scans, written otherwise."] = "comparator.csv"
+    pitch_um: Annotated[
+        tuple[float, float] | None,
+        Key("number or [x, y]", _pitch),
+        "Of a pixel of the scans; absent: by the files' resolution tags, or the marks.",
+    ] = None
+    output: Annotated[FilePath, "Folder of the results."] = "out"
+    measure: Annotated[MeasureTable, "How to measure."] = MeasureTable()
+    scanner: Annotated[ScannerTable, "What took the scans."] = ScannerTable()
+    targets: Annotated[Values | None, "What the targets are; absent: only fiducials are measured."] = None
+    ties: Annotated[Values | None, "Natural points; absent: none are sought."] = None
+    object: Annotated[ObjectTable, "Object space."] = ObjectTable()
+    adjust: Annotated[AdjustSettings, "How to adjust."] = AdjustSettings()
 
 
 def keys_text() -> str:

@@ -239,7 +239,9 @@ def _start(
         fiducials.append(one)
     given = _up_from_camera(placement)
     pose = min(POSES, key=lambda name: float(np.abs(up_from_camera(name) - given).sum()))
-    learned_from = LearnedFrom(task.name, digest(scan.path), pose, camera.clicks is not None, alike)
+    learned_from = LearnedFrom(
+        scan=task.name, sha256=digest(scan.path), pose=pose, clicked=camera.clicks is not None, alike=alike
+    )
     return replace(camera, fiducials=tuple(fiducials), learned_from=learned_from)
 
 

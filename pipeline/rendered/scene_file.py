@@ -1,25 +1,34 @@
 """SCENE.toml: the scene to be rendered, and the precision of its given camera, points and orientations."""
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal, TypeVar, cast, get_args
+from typing import Annotated, Any, cast
 
 import numpy as np
+from pydantic import Field
 
 from measure.marks import shapes
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile, parse_camera, read_camera
 from pipeline.files.library import camera_path
-from pipeline.rendered.design_table import read_design
+from pipeline.rendered.design_table import DesignSettings
 from pipeline.rendered.field_table import read_field
 from pipeline.rendered.scene_project import Given, SceneFile, write_project
+from pipeline.text.table_models import (
+    Key,
+    NotNegative,
+    NumberOrPair,
+    Values,
+    choice,
+    number_or_word,
+    read_model,
+    table_model,
+)
 from pipeline.text.tables import Table, read_toml
 from synthetic_images import areas, scene
 from synthetic_images.render import Progress, render_scene
-
-Made = TypeVar("Made")
 
 TRUTH = "truth.json"
 WRITTEN = ("project.toml", "camera.toml", "points.csv", "images.csv")
@@ -58,59 +67,117 @@ def read_scene(path: Path) -> SceneFile:
     return parse_scene(read_toml(path))
 
 
+@table_model
+class FilmTable(scene.Film):
+    """[film] of a scene: the film, and standard deviations of the random film transformation of each frame."""
+
+    kind: Annotated[scene.FilmKind, Field(alias="transformation")] = "affine"
+    scale_sigma_ppm: NotNegative = 0.0
+    shear_sigma_urad: NotNegative = 0.0
+
+
+@table_model
+class ScanTable(scene.Scanner):
+    """[scan] of a scene: the scanner, and standard deviations of the random position of each frame on it."""
+
+    pitch_um: NumberOrPair
+    tone: Annotated[float | str, number_or_word(*scene.TONES)] = 1.0
+    turn_sigma_deg: NotNegative = 0.0
+    offset_sigma_mm: NotNegative = 0.0
+
+
+@table_model
+class PictureTable:
+    """[picture] of a scene."""
+
+    tones: scene.Tones = scene.Tones()
+    background: scene.Background = "plain"
+    ground: float = 0.0
+    relief: NotNegative = 0.0
+    pad_mm: NotNegative = 0.0
+    pocket_mm: NotNegative = 0.0
+    corner_radius_mm: NotNegative = 0.0
+
+
+@table_model
+class ImageFilmTable:
+    """[image.film] of a scene; absent keys: random."""
+
+    scale_ppm: NumberOrPair | None = None
+    shear_urad: float | None = None
+    rotation_deg: float = 0.0
+    shift_mm: tuple[float, float] = (0.0, 0.0)
+
+
+@table_model
+class ImageTable:
+    """[[image]] of a scene; the position on the scanner is random if absent."""
+
+    name: str
+    position: tuple[float, float, float]
+    angles_deg: tuple[float, float, float]
+    pose: Annotated[str, choice(*scene.POSES)] = "0"
+    turn_deg: float | None = None
+    offset_mm: tuple[float, float] | None = None
+    film: ImageFilmTable = ImageFilmTable()
+    covered: tuple[str, ...] = ()
+    neighbour: scene.Side | None = None
+    neighbour_gap_mm: NotNegative = 3.0
+    writing: tuple[scene.Writing, ...] = ()
+    part_of: str = ""
+    part: tuple[float, float] = (0.0, 1.0)
+
+
+@table_model
+class SceneTable:
+    """SCENE.toml. camera: its table or the name of its file; writing: on all frames."""
+
+    name: str | None = None
+    seed: int = 1
+    camera: Annotated[str | Mapping[str, Any], Key("text or table", lambda value: value)]
+    field: Values
+    film: FilmTable = FilmTable()
+    scan: ScanTable
+    picture: PictureTable = PictureTable()
+    image: tuple[ImageTable, ...] = ()
+    writing: tuple[scene.Writing, ...] = ()
+    given: Given = Given()
+    design: DesignSettings = DesignSettings()
+
+
 def parse_scene(table: Table) -> SceneFile:
     """Build the scene from the root table of a file."""
-    path = table.file
-    seed = table.whole("seed", 1)
+    given = read_model(table, SceneTable)
     camera = _camera(table)
-    field_table = table.table("field")
-    unit = field_table.text("unit", "m", ("m", "dm", "cm", "mm"))
-    field = _build(path, lambda: read_field(field_table, unit, seed))
-    field_table.done()
-    film_table, scanner_table, picture = table.table("film"), table.table("scan"), table.table("picture")
-    film = _build(path, lambda: _film(film_table))
-    scanner = _build(path, lambda: _scanner(scanner_table))
-    laws = _Laws.read(film_table, scanner_table, film.kind)
-    images, on_all = table.tables("image"), _build(path, lambda: _writing(table))
-    generators = [np.random.default_rng([seed, index, 0]) for index in range(len(images))]
-    made = _build(
-        path,
-        lambda: scene.Scene(
-            name=table.text("name", path.stem),
-            seed=seed,
+    try:
+        field, unit = read_field(table.table("field"), given.seed)
+        made = scene.Scene(
+            name=given.name or table.file.stem,
+            seed=given.seed,
             camera=_scene_camera(camera),
             field=field,
-            images=tuple(_image(image, laws, g, on_all) for image, g in zip(images, generators, strict=True)),
-            scanner=scanner,
-            film=film,
-            tones=_tones(picture.table("tones")),
-            background=cast(scene.Background, picture.text("background", "plain", get_args(scene.Background))),
-            ground=picture.number("ground", 0.0),
-            relief=picture.number("relief", 0.0, least=0.0),
-            pad_mm=picture.number("pad_mm", 0.0, least=0.0),
-            pocket_mm=picture.number("pocket_mm", 0.0, least=0.0),
-            corner_radius_mm=picture.number("corner_radius_mm", 0.0, least=0.0),
-        ),
-    )
-    given = _read_given(table.table("given"))
-    design = read_design(table.table("design"), given.point[0] if given.planimetry else math.inf, given.point[1])
-    for part in (film_table, scanner_table, picture, table):
-        part.done()
-    return SceneFile(path, made, camera, unit, given, design)
-
-
-def _build(path: Path, make: Callable[[], Made]) -> Made:
-    """Build a part of the scene; a ValueError becomes an InputError for the file."""
-    try:
-        return make()
+            images=tuple(_image(image, given, number) for number, image in enumerate(given.image)),
+            scanner=given.scan,
+            film=given.film,
+            **vars(given.picture),
+        )
     except ValueError as error:
-        raise InputError(f"{path}: {error}. Correct the scene file.") from None
+        raise InputError(f"{table.file}: {error}. Correct the scene file.") from None
+    errors, wanted = given.given, table.table("design")
+    design, planimetry = given.design, errors.point[0] if errors.planimetry else math.inf
+    design = replace(
+        design,
+        sigma_planimetry=design.sigma_planimetry if "sigma_planimetry" in wanted else planimetry,
+        sigma_height=design.sigma_height if "sigma_height" in wanted else errors.point[1],
+    )
+    return SceneFile(table.file, made, camera, unit, errors, design)
 
 
 def _camera(table: Table) -> CameraFile:
     """Read the camera from the scene file, or from the camera file it names."""
-    if isinstance(table.values.get("camera"), str):
-        camera = read_camera(camera_path(table.text("camera"), table.file.parent))
+    given = table.values["camera"]
+    if isinstance(given, str):
+        camera = read_camera(camera_path(given, table.file.parent))
     else:
         camera = parse_camera(table.table("camera"))
     if camera.frame_mm is None or camera.principal_distance_mm is None:
@@ -159,163 +226,34 @@ def _area(part: shapes.Part) -> areas.Area:
     return areas.polygon(part.vertices_mm)
 
 
-def _film(table: Table) -> scene.Film:
-    return scene.Film(
-        kind=cast(scene.FilmKind, table.text("transformation", "affine", get_args(scene.FilmKind))),
-        tilt_deg=table.number("tilt_deg", 0.0),
-        tilt_direction_deg=table.number("tilt_direction_deg", 0.0),
-        photographed_from_mm=table.number("photographed_from_mm", 600.0, above=0.0),
-        deformation_um=table.number("deformation_um", 0.0),
-        grain=table.number("grain", 0.0),
-        grain_px=table.number("grain_px", 1.0),
-        dust=table.whole("dust", 0),
-        scratches=table.whole("scratches", 0),
-        hairs=table.whole("hairs", 0),
-    )
-
-
-def _scanner(table: Table) -> scene.Scanner:
-    bend = table.table("bend_um")
-    bend_um = {name: bend.number(name) for name in sorted(bend.values)}
-    return scene.Scanner(
-        pitch_um=table.number_or_pair("pitch_um"),
-        margin_mm=table.number("margin_mm", 5.0),
-        blur_px=table.number("blur_px", 0.7),
-        noise=table.number("noise", 0.0),
-        bit_depth=cast(Literal[8, 16], table.whole("bit_depth", 16)),
-        colour=table.flag("colour", False),
-        negative=table.flag("negative", False),
-        white_is_zero=table.flag("white_is_zero", False),
-        compression=cast(scene.Compression, table.text("compression", "none", get_args(scene.Compression))),
-        tile_px=table.whole("tile_px", 256),
-        tone=table.number_or_text("tone", 1.0, scene.TONES, above=0.0),
-        bend_um=bend_um,
-        sharpen=_unsharp_mask(table.table("sharpen")),
-        lens=_taking_lens(table.table("lens")) if "lens" in table else None,
-    )
-
-
-def _taking_lens(table: Table) -> scene.TakingLens:
-    lens = scene.TakingLens(
-        focal_px=table.number("focal_px", above=0.0),
-        center_px=table.pair("center_px") if "center_px" in table else None,
-        **{name: table.number(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")},
-    )
-    table.done()
-    return lens
-
-
-def _unsharp_mask(table: Table) -> scene.UnsharpMask:
-    usual = scene.UnsharpMask()
-    mask = scene.UnsharpMask(
-        amount=table.number("amount", usual.amount, least=0.0),
-        radius_px=table.number("radius_px", usual.radius_px, above=0.0),
-    )
-    table.done()
-    return mask
-
-
-def _tones(table: Table) -> scene.Tones:
-    usual = scene.Tones()
-    tones = scene.Tones(**{name: table.number(name, value) for name, value in vars(usual).items()})
-    table.done()
-    return tones
-
-
-@dataclass(frozen=True)
-class _Laws:
-    """Standard deviations of the random film transformation of each frame and its position on the scanner."""
-
-    kind: scene.FilmKind
-    scale_ppm: float
-    shear_urad: float
-    turn_deg: float
-    offset_mm: float
-
-    @staticmethod
-    def read(film: Table, scan: Table, kind: scene.FilmKind) -> "_Laws":
-        return _Laws(
-            kind,
-            film.number("scale_sigma_ppm", 0.0, least=0.0),
-            film.number("shear_sigma_urad", 0.0, least=0.0),
-            scan.number("turn_sigma_deg", 0.0, least=0.0),
-            scan.number("offset_sigma_mm", 0.0, least=0.0),
-        )
-
-
-def _image(
-    table: Table, laws: _Laws, generator: np.random.Generator, on_all: tuple[scene.Writing, ...]
-) -> scene.SceneImage:
-    """One frame. Film and position on the scanner are random where the file does not give them. on_all: text on all
-    frames."""
-    scale = 1.0 + generator.normal(0.0, laws.scale_ppm * 1e-6, 2)
-    shear = float(generator.normal(0.0, laws.shear_urad * 1e-6))
-    if laws.kind == "similarity":
+def _image(table: ImageTable, given: SceneTable, number: int) -> scene.SceneImage:
+    """One frame. Film and position on the scanner are random where the file does not give them."""
+    generator = np.random.default_rng([given.seed, number, 0])
+    scale = 1.0 + generator.normal(0.0, given.film.scale_sigma_ppm * 1e-6, 2)
+    shear = float(generator.normal(0.0, given.film.shear_sigma_urad * 1e-6))
+    if given.film.kind == "similarity":
         scale, shear = scale[[0, 0]], 0.0
-    turn = float(generator.normal(0.0, laws.turn_deg))
-    offset = generator.normal(0.0, laws.offset_mm, 2)
-    film = table.table("film")
-    scale_ppm = film.number_or_pair("scale_ppm", ((scale[0] - 1) * 1e6, (scale[1] - 1) * 1e6))
-    image = scene.SceneImage(
-        name=table.text("name"),
-        exterior=_exterior(table),
-        pose=table.text("pose", "0", scene.POSES),
-        turn_rad=math.radians(table.number("turn_deg", turn)),
-        offset_mm=table.pair("offset_mm", (float(offset[0]), float(offset[1]))),
+    turn = float(generator.normal(0.0, given.scan.turn_sigma_deg))
+    offset = generator.normal(0.0, given.scan.offset_sigma_mm, 2)
+    film, x_y_z = table.film, table.position
+    scale_ppm = film.scale_ppm or ((scale[0] - 1) * 1e6, (scale[1] - 1) * 1e6)
+    omega, phi, kappa = (math.radians(angle) for angle in table.angles_deg)
+    return scene.SceneImage(
+        name=table.name,
+        exterior=(*x_y_z, omega, phi, kappa),
+        pose=table.pose,
+        turn_rad=math.radians(turn if table.turn_deg is None else table.turn_deg),
+        offset_mm=table.offset_mm or (float(offset[0]), float(offset[1])),
         film=scene.FilmTransformation(
             scale=(1.0 + scale_ppm[0] * 1e-6, 1.0 + scale_ppm[1] * 1e-6),
-            shear_rad=film.number("shear_urad", shear * 1e6) * 1e-6,
-            rotation_rad=math.radians(film.number("rotation_deg", 0.0)),
-            shift_mm=film.pair("shift_mm", (0.0, 0.0)),
+            shear_rad=(shear * 1e6 if film.shear_urad is None else film.shear_urad) * 1e-6,
+            rotation_rad=math.radians(film.rotation_deg),
+            shift_mm=film.shift_mm,
         ),
-        covered=table.texts("covered") if "covered" in table else (),
-        neighbour=cast(scene.Side, table.text("neighbour", choices=get_args(scene.Side)))
-        if "neighbour" in table
-        else None,
-        neighbour_gap_mm=table.number("neighbour_gap_mm", 3.0, least=0.0),
-        writing=(*on_all, *_writing(table)),
-        part_of=table.text("part_of", ""),
-        part=table.pair("part", (0.0, 1.0)),
+        covered=table.covered,
+        neighbour=table.neighbour,
+        neighbour_gap_mm=table.neighbour_gap_mm,
+        writing=(*given.writing, *table.writing),
+        part_of=table.part_of,
+        part=table.part,
     )
-    film.done()
-    table.done()
-    return image
-
-
-def _writing(table: Table) -> tuple[scene.Writing, ...]:
-    lines = []
-    for entry in table.tables("writing"):
-        line = scene.Writing(
-            text=entry.text("text"),
-            xy_mm=entry.pair("xy_mm"),
-            height_mm=entry.number("height_mm"),
-            turn_deg=entry.number("turn_deg", 0.0),
-            mirrored=entry.flag("mirrored", False),
-            font=entry.text("font", scene.Writing.font),
-        )
-        entry.done()
-        lines.append(line)
-    return tuple(lines)
-
-
-def _exterior(table: Table) -> tuple[float, float, float, float, float, float]:
-    x, y, z = table.triple("position")
-    omega, phi, kappa = (math.radians(angle) for angle in table.triple("angles_deg"))
-    return (x, y, z, omega, phi, kappa)
-
-
-def _read_given(table: Table) -> Given:
-    given = Given(
-        principal_distance_mm=table.number("principal_distance_error_mm", 0.0, least=0.0),
-        principal_point_mm=table.number("principal_point_error_mm", 0.0, least=0.0),
-        fiducial_mm=table.number("fiducial_error_mm", 0.0, least=0.0),
-        point=table.number_or_pair("point_sigma", (0.0, 0.0)),
-        planimetry=table.text("control", "full", ("full", "heights")) == "full",
-        fixed_points=table.texts("fixed_points") if "fixed_points" in table else (),
-        position=table.number("position_error", 0.01, least=0.0),
-        angle_deg=table.number("angle_error_deg", 1.0, least=0.0),
-    )
-    if min(given.point) < 0.0:
-        raise table.error("point_sigma", "is a standard deviation and cannot be negative.")
-    table.done()
-    return given

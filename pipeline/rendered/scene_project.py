@@ -4,11 +4,11 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from pydantic import Field
 
 from adjust.functional_model.lens import Prior
 from measure.marks import shapes
@@ -19,6 +19,8 @@ from pipeline.files.project_tables import UNITS_MM
 from pipeline.rendered.design_table import DesignSettings
 from pipeline.text.atomic import write_atomically
 from pipeline.text.csv_table import csv_line
+from pipeline.text.table_models import NotNegative, NumberOrPair, WrongKey, table_model
+from pipeline.types import Array
 from synthetic_images.film import frame_geometry
 from synthetic_images.scene import (
     BoardField,
@@ -32,34 +34,41 @@ from synthetic_images.scene import (
 )
 from synthetic_images.targets import Target, field_targets
 
-Array = NDArray[np.float64]
-
 TAKING_CAMERA = "taking-camera.yaml"
 NEGATIVE: Mapping[shapes.Polarity, shapes.Polarity] = {"light": "dark", "dark": "light", "auto": "auto"}
 
 
-@dataclass(frozen=True)
+@table_model
 class Given:
-    """Standard deviations of the errors of the given values.
+    """The table [given] of a scene: standard deviations of the errors of the given values.
 
     Attributes
     ----------
     principal_distance_mm, principal_point_mm, fiducial_mm : of the given camera.
     point : of the given coordinates X, Y and Z, object units.
-    planimetry : whether X and Y are control; else they are approximations, except those of fixed_points, which are
-        exact.
+    control : heights: X and Y are approximations, except those of fixed_points, which are exact.
     position : of the given exterior orientations, as a fraction of the distance to the field.
     angle_deg : of the given exterior orientations, degrees.
     """
 
-    principal_distance_mm: float
-    principal_point_mm: float
-    fiducial_mm: float
-    point: tuple[float, float]
-    planimetry: bool
-    fixed_points: tuple[str, ...]
-    position: float
-    angle_deg: float
+    principal_distance_mm: Annotated[NotNegative, Field(alias="principal_distance_error_mm")] = 0.0
+    principal_point_mm: Annotated[NotNegative, Field(alias="principal_point_error_mm")] = 0.0
+    fiducial_mm: Annotated[NotNegative, Field(alias="fiducial_error_mm")] = 0.0
+    point: Annotated[NumberOrPair, Field(alias="point_sigma")] = (0.0, 0.0)
+    control: Literal["full", "heights"] = "full"
+    fixed_points: tuple[str, ...] = ()
+    position: Annotated[NotNegative, Field(alias="position_error")] = 0.01
+    angle_deg: Annotated[NotNegative, Field(alias="angle_error_deg")] = 1.0
+
+    def __post_init__(self) -> None:
+        """Raises WrongKey for a negative standard deviation."""
+        if min(self.point) < 0.0:
+            raise WrongKey("point_sigma", "is a standard deviation and cannot be negative.")
+
+    @property
+    def planimetry(self) -> bool:
+        """Whether X and Y are control."""
+        return self.control == "full"
 
 
 @dataclass(frozen=True)

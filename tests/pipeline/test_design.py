@@ -78,7 +78,7 @@ def small(folder: Path, *changes: tuple[str, str]) -> Path:
 def vary_juhl(quantity: str, values: tuple[float, ...], layouts: int) -> Swept:
     scene = Variations.read(JUHL)
     scene.values["design"]["layouts"] = layouts
-    return sweep(scene, 1, Sweep(quantity, values))
+    return sweep(scene, 1, Sweep(quantity=quantity, values=values))
 
 
 @pytest.fixture(scope="module")
@@ -245,20 +245,22 @@ def test_the_network_is_what_the_frames_show(tmp_path: Path) -> None:
     ],
 )
 def test_any_quantity_of_the_scene_can_be_varied(tmp_path: Path, quantity: str, value: float, found: object) -> None:
-    varied = Variations.read(small(tmp_path)).varied(1, Sweep(quantity, (value, 99)), value)
+    varied = Variations.read(small(tmp_path)).varied(1, Sweep(quantity=quantity, values=(value, 99)), value)
     assert callable(found)
     assert found(varied.setup()) == pytest.approx(value)
 
 
 def test_as_many_points_stand_over_the_same_area(tmp_path: Path) -> None:
     scene = Variations.read(small(tmp_path))
-    xyz = np.array([point.xyz for point in scene.varied(1, Sweep("field.points", (100, 1)), 100).setup().points])
+    xyz = np.array(
+        [point.xyz for point in scene.varied(1, Sweep(quantity="field.points", values=(100, 1)), 100).setup().points]
+    )
     assert np.ptp(xyz[:, :2], axis=0) == pytest.approx([4.0 * 9 / 10] * 2)
 
 
 def test_a_camera_in_a_file_of_its_own_can_be_varied() -> None:
     scene = Variations.read(SCENES / "aerial_five.toml")
-    varied = scene.varied(1, Sweep("camera.principal_distance_mm", (210.0, 300.0)), 210.0)
+    varied = scene.varied(1, Sweep(quantity="camera.principal_distance_mm", values=(210.0, 300.0)), 210.0)
     assert varied.setup().lens.principal_distance_mm == 210.0
     assert len(varied.setup().camera.fiducials) == 8
 
@@ -278,7 +280,7 @@ def test_a_camera_in_a_file_of_its_own_can_be_varied() -> None:
 def test_a_wrong_quantity_is_reported_with_what_is_near(tmp_path: Path, quantity: str, words: str) -> None:
     scene = Variations.read(small(tmp_path))
     with pytest.raises(InputError) as caught:
-        sweep(scene, 1, Sweep(quantity, (1.5, 2.5)))
+        sweep(scene, 1, Sweep(quantity=quantity, values=(1.5, 2.5)))
     assert f"[design.sweep[1]] {quantity} = 1.5" in str(caught.value)
     assert words in str(caught.value)
 
