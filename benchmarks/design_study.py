@@ -299,8 +299,10 @@ def juhl(folder: Path) -> str:
     """Juhl's table, figures and fourth photograph."""
     scene = Variations.read(JUHL)
     scene.values["design"]["layouts"] = LAYOUTS
-    points = sweep(scene, 1, Sweep("field.points", (75, 100, 125, 150, 175, 200)))
-    heights = sweep(scene, 2, Sweep("design.sigma_height", (0.001, 0.01, 0.02, 0.04, 0.075, 0.11, 0.15, 0.225, 0.3)))
+    points = sweep(scene, 1, Sweep(quantity="field.points", values=(75, 100, 125, 150, 175, 200)))
+    heights = sweep(
+        scene, 2, Sweep(quantity="design.sigma_height", values=(0.001, 0.01, 0.02, 0.04, 0.075, 0.11, 0.15, 0.225, 0.3))
+    )
     standard = next(step for step in points.steps if step.value == 150)
     fourth = Variations(scene.path, scene.values | {"image": [*scene.values["image"], _fourth(scene)]})
     after = over_layouts(fourth, expect(fourth.setup()))
