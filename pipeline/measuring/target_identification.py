@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from math import comb
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
@@ -25,8 +26,12 @@ from pipeline.results.comparator_file import comparator_from_pixel, pixel_from_c
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.types import Array, Indices, Mask
 
+ComplexArray = NDArray[np.complex128]  # places in the plane: x + iy
+
+_SCALE, _TURN_RAD = 0.15, 0.15  # tolerances of a predicted pattern: relative change of scale, rotation
+_DISTORTION = 0.03  # residuals after these, due to tilt and relief, as a fraction of the pattern's size
 _PAIRS = 60  # distant pairs of targets that generate hypotheses on the placement
-_TESTED = 400  # hypotheses that are tested on all targets
+_TESTED, _REFINED = 400, 8  # hypotheses that are tested on all targets, and that are refined
 _OF_POSE = 3  # targets that always fit three marks, in P3P,
 _POSES = 4  # by up to four exterior orientations
 _SIGMA_PX = 0.5  # px, of a candidate, including locally varying effects of eccentricity and lens
@@ -39,60 +44,98 @@ _SIZES = 4.0  # largest ratio of a target's size to that in an image filled by t
 _IN_THE_PICTURE = 0.4  # of the scan's size: largest offset of the principal point from its centre, if not cropped
 
 
-@dataclass(frozen=True)
-class PatternOptions:
-    """Tolerances of a predicted pattern.
+def recognise(predicted_px: Array, found_px: Array, shift_px: float) -> tuple[Array, int] | None:
+    """Lay a predicted pattern (n, 2) on candidates (m, 2), most places on candidates, false alarm or not.
 
-    Attributes
-    ----------
-    shift_px : shift.
-    scale : relative change of scale.
-    turn_rad : rotation.
-    distortion : residuals after these are removed, due to tilt and relief, as a fraction of the pattern's size.
-    """
-
-    shift_px: float = 1500.0
-    scale: float = 0.15
-    turn_rad: float = 0.15
-    distortion: float = 0.03
-
-    def __post_init__(self) -> None:
-        for name in ("shift_px", "scale", "turn_rad", "distortion"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"{name} is {getattr(self, name)}; a positive number is right")
-
-
-@dataclass(frozen=True, eq=False)
-class Placement:
-    """Best placement of a pattern. matrix (2, 3): affine transformation from predicted places to candidates, px; tried:
-    number of placements it was chosen from."""
-
-    matrix: Array
-    tried: int
-
-    def places(self, predicted_px: Array) -> Array:
-        """(n, 2) places of the targets in px."""
-        return _mapped(self.matrix, predicted_px)
-
-
-def recognise(predicted_px: Array, found_px: Array, options: PatternOptions | None = None) -> Placement | None:
-    """Find the placement with the most predicted places (n, 2) on candidates (m, 2), false alarm or not.
+    Similarities that map distant pairs of targets onto pairs of candidates are refined to affine transformations.
+    shift_px: largest shift of the pattern.
 
     Returns
     -------
-    None where there are fewer than three of either, or no placement is within the tolerances.
+    Places (n, 2) of the targets, and the number of placements that they were chosen from; None where there are fewer
+    than three of either, or no placement is within the tolerances.
     """
-    options = options or PatternOptions()
-    if len(predicted_px) < 3 or len(found_px) < 3:
+    if min(len(predicted_px), len(found_px)) < 3:
         return None
-    size = float(np.linalg.norm(np.ptp(predicted_px, axis=0)))
-    tree = cKDTree(found_px)
-    suggestions = _suggestions(predicted_px, found_px, options)
-    if not len(suggestions):
+    scales, shifts = _similarities(_complex(predicted_px), _complex(found_px), shift_px)
+    if not len(scales):
         return None
-    counts = np.array([_support(s, predicted_px, tree, options.distortion * size).sum() for s in suggestions])
-    best = suggestions[np.argsort(-counts, kind="stable")[:8]]
-    return Placement(_tightened(best, predicted_px, found_px, tree, size, options), len(suggestions))
+    tree, gate_px = cKDTree(found_px), _DISTORTION * float(np.linalg.norm(np.ptp(predicted_px, axis=0)))
+    placements = _plane(scales[:, None] * _complex(predicted_px) + shifts[:, None])
+    counts = np.array([_hits(places, tree, gate_px)[0].sum() for places in placements])
+    best = placements[np.argsort(-counts, kind="stable")[:_REFINED]]
+    refined = [_tightened(places, predicted_px, found_px, tree, gate_px) for places in best]
+    return max(refined, key=lambda places: _score(places, tree, gate_px)), len(scales)
+
+
+def _similarities(predicted: ComplexArray, found: ComplexArray, shift_px: float) -> tuple[ComplexArray, ComplexArray]:
+    """Scales (with rotation) and shifts that map a distant pair of targets onto a pair of candidates, within the
+    tolerances; of many the ones with the most similar ones, in terms of the places of the pattern's corners."""
+    first, second = _long_pairs(predicted)
+    start, end = np.nonzero(~np.eye(len(found), dtype=bool))
+    across, between = predicted[second] - predicted[first], found[end] - found[start]
+    pairs = cKDTree(_plane(between))
+    near = pairs.query_ball_point(_plane(across), np.abs(across) * np.hypot(_SCALE, _TURN_RAD))
+    row, pair = np.repeat(np.arange(len(near)), list(map(len, near))), np.concatenate(near).astype(np.intp)
+    scales = between[pair] / across[row]
+    shifts = found[start[pair]] - scales * predicted[first[row]]
+    allowed = np.abs(scales * predicted.mean() + shifts - predicted.mean()) <= shift_px
+    scales, shifts = scales[allowed], shifts[allowed]
+    if len(scales) > _TESTED:
+        x, y = predicted.real, predicted.imag
+        corners = np.array([x.min() + 1j * y.min(), x.max() + 1j * y.max()])
+        places = _plane(scales[:, None] * corners + shifts[:, None]).reshape(-1, 4)
+        tolerance = 0.02 * float(np.linalg.norm(np.ptp(_plane(found), axis=0)))
+        votes = cKDTree(places).query_ball_point(places, tolerance, return_length=True)
+        chosen = np.argsort(-votes, kind="stable")[:_TESTED]
+        scales, shifts = scales[chosen], shifts[chosen]
+    return scales, shifts
+
+
+def _complex(places: Array) -> ComplexArray:
+    return np.asarray(places[:, 0] + 1j * places[:, 1], dtype=np.complex128)
+
+
+def _plane(points: ComplexArray) -> Array:
+    """(..., 2) real and imaginary parts."""
+    return np.stack([points.real, points.imag], axis=-1)
+
+
+def _long_pairs(points: ComplexArray) -> tuple[Indices, Indices]:
+    """The longest pairs, with a limited number per point."""
+    first, second = np.triu_indices(len(points), 1)
+    uses, chosen = np.zeros(len(points), dtype=int), list[int]()
+    for k in np.argsort(-np.abs(points[second] - points[first]), kind="stable"):
+        if uses[first[k]] < 6 and uses[second[k]] < 6 and len(chosen) < _PAIRS:
+            uses[[first[k], second[k]]] += 1
+            chosen.append(k)
+    return first[chosen], second[chosen]
+
+
+def _hits(places: Array, tree: cKDTree, gate_px: float) -> tuple[Mask, Array, Indices]:
+    """Mask of the targets with a candidate within the gate, each candidate once; distance and index of the nearest."""
+    distances, nearest = (np.ravel(each) for each in tree.query(places))
+    order = np.argsort(distances, kind="stable")
+    once = np.zeros(len(places), dtype=bool)
+    once[order[np.unique(nearest[order], return_index=True)[1]]] = True
+    return once & (distances <= gate_px), distances, nearest
+
+
+def _tightened(places: Array, predicted: Array, found: Array, tree: cKDTree, gate_px: float) -> Array:
+    """Places after affine fits with a decreasing gate."""
+    design = np.column_stack([predicted, np.ones(len(predicted))])
+    for share in (1.0, 0.7, 0.5, 0.35, 0.35):
+        hit, _, nearest = _hits(places, tree, share * gate_px)
+        if hit.sum() < 4:
+            break
+        places = design @ np.linalg.lstsq(design[hit], found[nearest[hit]], rcond=None)[0]
+    return places
+
+
+def _score(places: Array, tree: cKDTree, gate_px: float) -> float:
+    """Number of targets explained, with weights that decrease with distance."""
+    hit, distances, _ = _hits(places, tree, gate_px)
+    return float(np.sum(1.0 - (distances[hit] / gate_px) ** 2))
 
 
 def log10_of_chance(places_px: Array, found_px: Array, gate_px: float, tried: int) -> float:
@@ -122,123 +165,6 @@ def assign(predicted_px: Array, found_px: Array, gate_px: float) -> list[tuple[i
     capped = np.minimum(distances, 2.0 * gate_px)
     rows, columns = linear_sum_assignment(capped)
     return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if distances[i, j] <= gate_px]
-
-
-def _suggestions(predicted: Array, found: Array, options: PatternOptions) -> Array:
-    """Similarities (k, 2, 3) that map a distant pair of targets onto a pair of candidates, within the tolerances."""
-    first, second = _long_pairs(predicted)
-    across = predicted[second] - predicted[first]
-    a, b = (grid.ravel() for grid in np.meshgrid(np.arange(len(found)), np.arange(len(found)), indexing="ij"))
-    a, b = a[a != b], b[a != b]
-    pairs = cKDTree(found[b] - found[a])
-    lengths = np.linalg.norm(across, axis=1)
-    near = pairs.query_ball_point(across, lengths * np.hypot(options.scale, options.turn_rad))
-    matrices = [
-        _similarities(predicted[first[k]], across[k], found[a[at]], found[b[at]] - found[a[at]])
-        for k, at in enumerate(near)
-        if len(at)
-    ]
-    if not matrices:
-        return np.zeros((0, 2, 3))
-    similarities = np.concatenate(matrices)
-    middle = predicted.mean(axis=0)
-    shift = np.linalg.norm(similarities[:, :, :2] @ middle + similarities[:, :, 2] - middle, axis=1)
-    allowed = similarities[shift <= options.shift_px]
-    return _most_agreed(allowed, predicted, found)
-
-
-def _long_pairs(points: Array) -> tuple[Indices, Indices]:
-    """The longest pairs, with a limited number per point."""
-    first, second = np.triu_indices(len(points), 1)
-    order = np.argsort(-np.linalg.norm(points[second] - points[first], axis=1), kind="stable")
-    uses = np.zeros(len(points), dtype=int)
-    chosen = []
-    for k in order:
-        if uses[first[k]] < 6 and uses[second[k]] < 6:
-            uses[[first[k], second[k]]] += 1
-            chosen.append(k)
-        if len(chosen) == _PAIRS:
-            break
-    return first[chosen], second[chosen]
-
-
-def _similarities(start: Array, across: Array, found_start: Array, found_across: Array) -> Array:
-    ratio = (found_across[:, 0] + 1j * found_across[:, 1]) / (across[0] + 1j * across[1])
-    linear = np.stack([np.stack([ratio.real, -ratio.imag], -1), np.stack([ratio.imag, ratio.real], -1)], axis=1)
-    return np.concatenate([linear, (found_start - linear @ start)[:, :, None]], axis=2)
-
-
-def _most_agreed(similarities: Array, predicted: Array, found: Array) -> Array:
-    """The hypotheses with the most similar ones, in terms of the places of the pattern's corners."""
-    if len(similarities) <= _TESTED:
-        return similarities
-    corners = np.array([predicted.min(axis=0), predicted.max(axis=0)])
-    places = np.einsum("kij,cj->kci", similarities[:, :, :2], corners) + similarities[:, None, :, 2]
-    tolerance = 0.02 * float(np.linalg.norm(np.ptp(found, axis=0)))
-    votes = cKDTree(places.reshape(-1, 4)).query_ball_point(places.reshape(-1, 4), tolerance, return_length=True)
-    chosen: Array = similarities[np.argsort(-votes, kind="stable")[:_TESTED]]
-    return chosen
-
-
-def _support(matrix: Array, predicted: Array, tree: cKDTree, tolerance_px: float) -> Mask:
-    """Mask of the targets with a candidate within the tolerance; each candidate counts once."""
-    distances, nearest = _nearest(tree, _mapped(matrix, predicted))
-    supported: Mask = distances <= tolerance_px
-    order = np.argsort(distances, kind="stable")
-    _, firsts = np.unique(nearest[order], return_index=True)
-    once = np.zeros(len(predicted), dtype=bool)
-    once[order[firsts]] = True
-    return supported & once
-
-
-def _tightened(
-    candidates: Array, predicted: Array, found: Array, tree: cKDTree, size: float, options: PatternOptions
-) -> Array:
-    """The best candidate matrix after affine fits with a decreasing tolerance."""
-    refined: list[Array] = []
-    for matrix in candidates:
-        for share in (1.0, 0.7, 0.5, 0.35, 0.35):
-            pairs = _support(matrix, predicted, tree, share * options.distortion * size)
-            if pairs.sum() < 3:
-                break
-            _, nearest = _nearest(tree, _mapped(matrix, predicted[pairs]))
-            matrix = _affine(predicted[pairs], found[nearest])
-        refined.append(matrix)
-    scores = [_score(matrix, predicted, tree, options.distortion * size) for matrix in refined]
-    return refined[int(np.argmax(scores))]
-
-
-def _score(matrix: Array, predicted: Array, tree: cKDTree, tolerance_px: float) -> float:
-    """Number of targets explained, with weights that decrease with distance."""
-    supported = _support(matrix, predicted, tree, tolerance_px)
-    distances, _ = _nearest(tree, _mapped(matrix, predicted[supported]))
-    return float(np.sum(1.0 - (distances / tolerance_px) ** 2))
-
-
-def _nearest(tree: cKDTree, points: Array) -> tuple[Array, Indices]:
-    """Distance and index of the candidate nearest to each place."""
-    distances, nearest = tree.query(points)
-    return np.asarray(distances, dtype=np.float64), np.asarray(nearest, dtype=np.intp)
-
-
-def _affine(source: Array, target: Array) -> Array:
-    """Least-squares affine transformation; a similarity if three points would leave no redundancy."""
-    if len(source) < 4:
-        return _similarity(source, target)
-    design = np.column_stack([source, np.ones(len(source))])
-    return np.asarray(np.linalg.lstsq(design, target, rcond=None)[0].T, dtype=np.float64)
-
-
-def _similarity(source: Array, target: Array) -> Array:
-    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
-    ratio = np.vdot(a[:, 0] + 1j * a[:, 1], b[:, 0] + 1j * b[:, 1]) / np.vdot(a, a)
-    linear = np.array([[ratio.real, -ratio.imag], [ratio.imag, ratio.real]])
-    return np.column_stack([linear, target.mean(axis=0) - linear @ source.mean(axis=0)])
-
-
-def _mapped(matrix: Array, points: Array) -> Array:
-    mapped: Array = points @ matrix[:, :2].T + matrix[:, 2]
-    return mapped
 
 
 def likely_diameters_px(field: Field, measured: MeasuredScan) -> tuple[float, float]:

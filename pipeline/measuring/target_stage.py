@@ -29,7 +29,6 @@ from pipeline.measuring.target_field import (
 )
 from pipeline.measuring.target_identification import (
     NamedField,
-    PatternOptions,
     assign,
     camera_model,
     likely_diameters_px,
@@ -233,12 +232,11 @@ def _oriented(
         return f"the approximate orientation puts no target of {LEAST_DIAMETER_PX} px or more into the scan"
     strongest = target_candidates(scan, settings, diameters)[: _STRONGEST * len(predicted)]
     found = np.array([patch.center_px for patch in strongest]).reshape(-1, 2)
-    placement = recognise(predicted, found, PatternOptions(shift_px=size / 2.0))
+    placement = recognise(predicted, found, size / 2.0)
     unlike = f"the {len(found)} marks found do not make the pattern of the {len(predicted)} targets predicted"
     if placement is None:
         return unlike
-    gate_px = _GATE_SHARE * size
-    places = placement.places(predicted)
+    (places, tried), gate_px = placement, _GATE_SHARE * size
     for _ in range(2):
         pairs = assign(places, found, gate_px)
         resection = _resected(model, field, [(predictions[i].point, found[j]) for i, j in pairs], measured)
@@ -248,7 +246,7 @@ def _oriented(
         predictions = field.predictions(model, measured, gate_px)
         places = np.array([p.center_px for p in predictions])
     shown = ((places >= 0.0) & (places <= (measured.width_px - 1, measured.height_px - 1))).all(axis=1)
-    if log10_of_chance(places[shown], found, gate_px, placement.tried) > _MOST_LOG10_CHANCE:
+    if log10_of_chance(places[shown], found, gate_px, tried) > _MOST_LOG10_CHANCE:
         return f"{unlike}, except for possible false alarms"
     named = {
         predictions[i].point: replace(strongest[j], pixel_from_disk=predictions[i].pixel_from_disk)
