@@ -16,7 +16,7 @@ from measure.flags import Status
 from measure.marks.shapes import Bar, FiducialLayout, LayoutMark, MarkShape, Ring
 from measure.scans.opening import open_scan
 from measure.tone.curve import LINEAR
-from pipeline.files.taking_lens import read_lens
+from pipeline.files.opencv_file import read_lens
 from pipeline.rendered.scene_project import taking_camera_yaml
 from synthetic_images.render import render_scene
 from synthetic_images.scene import (

@@ -18,13 +18,12 @@ from measure.results import Pose
 from pipeline.archive.status import NAMED, ArchiveStatus, archive_status, worst_named
 from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_counts
 from pipeline.files.project_file import Project
-from pipeline.report.camera_values import CameraValue, camera_values
-from pipeline.report.data import Problem, ReportData
+from pipeline.report.data import Problem, ReportData, current_scans
+from pipeline.report.data import frames as report_frames
 from pipeline.report.fiducials import Distance, correction_sentence, figure
 from pipeline.report.many_frames import frame_counts
-from pipeline.report.marks import current_scans
-from pipeline.report.marks import frames as report_frames
 from pipeline.report.numbers import value_and_sigma
+from pipeline.report.parameters import CameraValue, camera_values
 from pipeline.report.verdict import Level, ReportVerdict, judge
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.check_file import Check

@@ -20,12 +20,11 @@ from adjust.solution.result import Adjustment
 from adjust.solution.unmodelled_error import adjust_unmodelled
 from pipeline.adjusting.adjust_stage import adjust_marks, adjustment_options
 from pipeline.adjusting.network import build_network
-from pipeline.calibration.camera_yaml import camera_files
 from pipeline.calibration.intrinsics import CameraIntrinsics, camera_intrinsics
 from pipeline.calibration.lens_choice import LensChoice, LensModel, choose_lens
 from pipeline.calibration.picture_turns import find_turns
 from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures, find_pictures
-from pipeline.calibration.project_files import CalibrationOptions, write_project
+from pipeline.calibration.project_files import CalibrationOptions, camera_files, write_project
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter

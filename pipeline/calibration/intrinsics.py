@@ -14,7 +14,7 @@ from adjust.solution.result import Adjustment
 from pipeline.calibration.lens_choice import LensChoice
 from pipeline.calibration.pictures import CameraPictures
 from pipeline.results.check_file import CameraCheck, PixelCalibration
-from pipeline.results.pixel_intrinsics import CENTRE, pixel_intrinsics
+from pipeline.results.image_unit import CENTRE, pixel_intrinsics
 from pipeline.text.wording import counted, listed
 from pipeline.types import Array
 

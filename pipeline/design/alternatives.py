@@ -6,15 +6,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles
 from pipeline.adjusting.network import FEWEST_TARGETS
 from pipeline.design.expected import Expected, expect
 from pipeline.design.setup import PlannedPoint, Setup
+from pipeline.types import Array
 from synthetic_images.scene import SceneImage
-
-Array = NDArray[np.float64]
 
 QUARTER = math.pi / 2
 FOUND = 100.0  # percent: gain where only the changed plan determines a quantity

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Lens, Prior
@@ -17,10 +16,10 @@ from adjust.quality.reliability import OuterEffect
 from adjust.solution.adjustment import Options
 from adjust.solution.planning import Plan, plan
 from pipeline.design.setup import Setup, planned_network
+from pipeline.types import Array
 
 UM_PER_MM = 1000.0
 IN_MM = ("target", "tie", "fiducial", "datum", "scanner", "fiducial distance")
-Array = NDArray[np.float64]
 
 DIRECTIONS = 36
 QUARTERS = 4

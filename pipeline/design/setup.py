@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.scanner import smooth_terms
@@ -22,12 +21,11 @@ from pipeline.files.project_file import DEFAULT_SCANNER
 from pipeline.rendered.design_table import DesignSettings
 from pipeline.rendered.scene_project import SceneFile, film_transformation
 from pipeline.text.wording import did_you_mean
+from pipeline.types import Array
 from synthetic_images.film import turn
 from synthetic_images.projection import camera_from_object
 from synthetic_images.scene import SceneCamera, SceneImage
 from synthetic_images.targets import field_targets
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

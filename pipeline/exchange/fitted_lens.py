@@ -11,7 +11,7 @@ from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.lens_conversion import convert_lens, frame_grid_mm
 from pipeline.exchange.block import Block, Frame
 from pipeline.exchange.formats import ExportOptions
-from pipeline.opencv_check.opencv_model import FISHEYE, NAMES, fixed, opencv_values
+from pipeline.opencv_check.opencv_calibration import FISHEYE, NAMES, fixed, opencv_values
 from pipeline.types import Array
 
 BROWN = ("k1", "k2", "p1", "p2", "k3")

@@ -13,7 +13,7 @@ from pipeline.exchange.incoming import ForeignPose, ImportOptions, Incoming, for
 from pipeline.exchange.pinhole import PinholeFrame, pinhole_frames, pinholes_written
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.opencv_file import FISHEYE, read_pixel_camera
-from pipeline.opencv_check.opencv_model import NAMES
+from pipeline.opencv_check.opencv_calibration import NAMES
 from pipeline.text.names import image_name
 
 CONVENTION = Convention(

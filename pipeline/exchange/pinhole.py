@@ -12,7 +12,7 @@ from pipeline.errors import InputError
 from pipeline.exchange.block import Block, Frame, WholeFrame
 from pipeline.exchange.fitted_lens import FittedLens, fisheye_lens, nearest_lens
 from pipeline.exchange.formats import Convention, ExportOptions, Written
-from pipeline.opencv_check.opencv_model import INTERIOR
+from pipeline.opencv_check.opencv_calibration import INTERIOR
 from pipeline.resampling.canvas import Canvas, outline_canvas
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.types import Array

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Prior
@@ -20,8 +19,7 @@ from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, D
 from pipeline.results.covariance_file import Covariance, covariance_path, read_covariance
 from pipeline.results.record_json import plain_json
 from pipeline.text.tables import Table
-
-Array = NDArray[np.float64]
+from pipeline.types import Array
 
 INTERIOR = ("c", "x0", "y0")
 

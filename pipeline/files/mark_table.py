@@ -30,8 +30,8 @@ from pipeline.text.table_models import (
 )
 from pipeline.text.tables import Table
 from pipeline.text.wording import numbers, quoted
+from pipeline.types import Array
 
-Array = NDArray[np.float64]
 Picture = NDArray[np.uint16]
 SavePicture = Callable[[str, Picture], str]
 

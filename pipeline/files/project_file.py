@@ -34,7 +34,7 @@ from pipeline.text.wording import nearest
 
 if TYPE_CHECKING:
     from measure.scans.scan import Scan
-    from pipeline.files.taking_lens import CalibratedLens
+    from pipeline.files.opencv_file import CalibratedLens
 
 ASSUMED_PITCH_UM = 5.0  # for digital cameras of unknown pitch: results are in pixels, so it cancels
 _UNDRAWN = "camera.toml"  # name of a camera file that has yet to be drawn
@@ -330,7 +330,7 @@ def _taking_lens(table: Table, given: ProjectTable) -> "CalibratedLens | None":
         raise scanner.error(
             "lens", "goes with pitch_um, one number: how many µm of film a pixel shows. A photograph does not say it."
         )
-    from pipeline.files.taking_lens import read_lens  # imports OpenCV, which few projects need here
+    from pipeline.files.opencv_file import read_lens  # imports OpenCV, which few projects need here
 
     return read_lens(table.file.parent / name, given.pitch_um[0])
 

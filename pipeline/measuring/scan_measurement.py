@@ -22,7 +22,7 @@ from measure.scans.opening import crop_scan
 from measure.scans.remote import TRAFFIC, ScanPart, Window, public_text, scan_path
 from measure.scans.scan import Scan
 from pipeline.errors import InputError, what_to_do
-from pipeline.files.taking_lens import CalibratedLens
+from pipeline.files.opencv_file import CalibratedLens
 from pipeline.measuring.learn_stage import tone_before
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
 from pipeline.measuring.target_identification import misplaced_principal_point

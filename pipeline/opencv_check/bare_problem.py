@@ -15,8 +15,16 @@ from adjust.problem.network import EXTERIOR_NAMES, Approximations, Image, Networ
 from adjust.problem.observations import ObservationKind, Observations
 from adjust.problem.parameter import Parameter
 from adjust.solution.result import Adjustment
-from pipeline.opencv_check.opencv_calibration import ImagePoints, can_begin
-from pipeline.opencv_check.opencv_model import FISHEYE, NAMES, Freedom, fixed, opencv_values, to_opencv_model
+from pipeline.opencv_check.opencv_calibration import (
+    FISHEYE,
+    NAMES,
+    Freedom,
+    ImagePoints,
+    can_begin,
+    fixed,
+    opencv_values,
+    to_opencv_model,
+)
 from pipeline.types import Array
 
 GROSS_WEIGHT = 0.5  # observations with a lower robust weight are left out

@@ -28,9 +28,18 @@ from pipeline.opencv_check.bare_problem import (
     free_parameters,
     opencv_problem,
 )
-from pipeline.opencv_check.opencv_calibration import OpenCvCalibration, calibrate, calibrate_fisheye
+from pipeline.opencv_check.opencv_calibration import (
+    FISHEYE,
+    INTERIOR,
+    NAMES,
+    OPENCV_RADIAL,
+    Freedom,
+    OpenCvCalibration,
+    calibrate,
+    calibrate_fisheye,
+    model_names,
+)
 from pipeline.opencv_check.opencv_corners import BoardPictures, compare_corners
-from pipeline.opencv_check.opencv_model import FISHEYE, INTERIOR, NAMES, OPENCV_RADIAL, Freedom, model_names
 from pipeline.results.check_file import CameraCheck, Check, Estimate, Row, Verdict
 
 LARGEST_DIFFERENCE = 1.0  # sigmas; about 0.1 is usual, since the two models differ slightly

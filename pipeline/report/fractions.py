@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import bdtrik, chdtrc
 
 from pipeline.drawing import svg
-from pipeline.report.marks import Frame
+from pipeline.report.data import Frame
 from pipeline.types import Array
 
 BINS = 10

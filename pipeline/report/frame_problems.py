@@ -4,9 +4,8 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 
-from pipeline.report.data import Problem
+from pipeline.report.data import Frame, Mark, Problem
 from pipeline.report.fractions import fraction_test
-from pipeline.report.marks import Frame, Mark
 from pipeline.report.numbers import fixed
 from pipeline.text.wording import LISTED, capitalised, counted, drop_file_name, listed
 from pipeline.types import Array

@@ -1,26 +1,36 @@
-"""Frames in the report: a line of the summary, marks, residuals, orientation and writing."""
+"""Frames in the report: a line of the summary, marks with their pictures, residuals, orientation and writing."""
 
+import base64
 from collections import defaultdict
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from markupsafe import Markup
+from numpy.typing import NDArray
 
 from measure.annotations.fields import Line
 from measure.flags import CAUSE_MEANING, Status
 from measure.geometry import up_from_camera
 from measure.results import Covariance
 from pipeline.drawing import svg
-from pipeline.report import mark_pictures, vectors
-from pipeline.report.data import ReportData
-from pipeline.report.marks import Frame, Mark
+from pipeline.report import vectors
+from pipeline.report.data import Frame, Mark, ReportData
 from pipeline.report.numbers import fixed
+from pipeline.report.vectors import LEAST_UM
 from pipeline.report.verdict import suspect_rows
 from pipeline.results.adjustment_record import ImageRecord
 from pipeline.results.assessment_record import ResidualRecord
 from pipeline.results.image_unit import ImageUnit
 from pipeline.results.measured_record import MeasuredScan
+from pipeline.results.thumbnail import Thumbnail
+
+SIZE_PX = 92.0  # a picture's width and height on the page
+TARGETS = 600  # largest number of target pictures; beyond it only the worst of each frame are shown
+LEAST_TARGETS = 4
+PICTURES = 1200  # largest number of pictures at full resolution; beyond it they are halved, to limit the file size
+ARROW_PX = 34.0  # px, longest arrow
 
 _WIDTH_PX = 1000.0  # px; data plates 20 mm wide on film of 230 mm remain legible
 _LEAST_PX = 7.0  # px, smallest letters
@@ -29,6 +39,93 @@ MOST_CARDS = 60  # largest number of marks that need a look
 PLOT_PX = 330.0
 LONGEST_VECTOR_PX = 42.0
 _LEAST_PART_PX = 0.0005  # px, half of the last digit printed
+
+
+def shown_marks(shots: list[Frame]) -> dict[str, list[Mark]]:
+    """Select the marks of each frame that get a picture: all fiducials, and all targets or the worst of them."""
+    targets = sum(not mark.is_fiducial for frame in shots for mark in frame.marks)
+    most = targets if targets <= TARGETS else max(LEAST_TARGETS, TARGETS // len(shots))
+    return {frame.image: _worst(frame, most) for frame in shots}
+
+
+def stored_px(shown: dict[str, list[Mark]]) -> float:
+    """Largest stored width of a picture."""
+    return SIZE_PX if sum(len(marks) for marks in shown.values()) <= PICTURES else 0.5 * SIZE_PX
+
+
+def _worst(frame: Frame, most: int) -> list[Mark]:
+    targets = sorted((mark for mark in frame.marks if not mark.is_fiducial), key=_badness, reverse=True)[:most]
+    chosen = {mark.point for mark in targets}
+    return [mark for mark in frame.marks if mark.is_fiducial or mark.point in chosen]
+
+
+def _badness(mark: Mark) -> tuple[bool, bool, float]:
+    """Sort key, larger is worse: rejected, then weak or predicted, then the standardised residual."""
+    return (
+        mark.status == "rejected",
+        mark.status in ("weak", "predicted"),
+        abs(mark.w) if mark.w is not None else 0.0,
+    )
+
+
+def arrow_scale(marks: list[Mark]) -> float:
+    """Scale of residual arrows, page pixels per µm: a round number at which the longest arrow fits."""
+    lengths = [float(np.hypot(*mark.residual.v_um)) for mark in marks if mark.residual]
+    return svg.round_step(ARROW_PX / max(*lengths, LEAST_UM)) if lengths else 1.0
+
+
+def mark_picture(mark: Mark, thumbnail: Thumbnail, px_per_um: float, most_px: float) -> Markup:
+    """Draw the picture with a crosshair at the measured centre and the residual as an arrow."""
+    rows, cols = thumbnail.pixels.shape
+    zoom = SIZE_PX / (max(rows, cols) * thumbnail.step_px)  # page pixels to a pixel of the scan
+    width, height = cols * thumbnail.step_px * zoom, rows * thumbnail.step_px * zoom
+    image = svg.tag("image", href=_png_uri(thumbnail.pixels, most_px), width=width, height=height, class_="chip")
+    overlay = Markup("")
+    if mark.center_px is not None:
+        # The centre of the top-left thumbnail pixel lies half a thumbnail pixel inside the picture's edge.
+        x, y = (mark.center_px - thumbnail.origin_px + 0.5 * thumbnail.step_px) * zoom
+        overlay = _crosshair(x, y, mark) + (_arrow(x, y, mark.residual, px_per_um) if mark.residual else Markup(""))
+    return svg.picture(SIZE_PX, SIZE_PX, _description(mark), image, overlay, class_="thumb")
+
+
+def _png_uri(pixels: NDArray[np.generic], most_px: float) -> str:
+    """Encode grey values as an 8-bit PNG data URI, stretched between the 0.1 and 99.9 percentiles."""
+    grey = pixels.astype(np.float64)
+    low, high = np.percentile(grey, [0.1, 99.9])
+    stretched = np.clip((grey - low) / max(high - low, 1e-12), 0.0, 1.0) * 255.0
+    if max(grey.shape) > most_px:
+        factor = most_px / max(grey.shape)
+        stretched = cv2.resize(stretched, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    _, data = cv2.imencode(".png", np.rint(stretched).astype(np.uint8), [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    return "data:image/png;base64," + base64.b64encode(data.tobytes()).decode("ascii")
+
+
+def _crosshair(x: float, y: float, mark: Mark) -> Markup:
+    """Draw four ticks that leave the centre visible; dashed if the mark is not an observation."""
+    ends = np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])
+    at = np.array([x, y])
+    class_ = "hair" if mark.status.is_observation else "hair guess"
+    return svg.strokes(at + 5.0 * ends, at + 17.0 * ends, "halo") + svg.strokes(
+        at + 5.0 * ends, at + 17.0 * ends, class_
+    )
+
+
+def _arrow(x: float, y: float, residual: ResidualRecord, px_per_um: float) -> Markup:
+    """Draw the residual from the measured centre; comparator y points up, rows point down."""
+    v = px_per_um * np.array([residual.vx_um, -residual.vy_um])
+    length = float(np.hypot(*v))
+    start = np.array([x, y])
+    end = start + v
+    shaft = svg.strokes(start[None], end[None], "arrow")
+    if length < 4.0:
+        return shaft
+    back, side = -v / length, np.array([v[1], -v[0]]) / length
+    x_head, y_head = np.stack([end + 6.0 * back + 3.0 * side, end, end + 6.0 * back - 3.0 * side], axis=1)
+    return svg.strokes(start[None], end[None], "halo") + shaft + svg.line(x_head, y_head, "arrow")
+
+
+def _description(mark: Mark) -> str:
+    return f"{mark.kind} {mark.point} in {mark.image}, {mark.status}: the scan about its measured centre"
 
 
 def writing_picture(scan: MeasuredScan | None) -> Markup | None:
@@ -121,15 +218,15 @@ class FrameView:
 def frame_views(data: ReportData, shots: list[Frame], every_mark: bool = False) -> list[FrameView]:
     """Views of all frames, the worst first, drawn to common scales. every_mark: show all marks, whatever their
     number."""
-    shown = {frame.image: list(frame.marks) for frame in shots} if every_mark else mark_pictures.shown_marks(shots)
-    px_per_um, most_px = thumbnail_scale(shots), mark_pictures.stored_px(shown)
+    shown = {frame.image: list(frame.marks) for frame in shots} if every_mark else shown_marks(shots)
+    px_per_um, most_px = thumbnail_scale(shots), stored_px(shown)
     by_image = residuals_by_image(data)
     suspects = suspect_rows(data.adjustment) if data.adjustment else frozenset[ResidualRecord]()
     plots = _plots(data, by_image, suspects, [frame.image for frame in shots if frame.image in by_image])
 
     def card(mark: Mark) -> Card:
         thumbnail = data.thumbnail(mark.image, mark.point, mark.kind) if data.thumbnail else None
-        picture = mark_pictures.mark_picture(mark, thumbnail, px_per_um, most_px) if thumbnail else None
+        picture = mark_picture(mark, thumbnail, px_per_um, most_px) if thumbnail else None
         return Card(mark, picture, _causes(mark.covariance), mark.residual in suspects, data.unit_of_image(mark.image))
 
     views = [
@@ -159,7 +256,7 @@ def cards_to_show(views: Iterable[FrameView]) -> tuple[list[Card], int]:
 
 def thumbnail_scale(shots: list[Frame]) -> float:
     """Scale of the residual arrows on the thumbnails, page pixels per µm."""
-    return mark_pictures.arrow_scale([mark for frame in shots for mark in frame.marks])
+    return arrow_scale([mark for frame in shots for mark in frame.marks])
 
 
 def residuals_by_image(data: ReportData) -> dict[str, list[ResidualRecord]]:

@@ -14,8 +14,8 @@ from markupsafe import Markup
 
 from measure import flags
 from pipeline.drawing import svg
-from pipeline.report.camera_views import camera_views
-from pipeline.report.data import Problem, ReportData
+from pipeline.report.camera_views import camera_views, scanner_views
+from pipeline.report.data import Frame, Problem, ReportData, frames
 from pipeline.report.fractions import (
     LEAST_MARKS,
     FractionTest,
@@ -25,10 +25,8 @@ from pipeline.report.fractions import (
 )
 from pipeline.report.frame_views import FrameView, cards_to_show, frame_views, thumbnail_scale
 from pipeline.report.many_frames import totals_view
-from pipeline.report.marks import Frame, frames
 from pipeline.report.numbers import fixed, fixed_list, significant, value_and_sigma
 from pipeline.report.parameters import axes_sentence, group_sentences, spoken_name
-from pipeline.report.scanner_views import scanner_views
 from pipeline.report.vectors import joined_view
 from pipeline.report.verdict import A_PRIORI, contradiction, critical_w, judge, lens_sentences, sigma0_bounds
 from pipeline.results.adjustment_record import AdjustmentRecord, PointRecord

@@ -10,13 +10,11 @@ from scipy.special import chdtri, ndtri
 
 from adjust.problem.parameter import description, parameter_from_text
 from measure.flags import Status
-from pipeline.report.camera_values import LARGER, camera_values, cluster_ratio
-from pipeline.report.data import MarkKey, Problem, ReportData
+from pipeline.report.data import Frame, MarkKey, Problem, ReportData, frames
 from pipeline.report.fractions import places_px
 from pipeline.report.frame_problems import frame_problems, images_by_sentence, pixel_locking
-from pipeline.report.marks import Frame, frames
 from pipeline.report.numbers import fixed, value_and_sigma
-from pipeline.report.parameters import spoken_name
+from pipeline.report.parameters import LARGER, camera_values, cluster_ratio, spoken_name
 from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord
 from pipeline.results.assessment_record import (
     ContradictionRecord,

@@ -25,9 +25,8 @@ from measure.errors import MissingError
 from measure.scans.opening import open_scan
 from measure.scans.scan import Scan
 from pipeline.cli import run
-from pipeline.opencv_check.opencv_calibration import ImagePoints, OpenCvCalibration, calibrate
+from pipeline.opencv_check.opencv_calibration import NAMES, Freedom, ImagePoints, OpenCvCalibration, calibrate
 from pipeline.opencv_check.opencv_corners import BoardPictures, compare_corners, detector_name, find_points
-from pipeline.opencv_check.opencv_model import NAMES, Freedom
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.lens_conversion import convert_lens
-from pipeline.opencv_check.opencv_model import (
+from pipeline.opencv_check.opencv_calibration import (
     FISHEYE,
     NAMES,
     Freedom,

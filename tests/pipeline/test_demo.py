@@ -11,10 +11,10 @@ from browser import browser_page, needs_browser
 from demonstration import FRAMES
 from playwright.sync_api import Browser, Page
 from single_scans import measure_scan
+from truth_comparison import compare_with_truth
 
 from pipeline.cli import DONE, run
 from pipeline.files.project_file import read_project
-from pipeline.rendered.against_truth import compare_with_truth
 from pipeline.results.comparator_file import mark_rows, write_comparator
 
 

@@ -38,7 +38,7 @@ from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
 from pipeline.exchange import asp_format, colmap_format, micmac_format, mmvii_format, opencv_format, pinhole
 from pipeline.exchange.block import read_block
 from pipeline.exchange.formats import FORMATS
-from pipeline.exchange.map_projection import lon_lat
+from pipeline.exchange.geojson_format import lon_lat
 from pipeline.files.project_file import read_project
 
 Array = NDArray[np.float64]

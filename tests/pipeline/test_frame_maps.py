@@ -5,8 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from pipeline.report.frame_maps import CELLS, contour_plot, coverage_counts, coverage_plot
-from pipeline.report.vectors import Plane
+from pipeline.report.vectors import CELLS, Plane, contour_plot, coverage_counts, coverage_plot
 
 FRAME = Plane(np.array([[-60.0, -30.0], [60.0, 30.0]]), 652.0)  # 5 px per mm
 

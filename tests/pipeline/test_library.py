@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
+from truth_comparison import compare_with_truth
 
 from measure.fiducials.camera_recognition import Answer, search_camera
 from measure.marks.shapes import FiducialLayout
@@ -29,7 +30,6 @@ from pipeline.measuring import camera_trials
 from pipeline.measuring.camera_identification import Identification, Trial, drawn_alike
 from pipeline.measuring.camera_trials import LayoutSearch, Tried, _alike, identify
 from pipeline.progress import Reporter
-from pipeline.rendered.against_truth import compare_with_truth
 from pipeline.rendered.scene_file import render_project
 
 LIBRARY = read_library()

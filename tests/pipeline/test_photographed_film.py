@@ -15,8 +15,8 @@ from measure.scans.opening import open_scan
 from pipeline.archive.measurement import read_measurement
 from pipeline.cli import run
 from pipeline.errors import InputError
+from pipeline.files.opencv_file import read_lens
 from pipeline.files.project_file import read_project
-from pipeline.files.taking_lens import read_lens
 from pipeline.rendered.scene_project import taking_camera_yaml
 from pipeline.results.adjustment_file import read_adjustment
 from pipeline.results.measured_record import MeasuredScan

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from measure.flags import NO_REASON, Status
 from pipeline.drawing.svg import Axes, round_step, ticks
 from pipeline.report import Thumbnail
-from pipeline.report.mark_pictures import SIZE_PX, arrow_scale, mark_picture
-from pipeline.report.marks import Mark, natural
+from pipeline.report.data import Mark, natural
+from pipeline.report.frame_views import SIZE_PX, arrow_scale, mark_picture
 from pipeline.report.numbers import fixed, significant, value_and_sigma
 from pipeline.report.vectors import VectorField, all_images_plot, plane
 from pipeline.results.assessment_record import ResidualRecord

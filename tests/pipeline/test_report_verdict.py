@@ -12,8 +12,8 @@ from adjust.solution.explanations import Explanation
 from measure.flags import Status
 from measure.results import MarkMeasurement, Pose
 from pipeline.report import Problem, ReportData, judge
+from pipeline.report.data import frames
 from pipeline.report.fractions import fraction_test, places_px
-from pipeline.report.marks import frames
 from pipeline.report.parameters import spoken_name
 from pipeline.report.verdict import NEEDS_A_LOOK, critical_w, sigma0_bounds
 from pipeline.results.adjustment_record import Quantity

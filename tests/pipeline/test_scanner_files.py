@@ -11,16 +11,16 @@ import pytest
 from networks import bent_films
 from simulated_project import write_project
 from small_scene import OBLIQUE, SCANNER, scene
+from truth_comparison import Comparison, bend_quantities
 
 from adjust.functional_model.lens import Prior
 from adjust.initial_values.approximations import approximate
 from adjust.problem.network import Network, Scanner
 from adjust.solution.adjustment import adjust
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
-from pipeline.rendered.against_truth import Comparison, bend_quantities
 from pipeline.rendered.scene_file import read_scene
 from pipeline.rendered.scene_project import write_project as write_rendered
-from pipeline.report.scanner_views import bend_field
+from pipeline.report.camera_views import bend_field
 from pipeline.results.adjustment_file import read_adjustment
 from pipeline.results.covariance_file import read_covariance
 from synthetic_images.film import frame_geometry, scanner_bend
