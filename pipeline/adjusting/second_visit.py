@@ -123,7 +123,7 @@ def _visited(
     """
     if isinstance(seen, str):
         problem = Reason(f"The second pass failed: {seen}", Code.UNREACHABLE)
-        return replace(scan, frame=replace(scan.frame, problems=(*scan.frame.problems, problem)))
+        return scan.changed(problems=[problem])
     targets = {mark.point: mark for mark in scan.frame.marks if mark.kind not in ON_FILM}
     taken = [mark.center_px for mark in targets.values() if mark.status.is_observation and mark.center_px is not None]
     fresh = {mark.point: mark for mark in seen if _is_free(mark, np.array(taken).reshape(-1, 2))}

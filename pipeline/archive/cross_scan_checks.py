@@ -65,7 +65,7 @@ def check_lots(
 
     def checked_lot(of_cameras: Sequence[OfCamera]) -> Iterable[MeasuredScan]:
         scans = [scan for each in of_cameras for scan in _check_camera(project, *each, work)]
-        return share([_add_remarks(scan, remarks) for scan in scans])
+        return share([scan.changed(None, *remarks.get(scan.frame.image, ((), ()))) for scan in scans])
 
     for of_cameras in _lots(project, own):
         some = [task for _, each in of_cameras for task in each]
@@ -178,12 +178,6 @@ def _writing_remarks(project: Project, tasks: Sequence[ScanTask], work: Work) ->
     return {scan.frame.image: (scan.frame.problems, scan.notes) for scan in noted if scan.frame.problems or scan.notes}
 
 
-def _add_remarks(scan: MeasuredScan, remarks: Remarks) -> MeasuredScan:
-    problems, notes = remarks.get(scan.frame.image, ((), ()))
-    frame = replace(scan.frame, problems=(*scan.frame.problems, *problems))
-    return replace(scan, frame=frame, notes=(*scan.notes, *notes))
-
-
 def _checked_result(scan: MeasuredScan, work: Work) -> CheckedResult:
     name = scan.frame.image
     return CheckedResult(work.results[name], work.apply_decisions(scan), work.decisions_hash(name))
@@ -197,5 +191,4 @@ def _copy(scan: MeasuredScan, original: str) -> MeasuredScan:
         for mark in scan.frame.marks
     ]
     sentence = f"its file is byte for byte that of {original}: its marks count once. Name one of both in `exclude`."
-    problem = Reason(sentence, Code.COPY)
-    return replace(scan, frame=replace(scan.frame, marks=tuple(marks), problems=(*scan.frame.problems, problem)))
+    return scan.changed(marks, [Reason(sentence, Code.COPY)])

@@ -137,20 +137,21 @@ def after_checks(scan: MeasuredScan, counting: Mapping[About, Decision]) -> Meas
 
 
 def _apply_to_task(task: ScanTask, decisions: Iterable[Decision]) -> ScanTask:
-    clicks, fiducials = list[Click](), task.options.fiducials
+    clicks = list[Click]()
     for one in sorted(decisions, key=lambda one: one.subject):
         if one.decision is Choice.POSE:
-            fiducials = replace(fiducials, pose=one.pose)
+            task = task.changed(pose=one.pose)
         elif one.decision is Choice.PLACE and one.subject[2] == "fiducial":
             assert one.col_px is not None
             assert one.row_px is not None
             clicks.append(Click(one.point, one.col_px, one.row_px))
-    return replace(task, options=replace(task.options, fiducials=replace(fiducials, clicks=tuple(clicks))))
+    return task.changed(clicks=tuple(clicks))
 
 
 def _changed(scan: MeasuredScan, counting: Mapping[About, Decision]) -> MeasuredScan:
-    marks = [_apply_to_mark(mark, counting.get((scan.frame.image, mark.point, mark.kind))) for mark in scan.frame.marks]
-    return replace(scan, frame=replace(scan.frame, marks=tuple(marks)))
+    image = scan.frame.image
+    marks = [_apply_to_mark(mark, counting.get((image, mark.point, mark.kind))) for mark in scan.frame.marks]
+    return scan.changed(marks)
 
 
 def _apply_to_mark(mark: MarkMeasurement, decision: Decision | None) -> MarkMeasurement:

@@ -3,7 +3,7 @@ JSON."""
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import cv2
@@ -101,8 +101,7 @@ def _add_plate(
             f"The camera's plate{number} says a principal distance of {plate['principal_distance_mm']} mm, its file "
             f"{camera.principal_distance_mm:g} mm: worth taking as an approximation, and nothing is changed by it."
         )
-    frame = replace(scan.frame, problems=(*scan.frame.problems, *(Reason(each, Code.PLATE) for each in problems)))
-    return replace(scan, frame=frame, notes=(*scan.notes, *notes))
+    return scan.changed(None, [Reason(each, Code.PLATE) for each in problems], notes)
 
 
 # Cameras with solid marks (wings, notches, arrows) that resemble those of others: a scan hardly distinguishes them.

@@ -341,11 +341,11 @@ def _verdicts(images: Sequence[ImagePoints], sheet: _Sheet) -> list[dict[str, _V
 
 
 def _apply_verdicts(scan: MeasuredScan, verdicts: Mapping[str, _Verdict]) -> MeasuredScan:
-    marks = tuple(
+    marks = [
         _apply_verdict(mark, verdicts[mark.point]) if mark.kind == "target" and mark.point in verdicts else mark
         for mark in scan.frame.marks
-    )
-    return replace(scan, frame=replace(scan.frame, marks=marks))
+    ]
+    return scan.changed(marks)
 
 
 def _apply_verdict(mark: MarkMeasurement, verdict: _Verdict) -> MarkMeasurement:

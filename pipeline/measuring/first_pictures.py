@@ -3,11 +3,9 @@
 The places come from clicks, or from what recurs in all scans near the given coordinates.
 """
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -25,6 +23,7 @@ from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.mark_table import Clicks, LearnedFrom
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
+from pipeline.provenance import content_hash
 from pipeline.types import Array
 
 Places = Mapping[str, Array]  # (2,) px by fiducial
@@ -66,7 +65,7 @@ def _clicked(camera: CameraFile, clicks: Clicks, tasks: Sequence[ScanTask]) -> C
             f"They are {', '.join(names[:5])}{', ...' if len(names) > 5 else ''}."
         )
     with task.opened() as scan:
-        if clicks.sha256 and clicks.sha256 != digest(scan.path):
+        if clicks.sha256 and clicks.sha256 != content_hash(scan.path):
             raise InputError(
                 f"{camera.path}: its marks were shown in {clicks.scan}, whose file is another one since. Click them "
                 "again in `reseau review`."
@@ -240,7 +239,7 @@ def _start(
     given = _up_from_camera(placement)
     pose = min(POSES, key=lambda name: float(np.abs(up_from_camera(name) - given).sum()))
     learned_from = LearnedFrom(
-        scan=task.name, sha256=digest(scan.path), pose=pose, clicked=camera.clicks is not None, alike=alike
+        scan=task.name, sha256=content_hash(scan.path), pose=pose, clicked=camera.clicks is not None, alike=alike
     )
     return replace(camera, fiducials=tuple(fiducials), learned_from=learned_from)
 
@@ -249,9 +248,3 @@ def _up_from_camera(placement: Array) -> Array:
     """(2, 2) rotation, or rotation with reflection, from the camera's axes to the scan's (right, up)."""
     linear = placement[:, :2] / np.sqrt(abs(np.linalg.det(placement[:, :2])))
     return np.asarray(np.diag([1.0, -1.0]) @ linear)
-
-
-def digest(path: Path) -> str:
-    """SHA-256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -24,10 +24,10 @@ from pipeline.files.camera_file import CameraFile, GivenFiducial, read_camera
 from pipeline.files.camera_text import camera_text
 from pipeline.files.mark_table import picture_writer
 from pipeline.files.project_file import Project
-from pipeline.measuring.first_pictures import digest, first_pictures
+from pipeline.measuring.first_pictures import first_pictures
 from pipeline.measuring.scan_task import Measure, Memory, ScanTask, sample_names, scan_tasks
 from pipeline.progress import Reporter
-from pipeline.provenance import fingerprint, hash_file
+from pipeline.provenance import content_hash, fingerprint, hash_file
 from pipeline.results.measured_record import read_tone_information, tone_information_record
 from pipeline.text.atomic import write_atomically
 
@@ -118,7 +118,9 @@ def _check_learned_scan(project: Project, camera: CameraFile) -> CameraFile:
     this project, and none of its scans has a share in them.
     """
     learned = camera.learned_from
-    if learned is None or (learned.scan in project.scans and digest(project.scans[learned.scan]) == learned.sha256):
+    if learned is None or (
+        learned.scan in project.scans and content_hash(project.scans[learned.scan]) == learned.sha256
+    ):
         return camera
     fiducials = tuple(replace(one, mark=_drop_shares(one.mark)) for one in camera.fiducials)
     return replace(camera, fiducials=fiducials, learned_from=None)

@@ -303,4 +303,4 @@ def _note_same_frame(
         "is misread. Leave one of them out, or look at frames.csv.",
         Code.AMBIGUOUS,
     )
-    return replace(scan, frame=replace(scan.frame, problems=(*scan.frame.problems, problem)))
+    return scan.changed(problems=[problem])

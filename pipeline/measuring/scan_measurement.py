@@ -3,7 +3,7 @@
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,28 +31,11 @@ from pipeline.provenance import parts_hash
 from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan
 from pipeline.results.thumbnail import StoredThumbnail, TakenThumbnails
 from pipeline.text.wording import capitalised
-from pipeline.workers import Submits, iterate_results
 
 SecondPass = Callable[[Scan, MeasuredScan], None]
 
 
 _COUNTED = Path("/proc/self/io")
-
-
-def measure_scans(
-    tasks: Iterable[ScanTask], executor: Submits | None = None, in_flight: int | None = None
-) -> Iterator[MeasuredScan]:
-    """Measure scans, yielding each result as soon as it is available.
-
-    If the process of a scan was ended, its result is a failure that says so.
-
-    Parameters
-    ----------
-    executor : None: the scans are measured in this process, one after the other.
-    in_flight : maximum number of tasks submitted at a time.
-    """
-    for task, result in iterate_results(measured_scan, tasks, executor, in_flight):
-        yield ended_scan(task, result) if isinstance(result, Exception) else result
 
 
 def ended_scan(task: ScanTask, error: Exception) -> MeasuredScan:
@@ -165,9 +148,7 @@ def _measure(task: ScanTask, scan: Scan, options: ScanOptions) -> MeasuredScan:
     notes = (*file_notes, *notes, *curve, *_missed_reading(options, frame), *_unknown_lens(options))
     measured = MeasuredScan(task.shown_scan, scan.width_px, scan.height_px, pitch, frame, notes)
     if misplaced := misplaced_principal_point(options.camera, measured):
-        measured = replace(
-            measured, frame=replace(frame, problems=(*frame.problems, Reason(misplaced, Code.OFF_GIVEN)))
-        )
+        measured = measured.changed(problems=[Reason(misplaced, Code.OFF_GIVEN)])
     measured = measure_targets(options, scan, measured)
     return replace(measured, frame=with_damage(scan, measured.frame))
 

@@ -108,17 +108,19 @@ class ScanTask:
 
     def posed(self, pose: str) -> "ScanTask":
         """Copy with a known scan orientation; no text is read."""
-        fiducials = replace(self.options.fiducials, pose=pose, writing="none", known_lines=())
-        return replace(self, options=replace(self.options, fiducials=fiducials))
+        return self.changed(pose=pose, writing="none", known_lines=())
+
+    def changed(self, **fiducials: Any) -> "ScanTask":
+        """Copy with other options of the fiducials."""
+        return replace(self, options=replace(self.options, fiducials=replace(self.options.fiducials, **fiducials)))
 
     def fiducials_alone(self, tone: float | str) -> "ScanTask":
         """Copy that measures only the fiducials, with the given tone curve."""
-        fiducials = replace(self.options.fiducials, writing="none", known_lines=())
-        options = replace(self.options, fiducials=fiducials, tone=tone, said=(), targets=None, exterior=None)
-        return replace(self, options=options)
+        task = self.changed(writing="none", known_lines=())
+        return replace(task, options=replace(task.options, tone=tone, said=(), targets=None, exterior=None))
 
 
-Measure = Callable[[Iterable[ScanTask]], Iterator[MeasuredScan]]  # runs tasks: `measure_scans`, or a store of results
+Measure = Callable[[Iterable[ScanTask]], Iterator[MeasuredScan]]  # runs tasks, or reads their results from a store
 
 
 def scan_tasks(

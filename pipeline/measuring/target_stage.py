@@ -159,10 +159,8 @@ def replace_targets(
     code: Code = Code.UNNAMED,
 ) -> MeasuredScan:
     """Replace the targets of a scan. code: of the problems."""
-    frame = measured.frame
-    fiducials = tuple(mark for mark in frame.marks if mark.kind in ON_FILM)
-    reasons = (Reason(problem, code) for problem in problems)
-    return replace(measured, frame=replace(frame, marks=(*fiducials, *targets), problems=(*frame.problems, *reasons)))
+    fiducials = [mark for mark in measured.frame.marks if mark.kind in ON_FILM]
+    return measured.changed([*fiducials, *targets], [Reason(problem, code) for problem in problems])
 
 
 def _oriented_by_targets(

@@ -1,7 +1,7 @@
 """Third step of measuring: all scans of a project together, with joins between partial scans and natural tie points."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from typing import NewType
@@ -61,13 +61,19 @@ def _join_parts(
         lacking = Reason(
             f"It is a part of frame {frame}, of which no other scan could be measured: nothing joins it.", Code.FEW_TIES
         )
-        return [_add_marks(scan, (), (lacking,)) for scan in parts]
+        return [scan.changed(problems=[lacking]) for scan in parts]
     parts = sorted(parts, key=lambda scan: scan.frame.image)
     joins = measure_joins([_part_frame(project, scan) for scan in parts], workers=workers)
     problems = {image: (problem,) for image, problem in joins.problems.items()}
-    return _agreed(
-        [_add_marks(scan, joins.marks[scan.frame.image], problems.get(scan.frame.image, ())) for scan in parts]
-    )
+    return _agreed([_add_marks(scan, joins.marks, problems) for scan in parts])
+
+
+def _add_marks(
+    scan: MeasuredScan, marks: Mapping[str, Sequence[MarkMeasurement]], problems: Mapping[str, Sequence[Reason]]
+) -> MeasuredScan:
+    """Add the marks and problems of an image, by name."""
+    image = scan.frame.image
+    return scan.changed((*scan.frame.marks, *marks.get(image, ())), problems.get(image, ()))
 
 
 def _part_frame(project: Project, scan: MeasuredScan) -> TieFrame:
@@ -78,11 +84,6 @@ def _part_frame(project: Project, scan: MeasuredScan) -> TieFrame:
     ]
     marks = np.array(taken).reshape(-1, 3)
     return TieFrame(scan.frame.image, scan_path(scan.scan), np.eye(2, 3), None, marks, project.max_pixels)
-
-
-def _add_marks(scan: MeasuredScan, marks: Sequence[MarkMeasurement], problems: Sequence[Reason]) -> MeasuredScan:
-    frame = scan.frame
-    return replace(scan, frame=replace(frame, marks=(*frame.marks, *marks), problems=(*frame.problems, *problems)))
 
 
 def _agreed(scans: Sequence[MeasuredScan]) -> list[MeasuredScan]:
@@ -114,7 +115,7 @@ def _excuse_outside(scan: MeasuredScan, parts: Sequence[MeasuredScan]) -> Measur
         else mark
         for mark in scan.frame.marks
     ]
-    return replace(scan, frame=replace(scan.frame, marks=tuple(marks)))
+    return scan.changed(marks)
 
 
 def _fiducials(scan: MeasuredScan) -> dict[str, Array]:
@@ -170,10 +171,9 @@ def _contradicted(scan: MeasuredScan, other: MeasuredScan, off_mm: float) -> Mea
         "both, and place the marks or set the pose in a review.",
         Code.AMBIGUOUS,
     )
-    marks: Sequence[MarkMeasurement] = scan.frame.marks
     if len(_fiducials(scan)) <= len(_fiducials(other)):
-        marks = _changed(scan, Status.REJECTED, Reason(what, Code.AMBIGUOUS))
-    return replace(scan, frame=replace(scan.frame, marks=tuple(marks), problems=(*scan.frame.problems, problem)))
+        scan = _changed(scan, Status.REJECTED, Reason(what, Code.AMBIGUOUS))
+    return scan.changed(problems=[problem])
 
 
 def _unchecked(scan: MeasuredScan, is_checked: bool) -> MeasuredScan:
@@ -184,17 +184,17 @@ def _unchecked(scan: MeasuredScan, is_checked: bool) -> MeasuredScan:
         return replace(scan, frame=replace(scan.frame, problems=problems))
     if 0 < len(_fiducials(scan)) < _CHECKED:
         reason = Reason("so few fiducials fit many frames, and no other part of this one checks them", Code.NO_CHECK)
-        marks = _changed(scan, Status.WEAK, reason)
-        return replace(scan, frame=replace(scan.frame, marks=tuple(marks)))
+        return _changed(scan, Status.WEAK, reason)
     return scan
 
 
-def _changed(scan: MeasuredScan, status: Status, reason: Reason) -> list[MarkMeasurement]:
-    """The marks, with another status for those fiducials that are observations."""
-    return [
+def _changed(scan: MeasuredScan, status: Status, reason: Reason) -> MeasuredScan:
+    """Scan with another status of those fiducials that are observations."""
+    marks = [
         replace(mark, status=status, reason=reason) if mark.kind == "fiducial" and mark.status.is_observation else mark
         for mark in scan.frame.marks
     ]
+    return scan.changed(marks)
 
 
 def check_tie_names(project: Project) -> None:
@@ -215,17 +215,7 @@ def add_ties(
     placed = [frame for frame in frames.values() if frame is not None]
     ties = measure_ties(placed, settings.options, count, workers)
     problems = {**ties.problems, **{image: (_NO_FRAME,) for image, frame in frames.items() if frame is None}}
-    return tuple(
-        replace(
-            scan,
-            frame=replace(
-                scan.frame,
-                marks=(*scan.frame.marks, *ties.marks.get(scan.frame.image, ())),
-                problems=(*scan.frame.problems, *problems.get(scan.frame.image, ())),
-            ),
-        )
-        for scan in scans
-    )
+    return tuple(_add_marks(scan, ties.marks, problems) for scan in scans)
 
 
 def _tie_frame(project: Project, scan: MeasuredScan) -> TieFrame | None:

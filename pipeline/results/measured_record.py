@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, get_args
@@ -91,6 +91,18 @@ class MeasuredScan:
     def failed(cls, scan: str, frame: FrameMeasurement, failure: Failure) -> "MeasuredScan":
         """Scan that could not be measured. frame: its marks, all absent."""
         return cls(scan, 0, 0, (math.nan, math.nan), frame, failure=failure)
+
+    def changed(
+        self,
+        marks: Sequence[MarkMeasurement] | None = None,
+        problems: Sequence[Reason] = (),
+        notes: Sequence[str] = (),
+    ) -> "MeasuredScan":
+        """Copy with other marks, if given, and further problems and notes."""
+        frame = self.frame
+        marks = frame.marks if marks is None else tuple(marks)
+        frame = replace(frame, marks=marks, problems=(*frame.problems, *problems))
+        return replace(self, frame=frame, notes=(*self.notes, *notes))
 
 
 # JSON has no non-finite numbers: they are written as strings that `float` reads.

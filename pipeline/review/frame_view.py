@@ -248,8 +248,7 @@ def measured_from_clicks(project: Project, image: str, clicks: Sequence[Click]) 
     if unknown:
         raise InputError(f"{image}: its camera has no mark {', '.join(unknown)}.")
     (task,) = scan_tasks(project, [image])
-    fiducials = replace(task.options.fiducials, clicks=tuple(clicks))
-    return _tried(replace(task, options=replace(task.options, fiducials=fiducials)))
+    return _tried(task.changed(clicks=tuple(clicks)))
 
 
 def measured_as_shown(project: Project, shown: str, px: Mapping[str, tuple[float, float]], image: str) -> MeasuredScan:
@@ -287,5 +286,5 @@ def camera_as_shown(project: Project, camera: CameraFile, clicks: Clicks) -> Cam
 
 
 def _tried(task: ScanTask) -> MeasuredScan:
-    fiducials = replace(task.options.fiducials, writing="none")
-    return measured_scan(replace(task, options=replace(task.options, fiducials=fiducials, targets=None, exterior=None)))
+    task = task.changed(writing="none")
+    return measured_scan(replace(task, options=replace(task.options, targets=None, exterior=None)))

@@ -14,9 +14,8 @@ from pipeline.errors import InputError
 from pipeline.files.decision import LEARNED, Choice, Decision
 from pipeline.files.decisions_file import append_decisions, learned_from, read_decisions, standing
 from pipeline.files.project_file import Project, reload_decisions
-from pipeline.measuring.first_pictures import digest
 from pipeline.measuring.learn_stage import add_learned_marks
-from pipeline.provenance import FileState, file_state
+from pipeline.provenance import FileState, content_hash, file_state
 from pipeline.review.frame_view import Looking
 from pipeline.review.queue import Entry, Question, build_queue
 
@@ -225,7 +224,7 @@ class Session:
     def _add_fingerprint(self, one: Decision) -> Decision:
         """Add the fingerprint of the scan to a decision to learn marks, so that it applies to this file only."""
         is_learned = one.decision is Choice.LEARN
-        return replace(one, fingerprint=digest(self.project.scans[one.image])) if is_learned else one
+        return replace(one, fingerprint=content_hash(self.project.scans[one.image])) if is_learned else one
 
     def _check(self, one: Decision) -> None:
         """Check that image and mark exist and the decision is possible. Raises InputError otherwise."""

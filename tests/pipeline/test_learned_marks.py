@@ -22,7 +22,7 @@ from pipeline.files.camera_file import read_camera
 from pipeline.files.project_file import Project, read_project
 from pipeline.measuring import learn_stage
 from pipeline.measuring.learn_stage import learn_marks
-from pipeline.measuring.scan_measurement import measure_scans
+from pipeline.measuring.scan_measurement import measured_scan
 from pipeline.measuring.scan_task import scan_tasks
 from pipeline.progress import Reporter
 from synthetic_images import areas, scene
@@ -106,7 +106,9 @@ class Forgetful:
 
 def learned(project: Project) -> Project:
     reporter = Reporter(Console(quiet=True))
-    return learn_marks(project, reporter, measure_scans, None, project.output / "learned", Forgetful())
+    return learn_marks(
+        project, reporter, lambda tasks: map(measured_scan, tasks), None, project.output / "learned", Forgetful()
+    )
 
 
 def measure_picture(project: Project, *scans: str) -> list[FrameMeasurement]:

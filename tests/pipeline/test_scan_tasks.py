@@ -5,7 +5,7 @@ import json
 import os
 import pickle
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
@@ -21,10 +21,11 @@ from pipeline.archive.measurement import read_measurement
 from pipeline.cli import run
 from pipeline.files.project_file import read_project
 from pipeline.measuring import scan_measurement
-from pipeline.measuring.scan_measurement import measure_scans, measured_scan
+from pipeline.measuring.scan_measurement import ended_scan, measured_scan
 from pipeline.measuring.scan_task import ScanTask, sample_names, scan_tasks
 from pipeline.results.comparator_file import read_comparator
 from pipeline.results.measured_record import FailureCode, MeasuredScan
+from pipeline.workers import iterate_results
 
 Changed = Callable[[str, str], tuple[str, str]]  # of project.toml and camera.toml
 SAID = pytest.CaptureFixture[str]
@@ -155,6 +156,11 @@ class Watched:
         return future
 
 
+def measured(tasks: Iterable[ScanTask], executor: Watched, in_flight: int = 4) -> Iterator[MeasuredScan]:
+    for task, result in iterate_results(measured_scan, tasks, executor, in_flight):
+        yield ended_scan(task, result) if isinstance(result, Exception) else result
+
+
 def test_results_come_one_by_one_and_few_tasks_are_handed_out_at_a_time(two: Path) -> None:
     a, _ = scan_tasks(read_project(two), ["a", "b"])
     lost = replace(a, scan="nowhere.tif")
@@ -166,7 +172,7 @@ def test_results_come_one_by_one_and_few_tasks_are_handed_out_at_a_time(two: Pat
             yield replace(lost, name=str(number))
 
     watched = Watched(20, holds=3)
-    results = measure_scans(tasks(), watched, in_flight=3)
+    results = measured(tasks(), watched, in_flight=3)
     first = next(results)
     assert first.failure is not None
     assert len(requests) == 3
@@ -181,7 +187,7 @@ def test_results_come_one_by_one_and_few_tasks_are_handed_out_at_a_time(two: Pat
 def test_a_scan_whose_process_ends_is_a_result(two: Path) -> None:
     project = read_project(two)
     tasks = scan_tasks(project, ["a", "b"])
-    results = {scan.frame.image: scan for scan in measure_scans(tasks, Watched(2, broken="b"))}
+    results = {scan.frame.image: scan for scan in measured(tasks, Watched(2, broken="b"))}
     assert results["a"].failure is None
     assert results["b"].failure is not None
     assert results["b"].failure.code is FailureCode.ENDED
