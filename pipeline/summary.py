@@ -140,7 +140,7 @@ def print_summary(summary: Summary, console: Console) -> None:
         console.print(Text(counts))
     if summary.frames:
         console.print(_frame_table(summary))
-    if summary.adjustment and not summary.values:
+    if summary.adjustment and summary.adjustment.converged and not summary.values:
         console.print(Text(f"Film transformations: {_quality(summary.adjustment)}."))
         for name, (sentence, distances) in summary.corrections.items():
             console.print(Text(f"{name}: {sentence}"))

@@ -1,6 +1,6 @@
 """Rank defects: null directions of the observation equations, named, with cause and remedy."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -31,6 +31,7 @@ SETTLED = 3.0  # ratio of the weights of priors and observations above which the
 INSIDE = 1e-6  # tolerance for a known direction to lie in the null space: rounding
 OBJECT_AXES = ("X", "Y", "Z", "X0", "Y0", "Z0")  # positions of points and stations
 NAMES_SHOWN = 3  # more names of one kind are collapsed to one with a star
+LOOSE = 0.05  # relative standard deviation of a principal distance above which a warning says so
 UNDETERMINED = 0.99  # ratio of posterior and prior standard deviation above which a quantity is undetermined
 
 
@@ -111,6 +112,20 @@ def undetermined(problem: Problem, state: State, variances: Array) -> str:
         return f"{statement}. What is given is all that places them: give it well, or fix what you do not need."
     field = field_geometry(problem, state, cameras[0])
     return f"{statement}, for {field.because}. To determine them, {field.remedy}."
+
+
+def loose_principal_distances(problem: Problem, state: State, variances: Array) -> Iterator[str]:
+    """Sentences on principal distances without a prior that the observations hardly determine."""
+    unknowns = problem.unknowns
+    for name, positions in unknowns.camera.items():
+        at = positions[0]
+        share = float(np.sqrt(variances[at]) / state.values[at])
+        if np.isinf(unknowns.sigma[at]) and share > LOOSE:
+            field = field_geometry(problem, state, name)
+            yield (
+                f"The principal distance of camera {name} is determined to {100.0 * share:.0f} % only, for "
+                f"{field.because}. To determine it better, {field.remedy}; or give it with its standard deviation."
+            )
 
 
 def _collapsed(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:

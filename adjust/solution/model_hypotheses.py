@@ -318,7 +318,9 @@ def _continued(run: Run, network: Network, like: dict[str, str] | None = None) -
 
 def _lens_words(camera: Camera, group: str, what: str, run: Run, added: Indices, rms_um: float) -> tuple[str, str]:
     cause = f"The lens model of camera {camera.name} is too simple: the residuals have {what}, {rms_um:.2g} µm rms"
-    fixed = [name for name in _own_terms(camera, group) if name not in _free_terms(camera)]
+    denominator = family(camera.distortion.family.removesuffix(EXTENDED)).alike_at_zero  # asked for by nobody at first
+    terms = [name for name in _own_terms(camera, group) if name not in denominator]
+    fixed = [name for name in terms if name not in _free_terms(camera)]
     if camera.distortion.family.removesuffix(EXTENDED) == "none":
         names = "k1 and k2" if group == "radial" else "p1 and p2"
         return cause, f'Give the camera a [distortion] of the family "brown", say, with {names} free.'

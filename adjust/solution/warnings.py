@@ -14,7 +14,7 @@ from adjust.problem.observations import Observations
 from adjust.problem.parameter import description
 from adjust.problem.problem import Problem
 from adjust.quality.run import Residuals, Run
-from adjust.rank_defect.diagnosis import undetermined, weak_directions
+from adjust.rank_defect.diagnosis import loose_principal_distances, undetermined, weak_directions
 from adjust.rank_defect.directions import weak_term_sentences
 from adjust.solution.reweighting import ROUNDS
 
@@ -74,6 +74,7 @@ def _weak_parameters(run: Run, cofactor: Cofactor) -> Iterator[str]:
         yield f"Practically singular without priors: {description(each.parameters)}. {each.cause} {each.remedy}"
     if run.converged:
         yield from filter(None, [undetermined(problem, state, cofactor.variances)])
+        yield from loose_principal_distances(problem, state, cofactor.variances)
         yield from weak_term_sentences(problem, state, free, run.factor, cofactor)
 
 

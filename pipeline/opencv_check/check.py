@@ -122,8 +122,8 @@ def _solve_without_priors(problem: BareProblem) -> Adjustment:
     c, sigma = solved.value(distance), solved.sigma(distance)
     if sigma > UNDETERMINED * c:
         raise _NotPossible(
-            f"Priors carried the solution: from the observations of the points alone the principal distance has a "
-            f"standard deviation of {sigma:.3g} mm, {sigma / c:.0%} of its value."
+            f"From the observations of the points alone the principal distance has a standard deviation of "
+            f"{sigma:.3g} mm, {100.0 * sigma / c:.0f} % of its value."
         )
     return solved
 

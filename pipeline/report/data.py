@@ -110,8 +110,9 @@ class ReportData:
     @property
     def is_film_alone(self) -> bool:
         """Whether only fiducial marks were adjusted and no camera is calibrated."""
-        stored = self.adjustment
-        return stored is not None and not any(camera.is_calibrated for camera in stored.cameras.values())
+        cameras = self.adjustment.cameras.values() if self.adjustment else ()
+        has_marks = any(camera.fiducials for camera in cameras)
+        return has_marks and not any(camera.is_calibrated for camera in cameras)
 
     @property
     def is_digital(self) -> bool:

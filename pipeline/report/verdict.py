@@ -1,6 +1,7 @@
 """Verdict on a calibration, and the problems that need a look."""
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -38,6 +39,7 @@ A_PRIORI = (
 CONTRADICTED = 0.01  # significance level of the test against an earlier calibration
 ON_FRAMES = ("target", "fiducial", "tie")  # groups of marks
 GIVEN = ("datum", "interior")  # groups of values that the camera's file gives
+LEAST_ALIKE, NEARLY_ALL = 6, 0.8  # number and share of suspects in one image from which its numbers may be wrong
 MOST_QUANTITIES = 3  # largest number of contradicted quantities named
 LEAST_SHARE = 0.5  # fraction of the corner radius up to which a lens must be observed
 CONFIDENCE = 0.99  # of the global test, and family-wise confidence of the tests of residuals
@@ -135,6 +137,12 @@ def _suspects(adjustment: AdjustmentRecord) -> Iterator[Problem]:
             "Look at the picture: reject a disturbed mark or a wrong number in comparator.csv, or correct the given "
             "coordinate. snooping = true under [adjust] leaves them out."
         )
+        owners = Counter(row.owner for row in rows if not row.removed and row.group in ON_FRAMES).most_common(1)
+        if owners and owners[0][1] >= max(LEAST_ALIKE, NEARLY_ALL * len(kept)):
+            remedy = (
+                f"Nearly all are marks of {owners[0][0]}: look for wrong point numbers of the whole image, or take it "
+                f"out. {remedy}"
+            )
         of_camera = "Correct the given value in the camera's file, or give it the standard deviation that it has."
         yield Problem(
             f"{counted(len(kept), 'gross error')} suspected: {listed(kept)}.",

@@ -100,7 +100,13 @@ C, CX, CY = 10.0, 6.41, 4.77
 LENS = np.array([-0.25, 0.08, 4e-4, -3e-4, 0.01])
 
 
-def board_network(seed: int, free: tuple[str, ...], noise: bool = True, images: int = 8) -> Network:
+def board_network(
+    seed: int,
+    free: tuple[str, ...],
+    noise: bool = True,
+    images: int = 8,
+    tilts_deg: tuple[float, float] = (20.0, 40.0),
+) -> Network:
     """A board of 54 corners in the middle of pictures of 1280 x 960 pixels of 0.01 mm, noise of a tenth of one."""
     rng = np.random.default_rng(seed)
     x, y = np.meshgrid(np.arange(9.0), np.arange(6.0))
@@ -108,7 +114,7 @@ def board_network(seed: int, free: tuple[str, ...], noise: bool = True, images: 
     matrix = np.array([[C, 0.0, CX], [0.0, C, CY], [0.0, 0.0, 1.0]])
     view = []
     for i in range(images):
-        azimuth, tilt = 2.0 * np.pi * i / images, np.radians(rng.uniform(20.0, 40.0))
+        azimuth, tilt = 2.0 * np.pi * i / images, np.radians(rng.uniform(*tilts_deg))
         turn = np.array([np.cos(azimuth) * tilt, np.sin(azimuth) * tilt, 0.2 * rng.normal()])
         shift = np.array([*rng.uniform(-60.0, 60.0, 2), rng.uniform(550.0, 800.0)])
         view.append(cv2.projectPoints(board, turn, shift, matrix, LENS)[0].reshape(-1, 2) * [1.0, -1.0])
@@ -268,6 +274,22 @@ def test_how_far_out_the_lens_is_known() -> None:
     unknown = result.lens_reach(camera)
     assert unknown is not None
     assert np.isnan(unknown.corner_mm)
+
+
+def test_a_principal_distance_that_nearly_parallel_images_hardly_tell_is_named() -> None:
+    """It went out as calibrated, known to a tenth of itself, without a word."""
+    result = adjust(board_network(0, EIGHT[:2], tilts_deg=(0.5, 1.5)))
+    share = result.sigma("IO.cam.c") / result.value("IO.cam.c")
+    assert share > 0.05
+    (warning,) = result.warnings
+    assert "The principal distance of camera cam is determined to " in warning
+    assert warning.endswith("points at other heights; or give it with its standard deviation.")
+    assert not adjust(board_network(0, EIGHT[:2])).warnings
+
+
+def test_a_lens_without_radial_terms_is_advised_no_denominator() -> None:
+    (found,) = adjust(board_network(0, (), images=4)).explanations[:1]
+    assert found.remedy == 'Free k1, k2, k3 under [distortion.sigma] of the camera ("free").'
 
 
 def test_coordinates_that_count_from_the_middle_of_the_picture_have_its_corners_about_it() -> None:

@@ -102,6 +102,25 @@ def test_a_given_value_that_is_suspect_is_no_mark_in_a_picture(adjusted_data: Re
     assert "Correct the given value in the camera's file" in both
 
 
+def test_suspects_of_one_image_ask_for_its_numbers(adjusted_data: ReportData) -> None:
+    of_one = tuple(suspect(name=f"target {k} in image f2")[0] for k in range(8))
+    assert "marks of f2: look for wrong point numbers" in describe(changed(adjusted_data, suspects=of_one))
+    of_two = tuple(replace(each, owner=f"f{k % 2}") for k, each in enumerate(of_one))
+    assert "look for wrong point numbers" not in describe(changed(adjusted_data, suspects=of_two))
+
+
+def test_pictures_without_fiducial_marks_are_no_film(adjusted_data: ReportData) -> None:
+    """Where a camera found no solution, its summary spoke of film transformations and fiducial marks."""
+    stored = adjusted_data.adjustment
+    assert stored is not None
+    uncalibrated = {
+        name: replace(camera, principal_distance_mm=Quantity(152.0, np.inf)) for name, camera in stored.cameras.items()
+    }
+    assert changed(adjusted_data, cameras=uncalibrated).is_film_alone
+    digital = {name: replace(camera, fiducials={}) for name, camera in uncalibrated.items()}
+    assert not changed(adjusted_data, cameras=digital).is_film_alone
+
+
 def test_what_could_as_well_be_wrong_is_named_too(adjusted_data: ReportData) -> None:
     text = describe(changed(adjusted_data, suspects=suspect(alike=("control point 1 Z",))))
     assert "target 1 in image f2 (w = −9.3; not distinguishable from control point 1 Z)." in text
