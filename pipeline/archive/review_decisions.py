@@ -15,8 +15,7 @@ from measure.results import MEASURE_REVISION, Covariance, MarkMeasurement
 from pipeline.archive.checked_statuses import find_judging
 from pipeline.archive.results_database import Store
 from pipeline.archive.results_integrity import row_digest
-from pipeline.files.decision import LEARNED, About, Choice, Decision
-from pipeline.files.decisions_file import push_decision, standing
+from pipeline.files.decisions_file import LEARNED, About, Choice, Decision, push_decision, standing
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_task import ScanTask, image_options
 from pipeline.provenance import fingerprint, options_hash

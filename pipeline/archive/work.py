@@ -18,7 +18,7 @@ from pipeline.archive.review_decisions import (
     request_hasher,
 )
 from pipeline.archive.thumbnails import ThumbnailStore
-from pipeline.files.decision import About, Decision
+from pipeline.files.decisions_file import About, Decision
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_measurement import MeasuredFile, ended_scan, measure_file, reads_writing
 from pipeline.measuring.scan_task import ScanTask

@@ -5,25 +5,26 @@ that the file keeps a record of who decided what, and when.
 """
 
 import gc
+import json
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, fields, replace
+from datetime import datetime
+from enum import StrEnum
+from functools import lru_cache
 from pathlib import Path
-from typing import BinaryIO
+from typing import Annotated, Any, BinaryIO, Literal
 
+from pydantic import AfterValidator, ConfigDict, Field, Strict, TypeAdapter, ValidationError, with_config
+
+from measure.geometry import POSES
 from pipeline.errors import InputError
-from pipeline.files.decision import (
-    LEARNED,
-    About,
-    Choice,
-    Decision,
-    LineError,
-    decision_line,
-    decisions_of_lines,
-    is_cut_short,
-)
+from pipeline.provenance import NO_FINGERPRINT
 from pipeline.text.atomic import write_atomically, writing
-from pipeline.text.text_file import read_bytes
+from pipeline.text.table_models import WrongKey
+from pipeline.text.text_file import quote_value, read_bytes, refuse_constant
+from pipeline.text.wording import did_you_mean
 
 try:
     import fcntl
@@ -31,11 +32,214 @@ except ImportError:  # not available on every system
     fcntl = None  # type: ignore[assignment]
 
 FILE = "decisions.jsonl"
-
-
 _LONGEST_LINE = 4_000_000  # bytes
 _BYTES_AT_A_TIME = 300_000
 _MOST_MB = 2000
+KINDS = ("fiducial", "target", "tie")
+LEARNED = "learned"  # kind of decisions about the appearance of a camera's marks, not about their places
+
+
+class Choice(StrEnum):
+    """Kinds of decisions."""
+
+    ACCEPT = "accept"
+    REJECT = "reject"
+    ABSENT = "absent"
+    PLACE = "place"
+    POSE = "pose"
+    LEARN = "learn"
+    UNDO = "undo"
+
+
+MEANING = {
+    Choice.ACCEPT: "The mark is right as it was measured: it counts as `measured`.",
+    Choice.REJECT: "What was measured is not this mark: it counts as `rejected`.",
+    Choice.ABSENT: "The scan does not show this mark: it counts as `absent`.",
+    Choice.PLACE: "The mark is here (`col_px`, `row_px`): matching starts there.",
+    Choice.POSE: "The scan lies as `pose` says.",
+    Choice.LEARN: "The camera's marks look as at these places of this scan (`px`, column and row by fiducial).",
+    Choice.UNDO: "The last decision about this mark, or this pose, is taken back.",
+}
+About = tuple[str, str, str]  # image, point, kind; of a pose: image, "", ""; of marks to be learned: image, "", LEARNED
+
+
+def _checked_pose(pose: str) -> str:
+    if pose and pose not in POSES:
+        raise ValueError(pose)
+    return pose
+
+
+@lru_cache(maxsize=4096)
+def _checked_time(text: str) -> str:
+    if text:
+        datetime.fromisoformat(text)
+    return text
+
+
+Text = Annotated[str, Strict()]
+Pixels = Annotated[float, Strict(), Field(gt=-1e9, lt=1e9)]
+
+
+@with_config(ConfigDict(extra="forbid"))
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """One decision.
+
+    Attributes
+    ----------
+    image : name of the image.
+    decision : kind of decision.
+    point, kind : of the mark; "" for a pose.
+    col_px, row_px : place of the mark (`place`).
+    pose : of the scan (`pose`).
+    note, who : remark and person.
+    when : ISO 8601.
+    fingerprint : of the result that was reviewed; for `learn` SHA-256 of the scan's file.
+    window : part of the scan that was visible: first column, first row, width, height, px.
+    px : places of the marks by fiducial (`learn`).
+    line : number of the line in the file; 0 outside a file.
+    """
+
+    image: Text
+    decision: Choice
+    point: Text = ""
+    kind: Literal["", "fiducial", "target", "tie", "learned"] = ""
+    col_px: Pixels | None = None
+    row_px: Pixels | None = None
+    pose: Annotated[str, AfterValidator(_checked_pose)] = ""
+    note: Text = ""
+    who: Text = ""
+    when: Annotated[str, AfterValidator(_checked_time)] = ""
+    fingerprint: Text = ""
+    window: tuple[Pixels, Pixels, Pixels, Pixels] | None = None
+    px: Mapping[str, tuple[Pixels, Pixels]] = field(default_factory=dict, hash=False)
+    line: int = field(default=0, compare=False, metadata=NO_FINGERPRINT)
+
+    @property
+    def subject(self) -> About:
+        """(image, point, kind) that the decision is about. The default kind is a fiducial."""
+        return self.image, self.point, self.kind or (KINDS[0] if self.point else "")
+
+
+_REQUIRED: Mapping[Choice, tuple[str, ...]] = {
+    **dict.fromkeys(Choice, ("image", "point")),
+    Choice.PLACE: ("image", "point", "col_px", "row_px"),
+    Choice.POSE: ("image", "pose"),
+    Choice.LEARN: ("image", "px"),
+    Choice.UNDO: ("image",),
+}
+_KEYS = tuple(each.name for each in fields(Decision) if each.name != "line")
+_WORDS: Mapping[str, tuple[str, ...]] = {"decision": tuple(map(str, Choice)), "kind": (*KINDS, LEARNED), "pose": POSES}
+_MUST_BE = {
+    **dict.fromkeys(_KEYS, "text"),
+    **{key: f"one of {', '.join(words)}" for key, words in _WORDS.items()},
+    "col_px": "a number of pixels",
+    "row_px": "a number of pixels",
+    "when": "a time as 2026-01-31T12:00:00+00:00",
+    "window": "four numbers of pixels: first column, first row, width, height",
+    "px": 'columns and rows by fiducial: {"1": [1863, 1786], ...}',
+}
+
+
+def _checked(decision: Decision) -> Decision:
+    """Decision of a line without what its kind has no use for. Raises WrongKey where a key is missing."""
+    kind = decision.decision
+    for key in _REQUIRED[kind]:
+        value = getattr(decision, key)
+        if not value and value != 0.0:
+            message = f"must be {_MUST_BE[key]}, not None." if _MUST_BE[key] != "text" else "is missing."
+            raise WrongKey(key, message)
+    of_scan = kind in (Choice.POSE, Choice.LEARN)
+    if of_scan and decision.point:
+        what = "a pose" if kind is Choice.POSE else "what is learned"
+        raise WrongKey("point", f"is of no use: {what} is of the whole scan. Take it out.")
+    if of_scan and decision.kind != (LEARNED if kind is Choice.LEARN else ""):
+        decision = replace(decision, kind="learned" if kind is Choice.LEARN else "")
+    if decision.px and kind is not Choice.LEARN:
+        decision = replace(decision, px={})
+    return replace(decision, pose="") if decision.pose and kind is not Choice.POSE else decision
+
+
+_DECISIONS = TypeAdapter(list[Annotated[Decision, AfterValidator(_checked)]])
+
+
+def decision_line(decision: Decision) -> str:
+    """Line of the file. Raises InputError for a decision that could not be read again."""
+    values = {key: getattr(decision, key) for key in _KEYS}
+    content = {key: value for key, value in values.items() if value not in (None, "", {})}
+    try:
+        line = json.dumps(content, ensure_ascii=False, allow_nan=False)
+        decisions_of_lines([(0, line.encode())])
+    except (LineError, ValueError) as error:
+        about = f"{decision.image}{f', {decision.point}' if decision.point else ''}"
+        raise InputError(f"the decision about {about}{error}. Nothing was written.") from None
+    return f"{line}\n"
+
+
+class LineError(Exception):
+    """Error in a line; its text follows the line's number."""
+
+    def __init__(self, number: int, message: str, key: str = "") -> None:
+        super().__init__(f"{f', {key}' if key else ''}: {message}")
+        self.number = number
+
+
+_read_json = json.JSONDecoder(parse_constant=refuse_constant).decode
+
+
+def is_cut_short(line: bytes) -> bool:
+    """Whether a line ends within its JSON object, as after a crash, rather than having a typing error."""
+    try:
+        _read_json(line.decode("utf-8", "replace"))
+    except json.JSONDecodeError as error:
+        ends = error.pos >= len(error.doc.rstrip()) or error.msg.startswith("Unterminated string")
+        return ends and line.lstrip().startswith(b"{")
+    except (ValueError, RecursionError):
+        pass
+    return False
+
+
+def decisions_of_lines(numbered: Sequence[tuple[int, bytes]]) -> list[Decision]:
+    """Decisions of lines, parsed all at once; one by one only where that fails, to find the line."""
+    numbers, lines = [number for number, _ in numbered], [line for _, line in numbered]
+    try:
+        objects = _read_json(f"[{b','.join(lines).decode()}]")
+    except (ValueError, RecursionError):
+        objects = []
+    if len(objects) != len(lines):
+        objects = [_json_object(number, line) for number, line in numbered]
+    try:
+        decisions = _DECISIONS.validate_python(objects)
+    except ValidationError as error:
+        found = error.errors(include_url=False)
+        first = min(found, key=lambda each: (each["loc"][0], each["type"] != "unexpected_keyword_argument"))
+        raise LineError(numbers[int(first["loc"][0])], *_problem(first)) from None
+    for decision, number in zip(decisions, numbers, strict=True):
+        object.__setattr__(decision, "line", number)  # a copy of each would take as long as reading them
+    return decisions
+
+
+def _json_object(number: int, line: bytes) -> Any:
+    try:
+        return _read_json(line.decode())
+    except (ValueError, RecursionError) as error:
+        raise LineError(number, f"is no JSON ({error}). Mend the line, or take it out.") from None
+
+
+def _problem(error: Any) -> tuple[str, str]:
+    """Message on an error of pydantic, and the key."""
+    cause = error.get("ctx", {}).get("error")
+    if isinstance(cause, WrongKey):
+        return str(cause), cause.key
+    if len(error["loc"]) == 1:
+        return f"must be a JSON object, not {quote_value(error['input'])}.", ""
+    key, value = str(error["loc"][1]), error["input"]
+    if error["type"] == "unexpected_keyword_argument":
+        return f"there is no such key.{did_you_mean(key, _KEYS)} Known: {', '.join(_KEYS)}.", key
+    if error["type"] == "missing" and len(error["loc"]) == 2:
+        return "is missing.", key
+    hint = did_you_mean(value, _WORDS[key]) if key in _WORDS and isinstance(value, str) else ""
+    return f"must be {_MUST_BE[key]}, not {quote_value(value)}.{hint}", key
 
 
 def read_decisions(path: Path) -> tuple[Decision, ...]:

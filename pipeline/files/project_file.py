@@ -15,9 +15,8 @@ from measure.fiducials.options import ANY_FILM, BelievedFilm, Reads
 from pipeline.errors import InputError
 from pipeline.files.adjust_table import AdjustSettings
 from pipeline.files.camera_file import CameraFile, read_camera
-from pipeline.files.decision import Decision
 from pipeline.files.decisions_file import FILE as DECISIONS
-from pipeline.files.decisions_file import cut_short_line, decisions_bytes, learned_from, parse_decisions
+from pipeline.files.decisions_file import Decision, cut_short_line, decisions_bytes, learned_from, parse_decisions
 from pipeline.files.images_file import GivenImages, read_images
 from pipeline.files.library import PREFIX, camera_path
 from pipeline.files.mark_table import Clicks

@@ -22,7 +22,7 @@ from measure.errors import MeasurementError
 from measure.fiducials.options import Click
 from measure.geometry import POSES
 from pipeline.errors import InputError
-from pipeline.files.decision import MEANING, Decision, LineError, decisions_of_lines
+from pipeline.files.decisions_file import MEANING, Decision, LineError, decisions_of_lines
 from pipeline.files.mark_table import MARK_TABLES
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_task import sample_names

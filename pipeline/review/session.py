@@ -11,8 +11,15 @@ from typing import Any
 from measure.scans.remote import fetch_location
 from pipeline.archive.results_database import Store
 from pipeline.errors import InputError
-from pipeline.files.decision import LEARNED, Choice, Decision
-from pipeline.files.decisions_file import append_decisions, learned_from, read_decisions, standing
+from pipeline.files.decisions_file import (
+    LEARNED,
+    Choice,
+    Decision,
+    append_decisions,
+    learned_from,
+    read_decisions,
+    standing,
+)
 from pipeline.files.project_file import Project, reload_decisions
 from pipeline.measuring.learn_stage import add_learned_marks
 from pipeline.provenance import FileState, content_hash, file_state

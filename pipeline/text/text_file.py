@@ -58,14 +58,15 @@ def read_json(path: Path) -> Any:
 def parse_json(data: bytes, path: Path) -> Any:
     """Parse the content of a JSON file, as `read_json` does. path: for messages."""
     try:
-        return json.loads(data.decode("utf-8"), parse_constant=_no_number)
+        return json.loads(data.decode("utf-8"), parse_constant=refuse_constant)
     except (ValueError, RecursionError) as error:
         raise InputError(
             f"{path}: is not valid JSON ({error}). It is a file of another kind, or damaged: then run its stage again."
         ) from None
 
 
-def _no_number(text: str) -> float:
+def refuse_constant(text: str) -> float:
+    """Refuse NaN and infinities, which are no JSON. Raises ValueError."""
     raise ValueError(f"{text} is no number of JSON")
 
 

@@ -20,8 +20,7 @@ from pipeline.cli import run
 from pipeline.errors import InputError, WriteError
 from pipeline.files import decisions_file
 from pipeline.files.camera_file import CameraFile
-from pipeline.files.decision import Choice, Decision
-from pipeline.files.decisions_file import append_decisions, read_decisions, standing
+from pipeline.files.decisions_file import Choice, Decision, append_decisions, read_decisions, standing
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
 from pipeline.results.comparator_file import (
     describe_decisions,

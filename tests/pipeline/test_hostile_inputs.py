@@ -31,8 +31,7 @@ from pipeline.exchange.export_stage import run_export
 from pipeline.exchange.formats import ExportOptions
 from pipeline.exchange.import_stage import run_import
 from pipeline.exchange.incoming import ImportOptions
-from pipeline.files.decision import Choice, Decision
-from pipeline.files.decisions_file import append_decisions, read_decisions
+from pipeline.files.decisions_file import Choice, Decision, append_decisions, read_decisions
 from pipeline.files.project_file import read_project
 from pipeline.results.measured_record import FailureCode, mark_row, scan_detail
 from pipeline.review.queue import build_queue

@@ -16,7 +16,7 @@ from review_pages import comparator, decisions, steer
 from review_server import BARE, GOOD, SCRATCHED, TURNED, Served, mark_px, served, write_faults
 
 from pipeline.cli import run
-from pipeline.files.decision import Choice, Decision
+from pipeline.files.decisions_file import Choice, Decision
 from pipeline.files.project_file import read_project
 from pipeline.review.session import Filters, Session
 

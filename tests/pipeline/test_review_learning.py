@@ -17,8 +17,7 @@ from review_server import Served, served
 
 from pipeline.cli import run
 from pipeline.errors import InputError
-from pipeline.files.decision import Choice, Decision
-from pipeline.files.decisions_file import append_decisions
+from pipeline.files.decisions_file import Choice, Decision, append_decisions
 from pipeline.files.project_file import read_project
 from pipeline.review.drawing_view import DrawingAnswers
 from pipeline.review.pictures import Pictures
