@@ -14,7 +14,7 @@ from datetime import datetime
 from enum import StrEnum
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO, Literal
+from typing import Annotated, Any, BinaryIO
 
 from pydantic import AfterValidator, ConfigDict, Field, Strict, TypeAdapter, ValidationError, with_config
 
@@ -63,10 +63,13 @@ MEANING = {
 About = tuple[str, str, str]  # image, point, kind; of a pose: image, "", ""; of marks to be learned: image, "", LEARNED
 
 
-def _checked_pose(pose: str) -> str:
-    if pose and pose not in POSES:
-        raise ValueError(pose)
-    return pose
+def _one_of(*words: str) -> AfterValidator:
+    def checked(word: str) -> str:
+        if word and word not in words:
+            raise ValueError(word)
+        return word
+
+    return AfterValidator(checked)
 
 
 @lru_cache(maxsize=4096)
@@ -103,13 +106,13 @@ class Decision:
     image: Text
     decision: Choice
     point: Text = ""
-    kind: Literal["", "fiducial", "target", "tie", "learned"] = ""
+    kind: Annotated[Text, _one_of(*KINDS, LEARNED)] = ""
     col_px: Pixels | None = None
     row_px: Pixels | None = None
-    pose: Annotated[str, AfterValidator(_checked_pose)] = ""
+    pose: Annotated[Text, _one_of(*POSES)] = ""
     note: Text = ""
     who: Text = ""
-    when: Annotated[str, AfterValidator(_checked_time)] = ""
+    when: Annotated[Text, AfterValidator(_checked_time)] = ""
     fingerprint: Text = ""
     window: tuple[Pixels, Pixels, Pixels, Pixels] | None = None
     px: Mapping[str, tuple[Pixels, Pixels]] = field(default_factory=dict, hash=False)
@@ -153,8 +156,8 @@ def _checked(decision: Decision) -> Decision:
     if of_scan and decision.point:
         what = "a pose" if kind is Choice.POSE else "what is learned"
         raise WrongKey("point", f"is of no use: {what} is of the whole scan. Take it out.")
-    if of_scan and decision.kind != (LEARNED if kind is Choice.LEARN else ""):
-        decision = replace(decision, kind="learned" if kind is Choice.LEARN else "")
+    if of_scan and decision.kind != (own := LEARNED if kind is Choice.LEARN else ""):
+        decision = replace(decision, kind=own)
     if decision.px and kind is not Choice.LEARN:
         decision = replace(decision, px={})
     return replace(decision, pose="") if decision.pose and kind is not Choice.POSE else decision
