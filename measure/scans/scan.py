@@ -16,6 +16,7 @@ from measure.scans.cache import LostPart, OpenedPicture, SegmentCache, Segments
 from measure.scans.compression import earlier_step_dn
 from measure.scans.metadata import Pitch, Samples
 from measure.scans.parallel import map_in_threads
+from measure.scans.remote import ScanPart, Window
 from measure.scans.tiff_segments import RawRows
 from measure.tone.curve import LINEAR, Tone
 
@@ -169,6 +170,12 @@ class Scan:
         rows[:, :before], rows[:, before + inside.shape[1] :] = inside[:, :1], inside[:, -1:]
         samples[:above], samples[above + len(rows) :] = rows[0], rows[-1]
         return samples
+
+    @property
+    def part_px(self) -> Window:
+        """First column and row, width and height of the window that the path names, or of the whole picture."""
+        part = self.path.window if isinstance(self.path, ScanPart) else None
+        return part or (0, 0, self.width_px, self.height_px)
 
     def inside(self, col0: int, row0: int, width: int, height: int, is_read: bool = False) -> NDArray[np.bool_]:
         """(height, width) mask of the pixels of a window that lie in the scan and could be decoded. is_read: the window

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,6 +23,10 @@ from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.comparator_file import ComparatorPoint, pixel_from_comparator, read_comparator, read_pitches
 from pipeline.results.covariance_file import Covariance, read_own_covariance
 from pipeline.types import Array
+
+if TYPE_CHECKING:
+    from measure.scans.remote import Window
+    from measure.scans.scan import Scan
 
 NO_PITCH = (1000.0, 1000.0)  # µm, where pixel coordinates are not needed
 
@@ -183,13 +188,21 @@ class Block:
 
     def size_px(self, frame: OutFrame) -> tuple[int, int]:
         """Width and height of an image's scan. Raises InputError where there is no scan."""
+        with self._open_scan(frame) as scan:
+            return scan.width_px, scan.height_px
+
+    def part_px(self, frame: OutFrame) -> "Window":
+        """Window of the scan that shows an image. Raises InputError where there is no scan."""
+        with self._open_scan(frame) as scan:
+            return scan.part_px
+
+    def _open_scan(self, frame: OutFrame) -> "Scan":
         if frame.scan is None:
             raise InputError(
                 f"the scan of image {frame.image!r} is not known, and this format needs its size. Name the scans in "
                 "the project."
             )
-        with self.project.open_scan(frame.image) as scan:
-            return scan.width_px, scan.height_px
+        return self.project.open_scan(frame.image)
 
     def oriented(self) -> Iterator[OutFrame]:
         return (frame for frame in self.frames if frame.is_oriented)

@@ -134,7 +134,7 @@ def sight_misfit_mm(block: Block, frame: Frame) -> float:
 def _pinhole(block: Block, frame: WholeFrame, lens: FittedLens, options: ExportOptions) -> PinholeFrame:
     """Pinhole of one frame. Raises MeasurementError where the lens folds within the scan."""
     pitch_um = options.pitch_um or float(np.sqrt(np.prod(frame.known_pitch_um)))
-    scans = [(scan.chain(options.with_lens), *block.size_px(scan)) for scan in frame.scans]
+    scans = [(scan.chain(options.with_lens), block.part_px(scan)) for scan in frame.scans]
     canvas = outline_canvas(scans, pitch_um / 1000.0)
     misfit_mm = lens.largest_mm + sight_misfit_mm(block, frame)
     return PinholeFrame(frame, canvas, lens, misfit_mm / canvas.pitch_mm, options.with_lens)

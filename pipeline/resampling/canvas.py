@@ -13,6 +13,7 @@ from adjust.functional_model.lens import Lens
 from adjust.functional_model.scanner import NO_BEND, Bend
 from adjust.functional_model.transformation import Film, film_parameter_names
 from measure.errors import MeasurementError
+from measure.scans.remote import Window
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.comparator_file import comparator_from_pixel, pixel_from_comparator
 from pipeline.results.measured_record import MeasuredScan
@@ -125,9 +126,8 @@ class Canvas:
         return np.stack([x, y], axis=-1)
 
 
-def outline_canvas(scans: Sequence[tuple[FrameChain, int, int]], pitch_mm: float) -> Canvas:
-    """Canvas that contains the outlines of scans, each with its width and height. Pixels lie at whole multiples of the
-    pitch.
+def outline_canvas(scans: Sequence[tuple[FrameChain, Window]], pitch_mm: float) -> Canvas:
+    """Canvas that contains the outlines of windows of scans. Pixels lie at whole multiples of the pitch.
 
     The ideal image of a fisheye is unbounded: it is cut off where it would be stretched by a factor of five (63
     degrees).
@@ -140,9 +140,12 @@ def outline_canvas(scans: Sequence[tuple[FrameChain, int, int]], pitch_mm: float
     return Canvas(first[0] * pitch_mm, first[1] * pitch_mm, pitch_mm, last[0] - first[0] + 1, first[1] - last[1] + 1)
 
 
-def _outline_mm(chain: FrameChain, width_px: int, height_px: int) -> Array:
-    """(n, 2) places along a scan's edge in the camera frame, mm."""
-    across, down = np.linspace(-0.5, width_px - 0.5, _EDGE_POINTS), np.linspace(-0.5, height_px - 0.5, _EDGE_POINTS)
+def _outline_mm(chain: FrameChain, window: Window) -> Array:
+    """(n, 2) places along a window's edge in the camera frame, mm."""
+    across, down = (
+        np.linspace(first - 0.5, first + size - 0.5, _EDGE_POINTS)
+        for first, size in zip(window[:2], window[2:], strict=True)
+    )
     sides = [(across, np.full_like(across, row)) for row in (down[0], down[-1])]
     sides += [(np.full_like(down, col), down) for col in (across[0], across[-1])]
     outline, found = chain.frame_from_scan(np.concatenate([np.stack(side, axis=1) for side in sides]))

@@ -205,7 +205,7 @@ def _resampled(task: ResampleTask) -> Resampled:
     given = [(task.scan, task.chain), *((other.scan, other.chain) for other in task.others)]
     with ExitStack() as opened:
         scans = [(opened.enter_context(open_scan(path, task.max_pixels)), chain) for path, chain in given]
-        canvas = outline_canvas([(chain, scan.width_px, scan.height_px) for scan, chain in scans], task.pitch_mm)
+        canvas = outline_canvas([(chain, scan.part_px) for scan, chain in scans], task.pitch_mm)
         done = Resampled(task.image, task.target, canvas.width_px, canvas.height_px)
         fingerprint = task.fingerprint
         if before is not None and before.get("fingerprint") == fingerprint:

@@ -287,6 +287,7 @@ def test_a_principal_distance_that_nearly_parallel_images_hardly_tell_is_named()
     assert not adjust(board_network(0, EIGHT[:2])).warnings
 
 
+@pytest.mark.study
 def test_a_lens_without_radial_terms_is_advised_no_denominator() -> None:
     (found,) = adjust(board_network(0, (), images=4)).explanations[:1]
     assert found.remedy == 'Free k1, k2, k3 under [distortion.sigma] of the camera ("free").'

@@ -95,3 +95,25 @@ def test_pages_and_windows_are_images_of_their_own(roll: Path, capsys: pytest.Ca
     (roll / "images.csv").write_text("image,window\nroll,0 0 0 10\n")
     assert run(["measure", str(whole)]) == WRONG_INPUT
     assert '"col row width height" in px' in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_window_is_resampled_and_its_neighbour_is_not(roll: Path, tmp_path: Path) -> None:
+    """Both frames stood in each rectified scan; the second page shows the second frame alone."""
+    height, width = tifffile.imread(roll / "scans" / "roll.tif", key=1).shape
+    project = roll / "windows.toml"
+    text = (
+        (roll / "project.toml")
+        .read_text()
+        .replace("[measure]", 'output = "windows"\ncomparator = "windows.csv"\n[measure]')
+    )
+    project.write_text(text + '[object]\nimages = "windows_images.csv"\n')
+    (roll / "windows_images.csv").write_text(
+        f"image,page,window\nroll-a,1,0 0 {width} {height}\nroll-b,1,{width} 0 {width} {height}\nroll-c,2,\n"
+    )
+    assert run(["measure", str(project)]) in (0, LOOK)
+    assert run(["resample", str(project), str(tmp_path), "--pitch-um", "50"]) in (0, LOOK)
+    first, second, alone = (tifffile.imread(tmp_path / f"roll-{name}.tif") for name in "abc")
+    assert second.shape == alone.shape
+    middle = np.s_[10:-10, 10:-10]
+    assert np.abs(second[middle].astype(float) - alone[middle]).max() < 0.02 * np.ptp(alone)
+    assert max(np.subtract(first.shape, alone.shape)) < 8
