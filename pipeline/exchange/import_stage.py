@@ -14,9 +14,8 @@ from pipeline.errors import InputError
 from pipeline.exchange.export_stage import Exchanged, check_folder, publish, readme
 from pipeline.exchange.formats import Written, format_reader
 from pipeline.exchange.incoming import ForeignMark, ForeignPose, ImportOptions, Incoming
-from pipeline.files.camera_file import CameraFile
+from pipeline.files.camera_file import CameraFile, camera_text
 from pipeline.files.camera_tables import DEFAULT_SIGMA_MM
-from pipeline.files.camera_text import camera_text
 from pipeline.files.images_file import ELEMENTS
 from pipeline.results.comparator_file import ComparatorPoint, comparator_from_pixel, points_text
 from pipeline.text.csv_table import csv_line

@@ -17,9 +17,8 @@ from adjust.functional_model.lens import Prior
 from adjust.problem.parameter import Parameter
 from pipeline.errors import InputError
 from pipeline.exchange.block import current_adjustment
-from pipeline.files.camera_file import CameraFile, read_camera
+from pipeline.files.camera_file import CameraFile, camera_text, read_camera
 from pipeline.files.camera_tables import Source
-from pipeline.files.camera_text import camera_text
 from pipeline.files.earlier_calibration import EarlierCalibration
 from pipeline.files.mark_table import picture_writer
 from pipeline.files.project_file import Project

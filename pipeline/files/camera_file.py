@@ -2,9 +2,11 @@
 
 import dataclasses
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,14 +16,21 @@ from adjust.problem.camera import Camera, Fiducial, FiducialDistance
 from measure.marks import shapes
 from measure.marks.rendering import extent_px
 from pipeline.errors import InputError
-from pipeline.files.camera_tables import DEFAULT_SIGMA_MM, CameraTable, ClicksTable, FiducialDistanceTable, Source
+from pipeline.files.camera_tables import (
+    DEFAULT_SIGMA_MM,
+    CameraTable,
+    ClicksTable,
+    FiducialDistanceTable,
+    Source,
+    written_place_text,
+)
 from pipeline.files.earlier_calibration import EarlierCalibration, read_calibration
-from pipeline.files.mark_table import Clicks, Drawing, LearnedFrom, read_marks
+from pipeline.files.mark_table import Clicks, Drawing, LearnedFrom, SavePicture, read_marks, template_values
 from pipeline.text.names import image_name
 from pipeline.text.table_models import read_model
 from pipeline.text.tables import Table, list_words, read_toml
 from pipeline.text.text_file import SMALLEST_SIGMA
-from pipeline.text.wording import did_you_mean
+from pipeline.text.wording import did_you_mean, table_lines
 
 FIELD_RATIO = 50.0  # largest half diagonal over principal distance, or frame over fiducials' extent: 178° field of view
 LONGEST_RATIO = 500.0  # largest principal distance over half the diagonal: small plates of astrographs with c = 10 m
@@ -342,3 +351,67 @@ def _distortion(table: Table, camera: CameraTable) -> Distortion:
     parameters = {each: Prior(given.value.get(each, 0.0), given.sigma.get(each, every)) for each in named}
     r0_mm = given.r0_mm if given.r0_dm is None else 100.0 * given.r0_dm
     return Distortion(given.family, parameters, given.decentering, r0_mm, half_mm)
+
+
+def camera_text(camera: CameraFile, save: SavePicture) -> str:
+    """Text of a camera file to be written at camera.path, which `read_camera` can read.
+
+    save(name, picture) stores an image beside it and returns its relative path.
+    """
+    drawings = dict.fromkeys(one.mark for one in camera.fiducials if one.mark is not None)
+    names = {mark: f"mark-{number}" for number, mark in enumerate(drawings, 1)}
+    distortion, calibration, parameters = camera.distortion, camera.calibration, camera.distortion.parameters
+    in_dm, needs_half = distortion.family == "juhl", family(distortion.family).needs == "half_mm"
+    source = {} if camera.source is None else dataclasses.asdict(camera.source)
+    content: dict[str, Any] = {
+        "name": camera.name,
+        "frame_mm": camera.frame_mm,
+        "number": camera.number or None,
+        "writing": [written_place_text(place) for place in camera.writing] or None,
+        "principal_distance_mm": camera.principal_distance_mm,
+        "principal_point_mm": camera.principal_point_mm,
+        "sigma": {
+            "principal_distance_mm": camera.principal_distance_sigma_mm,
+            "principal_point_mm": camera.principal_point_sigma_mm,
+            "calibration": calibration and os.path.relpath(calibration.path, camera.path.parent),
+            "calibration_fiducials": calibration and calibration.tells_fiducials,
+        },
+        "source": {key: value for key, value in source.items() if value} or None,
+        "distortion": {
+            "family": distortion.family,
+            "decentering": distortion.decentering,
+            "r0_dm" if in_dm else "r0_mm": distortion.r0_mm / 100.0 if in_dm else distortion.r0_mm,
+            "half_mm": distortion.half_mm if needs_half else None,
+            "value": {name: prior.value for name, prior in parameters.items()},
+            "sigma": {name: prior.sigma for name, prior in parameters.items()},
+        },
+        "fiducial": [
+            {
+                "id": one.id,
+                "xy_mm": one.xy_mm,
+                "sigma_mm": one.sigma_mm,
+                "seen_mm": one.seen_mm,
+                "mark": names[one.mark] if one.mark is not None else NO_MARK if one.passed_over else None,
+            }
+            for one in camera.fiducials
+        ],
+        "fiducial_distance": [
+            {"from": one.start, "to": one.end, "mm": one.value_mm, "sigma_mm": one.sigma_mm} for one in camera.distances
+        ],
+        "learned_from": camera.learned_from and dataclasses.asdict(camera.learned_from),
+        "mark": {name: _mark_values(mark, name, save) for mark, name in names.items()} or None,
+    }
+    return "\n".join(table_lines({key: value for key, value in content.items() if value != []})) + "\n"
+
+
+def _mark_values(mark: shapes.Mark | shapes.LearnedMark, name: str, save: SavePicture) -> dict[str, Any]:
+    match mark:
+        case shapes.LearnedMark():
+            return {"kind": "learned", "size_mm": mark.size_mm}
+        case shapes.MarkTemplate():
+            return template_values(mark, name, save)
+        case shapes.FrameCorner():
+            sizes = {"reach_mm": mark.reach_mm, "radius_mm": mark.radius_mm}
+            return {"kind": "frame-corner", **sizes, "polarity": mark.polarity}
+    parts = [{"shape": type(part).__name__.lower(), **vars(part)} for part in mark.parts]
+    return {"kind": "parts", "polarity": mark.polarity, "true_mm": mark.true_mm, "part": parts}

@@ -29,7 +29,6 @@ from pipeline.text.table_models import (
     table_model,
 )
 from pipeline.text.tables import Table
-from pipeline.text.wording import numbers, quoted
 from pipeline.types import Array
 
 Picture = NDArray[np.uint16]
@@ -132,29 +131,30 @@ def picture_file(picture: Picture) -> bytes:
     return file.getvalue()
 
 
-def template_lines(template: MarkTemplate, name: str, save: SavePicture) -> list[str]:
-    """Lines of the table [mark.NAME]. save(name, picture) stores an image and returns its path there."""
+def template_values(template: MarkTemplate, name: str, save: SavePicture) -> dict[str, Any]:
+    """Content of the table [mark.NAME]. save(name, picture) stores an image and returns its path there."""
     least, range_dn = float(template.image.min()), float(np.ptp(template.image))
-    image = save(name, _picture((template.image - least) / (range_dn or 1.0)))
-    lines = ['kind = "template"', f"image = {quoted(image)}", f"pitch_um = {template.pitch_um!r}"]
-    lines += [f"origin_px = {numbers(template.origin_px)}", f"polarity = {quoted(template.polarity)}"]
-    lines += [f"detail_mm = {template.detail_mm!r}"]
-    if template.turn_deg:
-        lines.append(f"turn_deg = {template.turn_deg!r}")
-    return [*lines, *_learned_lines(template, range_dn, name, save)] if template.learned_mm else lines
-
-
-def _learned_lines(template: MarkTemplate, range_dn: float, name: str, save: SavePicture) -> list[str]:
-    lines = [f"[mark.{name}.learned]", f"size_mm = {template.learned_mm!r}"]
-    if template.alike:
-        lines.append(f"alike = [{', '.join(map(quoted, template.alike))}]")
-    lines += [f"range_dn = {range_dn!r}", f"noise_dn = {template.noise_dn!r}"]
-    lines.append(f"slope_noise_dn = {template.slope_noise_dn!r}")
-    for key, values in (("steadiness", template.steadiness), ("steady", template.steady)):
-        if values is not None:
-            lines.append(f"{key} = {quoted(save(f'{name}-{key}', _picture(values)))}")
-    shares = [f"{quoted(scan)} = {share!r}" for scan, share in template.shares.items()]
-    return [*lines, f"[mark.{name}.learned.shares]", *shares]
+    values: dict[str, Any] = {
+        "kind": "template",
+        "image": save(name, _picture((template.image - least) / (range_dn or 1.0))),
+        "pitch_um": template.pitch_um,
+        "origin_px": list(map(float, template.origin_px)),
+        "polarity": template.polarity,
+        "detail_mm": template.detail_mm,
+        "turn_deg": template.turn_deg or None,
+    }
+    if template.learned_mm:
+        pictures = {"steadiness": template.steadiness, "steady": template.steady}
+        values["learned"] = {
+            "size_mm": template.learned_mm,
+            "alike": template.alike or None,
+            "range_dn": range_dn,
+            "noise_dn": template.noise_dn,
+            "slope_noise_dn": template.slope_noise_dn,
+            **{key: save(f"{name}-{key}", _picture(each)) for key, each in pictures.items() if each is not None},
+            "shares": dict(template.shares),
+        }
+    return values
 
 
 def _picture(shares: NDArray[np.float64] | NDArray[np.bool_]) -> Picture:

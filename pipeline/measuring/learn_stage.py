@@ -20,8 +20,7 @@ from measure.results import MEASURE_REVISION, FrameMeasurement
 from measure.scans.opening import declared_tone
 from measure.scans.parallel import map_items
 from measure.tone.curve import Tone, ToneInformation, power, srgb
-from pipeline.files.camera_file import CameraFile, GivenFiducial, read_camera
-from pipeline.files.camera_text import camera_text
+from pipeline.files.camera_file import CameraFile, GivenFiducial, camera_text, read_camera
 from pipeline.files.mark_table import picture_writer
 from pipeline.files.project_file import Project
 from pipeline.measuring.first_pictures import first_pictures

@@ -12,8 +12,7 @@ from pydantic import Field
 
 from adjust.functional_model.lens import Prior
 from measure.marks import shapes
-from pipeline.files.camera_file import CameraFile, GivenFiducial
-from pipeline.files.camera_text import camera_text
+from pipeline.files.camera_file import CameraFile, GivenFiducial, camera_text
 from pipeline.files.mark_table import picture_writer
 from pipeline.files.project_tables import UNITS_MM
 from pipeline.rendered.design_table import DesignSettings

@@ -18,10 +18,9 @@ from measure.marks.shapes import MarkTemplate, Point
 from measure.marks.templates import cut, learn_template
 from measure.scans.scan import Scan
 from pipeline.errors import InputError
-from pipeline.files.camera_file import CameraFile, parse_camera, read_camera
+from pipeline.files.camera_file import CameraFile, camera_text, parse_camera, read_camera
 from pipeline.files.camera_tables import DEFAULT_SIGMA_MM
-from pipeline.files.camera_text import camera_text
-from pipeline.files.mark_table import SavePicture, picture_writer, template_lines
+from pipeline.files.mark_table import SavePicture, picture_writer, template_values
 from pipeline.review.requests import parse_values
 from pipeline.text.atomic import write_atomically
 from pipeline.text.tables import Table
@@ -275,10 +274,10 @@ def save_drawing(drawing: CameraDrawing, placement: FramePlacement, scan: Scan, 
         raise InputError("the frame's size is not known. Give it in mm, or click two of its opposite corners.")
     drawn_camera(drawing, placement, path).layout()
     if drawing.is_picture:
-        mark = _chip_lines(drawing, placement, scan, picture_writer(path.parent, f"{path.stem}-"))
+        mark = _chip_values(drawing, placement, scan, picture_writer(path.parent, f"{path.stem}-"))
     else:
-        mark = table_lines(drawing.mark, f"mark.{MARK}")
-    body = [*table_lines(camera_content(drawing, placement)), "", f"[mark.{MARK}]", *mark]
+        mark = dict(drawing.mark)
+    body = table_lines({**camera_content(drawing, placement), "mark": {MARK: mark}})
     write_atomically(path, "\n".join([*_remarks(drawing, placement), "", *body]) + "\n")
     return read_camera(path)
 
@@ -295,14 +294,14 @@ def learned_remarks(image: str) -> list[str]:
     return [f"{_DRAWN_BY}: its marks were learned from their places in {_join_lines(image)}."]
 
 
-def _chip_lines(drawing: CameraDrawing, placement: FramePlacement, scan: Scan, save: SavePicture) -> list[str]:
-    """Lines of the table of a mark that is an image patch, cut around the mark shown or the first one."""
+def _chip_values(drawing: CameraDrawing, placement: FramePlacement, scan: Scan, save: SavePicture) -> dict[str, Any]:
+    """Content of the table of a mark that is an image patch, cut around the mark shown or the first one."""
     size_mm = float(drawing.mark["size_mm"])
     one = next((mark for mark in drawing.marks if mark.id == drawing.point), drawing.marks[0])
     place = np.column_stack([placement.pixel_from_camera[:, :2], one.px])
     learned = learn_template([cut(scan, place, size_mm)], size_mm)
     chip = MarkTemplate(learned.image, learned.pitch_um, learned.origin_px, 0.0, "light", learned.detail_mm)
-    return template_lines(chip, MARK, save)
+    return template_values(chip, MARK, save)
 
 
 def _remarks(drawing: CameraDrawing, placement: FramePlacement) -> list[str]:

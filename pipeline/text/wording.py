@@ -71,15 +71,22 @@ def quoted(text: str) -> str:
     return f'"{escaped}"'
 
 
-def table_lines(values: Mapping[str, Any], name: str = "") -> list[str]:
-    """Lines of a TOML table below its header; sub-tables come last. name: of the table."""
+def table_lines(values: Mapping[str, Any], name: str = "", is_inner: bool = False) -> list[str]:
+    """Lines of a TOML table below its header; values of None are left out, sub-tables come last.
+
+    name: of the table; is_inner: it has a header of its own, and its sub-tables follow without a blank line.
+    """
+    values = {key: value for key, value in values.items() if value is not None}
     inside = {key: value for key, value in values.items() if isinstance(value, Mapping) or _is_tables(value)}
     lines = [f"{_key(key)} = {_value(value)}" for key, value in values.items() if key not in inside]
     for key, value in inside.items():
         path = f"{name}.{_key(key)}" if name else _key(key)
         for one in [value] if isinstance(value, Mapping) else value:
             head = f"[{path}]" if isinstance(value, Mapping) else f"[[{path}]]"
-            lines += ["", head, *table_lines(one, path)]
+            has_keys = not one or any(not isinstance(each, Mapping) for each in one.values())
+            if has_keys:
+                lines += [head] if is_inner else ["", head]
+            lines += table_lines(one, path, has_keys)
     return lines
 
 
@@ -92,19 +99,9 @@ def _key(key: str) -> str:
 
 
 def _value(value: Any) -> str:
-    """Value as TOML: strings, integers, lists and booleans as in JSON; floats keep their decimal point."""
+    """Value as TOML: strings, integers, lists and booleans as in JSON; floats keep their decimal point; inf: "free"."""
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_value, value))}]"
-    return repr(value) if isinstance(value, float) else json.dumps(value, ensure_ascii=False)
-
-
-def numbers(values: Iterable[float]) -> str:
-    return f"[{', '.join(repr(float(value)) for value in values)}]"
-
-
-def sigma(value: float) -> str:
-    return '"free"' if math.isinf(value) else repr(float(value))
-
-
-def sigmas(values: tuple[float, float]) -> str:
-    return f"[{sigma(values[0])}, {sigma(values[1])}]"
+    if isinstance(value, float):
+        return '"free"' if math.isinf(value) else repr(float(value))
+    return json.dumps(value, ensure_ascii=False)

@@ -18,8 +18,7 @@ from measure.results import Covariance, FrameMeasurement, MarkMeasurement
 from pipeline.archive.measure_archive import check_measurable
 from pipeline.archive.measurement import read_measurement
 from pipeline.errors import InputError
-from pipeline.files.camera_file import read_camera
-from pipeline.files.camera_text import camera_text
+from pipeline.files.camera_file import camera_text, read_camera
 from pipeline.files.images_file import read_images
 from pipeline.files.mark_table import picture_writer
 from pipeline.files.points_file import read_points

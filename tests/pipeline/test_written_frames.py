@@ -20,8 +20,7 @@ from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from pipeline.archive.measurement import read_measurement
 from pipeline.cli import run
 from pipeline.errors import InputError
-from pipeline.files.camera_file import parse_camera, read_camera
-from pipeline.files.camera_text import camera_text
+from pipeline.files.camera_file import camera_text, parse_camera, read_camera
 from pipeline.files.images_file import WRITTEN, fill_images, read_images
 from pipeline.measuring.camera_identification import Identification, Trial, add_plates, contradictions, parse_plate
 from pipeline.measuring.roll import add_known_lines, known_lines, note_same_frames, poses_of_roll
