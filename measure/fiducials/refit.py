@@ -2,13 +2,12 @@
 unlike the others."""
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from measure.array_types import Array
-from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import CLEAR_LIKENESS, WRONG_PX, Frame, orient_frame
 from measure.fiducials.mark_comparison import (
     SharedBlur,
@@ -24,25 +23,18 @@ from measure.fiducials.mark_fit import detect_mark, is_held_by_frame, strain_err
 from measure.fiducials.options import film_terms, interleaved
 from measure.flags import LARGE_ERROR, Cause
 from measure.geometry import linear_scale
-from measure.marks.rendering import extent_px, reach_px
-from measure.marks.shapes import Disk, FiducialLayout, FrameCorner, LayoutMark, Mark, MarkShape, Ring
+from measure.marks.rendering import reach_px
+from measure.marks.shapes import Disk, Mark, MarkShape, Ring
 from measure.matching.arms import is_cross, measure_arms
-from measure.matching.frame_edge import Course, edge_along, pool_edge_tones
 from measure.matching.match import mark_window
 from measure.matching.models import PIXEL_VARIANCE_PX2, MatchOptions, is_round
 from measure.matching.window import read_window
 from measure.noise.noise_model import may_be_noise
 from measure.results import MarkFit
-from measure.scans.scan import Scan
-from measure.tone.curve import Tone, ToneInformation
+from measure.tone.curve import Tone
 from measure.tone.estimate import FrameTone, MarkTone
 from measure.tone.sharpening import estimate_sharpening
 
-_NEAR_MM = 3.0  # largest distance of a mark from the frame edge, which then lies in the part of the scan being read
-_BESIDE_MM, _LONGEST_MM = 0.5, 6.0  # gap between a mark and a section of the edge; farthest end of it from the mark
-_PIECES = 8  # about this many sections of the edge are measured
-_SEARCH_MM = 0.3  # search range around the edge that the frame's size predicts
-_SHARE_PX, _FEWEST = 8.0, 5  # length of edge per profile; fewest profiles of a section
 _STRAINED = 1 / 3  # fraction of a mark's standard deviation: a larger strain error raises it by more than a twentieth
 _TONE_ROUNDS = 5  # largest number of refits with an improved tone curve
 _OTHER_STARTS, _AGREED = (2.2, 1.0), 0.1  # gammas of further initial curves; disagreement up to which none is tried
@@ -111,17 +103,16 @@ def _refit_from_curve(frame: Frame, prior: Tone, start: Tone) -> Frame:
         pending = {index for index, fit in clear_fits(frame).items() if _needs_frame(frame, index, fit)}
     else:
         frame, pending = replace(frame, scan=frame.scan.replace_tone(start)), set(_mark_tones(frame))
-    edges = _edges(frame)
     for _ in range(_TONE_ROUNDS):
-        estimate = FrameTone.from_marks(prior, _mark_tones(frame), frame.scan.tone, edges)
+        estimate = FrameTone.from_marks(prior, _mark_tones(frame), frame.scan.tone)
         moved = _moved_by_tone(frame, estimate)
         if moved:
             frame = replace(frame, scan=frame.scan.replace_tone(estimate.next_curve(frame.scan.tone)))
         if not pending | moved:
             break
         frame = _refit(frame, dict.fromkeys(pending | moved, frame.options.match))
-        edges, pending = _edges(frame), set()
-    return replace(frame, tone=FrameTone.from_marks(prior, _mark_tones(frame), frame.scan.tone, edges))
+        pending = set()
+    return replace(frame, tone=FrameTone.from_marks(prior, _mark_tones(frame), frame.scan.tone))
 
 
 def _needs_frame(frame: Frame, index: int, fit: MarkFit) -> bool:
@@ -140,14 +131,6 @@ def _moved_by_tone(frame: Frame, estimate: FrameTone) -> set[int]:
     fits, tones = clear_fits(frame), _mark_tones(frame)
     moves = (estimate.shift_px(tone, frame.scan.tone) > _MOVED * fits[index].sigma_px for index, tone in tones.items())
     return set(tones) if any(moves) else set()
-
-
-def _edges(frame: Frame) -> Sequence[ToneInformation]:
-    """Information on the tone curve from the edges of the frame next to the marks; none where no mark depends on the
-    curve. Lossy scans are excluded: their quantisation is alike all along an edge, and resembles a tone curve."""
-    if frame.scan.is_lossy or not _depends_on_tone(frame):
-        return []
-    return edge_tone_information(frame.scan, frame.layout, frame.fitted_placement, frame.weights)
 
 
 def _depends_on_tone(frame: Frame) -> bool:
@@ -344,68 +327,3 @@ def _fit_again(frame: Frame, index: int, options: MatchOptions) -> MarkFit | Non
         return None
     expected = frame.prediction(index, _REFIT_PX).moved(before.center_px)
     return detect_mark(frame.scan, expected, options, _linear_sigma(frame)).fit
-
-
-# The edges of wedges, wings and notches are short, and determine the tone curve poorly. The edge of the exposed frame
-# next to them is long, and separates the same dark and light grey values.
-
-
-def edge_tone_information(
-    scan: Scan, layout: FiducialLayout, placement: Placement, weights: Sequence[float] | None
-) -> list[ToneInformation]:
-    """Pool the information on the tone curve of all straight sections of the frame's edge: a list of at most one."""
-    px_per_mm = linear_scale(placement.pixel_from_camera)
-    tones = []
-    pieces = list(_pieces(layout))
-    for start_mm, along_mm, inwards_mm, length_mm in pieces[:: max(len(pieces) // _PIECES, 1)]:
-        count = int(length_mm * px_per_mm / _SHARE_PX)
-        if count < _FEWEST:
-            continue
-        linear = placement.linear(start_mm)
-        along, across = linear @ along_mm, linear @ inwards_mm
-        across = across - along * (across @ along) / (along @ along)
-        course = Course(
-            scan,
-            placement.places_px(start_mm[None])[0],
-            along / np.hypot(*along),
-            across / np.hypot(*across),
-            weights,
-        )
-        edge = edge_along(course, (0.0, length_mm * px_per_mm), _SEARCH_MM * px_per_mm, 0, count)
-        if edge is not None and edge.tone is not None:
-            tones.append(edge.tone)
-    return [pool_edge_tones(tones, scan.tone)] if tones else []
-
-
-def _pieces(layout: FiducialLayout) -> Iterator[tuple[Array, Array, Array, float]]:
-    """Sections of the frame's edge on both sides of each mark near it: start (mm), unit vectors along the edge and
-    towards the inside of the frame, length (mm)."""
-    half = np.array(layout.frame_mm) / 2
-    for mark in layout.marks:
-        at = np.array(mark.xy_mm)
-        side = int(np.argmin(half - np.abs(at)))
-        if half[side] - abs(at[side]) > _NEAR_MM or isinstance(mark.mark, FrameCorner):
-            continue
-        inwards, run = np.zeros(2), np.zeros(2)
-        inwards[side], run[1 - side] = -np.sign(at[side]), 1.0
-        on_edge = np.where(np.arange(2) == side, np.sign(at) * half, at)
-        reach = _reach_mm(mark, 1 - side) + _BESIDE_MM
-        for way in (1.0, -1.0):
-            room = half[1 - side] - way * at[1 - side]  # distance to the corner
-            neighbours = [
-                way * (np.array(other.xy_mm) - at)[1 - side] for other in _same_side_marks(layout, mark, side)
-            ]
-            room = min([room, *(gap - reach for gap in neighbours if gap > 0)]) - _BESIDE_MM
-            yield on_edge + way * reach * run, way * run, inwards, min(room, _LONGEST_MM) - reach
-
-
-def _same_side_marks(layout: FiducialLayout, mark: LayoutMark, side: int) -> list[LayoutMark]:
-    """Other marks near the same edge."""
-    half, sign = layout.frame_mm[side] / 2, np.sign(mark.xy_mm[side])
-    return [one for one in layout.marks if one is not mark and half - sign * one.xy_mm[side] < 2 * _NEAR_MM]
-
-
-def _reach_mm(mark: LayoutMark, axis: int) -> float:
-    """Largest extent of a mark from its place along an axis."""
-    least, greatest = extent_px(mark.mark, np.eye(2, 3))
-    return float(max(-least[axis], greatest[axis]))

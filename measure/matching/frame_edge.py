@@ -9,7 +9,7 @@ A wrong tone curve leaves the same residuals in all profiles; their scatter give
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -24,10 +24,10 @@ from measure.matching.window import FAINT
 from measure.noise.robust_estimation import gauss_newton_step, tukey_fit
 from measure.results import Covariance, MarkFit
 from measure.scans.scan import Scan
-from measure.tone.curve import Tone, ToneInformation
-from measure.tone.estimate import MarkTone, ToneScore, tone_score
+from measure.tone.curve import ToneInformation
+from measure.tone.estimate import MarkTone, tone_score
 
-PROFILES = 60  # profiles along an edge, each the median over its section
+_PROFILES = 60  # profiles along an edge, each the median over its section
 _LEAST_SHARE = 0.5  # fraction of the profiles that must lie on the line; with fewer it may be a different line
 _LEAST_SNR = 3.0  # of the step in one profile; less may be texture
 _ABOUT_PX = 5.0  # px on either side of the line, enough for an edge under any usual blur
@@ -47,21 +47,7 @@ _ROUNDED = 0.1  # fraction of the reach excluded at every corner, since few corn
 
 
 @dataclass(frozen=True, eq=False)
-class EdgeTone:
-    """Information of an edge on the tone curve.
-
-    score: one per profile; floor: (k, k) lower bound of a profile's covariance; on_line: (2, k) derivatives of offset
-    and slope with respect to the departures; codes: smallest and largest code of the step, fractions of full scale.
-    """
-
-    score: ToneScore
-    floor: Array
-    on_line: Array
-    codes: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Edge:
+class _Edge:
     """Straight edge: across = offset + slope * along, in px from the start.
 
     Attributes
@@ -70,7 +56,7 @@ class Edge:
     covariance : (2, 2) of the line.
     share, count : fraction and number of the profiles on the line.
     contrast_dn, noise_dn, blur_px, likeness : medians over these profiles.
-    tone : information on the tone curve; None where the curve is known.
+    tone : information on the tone curve, with derivatives of the line in place of a point; None where it is known.
     """
 
     line: Array
@@ -81,11 +67,11 @@ class Edge:
     noise_dn: float
     blur_px: float
     likeness: float
-    tone: EdgeTone | None
+    tone: MarkTone | None
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class _Course:
     """Expected course of an edge: start (2,) px in the scan, unit vectors along (2,) the edge and across (2,) towards
     the inside of the frame; weights: of the channels."""
 
@@ -113,61 +99,23 @@ class Course:
         return np.asarray(np.median(grey, axis=1), dtype=float), np.asarray(inside.all(axis=(1, 2, 3)))
 
 
-def edge_along(
-    course: Course, extent: tuple[float, float], search_px: float, polarity: int, count: int = PROFILES
-) -> Edge | None:
-    """Measure the edge of the frame along a course.
-
-    Parameters
-    ----------
-    course : Course
-        Expected course.
-    extent : (float, float)
-        First and last distance from the start along the course, px.
-    search_px : float
-        Largest distance of the edge from the course.
-    polarity : int
-        1 if the inside of the frame is lighter than the outside, -1 if darker, 0 if unknown.
-    count : int
-        Number of profiles.
-
-    Returns
-    -------
-    Edge, or None if no straight edge is found.
-    """
-    share = (extent[1] - extent[0]) / count
-    middle: Array = np.asarray(extent[0] + share * (np.arange(count) + 0.5), dtype=float)
+def _edge_along(course: _Course, extent: tuple[float, float], search_px: float, polarity: int) -> _Edge | None:
+    """Measure the edge of the frame within search_px of a course, between two distances from its start; None if there
+    is no straight one."""
+    share = (extent[1] - extent[0]) / _PROFILES
+    middle: Array = np.asarray(extent[0] + share * (np.arange(_PROFILES) + 0.5), dtype=float)
     half = round(search_px + _ABOUT_PX)
-    near, inside = course.profiles(middle, np.zeros(count), share, half)
+    near, inside = course.profiles(middle, np.zeros(_PROFILES), share, half)
     near, middle = near[inside], middle[inside]
-    if len(middle) < _LEAST_SHARE * count:
+    if len(middle) < _LEAST_SHARE * _PROFILES:
         return None
-    polarity = polarity or int(np.sign(np.median(near[:, -1] - near[:, 0])))
     offset, slope = _straightest(near * polarity, middle, half)
     steps = _fit_steps(course.profiles(middle, offset + slope * middle, share, _ABOUT_PX)[0])
     good = steps.good & (steps.contrast * polarity > FAINT * course.scan.full_scale_dn)
     good &= np.abs(steps.contrast) > _LEAST_SNR * steps.noise
-    if good.sum() < _LEAST_SHARE * count:
+    if good.sum() < _LEAST_SHARE * _PROFILES:
         return None
     return _fit_line(course.scan, middle, offset + slope * middle + steps.place, steps, good)
-
-
-def pool_edge_tones(edges: Sequence[EdgeTone], tone: Tone) -> ToneInformation:
-    """Pool the information of several edges on the tone curve.
-
-    The covariance comes from the scatter of the profiles, enlarged by the scatter from edge to edge: errors common to
-    an edge (background, JPEG) are counted once.
-    """
-    values = np.concatenate([edge.score.value for edge in edges])
-    normals = np.concatenate([edge.score.normal for edge in edges])
-    least = np.average([edge.floor for edge in edges], axis=0, weights=[len(edge.score.value) for edge in edges])
-    by_profile = np.cov(values.T) + least + _LEAST * np.trace(least) * np.eye(len(least))
-    off = np.array(
-        [(edge.score.value - values.mean(axis=0)).sum(axis=0) / np.sqrt(len(edge.score.value)) for edge in edges]
-    )
-    square = float(np.sum(off * np.linalg.solve(by_profile, off.T).T))
-    more = max(square / (len(least) * max(len(edges) - 1, 1)), 1.0)
-    return ToneScore(off, values, normals, off).information(more * len(values) * by_profile, tone)
 
 
 def _straightest(grey: Array, along: Array, half: float) -> tuple[float, float]:
@@ -226,11 +174,11 @@ def _fit_steps(grey: Array) -> _Steps:
 
 
 def _samples(profiles: Array) -> Array:
-    """(samples,) positions in px across the edge of profiles (n, samples)."""
+    """(samples,) positions (px) across the edge."""
     return np.asarray((np.arange(profiles.shape[1]) - (profiles.shape[1] - 1) / 2) * _STEP_PX)
 
 
-def _fit_line(scan: Scan, along: Array, across: Array, steps: _Steps, good: Mask) -> Edge | None:
+def _fit_line(scan: Scan, along: Array, across: Array, steps: _Steps, good: Mask) -> _Edge | None:
     """Fit a robust line (Tukey) through the good profiles. Its covariance comes from the scatter around it and the
     correlation of that along the edge."""
     design = np.stack([np.ones_like(along), along])[:, good]
@@ -244,7 +192,7 @@ def _fit_line(scan: Scan, along: Array, across: Array, steps: _Steps, good: Mask
     contrast, noise, blur, likeness = (
         float(np.median(each[kept])) for each in (steps.contrast, steps.noise, steps.blur, steps.likeness)
     )
-    return Edge(
+    return _Edge(
         line.factors,
         np.asarray(inverse * variance * _alike(residuals, on), dtype=float),
         share,
@@ -267,13 +215,10 @@ def _alike(residuals: Array, on: Mask) -> float:
     return (1 + alike) / (1 - alike)
 
 
-def _edge_tone(scan: Scan, steps: _Steps, kept: NDArray[np.intp], by_place: Array) -> EdgeTone:
-    """Score the tone curve with the profiles kept (n,). by_place (2, n): derivatives of the line's offset and slope
-    with respect to their places.
-
-    Uneven light on either side and the symmetric part of the blur's shape are eliminated as further unknowns: pixels
-    and their interpolation make the blur non-Gaussian.
-    """
+def _edge_tone(scan: Scan, steps: _Steps, kept: NDArray[np.intp], by_place: Array) -> MarkTone:
+    """Information of the profiles kept (n,) on the tone curve. by_place (2, n): derivatives of the line by places."""
+    # Uneven light on either side and the symmetric part of the blur's shape are eliminated as further unknowns: pixels
+    # and their interpolation make the blur non-Gaussian.
     drawn, design = steps.drawn[kept], steps.design[kept]
     z = (_samples(drawn) - steps.place[kept, None]) / steps.blur[kept, None]
     changes = np.moveaxis(scan.tone.derivatives(drawn, scan.full_scale_dn), 0, 1)
@@ -288,9 +233,12 @@ def _edge_tone(scan: Scan, steps: _Steps, kept: NDArray[np.intp], by_place: Arra
     ]
     score = tone_score(np.concatenate([design, np.stack(uneven, axis=1)], axis=1), changes, steps.residuals[kept])
     own = score.left * (_DRAWN * steps.contrast[kept, None, None])
+    least = np.mean(own @ own.swapaxes(1, 2), axis=0)
+    by_profile = np.cov(score.value.T) + least + _LEAST * np.trace(least) * np.eye(len(least))
     moved = tone_score(design, changes, steps.residuals[kept]).by_unknown[:, 0]
     codes = scan.tone.code(np.quantile(drawn, (0.0, 1.0)), scan.full_scale_dn) / scan.full_scale_dn
-    return EdgeTone(score, np.mean(own @ own.swapaxes(1, 2), axis=0), by_place @ moved, codes)
+    information = score.information(len(kept) * by_profile, scan.tone)
+    return MarkTone(information, by_place @ moved, float(codes[0]), float(codes[1]))
 
 
 def fit_frame_corner(
@@ -303,16 +251,8 @@ def fit_frame_corner(
 ) -> MarkFit:
     """Fit a corner of the exposed frame as the intersection of its two straight edges, excluding the rounded part.
 
-    Parameters
-    ----------
-    pixel_from_mark : (2, 3)
-        Predicted place of the corner.
-    search_px : float
-        Largest distance from there.
-    polarity : int
-        1 if the frame is lighter than its border, -1 if darker.
-    weights : optional
-        Weights of the scan's channels.
+    pixel_from_mark: predicted place, at most search_px off; polarity: 1 if the frame is lighter than its border, -1 if
+    darker; weights: of the scan's channels.
 
     Returns
     -------
@@ -326,17 +266,17 @@ def fit_frame_corner(
     for side in (0, 1):
         reach = mark.reach_mm * per_mm[side]
         first = max(mark.radius_mm * per_mm[side], _ROUNDED * reach)
-        course = Course(scan, pixel_from_mark[:, 2], unit[:, side], unit[:, 1 - side], weights)
-        edge = edge_along(course, (first, reach), search_px, polarity)
+        course = _Course(scan, pixel_from_mark[:, 2], unit[:, side], unit[:, 1 - side], weights)
+        edge = _edge_along(course, (first, reach), search_px, polarity)
         if edge is None:
             unseen = Reason("an edge of the frame is not visible there as one line", Code.NOT_FOUND)
             nothing = Covariance.from_noise(np.full((2, 2), np.inf))
             return MarkFit(False, unseen, pixel_from_mark[:, 2], nothing, pixel_from_mark)
         edges.append(edge)
-    return _intersect_edges(edges, unit, pixel_from_mark, scan.tone)
+    return _intersect_edges(edges, unit, pixel_from_mark)
 
 
-def _intersect_edges(edges: Sequence[Edge], unit: Array, pixel_from_mark: Array, tone: Tone) -> MarkFit:
+def _intersect_edges(edges: Sequence[_Edge], unit: Array, pixel_from_mark: Array) -> MarkFit:
     """Intersect the first edge, y = a + b x, with the second, x = c + d y."""
     (a, b), (c, d) = (edge.line for edge in edges)
     scale = 1 / (1 - b * d)
@@ -362,13 +302,21 @@ def _intersect_edges(edges: Sequence[Edge], unit: Array, pixel_from_mark: Array,
         redundancy=sum(edge.count for edge in edges) - 4,
         likeness=min(edge.likeness for edge in edges),
         significance=abs(contrast) / max(noise, 1e-12) * float(np.sqrt(least)),
-        tone=None if len(tones) < len(edges) else _corner_tone(tones, by_lines, tone),
+        tone=None if len(tones) < len(edges) else _corner_tone(tones, by_lines),
     )
 
 
-def _corner_tone(tones: Sequence[EdgeTone], by_lines: Sequence[Array], tone: Tone) -> MarkTone:
-    """Combine the edges' information for a corner. by_lines: for each edge (2, 2) derivatives of the corner's column
-    and row with respect to its offset and slope."""
-    on_place = sum(by @ each.on_line for by, each in zip(by_lines, tones, strict=True))
-    least, greatest = min(each.codes[0] for each in tones), max(each.codes[1] for each in tones)
-    return MarkTone(pool_edge_tones(tones, tone), np.asarray(on_place), float(least), float(greatest))
+def _corner_tone(tones: Sequence[MarkTone], by_lines: Sequence[Array]) -> MarkTone:
+    """Combine the edges' information for a corner. by_lines: (2, 2) derivatives of the corner by each edge's line."""
+    both = ToneInformation.pooled([each.information for each in tones])
+    # Errors common to an edge (background, JPEG) make the two disagree: a variance factor allows for them.
+    misfit = both.sum_of_squares - both.right_side @ np.linalg.pinv(both.matrix, hermitian=True) @ both.right_side
+    more = max(float(misfit) / (both.count - len(both.right_side)), 1.0)
+    information = replace(
+        both,
+        matrix=both.matrix / more,
+        right_side=both.right_side / more,
+        sum_of_squares=both.sum_of_squares / more,
+    )
+    on_place = np.asarray(sum(by @ each.on_place for by, each in zip(by_lines, tones, strict=True)))
+    return MarkTone(information, on_place, min(each.least for each in tones), max(each.greatest for each in tones))

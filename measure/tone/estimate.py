@@ -1,6 +1,6 @@
 """Score of a tone curve by the residuals of a fit, its estimate from a scan's marks, and its effect on their places."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -52,21 +52,11 @@ class FrameTone:
     apart: float = 0.0
 
     @classmethod
-    def from_marks(
-        cls, prior: Tone, marks: Mapping[int, MarkTone], matched_by: Tone, edges: Sequence[ToneInformation] = ()
-    ) -> "FrameTone":
-        """Estimate the curve.
-
-        Parameters
-        ----------
-        prior : prior of the curve.
-        marks : contribution of each mark.
-        matched_by : curve used for matching them.
-        edges : information of edges other than marks.
-        """
+    def from_marks(cls, prior: Tone, marks: Mapping[int, MarkTone], matched_by: Tone) -> "FrameTone":
+        """Estimate the curve from marks that were matched with the curve matched_by."""
         if not marks:
             return cls(prior)
-        each = [*(mark.information for mark in marks.values()), *edges]
+        each = [mark.information for mark in marks.values()]
         estimate = prior.estimate(each)
         least, greatest = min(mark.least for mark in marks.values()), max(mark.greatest for mark in marks.values())
         step = estimate.tone.mean - matched_by.mean

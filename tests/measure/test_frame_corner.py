@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 
-from measure.fiducials.constellation import Placement
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
-from measure.fiducials.refit import edge_tone_information
 from measure.flags import Status
-from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, frame_corner, polygon
+from measure.marks.shapes import FiducialLayout, LayoutMark, frame_corner
 from measure.matching.frame_edge import fit_frame_corner
 from measure.results import MarkFit
 from measure.tone.curve import Tone, power
@@ -111,24 +109,3 @@ def test_a_corner_moves_with_the_tone_curve_as_its_edges_say(gamma: float) -> No
     assert np.hypot(*estimate.on_place[:, 0]) > 0.15
     assert estimate.information.sum_of_squares < 25  # of 5 figures, by the true curve
     assert fit_mark(Tone(power(gamma))).tone is None
-
-
-@pytest.mark.parametrize("gamma", [1.0, 2.2])
-def test_the_frames_edges_next_to_its_marks_tell_the_curve(gamma: float) -> None:
-    wedge = MarkShape(polygon(((0.0, 0.0), (1.4, 0.7), (1.4, -0.7))))
-    places = ((9.2, 0.0), (-9.2, 0.0), (0.0, 9.2), (0.0, -9.2))
-    marks = FiducialLayout(
-        tuple(LayoutMark(str(n), at, (0.0, 0.0), wedge) for n, at in enumerate(places)), (20.0, 20.0)
-    )
-    scan = scan_of(65535 * (picture(5) / 65535) ** (1 / gamma))
-    by_truth = Tone(power(gamma), covariance=np.eye(5))
-    placement = Placement("0", MATRIX, 1.0, 4, 1, 1, (0.05, 0.05))
-    (information,) = edge_tone_information(scan.replace_tone(by_truth), marks, placement, None)
-    assert information.sum_of_squares < 25  # of 5 figures
-    other = by_truth.shift_to_power(gamma + 0.5)
-    (information,) = edge_tone_information(scan.replace_tone(other), marks, placement, None)
-    prior = Tone(power(gamma + 0.5), covariance=4 * np.eye(5))
-    found = prior.estimate([information]).tone
-    value, sigma = found.equivalent_power(0.2, 0.5)
-    assert abs(value - gamma) < 3 * sigma
-    assert sigma < 0.7 * prior.equivalent_power(0.2, 0.5)[1]
