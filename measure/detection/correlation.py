@@ -97,12 +97,10 @@ def correlation(image: Map, chip: Map, about: Map, varied: Map | None = None) ->
 
     Parameters
     ----------
-    image : (rows, columns)
-        Flattened image.
-    chip, about : (rows, columns)
-        Pattern and mask of `Surroundings.pattern`. The mask excludes the frame's edge or writing around the drawing.
-    varied : optional
-        Variation of the image under the mask, shared by patterns with the same mask.
+    image : (rows, columns) flattened image.
+    chip, about : (rows, columns) pattern and mask of `Surroundings.pattern`. The mask excludes the frame's edge or
+        writing around the drawing.
+    varied : variation of the image under the mask, shared by patterns with the same mask.
     """
     varied = variation(image, about) if varied is None else varied
     products = cv2.matchTemplate(image, chip, cv2.TM_CCORR)

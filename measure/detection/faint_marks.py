@@ -64,11 +64,9 @@ def detect_faint(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_p
 
     Parameters
     ----------
-    extreme_dn : float
-        Lightest or darkest grey value of the scan, which a mark of that polarity cannot exceed. On a background of that
-        value it is invisible.
-    blur_px : float
-        Blur of the scan.
+    extreme_dn : lightest or darkest grey value of the scan, which a mark of that polarity cannot exceed. On a
+        background of that value it is invisible.
+    blur_px : blur of the scan.
 
     Returns
     -------

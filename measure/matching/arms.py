@@ -29,11 +29,9 @@ def measure_arms(window: ScanWindow, mark: MarkShape, pixel_from_mark: Array, fi
 
     Parameters
     ----------
-    window : ScanWindow
-        Window with the cross.
-    pixel_from_mark : (2, 3)
-        In pixels of the scan. The place is the matched one. The linear part is that of the frame, since the mark's own
-        depends on the ends of its arms.
+    window : window with the cross.
+    pixel_from_mark : (2, 3) in pixels of the scan. The place is the matched one. The linear part is that of the frame,
+        since the mark's own depends on the ends of its arms.
 
     Returns
     -------

@@ -137,15 +137,12 @@ def second_order(design: Array, slopes: Array, used: Mask, covariance: Array, pr
 
     Parameters
     ----------
-    design : (unknowns, height, width)
-        Derivatives of the model; the first two by column and row, the last four by the greys.
-    slopes : (height, width)
-        Slopes of clipped grey values, 1 elsewhere.
-    used : (height, width)
-        Mask of the pixels used.
+    design : (unknowns, height, width) derivatives of the model; the first two by column and row, the last four by the
+        greys.
+    slopes : (height, width) slopes of clipped grey values, 1 elsewhere.
+    used : (height, width) mask of the pixels used.
     covariance : (unknowns, unknowns)
-    priors_dn2 : (unknowns,)
-        Weights of the priors relative to that of a pixel.
+    priors_dn2 : (unknowns,) weights of the priors relative to that of a pixel.
 
     Notes
     -----
@@ -222,12 +219,10 @@ def covariance_of_changed_tone(half_tones: Array, by_grey: Array, contrast_chang
 
     Parameters
     ----------
-    half_tones : (height, width)
-        Grey values: the contrast at half height between dark and light, 0 at both extremes.
-    by_grey : (unknowns, height, width)
-        Derivatives of the unknowns with respect to the grey values, column and row first.
-    contrast_change : float
-        Contrast over that of the images from which the chip was learned.
+    half_tones : (height, width) grey values: the contrast at half height between dark and light, 0 at both extremes.
+    by_grey : (unknowns, height, width) derivatives of the unknowns with respect to the grey values, column and row
+        first.
+    contrast_change : contrast over that of the images from which the chip was learned.
     """
     bent = _HALF_TONES * min(abs(float(np.log(contrast_change))), _MOST)
     moved = bent * products(by_grey[:2], half_tones[None])
@@ -273,14 +268,10 @@ def _second_place(fit: LinearFit, by_unknown: Array, normal: Array, weights: Arr
 
     Parameters
     ----------
-    by_unknown : (2, 2)
-        Derivatives of the place with respect to two unknowns.
-    normal : (2, 2)
-        Derivatives of the sums with respect to these unknowns.
-    weights : (2, height, width)
-        Weights of the residuals in the sums.
-    left : (2, height, width)
-        Derivatives of the sums with respect to the grey values.
+    by_unknown : (2, 2) derivatives of the place with respect to two unknowns.
+    normal : (2, 2) derivatives of the sums with respect to these unknowns.
+    weights : (2, height, width) weights of the residuals in the sums.
+    left : (2, height, width) derivatives of the sums with respect to the grey values.
 
     Returns
     -------
@@ -335,12 +326,9 @@ def own_shape(fit: LinearFit, shape: slice, strain: slice, departures: Array) ->
 
     Parameters
     ----------
-    shape : slice
-        Indices of scale and rotation among the unknowns.
-    strain : slice
-        Indices of stretch and shear, whose prior is kept.
-    departures : (unknowns,)
-        Deviations of the match from the frame's values.
+    shape : indices of scale and rotation among the unknowns.
+    strain : indices of stretch and shear, whose prior is kept.
+    departures : (unknowns,) deviations of the match from the frame's values.
 
     Returns
     -------

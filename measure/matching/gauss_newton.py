@@ -73,14 +73,10 @@ def gauss_newton(model: Model, tolerance_px: float, iterations: int, halvings: i
 
     Parameters
     ----------
-    model : Model
-        Left at its last state.
-    tolerance_px : float
-        A shorter step ends the iteration.
-    iterations : int
-        Maximum number of steps.
-    halvings : int
-        Maximum number of halvings of a step of a `ReversibleModel` that does not reduce the cost.
+    model : left at its last state.
+    tolerance_px : a shorter step ends the iteration.
+    iterations : maximum number of steps.
+    halvings : maximum number of halvings of a step of a `ReversibleModel` that does not reduce the cost.
 
     Returns
     -------

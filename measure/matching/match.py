@@ -49,14 +49,11 @@ def match(window: ScanWindow, mark: Mark, pixel_from_mark: Array, options: Match
 
     Parameters
     ----------
-    window : ScanWindow
-        If it was compressed with loss, the grain model is not estimated from blank film and damage is detected by
+    window : if it was compressed with loss, the grain model is not estimated from blank film and damage is detected by
         another rule.
-    mark : Mark
-        The mark to fit.
-    pixel_from_mark : (2, 3)
-        Affine matrix from (x_mm, y_mm, 1) to the scan's (col, row). Its last column is the approximate centre, correct
-        to a pixel or two.
+    mark : the mark to fit.
+    pixel_from_mark : (2, 3) affine matrix from (x_mm, y_mm, 1) to the scan's (col, row). Its last column is the
+        approximate centre, correct to a pixel or two.
     options : MatchOptions, optional
 
     Returns

@@ -38,15 +38,11 @@ def mark_tone_information(
 
     Parameters
     ----------
-    drawn, grey : (height, width)
-        Modelled and observed light.
-    clear : (height, width)
-        Mask of pixels far from the ends of the scanner's range. Near an end noise is cut off, which changes an edge as
-        a curve does.
-    priors_dn2, departures : (unknowns,)
-        See `tone_score`.
-    landscape : Landscape
-        Background texture within the mark.
+    drawn, grey : (height, width) modelled and observed light.
+    clear : (height, width) mask of pixels far from the ends of the scanner's range. Near an end noise is cut off, which
+        changes an edge as a curve does.
+    priors_dn2, departures : (unknowns,) see `tone_score`.
+    landscape : background texture within the mark.
     """
     on_place = _moved_px(fit, tone.derivatives(grey, full_scale_dn))
     information = ToneInformation.empty()
@@ -86,14 +82,10 @@ def sharpening_score(
 
     Parameters
     ----------
-    fit : LinearFit
-        Its mask used includes halos.
-    drawn : (height, width)
-        Modelled light.
-    priors_dn2, departures : (unknowns,)
-        See `tone_score`.
-    coding : Coding
-        Relation of light to stored grey values.
+    fit : its mask used includes halos.
+    drawn : (height, width) modelled light.
+    priors_dn2, departures : (unknowns,) see `tone_score`.
+    coding : relation of light to stored grey values.
 
     Returns
     -------

@@ -143,8 +143,7 @@ def pixels_beyond_edge(window: NDArray[np.floating], mark: Mark, pixel_from_mark
     Parameters
     ----------
     window : (height, width)
-    pixel_from_mark : (2, 3)
-        Approximate place of the mark in the window.
+    pixel_from_mark : (2, 3) approximate place of the mark in the window.
 
     Returns
     -------

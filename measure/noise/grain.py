@@ -85,14 +85,11 @@ def grain_model(
 
     Parameters
     ----------
-    residuals, used : (height, width)
-        Residuals of the fit, and the pixels used.
-    design : (unknowns, height, width)
-        Derivatives of the fitted model with respect to its unknowns.
-    neighbour_correlation : float
-        Of the residuals.
-    blank : (n, PATCH_PX, PATCH_PX), optional
-        Patches of blank film minus a plane. Where they hold more pixels than the window, they alone are used.
+    residuals, used : (height, width) residuals of the fit, and the pixels used.
+    design : (unknowns, height, width) derivatives of the fitted model with respect to its unknowns.
+    neighbour_correlation : of the residuals.
+    blank : (n, PATCH_PX, PATCH_PX) patches of blank film minus a plane. Where they hold more pixels than the window,
+        they alone are used.
     """
     has_blank = blank is not None and len(blank) > 0
     parts = []
@@ -123,8 +120,7 @@ def taken_out(used: Mask, design: Array, farthest_px: float = _FARTHEST_PX) -> A
 
     Parameters
     ----------
-    used, design : (height, width), (unknowns, height, width)
-        Pixels used, and derivatives of the model by its unknowns.
+    used, design : (height, width), (unknowns, height, width) pixels used, and derivatives of the model by its unknowns.
 
     Returns
     -------

@@ -140,13 +140,10 @@ def damage(residuals: Array, area: Mask, sigmas: float, floor_dn: float, is_loss
 
     Parameters
     ----------
-    residuals, area : (height, width)
-        Residuals of a fit, and the pixels used.
-    sigmas, floor_dn : float
-        Threshold in standard deviations; lower bound of the standard deviation, for data without noise.
-    is_lossy : bool
-        Whether the image was compressed with loss. The residuals then have long tails, which are not faint dust, thin
-        patterns that may touch a speck, and ringing in the pixels beside it.
+    residuals, area : (height, width) residuals of a fit, and the pixels used.
+    sigmas, floor_dn : threshold in standard deviations; lower bound of the standard deviation, for data without noise.
+    is_lossy : whether the image was compressed with loss. The residuals then have long tails, which are not faint dust,
+        thin patterns that may touch a speck, and ringing in the pixels beside it.
 
     Returns
     -------

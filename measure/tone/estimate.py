@@ -142,15 +142,11 @@ def tone_score(
 
     Parameters
     ----------
-    design : (..., unknowns, pixels)
-        Derivatives of the model with respect to its unknowns; 0 in unused pixels.
-    changes : (..., k, pixels)
-        Derivatives of the light with respect to the departures; 0 in unused pixels.
-    residuals : (..., pixels)
-        Residuals of the fits.
-    priors, departures : (unknowns,), optional
-        Weights of the priors of the unknowns, and deviations of the fit from them, treated as residuals of
-        pseudo-observations.
+    design : (..., unknowns, pixels) derivatives of the model with respect to its unknowns; 0 in unused pixels.
+    changes : (..., k, pixels) derivatives of the light with respect to the departures; 0 in unused pixels.
+    residuals : (..., pixels) residuals of the fits.
+    priors, departures : (unknowns,) weights of the priors of the unknowns, and deviations of the fit from them, treated
+        as residuals of pseudo-observations.
 
     Returns
     -------
