@@ -14,6 +14,10 @@ Scheffé's, with the unknowns of all contrasts, and Bonferroni's, over all parti
 the level LEVEL. Hypotheses are compared with each other, and with gross errors of single observations, by v'Pv plus
 twice the unknowns and the logarithm of the choices (Akaike); those within TOLD_APART of the best are reported with it.
 Nothing is reported unless all that is reported removes more than half of the excess of v'Pv over its redundancy.
+
+Where a standard deviation of unmodelled errors was estimated from the residuals, v'Pv equals its redundancy whatever
+the model lacks, and errors are correlated within an image. A hypothesis then has to remove LEAST_SHARE of v'Pv, and two
+groups of images must be clearer than a normal scatter of the images' interior orientations makes them.
 """
 
 from dataclasses import dataclass, replace
@@ -187,6 +191,7 @@ MOST_ADJUSTED = 4  # hypotheses adjusted per round
 LEFT = 0.5  # fraction of the excess of v'Pv over its redundancy that may remain
 WORTH = 0.3  # fraction of the largest first-order decrease above which a hypothesis is adjusted
 STEPS = 20
+LEAST_SHARE = 0.05  # of v'Pv; further lens terms remove up to 0.02 on real boards
 
 
 @dataclass(frozen=True)
@@ -217,14 +222,17 @@ class Explained:
     run: Run
 
 
-def explain(run: Run, redundancy: int, probabilities: Probabilities) -> Explained:
+def explain(run: Run, redundancy: int, probabilities: Probabilities, is_noise_fitted: bool = False) -> Explained:
     """Search for explanations of residuals larger than the given standard deviations.
 
-    There are none where sigma0 is at most 1 or the adjustment has no solution.
+    There are none where the adjustment has no solution, nor where sigma0 is at most 1, unless the standard deviation of
+    unmodelled errors was estimated from the residuals (is_noise_fitted).
     """
-    if not run.converged or not run.is_tested or redundancy < CHECKED or run.end.vpv <= redundancy:
+    if not run.converged or not run.is_tested or redundancy < CHECKED:
         return Explained((), run)
-    first = last = _Model(run, redundancy, probabilities)
+    if run.end.vpv <= redundancy and not is_noise_fitted:
+        return Explained((), run)
+    first = last = _Model(run, redundancy, probabilities, is_noise_fitted)
     found: list[Explanation] = []
     for _ in range(ROUNDS):
         if found and not last.exceeds(probabilities.family):
@@ -249,13 +257,14 @@ def explain(run: Run, redundancy: int, probabilities: Probabilities) -> Explaine
 class _Model:
     """An adjustment, and its agreement with the observations, with and without gross errors.
 
-    has_suspects: whether to search for gross errors; not done where the simpler model has none. hypothesis: addition to
-    the simpler model; p: p-value of the decrease of v'Pv.
+    is_noise_fitted: see `explain`. has_suspects: whether to search for gross errors; not done where the simpler model
+    has none. hypothesis: addition to the simpler model; p: p-value of the decrease of v'Pv.
     """
 
     run: Run
     redundancy: int
     probabilities: Probabilities
+    is_noise_fitted: bool = False
     has_suspects: bool = True
     hypothesis: ModelHypothesis | None = None
     p: float = 1.0
@@ -298,6 +307,10 @@ class _Model:
         """Cost of the unknowns and the choice of the hypothesis."""
         return 2.0 * (len(self.hypothesis.added) + self.hypothesis.choices) if self.hypothesis else 0.0
 
+    def is_large(self, hypothesis: ModelHypothesis, fall: float) -> bool:
+        """Whether a decrease of v'Pv is larger than errors correlated within images cause."""
+        return not self.is_noise_fitted or (fall > LEAST_SHARE * self.vpv and hypothesis.p_scatter() < LEVEL)
+
     def probability(self, hypothesis: ModelHypothesis, fall: float) -> float:
         """p-value of a decrease of v'Pv by a hypothesis."""
         single = self._fall_probability(fall, len(hypothesis.added))
@@ -320,7 +333,11 @@ def _best(model: _Model) -> tuple[list[_Model], bool]:
     falls = [(_first_order_fall(model.run, each), each) for each in model_hypotheses(model.run)]
     level = LEVEL / max(len(falls), 1)
     worth = WORTH * max((fall for fall, _ in falls), default=0.0)
-    likely = [(fall, each) for fall, each in falls if fall > worth and model.probability(each, fall) < level]
+    likely = [
+        (fall, each)
+        for fall, each in falls
+        if fall > worth and model.is_large(each, fall) and model.probability(each, fall) < level
+    ]
     likely.sort(key=lambda each: -each[0])
     candidates = [_larger_model(model, each) for _, each in likely[:MOST_ADJUSTED]]
     found = [each for each in candidates if each is not None and each.p < level]
@@ -352,7 +369,7 @@ def _larger_model(model: _Model, hypothesis: ModelHypothesis) -> _Model | None:
         return None
     left = model.redundancy - len(hypothesis.added)
     p = model.probability(hypothesis, model.vpv - run.end.vpv)
-    return _Model(run, left, model.probabilities, bool(model.gross_errors), hypothesis, p)
+    return _Model(run, left, model.probabilities, model.is_noise_fitted, bool(model.gross_errors), hypothesis, p)
 
 
 def _following(model: _Model) -> _Model | None:

@@ -28,6 +28,7 @@ from adjust.quality.run import Run
 
 MOST_TURNS = 20  # iterations of two-means
 FLAT = 1e-9  # fraction of the largest eigenvalue below which a direction is undetermined
+DRAWS = 4000  # simulated sets of images
 DIRECTIONS = 4  # directions in which groups are searched: c, x0', y0', scale of the whole image
 
 
@@ -36,12 +37,14 @@ class ImageGroups:
     """Partition of images.
 
     images: names in the smaller group; count: number of all images; choices: natural logarithm of the number of
-    partitions.
+    partitions; p_scatter: computes the p-value of so clear a partition of images whose interior orientations scatter
+    normally.
     """
 
     images: tuple[str, ...]
     count: int
     choices: float
+    p_scatter: Callable[[], float]
 
 
 def two_groups(run: Run, camera: str) -> ImageGroups | None:
@@ -62,7 +65,7 @@ def two_groups(run: Run, camera: str) -> ImageGroups | None:
     smaller = mask if 2 * mask.sum() <= len(names) else ~mask
     images = tuple(name for name, is_in in zip(names, smaller, strict=True) if is_in)
     choices = (len(names) - 1) * float(np.log(2.0)) + float(np.log(DIRECTIONS))
-    return ImageGroups(images, len(names), choices)
+    return ImageGroups(images, len(names), choices, partial(_scatter_probability, normal, right, mask))
 
 
 def _shifts(run: Run, camera: str) -> tuple[list[str], Array, Array]:
@@ -120,6 +123,32 @@ def _two_means(normal: Array, right: Array, mask: Mask) -> Mask:
     return mask
 
 
+def _scatter_probability(normal: Array, right: Array, mask: Mask) -> float:
+    """p-value of the partition's clearness along the difference of its groups, by simulation of normal scatter."""
+    # The variance between images is that of DerSimonian and Laird's method of moments (1986).
+    one, other = (_solved(normal[some].sum(axis=0), right[some].sum(axis=0)) for some in (mask, ~mask))
+    weight = np.einsum("i,mij,j->m", one - other, normal, one - other)
+    known = weight > 0.0
+    weight, shift = weight[known], (right @ (one - other))[known] / weight[known]
+    total = weight.sum()
+    scatter = float((weight * (shift - (weight * shift).sum() / total) ** 2).sum())
+    between = max(0.0, scatter - len(weight) + 1.0) / (total - (weight**2).sum() / total)
+    drawn = np.random.default_rng(0).normal(size=(DRAWS, len(weight))) * np.sqrt(between + 1.0 / weight)
+    return float(np.mean(_clearness(drawn, weight) >= _clearness(shift[None], weight)))
+
+
+def _clearness(shifts: Array, weight: Array) -> Array:
+    """(n,) fractions of the weighted sums of squares of shifts (n, m) that lie between the groups of their best
+    partitions."""
+    order = np.argsort(shifts, axis=1)
+    weights, ordered = weight[order], np.take_along_axis(shifts, order, axis=1)
+    total = weight.sum()
+    centred = ordered - (weights * ordered).sum(axis=1, keepdims=True) / total
+    below = np.cumsum(weights, axis=1)[:, :-1]
+    between = np.cumsum(weights * centred, axis=1)[:, :-1] ** 2 * (1.0 / below + 1.0 / (total - below))
+    return np.asarray(between.max(axis=1) / (weights * centred**2).sum(axis=1))
+
+
 def _quadratic(normal: Array, right: Array) -> Array:
     """g' N⁻¹ g of one system (k, k), (k,) or of many."""
     return np.asarray((right * _solved(normal, right)).sum(axis=-1))
@@ -151,6 +180,7 @@ class ModelHypothesis:
     added: Indices  # (k,) positions of the additional unknowns
     choices: float = 0.0  # natural logarithm of the number of models it was selected from
     contrasts: int = 0  # number of unknowns that all of these models would have together
+    p_scatter: Callable[[], float] = float  # of groups of images, see `ImageGroups`; 0 for other hypotheses
 
 
 def model_hypotheses(run: Run) -> Iterator[ModelHypothesis]:
@@ -223,7 +253,8 @@ def _second_interior_orientation(run: Run, camera: Camera) -> Iterator[ModelHypo
     problem = _continued(run, replace(network, images=images, cameras=cameras), {others: camera.name})
     added = problem.unknowns.camera[others][: len(INTERIOR_NAMES)]
     contrasts = len(INTERIOR_NAMES) * (groups.count - 1)
-    yield ModelHypothesis(GROUPS, partial(_group_words, camera.name, groups), problem, added, groups.choices, contrasts)
+    words = partial(_group_words, camera.name, groups)
+    yield ModelHypothesis(GROUPS, words, problem, added, groups.choices, contrasts, groups.p_scatter)
 
 
 def _bent_board(run: Run) -> Iterator[ModelHypothesis]:

@@ -253,7 +253,8 @@ class Adjustment(Estimates, PlottedResult):
 
     @cached_property
     def _explanation_run(self) -> Explained:
-        return explain(self.run, _redundancy(self.run, self.cofactor), self.probabilities)
+        is_noise_fitted = any(self.unmodelled_mm.values())
+        return explain(self.run, _redundancy(self.run, self.cofactor), self.probabilities, is_noise_fitted)
 
     @property
     def _is_tested(self) -> bool:

@@ -8,6 +8,7 @@ from faults import (
     BLUNDERS,
     MISFITS,
     NOTHING,
+    SIGMA_MM,
     Effects,
     Misfit,
     blunder_network,
@@ -26,7 +27,10 @@ from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
 from adjust import Adjustment, AdjustmentError, Distortion, Network, ObjectPoint, Options, Prior, adjust, approximate
+from adjust.problem.tested import Probabilities
 from adjust.solution.blunder_hypotheses import AXES
+from adjust.solution.explanations import explain
+from adjust.solution.unmodelled_error import adjust_unmodelled
 
 QUICK = ("lens: no radial term", "mm for m, stations in m", "noise too small")
 SOUND = MISFITS[NOTHING]
@@ -67,6 +71,29 @@ def test_standard_deviations_of_figures_grow_with_the_noise_that_is_left() -> No
         found = result.explanations[0]
         sigmas.append(float(found.cause.split(" ± ")[1].split(" ")[0]))
     assert sigmas[1] / sigmas[0] == pytest.approx(2.0, rel=0.1)
+
+
+@pytest.mark.parametrize("seed", [4, 5, 6, 7])
+def test_an_estimated_noise_does_not_hide_two_cameras_in_one(seed: int) -> None:
+    made = scene(seed, flat=True)
+    given = misfit_network(made, Effects(crop=0.5, zoom=0.2), SOUND, np.random.default_rng(seed))
+    result = adjust_unmodelled(given, adjust)
+    assert result.unmodelled_mm["cam"] > SIGMA_MM
+    assert [each.kind for each in result.explanations] == ["groups"]
+    some = [f"im{i:02d}" for i in np.flatnonzero(made.groups)]
+    assert f"The images {', '.join(some)} ({len(some)} of {len(made.groups)})" in result.explanations[0].cause
+    below = result.redundancy + 1  # v'Pv equals its redundancy then, but for rounding
+    assert explain(result.run, below, Probabilities(), is_noise_fitted=True).explanations[0].kind == "groups"
+    assert explain(result.run, below, Probabilities()).explanations == ()
+
+
+@pytest.mark.parametrize("seed", [4, 5, 6, 7])
+def test_errors_of_each_image_are_no_two_groups(seed: int) -> None:
+    made, rng = scene(seed, flat=True), np.random.default_rng(seed)
+    each_its_own = replace(made, groups=rng.normal(size=len(made.groups)))
+    result = adjust_unmodelled(misfit_network(each_its_own, Effects(zoom=0.3), SOUND, rng), adjust)
+    assert result.unmodelled_mm["cam"] > SIGMA_MM
+    assert result.explanations == ()
 
 
 @pytest.mark.study
