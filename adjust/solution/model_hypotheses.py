@@ -417,7 +417,10 @@ def _group_words(camera: str, groups: ImageGroups, run: Run, added: Indices, _: 
     fitting = [each for each, cost in zip(readings, costs, strict=True) if cost < min(costs) + ALIKE]
     special = [cause for along, cause in fitting if along.shape[1] < len(base)]
     causes = "; or ".join(special or [cause for _, cause in fitting])
-    return f"{causes[0].upper()}{causes[1:]}", "Give these images a camera of their own (column camera of images.csv)."
+    return (
+        f"{causes[0].upper()}{causes[1:]}",
+        "Give these images a camera of their own (column camera of images.csv), or a folder and project of their own.",
+    )
 
 
 def _misfit(difference: Array, covariance: Array, along: Array) -> float:

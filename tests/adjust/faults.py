@@ -520,13 +520,13 @@ LENS = {"k1": -0.22, "k2": 0.11, "p1": 4e-4, "p2": -3e-4, "k3": -0.02}
 
 @dataclass(frozen=True)
 class Scene:
-    """What a network is projected from: points (p, 3), stations and rotations; groups (m,): the images that differ."""
+    """What a network is projected from: points (p, 3), stations and rotations; groups (m,): how far images differ."""
 
     points: Array
     rotations: Array
     stations: Array
     point_mm: Array
-    groups: NDArray[np.bool_]
+    groups: Array
 
 
 @dataclass(frozen=True)
@@ -584,8 +584,8 @@ def scene(seed: int, flat: bool) -> Scene:
     distance = rng.uniform(1.0, 1.6, count) * extent * C_MM / (2.0 * HALF_MM[1])
     aim = middle + rng.uniform(-0.12, 0.12, (count, 3)) * extent
     stations = aim + distance[:, None] * np.einsum("nji,j->ni", rotations, [0.0, 0.0, 1.0])
-    groups = np.zeros(count, dtype=bool)
-    groups[rng.permutation(count)[: max(2, count // 3)]] = True
+    groups = np.zeros(count)
+    groups[rng.permutation(count)[: max(2, count // 3)]] = 1.0
     return Scene(points, rotations, stations, MIDDLE_MM + rng.normal(0.0, 0.1, 2), groups)
 
 
