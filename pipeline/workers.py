@@ -384,11 +384,8 @@ def _why_unreadable(scan: str) -> str:
 
 
 def _one_a_folder(scans: Sequence[str]) -> list[str]:
-    """First scan of each folder that is readable here.
-
-    A scan that nobody can read does not disqualify a worker. An unresponsive address costs four attempts, so only the
-    first address of a folder is tried.
-    """
+    """First scan of each folder that is readable here."""
+    # An unresponsive address costs four attempts, so only the first address of a folder is tried.
     firsts: dict[str, str] = {}
     for scan in filter(None, scans):
         folder = scan.rpartition("/")[0] if is_address(scan) else os.path.dirname(scan)

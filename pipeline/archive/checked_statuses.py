@@ -125,8 +125,7 @@ def judge_lots(store: Store, made_from: Mapping[str, str], input_hash: str, lots
 
 
 def _copy_lot(store: Store, judging: int, number: int, lot: Lot) -> str:
-    """Copy a sound lot from an earlier judging with the same input and return the hash of its content; "" if there is
-    none."""
+    """Copy a sound lot from a judging with the same input and return the hash of its content; "" if there is none."""
     db, of_lot = store.connection, "from judged_frame where judging = ? and lot = ?"
     found = db.execute(
         "select judging, lot, output from judged_lot join judging on judging.id = judging "
@@ -302,8 +301,8 @@ def checked_marks(store: Store, judging: Judging, images: Collection[str] | None
 
 
 def _covariance(spread: Sequence[float | None], causes: str | None) -> tuple[float, float, float] | None:
-    """(col², row², col·row) elements of the covariance; values that are not finite are stored only in the JSON of the
-    causes."""
+    """(col², row², col·row) elements of the covariance."""
+    # Values that are not finite are stored only in the JSON of the causes.
     of_col, of_row, both = spread
     if of_col is not None and of_row is not None and both is not None:
         return of_col, of_row, both

@@ -117,8 +117,8 @@ def hash_inputs(tasks: Sequence[ScanTask], work: Work, copies: Mapping[str, str]
 
 
 def _lots(project: Project, tasks: Sequence[ScanTask]) -> Sequence[Sequence[OfCamera]]:
-    """Scans that are checked together, by camera. Natural points may link any scans, so they need one lot; targets on a
-    sheet and parts of frames are checked in one lot only in small projects."""
+    """Scans that are checked together, by camera."""
+    # Natural points may link any scans; targets and parts of frames are linked only in small projects.
     of_cameras = _camera_lots(project, tasks)
     are_few = len(tasks) <= _TOGETHER and (project.targets is not None or project.has_parts)
     return [of_cameras] if project.ties is not None or are_few else [[each] for each in of_cameras]
@@ -137,11 +137,8 @@ def _project_inputs(project: Project, tasks: Sequence[ScanTask], input_hash: str
 
 
 def _camera_lots(project: Project, tasks: Sequence[ScanTask]) -> list[OfCamera]:
-    """Split the scans of each camera into lots.
-
-    All scans of a camera form one lot up to `_TOGETHER`; more are split by a hash of the frame's name, so that a new
-    scan changes a single lot. Parts of one frame are in one lot.
-    """
+    """Lots of each camera, of at most `_TOGETHER` scans."""
+    # Split by a hash of the frame's name: a new scan changes a single lot, and parts of one frame are in one lot.
     found = list[OfCamera]()
     for camera in project.cameras.values():
         own = [task for task in tasks if project.image_camera(task.name) is camera]
@@ -158,8 +155,7 @@ def _camera_lots(project: Project, tasks: Sequence[ScanTask]) -> list[OfCamera]:
 def _check_camera(
     project: Project, camera: CameraFile, tasks: Sequence[ScanTask], work: Work
 ) -> tuple[CheckedScan, ...]:
-    """Second step of the measurement. Scans whose marks are renamed by the comparison with others are measured
-    again."""
+    """Second step of the measurement. Scans whose marks get other names by it are measured again."""
     scans = [work.read(task.name) for task in tasks]
     roll = build_roll(tasks, scans, camera.writing)
     again = list(work.measure(roll.tasks)) if roll.tasks else []
@@ -167,8 +163,7 @@ def _check_camera(
 
 
 def _writing_remarks(project: Project, tasks: Sequence[ScanTask], work: Work) -> Remarks:
-    """Remarks from the writing on scans about other scans: plates of other cameras, frames scanned twice. Only the
-    writing of the scans is held in memory."""
+    """Remarks from the writing about other scans: plates of other cameras, frames scanned twice."""
     names = work.written([task.name for task in tasks])
     bare = dict[str, MeasuredScan]()
     for camera in project.cameras.values():

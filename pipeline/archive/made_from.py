@@ -86,8 +86,7 @@ def adjusted_from(project: Project, marks: Sequence[ComparatorPoint]) -> MadeFro
 
 
 def _parts(path: Path, project: Project, known: Mapping[str, Identity], files: FileStates) -> tuple[int, str]:
-    """Size of a scan's file and hash of its parts. The file is read only where its state differs from that in the
-    store; touching or moving it changes nothing."""
+    """Size of a scan's file and hash of its parts, read only where its state differs from that in the store."""
     state = files.get(path)
     found = known.get(state.uri)
     is_known = found is not None and found.state == state

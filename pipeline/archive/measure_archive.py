@@ -43,8 +43,7 @@ def check_measurable(project: Project) -> tuple[str, ...]:
 
 
 def _check_anything_to_measure(project: Project) -> None:
-    """Raise InputError where neither fiducials nor targets nor natural points are sought: comparator.csv would be
-    empty."""
+    """Raise InputError where neither fiducials nor targets nor natural points are sought."""
     sought = [one for camera in project.cameras.values() for one in camera.fiducials if not one.passed_over]
     if not sought and project.targets is None and project.ties is None:
         raise InputError(

@@ -294,8 +294,8 @@ def print_new_project(new: NewProject, console: Console) -> None:
 
 
 def _left_out(found: Catalogue) -> dict[str, list[Path]]:
-    """{reason: files}. Where no camera at all was identified, the camera file to be added to the project covers all
-    scans, so none is left out for it."""
+    """{reason: files}."""
+    # Without any identified camera, the camera file to be added covers all scans: none is left out for it.
     is_named = any(group.camera for group in found.groups)
     broken = [path for path in found.broken if isinstance(path, Address) or path.exists() or path.is_symlink()]
     unknown = [

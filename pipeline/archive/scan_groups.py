@@ -423,11 +423,8 @@ def _files_below(folder: Path) -> Iterator[Path]:
 
 
 def _copies(files: Sequence[Path], max_pixels: int | None) -> Iterator[tuple[Path, Path]]:
-    """Yield (copy, original) for files with identical bytes.
-
-    The original is the first file with the shortest name, since copies are called `Copy of 0001` or `0001 (1)`. Size
-    and a hash of parts of the file are compared first, since they distinguish most files cheaply.
-    """
+    """Yield (copy, original) for files with identical bytes; size and a hash of parts are compared first."""
+    # The original has the shortest name, since copies are called `Copy of 0001` or `0001 (1)`.
     for of_one_size in _equal_groups(lambda path: path.stat().st_size, files):
         for alike in _equal_groups(lambda path: parts_hash(path, max_pixels), of_one_size):
             for same in _equal_groups(content_hash, alike):

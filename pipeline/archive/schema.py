@@ -240,8 +240,7 @@ def opened(path: Path, schema: Schema | None = None) -> sqlite3.Connection:
 
 
 def _connection(path: Path) -> sqlite3.Connection:
-    """Open for reading and writing; read-only where the folder is not writable, since SQLite creates files beside its
-    own."""
+    """Open for reading and writing; read-only where the folder is not writable: SQLite creates files in it."""
     name, is_address = str(path), path.exists() and not all(os.access(one, os.W_OK) for one in (path.parent, path))
     if is_address:
         log = path.with_name(f"{path.name}-wal")  # exists while another process has the file open
@@ -268,8 +267,7 @@ def migrate(connection: sqlite3.Connection, schema: Schema) -> None:
 
 
 def _forget_secrets(connection: sqlite3.Connection) -> None:
-    """Delete scans that an earlier version stored under addresses with passwords or signatures, which are not used as
-    keys any more."""
+    """Delete scans that an earlier version stored under addresses with passwords or signatures."""
     rows = connection.execute("select id, uri from scan where uri like '%://%'").fetchall()
     if secret := [row for row, uri in rows if public_address(uri) != uri]:
         connection.execute("pragma secure_delete = on")

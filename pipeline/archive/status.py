@@ -107,8 +107,8 @@ def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
 
 
 def _status_rows(store: Store) -> Iterator[Sequence[Any]]:
-    """Rows of the query; a damaged row is reported as a failure. Marks are checked only in frames where the reason of
-    one may be shown."""
+    """Rows of the query; a damaged row is reported as a failure."""
+    # Marks are checked only in frames where the reason of one may be shown.
     judging = latest(store)
     rows = store.connection.execute(_QUERY, (-1 if judging is None else judging.row,)).fetchall()
     damaged = set[str]()

@@ -94,11 +94,8 @@ def is_answered(codes: Collection[str]) -> bool:
 
 
 def _mark_verdict(kind: str, status: Status, codes: Collection[str]) -> Verdict:
-    """Verdict on one mark.
-
-    An unobserved target does not affect the others. A fiducial must be found in every frame, unless it lies on another
-    part of it. A mark that a person has decided about needs no further look.
-    """
+    """Verdict on one mark."""
+    # An unobserved target does not affect the others; a fiducial must be found, unless it lies on another part.
     if is_answered(codes):
         return Verdict.DECIDED
     if Code.OTHER_PART in codes or (status is Status.PREDICTED and kind != "fiducial"):

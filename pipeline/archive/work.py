@@ -221,8 +221,7 @@ class Work:
         return self.read(task.name)
 
     def _measure(self, tasks: Sequence[ScanTask], as_scans: bool = False) -> Iterator[tuple[ScanTask, int, Kept]]:
-        """Measure tasks, and store each result at once. as_scans: as results of the project's own scans, not auxiliary
-        ones for other scans."""
+        """Measure tasks, and store each result at once. as_scans: as results of the project's own scans."""
         if tasks and self._only_kept:
             raise NotMeasured
         states = {task.name: self.state(task) for task in tasks}

@@ -239,11 +239,8 @@ def _picture(path: Path, max_pixels: int | None) -> tuple[Scan, float, tuple[flo
 
 
 def _limit_drawings(layout: FiducialLayout) -> FiducialLayout:
-    """Limit the drawings of marks within the frame (wings) to the frame.
-
-    Marks beyond the frame's edge are left as drawn: little more than a corner of them would remain, which correlates
-    with many structures.
-    """
+    """Limit the drawings of marks within the frame (wings) to the frame."""
+    # Of marks beyond its edge little more than a corner would remain, which correlates with many structures.
     half_mm = np.array(layout.frame_mm) / 2
     pairs = zip(layout.marks, limit_to_frame(layout).marks, strict=True)
     marks = tuple(limited if (np.abs(given.xy_mm) < half_mm).all() else given for given, limited in pairs)
@@ -259,11 +256,8 @@ def _plate(picture: Scan) -> dict[str, str]:
 def _alike_in_scan(
     search: LayoutSearch, trials: Sequence[Trial], tries: Mapping[Names, Tried], drawn: Mapping[str, Names]
 ) -> dict[str, Names]:
-    """For each camera that stands out: cameras with similar drawings that also score nearly as well at the same
-    placement.
-
-    Wings that differ little in the drawing may differ clearly in the scan.
-    """
+    """For each camera that stands out: cameras with similar drawings that score nearly as well at its placement."""
+    # Wings that differ little in the drawing may differ clearly in the scan.
     own = {name: names for names in tries for name in names}
     found = dict[str, Names]()
     for trial in trials:
@@ -285,11 +279,7 @@ def _first_that_stand_out(
     pitch_um: tuple[float, float] | None,
     count: Count,
 ) -> tuple[list[Trial], Mapping[Names, Tried]]:
-    """Try the layouts in stages until one stands out.
-
-    The stages: the likely layouts; all layouts at the given pitch, if some have fewer expected false alarms than the
-    limit; all with non-square pixels; all at any pitch. Returns the trials and the search results.
-    """
+    """Try likely layouts, all at the given pitch, with non-square pixels, at any pitch, until one stands out."""
     if likely:
         trials, tries = _try_pitch(search, likely, pitch_um, count)
         if any(trial.stands_out and trial.expected <= CAMERA_BY_CHANCE for trial in trials):
@@ -309,10 +299,7 @@ def _first_that_stand_out(
 def _try_pitch(
     search: LayoutSearch, layouts: Mapping[Names, FiducialLayout], pitch_um: tuple[float, float] | None, count: Count
 ) -> tuple[list[Trial], Mapping[Names, Tried]]:
-    """Trials at the given pitch, or at any pitch if none is given.
-
-    No trials are made if all layouts have more expected false alarms than the limit.
-    """
+    """Trials at the given pitch, or any; none where all expected numbers of false alarms exceed the limit."""
     if pitch_um is None:
         return _try_any_pitch(search, layouts, count)
     given = _each(layouts, partial(search.try_pitch, pitch_um=pitch_um), count)
@@ -345,11 +332,8 @@ def _try_any_pitch(
 
 
 def _trials(search: LayoutSearch, tries: Mapping[Names, Tried], count: Count) -> list[Trial]:
-    """Try the layouts in order of their expected false alarms.
-
-    Marks are not measured above 100 expected false alarms. Once a layout stands out, the others are measured only if
-    they are significant too and may hold more than a part of the marks found.
-    """
+    """Try the layouts in order of their expected false alarms."""
+    # Once a layout stands out, others are measured only if they are significant and may hold more marks.
     trials: list[Trial] = []
     ranked = sorted(tries, key=lambda names: _likeliest_first(tries[names]))
     for done, names in enumerate(ranked, len(ranked)):
@@ -369,12 +353,8 @@ def _likeliest_first(each: Tried) -> tuple[float, int]:
 
 
 def _expected_at_most(seen: Trial, marks: int) -> float:
-    """Limit on the expected false alarms of a layout with so many marks, given a trial that stands out.
-
-    If that trial is significant, the layout has to be significant as well. If the layout has fewer marks than were
-    found, it may be a part of them: nine crosses of a larger réseau match a layout of nine, but nine marks are a far
-    more probable false alarm than twenty-five.
-    """
+    """Limit on the expected false alarms of a layout with so many marks, given a trial that stands out."""
+    # Fewer marks may be a part of those found: nine crosses of a larger réseau match a layout of nine.
     most = CAMERA_BY_CHANCE if seen.expected <= CAMERA_BY_CHANCE else _BY_CHANCE
     return min(most, _ODDS * seen.expected) if seen.found > marks else most
 
@@ -401,13 +381,7 @@ def _alike(cameras: Mapping[str, CameraFile]) -> list[Names]:
 
 
 def _trial(search: LayoutSearch, names: Names, each: Tried, close: float) -> Trial:
-    """Measure the marks of one layout.
-
-    Parameters
-    ----------
-    close : score above which the layout will be named next to the best; below it, no comparison with the stretched
-        layout is needed.
-    """
+    """Measure the marks of one layout. close: score below which the stretched layout need not be compared."""
     start, expected = time.perf_counter(), each.answer.expected
     frame = search.recognise(each)
     fits = [fit for fit in frame.fits if fit] if frame else []
@@ -444,8 +418,7 @@ def _px_per_mm(frame: Frame) -> float:
 
 
 def _residual(frame: Frame, layout: FiducialLayout) -> tuple[float, float] | None:
-    """Residuals per axis of an affine transformation of the marks, in standard deviations and in mm; None without
-    redundancy."""
+    """Residuals per axis of an affine transformation, in standard deviations and mm; None without redundancy."""
     pairs = [(fit, given) for fit, given in zip(frame.fits, layout.marks, strict=True) if fit]
     redundancy = 2 * len(pairs) - _AFFINE
     if redundancy <= 0:
@@ -463,7 +436,7 @@ def _residual(frame: Frame, layout: FiducialLayout) -> tuple[float, float] | Non
 
 
 def _sigma_mm(covariance_px2: Array, given: LayoutMark, px_per_mm: float) -> Array:
-    """Standard deviations in x' and y' of mark, given place and film. The mark's covariance is small and nearly
-    isotropic, so its rotation is neglected."""
+    """Standard deviations in x' and y' of mark, given place and film."""
+    # The mark's covariance is small and nearly isotropic, so its rotation is neglected.
     own, film = float(np.trace(covariance_px2)) / 2 / px_per_mm**2, FiducialOptions().film_sigma_mm
     return np.asarray(np.sqrt(np.square(given.sigma_mm) + own + film**2))

@@ -349,10 +349,8 @@ def _apply_verdicts(scan: MeasuredScan, verdicts: Mapping[str, _Verdict]) -> Mea
 
 
 def _apply_verdict(mark: MarkMeasurement, verdict: _Verdict) -> MarkMeasurement:
-    """Set the status of a mark by its test.
-
-    Without another image, the mark and the point on the sheet may be at fault; with few others, any of them.
-    """
+    """Set the status of a mark by its test."""
+    # Without another image, the mark and the point on the sheet may be at fault; with few others, any of them.
     if verdict.chance > SHEET_POINT_OFF_PLACE:
         return mark
     witnesses = "the sheet's other points" + (" and other pictures" if verdict.others else "")

@@ -85,11 +85,8 @@ def _clicked(camera: CameraFile, clicks: Clicks, tasks: Sequence[ScanTask]) -> C
 
 
 def _check_orientation(camera: CameraFile, task: ScanTask, scan: Scan, px: Places) -> None:
-    """Raise InputError where the clicks contradict the scan orientation of the project.
-
-    A viewer that obeys the file's orientation tag counts other columns and rows than the file. If the project sets no
-    orientation and the clicks were not made in `reseau review`, a file with such a tag leaves open which were counted.
-    """
+    """Raise InputError where the clicks contradict the scan orientation of the project."""
+    # A viewer that obeys the file's orientation tag counts other columns and rows than the file.
     if len(px) < LEAST_CLICKS or camera.clicks is None or are_collinear(np.array(list(px.values()))):
         return
     given = _up_from_camera(_through_clicks(task.options, scan, px))
@@ -222,12 +219,7 @@ def _through_clicks(options: ScanOptions, scan: Scan, px: Places) -> Array:
 def _start(
     camera: CameraFile, task: ScanTask, scan: Scan, placement: Array, px: Places, alike: tuple[str, ...]
 ) -> CameraFile:
-    """Cut templates of the marks from one scan; the layout takes their places in it.
-
-    Parameters
-    ----------
-    alike : scans known or assumed to have the same scan orientation.
-    """
+    """Cut templates from one scan; the layout takes their places. alike: scans with the same scan orientation."""
     inverse = np.linalg.inv(placement[:, :2])
     fiducials = []
     for one in camera.fiducials:

@@ -95,11 +95,7 @@ def _learned_folder(project: Project) -> Path:
 
 
 def _file_names(cameras: Sequence[Path], learned: Path) -> Mapping[Path, str]:
-    """Names of the files of each camera in out/learned.
-
-    The name is that of the camera file, with a number where several folders have a file of that name, or where it would
-    be that file itself.
-    """
+    """Names of the files of each camera in out/learned: that of the camera file, with a number where it is taken."""
     names: dict[Path, str] = {}
     stems = {path.stem for path in cameras}
     for path in dict.fromkeys(cameras):
@@ -111,11 +107,8 @@ def _file_names(cameras: Sequence[Path], learned: Path) -> Mapping[Path, str]:
 
 
 def _check_learned_scan(project: Project, camera: CameraFile) -> CameraFile:
-    """Check the origin of the learned marks of a camera.
-
-    If the project has no such scan, or another one of that name, the marks tell nothing of the scan orientations in
-    this project, and none of its scans has a share in them.
-    """
+    """Drop the origin of learned marks, and the shares in them, where the project has no such scan."""
+    # They then tell nothing of the scan orientations in this project.
     learned = camera.learned_from
     if learned is None or (
         learned.scan in project.scans and content_hash(project.scans[learned.scan]) == learned.sha256
@@ -152,8 +145,7 @@ def _learned(
 
 
 def _tasks(project: Project, camera: CameraFile, names: Sequence[str]) -> list[ScanTask]:
-    """Tasks that measure the fiducials in linear grey values, as templates hold these. camera: as far as it is
-    learned."""
+    """Tasks that measure the fiducials in linear grey values, as templates hold these."""
     own = {name: camera if one.path == camera.path else one for name, one in project.cameras.items()}
     return [task.fiducials_alone("linear") for task in scan_tasks(replace(project, cameras=own), names)]
 
@@ -165,8 +157,7 @@ def _chips(
     measure: Measure,
     workers: Executor | None,
 ) -> tuple[Mapping[str, list[Chip]], set[str]]:
-    """Image patches of every learned mark, by fiducial; and the scan orientations that the marks of some frame do not
-    distinguish."""
+    """Image patches of every learned mark, by fiducial; and the scan orientations that some frame leaves open."""
     frames = {scan.frame.image: scan.frame for scan in measure(tasks)}
     named = [(task, frames[task.name]) for task in tasks if _is_named(frames[task.name], start)]
     chips = dict[str, list[Chip]]()
@@ -191,8 +182,7 @@ def _learned_chips(learned: Sequence[GivenFiducial], named: tuple[ScanTask, Fram
 
 
 def _is_named(frame: FrameMeasurement, start: CameraFile) -> bool:
-    """Whether the marks found have certain names, up to their own symmetry, or the scan has the orientation of the
-    clicked one."""
+    """Whether the marks found have certain names, up to their own symmetry, or the clicked orientation."""
     pose, learned = frame.pose, start.learned_from
     if pose is None or learned is None or frame.pixel_from_camera is None:
         return False
@@ -216,8 +206,7 @@ def _template(job: tuple[list[Chip], float]) -> MarkTemplate:
 
 
 def _average_origins(camera: CameraFile, poses: Collection[str]) -> CameraFile:
-    """Average the origins of the learned marks over scan orientations that frames do not distinguish, as far as the
-    marks look alike in them."""
+    """Average the origins of the learned marks over scan orientations in which the marks look alike."""
     learned = [one for one in camera.fiducials if isinstance(one.mark, MarkTemplate) and one.mark.learned_mm]
     if not learned:
         return camera
@@ -232,13 +221,7 @@ def _average_origins(camera: CameraFile, poses: Collection[str]) -> CameraFile:
 
 
 def _stored(camera: CameraFile, place: Path, folder: Path) -> CameraFile:
-    """Write the camera with its templates to a file, and return it as read back, so that later runs measure the same.
-
-    Parameters
-    ----------
-    place : of the file for now.
-    folder : its final folder.
-    """
+    """Write the camera to place, of later folder; return it as read back, so that later runs measure the same."""
     save = picture_writer(place.parent, f"{place.stem}-")
     write_atomically(place, camera_text(replace(camera, path=place), save))
     stored = replace(camera, fiducials=read_camera(place).fiducials)

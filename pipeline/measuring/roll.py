@@ -165,10 +165,8 @@ def poses_of_roll(scans: Sequence[MeasuredScan], places: Sequence[WrittenPlace])
 
 
 def _writing_likelihoods(frames: Sequence[FrameMeasurement], places: Sequence[WrittenPlace]) -> Mapping[str, float]:
-    """Log-likelihoods of the directions of text in the camera's frame, 0 for the best.
-
-    Text that recurs on several frames, except for its digits, is one title or one stamp and counts once.
-    """
+    """Log-likelihoods of the directions of text in the camera's frame, 0 for the best."""
+    # Text that recurs on several frames, except for its digits, is one title or one stamp and counts once.
     texts: dict[str, tuple[Pose, Line]] = {}
     for frame in frames:
         assert frame.pose is not None
@@ -181,13 +179,7 @@ def _writing_likelihoods(frames: Sequence[FrameMeasurement], places: Sequence[Wr
 
 
 def _together(frame: FrameMeasurement, turn: str, told: bool, frames: int) -> Pose:
-    """Scan orientation of a frame whose text has this direction in the camera's frame, like that of so many other
-    frames.
-
-    Parameters
-    ----------
-    told : whether the frames together determine the direction, or only agree.
-    """
+    """Scan orientation of a frame with text in this direction. told: whether the frames together determine it."""
     assert frame.pose is not None
     pose = replace(frame.pose, name=_scan_pose(frame.pose, turn))
     if not _face_is_known(pose) or _is_doubted(frame):

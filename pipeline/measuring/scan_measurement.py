@@ -219,13 +219,7 @@ def _add_sizes(
 def _pitch(
     options: ScanOptions, scan: Scan, frame: FrameMeasurement
 ) -> tuple[tuple[float, float], tuple[Reason, ...], tuple[str, ...]]:
-    """Pixel pitch of a scan in µm.
-
-    Returns
-    -------
-    The pitch in x and y, from the project, the file, the separations of the marks, or the frame's size, in this order;
-    problems that need review; notes.
-    """
+    """Pixel pitch, µm, from the project, the file, the marks or the frame's size; problems; notes."""
     if options.pitch_um is not None:
         return options.pitch_um, (), ()
     if scan.pitch_um is not None:

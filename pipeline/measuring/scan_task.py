@@ -192,11 +192,8 @@ def sample_names(names: Sequence[str], count: int) -> list[str]:
 
 
 def _pose(project: Project, camera: CameraFile, name: str) -> tuple[str, Pose | None]:
-    """Scan orientation of an image: as set in the project, or known from the learning of marks.
-
-    A scan whose marks were clicked has the orientation of the clicks. Marks that recur in all scans, without clicks,
-    were searched in one assumed orientation.
-    """
+    """Scan orientation of an image: as set in the project, or known from the learning of marks."""
+    # Marks that recur in all scans, without clicks, were searched in one assumed orientation.
     learned = camera.learned_from
     if learned is None or project.pose != "auto" or name not in learned.alike:
         return project.pose, None

@@ -69,8 +69,8 @@ def recognise(predicted_px: Array, found_px: Array, shift_px: float) -> tuple[Ar
 
 
 def _similarities(predicted: ComplexArray, found: ComplexArray, shift_px: float) -> tuple[ComplexArray, ComplexArray]:
-    """Scales (with rotation) and shifts that map a distant pair of targets onto a pair of candidates, within the
-    tolerances; of many the ones with the most similar ones, in terms of the places of the pattern's corners."""
+    """Scales (with rotation) and shifts that map a distant pair of targets onto a pair of candidates."""
+    # Of many, those with the most similar ones, in terms of the places of the pattern's corners, are returned.
     first, second = _long_pairs(predicted)
     start, end = np.nonzero(~np.eye(len(found), dtype=bool))
     across, between = predicted[second] - predicted[first], found[end] - found[start]

@@ -166,13 +166,7 @@ def replace_targets(
 def _oriented_by_targets(
     options: ScanOptions, sought: SoughtTargets, scan: Scan, measured: MeasuredScan
 ) -> tuple[tuple[ImageModel, Sequence[TargetPrediction]] | str, tuple[str, ...]]:
-    """Orient the image by its targets: from the approximate orientation or, if there is none that fits, from the
-    pattern alone.
-
-    Returns
-    -------
-    The model with the predicted targets, or the reason of the failure; and notes.
-    """
+    """Orient by the approximate orientation, else by the pattern: model and predictions, or a reason; notes."""
     camera, settings, field = options.camera, sought.settings, sought.field
     model = camera_model(camera, measured)
     if isinstance(model, str):
@@ -204,8 +198,7 @@ def _too_small(sought: SoughtTargets, largest_px: float) -> str:
 
 
 def _diameters_px(predictions: Sequence[TargetPrediction], measured: MeasuredScan) -> tuple[float, float] | None:
-    """Smallest and largest expected diameter of the targets in or near the scan, with tolerance; None where none is
-    large enough."""
+    """Smallest and largest expected diameter of the targets in or near the scan; None where none is large enough."""
     size = np.array([measured.width_px, measured.height_px])
     near = [p for p in predictions if np.all(np.abs(p.center_px - size / 2.0) < _NEAR * size)]
     axes = np.array([p.half_axes_px for p in near]).reshape(-1, 2)
@@ -217,11 +210,8 @@ def _diameters_px(predictions: Sequence[TargetPrediction], measured: MeasuredSca
 def _oriented(
     model: ImageModel, field: Field, scan: Scan, measured: MeasuredScan, settings: TargetSettings
 ) -> NamedField | str:
-    """Orient the image by matching the detected disks with the predicted pattern, and identify the targets.
-
-    Targets that an unknown lens distortion displaces by far more than a pixel are identified, too. Returns the reason
-    if the identification fails.
-    """
+    """Orient the image by matching the detected disks with the predicted pattern; or the reason of the failure."""
+    # Targets that an unknown lens distortion displaces by far more than a pixel are identified, too.
     size = float(np.hypot(measured.width_px, measured.height_px))
     predictions = field.predictions(model, measured, _SLACK_PX)
     predicted = np.array([prediction.center_px for prediction in predictions]).reshape(-1, 2)

@@ -127,8 +127,7 @@ def _fiducials(scan: MeasuredScan) -> dict[str, Array]:
 
 
 def _movement(first: MeasuredScan, second: MeasuredScan) -> Array | None:
-    """(2, 3) similarity from pixels of the first scan to those of the second, from their joins; None where there are
-    too few."""
+    """(2, 3) similarity from pixels of the first scan to the second, from their joins; None where they are too few."""
     places = [
         {mark.point: mark.center_px for mark in scan.frame.marks if mark.kind == "join" and mark.status.is_observation}
         for scan in (first, second)
@@ -177,8 +176,7 @@ def _contradicted(scan: MeasuredScan, other: MeasuredScan, off_mm: float) -> Mea
 
 
 def _unchecked(scan: MeasuredScan, is_checked: bool) -> MeasuredScan:
-    """Mark fiducials that are too few to check one another as weak, unless the joins check them; then drop that
-    problem."""
+    """Mark fiducials too few to check one another as weak; where the joins check them, drop that problem."""
     if is_checked:
         problems = tuple(problem for problem in scan.frame.problems if problem.codes != (Code.NO_CHECK,))
         return replace(scan, frame=replace(scan.frame, problems=problems))

@@ -183,8 +183,8 @@ def _pitch(drawing: CameraDrawing, known_um: Point | None, source: str) -> tuple
 
 
 def _through_coordinates(up_mm: Array, given_mm: Array, pose: str) -> Array:
-    """(2, 3) matrix, camera to the scan's (right, up), mm; mirrored if that fits better, or, with too few points to
-    decide, if the pose is."""
+    """(2, 3) matrix, camera to the scan's (right, up), mm."""
+    # Mirrored if that fits better, or, with too few points to decide, if the pose is.
     tells_mirror = len(given_mm) >= LEAST_CLICKS and not are_collinear(given_mm)
     mirrors = ("0", "0m") if tells_mirror else ("0m" if "m" in pose else "0",)
     fits = [fit_frame(given_mm, up_mm, np.full(len(up_mm), _CLICK_MM), up_from_camera(one)) for one in mirrors]
@@ -192,8 +192,7 @@ def _through_coordinates(up_mm: Array, given_mm: Array, pose: str) -> Array:
 
 
 def _skew_rad(places_mm: Array) -> float:
-    """Rotation of the marks against the axes: mean of the directions of the line through the means of the left and
-    right marks, and of that through the lower and upper ones."""
+    """Rotation of the marks against the axes, by lines through the means of the marks on opposite sides."""
     if len(places_mm) < 2:
         return 0.0
     middle, half = (places_mm.max(axis=0) + places_mm.min(axis=0)) / 2, np.ptp(places_mm, axis=0) / 2

@@ -178,8 +178,7 @@ def _half_px(shown: DrawnMark, lines: Sequence[Any], place: Affine, own: Sequenc
 
 
 def _handle_affine(drawing: CameraDrawing, shown: DrawnMark) -> Affine:
-    """Affine from the axes in which a mark is drawn to the scan; those of a radial mark are rotated with its
-    position."""
+    """Affine from the axes in which a mark is drawn to the scan; those of a radial mark turn with its position."""
     linear = shown.pixel_from_mark[:, :2]
     if drawing.mark.get("rotate") == "radial":
         x, y = np.array(shown.xy_mm) / (math.hypot(*shown.xy_mm) or 1.0)

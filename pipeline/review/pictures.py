@@ -133,8 +133,7 @@ def _window(scan: Scan, col0: int, row0: int, size: int) -> NDArray[np.uint8]:
 
 
 def _reduced_window(scan: Scan, col0: int, row0: int, side: int, step: int) -> NDArray[np.uint8]:
-    """(side, side) means over squares of step x step pixels. Only the part within the scan is read, one row of means at
-    a time."""
+    """(side, side) means over squares of step x step pixels, read within the scan, one row of means at a time."""
     shown = np.full((side, side), _NOTHING, np.uint8)
     cols, rows = (
         _overlapping_pixels(col0, scan.width_px, side, step),

@@ -196,11 +196,8 @@ class Session:
         self._by_key, self._judging = {entry.key: entry for entry in queue}, judging
 
     def _find_answer(self, entry: Entry) -> Decision | None:
-        """Decision that answers a question; None if it is open.
-
-        A question about several frames needs decisions on all of them. Any decision on a frame answers the question
-        about a frame without marks. A changed pose answers the questions about marks, since it renames them.
-        """
+        """Decision that answers a question; None if it is open."""
+        # One about several frames needs decisions on all. A changed pose answers those about marks: it renames them.
         if entry.question is not Question.CAMERA and entry.images[0] not in self._of_image:
             return None
         match entry.question:
