@@ -16,8 +16,8 @@ from adjust.solution.unmodelled_error import adjust_unmodelled
 from measure.results import ON_FILM
 from pipeline.adjusting.network import build_network
 from pipeline.errors import InputError
-from pipeline.files.adjust_table import AdjustSettings
 from pipeline.files.project_file import ASSUMED_PITCH_UM, Project
+from pipeline.files.project_tables import AdjustSettings
 from pipeline.measuring.target_field import across, disk_normals, eccentricity_mm, plane_normal
 from pipeline.results.comparator_file import ComparatorPoint, has_pixels_alone
 from pipeline.text.wording import listed

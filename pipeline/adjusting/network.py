@@ -17,10 +17,9 @@ from adjust.problem.observations import Calibration, Distance, Observations
 from measure.results import ON_FILM
 from pipeline.adjusting.turned_pictures import rotate_to_sensor
 from pipeline.errors import InputError
-from pipeline.files.adjust_table import AdjustSettings
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
-from pipeline.files.project_tables import UNITS_MM
+from pipeline.files.project_tables import UNITS_MM, AdjustSettings
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.text.wording import did_you_mean, listed
 from pipeline.types import Array

@@ -72,7 +72,7 @@ def export(
     as_json: AsJson = False,
 ) -> int:
     """Write files for another program."""
-    from pipeline.exchange.export_stage import run_export
+    from pipeline.exchange.exchange_stage import run_export
 
     done = run_export(read(project, max_pixels), format, out_dir, ExportOptions(pitch_um, lens, misfit_px))
     show(
@@ -96,7 +96,7 @@ def import_(
     fiducials: Annotated[bool, typer.Option("--fiducials", help="The marks are fiducials.")] = False,
 ) -> int:
     """Read files of another program, or a certificate."""
-    from pipeline.exchange.import_stage import run_import
+    from pipeline.exchange.exchange_stage import run_import
     from pipeline.exchange.incoming import ImportOptions
 
     if len(paths) < 2:

@@ -1,9 +1,8 @@
 """Ames Stereo Pipeline: a .tsai file per image, with the distortion models TSAI or FISHEYE, which are OpenCV's."""
 
 from pipeline.exchange.block import Block
-from pipeline.exchange.fitted_lens import BROWN
 from pipeline.exchange.formats import Convention, ExportOptions, Written
-from pipeline.exchange.pinhole import PinholeFrame, pinhole_frames, pinholes_written
+from pipeline.exchange.pinhole import BROWN, PinholeFrame, pinhole_frames, pinholes_written
 
 CONVENTION = Convention(
     (0.0, 0.0),

@@ -8,10 +8,9 @@ from typing import Any
 
 from pipeline.errors import InputError, missing_extra
 from pipeline.exchange.block import Block
-from pipeline.exchange.fitted_lens import BROWN, RATIONAL
 from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.exchange.incoming import ImportOptions, Incoming, foreign_pose, opencv_camera
-from pipeline.exchange.pinhole import PinholeFrame, pinhole_frames, pinholes_written
+from pipeline.exchange.pinhole import BROWN, RATIONAL, PinholeFrame, pinhole_frames, pinholes_written
 from pipeline.opencv_check.opencv_calibration import INTERIOR
 from pipeline.text.names import image_name
 

@@ -14,7 +14,7 @@ from adjust.functional_model.lens_conversion import ConvertedLens, convert_lens
 from adjust.problem.parameter import Parameter
 from pipeline.adjusting.compare_stage import calibrated_lens
 from pipeline.errors import InputError
-from pipeline.exchange.export_stage import check_folder, publish, readme
+from pipeline.exchange.exchange_stage import check_folder, publish, readme
 from pipeline.files.camera_file import camera_text, read_camera
 from pipeline.files.mark_table import Picture, picture_file
 from pipeline.provenance import hash_content

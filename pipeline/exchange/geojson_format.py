@@ -8,8 +8,8 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, WholeFrame
-from pipeline.exchange.fitted_lens import frame_corners_mm
 from pipeline.exchange.formats import Convention, ExportOptions, Written
+from pipeline.exchange.pinhole import frame_corners_mm
 from pipeline.types import Array
 
 # Semi-major axis in m and flattening. ETRS89 (GRS 80) and WGS 84 differ by less than a metre, and by plate motion.

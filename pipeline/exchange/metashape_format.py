@@ -6,11 +6,10 @@ from pathlib import Path
 
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, OutFrame
-from pipeline.exchange.fitted_lens import BROWN, FittedLens, sheared_lens
 from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.exchange.incoming import ImportOptions, Incoming, opencv_camera
 from pipeline.exchange.micmac_format import film_box
-from pipeline.exchange.pinhole import checked_misfits
+from pipeline.exchange.pinhole import BROWN, FittedLens, checked_misfits, sheared_lens
 from pipeline.exchange.xml_tree import child_numbers, read_xml, xml_text
 from pipeline.files.camera_file import CameraFile
 from pipeline.resampling.canvas import Canvas

@@ -9,10 +9,16 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, OutFrame
-from pipeline.exchange.fitted_lens import BROWN, FittedLens, frame_corners_mm, sheared_lens
 from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.exchange.incoming import ForeignMark, ImportOptions, Incoming, fiducial_camera
-from pipeline.exchange.pinhole import Y_DOWN_Z_FORWARD, checked_misfits
+from pipeline.exchange.pinhole import (
+    BROWN,
+    Y_DOWN_Z_FORWARD,
+    FittedLens,
+    checked_misfits,
+    frame_corners_mm,
+    sheared_lens,
+)
 from pipeline.exchange.xml_tree import Content, Element, child_numbers, child_text, read_xml, xml_text
 from pipeline.resampling.canvas import Canvas
 from pipeline.results.comparator_file import ComparatorPoint

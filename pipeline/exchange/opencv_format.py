@@ -7,10 +7,9 @@ import cv2
 import numpy as np
 
 from pipeline.exchange.block import Block
-from pipeline.exchange.fitted_lens import BROWN, PRISMS
 from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.exchange.incoming import ForeignPose, ImportOptions, Incoming, foreign_pose, opencv_camera
-from pipeline.exchange.pinhole import PinholeFrame, pinhole_frames, pinholes_written
+from pipeline.exchange.pinhole import BROWN, PRISMS, PinholeFrame, pinhole_frames, pinholes_written
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.opencv_file import FISHEYE, read_pixel_camera
 from pipeline.opencv_check.opencv_calibration import NAMES

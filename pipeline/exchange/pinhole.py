@@ -1,23 +1,203 @@
-"""Resampled frames as images of cameras without film: a pinhole with OpenCV's distortion, and an exterior
-orientation."""
+"""Resampled frames as images of cameras without film: a pinhole with OpenCV's distortion, which is the camera's own or
+fitted to it over the frame, and an exterior orientation."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from adjust.errors import AdjustmentError
+from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens import Distortion, Lens
+from adjust.functional_model.lens_conversion import convert_lens, frame_grid_mm
 from adjust.functional_model.projection import STRAIGHT
 from measure.errors import MeasurementError
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, Frame, WholeFrame
-from pipeline.exchange.fitted_lens import FittedLens, fisheye_lens, nearest_lens
 from pipeline.exchange.formats import Convention, ExportOptions, Written
-from pipeline.opencv_check.opencv_calibration import INTERIOR
+from pipeline.opencv_check.opencv_calibration import FISHEYE, INTERIOR, NAMES, fixed, opencv_values
 from pipeline.resampling.canvas import Canvas, outline_canvas
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.types import Array
 
+BROWN = ("k1", "k2", "p1", "p2", "k3")
+RATIONAL = (*BROWN, "k4", "k5", "k6")
+PRISMS = (*BROWN, "s1", "s2", "s3", "s4")
+_AFFINE = ("b1", "b2")
+_ONE_SCALE = ("none", "torlegard")  # families without affinity and shear
+
 Y_DOWN_Z_FORWARD = np.diag([1.0, -1.0, -1.0])  # from the camera's axes (y up, looking along -z) to these programs' axes
+
+
+@dataclass(frozen=True)
+class FittedLens:
+    """A lens in OpenCV's model.
+
+    Attributes
+    ----------
+    values : (18,) OpenCV's parameters as in `opencv_model`, in mm with y up.
+    largest_mm : largest error of a point in the frame.
+    fisheye : k1 to k4 of OpenCV's fisheye, instead of the distortion; otherwise empty.
+    shear : b2 as in the family `opencv`, for programs that have it.
+    """
+
+    values: Array
+    largest_mm: float
+    fisheye: tuple[float, ...] = ()
+    shear: float = 0.0
+
+    def named(self, names: Sequence[str]) -> Array:
+        return np.array([self.values[NAMES.index(name)] for name in names])
+
+
+def nearest_lens(block: Block, frame: Frame, models: Sequence[Sequence[str]], options: ExportOptions) -> FittedLens:
+    """Fit the lens of an image's camera in one of several models, each given by names of OpenCV's parameters.
+
+    The first model that is identical is taken; else the first that is close enough; else the last. If the lens
+    distortion is removed from the frames, the result is a lens without distortion.
+    """
+    lens = frame.lens
+    assert lens is not None
+    if options.with_lens or lens.distortion.family == "none":
+        return FittedLens(_undistorted(lens), 0.0)
+    for names in models:
+        if _has_only(lens, (*names, "b1")):
+            return _opencv(lens)
+    for names in models:
+        fitted = _fit_opencv(block, frame, names)
+        if fitted.largest_mm <= options.largest_misfit_px * min(frame.known_pitch_um) / 1000.0:
+            break
+    return fitted
+
+
+def fisheye_lens(block: Block, frame: Frame, options: ExportOptions) -> FittedLens | None:
+    """The lens of an image's camera if it is OpenCV's fisheye. Its shear, which programs leave out, becomes the
+    misfit."""
+    lens = frame.lens
+    assert lens is not None
+    if lens.distortion.family != FISHEYE or options.with_lens:
+        return None
+    *k, b1, b2 = lens.parameters.tolist()
+    c, x0, y0 = lens.interior
+    values = np.zeros(len(NAMES))
+    values[:4] = c * (1.0 + b1), c, x0, y0
+    farthest_mm = float(np.abs(frame_corners_mm(block, frame)[:, 1] - y0).max())
+    return FittedLens(values, abs(b2) * farthest_mm, tuple(k))
+
+
+def sheared_lens(block: Block, frame: Frame, at_ideal: bool) -> FittedLens:
+    """The lens of an image's camera with k1, k2, k3, p1, p2, affinity and shear.
+
+    Parameters
+    ----------
+    at_ideal : affinity and shear apply to the ideal point, as in MicMac, and not to the distorted one, as in Metashape.
+    """
+    lens = frame.lens
+    assert lens is not None
+    family = lens.distortion.family
+    if family == "none":
+        return FittedLens(_undistorted(lens), 0.0)
+    if _has_only(lens, BROWN if at_ideal else (*BROWN, *_AFFINE)):
+        return _opencv(lens)
+    if family in _ONE_SCALE or not at_ideal:
+        return _fit_opencv(block, frame, (*BROWN, *_AFFINE))
+    rays, observed_mm = _over_frame(block, frame)
+    fitted, shear = _sheared_step(rays, observed_mm)
+    return FittedLens(fitted, _largest(_sheared(fitted, shear, rays) - observed_mm), shear=shear)
+
+
+def frame_corners_mm(block: Block, frame: Frame) -> Array:
+    """(2, 2) opposite corners of the exposed frame, camera mm: from the camera file, or the extent of the
+    observations."""
+    camera = block.camera_file(frame.camera)
+    if camera.fiducials and camera.frame_mm is not None:
+        half = np.array(camera.frame_mm) / 2.0
+        return np.array([-half, half])
+    places = [
+        each.model.camera_from_comparator(np.array([mark.xy_mm for mark in each.marks]))
+        for each in block.frames
+        if each.camera == frame.camera and each.model is not None and each.marks
+    ]
+    observed = np.concatenate(places)
+    return np.array([observed.min(axis=0), observed.max(axis=0)])
+
+
+def _undistorted(lens: Lens) -> Array:
+    c, x0, y0 = lens.interior
+    values = np.zeros(len(NAMES))
+    values[:4] = c, c, x0, y0
+    return values
+
+
+def _has_only(lens: Lens, names: Sequence[str]) -> bool:
+    """Whether a lens is of OpenCV's family and has no other parameters than these."""
+    family = lens.distortion.family
+    known = zip(parameter_names(family), lens.parameters, strict=True)
+    return family == "opencv" and not any(value for name, value in known if name not in names)
+
+
+def _opencv(lens: Lens) -> FittedLens:
+    given = dict(zip(parameter_names(lens.distortion.family), lens.parameters.tolist(), strict=True))
+    values = _undistorted(lens)
+    values[0] *= 1.0 + given["b1"]
+    values[4:] = [given[name] for name in NAMES[4:]]
+    return FittedLens(values, 0.0, shear=given["b2"])
+
+
+def _over_frame(block: Block, frame: Frame) -> tuple[Array, Array]:
+    """Rays (n, 2) over the frame, y up, and their images (n, 2), mm."""
+    lens = frame.lens
+    assert lens is not None
+    grid_mm = frame_grid_mm(frame_corners_mm(block, frame))
+    rays, found = lens.ray_from_observed(grid_mm)
+    return rays[found], grid_mm[found]
+
+
+def _fit_opencv(block: Block, frame: Frame, names: Sequence[str]) -> FittedLens:
+    """Fit parameters of these names in OpenCV's model."""
+    lens = frame.lens
+    assert lens is not None
+    family = lens.distortion.family
+    estimated = [name for name in names if name not in _AFFINE] if family in _ONE_SCALE else [*names, "b1"]
+    own = zip(parameter_names(family), lens.parameters.tolist(), strict=True)
+    into = fixed("opencv", {name: value for name, value in own if name in estimated} if family == "opencv" else {})
+    corners_mm = frame_corners_mm(block, frame)
+    try:
+        found = convert_lens(lens, into, corners_mm, estimated)
+    except AdjustmentError:  # treat it as a model that does not fit
+        return FittedLens(_undistorted(lens), np.inf)
+    return FittedLens(opencv_values(found.lens)[0], found.largest_mm, shear=float(found.lens.parameters[-1]))
+
+
+def _sheared_step(rays: Array, observed_mm: Array) -> tuple[Array, float]:
+    """Parameters (18,) and shear, with affinity and shear of the ideal point, by one linear least-squares fit.
+
+    The observations are linear in c, in c times each of the other parameters, and in the principal point.
+    """
+    a, b = (rays * (1.0, -1.0)).T  # OpenCV's axes
+    r2, none, one = a * a + b * b, np.zeros_like(a), np.ones_like(a)
+    across = [a, a * r2, a * r2**2, 2 * a * b, r2 + 2 * a * a, a * r2**3, a, b, one, none]
+    down = [b, b * r2, b * r2**2, r2 + 2 * b * b, 2 * a * b, b * r2**3, none, none, none, -one]
+    design = np.concatenate([np.stack(across, axis=1), np.stack(down, axis=1)])
+    scale = np.linalg.norm(design, axis=0)
+    observed = np.concatenate([observed_mm[:, 0], -observed_mm[:, 1]])
+    c, k1, k2, p1, p2, k3, b1, b2, x0, y0 = (np.linalg.lstsq(design / scale, observed)[0] / scale).tolist()
+    values = np.zeros(len(NAMES))
+    values[:9] = c + b1, c, x0, y0, k1 / c, k2 / c, p1 / c, p2 / c, k3 / c
+    return values, b2 / c
+
+
+def _sheared(values: Array, shear: float, rays: Array) -> Array:
+    """Camera coordinates (n, 2) in mm of rays (n, 2)."""
+    fx, fy = values[:2]
+    unit = Lens(Distortion("opencv"), np.array([1.0, 0.0, 0.0]), np.array([*values[4:], 0.0, 0.0]))
+    bent, _ = unit.camera_from_ray(rays)
+    across = fy * bent[:, 0] + (fx - fy) * rays[:, 0] - fy * shear * rays[:, 1]
+    return np.asarray(np.column_stack([across, fy * bent[:, 1]]) + values[2:4])
+
+
+def _largest(off_mm: Array) -> float:
+    return float(np.linalg.norm(off_mm, axis=1).max())
 
 
 @dataclass(frozen=True)

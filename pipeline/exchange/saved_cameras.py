@@ -22,12 +22,12 @@ from pipeline.files.camera_tables import Source
 from pipeline.files.earlier_calibration import EarlierCalibration
 from pipeline.files.mark_table import picture_writer
 from pipeline.files.project_file import Project
-from pipeline.provenance import hash_file
+from pipeline.results.adjustment_file import write_with_covariance
 from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, FiducialRecord, Quantity
 from pipeline.results.comparator_file import read_comparator
-from pipeline.results.covariance_file import covariance_path, read_own_covariance
+from pipeline.results.covariance_file import read_own_covariance
 from pipeline.results.record_json import json_text
-from pipeline.text.atomic import atomic_path, write_atomically
+from pipeline.text.atomic import write_atomically
 from pipeline.text.wording import counted, listed
 from pipeline.types import Array
 
@@ -120,7 +120,8 @@ def _save(calibrations: Sequence[_Calibration], path: Path) -> SavedCamera:
     labels = {one.label_in_camera: value for one, value in spread.items()}
     source = Source(text=text, frames=frames, scanners=scanners, archives=len(calibrations), spread_mm=labels)
     earlier = path.with_name(f"{path.stem}-calibration.json")
-    _write_calibration(first, record, values, covariance, earlier)
+    names = np.array([each.text for each in first.parameters], dtype=np.str_)
+    write_with_covariance(earlier, json_text(record), lambda: {"names": names, "values": values, "matrix": covariance})
     camera = _adjusted_camera(first, record.cameras[first.camera.name], earlier, path, source)
     body = camera_text(camera, picture_writer(path.parent, f"{path.stem}-"))
     write_atomically(path, f"{_HEAD}: values, and in {earlier.name} their covariance.\n{body}")
@@ -225,23 +226,6 @@ def _fiducial(one: _Calibration, id: str, mark: FiducialRecord, changed: Changed
         scale = math.sqrt(covariance[at[0], at[0]] * covariance[at[1], at[1]])
         rho = float(covariance[at[0], at[1]] / scale) if scale else 0.0
     return replace(mark, x_mm=changed(x, mark.x_mm), y_mm=changed(y, mark.y_mm), rho=rho)
-
-
-def _write_calibration(
-    one: _Calibration, record: AdjustmentRecord, values: Array, covariance: Array, path: Path
-) -> None:
-    with atomic_path(covariance_path(path)) as arrays, atomic_path(path) as result:
-        with result.open("w", encoding="utf-8", newline="\n") as file:
-            file.writelines(json_text(record))
-        names = np.array([each.text for each in one.parameters], dtype=np.str_)
-        with arrays.open("wb") as data:
-            content = {
-                "fingerprint": np.array(hash_file(result)),
-                "names": names,
-                "values": values,
-                "matrix": covariance,
-            }
-            np.savez_compressed(data, allow_pickle=False, **content)
 
 
 def _adjusted_camera(one: _Calibration, record: CameraRecord, earlier: Path, path: Path, source: Source) -> CameraFile:

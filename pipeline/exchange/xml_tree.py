@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias
 from xml.etree import ElementTree
-from xml.parsers import expat
 
 import numpy as np
 
@@ -19,42 +18,40 @@ Content: TypeAlias = "str | float | Array | Mapping[str, Content] | Sequence[tup
 DEEPEST = 100  # largest nesting depth of elements: no format here has ten
 
 
-def read_xml(path: Path) -> Element:
-    """Read the root element of a file. Raises InputError for a missing file, broken XML, and any document type, since
-    it may define entities."""
-    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
-    depth = 0
+class _Builder(ElementTree.TreeBuilder):
+    """Builder of a tree of limited depth, without a document type, since it may define entities."""
 
-    def start(name: str, attributes: dict[str, str]) -> None:
-        nonlocal depth
-        depth += 1
-        if depth > DEEPEST:
-            raise InputError(f"{path}: its elements are nested more than {DEEPEST} deep; no such file is read.")
-        builder.start(name, attributes)
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.path, self.depth = path, 0
 
-    def end(name: str) -> None:
-        nonlocal depth
-        depth -= 1
-        builder.end(name)
+    def start(self, tag: str, attrs: dict[str, str]) -> Element:
+        self.depth += 1
+        if self.depth > DEEPEST:
+            raise InputError(f"{self.path}: its elements are nested more than {DEEPEST} deep; no such file is read.")
+        return super().start(tag, attrs)
 
-    def refuse(*_: object) -> None:
+    def end(self, tag: str) -> Element:
+        self.depth -= 1
+        return super().end(tag)
+
+    def doctype(self, *_: object) -> None:
         raise InputError(
-            f"{path}: has a document type (<!DOCTYPE>), and entities are not expanded here. No program's measurements "
-            "have one: remove it, or export the file again."
+            f"{self.path}: has a document type (<!DOCTYPE>), and entities are not expanded here. No program's "
+            "measurements have one: remove it, or export the file again."
         )
 
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.CharacterDataHandler = builder.data
-    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
+
+def read_xml(path: Path) -> Element:
+    """Read the root element of a file. Raises InputError for a missing file, broken XML, and any document type."""
     try:
-        parser.Parse(read_bytes(path), True)
+        return ElementTree.XML(read_bytes(path), ElementTree.XMLParser(target=_Builder(path)))
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file.") from None
     except IsADirectoryError:
         raise InputError(f"{path}: is a folder; an XML file is needed here.") from None
-    except expat.ExpatError as error:
+    except ElementTree.ParseError as error:
         raise InputError(f"{path}: is not valid XML ({error}). Export it again from the other program.") from None
-    return builder.close()
 
 
 def child_text(element: Element, name: str, path: Path) -> str:

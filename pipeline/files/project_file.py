@@ -13,7 +13,6 @@ from adjust.functional_model.lens import Prior
 from adjust.problem.network import ObjectPoint
 from measure.fiducials.options import ANY_FILM, BelievedFilm, Reads
 from pipeline.errors import InputError
-from pipeline.files.adjust_table import AdjustSettings
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.decisions_file import FILE as DECISIONS
 from pipeline.files.decisions_file import Decision, cut_short_line, decisions_bytes, learned_from, parse_decisions
@@ -21,7 +20,7 @@ from pipeline.files.images_file import GivenImages, read_images
 from pipeline.files.library import PREFIX, camera_path
 from pipeline.files.mark_table import Clicks
 from pipeline.files.points_file import GivenDistance, GivenPoints, read_distances, read_points
-from pipeline.files.project_tables import UNITS_MM, ProjectTable
+from pipeline.files.project_tables import UNITS_MM, AdjustSettings, ProjectTable
 from pipeline.files.scan_files import FoundScans, add_cuts, as_named, find_scans
 from pipeline.files.target_table import TargetSettings, TieSettings, read_targets, read_ties
 from pipeline.provenance import hash_content

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from pipeline.files.adjust_table import Datum, Film, ScannerSetting, ScannerSigma, scanner_setting
+from pipeline.files.project_tables import Datum, Film, ScannerSetting, ScannerSigma, scanner_setting
 from pipeline.text.table_models import (
     Key,
     NotNegative,

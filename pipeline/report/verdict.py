@@ -44,23 +44,28 @@ MOST_QUANTITIES = 3  # largest number of contradicted quantities named
 LEAST_SHARE = 0.5  # fraction of the corner radius up to which a lens must be observed
 CONFIDENCE = 0.99  # of the global test, and family-wise confidence of the tests of residuals
 
-# Observations other than marks: heading of their list, and remedy.
-DISTANCES = (
-    "contradicted by the images (p < 0.01)",
-    "Look for a wrong point or unit in the file of distances; two distances that contradict each other are both named.",
-)
-FIDUCIAL_DISTANCES = (
-    "contradicted by the images (p < 0.01; v in µm)",
-    "Compare the camera file with the certificate; two distances that contradict each other are both named.",
-)
+_CONTRADICTED_BY = "contradicted by the images (p < 0.01"
+_BOTH_NAMED = "two distances that contradict each other are both named."
 CALIBRATION = (
     "The images contradict the earlier calibration",
     "The camera has changed since, or the earlier adjustment lacked something; calibrate without it and compare.",
 )
-ANTENNAS = (
-    "contradicted by the images (p < 0.01)",
-    "Look for a wrong image or time, and at the antenna's offset and its sign.",
-)
+# Observations other than marks: attribute of the adjustment, their name in singular and plural, heading of their list,
+# remedy, and section of the report.
+FURTHER = (
+    (
+        "distances", "distance", "distances", f"{_CONTRADICTED_BY})",
+        f"Look for a wrong point or unit in the file of distances; {_BOTH_NAMED}", "reliability",
+    ),
+    (
+        "fiducial_distances", "distance between fiducials", "distances between fiducials",
+        f"{_CONTRADICTED_BY}; v in µm)", f"Compare the camera file with the certificate; {_BOTH_NAMED}", "fiducials",
+    ),
+    (
+        "antennas", "coordinate of antennas", "coordinates of antennas", f"{_CONTRADICTED_BY})",
+        "Look for a wrong image or time, and at the antenna's offset and its sign.", "",
+    ),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -171,26 +176,17 @@ def _suspect(row: SuspectRecord) -> str:
 
 
 def _further_problems(adjustment: AdjustmentRecord) -> Iterator[Problem]:
-    """Yield problems of distances, earlier calibrations and antennas that the images contradict."""
-    heading, remedy = DISTANCES
-    if bad := _outlying(adjustment, adjustment.distances):
-        what = f"{counted(len(bad), 'distance')} {heading}: {_named(bad, [row.name for row in bad])}."
-        yield Problem(what, remedy, section="reliability")
-    heading, remedy = FIDUCIAL_DISTANCES
-    if bad := _outlying(adjustment, adjustment.fiducial_distances):
-        count = counted(len(bad), "distance between fiducials", "distances between fiducials")
-        what = f"{count} {heading}: {_named(bad, [row.name for row in bad])}."
-        yield Problem(what, remedy, section="fiducials")
+    """Yield problems of earlier calibrations, distances and antennas that the images contradict."""
     heading, remedy = CALIBRATION
     tests = [test for test in adjustment.calibration_tests if test.p < CONTRADICTED]
     yield from (Problem(f"{heading}: {contradiction(test, adjustment.cameras)}.", remedy) for test in tests)
     if not tests and (bad := _outlying(adjustment, adjustment.calibrations)):
         names = [spoken_name(row.name, adjustment.cameras) for row in bad]
         yield Problem(f"{heading}: {_named(bad, names)}.", remedy)
-    heading, remedy = ANTENNAS
-    if bad := _outlying(adjustment, adjustment.antennas):
-        count = counted(len(bad), "coordinate of antennas", "coordinates of antennas")
-        yield Problem(f"{count} {heading}: {_named(bad, [row.name for row in bad])}.", remedy)
+    for group, one, many, heading, remedy, section in FURTHER:
+        if bad := _outlying(adjustment, getattr(adjustment, group)):
+            what = f"{counted(len(bad), one, many)} {heading}: {_named(bad, [row.name for row in bad])}."
+            yield Problem(what, remedy, section=section)
 
 
 def _named(rows: Sequence[Observed], names: Sequence[str]) -> str:

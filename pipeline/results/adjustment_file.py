@@ -1,9 +1,10 @@
 """`adjustment.json`, the adjustment with its input, and `adjustment.npz`, its covariance."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adjust.solution.result import Adjustment
 from pipeline.errors import InputError
@@ -40,15 +41,23 @@ def write_adjustment(
     InputError
         If a file cannot be written.
     """
-    record = adjustment_record(adjustment, frames_mm, made_from)
-    # Both files are complete before either is replaced, so that the covariance always matches the adjustment.
+    write_with_covariance(
+        path, json_text(adjustment_record(adjustment, frames_mm, made_from)), lambda: covariance_arrays(adjustment)
+    )
+
+
+def write_with_covariance(
+    path: Path, text: Iterable[str], arrays: Callable[[], Mapping[str, NDArray[np.generic]]]
+) -> None:
+    """Write the pieces of an adjustment.json, then the arrays of its covariance with its fingerprint.
+
+    Both files are complete before either is replaced, so that the covariance always matches the adjustment.
+    """
     with atomic_path(covariance_path(path)) as covariance, atomic_path(path) as result:
         with result.open("w", encoding="utf-8", newline="\n") as file:
-            file.writelines(json_text(record))
-        del record
-        fingerprint, arrays = np.array(hash_file(result)), covariance_arrays(adjustment)
+            file.writelines(text)
         with covariance.open("wb") as data:
-            np.savez_compressed(data, allow_pickle=False, fingerprint=fingerprint, **arrays)
+            np.savez_compressed(data, allow_pickle=False, fingerprint=np.array(hash_file(result)), **arrays())
 
 
 def observed_mm(path: Path, content: AdjustmentRecord, camera: str) -> Array:

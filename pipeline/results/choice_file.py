@@ -10,6 +10,10 @@ from adjust.model_selection.cross_validation import CrossValidation
 from adjust.model_selection.model_choice import Choice
 from pipeline.results.record_json import read_record
 
+STATISTICS = (
+    "observations", "unknowns", "redundancy", "vpv", "sigma0", "aic", "aicc", "cross_validation", "warnings",
+)  # fmt: skip
+
 
 @dataclass(frozen=True)
 class ModelRecord:
@@ -56,30 +60,12 @@ class CandidateRecord:
 
     @classmethod
     def from_candidate(cls, candidate: Candidate) -> "CandidateRecord":
-        model = candidate.model
-        known = cls(
-            name=model.name,
-            transformation=model.transformation,
-            family=model.family,
-            parameters=model.parameters,
-            bends=dict(model.bends),
-            problem=candidate.problem,
-        )
+        model = vars(ModelRecord.from_model(candidate.model))
+        known = cls(name=candidate.model.name, **model, problem=candidate.problem)
         if candidate.problem:
             return known
-        return replace(
-            known,
-            observations=candidate.observations,
-            unknowns=candidate.unknowns,
-            redundancy=candidate.redundancy,
-            vpv=candidate.vpv,
-            sigma0=candidate.sigma0,
-            aic=candidate.aic,
-            aicc=candidate.aicc,
-            cross_validation=candidate.cross_validation,
-            correlated=tuple(ParameterCorrelation((a, b), rho) for a, b, rho in candidate.correlated),
-            warnings=candidate.warnings,
-        )
+        correlated = tuple(ParameterCorrelation((a, b), rho) for a, b, rho in candidate.correlated)
+        return replace(known, **{name: getattr(candidate, name) for name in STATISTICS}, correlated=correlated)
 
 
 @dataclass(frozen=True)

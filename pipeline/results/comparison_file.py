@@ -16,19 +16,6 @@ DRIFT, NO_DRIFT = "drift", "no drift"
 
 
 @dataclass(frozen=True)
-class ChiSquareTest:
-    """Chi-square test. freedom: degrees of freedom; probability: p-value."""
-
-    chi_square: float
-    freedom: int
-    probability: float
-
-    @classmethod
-    def from_test(cls, test: Test) -> "ChiSquareTest":
-        return cls(test.chi_square, test.freedom, test.probability)
-
-
-@dataclass(frozen=True)
 class ComparedCalibration:
     """Calibration in a comparison. time: in the user's unit, or the number of the calibration."""
 
@@ -89,8 +76,8 @@ class ComparisonRecord:
     probability: float
     level: float
     use: str
-    same: ChiSquareTest
-    trend: ChiSquareTest | None
+    same: Test
+    trend: Test | None
     calibrations: tuple[ComparedCalibration, ...]
     places_mm: tuple[Pair, ...]
     differences: tuple[CalibrationDifference, ...]
@@ -107,8 +94,8 @@ def comparison_record(comparison: Comparison, remarks: Sequence[str], level: flo
         probability=comparison.probability,
         level=level,
         use=comparison.use,
-        same=ChiSquareTest.from_test(comparison.same),
-        trend=ChiSquareTest.from_test(trend) if trend else None,
+        same=comparison.same,
+        trend=trend,
         calibrations=tuple(
             ComparedCalibration(each.name, time, each.lens.distortion.family)
             for each, time in zip(comparison.calibrations, comparison.times.tolist(), strict=True)

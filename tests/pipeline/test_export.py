@@ -357,7 +357,7 @@ def test_an_export_takes_the_place_of_an_earlier_one_whole(
         path.touch()
 
     with monkeypatch.context() as broken:
-        broken.setattr("pipeline.exchange.export_stage.write_atomically", full)
+        broken.setattr("pipeline.exchange.exchange_stage.write_atomically", full)
         assert run(["export", str(project), "opencv", str(folder)]) == WRONG_INPUT
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
     assert [path.name for path in tmp_path.iterdir()] == ["opencv"]
@@ -375,7 +375,7 @@ def test_a_mirrored_scan_goes_out_resampled(project: Path, tmp_path: Path) -> No
 
 def test_a_digital_camera_goes_out_as_its_pictures_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without fiducials and film the frame is the picture: comparator coordinates are the camera's."""
-    monkeypatch.setattr("simulated.FIDUCIALS", {})
+    monkeypatch.setattr("networks.FIDUCIALS", {})
     here = replace(TRUTH, x0=125.4, y0=-125.3, mirrored=(False,) * 4)
     project = adjusted_project(tmp_path, here, kind="none")
     pixels = {i: camera_mm(i, here) * (1, -1) / PITCH_MM for i in IMAGES}

@@ -27,9 +27,8 @@ from pipeline.archive.results_database import Store
 from pipeline.archive.status import archive_status
 from pipeline.cli import run
 from pipeline.errors import InputError
-from pipeline.exchange.export_stage import run_export
+from pipeline.exchange.exchange_stage import run_export, run_import
 from pipeline.exchange.formats import ExportOptions
-from pipeline.exchange.import_stage import run_import
 from pipeline.exchange.incoming import ImportOptions
 from pipeline.files.decisions_file import Choice, Decision, append_decisions, read_decisions
 from pipeline.files.project_file import read_project
