@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 
+from measure.flags import Code
 from pipeline.report.data import Frame, Mark, Problem
 from pipeline.report.fractions import fraction_test
 from pipeline.report.numbers import fixed
@@ -95,7 +96,8 @@ def _measurement_problems(frame: Frame) -> Iterator[Problem]:
         )
     targets = [mark for mark in frame.marks if not mark.is_fiducial]
     is_lost = frame.scan is not None and frame.scan.failure is not None
-    if targets and not is_lost and not any(mark.status.is_observation for mark in targets):
+    is_copy = measured is not None and any(Code.COPY in problem.codes for problem in measured.problems)
+    if targets and not is_lost and not is_copy and not any(mark.status.is_observation for mark in targets):
         yield Problem(
             f"none of its {len(targets)} targets was measured.",
             "Look at their reasons in comparator.csv: a wrong pose, diameter or orientation misses them all.",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from adjust.solution.explanations import Explanation
-from measure.flags import Status
+from measure.flags import Code, Reason, Status
 from measure.results import MarkMeasurement, Pose
 from pipeline.report import Problem, ReportData, judge
 from pipeline.report.data import frames
@@ -194,7 +194,8 @@ def test_the_table_of_exit_code_1_is_that_of_the_code() -> None:
 
 def test_problems_of_a_frame_and_of_the_caller_are_passed_on(measured_data: ReportData) -> None:
     assert measured_data.measurement is not None
-    scans = {**measured_data.measurement, "f4": set_frame(measured_data.measurement["f4"], problems=("nearly black.",))}
+    dark = set_frame(measured_data.measurement["f4"], problems=(Reason("nearly black.", Code.NO_FRAME),))
+    scans = {**measured_data.measurement, "f4": dark}
     data = replace(measured_data, measurement=scans, problems=(Problem("points.csv: 99 was not measured."),))
     assert "f4: nearly black." in describe(data)
     assert "99 was not measured" in describe(data)
@@ -227,6 +228,12 @@ def test_a_frame_without_any_target_needs_attention(measured_data: ReportData) -
         for row in measured_data.comparator
     ]
     assert "f2: none of its 24 targets was measured." in describe(replace(measured_data, comparator=rows))
+    copied = Reason("its file is byte for byte that of f1: its marks count once.", Code.COPY)
+    scans = dict(measured_data.measurement or {})
+    scans["f2"] = set_frame(scans["f2"], problems=(copied,))
+    problems = describe(replace(measured_data, comparator=rows, measurement=scans))
+    assert "f2: its file is byte for byte that of f1" in problems
+    assert "none of its 24 targets" not in problems
 
 
 def test_single_targets_outside_the_scan_are_ordinary(measured_data: ReportData) -> None:
