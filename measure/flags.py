@@ -8,122 +8,80 @@ from enum import StrEnum
 from typing import Self
 
 
-class Status(StrEnum):
+class _Meaningful(StrEnum):
+    """Table of values, each with its meaning, a sentence for the user."""
+
+    meaning: str
+
+    def __new__(cls, value: str, meaning: str = "") -> Self:
+        member = str.__new__(cls, value)
+        member._value_, member.meaning = value, meaning
+        return member
+
+
+class Status(_Meaningful):
     """Status of a mark. Only `measured` and `weak` marks are observations of the adjustment."""
 
-    MEASURED = "measured"
-    WEAK = "weak"
-    PREDICTED = "predicted"
-    REJECTED = "rejected"
-    ABSENT = "absent"
+    MEASURED = (
+        "measured",
+        "Found, fitted and passed all checks; a deformation of its frame is in its standard deviation.",
+    )
+    WEAK = "weak", "Fitted, but damaged, faint, partly covered or imprecise; its standard deviation allows for it."
+    PREDICTED = "predicted", "Not found; the coordinates are predicted from the other marks."
+    REJECTED = "rejected", "Something was measured, but a check shows that it is not this mark."
+    ABSENT = "absent", "Not found, outside the scan or unreadable."
 
     @property
     def is_observation(self) -> bool:
         return self in (Status.MEASURED, Status.WEAK)
 
 
-STATUS_MEANING = {
-    Status.MEASURED: "Found, fitted and passed all checks; a deformation of its frame is in its standard deviation.",
-    Status.WEAK: "Fitted, but damaged, faint, partly covered or imprecise; its standard deviation allows for it.",
-    Status.PREDICTED: "Not found; the coordinates are predicted from the other marks.",
-    Status.REJECTED: "Something was measured, but a check shows that it is not this mark.",
-    Status.ABSENT: "Not found, outside the scan or unreadable.",
-}
-
-
-class Code(StrEnum):
+class Code(_Meaningful):
     """Code of a reason."""
 
-    OUTSIDE = "outside"
-    DAMAGED_FILE = "damaged-file"
-    FAILED_SCAN = "failed-scan"
-    UNREACHABLE = "unreachable"
-    NO_FRAME = "no-frame"
-    NOT_FOUND = "not-found"
-    GROUND = "ground"
-    COVERED = "covered"
-    CONTRAST = "contrast"
-    LIKENESS = "likeness"
-    POLARITY = "polarity"
-    SIZE = "size"
-    SMALL = "small"
-    BLUR = "blur"
-    NO_FIT = "no-fit"
-    IMPRECISE = "imprecise"
-    EDGES = "edges"
-    DUST = "dust"
-    OFF_PLACE = "off-place"
-    OFF_FRAMES = "off-frames"
-    OFF_GIVEN = "off-given"
-    AMBIGUOUS = "ambiguous"
-    UNNAMED = "unnamed"
-    OWN_PICTURE = "own-picture"
-    OTHER_SCANS = "other-scans"
-    FEW_SCANS = "few-scans"
-    POSE = "pose"
-    CHANCE = "chance"
-    FAINT_FRAME = "faint-frame"
-    OTHER_FRAME = "other-frame"
-    BENT_FRAME = "bent-frame"
-    BENT_SCANS = "bent-scans"
-    PERSPECTIVE = "perspective"
-    PITCH = "pitch"
-    NO_CHECK = "no-check"
-    NO_BOARD = "no-board"
-    PLATE = "plate"
-    FEW_TIES = "few-ties"
-    OTHER_PART = "other-part"
-    COPY = "copy"
-    SECOND_PICTURE = "second-picture"
-    CLICKED = "clicked"
-    DECIDED = "decided"
-
-
-CODE_MEANING = {
-    Code.OUTSIDE: "Its place lies outside of the scan, or behind the camera.",
-    Code.DAMAGED_FILE: "The scan's file is damaged there.",
-    Code.FAILED_SCAN: "The scan could not be measured at all; its failure gives the reason.",
-    Code.UNREACHABLE: "The second pass could not read the scan, or its process was killed.",
-    Code.NO_FRAME: "No frame of the camera was found in the scan.",
-    Code.NOT_FOUND: "No candidate near its place.",
-    Code.GROUND: "The background is as light or as dark as the mark: there is no contrast.",
-    Code.COVERED: "A part of it is damaged, covered or touched by something.",
-    Code.CONTRAST: "Its contrast is low against the noise or the texture around it.",
-    Code.LIKENESS: "The image does not match its drawing.",
-    Code.POLARITY: "It is light where the marks are dark, or the reverse.",
-    Code.SIZE: "Its size or rotation differs from the expected one.",
-    Code.SMALL: "It is so small that size, blur and dust cannot be separated.",
-    Code.BLUR: "Its blur differs from that of the other marks.",
-    Code.NO_FIT: "The fit did not converge, or converged to something else.",
-    Code.IMPRECISE: "Its standard deviation is large.",
-    Code.EDGES: "Its edges give another position than the fit.",
-    Code.DUST: "Dust may hide in it.",
-    Code.OFF_PLACE: "Its position contradicts the other marks of the scan, or the orientation.",
-    Code.OFF_FRAMES: "Its position contradicts the camera's other frames.",
-    Code.OFF_GIVEN: "Its position contradicts the given coordinates.",
-    Code.AMBIGUOUS: "Several candidates there may be this mark.",
-    Code.UNNAMED: "It could not be identified, or its marker was not read.",
-    Code.OWN_PICTURE: "It was learned from this scan alone: nothing checks its place.",
-    Code.OTHER_SCANS: "The image around the point, or its position, contradicts the other scans.",
-    Code.FEW_SCANS: "Too few scans agree on the point.",
-    Code.POSE: "The scan orientation is ambiguous.",
-    Code.CHANCE: "The frame may be a false alarm.",
-    Code.FAINT_FRAME: "The frame was found only with less background around each mark in the correlation.",
-    Code.OTHER_FRAME: "The scan shows another frame as well.",
-    Code.BENT_FRAME: "No affine transformation fits the given coordinates to the marks of this frame.",
-    Code.BENT_SCANS: "All scans have the same deformation in the scanner's axes.",
-    Code.PERSPECTIVE: "The film was photographed obliquely: no affine transformation fits.",
-    Code.PITCH: "The marks fit another pixel pitch.",
-    Code.NO_CHECK: "There are only as many marks as the transformation needs: no redundancy.",
-    Code.NO_BOARD: "The board, or a part of its markers, was not found.",
-    Code.PLATE: "The plate in the image contradicts the camera.",
-    Code.FEW_TIES: "Fewer natural points were found than wanted.",
-    Code.OTHER_PART: "Another part of the same frame shows it.",
-    Code.SECOND_PICTURE: "The file holds a second image of full size, or the scan shows a second frame.",
-    Code.COPY: "The scan's file is a copy of another one, whose marks are used.",
-    Code.CLICKED: "A person pointed at it, and nothing could be matched there.",
-    Code.DECIDED: "A person decided so.",
-}
+    OUTSIDE = "outside", "Its place lies outside of the scan, or behind the camera."
+    DAMAGED_FILE = "damaged-file", "The scan's file is damaged there."
+    FAILED_SCAN = "failed-scan", "The scan could not be measured at all; its failure gives the reason."
+    UNREACHABLE = "unreachable", "The second pass could not read the scan, or its process was killed."
+    NO_FRAME = "no-frame", "No frame of the camera was found in the scan."
+    NOT_FOUND = "not-found", "No candidate near its place."
+    GROUND = "ground", "The background is as light or as dark as the mark: there is no contrast."
+    COVERED = "covered", "A part of it is damaged, covered or touched by something."
+    CONTRAST = "contrast", "Its contrast is low against the noise or the texture around it."
+    LIKENESS = "likeness", "The image does not match its drawing."
+    POLARITY = "polarity", "It is light where the marks are dark, or the reverse."
+    SIZE = "size", "Its size or rotation differs from the expected one."
+    SMALL = "small", "It is so small that size, blur and dust cannot be separated."
+    BLUR = "blur", "Its blur differs from that of the other marks."
+    NO_FIT = "no-fit", "The fit did not converge, or converged to something else."
+    IMPRECISE = "imprecise", "Its standard deviation is large."
+    EDGES = "edges", "Its edges give another position than the fit."
+    DUST = "dust", "Dust may hide in it."
+    OFF_PLACE = "off-place", "Its position contradicts the other marks of the scan, or the orientation."
+    OFF_FRAMES = "off-frames", "Its position contradicts the camera's other frames."
+    OFF_GIVEN = "off-given", "Its position contradicts the given coordinates."
+    AMBIGUOUS = "ambiguous", "Several candidates there may be this mark."
+    UNNAMED = "unnamed", "It could not be identified, or its marker was not read."
+    OWN_PICTURE = "own-picture", "It was learned from this scan alone: nothing checks its place."
+    OTHER_SCANS = "other-scans", "The image around the point, or its position, contradicts the other scans."
+    FEW_SCANS = "few-scans", "Too few scans agree on the point."
+    POSE = "pose", "The scan orientation is ambiguous."
+    CHANCE = "chance", "The frame may be a false alarm."
+    FAINT_FRAME = "faint-frame", "The frame was found only with less background around each mark in the correlation."
+    OTHER_FRAME = "other-frame", "The scan shows another frame as well."
+    BENT_FRAME = "bent-frame", "No affine transformation fits the given coordinates to the marks of this frame."
+    BENT_SCANS = "bent-scans", "All scans have the same deformation in the scanner's axes."
+    PERSPECTIVE = "perspective", "The film was photographed obliquely: no affine transformation fits."
+    PITCH = "pitch", "The marks fit another pixel pitch."
+    NO_CHECK = "no-check", "There are only as many marks as the transformation needs: no redundancy."
+    NO_BOARD = "no-board", "The board, or a part of its markers, was not found."
+    PLATE = "plate", "The plate in the image contradicts the camera."
+    FEW_TIES = "few-ties", "Fewer natural points were found than wanted."
+    OTHER_PART = "other-part", "Another part of the same frame shows it."
+    COPY = "copy", "The scan's file is a copy of another one, whose marks are used."
+    SECOND_PICTURE = "second-picture", "The file holds a second image of full size, or the scan shows a second frame."
+    CLICKED = "clicked", "A person pointed at it, and nothing could be matched there."
+    DECIDED = "decided", "A person decided so."
 
 
 class Reason(str):
@@ -163,53 +121,35 @@ class Reason(str):
 NO_REASON = Reason()
 
 
-class Cause(StrEnum):
+class Cause(_Meaningful):
     """Cause of a part of a covariance, in the order in which the parts are listed."""
 
-    NOISE = "noise"
-    ROUNDING = "rounding"
-    SECOND_ORDER = "second order"
-    UNLIKE_DRAWING = "unlike drawing"
-    DAMAGE = "damage"
-    TEXTURE = "texture"
-    TONE = "tone"
-    SHARPENING = "sharpening"
-    CHANGED_TONES = "changed tones"
-    LANDSCAPE = "landscape"
-    COMPRESSION = "compression"
-    TOUCHED = "touched"
-    OWN_TURN = "own turn"
-    FILM = "film"
-    SECOND_METHOD = "second method"
-    GIVEN_PLACES = "given places"
-    OTHER_FRAMES = "other frames"
-    INTERPOLATION = "interpolation"
-    CLICK = "click"
-    LENS = "taking lens"
-
-
-CAUSE_MEANING = {
-    Cause.NOISE: "Film grain and scanner noise, estimated from the image.",
-    Cause.ROUNDING: "Quantisation of the grey values.",
-    Cause.SECOND_ORDER: "Second-order effects of position, blur and contrast for a soft and faint mark.",
-    Cause.UNLIKE_DRAWING: "Model misfit: at the edges the image differs from the drawing by more than noise.",
-    Cause.DAMAGE: "Faint damage may remain around the damaged pixels that were left out.",
-    Cause.TEXTURE: "Background texture on one side of its edges.",
-    Cause.TONE: "Uncertainty of the tone curve between light and grey values.",
-    Cause.SHARPENING: "Uncertainty of the scan's sharpening.",
-    Cause.CHANGED_TONES: "A learned mark may have other half tones than in the scans it was learned from.",
-    Cause.LANDSCAPE: "The background within a notch has texture.",
-    Cause.COMPRESSION: "Loss of the mark's edges by JPEG compression.",
-    Cause.TOUCHED: "Something may touch the mark, judging by its size or shape.",
-    Cause.OWN_TURN: "Rotation and scale are those of the frame, with its standard deviations; they were not fitted.",
-    Cause.FILM: "Film deformation, estimated from the camera's frames.",
-    Cause.SECOND_METHOD: "Disagreement with the position from its edges.",
-    Cause.GIVEN_PLACES: "Disagreement with the given coordinates.",
-    Cause.OTHER_FRAMES: "Disagreement with the camera's other frames.",
-    Cause.INTERPOLATION: "Interpolation between the pixels of two scans.",
-    Cause.CLICK: "A person pointed at it, and nothing could be matched there.",
-    Cause.LENS: "Uncertainty of the lens that photographed the film, from its calibration.",
-}
+    NOISE = "noise", "Film grain and scanner noise, estimated from the image."
+    ROUNDING = "rounding", "Quantisation of the grey values."
+    SECOND_ORDER = "second order", "Second-order effects of position, blur and contrast for a soft and faint mark."
+    UNLIKE_DRAWING = (
+        "unlike drawing",
+        "Model misfit: at the edges the image differs from the drawing by more than noise.",
+    )
+    DAMAGE = "damage", "Faint damage may remain around the damaged pixels that were left out."
+    TEXTURE = "texture", "Background texture on one side of its edges."
+    TONE = "tone", "Uncertainty of the tone curve between light and grey values."
+    SHARPENING = "sharpening", "Uncertainty of the scan's sharpening."
+    CHANGED_TONES = "changed tones", "A learned mark may have other half tones than in the scans it was learned from."
+    LANDSCAPE = "landscape", "The background within a notch has texture."
+    COMPRESSION = "compression", "Loss of the mark's edges by JPEG compression."
+    TOUCHED = "touched", "Something may touch the mark, judging by its size or shape."
+    OWN_TURN = (
+        "own turn",
+        "Rotation and scale are those of the frame, with its standard deviations; they were not fitted.",
+    )
+    FILM = "film", "Film deformation, estimated from the camera's frames."
+    SECOND_METHOD = "second method", "Disagreement with the position from its edges."
+    GIVEN_PLACES = "given places", "Disagreement with the given coordinates."
+    OTHER_FRAMES = "other frames", "Disagreement with the camera's other frames."
+    INTERPOLATION = "interpolation", "Interpolation between the pixels of two scans."
+    CLICK = "click", "A person pointed at it, and nothing could be matched there."
+    LENS = "taking lens", "Uncertainty of the lens that photographed the film, from its calibration."
 
 
 class Limit(float):

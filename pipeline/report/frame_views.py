@@ -11,7 +11,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from measure.annotations.fields import Line
-from measure.flags import CAUSE_MEANING, Status
+from measure.flags import Status
 from measure.geometry import up_from_camera
 from measure.results import Covariance
 from pipeline.drawing import svg
@@ -288,7 +288,7 @@ def _plots(
 def _causes(covariance: Covariance | None) -> tuple[tuple[str, str, str], ...]:
     sigmas = {} if covariance is None else covariance.sigmas_px
     parts = [(cause, sigma) for cause, sigma in sigmas.items() if sigma >= _LEAST_PART_PX]
-    named = tuple((str(cause), fixed(sigma, 3), CAUSE_MEANING[cause]) for cause, sigma in parts)
+    named = tuple((str(cause), fixed(sigma, 3), cause.meaning) for cause, sigma in parts)
     return named if len(named) > 1 else ()
 
 

@@ -129,8 +129,8 @@ def _common(data: ReportData) -> dict[str, object]:
         "adjustment": data.adjustment,
         "critical_w": critical_w(2 * len(data.adjustment.residuals)) if data.adjustment else 0.0,
         "has_pictures": data.thumbnail is not None,
-        "meaning": flags.STATUS_MEANING,
-        "codes": flags.CODE_MEANING,
+        "meaning": {status: status.meaning for status in flags.Status},
+        "codes": {code: code.meaning for code in flags.Code},
     }
 
 

@@ -11,7 +11,7 @@ import made_up_calibration
 import pytest
 from studies import parametrize_with_studies
 
-from measure.flags import CODE_MEANING, STATUS_MEANING, Code, Reason, Status
+from measure.flags import Code, Reason, Status
 from measure.results import FrameMeasurement
 from pipeline.report import Problem, ReportData, render_report, write_report
 from pipeline.results.adjustment_record import Sigma0Record
@@ -213,7 +213,7 @@ def test_every_mark_has_its_picture() -> None:
 
 def test_the_statuses_are_those_of_the_table() -> None:
     text = Document(good_page()).text
-    for status, meaning in STATUS_MEANING.items():
+    for status, meaning in ((each, each.meaning) for each in Status):
         assert status in text
         assert meaning in text
 
@@ -440,5 +440,5 @@ def test_marks_can_be_chosen_by_the_code_of_their_reason(measured_data: ReportDa
     assert '<option value="covered">covered (1)</option>' in html
     text = Document(html).text
     assert "half of it is gone covered size" in text
-    assert CODE_MEANING[Code.COVERED] in text
+    assert Code.COVERED.meaning in text
     assert "<select" not in good_page()
