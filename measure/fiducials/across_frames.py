@@ -120,8 +120,7 @@ def _misfit(
 
 
 def _explain_together(frames: Frames, layout: FiducialLayout, film_mm: float) -> tuple[Explanation, Reason]:
-    """Explain the misfits by film and marks alone, by wrong given coordinates, or by scanner distortion, whichever is
-    best. Returns also the problem in the latter two cases."""
+    """Explain the misfits by film and marks alone, wrong given coordinates or the scanner, with the problem."""
     places = np.array([mark.xy_mm for mark in layout.marks])
     given_mm = np.array([min(max(mark.sigma_mm), MOST_GIVEN_SIGMA_MM) for mark in layout.marks])
     if len(frames) == 1:
@@ -158,8 +157,7 @@ def _scan_sites(frames: Frames) -> Array:
 
 
 def _in_scan_axes(frame: FrameMisfit, sites: Array, given_mm: Array) -> FrameMisfit:
-    """Transform a frame to the scan's axes, right and up, and to the nearest sites (m, 2) of the scan. The
-    variances of its given places, from the standard deviations given_mm, are added to its marks."""
+    """Transform a frame to the scan's axes and nearest sites (m, 2), with the variances of its given places added."""
     marks = frame.marks.widen(given_mm[frame.sites] ** 2).rotate(up_from_camera(frame.pose))
     nearest = np.hypot(*np.moveaxis(marks.given_mm[:, None] - sites[None], -1, 0)).argmin(axis=1)
     return FrameMisfit(marks, nearest, frame.pose)
@@ -204,11 +202,7 @@ def _suspicion(off_mm: float) -> Reason:
 def _problem(
     own: FrameMisfit, shared: Explanation, names: Sequence[str], suspects: Collection[str], known_um: float
 ) -> Reason:
-    """Problem of an outlying frame; empty for any other.
-
-    suspects: names of its weak marks, the only ones named as possibly wrong; known_um: standard deviation to which its
-    marks are set.
-    """
+    """Problem of an outlying frame, empty for any other. suspects: its weak marks; known_um: set standard deviation."""
     if own.film_mm is None:
         return NO_REASON
     alone = len(shared.frames) == 1
@@ -299,8 +293,7 @@ def check_second_places(frames: Sequence[FrameMeasurement]) -> list[FrameMeasure
 
 
 def _p_values_among_others(squares: Array) -> Array:
-    """(n,) p-values of squared normalised differences of the two places, with the variance factor of the other
-    marks."""
+    """(n,) p-values of squared normalised differences, with the variance factor of the other marks."""
     others = [np.median(np.delete(squares, n)) for n in range(len(squares))] if len(squares) > 1 else [0.0]
     degrees = MEDIAN_EFFICIENCY * _AXES * (len(squares) - 1)
     factor = (_BELIEVED_DEGREES + degrees * np.array(others) / chdtri(_AXES, 0.5)) / (_BELIEVED_DEGREES + degrees)

@@ -20,7 +20,6 @@ from measure.fiducials.search import FrameSearch, PitchHypothesis
 from measure.flags import CAMERA_BY_CHANCE, CAMERA_BY_NOISE
 from measure.marks.shapes import FiducialLayout
 from measure.matching.models import MatchOptions
-from measure.results import MarkFit
 from measure.scans.scan import Scan
 
 _COMPARED = 3  # best placements: the one with the fewest false alarms is among them
@@ -75,12 +74,9 @@ def recognise_frame(scan: Scan, layout: FiducialLayout, answered: Answer, times:
 
 
 def _may_be_there(scan: Scan, layout: FiducialLayout, placement: Placement) -> bool:
-    """Whether the three most significant correlation peaks of the marks are improbable as noise.
-
-    The test is ten times as fast as a fit.
-    """
+    """Whether the three most significant peaks are improbable as noise: ten times as fast as a fit."""
     frame = Frame.from_placement(scan, layout, placement, _QUICK_OPTIONS)
-    peaks = [localise(scan, frame.prediction(index, frame.first_search_px)) for index in range(len(layout.marks))]
+    peaks = [localise(scan, frame.prediction(index, frame.first_search_px())) for index in range(len(layout.marks))]
     false_alarms = np.sort([1.0 if peak is None else peak[1] for peak in peaks])[:_AT_LEAST]
     return bool(comb(len(peaks), len(false_alarms)) * false_alarms.prod() <= CAMERA_BY_NOISE)
 
@@ -103,8 +99,5 @@ def likeness(frame: Frame) -> float:
 
     Parts of another mark count as damage, such as a ring around a cross that is drawn without one.
     """
-    return float(np.mean([0.0 if fit is None else _undamaged(fit) for fit in frame.fits]))
-
-
-def _undamaged(fit: MarkFit) -> float:
-    return fit.likeness * (1.0 - fit.damaged_fraction)
+    scores = (fit.likeness * (1.0 - fit.damaged_fraction) for fit in frame.inlier_fits.values())
+    return float(sum(scores) / len(frame.detections))

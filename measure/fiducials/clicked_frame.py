@@ -94,16 +94,14 @@ def _clicked_places(layout: FiducialLayout, clicks: Sequence[Click]) -> tuple[Ar
 
 
 def _clicked_pose(camera: Array, up_mm: Array, poses: Sequence[str]) -> tuple[str, Array]:
-    """Select the scan orientation that fits the marks best, then the one with the least rotation. Returns also its
-    similarity (2, 3)."""
+    """Scan orientation that fits the marks best, then with the least rotation; and its similarity (2, 3)."""
     found = [(pose, *_similarity(camera, up_mm, pose)) for pose in poses]
     pose, up, _ = min(found, key=lambda one: (round(one[2] / np.ptp(up_mm), 9), abs(_turn_rad(one[1], one[0]))))
     return pose, up
 
 
 def _similarity(camera: Array, up_mm: Array, pose: str) -> tuple[Array, float]:
-    """Fit a similarity on top of a scan orientation by least squares. Returns (2, 3) from camera mm to the scan's mm
-    (right, up), and the largest residual, mm."""
+    """Similarity (2, 3) from camera mm to mm right and up in a scan orientation; largest residual, mm."""
     turned = camera @ up_from_camera(pose).T
     own, observed = turned @ (1.0, 1j), up_mm @ (1.0, 1j)
     design = np.column_stack([own, np.ones(len(own))])

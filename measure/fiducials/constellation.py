@@ -296,11 +296,7 @@ class _Constellation:
         ]
 
     def _step_along_lattice(self, scale: Complex, offset: Complex) -> tuple[Complex, Complex]:
-        """Shift the best hypotheses of a lattice step by step while the score increases.
-
-        A lattice may have more marks than candidates are kept, so that the best hypothesis is many steps off. Returns
-        no hypotheses if the marks form no lattice.
-        """
+        """Shift the best hypotheses of a lattice step by step while the score increases: they may be many steps off."""
         turned = self.search.steps_mm @ up_from_camera(self.pose).T
         steps = np.append(0.0, turned @ [1.0, 1.0j])
         best = np.full(len(scale) if len(steps) > 1 else 0, -1)
@@ -353,10 +349,7 @@ class _Constellation:
         return score, (strength > 0).sum(axis=1)
 
     def _refined(self, scale: Complex, offset: Complex) -> tuple[Complex, Complex]:
-        """Refine similarities (n,) by least squares on the highest responses around their predictions.
-
-        Weights are the heights of the responses above a threshold.
-        """
+        """Refine similarities (n,) by least squares on the highest responses around their predictions."""
         widest = self.search.tolerance_px
         scale, offset = scale.copy(), offset.copy()
         moving = np.ones(len(scale), dtype=bool)

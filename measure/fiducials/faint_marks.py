@@ -57,7 +57,7 @@ def detect_faint_marks(frame: Frame, reach_px: float) -> Frame:
         if detection.inside and not (frame.is_clear(index) and near[index])
         if not isinstance(frame.layout.marks[index].mark, FrameCorner)  # it has no lines that stand out from texture
     ]
-    agreeing = {index: fit for index, fit in enumerate(frame.fits) if fit}
+    agreeing = frame.inlier_fits
     if not faint or not agreeing:
         return frame
     # Blur and contrast come from the inliers: a faint mark gives both less accurately.
@@ -83,10 +83,7 @@ def faint_reach_px(frame: Frame) -> float:
 
 
 def _extremes_dn(frame: Frame) -> Array:
-    """Darkest and lightest grey values around the marks.
-
-    The marks are spread over the scan, so that no more of it has to be read.
-    """
+    """Darkest and lightest grey values around the marks, which are spread over the scan."""
     inside = [index for index, detection in enumerate(frame.detections) if detection.inside]
     expected = [frame.prediction(index, 0.0) for index in inside]
     grey = [_surrounding_grey(frame, each.mark, each.pixel_from_mark, _SURROUND).ravel() for each in expected]
@@ -120,12 +117,7 @@ def _surrounding_grey(frame: Frame, mark: Mark, pixel_from_mark: Array, times: f
 
 
 def _decide(frame: Frame, index: int, mark: FaintMark | None, why_not: Reason) -> tuple[Detection, bool]:
-    """Choose between the earlier detection of a mark and the faint one. Returns the detection and whether it is
-    certain.
-
-    A clear fit stays if there is no faint mark or it is at the same place; otherwise the faint mark replaces it, since
-    it is significant against the texture. A clear fit elsewhere makes the place ambiguous.
-    """
+    """Choose between the earlier detection of a mark and the faint one; returns also whether it is certain."""
     before, is_clear = frame.detections[index], frame.is_clear(index)
     if mark is None:
         return before if is_clear else Detection(before.predicted_px, True, None, why_not), False

@@ -1,6 +1,6 @@
 """One frame of a scan as an immutable value: detections, inliers and the interior orientation from the inliers."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -10,7 +10,7 @@ from scipy.special import chdtrc
 from measure.array_types import Array, Mask
 from measure.detection.localisation import MarkPrediction
 from measure.fiducials.consistency import FrameMarks, Scatter, gross_errors
-from measure.fiducials.constellation import NARROW, Placement, mark_sign
+from measure.fiducials.constellation import Placement, mark_sign
 from measure.fiducials.interior_orientation import FilmFit, fit_frame
 from measure.fiducials.mark_fit import Detection
 from measure.fiducials.options import CLICK_SIGMA_PX, SCATTER_DEGREES, SCATTER_MM, FiducialOptions
@@ -35,7 +35,7 @@ _MOST_LOST = 0.85  # fraction of the information on the place: the rest may be t
 _MOST_UNLIKE = 0.03  # fraction of a mark that a wrong drawing may explain, added to CLEAR_DAMAGE
 _FAR = 4.0  # times the median misfit of the inliers: nearly five standard deviations
 _LEAST_SCATTER_MM = 2 * SCATTER_MM  # mm, least median misfit: a few marks may agree by chance better than film allows
-_UNSETTLED = {Code.NO_FIT, Code.OFF_PLACE, Code.SIZE, Code.POLARITY}  # failures that another tone curve may cure
+_FAILED = {Code.NO_FIT, Code.OFF_PLACE, Code.SIZE, Code.POLARITY}  # reasons that another tone curve may cure
 _SAME_MARK_PX = 5.0  # px between two fits of one mark at most; two marks lie farther apart: each is some 14 px large
 _REDUCED_PX = 1.5  # px of the reduced scan: accuracy of the places that a placement predicts
 _CLICK_REACH_PX = 6 * CLICK_SIGMA_PX  # px around a click: three sigma, doubled for people who point less accurately
@@ -99,18 +99,8 @@ class Frame:
         """Search radius around a place predicted from the other marks."""
         return self.options.gate_mm / float(self.pitch_mm.mean())
 
-    @property
-    def first_search_px(self) -> float:
-        """Search radius around a place predicted from the placement alone."""
-        return self._reach_px(1.0)
-
-    @property
-    def near_px(self) -> float:
-        """First search radius for film that is hardly deformed."""
-        return self._reach_px(NARROW)
-
-    def _reach_px(self, share: float) -> float:
-        """Search radius around a placement's predictions, for a share of the largest deviation allowed."""
+    def first_search_px(self, share: float = 1.0) -> float:
+        """Search radius around a place predicted from the placement, for a share of the largest deviation allowed."""
         search_px = share * self.options.search_mm(self.layout) / float(self.pitch_mm.mean())
         return _REDUCED_PX * self.placement.reduction + search_px
 
@@ -155,11 +145,6 @@ class Frame:
         fit = self.detections[index].fit
         return fit is not None and fit.likeness >= CLEAR_LIKENESS
 
-    @property
-    def is_certain_of_places(self) -> bool:
-        """Whether enough marks agree, half of `MANY` of them clear, for the places of the others to be reliable."""
-        return bool(self.inliers.sum() >= MANY and self._clear >= MANY / 2)
-
     def replace_detections(self, changed: Mapping[int, Detection]) -> "Frame":
         """Return the frame with the detections of some marks replaced, by index."""
         return replace(self, detections=tuple(changed.get(index, each) for index, each in enumerate(self.detections)))
@@ -167,35 +152,41 @@ class Frame:
     def replace_fits(self, changed: Mapping[int, MarkFit]) -> "Frame":
         """Return the frame with the fits of some marks replaced, by index."""
         return self.replace_detections(
-            {index: replace(self.detections[index], fit=fit) for index, fit in changed.items()}
+            {index: replace(self.detections[index], fit=each) for index, each in changed.items()}
         )
 
-    def add_reason(self, index: int, reason: Reason) -> "Frame":
-        """Return the frame with one more reason why a mark may be wrong."""
+    def amend(
+        self,
+        index: int,
+        *reasons: Reason,
+        parts: Mapping[Cause, Array] | None = None,
+        figures: Mapping[str, float] | None = None,
+    ) -> "Frame":
+        """Return the frame with more reasons why a mark may be wrong, parts (2, 2) of its covariance, and figures."""
         detection = self.detections[index]
-        return self.replace_detections({index: replace(detection, reason=Reason.combine((detection.reason, reason)))})
-
-    def add_covariance(self, index: int, cause: Cause, px2: Array) -> "Frame":
-        """Return the frame with a covariance (2, 2) added under a cause to the place of a mark, if it was found."""
-        fit = self.detections[index].fit
-        if fit is None:
-            return self
-        return self.replace_fits({index: replace(fit, place_covariance=fit.place_covariance.plus(cause, px2))})
-
-    def add_figures(self, index: int, figures: Mapping[str, float]) -> "Frame":
-        """Return the frame with further figures of a mark, if it was found."""
-        fit = self.detections[index].fit
-        return self if fit is None else self.replace_fits({index: replace(fit, figures={**fit.figures, **figures})})
+        fit, reason = detection.fit, Reason.combine((detection.reason, *reasons))
+        if fit is not None:
+            covariance = fit.place_covariance
+            for cause, px2 in (parts or {}).items():
+                covariance = covariance.plus(cause, px2)
+            fit = replace(fit, place_covariance=covariance, figures={**fit.figures, **(figures or {})})
+        return self.replace_detections({index: replace(detection, fit=fit, reason=reason)})
 
     @property
     def fits(self) -> list[MarkFit | None]:
         """Fits of all marks, None for those that are not inliers."""
-        return [s.fit if ok else None for s, ok in zip(self.detections, self.inliers, strict=True)]
+        return [self.inlier_fits.get(index) for index in range(len(self.detections))]
 
-    def centers_px(self, indices: Iterable[int]) -> dict[int, Array]:
-        """(2,) fitted centre by index, of the inliers among some marks."""
-        fits = {int(index): self.fits[index] for index in indices}
-        return {index: fit.center_px for index, fit in fits.items() if fit}
+    @cached_property
+    def inlier_fits(self) -> dict[int, MarkFit]:
+        """Fits of the inliers by index."""
+        fits = ((index, self.detections[index].fit) for index in np.flatnonzero(self.inliers).tolist())
+        return {index: fit for index, fit in fits if fit is not None}
+
+    @cached_property
+    def clear_fits(self) -> dict[int, MarkFit]:
+        """Fits of the inliers that correlate clearly with their drawings, by index."""
+        return {index: fit for index, fit in self.inlier_fits.items() if fit.likeness >= CLEAR_LIKENESS}
 
     @cached_property
     def fitted_placement(self) -> Placement:
@@ -203,40 +194,38 @@ class Frame:
         return replace(self.placement, pixel_from_camera=self.pixel_from_camera, film=self.film)
 
     @property
-    def all_clear(self) -> bool:
-        """Whether every inlier is clear."""
-        return all(fit is None or fit.likeness >= CLEAR_LIKENESS for fit in self.fits)
-
-    @property
-    def missed_px(self) -> list[Array]:
-        """Predicted places of the marks in the scan that were not found."""
-        inside = np.array([detection.inside for detection in self.detections])
-        return list(self.predicted_px[inside & ~self.inliers])
-
-    @property
     def inside(self) -> int:
         """Number of marks predicted within the scan."""
         return sum(detection.inside for detection in self.detections)
 
     @property
-    def agrees(self) -> bool:
-        """Whether enough marks are inliers, clear or not: three, and three in ten of those in the scan."""
-        return int(self.inliers.sum()) >= self._enough
+    def is_certain_of_places(self) -> bool:
+        """Whether enough marks agree, half of `MANY` of them clear, for the places of the others to be reliable."""
+        return len(self.inlier_fits) >= MANY and len(self.clear_fits) >= MANY / 2
 
     @property
-    def may_settle(self) -> bool:
-        """Whether at most one mark would be missing for acceptance if every candidate could be fitted."""
+    def agrees(self) -> bool:
+        """Whether enough marks are inliers, clear or not: three, and three in ten of those in the scan."""
+        return len(self.inlier_fits) >= self._enough
+
+    @property
+    def failed_fits(self) -> list[int]:
+        """Indices of the marks whose fit failed, if at most one would be missing for acceptance with all of them."""
+        failed = [i for i, each in enumerate(self.detections) if each.fit is None and _FAILED & {*each.reason.codes}]
         found = sum(each.fit is not None for each in self.detections)
-        return found + len(self._unsettled) >= self._enough - 1
+        return failed if found + len(failed) >= self._enough - 1 else []
 
     def is_nearer_than(self, other: "Frame | None") -> bool:
         """Whether it is nearer to acceptance than another frame: more inliers, then more clear ones."""
-        return other is None or (int(self.inliers.sum()), self._clear) > (int(other.inliers.sum()), other._clear)
+        if other is None:
+            return True
+        own, others = ((len(frame.inlier_fits), len(frame.clear_fits)) for frame in (self, other))
+        return own > others
 
     @property
     def accepted(self) -> bool:
         """Whether enough marks agree for the frame to be no false alarm, at least three of them clear."""
-        return self.agrees and self._clear >= self._least
+        return self.agrees and len(self.clear_fits) >= self._least
 
     @property
     def unblemished(self) -> list[int]:
@@ -257,17 +246,7 @@ class Frame:
     @property
     def is_complete(self) -> bool:
         """Whether no further search is needed: every mark is a clear inlier."""
-        return bool(self.accepted and len(self.inliers) >= _CHECKED and self.inliers.all() and self.all_clear)
-
-    @property
-    def _clear(self) -> int:
-        """Number of clear inliers."""
-        return sum(fit is not None and fit.likeness >= CLEAR_LIKENESS for fit in self.fits)
-
-    @property
-    def _unsettled(self) -> list[int]:
-        """Indices of the marks with a candidate that could not be fitted."""
-        return [i for i, each in enumerate(self.detections) if each.fit is None and _UNSETTLED & {*each.reason.codes}]
+        return self.accepted and len(self.clear_fits) == len(self.inliers) >= _CHECKED
 
     @property
     def _enough(self) -> int:
@@ -283,29 +262,29 @@ class Frame:
 
         A frame shifted by the distance of two marks has its marks at places of other marks of this one.
         """
-        own, others = ([fit.center_px for fit in frame.fits if fit] for frame in (self, other))
+        own, others = ([fit.center_px for fit in frame.inlier_fits.values()] for frame in (self, other))
         if not others or len(others) >= len(own):
             return False
-        nearest = [min(float(np.hypot(*(place - known))) for known in own) for place in others]
-        return max(nearest) < _SAME_MARK_PX
+        nearest = np.hypot(*np.moveaxis(np.array(others)[:, None] - np.array(own)[None], -1, 0)).min(axis=1)
+        return bool(nearest.max() < _SAME_MARK_PX)
 
-    @property
-    def _unlike_drawing(self) -> float:
+    @cached_property
+    def _usual_damage(self) -> float:
         """Median damaged fraction of the inliers: damage common to all means that the drawing is wrong."""
-        fractions = [fit.damaged_fraction for fit in self.fits if fit is not None]
+        fractions = [fit.damaged_fraction for fit in self.inlier_fits.values()]
         return float(np.median(fractions)) if len(fractions) >= _CHECKED else 0.0
 
     def misfit(self, ids: Sequence[str]) -> Reason:
         """Explain why the frame is not accepted. ids: of its marks, in the order of the detections."""
-        found = f"{int(self.inliers.sum())} of {len(self.detections)} marks were found where the others put them"
+        found = f"{len(self.inlier_fits)} of {len(self.detections)} marks were found where the others put them"
         if self.agrees:
             return Reason(
-                f"{found}, but only {self._clear} of them match their drawings, where {self._least} have "
+                f"{found}, but only {len(self.clear_fits)} of them match their drawings, where {self._least} have "
                 "to: compare the drawings with the scan, or set its tone curve (tone under [measure])",
                 Code.NO_FRAME,
             )
-        if self._unsettled and self.may_settle:
-            names = ", ".join(ids[index] for index in self._unsettled)
+        if self.failed_fits:
+            names = ", ".join(ids[index] for index in self.failed_fits)
             return Reason(
                 f"only {found}, and the fit of {names} did not converge, with whatever tone curve it began", Code.NO_FIT
             )
@@ -337,7 +316,7 @@ class Frame:
             reasons.append(Reason(f"it correlates with its drawing by only {fit.likeness:.2f}", Code.LIKENESS))
         if fit.snr < _CLEAR_SNR and fit.significance < _CLEAR_SIGNIFICANCE:
             reasons.append(Reason(f"its contrast is only {fit.snr:.1f} times the noise", Code.CONTRAST))
-        if fit.damaged_fraction > CLEAR_DAMAGE + min(self._unlike_drawing, _MOST_UNLIKE):
+        if fit.damaged_fraction > CLEAR_DAMAGE + min(self._usual_damage, _MOST_UNLIKE):
             reasons.append(Reason(f"{fit.damaged_fraction:.0%} of it is damaged", Code.COVERED))
         elif fit.lost_fraction > _MOST_LOST:
             lost = f"{fit.lost_fraction:.0%} of what tells its place in one direction is damaged"

@@ -117,9 +117,7 @@ def _linear(solution: Array, turn: Array) -> Array:
 def _solve(
     given: Array, measured: Array, sigma: Array, terms: Array, affinity_sigma: float
 ) -> tuple[Array, Array, float, Array]:
-    """Estimate rotation and scale, shift, stretch and shear, and the coefficients of the terms, by least squares, with
-    pseudo-observations of 0 for all but the first four unknowns. Returns the solution, the pseudo-inverse of the design
-    matrix, chi-square and the residuals (n, 2)."""
+    """Least squares with pseudo-observations: solution, pseudo-inverse of the design, chi-square, residuals (n, 2)."""
     x, y = given.T
     one, none = np.ones_like(x), np.zeros_like(x)
     rows = np.concatenate([np.stack([x, -y, one, none, x, y], axis=1), np.stack([y, x, none, one, -y, x], axis=1)])

@@ -222,11 +222,7 @@ class _Expected:
 
 
 def _expect_from_others(own: Array, sigma: Array, spread: _Spread, fewest: int) -> "list[_Expected | None]":
-    """Predict the figure of each mark from the others; None where these are too few.
-
-    own, sigma: (n,) figure of each mark and its standard deviation, infinite where not estimated; fewest: other marks
-    needed.
-    """
+    """Predict figures (n,) from at least so many others. sigma (n,): inf where not estimated."""
     result: list[_Expected | None] = []
     for index in range(len(own)):
         others = np.isfinite(sigma) & (np.arange(len(own)) != index)
@@ -308,8 +304,7 @@ def own_figures(frames: Sequence[FrameMeasurement]) -> dict[Key, tuple[list[int]
 
 
 def _figures(frame: FrameMeasurement) -> dict[Key, tuple[float, float]]:
-    """Figures of the marks of a frame and their standard deviations. Rotations are those of an unmirrored scan. Arms
-    are relative to the median of the frame, since exposure makes all of them longer or shorter."""
+    """Figures of a frame's marks, as in an unmirrored scan and with arms relative to the frame's, and their sigmas."""
     mirrored = -1.0 if frame.pose and frame.pose.name.endswith("m") else 1.0
     figures: dict[Key, tuple[float, float]] = {}
     for mark in frame.marks:
@@ -363,8 +358,7 @@ def _unlike_frames(kind: str, off: float) -> Reason:
 
 
 def _assess_mark(mark: MarkMeasurement, findings: Mapping[str, Reason], arms: Sequence[float]) -> MarkMeasurement:
-    """Update the status of a mark. findings: reason why shape or blur differ from the other frames, empty if they
-    agree; arms: log lengths of the arms on the plate, which explain the size of a cross within their range."""
+    """Update the status of a mark. findings: reasons by kind, empty if frames agree; arms: log lengths on the plate."""
     quality, unlike = mark.quality, findings.get(_SHAPE, NO_REASON)
     if unlike and Code.SIZE not in mark.reason.codes:
         return replace(mark, status=Status.WEAK, reason=Reason.combine((mark.reason, unlike)))

@@ -166,10 +166,7 @@ def options_for(mark: Mark, options: MatchOptions, frame_sigma: float | None) ->
 
 
 def _is_solid(mark: Mark) -> bool:
-    """Whether the mark has an outline only.
-
-    The two edges of a line fix its place whatever the slope of the background is; an outline lacks that.
-    """
+    """Whether the mark has an outline only, whose place depends on the slope of the background."""
     return isinstance(mark, MarkShape) and all(isinstance(part, Polygon | Disk) for part in mark.parts)
 
 

@@ -4,38 +4,44 @@ The marks are detected, the interior orientation is estimated from the inliers, 
 predicts them, and all marks are refitted with the frame's rotation, scale, stretch and shear as priors.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from measure.array_types import Array
 from measure.detection.correlation import CLOSE
-from measure.detection.localisation import MarkPrediction
-from measure.fiducials.channels import choose_channels
-from measure.fiducials.constellation import Placement
+from measure.detection.localisation import MarkPrediction, highest_peak
+from measure.fiducials.constellation import NARROW, Placement
 from measure.fiducials.faint_marks import detect_faint_marks, faint_reach_px
 from measure.fiducials.frame import CLEAR_LIKENESS, MANY, Frame, orient_frame
 from measure.fiducials.mark_fit import Detection, detect_mark, not_found
 from measure.fiducials.options import FiducialOptions
 from measure.fiducials.refit import refit_frame, sharpen_frame
 from measure.flags import FAINT_MARK_BY_NOISE, TEXTURE_LIKE_A_FAINT_MARK
-from measure.marks.shapes import FiducialLayout
+from measure.marks.rendering import picture
+from measure.marks.shapes import FiducialLayout, Mark
+from measure.matching.match import mark_window
 from measure.scans.parallel import map_in_threads
-from measure.scans.scan import Scan
+from measure.scans.scan import LUMINANCE, SINGLE_CHANNELS, Scan
 
 LEAST_LIKENESS = 0.35  # correlation with the drawing: below it texture, text and scratches are as similar
 _LEAST_SIGNIFICANCE = 4.5  # standard deviations of the contrast: texture alone stays below it
 _FAINT_SIGNIFICANCE = 2.0  # the same where noise hardly gives such a peak: there is contrast, at 95 %
+_MARGIN_PX = 4.0  # width of the background around a mark, used to estimate its offset and slopes
+_BLUR_PX = 0.8  # blur of a mark's image, the initial value of a match
+_CLEAR_PEAK = 0.25  # NCC before the fit that corresponds to the likeness of a clear mark after it
+_TRIALS = 6  # about this many marks are used to choose the channels
+_SHRINK = 0.1  # shrinkage of the noise covariance towards a multiple of the unit matrix: few pixels determine it poorly
 _ROUNDS = 2  # of detecting faint marks: the first marks found improve the predictions of the others
 
 
 def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
-    """Measure a frame from its placement. If the scan proves to be sharpened, unclear marks are detected again."""
-    frame = detect_frame(scan, layout, placement, options)
-    sharpened = sharpen_frame(frame)
-    if sharpened.scan.tone.sharpening and not scan.tone.sharpening:
-        sharpened = sharpen_frame(detect_missing_marks(_detect_unfitted(sharpened)))
-    return refit_frame(sharpened)
+    """Measure a frame from its placement. If the scan proves to be sharpened, missing marks are detected again."""
+    frame = sharpen_frame(detect_frame(scan, layout, placement, options))
+    if frame.scan.tone.sharpening and not scan.tone.sharpening:
+        frame = sharpen_frame(detect_missing_marks(frame))
+    return refit_frame(frame)
 
 
 def detect_frame(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
@@ -46,15 +52,7 @@ def detect_frame(scan: Scan, layout: FiducialLayout, placement: Placement, optio
 def detect_clear_marks(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
     """Detect the marks of a frame around the places predicted by its placement, and orient the frame."""
     frame = choose_channels(Frame.from_placement(scan, layout, placement, options))
-    return orient_frame(_detect(frame, range(len(layout.marks)), frame.first_search_px))
-
-
-def _detect_unfitted(frame: Frame) -> Frame:
-    """Detect unclear marks again, and those placed by a filter only; only clear new detections replace the old ones."""
-    fits = [each.fit for each in frame.detections]
-    pending = [i for i, fit in enumerate(fits) if not frame.is_clear(i) or (fit and fit.covariance is None)]
-    again = _detect(frame, pending, frame.gate_px)
-    return orient_frame(frame.replace_detections({i: again.detections[i] for i in pending if again.is_clear(i)}))
+    return orient_frame(_detect(frame, range(len(layout.marks)), frame.first_search_px()))
 
 
 def rename_frame(scan: Scan, frame: Frame, pose: str) -> Frame:
@@ -74,7 +72,7 @@ def rename_frame(scan: Scan, frame: Frame, pose: str) -> Frame:
         )
     )
     unclear = [index for index in range(len(frame.detections)) if not renamed.is_clear(index)]
-    renamed = refit_frame(detect_missing_marks(orient_frame(_detect(renamed, unclear, renamed.first_search_px))))
+    renamed = refit_frame(detect_missing_marks(orient_frame(_detect(renamed, unclear, renamed.first_search_px()))))
     return renamed if renamed.inliers.sum() >= frame.inliers.sum() else frame
 
 
@@ -85,7 +83,7 @@ def detect_missing_marks(frame: Frame) -> Frame:
     if frame.inliers.sum() >= 2 and not frame.is_certain_of_places:
         if len(frame.detections) > MANY:
             # If the frame itself is uncertain, the wide radius would turn texture into marks.
-            reach_px = frame.near_px if frame.placement.surroundings.robust else frame.gate_px
+            reach_px = frame.first_search_px(NARROW) if frame.placement.surroundings.robust else frame.gate_px
             frame = detect_faint_marks(frame, reach_px)
             # With such a search radius no mark is exempt from the outlier test.
             frame = replace(frame, certain=np.zeros_like(frame.certain))
@@ -107,11 +105,7 @@ def _detect(frame: Frame, indices: Iterable[int], search_px: float) -> Frame:
 
 
 def _detection(frame: Frame, expected: MarkPrediction) -> Detection:
-    """Detect one mark; fits that texture could give are dropped.
-
-    With robust local contrast (faint frames), fainter fits are kept if noise seldom gives such a peak nearby: the marks
-    together then decide on the frame.
-    """
+    """Detect one mark; a fit that texture could give is dropped, unless faint marks together decide on the frame."""
     detection = detect_mark(frame.scan, expected, replace(frame.options.match, tells_sharpening=True))
     fit, closer = detection.fit, frame.placement.surroundings.robust
     sure = closer and detection.false_alarms <= FAINT_MARK_BY_NOISE
@@ -122,10 +116,7 @@ def _detection(frame: Frame, expected: MarkPrediction) -> Detection:
 
 
 def _detect_closer(frame: Frame) -> Frame:
-    """Detect marks that are unclear or no inliers again, with the narrow robust surroundings `CLOSE`.
-
-    Dust or the frame's edge may lie beside such a mark. Only clear fits count.
-    """
+    """Detect unclear marks again with narrow surroundings, since dust or an edge may lie beside."""
     changed = {}
     for index in range(len(frame.detections)):
         if frame.is_clear(index) and frame.inliers[index]:
@@ -139,10 +130,7 @@ def _detect_closer(frame: Frame) -> Frame:
 
 
 def _detect_elsewhere(frame: Frame) -> Frame:
-    """Detect unclear marks within the gate of their predictions, then farther off, where only clear fits count.
-
-    The larger radius is the farthest at which a mark, once fitted, still keeps the gate.
-    """
+    """Detect unclear marks within the gate of their predictions, then farther off, where only clear fits count."""
     for index in [index for index in range(len(frame.detections)) if not frame.is_clear(index)]:
         near = _detect(frame, [index], frame.gate_px)
         far_px = _farthest_px(frame, index)
@@ -162,4 +150,83 @@ def _farthest_px(frame: Frame, index: int) -> float:
     if np.linalg.matrix_rank(affine[others]) < affine.shape[1]:
         return frame.gate_px
     variance = float(affine[index] @ np.linalg.inv(affine[others].T @ affine[others]) @ affine[index])
-    return min((1 + variance) * frame.gate_px, frame.first_search_px)
+    return min((1 + variance) * frame.gate_px, frame.first_search_px())
+
+
+def choose_channels(frame: Frame) -> Frame:
+    """Choose the channel weights of a colour scan.
+
+    Some marks are located, each in the channel (or the luminance) with the highest correlation peak. The weights are
+    then estimated from these marks.
+    If no mark is drawn as light or dark, the weights also determine the polarity.
+    """
+    if frame.scan.channels == 1:
+        return frame
+    marks = frame.layout.marks
+    places = []
+    for index in range(0, len(marks), max(1, len(marks) // _TRIALS)):
+        expected = frame.prediction(index, frame.first_search_px())
+        peaks = [
+            highest_peak(frame.scan, replace(expected, weights=weights)) for weights in (LUMINANCE, *SINGLE_CHANNELS)
+        ]
+        place, height = max(peaks, key=lambda peak: peak[1])
+        if height > _CLEAR_PEAK:
+            places.append((expected.mark, expected.moved(place).pixel_from_mark, expected.polarity))
+    unsaid = all(mark.mark.polarity == "auto" for mark in marks)
+    best = best_weights(frame.scan, places, (1, -1) if unsaid else (1,))
+    if best is None:
+        return frame
+    weights, sign = best
+    return replace(frame, weights=weights, placement=replace(frame.placement, polarity=sign * frame.placement.polarity))
+
+
+def best_weights(
+    scan: Scan, marks: Sequence[tuple[Mark, Array, int]], signs: Sequence[int] = (1,)
+) -> tuple[tuple[float, ...], int] | None:
+    """Estimate channel weights by Fisher's linear discriminant.
+
+    Parameters
+    ----------
+    scan : colour scan.
+    marks : marks with pixel_from_mark (2, 3) and sign: +1 lighter than the background, -1 darker.
+    signs : common factors of all signs to try, since a mark may be lighter in one channel and darker in another.
+
+    Returns
+    -------
+    Weights with sum 1, and the best of signs. None for a grey scan, or if no mark has any contrast.
+
+    Notes
+    -----
+    Negative weights are set to 0: a difference of channels would show their misregistration.
+    """
+    if scan.channels == 1 or not marks:
+        return None
+    contrast, covariance = np.zeros(scan.channels), np.zeros((scan.channels, scan.channels))
+    for mark, pixel_from_mark, sign in marks:
+        col0, row0, width, height = mark_window(mark, pixel_from_mark, _MARGIN_PX)
+        channels = np.stack(
+            [scan.window(col0, row0, width, height, unit).ravel() for unit in np.eye(scan.channels).tolist()]
+        )
+        shifted = np.array(pixel_from_mark)
+        shifted[:, 2] -= (col0, row0)
+        value = picture(mark, shifted, width, height, _BLUR_PX).ravel()
+        row, col = np.mgrid[:height, :width].reshape(2, -1).astype(float)
+        design = np.stack([value, np.ones_like(value), col, row], axis=1)
+        solution, *_ = np.linalg.lstsq(design, channels.T, rcond=None)
+        contrast += sign * solution[0]
+        covariance += np.cov(channels - (design @ solution).T)
+    covariance += _SHRINK * np.trace(covariance) / len(covariance) * np.eye(len(covariance))
+    if not np.linalg.det(covariance) > 0:
+        return None
+    discriminant = np.linalg.solve(covariance, contrast)
+
+    def contrast_over_noise(sign: int) -> float:
+        """Contrast over noise of the non-negative weights for a sign."""
+        weights = np.maximum(sign * discriminant, 0.0)
+        return float(sign * weights @ contrast / np.sqrt(max(weights @ covariance @ weights, 1e-300)))
+
+    best = max(signs, key=contrast_over_noise)
+    if not contrast_over_noise(best) > 0:
+        return None
+    weights = np.maximum(best * discriminant, 0.0)
+    return tuple(float(weight) for weight in weights / weights.sum()), best

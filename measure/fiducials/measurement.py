@@ -130,10 +130,7 @@ def _rename(search: FrameSearch, frame: Frame, pose: Pose) -> tuple[Frame, Pose]
 def _read(
     scan: Scan, layout: FiducialLayout, frame: Frame | None, known_lines: Sequence[KnownLine] = ()
 ) -> tuple[Line, ...] | None:
-    """Read the writing around the frame, or along the scan's edges without one.
-
-    If a known line is read at its place, only its surroundings are read. None: the text networks are not available.
-    """
+    """Read the writing around the frame, or only around a known line; along the scan's edges without a frame."""
     nets = networks()
     if nets is None:
         return None
@@ -157,7 +154,7 @@ def _against_the_set_pose(search: FrameSearch, frame: Frame, lines: Sequence[Lin
         return NO_REASON
     own = frame.fitted_placement
     both = [own, own.posed(likeliest.name, frame.camera_mm)]
-    pose = decide_pose(search.scan, search.layout, both, frame, search.options, lines)
+    pose = decide_pose(search.scan, both, frame, lines)
     if not pose.decided or pose.name == frame.placement.pose:
         return NO_REASON
     evidence = " ".join(pose.evidence).rstrip(".")

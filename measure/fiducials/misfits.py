@@ -222,10 +222,7 @@ def explain(frames: Frames, places_mm: Array, sigma_mm: Array, free_mm: float, b
 
 
 def _explain_alone(frame: FrameMisfit, marks: FrameMarks, film: Scatter, affinity: Affinity) -> FrameMisfit:
-    """Explain an outlying frame by a gross error in one mark, or else by its film, its pitch or a perspective.
-
-    Marks that may have the gross error get the variance that corresponds to its size.
-    """
+    """Explain an outlying frame by a gross error in one mark, or else by its film, its pitch or a perspective."""
     found = frame_consistency(marks, film, affinity)
     off_mm, mark = np.hypot(*found.off_mm.T), found.wrong_mark
     if mark is not None and mark not in frame.off_mm:
@@ -239,8 +236,7 @@ def _explain_alone(frame: FrameMisfit, marks: FrameMarks, film: Scatter, affinit
 
 
 def _own_film_mm(marks: FrameMarks, film: Scatter) -> float:
-    """Film scatter of one frame with Student's t as the distribution across frames: outlying frames get little weight
-    in the pattern."""
+    """Film scatter of one frame, with Student's t across frames: outlying ones get little weight in the pattern."""
     known = SCATTER_DEGREES * film.sigma**2 + marks.redundancy * marks.film_variance_mm2()
     return float(np.sqrt(known / (SCATTER_DEGREES + marks.redundancy)))
 
@@ -259,8 +255,7 @@ def _film(frames: Sequence[FrameMarks], believed_mm: float) -> tuple[Scatter, bo
 
 
 def _affinities(frames: Mapping[int, tuple[FrameMarks, str]], film_mm: float) -> dict[int, Affinity]:
-    """For each frame, given with its scan orientation: median and scatter of the affinity of the others with the same
-    orientation."""
+    """For each frame, median and scatter of the affinity of the others with the same scan orientation."""
     result = dict.fromkeys(frames, LONE_AFFINITY)
     for pose in {pose for _, pose in frames.values()}:
         alike = [place for place, (_, own) in frames.items() if own == pose]

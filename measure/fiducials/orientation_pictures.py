@@ -186,8 +186,7 @@ class MarkSite:
         return np.asarray(np.log((1 - SPOILT) * relative + SPOILT))[view_of]
 
     def _most_excess(self, best: View, view: View, scale_dn: float) -> float:
-        """Largest excess misfit of a chip over the best one that their difference explains, noise included. Any further
-        excess comes from the noise of the chips or from a wrong placement."""
+        """Largest excess misfit of a chip over the best one that their difference explains, noise included."""
         if view is best or not view.is_chip:
             return 0.0 if view is best else np.inf
         squares = view.unlike(best, abs(self.contrast_dn) / scale_dn)
@@ -221,8 +220,7 @@ class MarkSite:
         return np.asarray(means(np.asarray(upright, np.float32)[..., None], reduction)[..., 0], np.float64)
 
     def _residuals(self, window: Array, shown: Array, area: Mask) -> Array:
-        """Residuals of a fit of the image on a plane background, with the polarity of the mark that was found. A small
-        shift is estimated, since the place was fitted with another drawing."""
+        """Residuals of a fit of the image, slightly shifted, on a plane background, with the found polarity."""
         grey = window[area]
         row, col = np.nonzero(area)
         ground = [np.ones_like(grey), col / len(window), row / len(window)]
@@ -271,8 +269,7 @@ def _distinct(views: Sequence[View]) -> tuple[list[View], list[int]]:
 
 
 def _excess(misfits: Array, areas: Mask) -> Array:
-    """(n,) excess of each image's misfit over that of the best one, over the common area: neither a small chip nor the
-    surroundings of another chip give an advantage. misfits, areas: (n, size, size)."""
+    """(n,) excess of misfits (n, size, size) over the best one's, over the area common to both."""
     counts = areas.sum(axis=(1, 2)).clip(min=1)
     best = int(((misfits * areas).sum(axis=(1, 2)) / counts).argmin())
     excess = ((misfits - misfits[best]) * (areas & areas[best])).sum(axis=(1, 2))

@@ -48,13 +48,12 @@ _REFIT_PX = 1.5  # search range around a mark that was fitted already
 def refit_frame(frame: Frame) -> Frame:
     """Refit the marks of a frame with parameters estimated from all of them, and compare them with one another.
 
-    Marks whose image does not determine rotation and scale take those of the frame. Marks displaced by stretch and
-    shear, which no single fit determines, take these too. Marks displaced by the tone curve are refitted with the curve
-    estimated from all marks. Marks whose blur is poorly determined take that of the others.
+    Marks whose image does not determine rotation and scale take those of the frame, as do marks displaced by stretch
+    and shear, which no single fit determines. Marks displaced by the tone curve are refitted with the curve estimated
+    from all marks. Marks whose blur is poorly determined take that of the others.
     """
-    if frame.inliers.sum() >= 2:
-        frame = _refit_with_tone(frame)
-        frame = _refit_with_blur(frame)
+    if len(frame.inlier_fits) >= 2:
+        frame = _refit_with_blur(_refit_with_tone(frame))
     return _compare_shapes(_add_lens_covariance(_add_tone_covariance(frame)))
 
 
@@ -65,7 +64,7 @@ def sharpen_frame(frame: Frame) -> Frame:
     """
     if not frame.agrees:
         return frame
-    plainest, begun = sorted(clear_fits(frame).items(), key=lambda item: -item[1].significance), frame
+    plainest, begun = sorted(frame.clear_fits.items(), key=lambda item: -item[1].significance), frame
     telling = [index for index, fit in plainest if fit.sharpening is not None]
     for _ in range(_SHARPENING_ROUNDS):
         before = frame.scan.tone.sharpening
@@ -83,11 +82,7 @@ def sharpen_frame(frame: Frame) -> Frame:
 
 
 def _refit_with_tone(frame: Frame) -> Frame:
-    """Refit the marks with the tone curve estimated from them.
-
-    Far from the right curve the noise depends on the grey value, and may hide that curve: where the marks disagree,
-    further initial curves are tried.
-    """
+    """Refit the marks with the tone curve estimated from them; if they disagree, from further initial curves."""
     prior = frame.scan.tone.prior
     best = _refit_from_curve(frame, prior, frame.scan.tone)
     for power in _OTHER_STARTS if best.tone.disagreement > _AGREED and _depends_on_tone(best) else ():
@@ -97,10 +92,9 @@ def _refit_with_tone(frame: Frame) -> Frame:
 
 
 def _refit_from_curve(frame: Frame, prior: Tone, start: Tone) -> Frame:
-    """Refit the marks at their measured places, alternating with the tone curve. prior: curve known before this frame;
-    start: initial curve."""
+    """Refit the marks at their places and estimate the tone curve in turn. prior: known before; start: initial curve."""
     if start is frame.scan.tone:
-        pending = {index for index, fit in clear_fits(frame).items() if _needs_frame(frame, index, fit)}
+        pending = {index for index, fit in frame.clear_fits.items() if _needs_frame(frame, index, fit)}
     else:
         frame, pending = replace(frame, scan=frame.scan.replace_tone(start)), set(_mark_tones(frame))
     for _ in range(_TONE_ROUNDS):
@@ -116,8 +110,7 @@ def _refit_from_curve(frame: Frame, prior: Tone, start: Tone) -> Frame:
 
 
 def _needs_frame(frame: Frame, index: int, fit: MarkFit) -> bool:
-    """Whether a fit depends on the rotation and scale, or the stretch and shear, of the frame. With a film model beyond
-    affine, or a taking lens, every fit does: the shape of a mark then varies with its place."""
+    """Whether a fit depends on rotation, scale, stretch or shear of the frame; with a film model or lens all do."""
     if frame.film is not None or frame.options.lens is not None:
         return True
     mark, linear = frame.layout.marks[index].mark, frame.linear(index)
@@ -126,38 +119,36 @@ def _needs_frame(frame: Frame, index: int, fit: MarkFit) -> bool:
 
 
 def _moved_by_tone(frame: Frame, estimate: FrameTone) -> set[int]:
-    """Indices of all marks with information on the tone curve, if the estimated curve displaces any of them; otherwise
-    none."""
-    fits, tones = clear_fits(frame), _mark_tones(frame)
+    """Marks with information on the tone curve, if the estimated curve displaces any of them."""
+    fits, tones = frame.clear_fits, _mark_tones(frame)
     moves = (estimate.shift_px(tone, frame.scan.tone) > _MOVED * fits[index].sigma_px for index, tone in tones.items())
     return set(tones) if any(moves) else set()
 
 
 def _depends_on_tone(frame: Frame) -> bool:
     """Whether the prior uncertainty of a tone curve displaces any mark by more than its standard deviation."""
-    fits = clear_fits(frame)
+    fits = frame.clear_fits
     return any(tone.sensitivity_px > fits[index].sigma_px for index, tone in _mark_tones(frame).items())
 
 
 def _mark_tones(frame: Frame) -> dict[int, MarkTone]:
-    return {index: fit.tone for index, fit in clear_fits(frame).items() if fit.tone is not None}
+    return {index: fit.tone for index, fit in frame.clear_fits.items() if fit.tone is not None}
 
 
 def _add_tone_covariance(frame: Frame) -> Frame:
     """Add the uncertainty of tone curve and sharpening to the covariance of each mark."""
+    sharpening = frame.scan.tone.sharpening
     for index, detection in enumerate(frame.detections):
-        if detection.fit is not None and detection.fit.tone is not None:
-            frame = frame.add_covariance(index, Cause.TONE, frame.tone.covariance_px2(detection.fit.tone))
-        if detection.fit is not None and detection.fit.sharpening is not None and frame.scan.tone.sharpening:
-            unknown = detection.fit.sharpening.covariance_px2(frame.scan.tone.sharpening)
-            frame = frame.add_covariance(index, Cause.SHARPENING, unknown)
+        tone, score = (None, None) if detection.fit is None else (detection.fit.tone, detection.fit.sharpening)
+        parts = {} if tone is None else {Cause.TONE: frame.tone.covariance_px2(tone)}
+        parts |= {Cause.SHARPENING: score.covariance_px2(sharpening)} if score is not None and sharpening else {}
+        frame = frame.amend(index, parts=parts)
     return frame
 
 
 def _add_lens_covariance(frame: Frame) -> Frame:
-    """Add to each mark the uncertainty of the taking lens, projected on the complement of the affine transformation and
-    the film model."""
-    fits, lens = _inlier_fits(frame), frame.options.lens
+    """Add the uncertainty of the taking lens, as far as affine transformation and film model leave it."""
+    fits, lens = frame.inlier_fits, frame.options.lens
     if lens is None or not fits:
         return frame
     covariance = lens.covariance_px2(np.array([fit.center_px for fit in fits.values()]))
@@ -168,20 +159,21 @@ def _add_lens_covariance(frame: Frame) -> Frame:
     left = np.eye(len(free)) - free @ np.linalg.pinv(free)
     parts = (left @ covariance @ left).reshape(len(fits), 2, len(fits), 2)
     for number, index in enumerate(fits):
-        frame = frame.add_covariance(index, Cause.LENS, parts[number, :, number])
+        frame = frame.amend(index, parts={Cause.LENS: parts[number, :, number]})
     return frame
 
 
 def _refit_with_blur(frame: Frame) -> Frame:
-    """Refit marks with a poorly determined blur, using the blur of the others as an observation.
-
-    Faint marks, located so far by a filter, are refitted too. Marks whose blur differs from the others' become weak.
-    """
-    drawn = {index: fit for index, fit in _inlier_fits(frame).items() if _is_drawn(frame, index)}
+    """Refit faint marks and those with a poorly determined blur, with the blur of the others as an observation."""
+    drawn = {index: fit for index, fit in frame.inlier_fits.items() if _is_drawn(frame, index)}
     faint = {index: fit for index, fit in drawn.items() if fit.covariance is None}
     fits = {index: fit for index, fit in drawn.items() if index not in faint and frame.is_clear(index)} | faint
     shared = dict(zip(fits, shared_blurs(list(fits.values())), strict=True))
-    options = {index: _set_blur(frame.options.match, blur) for index, blur in shared.items() if blur is not None}
+    options = {
+        index: replace(frame.options.match, blur_px=blur.blur_px, blur_sigma=blur.sigma)
+        for index, blur in shared.items()
+        if blur is not None
+    }
     matched = _refit(frame, {index: each for index, each in options.items() if index not in faint}, orient=False)
     for index, before in faint.items():
         fit = _fit_again(frame, index, options.get(index, frame.options.match))
@@ -189,21 +181,15 @@ def _refit_with_blur(frame: Frame) -> Frame:
             matched = matched.replace_fits({index: fit})
     total_px = {index: float(np.sqrt(fit.blur_px**2 + PIXEL_VARIANCE_PX2)) for index, fit in fits.items()}
     for index, blur in shared.items():
-        ratio = total_px[index] / float(np.median(list(total_px.values())))
-        if np.isfinite(fits[index].blur_sigma):
-            matched = matched.add_figures(index, {"blur_ratio": ratio, "blur_sigma": fits[index].blur_sigma})
-        if blur is not None and blur.differs and index not in faint:
-            matched = matched.add_reason(index, unlike_blur(ratio))
+        ratio, sigma = total_px[index] / float(np.median(list(total_px.values()))), fits[index].blur_sigma
+        figures = {"blur_ratio": ratio, "blur_sigma": sigma} if np.isfinite(sigma) else {}
+        is_unlike = blur is not None and blur.differs and index not in faint
+        matched = matched.amend(index, *([unlike_blur(ratio)] if is_unlike else []), figures=figures)
     return orient_frame(matched)
 
 
-def _set_blur(options: MatchOptions, blur: SharedBlur) -> MatchOptions:
-    return replace(options, blur_px=blur.blur_px, blur_sigma=blur.sigma)
-
-
 def _is_better(before: MarkFit, fit: MarkFit, blur: SharedBlur | None) -> bool:
-    """Whether the fit of a faint mark replaces its filtered place: same mark, blur of the others, smaller standard
-    deviation. The filter counts everything finer than the mark as texture: in white noise a fit is far more precise."""
+    """Whether the fit of a faint mark replaces its filtered place: same mark, others' blur, smaller sigma."""
     if blur is not None and not blur.is_confirmed(fit):
         return False
     off = fit.center_px - before.center_px
@@ -211,13 +197,8 @@ def _is_better(before: MarkFit, fit: MarkFit, blur: SharedBlur | None) -> bool:
 
 
 def _compare_shapes(frame: Frame) -> Frame:
-    """Doubt marks with an outlying size or rotation: something, dust for example, covers or touches them.
-
-    Marks whose size is estimated are compared with those of the same drawing. Marks fitted with the frame's rotation
-    and scale are compared all together, by the rotation and scale that their own images show. The covariance of each
-    mark grows by the displacement that an object touching it may cause.
-    """
-    fits = {index: fit for index, fit in clear_fits(frame).items() if fit.covariance is not None}
+    """Doubt marks with an outlying size or rotation; each covariance grows by what an object touching it may cause."""
+    fits = {index: fit for index, fit in frame.clear_fits.items() if fit.covariance is not None}
     groups: dict[Mark | None, list[int]] = defaultdict(list)
     for index, fit in fits.items():
         mark = frame.layout.marks[index].mark
@@ -242,8 +223,7 @@ def _shape_figures(fit: MarkFit, linear: Array, is_held: bool) -> tuple[Array, A
 
 
 def _doubt_shape(frame: Frame, index: int, fit: MarkFit, shape: SharedShape, sigma: Array) -> Frame:
-    """Store the shape of a mark relative to the others; flag an outlier and add the covariance of a touching object.
-    sigma (k,): standard deviations of the mark's own figures."""
+    """Store the shape of a mark relative to the others, and doubt an outlier. sigma (k,): of the mark's own figures."""
     mark, is_damaged, touch = frame.layout.marks[index].mark, fit.damaged_fraction > 0, None
     figures = dict(
         zip(("size_ratio", "turn_rad"), (float(np.exp(shape.off[0])), *shape.off[1:].tolist()), strict=False)
@@ -254,7 +234,6 @@ def _doubt_shape(frame: Frame, index: int, fit: MarkFit, shape: SharedShape, sig
         window = read_window(frame.scan, mark_window(mark, place, frame.options.match.margin_px), frame.weights)
         for number, (length, sigma_length) in enumerate(zip(*measure_arms(window, mark, place, fit), strict=True), 1):
             figures |= {f"arm{number}_ratio": float(length), f"arm{number}_sigma": float(sigma_length)}
-    frame = frame.add_figures(index, figures)
     unlike = unlike_others(figures["size_ratio"], figures.get("turn_rad"))
     if fit.own_shape is not None and is_held_by_frame(mark):
         middle_px = reach_px(mark, fit.pixel_from_mark[:, :2]) / 2
@@ -262,15 +241,12 @@ def _doubt_shape(frame: Frame, index: int, fit: MarkFit, shape: SharedShape, sig
     elif is_round(mark):
         px_per_mm = linear_scale(fit.pixel_from_mark)
         touch = touch_of_round(shape, _radius_mm(mark) * px_per_mm, px_per_mm, is_damaged)
-    if shape.differs:
-        frame = frame.add_reason(index, unlike)
-    elif touch is not None and is_round(mark) and is_damaged and touch.exceedance(WRONG_PX) > LARGE_ERROR:
-        size = unlike.split(":")[0]
-        near = f"{size}, and the picture next to it is damaged: something may touch it; error over {WRONG_PX} px"
-        frame = frame.add_reason(index, unlike.reword(near))
-    if touch is not None:
-        frame = frame.add_covariance(index, Cause.TOUCHED, touch.variance_px2 * np.eye(2))
-    return frame
+    reasons = [unlike] if shape.differs else []
+    if not reasons and touch and is_round(mark) and is_damaged and touch.exceedance(WRONG_PX) > LARGE_ERROR:
+        near = f"and the picture next to it is damaged: something may touch it; error over {WRONG_PX} px"
+        reasons = [unlike.reword(f"{unlike.split(':')[0]}, {near}")]
+    parts = {} if touch is None else {Cause.TOUCHED: touch.variance_px2 * np.eye(2)}
+    return frame.amend(index, *reasons, parts=parts, figures=figures)
 
 
 def _radius_mm(mark: Mark) -> float:
@@ -284,32 +260,20 @@ def _is_drawn(frame: Frame, index: int) -> bool:
     return isinstance(frame.layout.marks[index].mark, MarkShape)
 
 
-def _inlier_fits(frame: Frame) -> dict[int, MarkFit]:
-    return {index: fit for index, fit in enumerate(frame.fits) if fit is not None}
-
-
-def clear_fits(frame: Frame) -> dict[int, MarkFit]:
-    """Fits of the inliers with a likeness of at least `CLEAR_LIKENESS`, by index."""
-    return {index: fit for index, fit in _inlier_fits(frame).items() if fit.likeness >= CLEAR_LIKENESS}
-
-
 def _linear_sigma(frame: Frame) -> float:
-    """Standard deviation of rotation (rad), scale, stretch and shear at a mark: of the frame's parameters, and of the
-    film's bending between marks. Three marks reveal no gross error: a wrong name or place appears as stretch and shear,
-    so their estimate of these is added as uncertainty."""
+    """Standard deviation of the frame's rotation (rad), scale, stretch and shear at a mark, bending included."""
     places = frame.camera_mm[frame.inliers]
     radius_mm = float(np.hypot(*(places - places.mean(axis=0)).T).mean())
     bend = float(np.hypot(frame.options.film_sigma_mm, frame.scatter_mm)) / radius_mm
     unchecked = 0.0
-    if frame.inliers.sum() <= _UNCHECKED:
+    if frame.inliers.sum() <= _UNCHECKED:  # a wrong name or place appears as stretch and shear
         greater, less = np.linalg.svd(frame.pixel_from_camera[:, :2] * frame.pitch_mm[:, None], compute_uv=False)
         unchecked = (greater - less) / (greater + less)
     return float(np.linalg.norm([frame.linear_sigma, bend, unchecked]))
 
 
 def _refit(frame: Frame, options: Mapping[int, MatchOptions], orient: bool = True) -> Frame:
-    """Refit marks at their measured places, with options by index. A clear mark keeps its previous fit if the new one
-    is not clear, for example because it slid along a line."""
+    """Refit marks at their places, with options by index. A clear fit stays if the new one is not clear."""
     fits = {index: _fit_again(frame, index, each) for index, each in sorted(options.items())}
     kept = {
         index: fit

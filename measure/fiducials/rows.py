@@ -186,11 +186,7 @@ def _row(mark: LayoutMark, index: int, frame: Frame, scan: str) -> MarkMeasureme
 
 
 def _weaken_assumed_name(row: MarkMeasurement, mark: LayoutMark, pose: Pose) -> MarkMeasurement:
-    """Make a measured learned mark weak if the pose is only assumed.
-
-    The point of a drawn mark does not depend on its name. The origin of a learned mark is where somebody clicked; at
-    another mark that looks alike it lies elsewhere, unless the symmetry of the marks maps the origins onto each other.
-    """
+    """Make a measured learned mark weak if the pose is assumed: under another name its origin lies elsewhere."""
     if (
         not isinstance(mark.mark, MarkTemplate)
         or mark.mark.learned_mm == 0

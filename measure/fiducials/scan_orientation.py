@@ -7,7 +7,7 @@ if its odds against every other are a thousand to one. Among equal ones an unmir
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -16,8 +16,8 @@ from measure.annotations.orientation_from_text import line_score, main_pose, wri
 from measure.array_types import Array
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
-from measure.fiducials.interior_orientation import FrameFit, fit_frame
-from measure.fiducials.options import SCATTER_DEGREES, FiducialOptions
+from measure.fiducials.interior_orientation import fit_frame
+from measure.fiducials.options import SCATTER_DEGREES
 from measure.fiducials.orientation_pictures import Drawings, MarkSite, PosedMark
 from measure.geometry import pose_in_camera, up_from_camera
 from measure.marks.shapes import LEARNED_ORIGIN, Disk, FiducialLayout, LayoutMark, Mark, MarkShape, MarkTemplate
@@ -34,27 +34,60 @@ _FREE_MM = 1e3  # standard deviation of a place that is not given
 
 
 @dataclass(frozen=True, eq=False)
-class _Verdict:
-    """Log-likelihoods of one scan orientation.
+class _Hypothesis:
+    """Scan orientation with its log-likelihoods.
 
     Attributes
     ----------
     pose : scan orientation.
-    names : index of the mark at each site, -1 for none.
-    pictures : (sites,) log-likelihoods of the images.
-    coordinates : log-likelihood of the coordinates.
+    names : index of the mark at each site, of marks found and then of missed ones; -1 for none.
+    coordinates : log-likelihood of the coordinates. They follow Student's t distribution, since the scatter of the film
+        is known with few degrees of freedom.
     chi_square : chi-square of the coordinates.
+    pictures : (sites,) log-likelihoods of the images.
     by_chance : log-likelihood of all images if their differences do not belong to the marks.
     writing : log-likelihood of the writing.
     """
 
     pose: str
     names: tuple[int, ...]
-    pictures: Array
-    coordinates: float
-    chi_square: float
-    by_chance: float
+    coordinates: float = 0.0
+    chi_square: float = 0.0
+    pictures: Array = field(default_factory=lambda: np.zeros(0))
+    by_chance: float = -np.inf
     writing: float = 0.0
+
+    @classmethod
+    def from_placement(
+        cls, placement: Placement, frame: Frame, fits: Sequence[MarkFit], missed: Array
+    ) -> "_Hypothesis | None":
+        """Name each site after the nearest predicted mark, and fit the frame. Returns None if a name is assigned twice,
+        or fewer than two of two or more marks found are named."""
+        marks, options, pitch = frame.layout.marks, frame.options, frame.pitch_mm
+        centers = np.array([*(fit.center_px for fit in fits), *missed])
+        predicted = placement.places_px(frame.camera_mm)
+        distance = np.hypot(*np.moveaxis((predicted[:, None] - centers[None]) * pitch, -1, 0))
+        near = distance.min(axis=0) < _NAMED * options.gate_mm
+        names = np.where(near, distance.argmin(axis=0), -1)
+        found = near[: len(fits)]
+        if len(np.unique(names[near])) < near.sum() or (found.sum() < 2 <= len(fits)):
+            return None
+        hypothesis = cls(placement.pose, tuple(names.tolist()))
+        if len(fits) < 2:
+            return hypothesis
+        own = names[: len(fits)][found]
+        given = np.array([_given_sigma_mm(marks[name]) for name in own])
+        measured = np.array([fit.sigma_px for fit in fits])[found] * pitch.mean()
+        sigma = np.sqrt(given**2 + measured**2 + options.film_sigma_mm**2)
+        up = frame.up_mm(centers[: len(fits)][found])
+        fit = fit_frame(frame.camera_mm[own], up, sigma, up_from_camera(placement.pose), options.film_model)
+        degrees = SCATTER_DEGREES + max(fit.redundancy, 0)
+        coordinates = -degrees / 2 * float(np.log1p(fit.chi_square / SCATTER_DEGREES))
+        return replace(hypothesis, coordinates=coordinates, chi_square=fit.chi_square)
+
+    def posed_mark(self, site: int, layout: FiducialLayout) -> PosedMark:
+        name = self.names[site]
+        return PosedMark(None if name < 0 else layout.marks[name].mark, up_from_camera(self.pose))
 
     @property
     def pictures_total(self) -> float:
@@ -71,52 +104,43 @@ class _Verdict:
         return self.likelihood + (0.0 if self.pose.endswith("m") else _UNMIRRORED)
 
 
-def decide_pose(
-    scan: Scan,
-    layout: FiducialLayout,
-    placements: Sequence[Placement],
-    frame: Frame,
-    options: FiducialOptions,
-    lines: Sequence[Line] = (),
-) -> Pose:
+def decide_pose(scan: Scan, placements: Sequence[Placement], frame: Frame, lines: Sequence[Line] = ()) -> Pose:
     """Decide the scan orientation of a measured frame.
 
     Parameters
     ----------
-    scan, layout, options : scan, marks of the camera, and options.
+    scan : scan, with the tone curve in which images are compared.
     placements : one for each orientation, all at the place of the measured frame.
     frame : frame measured in one of the orientations.
     lines : writing around the frame, as far as it was read.
     """
-    fits = [fit for fit in frame.fits if fit is not None]
-    missed = frame.missed_px
-    named = [
-        each
-        for each in (_Named.from_placement(placement, layout, fits, missed, options) for placement in placements)
-        if each is not None
-    ]
-    if not named:
+    layout, fits = frame.layout, list(frame.inlier_fits.values())
+    inside = np.array([detection.inside for detection in frame.detections])
+    missed = frame.predicted_px[inside & ~frame.inliers]
+    every = (_Hypothesis.from_placement(placement, frame, fits, missed) for placement in placements)
+    hypotheses = [each for each in every if each is not None]
+    if not hypotheses:
         return _decision([], layout, len(fits))
     scan_from_up = frame.pixel_from_camera[:, :2] @ np.linalg.inv(up_from_camera(frame.placement.pose))
     blur_px = float(np.median([fit.blur_px for fit in fits]))
     drawings = Drawings([mark.mark for mark in layout.marks], scan_from_up, blur_px)
-    reach_px = frame.first_search_px
-    sites = [MarkSite(scan, fit, fit.center_px, frame.weights, drawings, reach_px) for fit in fits]
     # Sites without a mark take contrast and noise from a typical one: another orientation may predict a mark there.
     usual = sorted(fits, key=lambda fit: abs(fit.contrast_dn))[len(fits) // 2]
-    sites += [MarkSite(scan, usual, place, frame.weights, drawings, reach_px) for place in missed]
+    places = [*((fit, fit.center_px) for fit in fits), *((usual, place) for place in missed)]
+    sites = [MarkSite(scan, *each, frame.weights, drawings, frame.first_search_px()) for each in places]
 
     def site_likelihoods(index: int) -> Array:
-        return sites[index].likelihoods([each.posed_mark(index, layout) for each in named])
+        return sites[index].likelihoods([each.posed_mark(index, layout) for each in hypotheses])
 
-    pictures = np.array(map_in_threads(site_likelihoods, range(len(sites)))).reshape(len(sites), len(named))
+    pictures = np.array(map_in_threads(site_likelihoods, range(len(sites)))).reshape(len(sites), len(hypotheses))
     by_chance = _chance_likelihood(pictures) if any(_is_bare_chip(mark.mark) for mark in layout.marks) else -np.inf
-    verdicts = [each.verdict(pictures[:, index], by_chance) for index, each in enumerate(named)]
-    if not lines or not frame.accepted:
-        return _decision(verdicts, layout, len(fits))
-    written = writing_likelihoods(lines, layout.writing, [verdict.pose for verdict in verdicts])
-    verdicts = [replace(each, writing=own) for each, own in zip(verdicts, written.tolist(), strict=True)]
-    return _decision(verdicts, layout, len(fits), lines)
+    written = np.zeros(len(hypotheses))
+    lines = lines if frame.accepted else ()
+    if lines:
+        written = writing_likelihoods(lines, layout.writing, [each.pose for each in hypotheses])
+    likelihoods = zip(hypotheses, pictures.T, written.tolist(), strict=True)
+    hypotheses = [replace(each, pictures=own, by_chance=by_chance, writing=text) for each, own, text in likelihoods]
+    return _decision(hypotheses, layout, len(fits), lines)
 
 
 def _is_bare_chip(mark: Mark) -> bool:
@@ -125,65 +149,8 @@ def _is_bare_chip(mark: Mark) -> bool:
 
 
 def _chance_likelihood(pictures: Array) -> float:
-    """Log-likelihood of the images (sites, poses) under the null hypothesis that each of them favours an orientation
-    at random, all with equal probability."""
+    """Log-likelihood of images (sites, poses) that favour orientations at random."""
     return float((np.logaddexp.reduce(pictures, axis=1) - np.log(pictures.shape[1])).sum())
-
-
-@dataclass(frozen=True, eq=False)
-class _Named:
-    """Names that an orientation assigns to the places of found and missed marks (-1: none), and the fit of the frame to
-    the found ones, if there are two."""
-
-    pose: str
-    names: tuple[int, ...]
-    fit: FrameFit | None
-
-    @classmethod
-    def from_placement(
-        cls,
-        placement: Placement,
-        layout: FiducialLayout,
-        fits: Sequence[MarkFit],
-        missed: Sequence[Array],
-        options: FiducialOptions,
-    ) -> "_Named | None":
-        """Name each place after the nearest predicted mark, and fit the frame. Returns None if a name is assigned
-        twice, or fewer than two of two or more marks found are named."""
-        pitch, camera = np.asarray(placement.pitch_mm), np.array([mark.xy_mm for mark in layout.marks])
-        predicted = placement.places_px(camera)
-        centers = np.array([*(fit.center_px for fit in fits), *missed])
-        distance = np.hypot(*np.moveaxis((predicted[:, None] - centers[None]) * pitch, -1, 0))
-        nearest = distance.argmin(axis=0)
-        near = distance.min(axis=0) < _NAMED * options.gate_mm
-        names = np.where(near, nearest, -1)
-        if len(np.unique(names[near])) < near.sum():
-            return None
-        near, centers = near[: len(fits)], centers[: len(fits)]
-        if near.sum() < 2:
-            alone = cls(placement.pose, tuple(names.tolist()), None)
-            return alone if len(fits) < 2 else None
-        own = names[: len(fits)][near]
-        given = np.array([_given_sigma_mm(layout.marks[name]) for name in own])
-        measured = np.array([np.sqrt(np.trace(fit.covariance_px2) / 2) for fit in fits])[near] * pitch.mean()
-        sigma = np.sqrt(given**2 + measured**2 + options.film_sigma_mm**2)
-        ideal = centers[near] if options.lens is None else options.lens.ideal_px(centers[near])
-        up = ideal * pitch * (1.0, -1.0)
-        fit = fit_frame(camera[own], up, sigma, up_from_camera(placement.pose), options.film_model)
-        return cls(placement.pose, tuple(names.tolist()), fit)
-
-    def posed_mark(self, site: int, layout: FiducialLayout) -> PosedMark:
-        name = self.names[site]
-        return PosedMark(None if name < 0 else layout.marks[name].mark, up_from_camera(self.pose))
-
-    def verdict(self, pictures: Array, by_chance: float) -> _Verdict:
-        """Log-likelihoods of this orientation. The coordinates follow Student's t distribution, since the scatter of
-        the film is known with few degrees of freedom."""
-        if self.fit is None:
-            return _Verdict(self.pose, self.names, pictures, 0.0, 0.0, by_chance)
-        degrees = SCATTER_DEGREES + max(self.fit.redundancy, 0)
-        coordinates = -degrees / 2 * float(np.log1p(self.fit.chi_square / SCATTER_DEGREES))
-        return _Verdict(self.pose, self.names, pictures, coordinates, self.fit.chi_square, by_chance)
 
 
 def _given_sigma_mm(mark: LayoutMark) -> float:
@@ -192,12 +159,8 @@ def _given_sigma_mm(mark: LayoutMark) -> float:
     return float(np.hypot(min(max(mark.sigma_mm), _FREE_MM), origin_mm))
 
 
-def _decision(verdicts: Sequence[_Verdict], layout: FiducialLayout, found: int, lines: Sequence[Line] = ()) -> Pose:
-    """Select the most likely orientation, with the evidence in sentences.
-
-    Among equally likely ones, the orientation in which most of the writing is upright is assumed, so that the frames of
-    a roll are named consistently. found: number of marks found; the verdicts also use the places of missed ones.
-    """
+def _decision(verdicts: Sequence[_Hypothesis], layout: FiducialLayout, found: int, lines: Sequence[Line] = ()) -> Pose:
+    """Select the most likely orientation, with the evidence in sentences. found: number of marks found."""
     if not verdicts:
         return Pose("0", False, ("no pose names the marks that were found.",))
     best_likelihood = max(verdict.likelihood for verdict in verdicts)
@@ -213,6 +176,7 @@ def _decision(verdicts: Sequence[_Verdict], layout: FiducialLayout, found: int, 
     names = ", ".join(verdict.pose for verdict in alike)
     lead = best.total - alike[0].total
     near = [verdict for verdict in alike if best.total - verdict.total < TOLD]
+    # Among equal ones: that in which most of the writing is upright, so that the frames of a roll agree.
     upright = next((verdict.pose for verdict in near if main and pose_in_camera(main, verdict.pose) == "0"), "")
     like_writing = ", in which most of what is written is upright" if upright else ""
     if lead > TOLD:
@@ -233,7 +197,7 @@ def _decision(verdicts: Sequence[_Verdict], layout: FiducialLayout, found: int, 
     return Pose(assumed, False, (sentence, *against), written, main, rivals=rivals)
 
 
-def _against(best: _Verdict, rival: _Verdict, layout: FiducialLayout, lines: Sequence[Line]) -> tuple[str, ...]:
+def _against(best: _Hypothesis, rival: _Hypothesis, layout: FiducialLayout, lines: Sequence[Line]) -> tuple[str, ...]:
     """Sentences with the evidence for the best orientation against the most likely rejected one."""
     sentences = []
     by_site, lead = best.pictures - rival.pictures, best.pictures_total - rival.pictures_total
@@ -256,7 +220,7 @@ def _against(best: _Verdict, rival: _Verdict, layout: FiducialLayout, lines: Seq
     return tuple(sentences)
 
 
-def _writing_sentence(best: _Verdict, rival: _Verdict, layout: FiducialLayout, lines: Sequence[Line]) -> str:
+def _writing_sentence(best: _Hypothesis, rival: _Hypothesis, layout: FiducialLayout, lines: Sequence[Line]) -> str:
     """Sentence with the evidence of the writing on two orientations, quoting the most significant lines."""
     lead = best.writing - rival.writing
     by_line = [

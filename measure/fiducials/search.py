@@ -155,13 +155,7 @@ def centred_places_px(scan: Scan, layout: FiducialLayout, pixel_from_camera: Arr
 
 
 class FrameSearch:
-    """Search in one scan. Templates are rendered and correlated once for hypotheses with the same drawn_mm.
-
-    Attributes
-    ----------
-    unsettled : placements with unfitted marks that another tone curve may fit.
-    among : placements in which marks are fitted, None for all.
-    """
+    """Search in one scan. Templates are rendered and correlated once for hypotheses with the same drawn_mm."""
 
     def __init__(
         self,
@@ -177,8 +171,6 @@ class FrameSearch:
         self._signs = mark_signs(layout.marks)
         self._responses: tuple[Pair, Responses] | None = None
         self._searches: dict[Pair, PlacementSearch] = {}
-        self.unsettled: list[Placement] = []
-        self.among: list[Placement] | None = None
         self._found: dict[tuple[PitchHypothesis, ...], list[Placement]] = {}
         # Two thirds for the correlation maps, one third for the dilations: two for each view of one pose.
         cache_bytes = effort.scan_cache_bytes(scan.width_px * scan.height_px)
@@ -205,13 +197,9 @@ class FrameSearch:
         return self._found.setdefault(key, _best_first(found))
 
     def replace_tone(self, tone: Tone) -> "FrameSearch":
-        """Return the search with another tone curve for the fits.
-
-        The placements stay, since the correlation uses the stored grey values. Marks are fitted again only in the
-        unsettled placements.
-        """
+        """Return the search with another initial tone curve for the fits, in the same responses."""
         search = copy(self)
-        search.scan, search.among = self.scan.replace_tone(tone), self.unsettled
+        search.scan = self.scan.replace_tone(tone)
         return search
 
     def replace_film_model(self, model: str) -> "FrameSearch":
@@ -304,10 +292,7 @@ class FrameSearch:
     def _false_frames(
         self, placement: Placement, found_px: dict[int, Array], inside: int, tolerance_px: float
     ) -> float:
-        """Expected number of false frames, from the shares of places that respond as strongly as the marks found.
-
-        found_px: places by index; they agree with the frame within tolerance_px (of the reduced scan).
-        """
+        """Expected number of false frames, from the shares of places that respond as strongly within tolerance_px."""
         search, shares, same_px = self._searches[placement.pitch_mm], [], 1
         for index, place in found_px.items():
             dilation = search.response_map(placement, index).dilated(tolerance_px)
@@ -346,10 +331,7 @@ class FrameSearch:
         return [MarkView(mark.mark, linear @ up_from_camera(pose)) for pose in self.poses for mark in self.layout.marks]
 
     def _placements(self, hypotheses: Sequence[PitchHypothesis], responses: Responses) -> list[Placement]:
-        """Find placements under hypotheses that share templates.
-
-        Pose by pose, since the responses of all poses may exceed the cache.
-        """
+        """Find placements under hypotheses that share templates, pose by pose: the responses may exceed the cache."""
         marks = self.layout.marks
         rotation_rad, misfit_mm = float(np.deg2rad(self.options.rotation_deg)), self.options.search_mm(self.layout)
         searches = {
@@ -371,10 +353,7 @@ class FrameSearch:
         return [placement for placement in every if self._shows_middle(placement)]
 
     def _shows_middle(self, placement: Placement) -> bool:
-        """Whether the frame contains the scan's centre, for a scan of a part of a frame; True for a whole one.
-
-        Two marks, enough for a part, also fit frames that would lie beside the scan.
-        """
+        """Whether the frame contains the centre of a scan of its part: two marks also fit frames beside the scan."""
         if not self.options.part:
             return True
         linear, shift = placement.pixel_from_camera[:, :2], placement.pixel_from_camera[:, 2]

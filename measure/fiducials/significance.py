@@ -5,14 +5,14 @@ marks are therefore searched in the same way where they are not. The share of th
 strongly as the weakest mark found is the false-alarm rate of one mark.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from scipy.special import bdtrc
 
 from measure.array_types import Array
 from measure.detection.localisation import highest_peak
-from measure.fiducials.frame import CLEAR_LIKENESS, Frame
+from measure.fiducials.frame import Frame
 from measure.fiducials.search import FrameSearch
 from measure.flags import FRAME_BY_CHANCE, NO_FRAME, NO_REASON, Code, Reason
 from measure.scans.scan import Scan
@@ -44,37 +44,30 @@ def doubt_frame(search: FrameSearch, frame: Frame) -> Reason:
     if frame.placement.surroundings.robust:
         return NO_REASON
     inside = [index for index, detection in enumerate(frame.detections) if detection.inside]
-    clear = {
-        index: fit.center_px
-        for index, fit in enumerate(frame.fits)
-        if fit
-        and fit.likeness >= CLEAR_LIKENESS
-        and not frame.detections[index].closer  # searched only where the others predict it: no independent evidence
-    }
-    if frame.inliers.sum() >= _SURE:
+    # A mark searched only where the others predict it is no independent evidence.
+    clear = [index for index in frame.clear_fits if not frame.detections[index].closer]
+    if len(frame.inlier_fits) >= _SURE:
         return NO_REASON
     if len(clear) == len(inside):
         return _doubt_by_scan(search, frame, clear)
     return _doubt_by_neighbourhood(search, frame, inside, clear)
 
 
-def false_frames(search: FrameSearch, frame: Frame, found_px: dict[int, Array]) -> float:
+def false_frames(search: FrameSearch, frame: Frame, found: Iterable[int]) -> float:
     """Expected number of false frames as good in the scan.
 
-    found_px: (2,) place of each mark that counts, by index. Many places respond as strongly at reduced resolution, but
+    found: indices of the marks that count. Many places respond as strongly at reduced resolution, but
     few of them at full resolution: the number is multiplied by their share to the power of at most `_COUNTED` marks.
     """
+    found_px = {index: frame.inlier_fits[index].center_px for index in found}
     expected = search.false_frames(frame.placement, frame.inside, found_px)
     if frame.placement.reduction == 1 or not _SELDOM < expected < _HOPELESS:
         return expected
     return expected * _share_at_full_resolution(search, frame, found_px) ** min(_COUNTED, len(found_px))
 
 
-def _doubt_by_scan(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -> Reason:
-    """Test a frame of which every mark was found, by the number of false frames expected in the whole scan.
-
-    A frame found by the search in windows is not tested: the windows give no responses elsewhere.
-    """
+def _doubt_by_scan(search: FrameSearch, frame: Frame, clear: Sequence[int]) -> Reason:
+    """Test a frame of which every mark was found, by the false frames expected in a scan that was searched whole."""
     if len(clear) <= _FREE or not search.is_exhaustive(frame.placement):
         return NO_REASON
     expected = false_frames(search, frame, clear)
@@ -89,7 +82,7 @@ def _doubt_by_scan(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -
 
 def _share_at_full_resolution(search: FrameSearch, frame: Frame, found_px: dict[int, Array]) -> float:
     """Share of the places with responses as strong at reduced resolution that also have them at full resolution."""
-    marks_px, apart_px = np.array([*found_px.values()]), _APART * frame.first_search_px
+    marks_px, apart_px = np.array([*found_px.values()]), _APART * frame.first_search_px()
     others = [
         (index, place)
         for index, own in found_px.items()
@@ -102,16 +95,12 @@ def _share_at_full_resolution(search: FrameSearch, frame: Frame, found_px: dict[
     return _share(hits, len(others))
 
 
-def _doubt_by_neighbourhood(
-    search: FrameSearch, frame: Frame, inside: Sequence[int], clear: dict[int, Array]
-) -> Reason:
-    """Test a frame of which some marks were not found, by the correlation at places beside the marks.
-
-    The p-value is binomial: that of as many marks or more, two being free, at the false-alarm rate of those places.
-    """
-    found, radius = len(clear), frame.first_search_px
+def _doubt_by_neighbourhood(search: FrameSearch, frame: Frame, inside: Sequence[int], clear: Sequence[int]) -> Reason:
+    """Test a frame of which some marks were not found, by the correlation beside the marks (binomial)."""
+    found, radius = len(clear), frame.first_search_px()
     places = _neighbouring_places(search.scan, frame, inside, radius)
-    weakest = min((_response(search, frame, index, place, _FITTED_PX) for index, place in clear.items()), default=0.0)
+    fitted = ((index, frame.inlier_fits[index].center_px) for index in clear)
+    weakest = min((_response(search, frame, *each, _FITTED_PX) for each in fitted), default=0.0)
     hits = sum(_response(search, frame, index, place, radius) >= weakest for index, place in places)
     chance = float(bdtrc(found - _FREE - 1, len(inside) - _FREE, _share(hits, len(places))))
     if chance <= FRAME_BY_CHANCE:

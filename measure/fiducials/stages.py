@@ -1,13 +1,15 @@
-"""Search for a frame as a list of attempts, which differ in region, pitch, tone curve and treatment of the background.
+"""Search for a frame as a list of attempts, which differ in region, pitch, film model, tone curve and
+surroundings.
 
-A single loop makes the attempts in order and skips those that an earlier result makes unnecessary. One criterion
-accepts a frame: the expected number of false frames in all attempts so far, or in those under the given pitch alone,
-which is likelier than all others together.
+One loop makes the attempts in order and skips those that an earlier result makes unnecessary. One criterion accepts a
+frame: the expected number of false frames in all attempts so far, or in those under the given pitch alone, which is
+likelier than all others together.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter
+from typing import Literal
 
 import numpy as np
 
@@ -26,8 +28,11 @@ from measure.marks.shapes import FiducialLayout
 from measure.results import Pose
 from measure.scans.scan import Scan
 
-# Placements, best first; frames in order of preference, each with the expected number of false frames as good.
-Result = tuple[list[Placement], list[tuple[float, Frame]]]
+# middle, given: under the prior belief about the scan, in windows about its middle or in all of it; oblique: with a
+# perspective, for film that was photographed obliquely; pitch: under other pitches; faint: with narrower surroundings
+# of the marks, since the frame's edge may mask a mark in wider ones, and then with those for marks in strong grain.
+Kind = Literal["middle", "given", "oblique", "pitch", "faint"]
+Result = tuple[Sequence[Placement], list[tuple[float, Frame]]]  # best first; frames with expected false alarms
 
 _TRIALS = 4  # placements tried at full resolution after the best one
 _NOTHING = Reason("no two of the camera's marks were found in the scan", Code.NO_FRAME)
@@ -60,24 +65,6 @@ class Found:
     faint: tuple[float, Frame] | None = None
     misfit: Reason = _NOTHING
 
-    @property
-    def is_complete(self) -> bool:
-        return self.frame is not None and self.frame.is_complete
-
-    @property
-    def lacks_few_marks(self) -> bool:
-        """Whether the frame is taken and misses fewer marks than one on film that was photographed obliquely.
-
-        Weak marks do not count as missing: a perspective displaces marks, but leaves their quality unchanged.
-        """
-        if self.frame is None or not self.is_taken:
-            return False
-        return self.frame.inside - int(self.frame.inliers.sum()) < max(_GAINED, _LACKED * self.frame.inside)
-
-    @property
-    def is_undoubted(self) -> bool:
-        return self.is_taken and self.frame is not None and not doubt_frame(self.search, self.frame)
-
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
@@ -85,22 +72,37 @@ class Attempt:
 
     Attributes
     ----------
-    search : search in the scan.
+    kind : what is searched, and how a frame is tested.
+    search : in the scan, with tone curve, film model and surroundings of the marks.
     hypotheses : about the pitch.
-    find : function of the search, the hypotheses and the total number of hypotheses tried; returns a Result.
-    is_settled : whether the earlier results make the attempt unnecessary.
-    is_given : under the prior belief about the scan; its result replaces an earlier one, taken or not.
-    at_given : under the given pitch.
-    first : attempt that this one repeats from another initial tone curve; its placements are no further hypotheses.
+    at_given : whether they are under the given pitch.
+    is_repeated : from another initial tone curve; the hypotheses are counted already.
     """
 
+    kind: Kind
     search: FrameSearch
     hypotheses: Hypotheses
-    find: Callable[[FrameSearch, Hypotheses, int], Result]
-    is_settled: Callable[[Found], bool]
-    is_given: bool = False
     at_given: bool = False
-    first: "Attempt | None" = None
+    is_repeated: bool = False
+
+    @property
+    def is_given(self) -> bool:
+        """Whether its result replaces an earlier one, taken or not."""
+        return self.kind in ("middle", "given")
+
+    def is_unnecessary(self, found: Found) -> bool:
+        """Whether the earlier results make it unnecessary."""
+        frame = found.frame if found.is_taken else None
+        if self.is_repeated:
+            return found.is_taken or found.frame is None or not found.frame.failed_fits
+        if self.kind == "faint":
+            return found.is_taken
+        if self.kind == "given":
+            return found.frame is not None and found.frame.is_complete
+        if self.kind == "oblique":
+            # Weak marks do not count as missing: a perspective displaces marks, but leaves their quality unchanged.
+            return frame is not None and frame.inside - len(frame.inlier_fits) < max(_GAINED, _LACKED * frame.inside)
+        return self.kind == "pitch" and frame is not None and not doubt_frame(found.search, frame)
 
 
 def find_frame(
@@ -115,23 +117,23 @@ def find_frame(
     """
     found, every, at_given = Found(FrameSearch(scan, layout, options)), 0, 0
     ids = [mark.id for mark in layout.marks]
-    for attempt in _attempts(found.search, hypotheses, is_given):
-        if attempt.is_settled(found):
+    for attempt in list_attempts(found.search, hypotheses, is_given):
+        if attempt.is_unnecessary(found):
             continue
-        if attempt.first is None:
+        if not attempt.is_repeated:
             every += len(attempt.hypotheses)
             at_given += len(attempt.hypotheses) if attempt.is_given or attempt.at_given else 0
         tried = at_given if attempt.at_given else every
-        placements, frames = attempt.find(attempt.search, attempt.hypotheses, tried)
+        placements, frames = make_attempt(attempt, tried)
         expected, frame = frames[0] if frames else (np.inf, None)
         if expected <= FRAMES_BY_CHANCE:
             found = replace(found, search=attempt.search, placements=placements, frame=frame, is_taken=True)
         elif attempt.is_given:
-            if attempt.first is None or (frame is not None and frame.is_nearer_than(found.frame)):
+            if not attempt.is_repeated or (frame is not None and frame.is_nearer_than(found.frame)):
                 misfit = frame.misfit(ids) if frame else _NOTHING
                 found = replace(found, placements=placements, frame=frame, is_taken=False, misfit=misfit)
         else:
-            likely = [each for each in frames if _is_taken_if_given(each, attempt, at_given / tried)]
+            likely = [] if attempt.at_given else [each for each in frames if _is_taken_if_given(each, at_given / tried)]
             rejected = [each for each in (found.faint, *frames) if each and each not in likely]
             unsure = (*found.unsure, *(frame for _, frame in likely))
             found = replace(found, unsure=unsure, faint=min(rejected, key=itemgetter(0), default=None))
@@ -141,209 +143,123 @@ def find_frame(
     return replace(found, frame=None, misfit=found.misfit.reword(found.misfit + what_to_do))
 
 
-def _is_taken_if_given(result: tuple[float, Frame], attempt: Attempt, at_given: float) -> bool:
-    """Whether a frame under another pitch would be taken if that pitch were given.
-
-    at_given: share of the hypotheses that are under the given pitch.
-    """
-    return not attempt.at_given and (result[1].accepted or result[0] * at_given <= FRAMES_BY_CHANCE)
-
-
-def _attempts(wide: FrameSearch, hypotheses: Sequence[Hypotheses], is_given: bool) -> list[Attempt]:
-    """List the attempts in order.
-
-    1. The middle of a large scan, if the pitch is given; then the whole scan.
-    2. If marks are missing: with a perspective, for film that was photographed obliquely.
-    3. If the frame may be a false alarm: under other pitches.
-    4. If there is no frame: with narrower surroundings of the marks, since the frame's edge may mask a mark in wider
-       ones; then with surroundings for marks in strong grain.
-    """
+def list_attempts(wide: FrameSearch, hypotheses: Sequence[Hypotheses], is_given: bool) -> list[Attempt]:
+    """List the attempts in order; where fits fail, that of the whole scan is repeated from other tone curves."""
     given, *others = hypotheses
-    closer = [wide.with_surroundings(surroundings) for surroundings in (CLOSE, GRAINY)]
-    oblique = wide.replace_film_model("projective")
     near, nearly = slightly_longer(given[0], _STRETCH) if is_given else ([], given)
     in_windows = is_given and not wide.options.part and is_searched_by_windows(wide.scan, wide.layout, given[0].mm)
+    may_be_oblique = wide.options.film_model == "affine" and len(wide.layout.marks) >= _OBLIQUE
     return [
-        *([Attempt(wide, given, _search_middle, lambda _: False, True)] if in_windows else []),
-        *_through_tone_curves(Attempt(wide, given, _search_scan, lambda found: found.is_complete, True)),
+        *([Attempt("middle", wide, given)] if in_windows else []),
+        Attempt("given", wide, given),
         *(
-            [Attempt(oblique, given, _search_oblique, lambda found: found.lacks_few_marks, at_given=True)]
-            if wide.options.film_model == "affine" and len(wide.layout.marks) >= _OBLIQUE
-            else []
+            Attempt("given", wide.replace_tone(tone), given, is_repeated=True)
+            for tone in wide.scan.tone.starting_curves
         ),
+        *([Attempt("oblique", wide.replace_film_model("projective"), given, True)] if may_be_oblique else []),
+        *(Attempt("pitch", wide, group) for group in others),
         *(
-            each
-            for group in others
-            for each in _through_tone_curves(
-                Attempt(wide, group, _search_other_pitch, lambda found: found.is_undoubted)
-            )
-        ),
-        *(  # no other tone curves here: a mark need not correlate clearly with its drawing
-            Attempt(close, group, _search_closer, lambda found: found.is_taken, at_given=group is near)
-            for close in closer
+            Attempt("faint", wide.with_surroundings(surroundings), group, group is near)
+            for surroundings in (CLOSE, GRAINY)
             for group in (near, nearly)
             if group
         ),
     ]
 
 
-def _through_tone_curves(first: Attempt) -> list[Attempt]:
-    """Repeat an attempt from other initial tone curves, unless a frame is taken before."""
-    search = first.search
-    return [
-        first,
-        *(
-            replace(first, search=search.replace_tone(tone), is_settled=lambda found: found.is_taken, first=first)
-            for tone in search.scan.tone.starting_curves
-        ),
-    ]
+def make_attempt(attempt: Attempt, tried: int) -> Result:
+    """Search, measure the frame in the likely placements, and estimate the expected number of false frames as good.
+
+    An accepted frame of the prior belief needs no such test. Under another pitch or film model only unblemished marks
+    count, since the additional freedom yields false frames too; a perspective has to fit nearly all marks. Faint marks
+    need not be clear, only agree: `tried`, the number of hypotheses so far, limits which placements are measured.
+    """
+    search, hypotheses, kind = attempt.search, attempt.hypotheses, attempt.kind
+    found = search.search_middle(hypotheses[0]) if kind == "middle" else search.search_scan(hypotheses)
+    if attempt.is_given:
+        frame = best_frame(search, found[:1] if kind == "middle" else found)
+        return found, [] if frame is None else [(0.0 if frame.accepted else np.inf, frame)]
+    if kind == "faint":
+        results = [_faint_frame(search, place, tried) for place in _likely_placements(search, found, tried)]
+        return found, sorted((each for each in results if each is not None), key=itemgetter(0))
+    if kind == "oblique":
+        most = max(_OBLIQUE, len(search.layout.marks) - _GAINED + 1)
+        places = [place for place in found[:1] if place.supported >= most]
+    else:
+        places = _likely_placements(search, found, len(hypotheses))
+    frames = [frame for frame in (_measure(search, place) for place in places) if frame.accepted]
+    if kind == "oblique":
+        frames = [frame for frame in frames if frame.measured_count >= max(_OBLIQUE, frame.inside - _GAINED + 1)]
+    expected = [(tried * false_frames(search, frame, frame.unblemished), frame) for frame in frames]
+    return found, sorted(expected, key=itemgetter(0))
 
 
-def _search_middle(search: FrameSearch, hypotheses: Hypotheses, _: int) -> Result:
-    """Measure the frame in the best placement in the middle of a large scan."""
-    found = search.search_middle(hypotheses[0])
-    return found, _result(measure_frame(search.scan, search.layout, found[0], search.options) if found else None)
-
-
-def _search_scan(search: FrameSearch, hypotheses: Hypotheses, _: int) -> Result:
-    """Search the whole scan and measure the best frame; no frame without placements."""
-    found = search.search_scan(hypotheses)
-    return found, _result(best_frame(search, found))
-
-
-def _result(frame: Frame | None) -> list[tuple[float, Frame]]:
-    """Result of a search under the prior belief about the scan: an accepted frame needs no test of false alarms."""
-    return [] if frame is None else [(0.0 if frame.accepted else np.inf, frame)]
+def _is_taken_if_given(result: tuple[float, Frame], at_given: float) -> bool:
+    """Whether a frame would be taken if its pitch were given. at_given: share of the hypotheses under the given one."""
+    return result[1].accepted or result[0] * at_given <= FRAMES_BY_CHANCE
 
 
 def best_frame(search: FrameSearch, found: Sequence[Placement]) -> Frame | None:
     """Measure the frame in the best placements and select one.
 
-    Selected is the first frame that is sure and not outdone by another placement; else the sure frame with most
-    measured marks; else the first accepted one; else the one with most inliers. Frames whose marks are all among those
-    of an accepted frame tried before are skipped.
+    Selected is the first frame that is sure and not outdone by a placement with more supporting marks; else the sure
+    frame with most measured marks; else the first accepted one; else one whose fits failed; else by inliers. Frames
+    whose marks are all among those of an accepted frame tried before are skipped.
     """
-    placements, frames = _places_to_try(search, found), list[Frame]()
-    for placement in placements:
-        frame = _measure_in_its_pose(search, placement)
+    places, frames = _places_to_try(found), list[Frame]()
+    for placement in places:
+        frame = _measure(search, placement)
         if any(before.accepted and before.contains(frame) for before in frames):
             continue
-        if frame.is_sure and not _is_outdone(search, frame, placements):
+        is_outdone = any(place.supported > frame.measured_count for place in places)
+        if frame.is_sure and not (is_outdone and doubt_frame(search, frame)):
             return frame
         frames.append(frame)
-    sure = [frame for frame in frames if frame.is_sure]
-    if sure:
-        return max(sure, key=lambda frame: frame.measured_count)
-    accepted = [frame for frame in frames if frame.accepted]
-    return accepted[0] if accepted else max(frames, key=lambda frame: int(frame.inliers.sum()), default=None)
+    return max(frames, key=_preference, default=None)
 
 
-def _is_outdone(search: FrameSearch, frame: Frame, placements: Sequence[Placement]) -> bool:
-    """Whether another placement is supported by more marks than the frame has measured, and it may be a false alarm."""
-    more = any(placement.supported > frame.measured_count for placement in placements)
-    return more and bool(doubt_frame(search, frame))
+def _preference(frame: Frame) -> tuple[int, ...]:
+    """Order of frames that may be doubted: sure ones, accepted ones, those that another tone curve may cure."""
+    if frame.is_sure:
+        return 2, frame.measured_count
+    return (1, 0) if frame.accepted else (0, bool(frame.failed_fits), int(frame.inliers.sum()))
 
 
-def _measure_in_its_pose(search: FrameSearch, placement: Placement) -> Frame:
-    """Measure the frame in a placement, and correct its pose if it is not accepted.
-
-    At the right place in a wrong pose, marks with different drawings are not found under one another's names. The
-    images of the marks then decide the pose, and the frame is measured again in it.
-    """
+def _measure(search: FrameSearch, placement: Placement) -> Frame:
+    """Measure the frame in a placement. Sharpening belongs to the scan, wherever its frame lies."""
     frame = measure_frame(search.scan, search.layout, placement, search.options)
-    if frame.accepted and frame.scan.tone.sharpening:  # sharpening belongs to the scan, wherever its frame lies
+    if frame.accepted and frame.scan.tone.sharpening:
         search.scan = search.scan.replace_tone(search.scan.tone.sharpened(frame.scan.tone.sharpening))
-    if frame.may_settle and not frame.accepted and search.among is None:
-        search.unsettled.append(placement)
-    if frame.accepted or not frame.inliers.any() or search.options.pose != "auto":
-        return frame
-    pose = likeliest_pose(search, frame)
-    if not pose.decided or pose.name == placement.pose:
-        return frame
-    return rename_frame(search.scan, frame, pose.name)
+    return frame
 
 
-def _search_oblique(search: FrameSearch, hypotheses: Hypotheses, tried: int) -> Result:
-    """Search for the frame on film that was photographed obliquely, in the best placement only.
-
-    Nearly all marks in the scan have to be measured: a perspective has enough freedom to fit some marks of any frame.
-    """
-    found = search.search_scan(hypotheses)
-    if not found or found[0].supported < max(_OBLIQUE, len(search.layout.marks) - _GAINED + 1):
-        return found, []
-    frame = _measure_in_its_pose(search, found[0])
-    if not frame.accepted or frame.measured_count < max(_OBLIQUE, frame.inside - _GAINED + 1):
-        return found, []
-    return found, [(tried * false_frames(search, frame, frame.centers_px(frame.unblemished)), frame)]
-
-
-def _search_other_pitch(search: FrameSearch, hypotheses: Hypotheses, tried: int) -> Result:
-    """Search under other pitches than the given one; accepted frames by increasing number of false alarms.
-
-    Only unblemished marks count, since the additional freedom yields false frames too.
-    """
-    found = search.search_scan(hypotheses)
-    frames = [_measure_in_its_pose(search, place) for place in _likely_placements(search, found, len(hypotheses))]
-    expected = [
-        (tried * false_frames(search, frame, frame.centers_px(frame.unblemished)), frame)
-        for frame in frames
-        if frame.accepted
-    ]
-    return found, sorted(expected, key=itemgetter(0))
-
-
-def _search_closer(search: FrameSearch, hypotheses: Hypotheses, tried: int) -> Result:
-    """Search the whole scan for frames with enough inliers; by increasing number of false alarms.
-
-    That number is estimated from the measured marks and from the responses at reduced resolution. The smaller one
-    counts, times two for the two criteria. The marks need not be clear: this search decides whether there is a frame,
-    not which pose it has.
-    """
-    found, results = search.search_scan(hypotheses), list[tuple[float, Frame]]()
-    for place in _likely_placements(search, found, tried):
-        frames = [frame for frame in _measure_in_likeliest_pose(search, place) if frame.agrees]
-        if frames:
-            as_measured = min(
-                false_frames(search, frame, frame.centers_px(np.flatnonzero(frame.inliers))) for frame in frames
-            )
-            most = max(frames, key=lambda frame: frame.inliers.sum())
-            results.append((2 * tried * min(as_measured, search.false_placements(place)), most))
-    return found, sorted(results, key=itemgetter(0))
-
-
-def _measure_in_likeliest_pose(search: FrameSearch, placement: Placement) -> list[Frame]:
-    """Measure the frame in a placement and also in its likeliest pose.
-
-    Faint marks are not found under one another's names, although their images do not decide the pose reliably.
-    """
-    frame = measure_frame(search.scan, search.layout, placement, search.options)
-    if search.options.pose != "auto" or not frame.inliers.any():
-        return [frame]
-    pose = likeliest_pose(search, frame)
-    return [frame] if pose.name == placement.pose else [frame, rename_frame(search.scan, frame, pose.name)]
+def _faint_frame(search: FrameSearch, placement: Placement, tried: int) -> tuple[float, Frame] | None:
+    """Measure the faint frame in a placement and in its likeliest pose: names of other poses would hide its marks."""
+    frames = [measure_frame(search.scan, search.layout, placement, search.options)]
+    if search.options.pose == "auto" and frames[0].inliers.any():
+        pose = likeliest_pose(search, frames[0]).name
+        frames += [] if pose == placement.pose else [rename_frame(search.scan, frames[0], pose)]
+    frames = [frame for frame in frames if frame.agrees]
+    if not frames:
+        return None
+    # By the measured marks, or by the responses at reduced resolution: the smaller counts, times two for two criteria.
+    as_measured = min(false_frames(search, frame, frame.inlier_fits) for frame in frames)
+    most = max(frames, key=lambda frame: frame.inliers.sum())
+    return 2 * tried * min(as_measured, search.false_placements(placement)), most
 
 
 def _likely_placements(search: FrameSearch, found: Sequence[Placement], tried: int) -> list[Placement]:
     """Best placement and its rivals, without those with too many expected false placements."""
-    places = _places_to_try(search, found)
-    return [place for place in places if tried * search.false_placements(place) <= PLACEMENTS_BY_CHANCE]
+    return [place for place in _places_to_try(found) if tried * search.false_placements(place) <= PLACEMENTS_BY_CHANCE]
 
 
-def _places_to_try(search: FrameSearch, found: Sequence[Placement]) -> list[Placement]:
-    """Best placement and its rivals, restricted to those in which the search fits marks."""
-    places = [*found[:1], *(_rivals(found) if found else ())]
-    return places if search.among is None else [place for place in places if place in search.among]
-
-
-def _rivals(found: Sequence[Placement]) -> list[Placement]:
-    """Placements of the frame elsewhere, by score times supporting marks: a few high peaks alone are often false."""
-    others: list[Placement] = []
+def _places_to_try(found: Sequence[Placement]) -> list[Placement]:
+    """Best placement, then others elsewhere by score times supporting marks: a few high peaks alone are often false."""
+    places = list(found[:1])
     for placement in sorted(found[1:], key=lambda placement: -placement.score * placement.supported):
-        if not any(placement.same_place(other) for other in (found[0], *others)):
-            others.append(placement)
-        if len(others) == _TRIALS:
-            break
-    return others
+        if len(places) <= _TRIALS and not any(placement.same_place(other) for other in places):
+            places.append(placement)
+    return places
 
 
 def _pitch_to_try(unsure: Sequence[Frame]) -> str:
@@ -371,4 +287,4 @@ def _too_faint(likeliest: tuple[float, Frame] | None) -> str:
 def likeliest_pose(search: FrameSearch, frame: Frame, lines: Sequence[Line] = ()) -> Pose:
     """Decide the pose of a frame from the images of its marks. lines: of writing, as further evidence."""
     placements = [frame.fitted_placement.posed(pose, frame.camera_mm) for pose in POSES]
-    return decide_pose(search.scan, search.layout, placements, frame, search.options, lines)
+    return decide_pose(search.scan, placements, frame, lines)

@@ -1,6 +1,7 @@
 """The list of attempts to find a frame: which are made, by how many hypotheses each is judged, and what is taken."""
 
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -14,8 +15,8 @@ from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
 from measure.fiducials.options import FiducialOptions
 from measure.fiducials.search import FrameSearch, PitchHypothesis, pitch_hypotheses
-from measure.fiducials.stages import Attempt, Found, find_frame
-from measure.flags import FRAMES_BY_CHANCE, Reason
+from measure.fiducials.stages import Attempt, Found, Kind, find_frame
+from measure.flags import FRAMES_BY_CHANCE, NO_REASON, Reason
 from measure.scans.scan import Scan
 from measure.tone.curve import Tone
 
@@ -28,18 +29,15 @@ class Stand:
 
     def __init__(self, name: str) -> None:
         self.name, self.is_complete, self.accepted, self.measured_count = name, False, False, 0
+        self.is_sure, self.agrees, self.scan = False, False, SCAN
+        self.failed_fits: list[int] = []
         self.inliers, self.pixel_from_camera = np.ones(3, bool), np.eye(2, 3)
-        self.may_settle = self.is_sure = False
-        self.scan = SCAN
 
     def misfit(self, ids: Sequence[str]) -> Reason:
         return Reason(f"not {self.name}")
 
     def is_nearer_than(self, other: "Stand | None") -> bool:
         return other is None
-
-    def contains(self, other: "Stand") -> bool:
-        return False
 
 
 def search_attempts(
@@ -50,15 +48,21 @@ def search_attempts(
     which of the others is under the given pitch."""
     checked: list[int] = []
 
-    def attempt(number: int, each: float | None) -> Attempt:
-        def look(_: FrameSearch, __: Sequence[PitchHypothesis], tried: int) -> Any:
-            checked.append(tried)
-            return [], [] if each is None else [(tried * each, cast(Frame, Stand(str(number))))]
+    def attempt(number: int) -> Attempt:
+        kind = "given" if number < given else "pitch" if number != at_given else "faint"
+        return Attempt(
+            cast(Kind, kind), cast(FrameSearch, SimpleNamespace(number=number)), [GIVEN, GIVEN], number == at_given
+        )
 
-        search = cast(FrameSearch, None)
-        return Attempt(search, [GIVEN, GIVEN], look, lambda found: found.is_taken, number < given, number == at_given)
+    def make(attempt: Attempt, tried: int) -> Any:
+        number = cast(Any, attempt.search).number
+        each = expected[number]
+        checked.append(tried)
+        return [], [] if each is None else [(tried * each, cast(Frame, Stand(str(number))))]
 
-    monkeypatch.setattr(stages, "_attempts", lambda *_: [attempt(*each) for each in enumerate(expected)])
+    monkeypatch.setattr(stages, "list_attempts", lambda *_: [attempt(number) for number in range(len(expected))])
+    monkeypatch.setattr(stages, "make_attempt", make)
+    monkeypatch.setattr(stages, "doubt_frame", lambda *_: NO_REASON)
     return find_frame(SCAN, ALIKE, [[GIVEN]], True, FiducialOptions()), checked
 
 
@@ -110,7 +114,7 @@ def test_the_attempts_in_their_order(times: float | None, looks: int) -> None:
     filling_um = 1000 * max(ALIKE.frame_mm) / SCAN.width_px
     given_um, is_given = None if times is None else (times * filling_um,) * 2, times is not None
     hypotheses = pitch_hypotheses(SCAN, ALIKE, given_um, FiducialOptions())
-    listed = stages._attempts(FrameSearch(SCAN, ALIKE, FiducialOptions()), hypotheses, is_given)
+    listed = stages.list_attempts(FrameSearch(SCAN, ALIKE, FiducialOptions()), hypotheses, is_given)
     assert len(listed) == looks
     assert [each.is_given for each in listed] == [True, *[False] * (looks - 1)]
     assert [each.hypotheses for each in listed[: len(hypotheses)]] == hypotheses
@@ -120,27 +124,23 @@ def test_the_attempts_in_their_order(times: float | None, looks: int) -> None:
     assert [each.at_given for each in close] == 2 * closer_each
 
 
-def test_marks_are_fitted_through_other_tone_curves_only_where_the_first_leaves_them_unsettled(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Of two placements the first shows nothing, and the second is fitted beginning with a power of 0.5."""
-    nothing, unsettled = (Placement("0", np.eye(2, 3), 1.0, 4, 1, 1, GIVEN.mm) for _ in range(2))
-    begun: list[tuple[bool, float]] = []
-
-    def measure(scan: Scan, _: object, place: Placement, __: object) -> Any:
-        power = scan.tone.equivalent_power(0.1, 0.9)[0]
-        begun.append((place is unsettled, round(power, 1)))
-        frame = Stand("right")
-        frame.accepted = frame.is_complete = place is unsettled and power < 0.7
-        frame.may_settle, frame.is_sure = place is unsettled, frame.accepted
-        return frame
-
-    monkeypatch.setattr(stages, "measure_frame", measure)
-    monkeypatch.setattr(stages, "_rivals", lambda found: list(found[1:]))
-    monkeypatch.setattr(stages, "_is_outdone", lambda *_: False)
-    monkeypatch.setattr(FrameSearch, "search_scan", lambda *_: [nothing, unsettled])
+def test_marks_are_fitted_from_other_tone_curves_only_where_their_fits_failed(monkeypatch: pytest.MonkeyPatch) -> None:
     scan, options = SCAN.replace_tone(Tone.unknown()), FiducialOptions(pose="0")
-    found = find_frame(scan, ALIKE, [[GIVEN]], True, options)
-    assert found.is_taken
-    assert begun == [(False, 1.6), (True, 1.6), (True, 1.0), (True, 0.5)]
-    assert found.search.scan.tone.prior is scan.tone  # what the marks say is added to what was believed
+    place = Placement("0", np.eye(2, 3), 1.0, 4, 1, 1, GIVEN.mm)
+    monkeypatch.setattr(FrameSearch, "search_scan", lambda *_: [place])
+    monkeypatch.setattr(stages, "_likely_placements", lambda *_: [place])
+    monkeypatch.setattr(stages, "doubt_frame", lambda *_: NO_REASON)
+    for failed, expected in (([1], [1.6, 1.0, 0.5]), ([], [1.6, 1.6, 1.6])):
+        begun: list[float] = []
+
+        def measure(scan: Scan, *_: object, begun: list[float] = begun, failed: list[int] = failed) -> Any:
+            begun.append(round(scan.tone.equivalent_power(0.1, 0.9)[0], 1))
+            frame = Stand("right")
+            frame.failed_fits, frame.accepted, frame.measured_count = failed, begun[-1] < 0.7, 4
+            frame.is_sure = frame.is_complete = frame.accepted
+            return frame
+
+        monkeypatch.setattr(stages, "measure_frame", measure)
+        found = find_frame(scan, ALIKE, [[GIVEN], [GIVEN]], True, options)
+        assert found.is_taken == bool(failed)
+        assert begun[:3] == expected

@@ -164,7 +164,7 @@ def test_one_mark_and_the_places_of_the_others_tell_the_pose() -> None:
     layout = layout_of([MarkShape((*dot(0.2), *dots), "light") for dots in ids], CORNERS, (16.0, 16.0))
     scan = scan_of(picture(layout, "90"))
     frame = replace(make_frame(scan, layout), inliers=np.array([True, False, False, False]))
-    pose = decide_pose(scan, layout, [placement(pose) for pose in POSES], frame, OPTIONS)
+    pose = decide_pose(scan, [placement(pose) for pose in POSES], frame)
     assert (pose.name, pose.decided) == ("90", True)
 
 
@@ -189,7 +189,7 @@ def test_pictures_of_one_scan_alone_decide_a_pose_only_beyond_chance(
 
     monkeypatch.setattr(MarkSite, "likelihoods", best)
     placements = [placement(pose) for pose in POSES]
-    pose = decide_pose(scan, replace(DOTS, marks=tuple(with_chips)), placements, frame, OPTIONS)
+    pose = decide_pose(scan, placements, replace(frame, layout=replace(DOTS, marks=tuple(with_chips))))
     assert pose.decided is decided, pose.evidence
     assert pose.name == POSES[1]
 

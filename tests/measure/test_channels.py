@@ -6,7 +6,7 @@ import numpy as np
 from brute_marks import Array, written_scan
 from drawn_frames import FRAME_PX, NUMBERED, assert_right, measured, paint, pixel_from_camera
 
-from measure.fiducials.channels import best_weights
+from measure.fiducials.measure_frame import best_weights
 from measure.marks.templates import cut
 
 RED, GREEN, BLUE = np.eye(3)

@@ -11,7 +11,7 @@ from drawn_frames import layout_of, paint
 
 from measure.detection.correlation import CLOSE, WIDE, Surroundings
 from measure.fiducials import measure_frame
-from measure.fiducials.constellation import Placement
+from measure.fiducials.constellation import NARROW, Placement
 from measure.fiducials.frame import Frame
 from measure.fiducials.mark_fit import Detection
 from measure.fiducials.measurement import measure_fiducials
@@ -73,5 +73,5 @@ def test_at_closer_matching_marks_are_taken_that_noise_seldom_makes_for_all_toge
     layout = layout_of([wing(*place) for place in PLACES], PLACES, (2 * HALF_MM, 2 * HALF_MM))
     placement = Placement("0", matrix, 1.0, 4, 1, 1, (1 / PX_PER_MM,) * 2, surroundings)
     frame = Frame.from_placement(scan_of(np.zeros((300, 300))), layout, placement, FiducialOptions())
-    frame = measure_frame._detect(frame, range(4), frame.near_px)
+    frame = measure_frame._detect(frame, range(4), frame.first_search_px(NARROW))
     assert [detection.fit is faint for detection in frame.detections] == [is_taken] * 4

@@ -97,7 +97,7 @@ def test_what_widens_a_mark_is_added_to_its_covariance_under_its_cause() -> None
     frame, _ = make_frame(np.random.default_rng(3), 1.0, 1.0)
     before, added = frame.detections[2].fit, np.array([[4e-3, 1e-3], [1e-3, 2e-3]])
     assert before is not None
-    widened = frame.add_covariance(2, Cause.TOUCHED, added).add_covariance(2, Cause.TOUCHED, added)
+    widened = frame.amend(2, parts={Cause.TOUCHED: added}).amend(2, parts={Cause.TOUCHED: added})
     after = widened.detections[2].fit
     assert after is not None
     np.testing.assert_allclose(after.covariance_px2 - before.covariance_px2, 2 * added, atol=1e-12)
@@ -131,7 +131,7 @@ def test_a_frame_whose_marks_do_not_converge_says_so_and_not_that_camera_and_pit
     frame, _ = make_frame(np.random.default_rng(3), 1.0, 1.0)
     failed = [replace(each, fit=None, reason=UNSETTLED) for each in frame.detections[2:]]
     refused = orient_frame(replace(frame, detections=(*frame.detections[:2], *failed)))
-    assert refused.may_settle
+    assert refused.failed_fits == [2, 3, 4, 5, 6, 7]
     reason = refused.misfit("12345678")
     assert "only 2 of 8 marks" in reason
     assert "the fit of 3, 4, 5, 6, 7, 8 did not converge" in reason
