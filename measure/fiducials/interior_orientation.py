@@ -14,40 +14,11 @@ _INVERSIONS = 6  # iterations of the inversion of a perspective, each correction
 
 
 @dataclass(frozen=True, eq=False)
-class FrameFit:
-    """Interior orientation.
-
-    Attributes
-    ----------
-    up_from_camera : (2, 3) affine transformation from camera mm to the scan's mm (right, up); the best approximation
-        where a film model has further terms.
-    residuals_mm : (n, 2) measured less predicted.
-    chi_square : including the pseudo-observations of affinity and film terms.
-    redundancy : 2 n - 4, which counts these pseudo-observations.
-    linear_sigma : rms of the standard deviations of rotation (rad), scale, stretch and shear.
-    film : transformation with a film model; None for an affine one.
-    """
-
-    up_from_camera: Array
-    residuals_mm: Array
-    chi_square: float
-    redundancy: int
-    linear_sigma: float
-    film: "FilmFit | None" = None
-
-
-@dataclass(frozen=True, eq=False)
 class FilmFit:
     """Fitted film model with terms beyond an affine transformation, in units of radius_mm.
 
-    Attributes
-    ----------
-    model : film deformation model.
-    turn : (2, 2) rotation, and mirror if any, of the scan orientation.
-    radius_mm : unit of length.
-    center_mm : (2,) centroid of the marks in the scan.
-    affine : (2, 3) affine part.
-    terms : (k,) coefficients of the further terms.
+    turn (2, 2): of the scan orientation; center_mm (2,): centroid of the marks in the scan; affine (2, 3): affine part;
+    terms (k,): coefficients of the further terms.
     """
 
     model: str
@@ -67,25 +38,37 @@ class FilmFit:
         return np.asarray(places * self.radius_mm + self.center_mm)
 
 
+@dataclass(frozen=True, eq=False)
+class FrameFit:
+    """Interior orientation.
+
+    Attributes
+    ----------
+    up_from_camera : (2, 3) affine transformation from camera mm to the scan's mm (right, up); the best approximation
+        where a film model has further terms.
+    residuals_mm : (n, 2) measured less predicted.
+    chi_square, redundancy : including the pseudo-observations of affinity and film terms.
+    linear_sigma : rms of the standard deviations of rotation (rad), scale, stretch and shear.
+    film : transformation with a film model; None for an affine one.
+    """
+
+    up_from_camera: Array
+    residuals_mm: Array
+    chi_square: float
+    redundancy: int
+    linear_sigma: float
+    film: FilmFit | None = None
+
+
 def fit_frame(camera_mm: Array, up_mm: Array, sigma_mm: Array, turn: Array, model: str = "affine") -> FrameFit:
-    """Fit the interior orientation to n >= 2 marks.
+    """Fit the interior orientation to n >= 2 marks; raises ValueError for fewer.
 
     Parameters
     ----------
-    camera_mm : (n, 2) given places.
-    up_mm : (n, 2) measured places in the scan (right, up).
+    camera_mm, up_mm : (n, 2) given places, and measured ones in the scan (right, up).
     sigma_mm : (n,) standard deviations.
     turn : (2, 2) rotation, and mirror if any, of the scan orientation; the similarity is estimated relative to it.
     model : film deformation model.
-
-    Returns
-    -------
-    FrameFit
-
-    Raises
-    ------
-    ValueError
-        For fewer than two marks.
     """
     if len(camera_mm) < 2:
         raise ValueError(f"{len(camera_mm)} marks do not determine a frame; two or more do")

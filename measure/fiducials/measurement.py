@@ -69,7 +69,7 @@ def measure_fiducials(
         frame, pose = clicked_frame(scan, layout, pitch_um, options)
         lines = _read(scan, layout, frame) if options.writing == "all" else None
         shown = place_clicked_marks(
-            replace(present_frame(scan, layout, frame, pose, pitch_um, (), NO_REASON), writing=lines), options.clicks
+            replace(present_frame(frame, pose, pitch_um, (), NO_REASON), writing=lines), options.clicks
         )
         contradiction = contradicted_pose(layout, options, pitch_um)
         return _refused(shown, contradiction) if contradiction else shown
@@ -113,7 +113,7 @@ def _search_frame(
         pose = replace(pose, decided=False, evidence=(*pose.evidence, *doubts))
     if frame.options.film_model != options.film_model:
         problems.append(_OBLIQUE)
-    return replace(present_frame(scan, layout, frame, pose, pitch_um, problems, chance), writing=lines)
+    return replace(present_frame(frame, pose, pitch_um, problems, chance), writing=lines)
 
 
 def _rename(search: FrameSearch, frame: Frame, pose: Pose) -> tuple[Frame, Pose]:
@@ -172,23 +172,23 @@ def _rivals(search: FrameSearch, found: Sequence[Placement], frame: Frame) -> li
         if other.pose != best.pose or other.same_place(best):
             continue
         as_good = other.score >= _AMBIGUOUS * best.score and other.supported >= best.supported - 1
-        if as_good or _is_another_frame(search, other, frame):
-            shift = np.linalg.solve(
-                best.pixel_from_camera[:, :2], other.pixel_from_camera[:, 2] - best.pixel_from_camera[:, 2]
-            )
-            shift_mm = f"({shift[0]:.1f}, {shift[1]:.1f}) mm"
-            another = Reason(
+        if not (as_good or _is_another_frame(search, other, frame)):
+            continue
+        linear, shifts = best.pixel_from_camera[:, :2], (each.pixel_from_camera[:, 2] for each in (other, best))
+        shift = np.linalg.solve(linear, np.subtract(*shifts))
+        shift_mm = f"({shift[0]:.1f}, {shift[1]:.1f}) mm"
+        if (np.abs(shift) > _BESIDE * np.array(search.layout.frame_mm)).any():
+            sentence = (
                 f"the scan shows another frame {shift_mm} from this one, with {other.supported} marks where this one "
-                f"has {best.supported}: give a scan of one frame, or name both in images.csv by the column window",
-                Code.OTHER_FRAME,
+                f"has {best.supported}: give a scan of one frame, or name both in images.csv by the column window"
             )
-            shifted = Reason(
+            problems.append(Reason(sentence, Code.OTHER_FRAME))
+        else:
+            sentence = (
                 f"the constellation fits nearly as well shifted by {shift_mm}, on {other.supported} marks against "
-                f"{best.supported}: the marks' names are ambiguous",
-                Code.AMBIGUOUS,
+                f"{best.supported}: the marks' names are ambiguous"
             )
-            is_outside = (np.abs(shift) > _BESIDE * np.array(search.layout.frame_mm)).any()
-            problems.append(another if is_outside else shifted)
+            problems.append(Reason(sentence, Code.AMBIGUOUS))
     return problems[:3]
 
 

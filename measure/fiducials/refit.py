@@ -92,7 +92,7 @@ def _refit_with_tone(frame: Frame) -> Frame:
 
 
 def _refit_from_curve(frame: Frame, prior: Tone, start: Tone) -> Frame:
-    """Refit the marks at their places and estimate the tone curve in turn. prior: known before; start: initial curve."""
+    """Refit the marks and estimate the tone curve in turn. prior: curve known before; start: initial curve."""
     if start is frame.scan.tone:
         pending = {index for index, fit in frame.clear_fits.items() if _needs_frame(frame, index, fit)}
     else:

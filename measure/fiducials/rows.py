@@ -75,8 +75,6 @@ def _too_coarse(layout: FiducialLayout, pitch_um: float) -> Reason:
 
 
 def present_frame(
-    scan: Scan,
-    layout: FiducialLayout,
     frame: Frame,
     pose: Pose,
     pitch_um: tuple[float, float] | None,
@@ -97,40 +95,38 @@ def present_frame(
     the search for faint marks. If the frame is more likely a false alarm than not, no mark is an observation.
     """
     if Code.NO_FRAME in chance.codes:
-        return replace(_predicted_frame(scan, layout, frame, chance), pose=pose, problems=tuple(problems))
-    marks = tuple(_row(mark, index, frame, scan.name) for index, mark in enumerate(layout.marks))
-    marks = tuple(_weaken_assumed_name(row, mark, pose) for row, mark in zip(marks, layout.marks, strict=True))
+        return replace(_predicted_frame(frame, chance), pose=pose, problems=tuple(problems))
+    marks = tuple(_row(mark, index, frame) for index, mark in enumerate(frame.layout.marks))
+    marks = tuple(_weaken_assumed_name(row, mark, pose) for row, mark in zip(marks, frame.layout.marks, strict=True))
     unnamed = next((problem for problem in problems if Code.AMBIGUOUS in problem.codes), NO_REASON)
     weak = chance or unnamed or (_FAINT if frame.placement.surroundings.robust else NO_REASON)
     if weak:
         marks = tuple(
             replace(mark, status=Status.WEAK, reason=weak) if mark.status is Status.MEASURED else mark for mark in marks
         )
-    problems = (*problems, *_problems(scan, frame, pitch_um))
+    problems = (*problems, *_problems(frame, pitch_um))
     tone = replace(frame.tone, tone=frame.tone.tone.without_priors)
-    return FrameMeasurement(scan.name, marks, pose, frame.pixel_from_camera, problems, frame.weights, tone)
+    return FrameMeasurement(frame.scan.name, marks, pose, frame.pixel_from_camera, problems, frame.weights, tone)
 
 
-def _predicted_frame(scan: Scan, layout: FiducialLayout, frame: Frame, why: Reason) -> FrameMeasurement:
+def _predicted_frame(frame: Frame, why: Reason) -> FrameMeasurement:
     """Return the predicted places of the marks of a frame that is probably a false alarm."""
     marks = tuple(
         MarkMeasurement(mark.id, "fiducial", place, None, Status.PREDICTED, why)
         if detection.inside
         else MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, detection.reason)
-        for mark, detection, place in zip(
-            layout.marks, frame.detections, frame.fitted_placement.places_px(frame.camera_mm), strict=True
-        )
+        for mark, detection, place in zip(frame.layout.marks, frame.detections, frame.predicted_px, strict=True)
     )
-    return FrameMeasurement(scan.name, marks, weights=frame.weights)
+    return FrameMeasurement(frame.scan.name, marks, weights=frame.weights)
 
 
-def _problems(scan: Scan, frame: Frame, pitch_um: tuple[float, float] | None) -> list[Reason]:
+def _problems(frame: Frame, pitch_um: tuple[float, float] | None) -> list[Reason]:
     """Problems of the interior orientation: an implausible stretch, or no redundancy."""
     problems = []
     per_mm = np.hypot(*frame.pixel_from_camera[:, :2].T)
     given = pitch_um or (1.0, 1.0)
     if abs(per_mm[0] * given[0] / (per_mm[1] * given[1]) - 1) > 2 * AFFINITY_SIGMA:
-        problem = _stretch(scan, 1000 / per_mm[0], 1000 / per_mm[1], pitch_um)
+        problem = _stretch(frame.scan, 1000 / per_mm[0], 1000 / per_mm[1], pitch_um)
         problems.append(Reason(problem, Code.PITCH))
     used = int(frame.inliers.sum())
     if used <= 3:
@@ -156,7 +152,7 @@ def _stretch(scan: Scan, wide_um: float, tall_um: float, pitch_um: tuple[float, 
     )
 
 
-def _row(mark: LayoutMark, index: int, frame: Frame, scan: str) -> MarkMeasurement:
+def _row(mark: LayoutMark, index: int, frame: Frame) -> MarkMeasurement:
     detection = frame.detections[index]
     fit = detection.fit
     if not detection.inside:
@@ -179,8 +175,8 @@ def _row(mark: LayoutMark, index: int, frame: Frame, scan: str) -> MarkMeasureme
     status, reason = frame.verdict(index)
     covariance = fit.place_covariance
     if isinstance(mark.mark, MarkTemplate):
-        covariance = honest_covariance(mark.mark, scan, fit)
-        if status is Status.MEASURED and scan in mark.mark.shares and len(mark.mark.shares) == 1:
+        covariance = honest_covariance(mark.mark, frame.scan.name, fit)
+        if status is Status.MEASURED and frame.scan.name in mark.mark.shares and len(mark.mark.shares) == 1:
             status, reason = Status.WEAK, _OWN
     return MarkMeasurement(mark.id, "fiducial", fit.center_px, covariance, status, reason, quality)
 
@@ -200,12 +196,8 @@ def _edge_figures(edges: SecondPlace | None) -> dict[str, float]:
     """Offset of the second method's place from the matched one, px, and in its standard deviations."""
     if edges is None:
         return {}
-    col, row = edges.offset_px
-    return {
-        "second_method_col_px": float(col),
-        "second_method_row_px": float(row),
-        "second_method_sigmas": edges.sigmas,
-    }
+    col, row = edges.offset_px.tolist()
+    return {"second_method_col_px": col, "second_method_row_px": row, "second_method_sigmas": edges.sigmas}
 
 
 def pitch_problem(

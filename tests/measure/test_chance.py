@@ -138,7 +138,7 @@ def test_a_frame_that_chance_is_likelier_to_have_made_than_not_gives_no_observat
     frame = make_frame(scan, DOTS)
     chance = doubt_frame(FrameSearch(scan, DOTS, OPTIONS), frame)
     assert "(p = 1.00): the frame may lie elsewhere" in chance
-    result = present_frame(scan, DOTS, frame, Pose("0", False), (50.0, 50.0), (), chance)
+    result = present_frame(frame, Pose("0", False), (50.0, 50.0), (), chance)
     assert [mark.status for mark in result.marks] == [Status.PREDICTED] * 4
     assert all(mark.reason == chance and mark.covariance is None for mark in result.marks)
     for mark, place in zip(result.marks, centers_px(DOTS, "0"), strict=True):
