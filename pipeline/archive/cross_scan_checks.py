@@ -55,8 +55,8 @@ def check_lots(
 
     def lot(some: Sequence[ScanTask], depends_on: object, scans: Callable[[], Iterable[MeasuredScan]]) -> Lot:
         results = [
-            [task.name, keys[task.name], work.counting(task.name), *filter(None, [work.decisions_hash(task.name)])]
-            for task in some
+            [name, keys[name], [one for _, one in sorted(work.counting[name].items())], *filter(None, [of_decisions])]
+            for name, of_decisions in ((task.name, work.decisions_hash(task.name)) for task in some)
         ]
         made_by = [version("reseau"), MEASURE_REVISION]
         return Lot(

@@ -220,7 +220,7 @@ def _known_images(project: Project, store: Store, digest: str, work: "Work") -> 
     for image, *mark, is_measured in store.connection.execute(query, (judging.row, json.dumps(list(decisions)))):
         marks[image][mark[0], mark[1]] = bool(is_measured)
     for image, own in decisions.items():
-        yield from _idle_lines(own, work.counting_decisions(image), marks[image])
+        yield from _idle_lines(own, work.counting[image], marks[image])
 
 
 def _idle_lines(

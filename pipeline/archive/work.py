@@ -88,8 +88,10 @@ class Work:
         self._files = FileStates(self._folder)
         self._states: dict[str, FileState] = {}
         self._asked = request_hasher(project)
-        self._decisions = group_decisions(project.decisions)
-        self._counting: dict[str, Mapping[About, Decision]] = {}  # by image, for its last request
+        self.decisions = group_decisions(project.decisions)  # by image, the oldest first
+        self.counting = defaultdict[str, Mapping[About, Decision]](
+            dict
+        )  # by image, of its last request
         self._now: set[int] = set()  # rows measured in this run
         self.results: dict[str, int] = {}  # by image, row of the result of its last request
 
@@ -123,7 +125,7 @@ class Work:
     def read(self, name: str) -> MeasuredScan:
         """Scan of an image as last requested, with all decisions applied except acceptance (`before_checks`)."""
         scan = self._store.scan(self.results[name], name, self._folder)
-        return before_checks(scan, self._counting.get(name, {}))
+        return before_checks(scan, self.counting[name])
 
     def written(self, names: Sequence[str]) -> list[str]:
         """Images on whose scans writing was found."""
@@ -135,26 +137,13 @@ class Work:
         scan = self._store.scan(self.results[name], name, self._folder, with_marks=False)
         return replace(scan, frame=replace(scan.frame, problems=()), notes=())
 
-    @property
-    def decisions(self) -> Mapping[str, Sequence[Decision]]:
-        """All decisions about scans, by image, the oldest first."""
-        return self._decisions
-
-    def counting_decisions(self, name: str) -> Mapping[About, Decision]:
-        """Decisions that apply to an image, by subject."""
-        return self._counting.get(name, {})
-
-    def counting(self, name: str) -> list[Decision]:
-        """Decisions that apply to an image."""
-        return [one for _, one in sorted(self._counting.get(name, {}).items())]
-
     def decisions_hash(self, name: str) -> str:
         """Hash of all decisions about an image, whether they apply or not."""
-        return decisions_hash(self._decisions.get(name, ()))
+        return decisions_hash(self.decisions.get(name, ()))
 
     def apply_decisions(self, scan: MeasuredScan) -> MeasuredScan:
         """Checked scan with all decisions applied."""
-        return after_checks(scan, self._counting.get(scan.frame.image, {}))
+        return after_checks(scan, self.counting[scan.frame.image])
 
     def keys(self) -> dict[str, str]:
         """{image: fingerprint of its last requested result}."""
@@ -191,7 +180,7 @@ class Work:
 
     def _reviewed_task(self, task: ScanTask) -> ScanTask:
         """Task with the decisions about its scan applied."""
-        decisions = self._decisions.get(task.name)
+        decisions = self.decisions.get(task.name)
         if decisions is None:
             return task
         state = self.state(task)
@@ -205,7 +194,7 @@ class Work:
             lambda one: result_key(identity, _hash_of(_options_json(one))),
             lambda key: None if (row := self._rows.get(key)) is None else self._store.pose_name(row),
         )
-        self._counting[task.name] = now.counting
+        self.counting[task.name] = now.counting
         return now.task
 
     def _row(self, task: ScanTask) -> int | None:

@@ -28,7 +28,7 @@ from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
-from pipeline.measuring.target_field import Field, checked_places
+from pipeline.measuring.target_field import Field, absent_targets, checked_places
 from pipeline.measuring.target_identification import NamedField, camera_model, name_field
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.wording import did_you_mean, listed
@@ -142,18 +142,15 @@ def measure_sheet(scan: Scan, sheet: CodedPoints) -> tuple[tuple[MarkMeasurement
         found, coded = [found[i] for i in alike], {new: coded[i] for new, i in enumerate(alike) if i in coded}
         naming = name_dots(sheet.places, _dots(found, coded), (scan.width_px, scan.height_px))
     if isinstance(naming, str):
-        unnamed = Reason(naming, Code.UNNAMED)
-        marks = tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, unnamed) for id in sheet.ids)
-        return marks, (*notes, f"No target has a name: {naming}.")
+        return absent_targets(sheet.ids, naming), (*notes, f"No target has a name: {naming}.")
     misread = [sheet.ids[coded[dot]] for dot in naming.misread]
     if misread:
         notes = (*notes, f"Rings that read as {listed(misread)} lie where the sheet has another point, or none.")
     options = TargetOptions("light" if _sign(found, coded) > 0.0 else "dark")
     predictions = _predictions(sheet, found, naming)
-    measured = {mark.point: mark for mark in measure_disks(scan, predictions, options)}
-    unseen = Reason("the sheet's place in the picture does not show it", Code.OUTSIDE)
-    absent = {id: MarkMeasurement(id, "target", None, None, Status.ABSENT, unseen) for id in sheet.ids}
-    return tuple((absent | measured).values()), notes
+    unseen = absent_targets(sheet.ids, "the sheet's place in the picture does not show it", Code.OUTSIDE)
+    marks = {mark.point: mark for mark in (*unseen, *measure_disks(scan, predictions, options))}
+    return tuple(marks.values()), notes
 
 
 def _sign(found: Sequence[Candidate], coded: dict[int, int]) -> float:
@@ -199,9 +196,7 @@ def measure_coded_field(
     else:
         named = name_field(field, model, camera, measured, found, coded)
     if isinstance(named, str):
-        unnamed = Reason(named, Code.UNNAMED)
-        marks = tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, unnamed) for id in points.ids)
-        return marks, (*notes, f"No target has a name: {named}.")
+        return absent_targets(points.ids, named), (*notes, f"No target has a name: {named}.")
     ids = {dot: points.ids[point] for dot, point in read.items()}
     misread = [(id, found[dot]) for dot, id in ids.items() if named.candidates.get(id) is not found[dot]]
     if misread:
@@ -214,10 +209,9 @@ def measure_coded_field(
         if (reason := _contradiction(one, misread))
     }
     sought = [one for one in predictions if one.point not in contradicted]
-    fitted = {mark.point: mark for mark in measure_disks(scan, sought, TargetOptions(points.settings.polarity))}
-    unseen = Reason("it lies behind the camera", Code.OUTSIDE)
-    absent = {id: MarkMeasurement(id, "target", None, None, Status.ABSENT, unseen) for id in points.ids}
-    marks = tuple((absent | fitted | contradicted).values())
+    fitted = measure_disks(scan, sought, TargetOptions(points.settings.polarity))
+    unseen = absent_targets(points.ids, "it lies behind the camera", Code.OUTSIDE)
+    marks = tuple(({mark.point: mark for mark in (*unseen, *fitted)} | contradicted).values())
     return checked_places(marks, field, named.model, measured), notes
 
 

@@ -174,6 +174,12 @@ class Field:
         )  # fmt: skip
 
 
+def absent_targets(ids: Sequence[str], text: str, code: Code = Code.UNNAMED) -> tuple[MarkMeasurement, ...]:
+    """Marks of targets that are not in a scan. text, code: why."""
+    reason = Reason(text, code)
+    return tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, reason) for id in ids)
+
+
 def target_field(project: Project) -> Field:
     """Field of the targets whose coordinates are known, at least approximately."""
     places = {id: (point.X, point.Y, point.Z) for id, point in project.object_points.items()}

@@ -10,7 +10,7 @@ from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.initial_values.resection import resect
 from measure.boards.measure import measure_board
-from measure.flags import Code, Reason, Status
+from measure.flags import Code, Reason
 from measure.results import ON_FILM, MarkMeasurement
 from measure.scans.scan import Scan
 from measure.targets.identification import TargetPrediction
@@ -22,6 +22,7 @@ from pipeline.measuring.scan_task import ScanOptions
 from pipeline.measuring.target_field import (
     LEAST_DIAMETER_PX,
     Field,
+    absent_targets,
     checked_places,
     measure_single_targets,
     target_candidates,
@@ -144,9 +145,7 @@ def measure_targets(options: ScanOptions, scan: Scan, measured: MeasuredScan) ->
         return replace_targets(measured, board.marks, (*problems, *mirrored, *notes), Code.NO_BOARD)
     found, notes = _oriented_by_targets(options, sought, scan, measured)
     if isinstance(found, str):
-        unnamed = Reason(found, Code.UNNAMED)
-        marks = tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, unnamed) for id in field.ids)
-        return replace_targets(measured, marks, (*notes, f"No target has a name: {found}."))
+        return replace_targets(measured, absent_targets(field.ids, found), (*notes, f"No target has a name: {found}."))
     model, predictions = found
     fitted = measure_single_targets(scan, predictions, settings)
     return replace_targets(measured, checked_places(fitted, field, model, measured), notes)
