@@ -13,7 +13,7 @@ import pytest
 from pipeline.cli import DONE, GROUPS, LOOK, WRONG_INPUT
 
 pytestmark = pytest.mark.skipif(not plain_environment.PYTHON.exists(), reason=plain_environment.REASON)
-MODULES_OF_EXTRAS = {"pipeline.review.server": "anyio", "pipeline.review.safety": "starlette"}
+MODULES_OF_EXTRAS = {"pipeline.review.server": "anyio"}
 READS_WRITING = "rapidocr-onnxruntime"  # installed for the files that it carries, without what it asks for
 
 

@@ -89,9 +89,7 @@ class Work:
         self._states: dict[str, FileState] = {}
         self._asked = request_hasher(project)
         self.decisions = group_decisions(project.decisions)  # by image, the oldest first
-        self.counting = defaultdict[str, Mapping[About, Decision]](
-            dict
-        )  # by image, of its last request
+        self.counting = defaultdict[str, Mapping[About, Decision]](dict)  # by image, of its last request
         self._now: set[int] = set()  # rows measured in this run
         self.results: dict[str, int] = {}  # by image, row of the result of its last request
 

@@ -1,6 +1,11 @@
-"""Local web server of the review page: routes and answers."""
+"""Local web server of the review page: routes, answers, and who may ask.
+
+Any page open in the same browser can send requests to 127.0.0.1 (CSRF), and a foreign host name can resolve to it (DNS
+rebinding). Every request is therefore checked for its Host, its Origin and a cookie that only this browser has.
+"""
 
 import getpass
+import hmac
 import json
 import secrets
 import socket
@@ -10,13 +15,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields
 from importlib import resources
 from typing import Any
+from urllib.parse import parse_qs
 
 import anyio.to_thread
 import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
-from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.responses import JSONResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.routing import Route
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from measure.errors import MeasurementError
 from measure.fiducials.options import Click
@@ -31,9 +38,19 @@ from pipeline.review.drawing_view import DrawingAnswers
 from pipeline.review.frame_view import mark_json, measured_as_shown, measured_from_clicks
 from pipeline.review.pictures import Pictures
 from pipeline.review.requests import Decide, MeasureFrame, Query, ShownMarks, parse_json, parse_values
-from pipeline.review.safety import Guard
 from pipeline.review.session import Filters, Session
 
+HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
 _SCRIPT = "text/javascript"
 _FILES = {
     "review.js": _SCRIPT,
@@ -46,6 +63,60 @@ _LARGEST_BODY = 200_000  # bytes
 _WIDEST_PX = 60_000
 _OFFERED, _TRIED = 100, 4  # scans offered for clicking a camera's marks, and scans for trying the learned templates
 _HALF_PX = 40  # px, half width of a window around a mark of unknown size
+_SPENT = "This page needs the address that `reseau review` printed, with what stands behind `token=` in it.\n"
+
+
+class Guard:
+    """ASGI middleware that refuses unauthorised requests. port: of the server."""
+
+    def __init__(self, app: ASGIApp, port: int, token: str) -> None:
+        self._app, self._token = app, token
+        self._hosts = (f"127.0.0.1:{port}", f"localhost:{port}")
+        self._cookie, self._secret = f"reseau_{port}", secrets.token_urlsafe(32)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        answer = self._refusal(Request(scope))
+        await (answer or self._app)(scope, receive, _add_headers(send))
+
+    def _refusal(self, request: Request) -> Response | None:
+        """Response to an unauthorised request, or the redirect that sets the cookie; None for an authorised request."""
+        host, origin = request.headers.get("host", ""), request.headers.get("origin")
+        if host not in self._hosts:
+            return _refused(f"This server answers to {self._hosts[0]} only.\n")
+        needs_origin = request.method not in ("GET", "HEAD")
+        if origin != f"http://{host}" and (origin is not None or needs_origin):
+            return _refused("Only the page itself may ask this.\n")
+        if request.url.path == "/" and (given := _token(request)):
+            return self._welcome() if hmac.compare_digest(given.encode(), self._token.encode()) else _refused(_SPENT)
+        own = request.cookies.get(self._cookie, "")
+        return None if hmac.compare_digest(own.encode(), self._secret.encode()) else _refused(_SPENT)
+
+    def _welcome(self) -> Response:
+        """Redirect that replaces the token in the address, where others could read it, by a cookie."""
+        answer = RedirectResponse("/", status_code=303)
+        answer.set_cookie(self._cookie, self._secret, httponly=True, samesite="strict")
+        return answer
+
+
+def _token(request: Request) -> str:
+    return (parse_qs(request.url.query).get("token") or [""])[0]
+
+
+def _refused(text: str) -> Response:
+    return PlainTextResponse(text, status_code=403)
+
+
+def _add_headers(send: Send) -> Send:
+    async def sending(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            own: Mapping[str, str] = HEADERS
+            message["headers"] = [*message["headers"], *((k.lower().encode(), v.encode()) for k, v in own.items())]
+        await send(message)
+
+    return sending
 
 
 class Server:

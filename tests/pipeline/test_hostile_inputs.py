@@ -33,7 +33,7 @@ from pipeline.exchange.incoming import ImportOptions
 from pipeline.files.decisions_file import Choice, Decision, append_decisions, read_decisions
 from pipeline.files.project_file import read_project
 from pipeline.results.measured_record import FailureCode, mark_row, scan_detail
-from pipeline.review.queue import build_queue
+from pipeline.review.session import build_queue
 from pipeline.text.names import names_below
 
 REFUSED = (InputError, MeasurementError, AdjustmentError)
