@@ -1,6 +1,6 @@
 from .adjusting.network import build_network as build_network
 from .archive.measurement import read_measurement as read_measurement
-from .calibration.board_calibration import calibrate as calibrate
+from .calibration.calibrate_stage import calibrate as calibrate
 from .errors import InputError as InputError
 from .files.camera_file import read_camera as read_camera
 from .files.images_file import read_images as read_images

@@ -1,12 +1,13 @@
-"""Stages of `reseau calibrate`: a project is written, measured, adjusted and checked for each camera."""
+"""`reseau calibrate`: a project is written, measured, adjusted and checked for each camera."""
 
+import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from rich.console import Console
@@ -20,8 +21,9 @@ from adjust.solution.result import Adjustment
 from adjust.solution.unmodelled_error import adjust_unmodelled
 from pipeline.adjusting.adjust_stage import adjust_marks, adjustment_options
 from pipeline.adjusting.network import build_network
+from pipeline.calibration.board_options import board_options
 from pipeline.calibration.intrinsics import CameraIntrinsics, camera_intrinsics
-from pipeline.calibration.lens_choice import LensChoice, LensModel, choose_lens
+from pipeline.calibration.lens_choice import LensChoice, LensModel, LensSetting, choose_lens
 from pipeline.calibration.picture_turns import find_turns
 from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures, find_pictures
 from pipeline.calibration.project_files import CalibrationOptions, camera_files, write_project
@@ -33,12 +35,15 @@ from pipeline.results.comparator_file import ComparatorPoint, read_comparator
 from pipeline.stages import run_all, run_measure
 from pipeline.summary import Summary
 from pipeline.text.atomic import write_atomically
-from pipeline.text.wording import counted, listed
+from pipeline.text.wording import counted, did_you_mean, listed
 from pipeline.workers import WorkOptions
 
 GENEROUS = 2.0  # factor on the unmodelled standard deviation, for lens models with larger misfit than the first
 FEWEST_CORNERS = 4  # corners for a space resection with redundancy
 FEWEST_PICTURES = 3  # images of a flat board needed for principal distance and principal point
+
+OUT = Path("calibration")
+LENSES: dict[str, LensSetting] = {"auto": "auto", **{model: model for model in get_args(LensModel)}}
 
 
 @dataclass(frozen=True, repr=False)
@@ -282,3 +287,64 @@ def _nothing(pictures: BoardPictureFiles, left_out: Mapping[str, str], not_calib
 def _most_common(reasons: Iterable[str]) -> str:
     """The most frequent reason; "" without any."""
     return next((reason for reason, _ in Counter(reasons).most_common(1)), "")
+
+
+def calibrate(
+    pictures: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    board: str,
+    square: str,
+    *,
+    kind: str = "chessboard",
+    marker: str | None = None,
+    dictionary: str | None = None,
+    legacy: bool = False,
+    first_id: int = 0,
+    lens: str = "auto",
+    square_pixels: bool = False,
+    pitch_um: float | None = None,
+    out: str | os.PathLike[str] = OUT,
+    ros: bool = False,
+    workers: int | None = None,
+    reporter: Reporter | None = None,
+) -> Calibration:
+    """Calibrate digital cameras from images of a board, as `reseau calibrate` does.
+
+    Parameters
+    ----------
+    pictures : a folder or an image file, or several of these
+    board : columns x rows, such as "9x6": inner corners of a chessboard, squares, markers or circles
+    square : side of a square, or distance from one marker or circle to the next, with its unit, such as "25mm"
+    kind : chessboard, charuco, aprilgrid, aruco, circle-grid or asymmetric-circle-grid
+    marker : side of a marker or diameter of a circle, with its unit
+    dictionary : of the markers, such as "4X4_50"
+    legacy : whether a ChArUco board has the older layout; if not set, both are tried
+    first_id : number of the first marker
+    lens : opencv4, opencv5, opencv8, fisheye, or auto, by cross-validation
+    square_pixels : whether x and y have the same focal length
+    pitch_um : side of a pixel, for results in mm
+    out : folder of the project, camera.yaml and the report
+    ros : whether ROS's camera info is written as well
+    workers : number of measuring processes; None: one per core
+    reporter : reports the progress, on stderr by default
+
+    Returns
+    -------
+    Calibration
+        Its cameras in px with standard deviations, `adjustments` by camera, plots and a table.
+
+    Raises
+    ------
+    InputError
+        For a wrong option, and where no camera can be calibrated; the message gives the reason.
+
+    Examples
+    --------
+    >>> result = reseau.calibrate("pictures", board="9x6", square="25mm")  # doctest: +SKIP
+    >>> result.plot_uncertainty()  # doctest: +SKIP
+    """
+    if lens not in LENSES:
+        raise InputError(f"--lens {lens}: possible are {', '.join(LENSES)}.{did_you_mean(lens, LENSES)}")
+    given = board_options(kind, board, square, marker, dictionary, legacy, first_id)
+    options = CalibrationOptions(given, LENSES[lens], square_pixels, pitch_um, ros)
+    paths = [pictures] if isinstance(pictures, str | os.PathLike) else pictures
+    return calibrate_pictures([Path(path) for path in paths], Path(out), options, reporter or Reporter(), workers)

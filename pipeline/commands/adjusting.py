@@ -168,7 +168,7 @@ def calibrate(
     as_json: AsJson = False,
 ) -> int:
     """Calibrate a digital camera from pictures of a board."""
-    from pipeline.calibration.board_calibration import calibrate
+    from pipeline.calibration.calibrate_stage import calibrate
 
     found = calibrate(
         pictures,

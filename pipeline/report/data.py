@@ -61,7 +61,7 @@ class FrameTotals:
     of_targets : number of marks other than fiducials, by kind and status.
     verdicts : number of frames by (camera, kind of file) and verdict.
     problems : of the frames.
-    places_px : distinct positions of the observed marks by axis, see `fractions.places_px`.
+    places_px : distinct positions of the observed marks by axis, see `frame_problems.places_px`.
     """
 
     marks: Mapping[str, Mapping[str, int]]

@@ -13,8 +13,14 @@ from measure.flags import Status
 from pipeline.archive.measurement import MarkColumns, StoredFrame, StoredMarks
 from pipeline.archive.verdicts import Verdict, frame_verdict, has_problem, scan_counts
 from pipeline.report.data import Frame, FrameTotals, Problem, ReportData, frames
-from pipeline.report.fractions import centers_px, places_apart
-from pipeline.report.frame_problems import Gathered, gather, named_problem, single_frame_problems
+from pipeline.report.frame_problems import (
+    Gathered,
+    centers_px,
+    gather,
+    named_problem,
+    places_apart,
+    single_frame_problems,
+)
 from pipeline.report.frame_views import residuals_by_image
 from pipeline.report.verdict import suspect_rows
 from pipeline.results.comparator_file import ComparatorPoint

@@ -16,7 +16,7 @@ from measure import flags
 from pipeline.drawing import svg
 from pipeline.report.camera_views import camera_views, scanner_views
 from pipeline.report.data import Frame, Problem, ReportData, frames
-from pipeline.report.fractions import (
+from pipeline.report.frame_problems import (
     LEAST_MARKS,
     FractionTest,
     fraction_plot,

@@ -12,8 +12,7 @@ from scipy.special import chdtri, ndtri
 from adjust.problem.parameter import description, parameter_from_text
 from measure.flags import Status
 from pipeline.report.data import Frame, MarkKey, Problem, ReportData, frames
-from pipeline.report.fractions import places_px
-from pipeline.report.frame_problems import frame_problems, images_by_sentence, pixel_locking
+from pipeline.report.frame_problems import frame_problems, images_by_sentence, pixel_locking, places_px
 from pipeline.report.numbers import fixed, value_and_sigma
 from pipeline.report.parameters import LARGER, camera_values, cluster_ratio, spoken_name
 from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord

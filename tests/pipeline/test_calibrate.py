@@ -18,7 +18,7 @@ from test_check_corners import CENTER_PX, FOCAL_PX, SIZE_PX, TURNS, picture
 
 import reseau
 from pipeline.adjusting.turned_pictures import turned_back
-from pipeline.calibration import board_calibration
+from pipeline.calibration import calibrate_stage
 from pipeline.calibration.board_options import board_options
 from pipeline.calibration.calibrate_stage import Calibration
 from pipeline.calibration.pictures import find_pictures
@@ -55,14 +55,14 @@ def calibrations() -> list[Calibration]:
 @pytest.fixture(scope="module")
 def result(folder: Path, calibrations: list[Calibration]) -> dict[str, Any]:
     """What the command prints; its files stand in the folder `calibration`."""
-    out, printed, calibrate = folder / "calibration", io.StringIO(), board_calibration.calibrate
+    out, printed, calibrate = folder / "calibration", io.StringIO(), calibrate_stage.calibrate
 
     def keep(*arguments: Any, **options: Any) -> Calibration:
         calibrations.append(calibrate(*arguments, **options))
         return calibrations[-1]
 
     with redirect_stdout(printed), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(board_calibration, "calibrate", keep)
+        patch.setattr(calibrate_stage, "calibrate", keep)
         code = run(["calibrate", str(folder), *BOARD, "--lens", "opencv4", "--out", str(out), "--ros", "--json"])
     assert code == 1  # two pictures are left out
     return dict(json.loads(printed.getvalue()))

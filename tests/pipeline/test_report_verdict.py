@@ -13,7 +13,7 @@ from measure.flags import Code, Reason, Status
 from measure.results import MarkMeasurement, Pose
 from pipeline.report import Problem, ReportData, judge
 from pipeline.report.data import frames
-from pipeline.report.fractions import fraction_test, places_px
+from pipeline.report.frame_problems import fraction_test, places_px
 from pipeline.report.parameters import spoken_name
 from pipeline.report.verdict import NEEDS_A_LOOK, critical_w, sigma0_bounds
 from pipeline.results.adjustment_record import Quantity
