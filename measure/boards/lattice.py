@@ -187,6 +187,8 @@ def find_grid(points_px: Array, appearances: Array, spec: CircleGridSpec | Squar
     what : word for the points in messages.
     """
     size, places = f"{spec.columns} x {spec.rows} {what}", spec.places()
+    if isinstance(spec, CircleGridSpec) and spec.asymmetric:  # its columns may be counted as dots or as places
+        size = f"{len(places)} {what} in {spec.rows} rows"
     assignments = grid_places(points_px, appearances, places)
     if not is_whole(assignments):
         message = f"no grid of {size} is whole in the scan; {len(points_px)} spots are candidates for {what}"

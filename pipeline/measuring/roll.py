@@ -89,7 +89,8 @@ def add_known_lines(
     """
     of_camera = defaultdict[int, list[ScanTask]](list)
     for task in tasks:
-        if task.options.fiducials.pose == "auto" and task.options.fiducials.writing == "pose":
+        has_marks = bool(task.options.camera.fiducials)  # pictures of a digital camera have none, and no writing
+        if has_marks and task.options.fiducials.pose == "auto" and task.options.fiducials.writing == "pose":
             of_camera[id(task.options.camera)].append(task)
     rolls = {camera: _first(own) for camera, own in of_camera.items() if len(own) > _READ_FIRST}
     first = [task for own in rolls.values() for task in own]

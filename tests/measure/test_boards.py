@@ -291,6 +291,9 @@ def test_a_few_spots_are_no_circle_grid() -> None:
 
     board = measure_board(scan_of(8000 + 30000 * drawn(light, 340, 250, 0.8, fineness=4)), spec)
     assert "no grid of 6 x 5 dots is whole in the scan; 5 spots are candidates for dots" in board.reason
+    staggered = CircleGridSpec(8, 11, 28.0, 12.0, asymmetric=True)
+    board = measure_board(scan_of(8000 + 30000 * drawn(light, 340, 250, 0.8, fineness=4)), staggered)
+    assert "no grid of 44 dots in 11 rows is whole in the scan" in board.reason  # 4 x 11, as OpenCV counts
 
 
 @pytest.mark.parametrize(

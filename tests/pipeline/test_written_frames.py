@@ -206,8 +206,9 @@ def test_frames_are_known_by_the_line_that_all_have_and_that_tells_itself_best()
     assert known_lines([frame_of_roll(image, "0", "8601 8639") for image in "ab"]) == ()
 
 
-def roll_tasks(images: Sequence[str], writing: Reads = "pose") -> list[ScanTask]:
-    camera = parse_camera(Table({**CAMERA}, Path("camera.toml"), ""))
+def roll_tasks(images: Sequence[str], writing: Reads = "pose", has_marks: bool = True) -> list[ScanTask]:
+    values = {key: value for key, value in CAMERA.items() if has_marks or key not in ("fiducial", "mark")}
+    camera = parse_camera(Table(values, Path("camera.toml"), ""))
     options = ScanOptions(camera, None, FiducialOptions(writing=writing))
     return [ScanTask(image, f"{image}.tif", options) for image in images]
 
@@ -230,7 +231,8 @@ def test_a_few_frames_of_a_roll_are_read_and_the_others_know_by_what() -> None:
         assert [each.text[:11] for each in known] == ([] if task.name in read else ["DEVELOPMENT"])
     assert len({id(task.options) for task in knowing}) == 2
     assert knowing[0].posed("90").options.fiducials.known_lines == ()
-    for none in (roll_tasks(["a", "b", "c", "d"]), roll_tasks([f"{n}" for n in range(9)], "all")):
+    nine = [f"{n}" for n in range(9)]
+    for none in (roll_tasks(["a", "b", "c", "d"]), roll_tasks(nine, "all"), roll_tasks(nine, has_marks=False)):
         assert add_known_lines(none, measure, Reporter(Console(quiet=True))) == (tuple(none), {})
 
 
