@@ -266,6 +266,11 @@ def _refusal(spec: ChessboardSpec, pattern: WholePattern | None) -> str:
     rows, columns = pattern.grid.shape[:2]
     both = ((columns, rows), (rows, columns))  # rows and columns cannot be distinguished
     columns, rows = min(both, key=lambda one: ((one[0] - spec.columns) ** 2 + (one[1] - spec.rows) ** 2, -one[0]))
+    if (columns, rows) == (spec.columns, spec.rows):
+        return (
+            f"{message}: some of its corners, or of the light border around them, lie outside or are covered. Show the "
+            "whole board with its border"
+        )
     message += f"; one of {columns} x {rows} is"
     if pattern.is_bounded and (columns, rows) == (spec.columns - 1, spec.rows - 1):
         return f"{message}: squares may have been counted in place of inner corners, which columns and rows count"

@@ -184,6 +184,14 @@ def test_a_part_of_a_chessboard_that_may_be_another_is_refused(
     assert "nothing tells which part it is" in board.reason
 
 
+def test_a_board_whose_outer_corners_lie_outside_is_refused_in_words_that_fit(
+    large_board: tuple[Array, dict[str, Array]],
+) -> None:
+    board = measure_board(scan_of(large_board[0][:195, 52:256]), LARGE)
+    assert not any(mark.status.is_observation for mark in board.marks)
+    assert "9 x 6 inner corners is whole in the scan: some of its corners, or of the light border" in board.reason
+
+
 @pytest.mark.parametrize("left_out", [None, 0, 1, 3])
 def test_lines_of_a_board_are_evenly_spaced_under_one_homography(left_out: int | None) -> None:
     """Of a lens with 6 % of distortion at the corner, seen at an angle; one line left out shows, wherever it is."""
