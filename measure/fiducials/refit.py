@@ -25,8 +25,7 @@ from measure.flags import LARGE_ERROR, Cause
 from measure.geometry import linear_scale
 from measure.marks.rendering import reach_px
 from measure.marks.shapes import Disk, Mark, MarkShape, Ring
-from measure.matching.arms import is_cross, measure_arms
-from measure.matching.match import mark_window
+from measure.matching.match import is_cross, mark_window, measure_arms
 from measure.matching.models import PIXEL_VARIANCE_PX2, MatchOptions, is_round
 from measure.matching.window import read_window
 from measure.noise.noise_model import may_be_noise

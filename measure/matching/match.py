@@ -13,8 +13,8 @@ import numpy as np
 
 from measure.array_types import Array, Mask
 from measure.flags import Cause
-from measure.marks.rendering import extent_px, frame_pixel_mask, known_mask
-from measure.marks.shapes import Mark, MarkTemplate
+from measure.marks.rendering import extent_px, frame_pixel_mask, known_mask, picture
+from measure.marks.shapes import Bar, Mark, MarkShape, MarkTemplate
 from measure.matching.covariance import (
     Landscape,
     LinearFit,
@@ -25,7 +25,7 @@ from measure.matching.covariance import (
     sloping_place,
 )
 from measure.matching.gauss_newton import EDGE_BLURS, PictureFit
-from measure.matching.models import GREY, MatchOptions, PictureModel, background_px, is_round
+from measure.matching.models import GREY, MatchOptions, PictureModel, background_planes, background_px, is_round
 from measure.matching.tone_information import (
     mark_tone_information,
     sharpening_score,
@@ -244,12 +244,10 @@ def _mark_tone(fit: PictureFit, linear: LinearFit, priors_dn2: Array, landscape:
     if coding.tone.is_known or model.is_chip:
         return None
     if model.background_px is not None:
-        return tone_without_information(linear, model.light, model.detail, coding.tone, coding.full_scale_dn)
+        return tone_without_information(linear, model.light, model.detail, coding)
     drawn, linear = model.drawn_light, replace(linear, noise=linear.noise.floored(fit.floor_dn**2))
     clear = clear_of_ends(drawn, model.grey, model.clipped, model.noise_dn)
-    return mark_tone_information(
-        linear, drawn, model.grey, clear, priors_dn2, model.departures, coding.tone, coding.full_scale_dn, landscape
-    )
+    return mark_tone_information(linear, drawn, model.grey, clear, priors_dn2, model.departures, coding, landscape)
 
 
 def _sharpening_score(fit: PictureFit, linear: LinearFit, priors_dn2: Array) -> SharpeningScore | None:
@@ -273,3 +271,72 @@ def _likeness(fit: PictureFit) -> float:
     without = grey - combined(factors(background, grey), background)
     unexplained = np.sum(fit.model.residuals[fit.used] ** 2) / max(np.sum(without**2), 1e-12)
     return float(np.sqrt(max(1 - unexplained, 0.0)))
+
+
+# Measured lengths of the arms of a cross relative to the drawn ones.
+
+
+_CHANGE = 0.3  # fraction of the arm's length, step of the central differences in the design matrix
+_LEAST = 0.1  # fraction of the fitted contrast: a smaller gain is replaced by it
+
+
+def is_cross(mark: MarkShape) -> bool:
+    """Whether a mark consists of bars only, with the ends of all arms known."""
+    return mark.known_mm is None and all(isinstance(part, Bar) for part in mark.parts)
+
+
+def measure_arms(window: ScanWindow, mark: MarkShape, pixel_from_mark: Array, fit: MarkFit) -> tuple[Array, Array]:
+    """Estimate the lengths of the arms of a cross, relative to the drawn ones, by linear least squares.
+
+    Gain, offset and slopes are further unknowns. The derivative with respect to a length is the difference of images
+    with a longer and a shorter arm, which is uniform along the end of the arm: the estimate is proportional to the
+    missing part, regardless of the blur. Pixels masked as damage are used, since a missing arm is masked, too.
+
+    Parameters
+    ----------
+    window : window with the cross.
+    pixel_from_mark : (2, 3) in pixels of the scan. The place is the matched one. The linear part is that of the frame,
+        since the mark's own depends on the ends of its arms.
+
+    Returns
+    -------
+    (arms,) relative lengths, in the order of the bars' ends, and their standard deviations.
+    """
+    place = pixel_from_mark - np.column_stack([np.zeros((2, 2)), window.origin_px])
+    height, width = window.grey.shape
+    drawn = picture(mark, place, width, height, fit.blur_px)
+    changes = [
+        (picture(more, place, width, height, fit.blur_px) - picture(less, place, width, height, fit.blur_px))
+        / (2 * _CHANGE)
+        for more, less in _arm_variants(mark)
+    ]
+    used = window.usable & (window.sides == 0)
+    design = np.stack([*changes, drawn, *background_planes(height, width)])[:, used]
+    grey = window.grey[used]
+    inverse: Array = np.asarray(np.linalg.pinv(design @ design.T), float)
+    solution = inverse @ (design @ grey)
+    left = grey - solution @ design
+    # Noise correlated by rho along columns and rows reduces the effective number of pixels.
+    rho = float(np.clip(fit.neighbour_correlation, 0.0, 0.9))
+    variance = float(left @ left) / max(len(grey) - len(design), 1) * ((1 + rho) / (1 - rho)) ** 2
+    gain = solution[len(changes)]
+    gain = gain if abs(gain) > _LEAST * abs(fit.contrast_dn) else fit.contrast_dn
+    sigmas = np.sqrt(variance * np.diag(inverse)[: len(changes)]) / abs(gain)
+    return 1 + solution[: len(changes)] / gain, sigmas
+
+
+def _arm_variants(mark: MarkShape) -> list[tuple[MarkShape, MarkShape]]:
+    """For each arm: the mark with that arm longer, and with it shorter."""
+    pairs = list[tuple[MarkShape, MarkShape]]()
+    for index, bar in enumerate(mark.parts):
+        assert isinstance(bar, Bar)
+        for tip, other in ((bar.from_mm, bar.to_mm), (bar.to_mm, bar.from_mm)):
+            if np.dot(tip, np.subtract(tip, other)) > 0:  # the start of an arm near the centre is no tip
+                ends = ((tip[0] * share, tip[1] * share) for share in (1 + _CHANGE, 1 - _CHANGE))
+                longer, shorter = (_with_part(mark, index, Bar(other, end, bar.line_mm)) for end in ends)
+                pairs.append((longer, shorter))
+    return pairs
+
+
+def _with_part(mark: MarkShape, index: int, part: Bar) -> MarkShape:
+    return replace(mark, parts=(*mark.parts[:index], part, *mark.parts[index + 1 :]))

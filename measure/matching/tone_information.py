@@ -1,6 +1,7 @@
 """Information of a mark's fit on the tone curve, and the derivatives of its place with respect to the curve."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -9,7 +10,7 @@ from measure.matching.covariance import Landscape, LinearFit
 from measure.matching.models import GREY
 from measure.matching.window import Coding
 from measure.noise.noise_model import combined, products
-from measure.tone.curve import Tone, ToneInformation
+from measure.tone.curve import ToneInformation
 from measure.tone.estimate import MarkTone, ToneScore, tone_score
 from measure.tone.sharpening import SharpeningScore
 
@@ -25,8 +26,7 @@ def mark_tone_information(
     clear: Mask,
     priors_dn2: Array,
     departures: Array,
-    tone: Tone,
-    full_scale_dn: float,
+    coding: Coding,
     landscape: Landscape,
 ) -> MarkTone:
     """Compute the information of a linearised fit on the tone curve, with the fit's unknowns eliminated.
@@ -44,69 +44,68 @@ def mark_tone_information(
     priors_dn2, departures : (unknowns,) see `tone_score`.
     landscape : background texture within the mark.
     """
+    tone, full_scale_dn = coding.tone, coding.full_scale_dn
     on_place = _moved_px(fit, tone.derivatives(grey, full_scale_dn))
     information = ToneInformation.empty()
-    if np.ptp(drawn) > _LEAST_CONTRAST * np.abs(drawn).max():  # otherwise the model has no edges
-        counts = fit.used & clear
+    if _has_contrast(drawn):
+        within = replace(fit, used=fit.used & clear)
         uneven = _uneven(fit.design[-GREY], fit.steadiness)
-        design = np.concatenate([fit.design, uneven]) * counts
-        changes = tone.derivatives(drawn, full_scale_dn) * counts * fit.steadiness
-        residuals = np.where(counts, fit.residuals, 0.0)
-        priors = np.append(priors_dn2, np.zeros(len(uneven)))
-        departures = np.append(departures, np.zeros(len(uneven)))
-        flat, flat_changes = (images.reshape(-1, counts.size) for images in (design, changes))
-        score = tone_score(flat, flat_changes, residuals.ravel(), priors, departures)
-        left, by_prior = score.left.reshape(changes.shape), score.by_unknown * np.sqrt(priors)[:, None]
-        covariance = fit.covariance(left) + landscape.covariance(left) + fit.noise.variance_dn2 * by_prior.T @ by_prior
-        # Where the fit's unknowns absorb a departure completely only numerical rounding is left: give it no weight.
-        whole = fit.noise.variance_dn2 * float(np.sum(changes**2))
-        covariance += _LEAST_VARIANCE * max(whole, 1e-30) * np.eye(len(covariance))
-        covariance *= _disagreement(score, left, residuals, covariance, on_place)
+        changes = tone.derivatives(drawn, full_scale_dn) * within.used * fit.steadiness
+        score, left, covariance = _score(within, changes, priors_dn2, departures, uneven)
+        covariance += landscape.covariance(left) + _least_variances(fit, changes).sum() * np.eye(len(left))
+        covariance *= _disagreement(score, left, np.where(within.used, fit.residuals, 0.0), covariance, on_place)
         information = score.information(covariance, tone)
-    return _mark_tone(fit, information, on_place, drawn, tone, full_scale_dn)
+    return _mark_tone(fit, information, on_place, drawn, coding)
 
 
 def tone_without_information(
-    fit: LinearFit, light: Array, detail: Callable[[Array], Array], tone: Tone, full_scale_dn: float
+    fit: LinearFit, light: Array, detail: Callable[[Array], Array], coding: Coding
 ) -> MarkTone:
     """Effect of the curve on a mark of which only the detail was fitted. It gives no information on the curve, since
     its background is not modelled. light (height, width): with background; detail: subtracts the background."""
-    changes = np.stack([detail(each) for each in tone.derivatives(light, full_scale_dn)])
-    return _mark_tone(fit, ToneInformation.empty(), _moved_px(fit, changes), light, tone, full_scale_dn)
+    changes = np.stack([detail(each) for each in coding.tone.derivatives(light, coding.full_scale_dn)])
+    return _mark_tone(fit, ToneInformation.empty(), _moved_px(fit, changes), light, coding)
 
 
 def sharpening_score(
     fit: LinearFit, drawn: Array, priors_dn2: Array, departures: Array, coding: Coding
 ) -> SharpeningScore | None:
-    """Score the scan's sharpening together with the tone curve, with the fit's unknowns eliminated.
-
-    Parameters
-    ----------
-    fit : its mask used includes halos.
-    drawn : (height, width) modelled light.
-    priors_dn2, departures : (unknowns,) see `tone_score`.
-    coding : relation of light to stored grey values.
-
-    Returns
-    -------
-    SharpeningScore, or None where the model has no contrast.
-    """
-    if not np.ptp(drawn) > _LEAST_CONTRAST * np.abs(drawn).max():
+    """Score the scan's sharpening together with the tone curve, as in `mark_tone_information`. The fit's mask includes
+    halos. None where the model has no contrast."""
+    if not _has_contrast(drawn):
         return None
-    tone, full_scale_dn, used = coding.tone, coding.full_scale_dn, fit.used
-    codes, slope = tone.code(drawn, full_scale_dn), tone.slope(drawn, full_scale_dn)
-    halos = tone.sharpening.changes(codes)
+    tone, full_scale_dn = coding.tone, coding.full_scale_dn
+    halos = tone.sharpening.changes(tone.code(drawn, full_scale_dn))
     # Sign: light by a wrong curve lacks the departure, whereas sharpening adds halos to it.
-    changes = np.concatenate([tone.derivatives(drawn, full_scale_dn), -slope * halos]) * (used * fit.steadiness)
-    flat = fit.design.reshape(len(fit.design), -1) * used.ravel()
-    residuals = np.where(used, fit.residuals, 0.0).ravel()
-    score = tone_score(flat, changes.reshape(len(changes), -1), residuals, priors_dn2, departures)
-    left, by_prior = score.left.reshape(changes.shape), score.by_unknown * np.sqrt(priors_dn2)[:, None]
-    covariance = fit.covariance(left) + fit.noise.variance_dn2 * by_prior.T @ by_prior
-    whole = fit.noise.variance_dn2 * np.sum(changes**2, axis=(1, 2))
-    covariance += np.diag(_LEAST_VARIANCE * np.maximum(whole, 1e-30))
-    on_place = products(fit.by_grey[:2], changes[-len(halos) :])
-    return SharpeningScore(score.value, score.normal, covariance, on_place)
+    halos = -tone.slope(drawn, full_scale_dn) * halos
+    changes = np.concatenate([tone.derivatives(drawn, full_scale_dn), halos]) * (fit.used * fit.steadiness)
+    score, _, covariance = _score(fit, changes, priors_dn2, departures)
+    covariance += np.diag(_least_variances(fit, changes))
+    return SharpeningScore(score.value, score.normal, covariance, _moved_px(fit, halos))
+
+
+def _has_contrast(drawn: Array) -> bool:
+    return bool(np.ptp(drawn) > _LEAST_CONTRAST * np.abs(drawn).max())
+
+
+def _score(
+    fit: LinearFit, changes: Array, priors_dn2: Array, departures: Array, uneven: Array | None = None
+) -> tuple[ToneScore, Array, Array]:
+    """Score of changes (k, height, width) of the used light, what the unknowns leave of these, its covariance (k, k).
+    uneven (m, height, width): derivatives by further unknowns."""
+    count = 0 if uneven is None else len(uneven)
+    design = (fit.design if uneven is None else np.concatenate([fit.design, uneven])) * fit.used
+    priors, departures = (np.append(each, np.zeros(count)) for each in (priors_dn2, departures))
+    residuals = np.where(fit.used, fit.residuals, 0.0).ravel()
+    flat, flat_changes = (images.reshape(len(images), -1) for images in (design, changes))
+    score = tone_score(flat, flat_changes, residuals, priors, departures)
+    left, by_prior = score.left.reshape(changes.shape), score.by_unknown * np.sqrt(priors)[:, None]
+    return score, left, fit.covariance(left) + fit.noise.variance_dn2 * by_prior.T @ by_prior
+
+
+def _least_variances(fit: LinearFit, changes: Array) -> Array:
+    """(k,) floor of a score's variances: of a departure that the unknowns absorb only rounding errors are left."""
+    return np.asarray(np.maximum(_LEAST_VARIANCE * fit.noise.variance_dn2 * np.sum(changes**2, axis=(1, 2)), 1e-39))
 
 
 def _disagreement(score: ToneScore, left: Array, residuals: Array, covariance: Array, on_place: Array) -> float:
@@ -136,11 +135,8 @@ def _moved_px(fit: LinearFit, changes: Array) -> Array:
     return products(fit.by_grey[:2], changes * fit.used * fit.steadiness)
 
 
-def _mark_tone(
-    fit: LinearFit, information: ToneInformation, on_place: Array, light: Array, tone: Tone, full_scale_dn: float
-) -> MarkTone:
-    """Assemble a MarkTone. light (height, width): of the window."""
-    codes = tone.code(np.quantile(light[fit.used], (0.0, 1.0)), full_scale_dn) / full_scale_dn
+def _mark_tone(fit: LinearFit, information: ToneInformation, on_place: Array, light: Array, coding: Coding) -> MarkTone:
+    codes = coding.tone.code(np.quantile(light[fit.used], (0.0, 1.0)), coding.full_scale_dn) / coding.full_scale_dn
     return MarkTone(information, on_place, float(codes[0]), float(codes[1]))
 
 

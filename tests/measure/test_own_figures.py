@@ -14,8 +14,7 @@ from measure.fiducials.across_frames import check_frames
 from measure.fiducials.mark_comparison import OwnFigure, check_own_figures, unlike_blur, unlike_others
 from measure.flags import Cause, Code, Reason, Status
 from measure.marks.shapes import Bar, MarkShape, cross
-from measure.matching.arms import measure_arms
-from measure.matching.match import match
+from measure.matching.match import match, measure_arms
 from measure.matching.window import ScanWindow
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 

@@ -15,7 +15,7 @@ from measure.matching.covariance import Landscape, LinearFit
 from measure.matching.match import match
 from measure.matching.models import MatchOptions
 from measure.matching.tone_information import mark_tone_information
-from measure.matching.window import read_window
+from measure.matching.window import Coding, read_window
 from measure.noise.noise_model import NoiseModel
 from measure.results import MarkFit
 from measure.tone.curve import LINEAR, Tone, ToneInformation, power, sampled_curve, srgb
@@ -77,13 +77,13 @@ def test_pixels_that_the_pictures_own_unknowns_take_up_whole_tell_nothing_of_the
     used, landscape = np.ones(shape, bool), Landscape(drawn, np.zeros(shape, bool), design[3])
     fit = LinearFit(rng.normal(size=shape), used, design, design / 576.0, noise, np.ones(shape))
     information = mark_tone_information(
-        fit, drawn, drawn, clear, np.zeros(7), np.zeros(7), Tone.unknown(), FULL, landscape
+        fit, drawn, drawn, clear, np.zeros(7), np.zeros(7), Coding(None, Tone.unknown(), FULL), landscape
     ).information
     assert np.abs(information.matrix).max() < 1e-3
     blank = replace(fit, residuals=np.zeros(shape), noise=NoiseModel(4e-35, np.full((1, 1), 4e-35), 0.0))
     even = np.full(shape, 87.8)
     assert not mark_tone_information(
-        blank, even, even, used, np.zeros(7), np.zeros(7), Tone.unknown(), FULL, landscape
+        blank, even, even, used, np.zeros(7), np.zeros(7), Coding(None, Tone.unknown(), FULL), landscape
     ).information.matrix.any()
 
 
@@ -326,7 +326,7 @@ def test_what_a_mark_says_of_the_curve_is_the_same_however_closely_the_fit_held_
         fit = LinearFit(residuals - change * design[2], everywhere, design, by_grey, noise, np.ones(shape))
         priors, departures = np.array([0, 0, 50.0, 0, 0, 0, 0]), np.array([0, 0, 0.002 + change, 0, 0, 0, 0])
         estimate = mark_tone_information(
-            fit, drawn, drawn, everywhere, priors, departures, Tone.unknown(), FULL, landscape
+            fit, drawn, drawn, everywhere, priors, departures, Coding(None, Tone.unknown(), FULL), landscape
         )
         rights.append(estimate.information.right_side)
     np.testing.assert_allclose(rights[1], rights[0], rtol=1e-6)
