@@ -16,8 +16,7 @@ from measure.fiducials.options import FiducialOptions
 from measure.fiducials.rows import absent_frame, lost_frame, present_frame
 from measure.fiducials.scan_orientation import decide_pose
 from measure.fiducials.search import FrameSearch, pitch_hypotheses
-from measure.fiducials.significance import doubt_frame
-from measure.fiducials.stages import find_frame, likeliest_pose
+from measure.fiducials.stages import doubt_frame, find_frame, likeliest_pose
 from measure.flags import FRAMES_BY_CHANCE, NO_REASON, Code, Reason, Status
 from measure.geometry import up_from_camera
 from measure.marks.shapes import FiducialLayout, limit_to_crossings, limit_to_frame

@@ -19,7 +19,7 @@ from measure.fiducials.orientation_pictures import SPOILT, MarkSite, PosedMark
 from measure.fiducials.rows import present_frame
 from measure.fiducials.scan_orientation import decide_pose
 from measure.fiducials.search import FrameSearch, PitchHypothesis, pitch_hypotheses
-from measure.fiducials.significance import doubt_frame
+from measure.fiducials.stages import doubt_frame
 from measure.flags import Status
 from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import Disk, FiducialLayout, MarkShape, dot
