@@ -379,7 +379,7 @@ def _board_words(run: Run, added: Indices, _: float) -> tuple[str, str]:
     sigma = np.sqrt(np.diag(covariance))
     cause = (
         f"The board of the given points is not flat: its middle stands {value[0]:.3g} ± {sigma[0]:.1g} off along its "
-        f"first axis and {value[1]:.3g} ± {sigma[1]:.1g} along its second (object units; ± for independent errors, "
+        f"first axis and {value[1]:.3g} ± {sigma[1]:.1g} along its second (points' unit; ± for independent errors, "
         "on real boards up to 5 times as much)"
     )
     return cause, 'Put it on a flat plate, or let its bend be adjusted: board_bend = "free" under [object].'

@@ -143,6 +143,16 @@ class CameraIntrinsics:
             f"Corners {self.corner_sigma_px:.3f} px, unmodelled {self.unmodelled_sigma_px:.3f} px: what lens model, "
             "board and the picture's processing leave."
         )
+        if self.lens is not None and self.lens.scores:
+            rms_px = {
+                score.model: "no solution" if score.rms_px is None else f"{score.rms_px:.3f} px"
+                for score in self.lens.scores
+            }
+            others = ", ".join(f"{model} {rms}" for model, rms in rms_px.items() if model != self.lens.model)
+            yield (
+                f"Lens {self.lens.model}, by cross-validation over pictures: rms {rms_px[self.lens.model]} in pictures "
+                f"left out ({others})."
+            )
         if larger := [name for name, each in self.values.items() if each.sigma > each.sigma_model]:
             most = max(self.values[name].sigma / self.values[name].sigma_model for name in larger)
             yield (

@@ -6,6 +6,7 @@ import re
 import sys
 import tomllib
 from contextlib import redirect_stdout
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 from PIL import Image
+from rich.console import Console
 from test_check_corners import CENTER_PX, FOCAL_PX, SIZE_PX, TURNS, picture
 
 import reseau
@@ -21,6 +23,7 @@ from pipeline.adjusting.turned_pictures import turned_back
 from pipeline.calibration import calibrate_stage
 from pipeline.calibration.board_options import board_options
 from pipeline.calibration.calibrate_stage import Calibration
+from pipeline.calibration.lens_choice import LensChoice, LensScore
 from pipeline.calibration.pictures import find_pictures
 from pipeline.cli import run
 from pipeline.errors import InputError
@@ -98,6 +101,17 @@ def test_a_folder_of_pictures_gives_intrinsics_in_pixels(result: dict[str, Any],
     assert covariance[4, 5] < -0.5 * sigmas[4] * sigmas[5]  # k1 and k2 take one another's place
     assert "distortion_model: plumb_bob" in (out / "camera-ros.yaml").read_text(encoding="utf-8")
     assert re.search(r"fx = 520\.\d+ ± 0\.\d+ px", (out / "out" / "report.html").read_text(encoding="utf-8"))
+
+
+def test_the_lens_that_was_chosen_is_printed_with_what_it_was_chosen_from(
+    result: dict[str, Any], calibrations: list[Calibration]
+) -> None:
+    (camera,) = calibrations[0].cameras
+    scores = (LensScore("opencv4", 0.1624), LensScore("opencv5", 0.158), LensScore("fisheye", None))
+    text = io.StringIO()
+    replace(camera, lens=LensChoice("opencv5", scores)).print(Console(file=text, width=200))
+    line = next(line for line in text.getvalue().splitlines() if line.startswith("Lens opencv5"))
+    assert line.endswith("rms 0.158 px in pictures left out (opencv4 0.162 px, fisheye no solution).")
 
 
 @pytest.mark.study

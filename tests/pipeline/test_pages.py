@@ -206,6 +206,7 @@ def test_the_table_of_the_page_of_boards(tmp_path: Path, capsys: pytest.CaptureF
         assert float(value.replace("−", "-")) == pytest.approx(found["value"], abs=0.51 * 10**-decimals)
         assert float(sigma) == pytest.approx(found["sigma"], abs=0.51 * 10**-decimals)
     assert f"rms {camera['rms_px']:.3f} px a point" in page.read_text(encoding="utf-8")
+    assert f"rms {camera['lens_rms_px']['opencv4']:.3f} px in pictures left out" in page.read_text(encoding="utf-8")
 
 
 def table(page: Path, first: str) -> list[list[str]]:
