@@ -25,13 +25,9 @@ from pipeline.types import Array
 
 UM_PER_MM = 1000.0
 
-_ROUNDS = (  # largest number of corrections: their relative error shrinks each time, after two rounds below the noise
-    4  # largest number of corrections: each round is off by its own relative error, so the second is below the noise
-)
+_ROUNDS = 4  # largest number of corrections: each is off by its own relative error, so the second is below the noise
 _SETTLED_SIGMAS = 0.01  # change of the correction that ends the iteration, standard deviations of an observation
-_NOTICEABLE_SIGMAS = (  # standard deviations: a larger possible eccentricity that is not corrected is reported
-    0.2  # standard deviations of a coordinate: a possible uncorrected eccentricity beyond it is reported
-)
+_NOTICEABLE_SIGMAS = 0.2  # standard deviations: a larger possible eccentricity that is not corrected is reported
 
 
 def add_scanner_bends(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from pipeline.errors import InputError
-from pipeline.text.wording import did_you_mean, quoted
+from pipeline.text.wording import did_you_mean, table_lines
 
 BoardKind = Literal["chessboard", "charuco", "aprilgrid", "aruco", "circle-grid", "asymmetric-circle-grid"]
 MOST = 500  # largest number of columns or rows in `[targets]`
@@ -62,7 +62,7 @@ class BoardOptions:
                 keys |= {"first_id": self.first_id}
             case "circle-grid" | "asymmetric-circle-grid":
                 keys |= {"spacing_mm": self.spacing_mm, "diameter_mm": self._size}
-        return "[targets]\n" + "".join(f"{key} = {_toml(value)}\n" for key, value in keys.items())
+        return "\n".join(["[targets]", *table_lines(keys), ""])
 
     @property
     def _size(self) -> float:
@@ -113,7 +113,3 @@ def _length_mm(option: str, text: str) -> float:
     if found is None or float(found[1]) == 0.0:
         raise InputError(f"{option} {text}: must be a length with its unit (mm, cm, m, in), such as 25mm.")
     return float(found[1]) * MM[found[2]]
-
-
-def _toml(value: object) -> str:
-    return quoted(value) if isinstance(value, str) else str(value).lower() if isinstance(value, bool) else repr(value)
