@@ -34,22 +34,15 @@ class CameraPlots:
 
     Attributes
     ----------
-    name : str
-        Name of the camera.
-    lens : Lens
-        Lens with covariance.
-    places_mm, vectors_mm : Array (n, 2)
-        Observations and their residuals, along the camera's axes.
-    is_fiducial : Mask (n,)
-        Which observations are fiducials.
-    images : int
-        Number of images of the camera.
-    corners_mm : Array (2, 2)
-        Lower left and upper right corner of the image.
-    uncertainty : Callable
-        Returns places (r, c, 2) over the image and standard deviations (r, c) in mm, for a distance of the points.
-    pixel_mm : float or None
-        Side of a pixel; if given, plots are in px, y down.
+    name : name of the camera.
+    lens : lens with covariance.
+    places_mm, vectors_mm : (n, 2) observations and their residuals, along the camera's axes.
+    is_fiducial : (n,) which observations are fiducials.
+    images : number of images of the camera.
+    corners_mm : (2, 2) lower left and upper right corner of the image.
+    uncertainty : returns places (r, c, 2) over the image and standard deviations (r, c) in mm, for a distance of the
+        points.
+    pixel_mm : side of a pixel; if given, plots are in px, y down.
     """
 
     name: str

@@ -103,34 +103,20 @@ FOURIER_ORDERS = range(1, 10)
 
 @dataclass(frozen=True)
 class Family:
-    """Distortion family.
+    """Distortion family."""
 
-    Attributes
-    ----------
-    parameters : names of the parameters.
-    image : image of a ray (object-side families).
-    correct : correction subtracted from the observed point (image-side families).
-    units : units of the parameters; empty: mm.
-    needs : name of a required setting of `Distortion`.
-    y_down : parameters defined with y down that would change sign with y up.
-    groups : (name, parameters) of one physical cause or one degree.
-    ladder : parameter sets for model selection, simplest first.
-    alike_at_zero : parameters whose derivatives equal those of others while they are 0.
-    apart : returns parameters of nearly the same distortion at which those derivatives differ.
-    is_pinhole_at_zero : whether there is no distortion while all parameters are 0.
-    """
-
-    parameters: tuple[str, ...] = ()
-    image: Image = undistorted
-    correct: Correct = no_correction
-    units: tuple[str, ...] = ()
-    needs: str = ""
-    y_down: tuple[str, ...] = ()
-    groups: tuple[tuple[str, tuple[str, ...]], ...] = ()
-    ladder: tuple[str, ...] = ()
-    alike_at_zero: tuple[str, ...] = ()
+    parameters: tuple[str, ...] = ()  # names of the parameters
+    image: Image = undistorted  # image of a ray (object-side families)
+    correct: Correct = no_correction  # correction subtracted from the observed point (image-side families)
+    units: tuple[str, ...] = ()  # units of the parameters; empty: mm
+    needs: str = ""  # name of a required setting of `Distortion`
+    y_down: tuple[str, ...] = ()  # parameters defined with y down that would change sign with y up
+    groups: tuple[tuple[str, tuple[str, ...]], ...] = ()  # (name, parameters) of one physical cause or one degree
+    ladder: tuple[str, ...] = ()  # parameter sets for model selection, simplest first
+    alike_at_zero: tuple[str, ...] = ()  # parameters whose derivatives equal those of others while they are 0
+    # returns parameters of nearly the same distortion at which those derivatives differ
     apart: Callable[[Array], Array] = np.copy
-    is_pinhole_at_zero: bool = True
+    is_pinhole_at_zero: bool = True  # whether there is no distortion while all parameters are 0
 
     def unit(self, parameter: str) -> str:
         return self.units[self.parameters.index(parameter)] if self.units else "mm"

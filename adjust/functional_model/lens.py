@@ -47,16 +47,12 @@ class Distortion:
 
     Attributes
     ----------
-    family : str
-        Name in `functional_model.families`.
-    parameters : mapping of str to Prior
-        A parameter that is missing is fixed at 0.
-    decentering : {"reduced", "paper"}
-        "paper": Torlegård's decentering terms with x', y' as printed, not reduced to the principal point.
-    r0_mm : float
-        Radius of zero radial distortion of `torlegard`; period of `juhl`.
-    half_mm : (float, float)
-        Half the frame in x' and y', the unit length of `ebner`, `gruen`, `legendre(n)` and `fourier(n)`; 0: not given.
+    family : name in `functional_model.families`.
+    parameters : a parameter that is missing is fixed at 0.
+    decentering : "paper": Torlegård's decentering terms with x', y' as printed, not reduced to the principal point.
+    r0_mm : radius of zero radial distortion of `torlegard`; period of `juhl`.
+    half_mm : half the frame in x' and y', the unit length of `ebner`, `gruen`, `legendre(n)` and `fourier(n)`; 0: not
+        given.
     """
 
     family: str = "none"
@@ -137,14 +133,10 @@ class Lens:
 
     Attributes
     ----------
-    distortion : Distortion
-        The family and its settings. Its priors are not used here.
-    interior : Array (3,)
-        Principal distance c and principal point x0', y0' in mm.
-    parameters : Array (k,)
-        Parameters of the distortion, in the order of `families.parameter_names`, in their own units.
-    covariance : Array (3 + k, 3 + k)
-        Covariance of interior orientation and parameters; empty where unknown.
+    distortion : the family and its settings. Its priors are not used here.
+    interior : (3,) principal distance c and principal point x0', y0' in mm.
+    parameters : (k,) parameters of the distortion, in the order of `families.parameter_names`, in their own units.
+    covariance : (3 + k, 3 + k) covariance of interior orientation and parameters; empty where unknown.
     """
 
     distortion: Distortion

@@ -51,20 +51,14 @@ def convert_lens(
 
     Parameters
     ----------
-    source : Lens
-        Lens to convert.
-    into : Distortion
-        Target family and its settings, such as r0, and initial values of parameters that do not start at 0. Parameters
-        that are not estimated keep these values.
-    corners_mm : Array (2, 2)
-        Two opposite corners of the rectangle.
-    estimated : sequence of str, optional
-        Parameters of the target family to fit. Default: the usual ones, with affinity and shear where these at least
-        halve the rms, without those that stay 0 whatever the uncertain parameters of the source are.
-    uncertain : sequence of str
-        Quantities of the source that have a standard deviation.
-    held : sequence of str
-        Which of c, x0 and y0 are not estimated.
+    source : lens to convert.
+    into : target family and its settings, such as r0, and initial values of parameters that do not start at 0.
+        Parameters that are not estimated keep these values.
+    corners_mm : (2, 2) two opposite corners of the rectangle.
+    estimated : optional; parameters of the target family to fit. Default: the usual ones, with affinity and shear where
+        these at least halve the rms, without those that stay 0 whatever the uncertain parameters of the source are.
+    uncertain : quantities of the source that have a standard deviation.
+    held : which of c, x0 and y0 are not estimated.
 
     Raises
     ------

@@ -103,34 +103,22 @@ def _sinc_slope(angle: Array) -> Array:
 
 def _refracted(unit_m: float, stations: Array, xyz: Array, apparent: SightVectors) -> SightVectors:
     """Raise the points by the refraction coefficient times the square of their distance."""
-    air = bending(unit_m * stations[:, 2], unit_m * xyz[:, 2])
-    coefficient = unit_m * air.coefficient
+    per_m, by_station_height, by_point_height = bending(unit_m * stations[:, 2], unit_m * xyz[:, 2])
+    coefficient = unit_m * per_m
     square = (apparent.vector**2).sum(axis=1)
     vector, by_station, by_point = apparent.vector.copy(), apparent.by_station.copy(), apparent.by_point.copy()
     vector[:, 2] += coefficient * square
     for derivative, by_height, of_vector in (
-        (by_station, air.by_station, apparent.by_station),
-        (by_point, air.by_point, apparent.by_point),
+        (by_station, by_station_height, apparent.by_station),
+        (by_point, by_point_height, apparent.by_point),
     ):
         derivative[:, 2] += 2.0 * coefficient[:, None] * np.einsum("ni,nij->nj", apparent.vector, of_vector)
         derivative[:, 2, 2] += unit_m**2 * by_height * square
     return SightVectors(vector, by_station, by_point)
 
 
-# Refraction of the lines of sight in the standard atmosphere.
-
-
-@dataclass(frozen=True)
-class Bending:
-    """Refraction coefficients (n,) in 1/m, and their derivatives (n,) with respect to both heights in 1/m²."""
-
-    coefficient: Array
-    by_station: Array
-    by_point: Array
-
-
-def bending(station_m: Array, point_m: Array) -> Bending:
-    """Compute the refraction between heights (n,) of stations and points.
+def bending(station_m: Array, point_m: Array) -> tuple[Array, Array, Array]:
+    """Refraction coefficients (n,), 1/m, between heights of stations and points, and their derivatives by both, 1/m².
 
     A point at the slant distance s appears higher by coefficient times s². With N = n - 1 at the station and the mean
     of N between both heights, the angle of refraction is K tan(nadir angle), K = mean - N (Schut, Photogrammetric
@@ -142,7 +130,7 @@ def bending(station_m: Array, point_m: Array) -> Bending:
     (pressure, there, slope), (pressure_below, below, _) = _air(station_m), _air(point_m)
     weight = REFRACTIVITY_K_PER_HPA * GAS_CONSTANT / GRAVITY_M_PER_S2
     mean = weight * (pressure_below - pressure) / difference
-    return Bending(
+    return (
         np.where(level, -slope / 2.0, (mean - there) / difference),
         np.where(level, 0.0, (2.0 * (there - mean) / difference - slope) / difference),
         np.where(level, 0.0, (2.0 * mean - below - there) / difference**2),
@@ -164,23 +152,14 @@ def _air(height_m: Array) -> tuple[Array, Array, Array]:
 
 @dataclass(frozen=True)
 class ImageModel:
-    """Current model of one image: lens, exterior orientation, film transformation, scanner.
+    """Current model of one image: lens, exterior orientation, film transformation, scanner."""
 
-    Attributes
-    ----------
-    lens : lens with values.
-    rotation : (3, 3) object to camera.
-    station : (3,) projection centre in object units.
-    film : film transformation.
-    line_of_sight : earth curvature and refraction.
-    bend, bend_parameters : scanner terms and their parameters (k,).
-    """
-
-    lens: Lens
-    rotation: Array
-    station: Array
-    film: Film
-    line_of_sight: LineOfSight = STRAIGHT
+    lens: Lens  # lens with values
+    rotation: Array  # (3, 3) object to camera
+    station: Array  # (3,) projection centre in object units
+    film: Film  # film transformation
+    line_of_sight: LineOfSight = STRAIGHT  # earth curvature and refraction
+    # bend, bend_parameters: scanner terms and their parameters (k,)
     bend: Bend = NO_BEND
     bend_parameters: Array = field(default_factory=lambda: np.empty(0))
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import groupby
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from adjust.functional_model.families import family
 from adjust.functional_model.lens import Lens
 from adjust.functional_model.rotation import angles_from_rotation, angles_near
 from adjust.initial_values.fiducial_fit import fit_transformation
-from adjust.initial_values.frames import Film, Frames, camera_frames, joined_frames, whole_frames
+from adjust.initial_values.frames import Film, Frames, camera_frames, joined_frame, whole_frames
 from adjust.initial_values.orientation import orient
 from adjust.initial_values.pose import KnownField, Pose, Sight
 from adjust.initial_values.principal_distance import FEWEST, find_principal_distance, find_wide_distance
@@ -77,9 +78,13 @@ def _initial_values(network: Network) -> Approximations:
 def _joined_values(network: Network) -> Approximations:
     """Initial values of a network with frames scanned in parts: whole frames first, then their parts."""
     films, joins = dict[str, Film](), dict[tuple[str, str], Array]()
-    for frame in joined_frames(network):
-        films |= frame.films
-        joins |= {(frame.name, point): xy for point, xy in frame.joins.items()}
+    by_name = sorted(
+        (image for image in network.images if image.part_of), key=lambda image: (image.part_of, image.name)
+    )
+    for frame, parts in groupby(by_name, key=lambda image: image.part_of):
+        of_parts, in_camera = joined_frame(network, list(parts))
+        films |= of_parts
+        joins |= {(frame, point): xy for point, xy in in_camera.items()}
     films |= _film_transformations(network)
     whole = whole_frames(network, films)
     found = _initial_values(whole) if whole.images else Approximations({}, {}, {}, {})

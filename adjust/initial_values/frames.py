@@ -5,8 +5,7 @@ points in common with the parts placed so far. All fiducial marks of the frame t
 as if it had been scanned at once. The film transformation of each part follows from it.
 """
 
-from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -104,17 +103,8 @@ Mark = tuple[str, str]  # kind and point
 FEWEST_COMMON = 3  # common points of two parts: a mirrored similarity fits two points as well
 
 
-@dataclass(frozen=True)
-class JoinedFrame:
-    """Frame scanned in parts."""
-
-    name: str  # name of the frame
-    films: Mapping[str, Film]  # film transformation of each part, by its name
-    joins: Mapping[str, Array]  # (2,) coordinates of each join point in the fiducial system, mm
-
-
-def joined_frame(network: Network, parts: Sequence[Image]) -> JoinedFrame:
-    """Determine the film transformations of the parts of one frame.
+def joined_frame(network: Network, parts: Sequence[Image]) -> tuple[dict[str, Film], dict[str, Array]]:
+    """Film transformations of the parts of one frame by name, and its joins (2,) in the fiducial system, mm, by point.
 
     Raises AdjustmentError if the parts have too few points in common, or the frame has too few fiducial marks.
     """
@@ -136,7 +126,7 @@ def joined_frame(network: Network, parts: Sequence[Image]) -> JoinedFrame:
         films[part.name] = fit_transformation(kind, lattice, whole.apply(parameters, in_first))
     joins = [(point, xy) for (what, point), xy in place.items() if what == "join"]
     in_camera = whole.apply(parameters, np.array([xy for _, xy in joins]).reshape(-1, 2))
-    return JoinedFrame(parts[0].part_of, films, {point: xy for (point, _), xy in zip(joins, in_camera, strict=True)})
+    return films, {point: xy for (point, _), xy in zip(joins, in_camera, strict=True)}
 
 
 def _marks(network: Network, part: Image) -> dict[Mark, Array]:
@@ -170,16 +160,6 @@ def _placed(frame: str, marks_by_part: Mapping[str, Mapping[Mark, Array]]) -> tu
         place |= {mark: xy for mark, xy in zip(own, moved, strict=True) if mark not in place}
         left.remove(name)
     return films, place
-
-
-def joined_frames(network: Network) -> Iterator[JoinedFrame]:
-    """Iterate over the frames that were scanned in parts."""
-    parts = defaultdict(list)
-    for image in network.images:
-        if image.part_of:
-            parts[image.part_of].append(image)
-    for frame in sorted(parts):
-        yield joined_frame(network, sorted(parts[frame], key=lambda image: image.name))
 
 
 def whole_frames(network: Network, films: Mapping[str, Film]) -> Network:

@@ -62,10 +62,8 @@ def resect_images(fields: Sequence[KnownField], principal_distances_mm: Sequence
 
     Parameters
     ----------
-    fields : sequence of KnownField
-        At least three points per image.
-    principal_distances_mm : sequence of float
-        One per image.
+    fields : at least three points per image.
+    principal_distances_mm : one per image.
 
     Returns
     -------

@@ -165,29 +165,21 @@ DECISIVE = 10.0  # difference of AICc above which the worse model has essentiall
 
 @dataclass(frozen=True)
 class Candidate:
-    """Adjusted model.
+    """Adjusted model."""
 
-    Attributes
-    ----------
-    model : the model.
-    problem : why it has no solution; empty where it has one.
-    observations, unknowns, redundancy : counts.
-    vpv, sigma0 : of the adjustment.
-    cross_validation : prediction errors.
-    correlated : pairs of highly correlated interior parameters, with their correlation.
-    warnings : of the adjustment.
-    """
-
-    model: Model
-    problem: str = ""
+    model: Model  # the model
+    problem: str = ""  # why it has no solution; empty where it has one
+    # observations, unknowns, redundancy: counts
     observations: int = 0
     unknowns: int = 0
     redundancy: int = 0
+    # vpv, sigma0: of the adjustment
     vpv: float = 0.0
     sigma0: float = 0.0
-    cross_validation: CrossValidation | None = None
+    cross_validation: CrossValidation | None = None  # prediction errors
+    # pairs of highly correlated interior parameters, with their correlation
     correlated: tuple[tuple[str, str, float], ...] = ()
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # of the adjustment
 
     @property
     def aic(self) -> float:

@@ -72,15 +72,12 @@ def choose(
 
     Parameters
     ----------
-    own : Adjustment
-        The network adjusted with its own model. All candidates get the weights that robust estimation, data snooping
+    own : the network adjusted with its own model. All candidates get the weights that robust estimation, data snooping
         and variance components gave its image points.
-    options : Options, optional
-        Options of that adjustment.
-    half_mm : mapping, optional
-        Half the frame by camera, for the self-calibration sets, which are left out unless every camera has it.
-    progress : callable
-        Called with the name of each model and the number of candidates done.
+    options : optional; options of that adjustment.
+    half_mm : optional; half the frame by camera, for the self-calibration sets, which are left out unless every camera
+        has it.
+    progress : called with the name of each model and the number of candidates done.
     """
     options = options or Options()
     half_mm = half_mm or {}

@@ -24,32 +24,21 @@ class Unknowns:
     """All quantities of a network, numbered.
 
     Cameras, scanners, boards and points come before the images. Parts of one frame share the exterior orientation.
-
-    Attributes
-    ----------
-    parameters : keys.
-    given : (n,) given values, nan without.
-    sigma : (n,) standard deviations of the given values: 0 fixed, inf free.
-    start : (n,) initial values.
-    camera : positions by name: c, x0', y0', then the distortion parameters.
-    fiducial : positions by (camera, id).
-    scanner, board : positions by name.
-    point : positions by id.
-    transformation, exterior : positions by image name.
-    join : positions by frame and point.
     """
 
-    parameters: tuple[Parameter, ...]
-    given: Array
-    sigma: Array
-    start: Array
-    camera: dict[str, Indices]
-    fiducial: dict[tuple[str, str], Indices]
+    parameters: tuple[Parameter, ...]  # keys
+    given: Array  # (n,) given values, nan without
+    sigma: Array  # (n,) standard deviations of the given values: 0 fixed, inf free
+    start: Array  # (n,) initial values
+    camera: dict[str, Indices]  # positions by name: c, x0', y0', then the distortion parameters
+    fiducial: dict[tuple[str, str], Indices]  # positions by (camera, id)
+    # scanner, board: positions by name
     scanner: dict[str, Indices]
-    point: dict[str, Indices]
+    point: dict[str, Indices]  # positions by id
+    # transformation, exterior: positions by image name
     transformation: dict[str, Indices]
     exterior: dict[str, Indices]
-    join: dict[tuple[str, str], Indices]
+    join: dict[tuple[str, str], Indices]  # positions by frame and point
     board: dict[str, Indices]
 
     def __len__(self) -> int:

@@ -39,16 +39,11 @@ class ProjectionUncertainty:
     Attributes
     ----------
     camera : str
-    distance : float
-        From the camera to the points in object units, inf at infinity.
-    median_distance : float
-        Of the targets that were observed.
-    places_mm : Array (..., 2)
-        Of the points, in the camera frame.
-    covariance_mm2 : Array (..., 2, 2)
-        By the model; nan where the lens forms no image.
-    cluster_covariance_mm2 : Array (..., 2, 2) or None
-        By the delete-one-image jackknife; None where images are too few.
+    distance : from the camera to the points in object units, inf at infinity.
+    median_distance : of the targets that were observed.
+    places_mm : (..., 2) of the points, in the camera frame.
+    covariance_mm2 : (..., 2, 2) by the model; nan where the lens forms no image.
+    cluster_covariance_mm2 : (..., 2, 2) by the delete-one-image jackknife; None where images are too few.
     """
 
     camera: str

@@ -53,13 +53,10 @@ def adjust(
 
     Parameters
     ----------
-    network : Network
-        Cameras, images, object points and observations with their priors.
-    approximations : Approximations, optional
-        Initial values. By default, and where the iteration does not converge from those given, they are computed from
-        the network itself.
-    options : Options, optional
-        Datum, weighting, method and tests.
+    network : cameras, images, object points and observations with their priors.
+    approximations : optional; initial values. By default, and where the iteration does not converge from those given,
+        they are computed from the network itself.
+    options : optional; datum, weighting, method and tests.
 
     Returns
     -------

@@ -48,32 +48,11 @@ KINDS = (("marks", ("target", "tie", "fiducial")), ("targets", ("target", "tie")
 UM_PER_MM = 1000.0
 
 
-@dataclass(frozen=True)
-class AddedNoise:
-    """Noise added to marks."""
+def added_noise(run: Run, redundancy: int) -> tuple[tuple[str, str], Run] | None:
+    """Adjust with a standard deviation added to those of marks that explains all residuals; None where none does.
 
-    marks: str  # "marks", "targets" or "fiducials"
-    sigma_mm: float  # added standard deviation
-    covariance_mm2: Array  # (n, 2, 2) given covariances of the marks
-    run: Run  # adjustment with the added noise
-
-    @property
-    def words(self) -> tuple[str, str]:
-        """Cause and remedy."""
-        given_um = UM_PER_MM * float(np.sqrt(np.median(np.trace(self.covariance_mm2, axis1=1, axis2=2) / 2.0)))
-        added_um = UM_PER_MM * self.sigma_mm
-        key = "sigma_fiducial_um" if self.marks == "fiducials" else "sigma_target_um"
-        return (
-            f"The standard deviations given to the {self.marks} are too small everywhere: the residuals are plain "
-            f"noise, alike in all images; {added_um:.3g} µm added to the {given_um:.3g} µm given (in quadrature) "
-            "explains all",
-            f"Give film_sigma_um = {added_um:.3g} under [adjust], which is added to the sigma of every mark, or larger "
-            f"sigmas in comparator.csv or {key}.",
-        )
-
-
-def added_noise(run: Run, redundancy: int) -> AddedNoise | None:
-    """Estimate the standard deviation that, added to those of marks, explains all residuals; None where none does."""
+    Also returns the cause in words, and the remedy.
+    """
     if not _is_noise(run):
         return None
     network = run.problem.network
@@ -90,8 +69,22 @@ def added_noise(run: Run, redundancy: int) -> AddedNoise | None:
         problem = replace(run.problem, network=replace(network, observations=observations))
         noisy = again(replace(run, problem=problem), run.weighting, STEPS, run.end.state)
         if noisy.converged and noisy.is_tested and _groups_agree(noisy):
-            return AddedNoise(marks, sigma_mm, covariance, noisy)
+            return _noise_words(marks, sigma_mm, covariance), noisy
     return None
+
+
+def _noise_words(marks: str, sigma_mm: float, covariance_mm2: Array) -> tuple[str, str]:
+    """Cause and remedy of noise added to marks of given covariances (n, 2, 2)."""
+    given_um = UM_PER_MM * float(np.sqrt(np.median(np.trace(covariance_mm2, axis1=1, axis2=2) / 2.0)))
+    added_um = UM_PER_MM * sigma_mm
+    key = "sigma_fiducial_um" if marks == "fiducials" else "sigma_target_um"
+    return (
+        f"The standard deviations given to the {marks} are too small everywhere: the residuals are plain "
+        f"noise, alike in all images; {added_um:.3g} µm added to the {given_um:.3g} µm given (in quadrature) "
+        "explains all",
+        f"Give film_sigma_um = {added_um:.3g} under [adjust], which is added to the sigma of every mark, or larger "
+        f"sigmas in comparator.csv or {key}.",
+    )
 
 
 def _is_noise(run: Run) -> bool:
@@ -214,24 +207,18 @@ class Explanation:
     sigma0: tuple[float, float]
 
 
-@dataclass(frozen=True)
-class Explained:
-    """Explanations, largest first, and the adjustment that includes them; the original one where there are none."""
-
-    explanations: tuple[Explanation, ...]
-    run: Run
-
-
-def explain(run: Run, redundancy: int, probabilities: Probabilities, is_noise_fitted: bool = False) -> Explained:
-    """Search for explanations of residuals larger than the given standard deviations.
+def explain(
+    run: Run, redundancy: int, probabilities: Probabilities, is_noise_fitted: bool = False
+) -> tuple[tuple[Explanation, ...], Run]:
+    """Explanations of residuals larger than the given standard deviations, largest first, and a run that includes them.
 
     There are none where the adjustment has no solution, nor where sigma0 is at most 1, unless the standard deviation of
     unmodelled errors was estimated from the residuals (is_noise_fitted).
     """
     if not run.converged or not run.is_tested or redundancy < CHECKED:
-        return Explained((), run)
+        return (), run
     if run.end.vpv <= redundancy and not is_noise_fitted:
-        return Explained((), run)
+        return (), run
     first = last = _Model(run, redundancy, probabilities, is_noise_fitted)
     found: list[Explanation] = []
     for _ in range(ROUNDS):
@@ -246,11 +233,12 @@ def explain(run: Run, redundancy: int, probabilities: Probabilities, is_noise_fi
         if following is None:
             break
     if last.exceeds(LEVEL) and not last.gross_errors and (noise := added_noise(last.run, last.redundancy)):
-        noisy = replace(last, run=noise.run)
-        found.append(_explanation("noise", noise.words, float(chdtrc(last.redundancy, last.vpv)), last, noisy))
+        words, with_noise = noise
+        noisy = replace(last, run=with_noise)
+        found.append(_explanation("noise", words, float(chdtrc(last.redundancy, last.vpv)), last, noisy))
         last = noisy
     explains = not last.exceeds(probabilities.family) or last.variance - 1.0 < LEFT * (first.variance - 1.0)
-    return Explained(tuple(found), last.run) if found and explains else Explained((), run)
+    return (tuple(found), last.run) if found and explains else ((), run)
 
 
 @dataclass(frozen=True)

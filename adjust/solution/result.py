@@ -29,7 +29,7 @@ from adjust.quality.significance import CalibrationTest, SignificanceTest, calib
 from adjust.quality.snooping import Snooping, Suspect
 from adjust.quality.variance_components import factor_sigmas, variance_factor
 from adjust.rank_defect.flat_valleys import held_directions, inseparable
-from adjust.solution.explanations import Explained, Explanation, explain
+from adjust.solution.explanations import Explanation, explain
 from adjust.solution.warnings import run_warnings
 
 
@@ -216,7 +216,7 @@ class Adjustment(Estimates, PlottedResult):
         """Suspected gross errors, worst first, after accounting for the explanations of all residuals."""
         if self.misread or not self._is_tested:
             return ()
-        run, variance, tested = self._explanation_run.run, self.variance, self.reliability
+        run, variance, tested = self._explanation_run[1], self.variance, self.reliability
         if run is not self.run:
             variance = variance_factor(run, _redundancy(run, self.cofactor))
             tested = _reliability(run, variance, self.probabilities)
@@ -225,7 +225,7 @@ class Adjustment(Estimates, PlottedResult):
     @cached_property
     def explanations(self) -> tuple[Explanation, ...]:
         """Explanations of a large sigma0. The suspects are those of an adjustment that includes them in the model."""
-        return () if self.misread else self._explanation_run.explanations
+        return () if self.misread else self._explanation_run[0]
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
@@ -252,7 +252,7 @@ class Adjustment(Estimates, PlottedResult):
         return inseparable(run.problem, run.end.state, self.cofactor.variances) if run.converged else {}
 
     @cached_property
-    def _explanation_run(self) -> Explained:
+    def _explanation_run(self) -> tuple[tuple[Explanation, ...], Run]:
         is_noise_fitted = any(self.unmodelled_mm.values())
         return explain(self.run, _redundancy(self.run, self.cofactor), self.probabilities, is_noise_fitted)
 

@@ -47,25 +47,16 @@ OTHER_CLUSTERS = 8  # clusters tried as other points; if each is found with p = 
 
 @dataclass(frozen=True, eq=False)
 class Names:
-    """Identified marks of an image.
+    """Identified marks of an image."""
 
-    Attributes
-    ----------
-    mark : index of the mark by index of the object point.
-    pose : exterior orientation.
-    principal_distance_mm, radial : of the view; images are p (1 + radial p²), p in principal distances.
-    expected : number of points that the image should show.
-    log10_chance : log10 of the expected number of false alarms.
-    gate_mm : largest distance of a mark from the predicted place of its point.
-    """
-
-    mark: dict[int, int]
-    pose: Pose
+    mark: dict[int, int]  # index of the mark by index of the object point
+    pose: Pose  # exterior orientation
+    # principal_distance_mm, radial: of the view; images are p (1 + radial p²), p in principal distances
     principal_distance_mm: float
     radial: float
-    expected: int
-    log10_chance: float
-    gate_mm: float
+    expected: int  # number of points that the image should show
+    log10_chance: float  # log10 of the expected number of false alarms
+    gate_mm: float  # largest distance of a mark from the predicted place of its point
 
 
 def name_marks(
