@@ -388,14 +388,14 @@ def test_of_many_scans_only_the_lot_of_a_new_one_is_tested_again(
     monkeypatch.setattr("pipeline.archive.work.measure_file", drop_targets)
     rewritten(folder, "project.toml", "[measure]", f"{BOARD}[measure]")
     measure(folder)
-    monkeypatch.setattr("pipeline.archive.measure_archive._TOGETHER", 1)
+    monkeypatch.setattr("pipeline.archive.cross_scan_checks._TOGETHER", 1)
     neighbour = list[list[str]]()
 
     def counted(camera: CameraFile, scans: Sequence[MeasuredScan], *more: Any) -> tuple[CheckedScan, ...]:
         neighbour.append([scan.frame.image for scan in scans])
         return check_scans(camera, scans, *more)
 
-    monkeypatch.setattr("pipeline.archive.measure_archive.check_scans", counted)
+    monkeypatch.setattr("pipeline.archive.cross_scan_checks.check_scans", counted)
     shutil.copy(three / "a.tif", folder / "other.tif")  # a copy is no frame of its own, and needs no checks
     pixels = tifffile.imread(three / "a.tif")
     for number, (name, lots) in enumerate({"d": [["d"]], "h": [["h"]], "e": [["a", "b", "c", "e"]]}.items()):
