@@ -67,6 +67,13 @@ class Summary:
     verdicts: Mapping[Verdict, int] = field(default_factory=dict)
     parts: int = 0
 
+    @property
+    def finds_no_frame(self) -> bool:
+        """Whether scans of film were read and no mark was observed in any."""
+        observed = (counts.get(status, 0) for counts in self.frames.values() for status in ("measured", "weak"))
+        was_read = self.verdicts.get(Verdict.POOR, 0) + self.verdicts.get(Verdict.LOOK, 0) > 0
+        return was_read and self.unit is FILM_UNIT and not any(observed)
+
     def as_json(self) -> dict[str, object]:
         return {
             "reseau": version("reseau"),

@@ -130,6 +130,10 @@ def summary_steps(project: Path, summary: "Summary") -> Iterator[str]:
         return
     if "report" in files:
         yield page_step(files["report"])
+    if summary.finds_no_frame:
+        yield command_step("cameras", "--scan", "SCAN", why="names the camera of a scan, if it is another one")
+        yield from verdict_steps(project, summary.verdicts)
+        return
     yield from verdict_steps(project, summary.verdicts)
     if "covariance" in files:
         yield command_step("check", project, why="compares the adjustment with OpenCV's calibration")

@@ -8,15 +8,26 @@ import pytest
 
 from pipeline.archive.verdicts import Verdict
 from pipeline.commands.shared import command_step, print_next, summary_steps
+from pipeline.report.verdict import ReportVerdict
+from pipeline.summary import Summary
 
 PROJECT = Path("my project.toml")
 
 
-def summary(*files: str, adjustment: Any = None, parts: int = 0, **verdicts: int) -> Any:
+def summary(*files: str, adjustment: Any = None, parts: int = 0, frames: Any = None, **verdicts: int) -> Any:
     """One that has what the steps depend on."""
     counts = {Verdict[name]: count for name, count in verdicts.items()}
     paths = {word: Path("out", word) for word in files}
-    return SimpleNamespace(files=paths, adjustment=adjustment, parts=parts, verdicts=counts)
+    return Summary(
+        ReportVerdict("look", "", (), ()),
+        frames or {"a": {"measured": 4}},
+        {},
+        adjustment,
+        None,
+        paths,
+        verdicts=counts,
+        parts=parts,
+    )
 
 
 def adjustment(is_calibrated: bool) -> Any:
@@ -32,6 +43,7 @@ def adjustment(is_calibrated: bool) -> Any:
         (summary("adjustment", "covariance", adjustment=adjustment(True)), ["reseau check", "reseau report"]),
         (summary("report", adjustment=adjustment(True)), ["open out/report", "reseau export"]),
         (summary("report", adjustment=adjustment(False), LOOK=1, POOR=1), ["open", "reseau review", "reseau resample"]),
+        (summary("measurement", frames={"a": {"absent": 4}}, POOR=1), ["reseau cameras --scan SCAN", "reseau review"]),
         (summary("part 1 of 8", parts=8), ["reseau merge 'my project.toml' out/measurement.*-of-8.db"]),
     ],
 )
