@@ -21,6 +21,7 @@ from adjust.problem.network import Approximations, Image, Network
 from adjust.problem.reduction import Reduction
 from adjust.validation import validate
 
+ON_A_LINE = 1e-6  # second extent of the known points over the first below which they lie on a line
 MOST_FOLDED = 0.05  # largest fraction of points outside the invertible range of the distortion (gross errors)
 
 
@@ -141,6 +142,11 @@ def _why_no_distance(fields: Sequence[KnownField]) -> str:
             f"none shows {FEWEST} points whose X, Y and Z are known. Give an approximate principal_distance_mm, or the "
             "coordinates of more points."
         )
+    xyz = np.concatenate([field.xyz for field in fields])
+    extents = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
+    if extents[1] <= ON_A_LINE * extents[0]:
+        where = "on one line" if extents[0] > 0.0 else "at one place"
+        return f"all known points that they show lie {where}. Correct their coordinates."
     return (
         "they see too few known points, or look straight at a flat field, where a longer principal distance is a "
         "larger distance from the field. Take images tilted by 20 to 40 degrees in different directions, or give "

@@ -289,7 +289,7 @@ def _point(row: Row, pitch_um: tuple[float, float] | None) -> ComparatorPoint:
     xy = None if x is None or y is None else np.array([x, y])
     if xy is None and Status(status).is_observation:
         raise row.error(
-            names[0], f"is blank, but the status is {status!r}. Give {names[0]} and {names[1]}, or the status absent."
+            names[0], f"is blank, but the status is '{status}'. Give {names[0]} and {names[1]}, or the status absent."
         )
     if sx == 0.0 or sy == 0.0:
         raise row.error(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from studies import parametrize_with_studies
 
-from adjust import Adjustment, Camera, Image, Network, ObjectPoint, Observations, adjust
+from adjust import Adjustment, AdjustmentError, Camera, Image, Network, ObjectPoint, Observations, adjust
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Lens, Prior
 from adjust.quality.significance import SignificanceTest
@@ -285,6 +285,17 @@ def test_a_principal_distance_that_nearly_parallel_images_hardly_tell_is_named()
     assert "The principal distance of camera cam is determined to " in warning
     assert warning.endswith("points at other heights; or give it with its standard deviation.")
     assert not adjust(board_network(0, EIGHT[:2])).warnings
+
+
+@pytest.mark.parametrize(("direction", "where"), [((1.0, 0.5, 0.0), "on one line"), ((0.0, 0.0, 0.0), "at one place")])
+def test_known_points_without_extent_tell_no_principal_distance(direction: tuple[float, ...], where: str) -> None:
+    network = board_network(0, ())
+    points = tuple(
+        ObjectPoint(point.id, *(Prior(20.0 + k * each) for each in direction)) for k, point in enumerate(network.points)
+    )
+    unknown = replace(network.cameras[0], principal_distance_mm=None)
+    with pytest.raises(AdjustmentError, match=f"all known points that they show lie {where}"):
+        adjust(replace(network, cameras=(unknown,), points=points))
 
 
 @pytest.mark.study

@@ -60,6 +60,24 @@ def test_each_ends_with_one_message(
     assert message.count("reseau: ") == 1
 
 
+@pytest.mark.parametrize(
+    ("status", "words"),
+    [("measured", "is blank, but the status is 'measured'. Give x_mm and y_mm"), ("weak", "the status is 'weak'")],
+)
+def test_a_blank_place_of_an_observation_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], status: str, words: str
+) -> None:
+    network, _ = simulated(np.random.default_rng(1))
+    project = write_project(network, tmp_path)
+    head, first, *rows = (tmp_path / "comparator.csv").read_text(encoding="utf-8").splitlines()
+    cells = first.split(",")
+    cells[3] = ""
+    rows = [f"{','.join(cells)},{status}", *(f"{row},measured" for row in rows)]
+    (tmp_path / "comparator.csv").write_text("\n".join([f"{head},status", *rows]) + "\n", encoding="utf-8")
+    assert run(["adjust", str(project)]) == WRONG_INPUT
+    assert words in capsys.readouterr().err
+
+
 def test_marks_that_were_all_refused_end_with_their_commonest_reason(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
