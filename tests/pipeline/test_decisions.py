@@ -213,7 +213,7 @@ def test_lines_of_all_forms_are_read_in_their_order_and_a_wrong_one_is_named(
         {"decision": "place", "image": "b", "point": "{}", "kind": "target", "col_px": 3, "row_px": 4.5},
         {"image": "c", "decision": "pose", "pose": "90m", "note": "{}"},
         {"image": "d", "decision": "learn", "px": {"1": [2, 3.5]}, "who": "{}", "pose": "0", "window": [0, 1, 2, 3]},
-        {"image": "e", "decision": "undo", "fingerprint": "{}", "row_px": 0.0},
+        {"image": "e", "decision": "undo", "fingerprint": "{}", "row_px": 0.0, "px": {"1": [1, 2]}},
     ]
     chosen = np.random.default_rng(3).integers(len(forms), size=200).tolist()
     lines = [json.dumps(forms[form]).replace("{}", str(k)) for k, form in enumerate(chosen)]
