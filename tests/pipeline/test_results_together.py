@@ -268,7 +268,7 @@ def test_a_scan_that_vanishes_before_the_second_visit_keeps_what_the_first_gave(
     code, own_summary = summary(project, capsys, "run")
     assert code == 1
     assert own_summary["adjustment"] is not None
-    assert "It second pass failed: frame2.tif: there is no scan any more." in join_problems(own_summary)
+    assert "The second pass failed: frame2.tif: there is no scan any more." in join_problems(own_summary)
 
 
 @pytest.mark.study
