@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import tifffile
-from drawn_project import write_project
+from projects import write_project
 
 from benchmarks.harness import Row
 from pipeline.cli import run

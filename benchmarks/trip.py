@@ -61,7 +61,7 @@ class Followed:
 
 def followed() -> Followed:
     cv2.setNumThreads(1)  # calls in other threads are not traced
-    from drawn_project import write_project
+    from projects import write_project
 
     from pipeline.archive import measure_archive
     from pipeline.archive.measurement import read_measurement

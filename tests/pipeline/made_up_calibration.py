@@ -11,20 +11,16 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.lens import Distortion, Prior
+from adjust import Adjustment, Camera, Distortion, Exterior, Fiducial, Image, Network, ObjectPoint, Parameter, Prior
 from adjust.least_squares.iteration import Iteration
-from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.estimates import NullDirection, VarianceFactor
-from adjust.problem.network import Exterior, Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
-from adjust.problem.parameter import Parameter
 from adjust.problem.tested import Probabilities
 from adjust.quality.run import Group, Residuals
-from adjust.solution.result import Adjustment
 from measure.flags import Cause, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
+from pipeline import read_adjustment, write_adjustment
 from pipeline.report import ReportData, Thumbnail
-from pipeline.results.adjustment_file import read_adjustment, write_adjustment
 from pipeline.results.adjustment_record import FilmRecord
 from pipeline.results.check_file import CameraCheck, Check, Estimate, Row
 from pipeline.results.comparator_file import ComparatorPoint

@@ -1,17 +1,21 @@
-"""A review of a small project, served by a process of its own, as a user starts it."""
+"""A review of a small project, served by a process of its own, and what a person does on its page."""
 
+import csv
+import json
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tifffile
 from brute_marks import Array
 from drawn_frames import ALIKE, CORNERS, NOISE_DN, frame_picture, pixel_from_camera
-from drawn_project import CAMERA, PROJECT
+from playwright.sync_api import Page
+from projects import CAMERA, PROJECT
 
 GOOD, BARE, SCRATCHED, TURNED = "good", "<img src=x onerror=alert(1)>", "scratched", "turned"
 FAR_TURN_RAD = 0.35  # of TURNED: no search looks for a frame that is laid so
@@ -69,3 +73,29 @@ def served(project: Path, port: int = 0) -> Iterator[Served]:
             yield Served(address, process)
         finally:
             process.kill()
+
+
+def steer(page: Page, view: str, place_px: Array) -> None:
+    """Arrow keys until the cursor, which the page tells, is there to a step of them."""
+    page.keyboard.press("ArrowRight")
+    before = cursor(page, view)
+    page.keyboard.press("ArrowRight")
+    step = cursor(page, view) - before
+    for axis, (less, more) in enumerate((("ArrowLeft", "ArrowRight"), ("ArrowUp", "ArrowDown"))):
+        left = (place_px - cursor(page, view))[axis]
+        for _ in range(round(abs(left) / step[0])):
+            page.keyboard.press(more if left > 0 else less)
+
+
+def cursor(page: Page, view: str) -> Array:
+    return np.array(json.loads(page.locator(f"#{view}").get_attribute("data-cursor") or "null"), dtype=float)
+
+
+def decisions(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / "decisions.jsonl").read_text(encoding="utf-8").splitlines()]
+
+
+def comparator(folder: Path) -> Mapping[tuple[str, str], Mapping[str, str]]:
+    lines = (folder / "comparator.csv").read_text(encoding="utf-8").splitlines()
+    rows = csv.DictReader(line for line in lines if not line.startswith("#"))
+    return {(row["image"], row["point"]): row for row in rows}

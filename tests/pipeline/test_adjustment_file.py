@@ -12,15 +12,10 @@ import numpy as np
 import pytest
 from networks import Setup, two_cameras, vertical
 
-from adjust.functional_model.lens import Prior
-from adjust.problem.network import ObjectPoint
-from adjust.problem.parameter import Parameter
+from adjust import Adjustment, ObjectPoint, Parameter, Prior, adjust
 from adjust.quality.run import Residuals
-from adjust.solution.adjustment import adjust
-from adjust.solution.result import Adjustment
-from pipeline.errors import InputError
+from pipeline import InputError, read_adjustment, write_adjustment
 from pipeline.results import covariance_file
-from pipeline.results.adjustment_file import read_adjustment, write_adjustment
 from pipeline.results.check_file import CameraCheck, Check, CornersCheck, Estimate, PixelCalibration, Row, read_check
 from pipeline.results.covariance_file import covariance_path, read_covariance
 from pipeline.results.record_json import plain_json

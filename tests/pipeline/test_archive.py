@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 import tifffile
 from drawn_frames import PITCH_UM, layout_of
-from drawn_project import CAMERA, write_project
+from projects import CAMERA, write_project
 from studies import parametrize_with_studies
 
-from measure.marks.shapes import MarkShape, polygon
-from measure.results import Pose
+from measure import MarkShape, Pose, polygon
+from pipeline import read_project
 from pipeline.archive.measurement import picture_sizes_mm
 from pipeline.archive.results_integrity import add_digests
 from pipeline.archive.schema import Schema, opened
@@ -29,7 +29,6 @@ from pipeline.archive.status import archive_status
 from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict
 from pipeline.cli import run
 from pipeline.files.camera_file import CameraFile
-from pipeline.files.project_file import read_project
 from pipeline.measuring.roll import CheckedScan, check_scans
 from pipeline.measuring.scan_measurement import MeasuredFile, measure_file
 from pipeline.measuring.scan_task import Measure, ScanTask

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from real_data import DATA, needs
 
-from measure.scans.opening import open_scan
+from measure import open_scan
 from measure.targets.disk_detection import DiskSearch, disk_candidates
 from measure.targets.ring_codes import RingCode, read_code
 from measure.targets.sheets import Dots, Naming, name_dots

@@ -1,5 +1,6 @@
-"""The command line on right and on wrong input: one message, the right code, earlier results untouched."""
+"""The command line on right and wrong input, what it suggests next, and the time that it expects."""
 
+import io
 import json
 import multiprocessing
 import os
@@ -12,16 +13,25 @@ import time
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import tifffile
-from kept_scans import content
+from projects import scan_content
+from rich.console import Console
 from studies import parametrize_with_studies
 
 from pipeline import stages
+from pipeline.archive.verdicts import Verdict
 from pipeline.cli import run
+from pipeline.commands.shared import command_step, print_next, summary_steps
+from pipeline.progress import Reporter, time_left
+from pipeline.report.verdict import ReportVerdict
+from pipeline.summary import Summary
+from pipeline.terminal import PlainConsole
+from pipeline.text.wording import count_sentence
 from pipeline.workers import worker_pool
 
 SAID = pytest.CaptureFixture[str]
@@ -42,7 +52,7 @@ def rewritten_scans(folder: Path, pattern: str) -> None:
 def results(folder: Path) -> dict[str, bytes]:
     """Everything that a run writes."""
     files = [folder / "comparator.csv", *sorted((folder / "out").iterdir())]
-    return {file.name: content(file) for file in files if not file.name.endswith(("-wal", "-shm"))}
+    return {file.name: scan_content(file) for file in files if not file.name.endswith(("-wal", "-shm"))}
 
 
 def no_project(folder: Path) -> None:
@@ -368,3 +378,96 @@ def test_a_reader_that_stops_reading_does_not_change_the_exit_code(arguments: li
     done = subprocess.run(command, stdout=writing, stderr=writing, check=False)
     os.close(writing)
     assert done.returncode == code
+
+
+PROJECT = Path("my project.toml")
+
+
+def summary(*files: str, adjustment: Any = None, parts: int = 0, frames: Any = None, **verdicts: int) -> Any:
+    """One that has what the steps depend on."""
+    counts = {Verdict[name]: count for name, count in verdicts.items()}
+    paths = {word: Path("out", word) for word in files}
+    return Summary(
+        ReportVerdict("look", "", (), ()),
+        frames or {"a": {"measured": 4}},
+        {},
+        adjustment,
+        None,
+        paths,
+        verdicts=counts,
+        parts=parts,
+    )
+
+
+def adjustment(is_calibrated: bool) -> Any:
+    return SimpleNamespace(converged=True, cameras={"a": SimpleNamespace(is_calibrated=is_calibrated)})
+
+
+@pytest.mark.parametrize(
+    ("given", "steps"),
+    [
+        (summary("measurement"), ["reseau run 'my project.toml'"]),
+        (summary("measurement", FAILED=2), ["reseau measure 'my project.toml' --retry", "reseau run"]),
+        (summary("measurement", OLD=1, WAITING=2), ["reseau measure 'my project.toml'  # 3 scans", "reseau run"]),
+        (summary("adjustment", "covariance", adjustment=adjustment(True)), ["reseau check", "reseau report"]),
+        (summary("report", adjustment=adjustment(True)), ["open out/report", "reseau export"]),
+        (summary("report", adjustment=adjustment(False), LOOK=1, POOR=1), ["open", "reseau review", "reseau resample"]),
+        (summary("measurement", frames={"a": {"absent": 4}}, POOR=1), ["reseau cameras --scan SCAN", "reseau review"]),
+        (summary("part 1 of 8", parts=8), ["reseau merge 'my project.toml' out/measurement.*-of-8.db"]),
+    ],
+)
+def test_a_summary_calls_for_what_mends_it_then_for_the_next_stage(given: Any, steps: list[str]) -> None:
+    found = list(summary_steps(PROJECT, given))
+    assert len(found) == len(steps)
+    for step, begins in zip(found, steps, strict=True):
+        assert step.startswith(begins)
+
+
+def test_three_steps_at_most_are_printed_each_once_and_none_next_to_json(capsys: pytest.CaptureFixture[str]) -> None:
+    print_next(False, "a", "a", "b", command_step("run", PROJECT, why="c"), "d")
+    assert capsys.readouterr().out == "Next: a\nNext: b\nNext: reseau run 'my project.toml'  # c\n"
+    print_next(True, "a")
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [
+        (0.2, "about a minute left"),
+        (110.0, "about 2 minutes left"),
+        (3000.0, "about 50 minutes left"),
+        (9000.0, "about 2.5 hours left"),
+    ],
+)
+def test_the_rest_takes_so_long(seconds: float, words: str) -> None:
+    assert time_left(seconds) == words
+
+
+def lines(quiet: bool = False, terminal: bool = False) -> list[str]:
+    text = io.StringIO()
+    console = PlainConsole(file=text, width=200, force_terminal=terminal, quiet=quiet)
+    with Reporter(console).stage("measured") as count:
+        for done in range(1, 31):
+            count("scans, 2 of 5 groups", done, 30, left_s=200.0)
+    return text.getvalue().splitlines()
+
+
+def test_thirty_scans_are_two_lines_where_there_is_no_terminal() -> None:
+    """The first and the last: between them lines come at intervals only."""
+    assert lines() == [
+        "measured 1 of 30 scans, 2 of 5 groups, about 3 minutes left",
+        "measured 30 of 30 scans, 2 of 5 groups",
+    ]
+
+
+def test_a_terminal_has_one_line_and_who_is_quiet_none() -> None:
+    assert any("measured 30 of 30 scans, 2 of 5 groups" in line for line in lines(terminal=True))
+    assert lines(quiet=True) == lines(quiet=True, terminal=True) == []
+    assert Reporter(quiet=True)._console.quiet
+    assert isinstance(Reporter()._console, Console)
+
+
+def test_scans_are_counted_in_one_form() -> None:
+    rest = {"without a camera": 3, "broken": 0}
+    assert count_sentence("can be measured", 15, 18, rest) == "15 of 18 scans can be measured (3 without a camera)"
+    assert count_sentence("measured", 1, 1, {}) == "1 of 1 scan measured"

@@ -1,17 +1,28 @@
-"""`reseau convert`, from camera files and from adjustments with their covariance."""
+"""Lenses converted, compared, and written as certificates."""
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from networks import lens_network
-from simulated_project import write_project
+from projects import write_network_project
 
+from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens import Distortion, Lens
+from pipeline import read_adjustment, read_camera
+from pipeline.adjusting.compare_stage import _labels
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
-from pipeline.files.camera_file import read_camera
-from pipeline.results.adjustment_file import read_adjustment
+from pipeline.exchange.certificate import fit, read_certificate
+from pipeline.provenance import hash_file
+from pipeline.report.lens import ANGLES_DEG, certificate
+from pipeline.results.comparison_file import read_comparison
 from pipeline.results.covariance_file import read_covariance
+from pipeline.results.record_json import plain_json
 
 CAMERA = """\
 name = "C"
@@ -47,7 +58,7 @@ def test_a_camera_file_becomes_opencvs(tmp_path: Path, capsys: pytest.CaptureFix
 
 def test_an_adjustment_keeps_its_covariance(tmp_path: Path) -> None:
     """The converted file compares with its source as no drift, and comes back to it when converted back."""
-    project = write_project(lens_network("australis", np.random.default_rng(7)), tmp_path)
+    project = write_network_project(lens_network("australis", np.random.default_rng(7)), tmp_path)
     run(["adjust", str(project)])
     first = tmp_path / "out" / "adjustment.json"
     there, back = tmp_path / "brown", tmp_path / "back"
@@ -74,7 +85,7 @@ def test_an_adjustment_keeps_its_covariance(tmp_path: Path) -> None:
 
 @pytest.mark.study
 def test_a_converted_calibration_is_taken_in(tmp_path: Path) -> None:
-    project = write_project(lens_network("australis", np.random.default_rng(7)), tmp_path)
+    project = write_network_project(lens_network("australis", np.random.default_rng(7)), tmp_path)
     run(["adjust", str(project)])
     assert run(["convert", str(tmp_path / "out" / "adjustment.json"), "brown", str(tmp_path / "brown")]) == DONE
     text = (tmp_path / "camera.toml").read_text(encoding="utf-8").replace('"australis"', '"brown"')
@@ -101,3 +112,193 @@ def test_what_does_not_fit_is_reported(tmp_path: Path, capsys: pytest.CaptureFix
     camera.write_text(CAMERA.replace("frame_mm = [36.0, 24.0]\n", ""), encoding="utf-8")
     assert run(["convert", str(camera), "opencv", str(tmp_path / "out")]) == WRONG_INPUT
     assert "has no frame_mm" in capsys.readouterr().err
+
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def shift_parameter(project: Path, name: str, change_mm: float) -> Path:
+    """A copy of the project's calibration whose principal distance is another."""
+    copy = project.parent / name / "adjustment.json"
+    copy.parent.mkdir()
+    content = json.loads((project / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    (camera,) = content["cameras"].values()
+    camera["principal_distance_mm"]["value"] += change_mm
+    copy.write_text(json.dumps(content), encoding="utf-8")
+    with np.load(project / "out" / "adjustment.npz") as arrays:
+        whole = dict(arrays)
+    whole["fingerprint"] = np.array(hash_file(copy))
+    whole["values"] = whole["values"] + change_mm * np.char.endswith(whole["names"], ".c")
+    np.savez(copy.with_suffix(".npz"), **whole)
+    return copy
+
+
+def test_an_unchanged_camera_and_a_changed_one(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first = project / "out" / "adjustment.json"
+    assert run(["compare", str(first), str(shift_parameter(project, "same", 0.0))]) == 0
+    output = " ".join(capsys.readouterr().out.split())
+    assert output.startswith("no drift ")
+    assert "same less out" in output
+    assert "were adjusted from the same measured marks: they are not independent" in output
+    out = project / "compared"
+    assert run(["compare", str(first), str(shift_parameter(project, "later", 0.5)), "--out", str(out)]) == 1
+    output = capsys.readouterr().out
+    assert output.startswith("drift\n")
+    (largest,) = re.findall(r"Fiducial marks after a similarity: at most ([\d.]+) µm", output)
+    assert float(largest) < 0.2  # of their 0.3 um: c and the marks are hardly tied
+    drawn = ElementTree.parse(out / "compare.svg").getroot()
+    assert len(drawn.findall(f".//{SVG}ellipse")) == 49  # one a place of the field
+    content = json.loads((out / "compare.json").read_text(encoding="utf-8"))
+    assert plain_json(read_comparison(out / "compare.json")) == content
+    (difference,) = content["differences"]
+    corner = np.array(difference["field_um"])[np.abs(content["places_mm"]).sum(axis=1).argmax()]
+    assert content["verdict"] == "drift"
+    # A ray at 25 mm of 60 moves by 0.5 / 60 of that, less what a change of the point or the lens would not take up.
+    assert np.hypot(*corner) == pytest.approx(np.hypot(25.0, 25.0) * 0.5 / 60.3 * 1e3, rel=0.1)
+
+
+def test_a_series_has_a_trend(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    paths = [str(shift_parameter(project, f"y{year}", 0.02 * (year - 1950))) for year in (1952, 1958, 1961, 1970)]
+    assert run(["compare", *paths, "--times", "1952,1958,1961,1970", "--json"]) == 1
+    content = json.loads(capsys.readouterr().out)
+    assert content["trend"]["probability"] < 1e-6
+    assert content["probability"] <= 2 * content["trend"]["probability"]
+    corner = np.array(content["trend_um"])[np.abs(content["places_mm"]).sum(axis=1).argmax()]
+    assert np.hypot(*corner) == pytest.approx(np.hypot(25.0, 25.0) * 0.36 / 60.3 * 1e3, rel=0.1)  # over 18 years
+    assert [each["time"] for each in content["calibrations"]] == [1952.0, 1958.0, 1961.0, 1970.0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--camera", "metric 6 x 7"], "holds no camera 'metric 6 x 7'"),
+        (["--times", "1952;1958"], "are not numbers with commas"),
+        (["--times", "1958,1952"], "in rising order"),
+    ],
+)
+def test_what_it_refuses(arguments: list[str], words: str, project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    paths = [str(project / "out" / "adjustment.json"), str(shift_parameter(project, "same", 0.0))]
+    assert run(["compare", *paths, *arguments]) == 2
+    assert words in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_the_covariance_of_another_adjustment_is_refused(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = shift_parameter(project, "other", 0.1)
+    other.with_suffix(".npz").write_bytes((project / "out" / "adjustment.npz").read_bytes())
+    assert run(["compare", str(project / "out" / "adjustment.json"), str(other)]) == 2
+    assert "is of another adjustment than" in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_a_file_named_twice_is_refused(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = str(project / "out" / "adjustment.json")
+    assert run(["compare", path, path]) == 2
+    assert "is named twice" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("files", "labels"),
+    [
+        (("a/out/adjustment.json", "b/out/adjustment.json"), ["a", "b"]),
+        (("1952/adjustment.json", "1959/adjustment.json"), ["1952", "1959"]),
+        (("a/x/adjustment.json", "b/x/adjustment.json", "b/y/adjustment.json"), ["a/x", "b/x", "b/y"]),
+        (("out/1952.json", "out/1959.json"), ["1952", "1959"]),
+    ],
+)
+def test_calibrations_are_named_by_what_differs_in_their_paths(files: tuple[str, ...], labels: list[str]) -> None:
+    assert _labels([Path(file) for file in files]) == labels
+
+
+C, K3, K5 = 153.02, 2.0e-8, -1.5e-12
+NAMES = parameter_names("torlegard")
+SIGMAS = {"c": 0.01, "k3": 4e-9, "k5": 3e-13}
+LENS = Lens(
+    Distortion("torlegard"),
+    np.array([C, 0.1, -0.2]),
+    np.array([{"k3": K3, "k5": K5, "p1": 3e-7}.get(name, 0.0) for name in NAMES]),
+    np.diag([SIGMAS.get(name, 0.0) ** 2 for name in ("c", "x0", "y0", *NAMES)]),
+)
+REACH_MM = 140.0
+
+
+def distortion_um(c: float, angle_deg: Any, lens: tuple[float, float, float] = (C, K3, K5)) -> Any:
+    """By fixed-point iteration, of the lens at angles against c."""
+    equivalent, k3, k5 = lens
+    tangent = np.tan(np.radians(angle_deg))
+    r = equivalent * tangent
+    for _ in range(20):
+        r = equivalent * tangent + k3 * r**3 + k5 * r**5
+    return 1000.0 * (r - c * tangent)
+
+
+def balanced(lens: tuple[float, float, float]) -> float:
+    """By bisection over a dense table."""
+    largest = REACH_MM - lens[1] * REACH_MM**3 - lens[2] * REACH_MM**5
+    angles = np.degrees(np.arctan(np.linspace(0.0, largest / lens[0], 800)))
+    own = distortion_um(0.0, angles, lens)
+    low, high = lens[0] - 1.0, lens[0] + 1.0
+    for _ in range(60):
+        middle = (low + high) / 2.0
+        off = own - 1000.0 * middle * np.tan(np.radians(angles))
+        low, high = (middle, high) if off.max() + off.min() > 0.0 else (low, middle)
+    return (low + high) / 2.0
+
+
+def test_the_table_is_that_of_the_lens() -> None:
+    view = certificate(LENS, REACH_MM)
+    calibrated = balanced((C, K3, K5))
+    assert view.calibrated[0] == pytest.approx(calibrated, abs=2e-5)
+    assert view.equivalent[0] == pytest.approx(C, abs=2e-5)
+    assert view.equivalent[1] == pytest.approx(SIGMAS["c"], rel=0.05)
+    assert [row.angle_deg for row in view.rows] == list(ANGLES_DEG)
+    for row in view.rows:
+        there = distortion_um(calibrated, row.angle_deg)
+        assert row.radial[0] == pytest.approx(there, abs=0.01)
+
+
+def test_its_standard_deviations_are_those_of_lenses_drawn_at_random() -> None:
+    rng = np.random.default_rng(2)
+    drawn = [rng.normal((C, K3, K5), list(SIGMAS.values())) for _ in range(300)]
+    view = certificate(LENS, REACH_MM)
+    distances = [balanced((float(c), float(k3), float(k5))) for c, k3, k5 in drawn]
+    assert view.calibrated[1] == pytest.approx(np.std(distances), rel=0.15)
+    for row in view.rows[1:]:
+        angle = row.angle_deg
+        values = [
+            distortion_um(own, angle, (float(c), float(k3), float(k5)))
+            for own, (c, k3, k5) in zip(distances, drawn, strict=True)
+        ]
+        assert row.radial[1] == pytest.approx(np.std(values), rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("c", "k3", "k5", "reach_mm"), [(C, K3, K5, REACH_MM), (60.3344, -5.991e-6, 1.995e-9, 33.0), (210.4, K3, K5, 155.0)]
+)
+def test_the_printed_table_gives_the_lens_back(tmp_path: Path, c: float, k3: float, k5: float, reach_mm: float) -> None:
+    """Typed as a certificate, the camera comes out again, to the tenths of a micrometre that are printed."""
+    powers = np.array([{"k3": k3, "k5": k5}.get(name, 0.0) for name in NAMES])
+    lens = replace(LENS, interior=np.array([c, 0.0, 0.0]), parameters=powers, covariance=1e-4 * LENS.covariance)
+    view = certificate(lens, reach_mm)
+    (tmp_path / "c.toml").write_text(
+        f"calibrated_principal_distance_mm = {view.calibrated[0]:.4f}\n"
+        f"angle_deg = {[row.angle_deg for row in view.rows]}\n"
+        f"radial_um = {[round(row.radial[0], 1) for row in view.rows]}\n",
+        encoding="utf-8",
+    )
+    fitted = fit(read_certificate(tmp_path / "c.toml"))
+    assert fitted.equivalent_mm == pytest.approx(c, abs=0.002)
+    at = np.linspace(0.2, 1.0, 5) * reach_mm
+    gone = (fitted.equivalent_mm - c) * at / c + (fitted.coefficients[0] - k3) * at**3
+    gone += (fitted.coefficients[1] - k5) * at**5 + fitted.coefficients[2] * at**7
+    assert np.abs(gone).max() < 0.001
+
+
+def test_a_narrow_camera_has_angles_of_its_own() -> None:
+    view = certificate(replace(LENS, interior=np.array([600.0, 0.0, 0.0])), 140.0)
+    angles = [row.angle_deg for row in view.rows]
+    assert len(angles) == 6
+    assert angles[-1] == pytest.approx(np.degrees(np.arctan(140.0 / 600.0)), abs=0.1)
+
+
+def test_the_report_shows_it(finished: tuple[Path, int]) -> None:
+    text = (finished[0] / "out" / "report.html").read_text(encoding="utf-8")
+    assert "The calibrated principal distance" in text

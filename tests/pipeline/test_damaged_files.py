@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from damaged_project import FILES, copied, damaged, make_project
+from projects import FILES, copied, damaged, make_table_project
 
 from pipeline.cli import run
 from pipeline.text.csv_table import csv_line, read_csv
@@ -28,7 +28,7 @@ LONGEST_S, LONGEST_MESSAGE, MOST_KB = 20.0, 4000, 1_000_000
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sound")
-    make_project(folder)
+    make_table_project(folder)
     return folder
 
 

@@ -9,12 +9,12 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from pipeline import InputError
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
 from pipeline.design.alternatives import alternatives, gains
 from pipeline.design.expected import alone, expect, rms
 from pipeline.design.setup import planned_network, scene_setup
 from pipeline.design.sweeps import Swept, Variations, over_layouts, sweep
-from pipeline.errors import InputError
 from pipeline.rendered.design_table import Sweep
 from pipeline.rendered.scene_file import read_scene
 

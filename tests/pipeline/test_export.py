@@ -14,7 +14,10 @@ import cv2
 import numpy as np
 import pyarrow.parquet
 import pytest
-from exported_project import (
+from foreign_readers import asp_px, colmap_px, metashape_mm, micmac_affine, micmac_px, opencv_px, values
+from networks import affine, rotation, simulated
+from numpy.typing import NDArray
+from projects import (
     IMAGES,
     LENS,
     MIRRORED,
@@ -28,18 +31,15 @@ from exported_project import (
     make_project,
     scan_px,
 )
-from foreign_readers import asp_px, colmap_px, metashape_mm, micmac_affine, micmac_px, opencv_px, values
-from networks import affine, rotation, simulated
-from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
-from adjust.functional_model.projection import LineOfSight
+from adjust import LineOfSight
+from pipeline import read_project
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
 from pipeline.exchange import asp_format, colmap_format, micmac_format, mmvii_format, opencv_format, pinhole
 from pipeline.exchange.block import read_block
 from pipeline.exchange.formats import FORMATS
 from pipeline.exchange.geojson_format import lon_lat
-from pipeline.files.project_file import read_project
 
 Array = NDArray[np.float64]
 

@@ -1,14 +1,30 @@
-"""Frames that show fiducial marks alone: their film transformations are adjusted, and nothing else is claimed."""
+"""Frames of fiducial marks alone, the form of their fiducials; snooping, robust weights and components by files."""
 
 import json
 import re
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from networks import field_points, simulated
+from numpy.typing import NDArray
+from projects import write_network_project as write_network
+from reference_cases import CASES
+from scipy.stats import chi2
+from studies import parametrize_with_studies
+from test_adjust_stage import write_project
 
+from adjust import Adjustment, Camera, Fiducial, Image, Network, Parameter, Prior, adjust, approximate
+from adjust.problem.estimates import adjusted_image
+from adjust.problem.observations import ObservationKind, Observations
+from pipeline import InputError, read_project
 from pipeline.cli import run
+from pipeline.report.fiducials import Figure, figure_of_films
+from pipeline.results.adjustment_record import FiducialRecord, GivenQuantity, Quantity
+from pipeline.results.covariance_file import read_own_covariance
 
 GIVEN = {"1": (-106.0, 106.0), "2": (106.0, 106.0), "3": (106.0, -106.0), "4": (-106.0, -106.0), "5": (0.0, 112.0)}
 AFFINE = np.array([[1.001, 0.02], [-0.021, 0.999]])
@@ -22,7 +38,7 @@ def comparator_mm(seed: int, count: int = 5) -> np.ndarray:
     return np.linalg.solve(AFFINE, (camera - SHIFT).T).T + noise
 
 
-def write_project(folder: Path, marks: dict[str, int], camera: str = "", extra: tuple[str, ...] = ()) -> Path:
+def write_fiducials_project(folder: Path, marks: dict[str, int], camera: str = "", extra: tuple[str, ...] = ()) -> Path:
     """Frames by name with so many fiducials each, and further lines of comparator.csv."""
     lines = ['name = "K"', camera]
     for id_, (x, y) in GIVEN.items():
@@ -44,7 +60,7 @@ def read_result(project: Path) -> dict[str, Any]:
 
 def test_film_transformations_without_an_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Against the linear least-squares fit, values and standard deviations; no orientation, no calibration."""
-    project = write_project(tmp_path, {"a": 5, "b": 5, "c": 3})
+    project = write_fiducials_project(tmp_path, {"a": 5, "b": 5, "c": 3})
     assert run(["run", str(project)]) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert "Film transformations from 13 marks in 3 frames; no frame is oriented, and no camera calibrated" in printed
@@ -79,7 +95,7 @@ def test_film_transformations_without_an_object(tmp_path: Path, capsys: pytest.C
 
 
 def test_a_frame_without_enough_targets_keeps_its_film_transformation(tmp_path: Path) -> None:
-    project = write_project(
+    project = write_fiducials_project(
         tmp_path,
         {"a": 5, "b": 2},
         "principal_distance_mm = 153.0",
@@ -99,14 +115,14 @@ def test_a_frame_without_enough_targets_keeps_its_film_transformation(tmp_path: 
 
 
 def test_too_few_fiducials_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["adjust", str(write_project(tmp_path, {"a": 2}))]) == 2
+    assert run(["adjust", str(write_fiducials_project(tmp_path, {"a": 2}))]) == 2
     message = " ".join(capsys.readouterr().err.split())
     assert "'a' shows the most fiducials, 2, and its affine transformation needs 3" in message
 
 
 def test_the_film_transformation_can_be_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """No lens to choose, but the kind of film: these marks have two scales that differ by 0.2 %."""
-    assert run(["choose", str(write_project(tmp_path, {"a": 5, "b": 5}))]) == 0
+    assert run(["choose", str(write_fiducials_project(tmp_path, {"a": 5, "b": 5}))]) == 0
     assert "The data ask for affine, no distortion" in " ".join(capsys.readouterr().out.split())
 
 
@@ -114,7 +130,7 @@ def test_the_form_of_the_fiducials_is_reported_where_they_are_estimated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Marks with a datum of 1 mm: no figure of mm is left in the form, and the dashes are gone."""
-    project = write_project(tmp_path, {f"f{i}": 5 for i in range(60)})
+    project = write_fiducials_project(tmp_path, {f"f{i}": 5 for i in range(60)})
     camera = tmp_path / "camera.toml"
     camera.write_text(camera.read_text(encoding="utf-8").replace("sigma_mm = 0\n", "sigma_mm = 1\n"), encoding="utf-8")
     assert run(["run", str(project)]) == 0
@@ -141,7 +157,7 @@ def test_the_form_of_the_fiducials_is_reported_where_they_are_estimated(
 def test_corrections_are_to_what_the_camera_file_rests_on(
     source: str, given_by: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    project = write_project(tmp_path, {"a": 5, "b": 5})
+    project = write_fiducials_project(tmp_path, {"a": 5, "b": 5})
     camera = tmp_path / "camera.toml"
     text = camera.read_text(encoding="utf-8").replace("sigma_mm = 0\n", "sigma_mm = 0.01\n")
     camera.write_text(f"{text}{source}", encoding="utf-8")
@@ -153,7 +169,7 @@ def test_a_single_frame_with_a_mere_datum_has_a_priori_sigmas(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """sigma0 was 0.003 here, and multiplied the datum's 1 mm: now the shift is known to 1 mm over the root of 5."""
-    project = write_project(tmp_path, {"a": 5})
+    project = write_fiducials_project(tmp_path, {"a": 5})
     camera = tmp_path / "camera.toml"
     camera.write_text(camera.read_text(encoding="utf-8").replace("sigma_mm = 0\n", "sigma_mm = 1\n"), encoding="utf-8")
     run(["adjust", str(project)])
@@ -168,7 +184,7 @@ def test_a_single_frame_with_a_mere_datum_has_a_priori_sigmas(
 
 def test_one_frame_within_its_certificate_needs_no_attention(tmp_path: Path) -> None:
     """Four calibrated fiducials of one frame, given to 10 µm and measured to 4 µm: nothing speaks against any."""
-    project = write_project(tmp_path, {"a": 4})
+    project = write_fiducials_project(tmp_path, {"a": 4})
     camera = tmp_path / "camera.toml"
     camera.write_text(camera.read_text(encoding="utf-8").replace("sigma_mm = 0", "sigma_mm = 0.01"), encoding="utf-8")
     assert run(["run", str(project)]) == 0
@@ -177,3 +193,244 @@ def test_one_frame_within_its_certificate_needs_no_attention(tmp_path: Path) -> 
     wrong = ",".join((name, id_, kind, str(float(x) + 0.4), *rest))  # 0.2 mm and more at each mark of an affine fit
     (tmp_path / "comparator.csv").write_text("\n".join([rows[0], wrong, *rows[2:]]) + "\n", encoding="utf-8")
     assert run(["run", str(project)]) == 1
+
+
+Array = NDArray[np.float64]
+
+GIVEN_MM = np.array(
+    [(-106, 106), (106, 106), (106, -106), (-106, -106), (0, 112), (112, 0), (0, -112), (-112, 0)], dtype=np.float64
+)
+IDS = tuple("12345678")
+MARK_SIGMA_MM, FRAMES, RUNS = 0.004, 10, 20
+TRUE_MM = GIVEN_MM + np.random.default_rng(0).normal(0.0, 0.006, GIVEN_MM.shape)
+
+
+class Known:
+    """The covariance of an adjustment, as the report has it from its file."""
+
+    def __init__(self, adjustment: Adjustment) -> None:
+        self.adjustment = adjustment
+
+    def select(self, names: Iterable[str]) -> Array:
+        return self.adjustment.sigma0**2 * self.adjustment.cofactor_of(list(names))
+
+
+def stored(result: Adjustment) -> dict[str, FiducialRecord]:
+    """What adjustment.json has of the fiducials."""
+
+    def quantity(id: str, axis: str, given: float) -> Quantity:
+        return Quantity(result.value(f"FID.K.{id}.{axis}"), 0.0, GivenQuantity(given, 1.0))
+
+    return {
+        id: FiducialRecord(quantity(id, "x", x), quantity(id, "y", y), 0.0)
+        for id, (x, y) in zip(IDS, GIVEN_MM.tolist(), strict=True)
+    }
+
+
+def form(kind: str, seed: int) -> Figure:
+    """Frames that bear little of what such a film can, with noise."""
+    rng = np.random.default_rng(seed)
+    names = tuple(f"f{i}" for i in range(FRAMES))
+    turn = rng.uniform(-0.5, 0.5, FRAMES)
+    linear = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]).transpose(2, 0, 1)
+    if kind != "similarity":
+        linear = linear + rng.normal(0.0, 1e-3, linear.shape)
+    xy_mm = TRUE_MM @ linear.transpose(0, 2, 1) + rng.normal(0.0, 5.0, (FRAMES, 1, 2))
+    if kind == "projective":
+        xy_mm /= 1.0 + np.einsum("nki,ni->nk", xy_mm, rng.normal(0.0, 1e-5, (FRAMES, 2)))[..., None]
+    xy_mm = xy_mm + rng.normal(0.0, MARK_SIGMA_MM, xy_mm.shape)
+    marks = {id: Fiducial(Prior(x, 1.0), Prior(y, 1.0)) for id, (x, y) in zip(IDS, GIVEN_MM.tolist(), strict=True)}
+    count = FRAMES * len(IDS)
+    kinds: tuple[ObservationKind, ...] = tuple("fiducial" for _ in range(count))
+    network = Network(
+        (Camera("K", None, None, None, fiducials=marks),),
+        tuple(Image(name, "K", kind) for name in names),
+        (),
+        Observations(
+            tuple(np.repeat(names, len(IDS)).tolist()),
+            IDS * FRAMES,
+            kinds,
+            xy_mm.reshape(-1, 2),
+            np.tile(MARK_SIGMA_MM**2 * np.eye(2), (count, 1, 1)),
+        ),
+    )
+    result = adjust(network, approximate(network))
+    films = {name: adjusted_image(result, name).film for name in names}
+    found = figure_of_films("K", stored(result), Known(result), films)  # type: ignore[arg-type]
+    assert found is not None
+    return found
+
+
+@pytest.mark.study
+@parametrize_with_studies(("kind", "taken_up"), [("similarity", 4), ("affine", 6), ("projective", 8)], quick=(1,))
+def test_the_sigmas_of_the_form_hold_against_realisations(kind: str, taken_up: int) -> None:
+    found = [form(kind, seed) for seed in range(RUNS)]
+    changes = np.array([each.change_um.ravel() for each in found])
+    claimed = np.mean([each.covariance_um2 for each in found], axis=0)
+    assert np.linalg.matrix_rank(claimed, tol=1e-3 * np.trace(claimed)) == 2 * len(IDS) - taken_up
+    # What is left of the truth's own form when all that films take up is gone, and the noise about it.
+    off = changes - changes.mean(axis=0)
+    free = RUNS - 1
+    ratio = (off**2).sum(axis=0) / np.diag(claimed)
+    assert ratio.min() > chi2.ppf(1e-4 / len(ratio), free)
+    assert ratio.max() < chi2.ppf(1 - 1e-4 / len(ratio), free)
+    together = (off**2).sum() / np.trace(claimed) / free
+    assert together == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / free / (2 * len(IDS) - taken_up)))
+    assert np.sqrt(np.diag(claimed)).max() < 1.1e3 * MARK_SIGMA_MM / np.sqrt(FRAMES)
+    assert not found[0].distances  # no such film keeps any
+
+
+def test_the_form_is_that_of_the_truth() -> None:
+    """Against the truth less its own best affine transformation, by least squares."""
+    found = form("affine", 99)
+    design = np.column_stack([np.ones(len(IDS)), GIVEN_MM])
+    offset = TRUE_MM - GIVEN_MM
+    left_um = 1e3 * (offset - design @ np.linalg.lstsq(design, offset)[0])
+    sigma_um = np.sqrt(np.diag(found.covariance_um2)).reshape(-1, 2)
+    assert np.abs((found.change_um - left_um) / sigma_um).max() < 4.0
+    assert np.abs(left_um).max() > 5.0
+
+
+CASE = "i_five_images_affine_reduced"
+POINT = "7"
+
+
+def spoilt_project(folder: Path, adjust: str) -> Path:
+    """The reference network with one target wrong by 0.1 mm."""
+    case: dict[str, Any] = json.loads((CASES / f"{CASE}.json").read_text(encoding="utf-8"))
+    row = next(row for row in case["input"]["obs"] if str(row[1]) == POINT)
+    row[2] += 0.1
+    write_project(case, folder)
+    file = folder / "project.toml"
+    file.write_text(file.read_text(encoding="utf-8") + adjust + "\n", encoding="utf-8")
+    return file
+
+
+@parametrize_with_studies(
+    ("adjust", "removed"),
+    [("", False), ("snooping = true\nvariance_components = true", True), ('robust = "igg3"', True)],
+)
+def test_a_gross_error_is_named_in_file_and_report(adjust: str, removed: bool, tmp_path: Path) -> None:
+    project = spoilt_project(tmp_path, adjust)
+    assert run(["adjust", str(project)]) == 1
+    result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    (suspect,) = result["suspects"]
+    name = f"target {POINT} in image {suspect['owner']}"
+    assert (suspect["name"], suspect["removed"]) == (name, removed)
+    assert suspect["error"][0] == pytest.approx(0.1, abs=0.02)
+    row = next(row for row in result["residuals"] if (row["image"], row["point"]) == (suspect["owner"], POINT))
+    assert (row["weight"] < 1e-9) is removed
+    assert row["smallest_error_x_um"] > 0.0
+    outer = {each["parameter"]: each for each in result["reliability"]["outer"]}
+    assert outer["IO.C.c"]["cause"]
+    given = {each["name"]: each for each in result["reliability"]["given"]}
+    assert given["given fiducial 3 x (camera C)"]["smallest_error"] > 0.0
+    assert run(["report", str(project)]) == 1
+    report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert f"{'Left out as gross errors' if removed else '1 gross error suspected'}: {name} (w = " in report
+    assert "of an undetected error in" in report
+    if "variance" in adjust:
+        assert result["variance_sigmas"].keys() == {"target", "fiducial"}
+        assert "Variance components: what the variances" in report
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("adjust", ["", "snooping = true\n"])
+def test_a_control_point_with_exchanged_coordinates_is_named(adjust: str, tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    network, _ = simulated(rng, points=field_points(rng, 15), fiducial_sigma=0.01, point_sigma=0.05)
+    project = write_network(network, tmp_path)
+    project.write_text(project.read_text(encoding="utf-8") + adjust, encoding="utf-8")
+    file = tmp_path / "points.csv"
+    lines = file.read_text(encoding="utf-8").splitlines()
+    name, x, y, *rest = lines[1].split(",")
+    file.write_text("\n".join([lines[0], ",".join([name, y, x, *rest]), *lines[2:]]) + "\n", encoding="utf-8")
+    assert run(["adjust", str(project)]) == 1
+    result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    left_out = {suspect["name"] for suspect in result["suspects"] if suspect["removed"]}
+    if adjust:
+        assert left_out == {f"control point {name} X", f"control point {name} Y"}
+        assert result["sigma0"] < 1.2
+    else:
+        assert left_out == set()
+        assert result["warnings"][0].startswith(f"Control point {name} is not where it is given")
+        assert "X and Y look exchanged." in result["warnings"][0]
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ('robust = "tukey"', "possible are"),
+        ('variance_components = ["targets"]', "names 'targets'; possible are target, tie, fiducial"),
+        ("robust = true\nsnooping = true", "Set one of the two to false"),
+    ],
+)
+def test_wrong_keys_are_reported(line: str, words: str, tmp_path: Path) -> None:
+    project = spoilt_project(tmp_path, line)
+    with pytest.raises(InputError, match=words):
+        read_project(project)
+
+
+@pytest.mark.study
+def test_an_image_without_orientation_is_left_out_and_named(tmp_path: Path) -> None:
+    """The targets of one of four frames have one another's numbers: the other three are adjusted."""
+    network, _ = simulated(np.random.default_rng(1), points=field_points(np.random.default_rng(2), 15))
+    observed = network.observations
+    rows = [
+        i
+        for i, (image, kind) in enumerate(zip(observed.image, observed.kind, strict=True))
+        if (image, kind) == ("f2", "target")
+    ]
+    points = list(observed.point)
+    for row, other in zip(rows, np.random.default_rng(4).permutation(rows).tolist(), strict=True):
+        points[row] = observed.point[other]
+    project = write_network(replace(network, observations=replace(observed, point=tuple(points))), tmp_path)
+    assert run(["adjust", str(project)]) == 1
+    result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    assert result["converged"]
+    assert sorted(result["images"]) == ["f0", "f1", "f3"]
+    assert result["left_out"]["f2"].startswith("image f2 sees 15 known points, but no orientation")
+    assert any(warning.startswith("Left out of the adjustment: image f2") for warning in result["warnings"])
+    assert run(["check", str(project)]) in (0, 1)
+    assert run(["report", str(project)]) == 1
+    assert "Left out of the adjustment: image f2" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
+@parametrize_with_studies(("frame_mm", "level"), [(228.0, 0), (600.0, 1)])
+def test_a_lens_known_in_the_middle_alone_needs_attention(frame_mm: float, level: int, tmp_path: Path) -> None:
+    """Targets within some 110 mm of the principal point: most of a picture of 228 mm, a quarter of one of 600 mm."""
+    free = {"k3": np.inf, "k5": np.inf}
+    network, _ = simulated(np.random.default_rng(1), points=field_points(np.random.default_rng(2), 40), free=free)
+    project = write_network(network, tmp_path)
+    camera = tmp_path / "camera.toml"
+    camera.write_text(camera.read_text(encoding="utf-8").replace("228.0", str(frame_mm)), encoding="utf-8")
+    assert run(["adjust", str(project)]) == level
+    known = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))["cameras"]["K"]["lens_known"]
+    assert (known["share"] < 0.5) is bool(level)
+    assert known["corner_sigma_um"] > known["sigma_um"] > 0.0
+    # By dr = k3 r³ + k5 r⁵ and the covariance that stands in adjustment.npz.
+    covariance = read_own_covariance(tmp_path / "out" / "adjustment.json")
+    of_terms = covariance.select([Parameter.interior("K", each) for each in ("k3", "k5")])
+    for radius, sigma in (("radius_mm", "sigma_um"), ("corner_mm", "corner_sigma_um")):
+        by_terms = 1e3 * known[radius] ** np.array([3.0, 5.0])
+        assert known[sigma] == pytest.approx(float(np.sqrt(by_terms @ of_terms @ by_terms)), rel=1e-6)
+    assert run(["report", str(project)]) in (0, level)
+    assert "of the way to the corner of the picture" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
+def test_points_that_no_image_shows_are_a_note_and_an_unknown_one_in_one_image_is_named(tmp_path: Path) -> None:
+    """A pattern is often larger than what the images show; one ray does not locate a point."""
+    network, _ = simulated(np.random.default_rng(1), points=field_points(np.random.default_rng(2), 40))
+    project = write_network(network, tmp_path)
+    points, marks = tmp_path / "points.csv", tmp_path / "comparator.csv"
+    points.write_text(points.read_text(encoding="utf-8") + "u1,5,5,0,0,0,0\nu2,6,6,0,0,0,0\n", encoding="utf-8")
+    assert run(["adjust", str(project)]) == 0
+    result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    assert [note for note in result["notes"] if "measured in no image: 2 points, u1, u2" in note]
+    points.write_text(points.read_text(encoding="utf-8") + "single,,,,,,\n", encoding="utf-8")
+    marks.write_text(marks.read_text(encoding="utf-8") + "f2,single,target,10,10,0.005,0.005\n", encoding="utf-8")
+    assert run(["adjust", str(project)]) == 1
+    result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    (warning,) = [warning for warning in result["warnings"] if "single" in warning]
+    assert "measured in one image only, and so left out: single (f2). Two images are needed" in warning
+    assert not any("single" in note for note in result["notes"])

@@ -9,19 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-from kept_scans import keep_scans
+from projects import keep_scans
 
 from measure.fiducials.options import SCATTER_MM, BelievedFilm
 from measure.flags import Cause, Code, Reason, Status
 from measure.marks.shapes import MarkShape, MarkTemplate, Polygon, turned
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement
+from pipeline import InputError, read_images, read_measurement, read_points
 from pipeline.archive.measure_archive import check_measurable
-from pipeline.archive.measurement import read_measurement
-from pipeline.errors import InputError
 from pipeline.files.camera_file import camera_text, read_camera
-from pipeline.files.images_file import read_images
 from pipeline.files.mark_table import picture_writer
-from pipeline.files.points_file import read_points
 from pipeline.files.project_file import Project, read_project, read_undrawn
 from pipeline.results.comparator_file import (
     comparator_from_pixel,

@@ -9,20 +9,19 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from exported_project import PITCH_MM, TRUTH, adjusted_project, camera_mm
 from networks import FIDUCIALS
 from numpy.typing import NDArray
+from projects import PITCH_MM, TRUTH, adjusted_project, camera_mm
 from studies import parametrize_with_studies
 
 from adjust.functional_model.lens import Lens, Prior
 from adjust.functional_model.physical import TORLEGARD_NAMES
 from adjust.problem.camera import FiducialDistance
+from pipeline import InputError, read_images
 from pipeline.cli import DONE, WRONG_INPUT, run
-from pipeline.errors import InputError
 from pipeline.exchange.certificate import balanced_mm, fit, read_certificate
 from pipeline.exchange.xml_tree import read_xml
 from pipeline.files.camera_file import CameraFile, read_camera
-from pipeline.files.images_file import read_images
 from pipeline.results.comparator_file import read_comparator, read_pitches
 
 Array = NDArray[np.float64]

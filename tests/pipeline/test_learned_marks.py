@@ -11,14 +11,11 @@ import numpy as np
 import pytest
 import tifffile
 from numpy.typing import NDArray
+from projects import measure_scan
 from rich.console import Console
-from single_scans import measure_scan
 
-from measure.flags import Status
-from measure.marks.shapes import MarkTemplate
-from measure.results import FrameMeasurement
-from pipeline.errors import InputError
-from pipeline.files.camera_file import read_camera
+from measure import FrameMeasurement, MarkTemplate, Status
+from pipeline import InputError, read_camera
 from pipeline.files.project_file import Project, read_project
 from pipeline.measuring import learn_stage
 from pipeline.measuring.learn_stage import learn_marks

@@ -15,17 +15,15 @@ import pytest
 import tifffile
 from truth_comparison import compare_with_truth
 
+from measure import FiducialLayout, Scan
 from measure.fiducials.camera_recognition import Answer, search_camera
-from measure.marks.shapes import FiducialLayout
 from measure.scans.metadata import Pitch
 from measure.scans.opening import ScanHead
-from measure.scans.scan import Scan
+from pipeline import InputError, read_project
 from pipeline.archive.scan_groups import ScanGroup
 from pipeline.cli import run
-from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.library import library_names, library_path, read_library
-from pipeline.files.project_file import read_project
 from pipeline.measuring import camera_trials
 from pipeline.measuring.camera_identification import Identification, Trial, drawn_alike
 from pipeline.measuring.camera_trials import LayoutSearch, Tried, _alike, identify

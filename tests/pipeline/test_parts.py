@@ -17,13 +17,10 @@ from foreign_readers import asp_px, colmap_px, opencv_px
 
 from measure.tie_points.features import TieFrame
 from measure.tie_points.joins import measure_joins
-from pipeline.archive.measurement import read_measurement
+from pipeline import InputError, read_comparator, read_images, read_measurement
 from pipeline.cli import run
-from pipeline.errors import InputError
-from pipeline.files.images_file import read_images
 from pipeline.files.project_file import Project, read_project
 from pipeline.measuring.tie_stage import add_joins
-from pipeline.results.comparator_file import read_comparator
 from pipeline.results.measured_record import MeasuredScan
 
 MARKS = """

@@ -11,8 +11,7 @@ import made_up_calibration
 import pytest
 from studies import parametrize_with_studies
 
-from measure.flags import Code, Reason, Status
-from measure.results import FrameMeasurement
+from measure import Code, FrameMeasurement, Reason, Status
 from pipeline.report import Problem, ReportData, render_report, write_report
 from pipeline.results.adjustment_record import Sigma0Record
 from pipeline.results.assessment_record import CorrelationRecord

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from adjust.solution.explanations import Explanation
-from measure.flags import Code, Reason, Status
-from measure.results import MarkMeasurement, Pose
+from measure import Code, MarkMeasurement, Pose, Reason, Status
 from pipeline.report import Problem, ReportData, judge
 from pipeline.report.data import frames
 from pipeline.report.frame_problems import fraction_test, places_px

@@ -16,8 +16,7 @@ from studies import parametrize_with_studies
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.transformation import Film
-from measure.errors import MeasurementError
-from measure.scans.opening import open_scan
+from measure import MeasurementError, open_scan
 from pipeline.cli import run
 from pipeline.resampling.canvas import FrameChain, outline_canvas, scan_places
 from pipeline.resampling.interpolation import open_source

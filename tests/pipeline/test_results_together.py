@@ -13,19 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 from in_process import Loses
-from kept_scans import keep_scans
+from projects import keep_scans
 from test_command_line import replaced, results, rewritten_scans
 
-from adjust.errors import AdjustmentError
-from adjust.functional_model.lens import Prior
-from measure.errors import MeasurementError
-from measure.flags import Status
-from pipeline import stages
+from adjust import AdjustmentError, Prior
+from measure import MeasurementError, Status
+from pipeline import read_measurement, read_project, stages
 from pipeline.adjusting import second_visit
 from pipeline.archive.made_from import measured_from
-from pipeline.archive.measurement import read_measurement
 from pipeline.cli import run
-from pipeline.files.project_file import read_project
 from pipeline.provenance import fingerprint, scan_fingerprint
 from pipeline.report.load import adjusted_data
 from pipeline.results.comparator_file import mark_rows, read_comparator, write_comparator

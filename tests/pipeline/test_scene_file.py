@@ -12,16 +12,13 @@ import pytest
 import tifffile
 from studies import parametrize_with_studies
 
+from measure import open_scan
 from measure.boards.specs import ChessboardSpec, CircleGridSpec
 from measure.marks import shapes
-from measure.scans.opening import open_scan
+from pipeline import InputError, read_camera, read_comparator, read_project
 from pipeline.adjusting.adjust_stage import adjust_marks
-from pipeline.errors import InputError
-from pipeline.files.camera_file import read_camera
-from pipeline.files.project_file import read_project
 from pipeline.rendered.scene_file import read_scene, render_project
 from pipeline.rendered.scene_project import SceneFile, write_project
-from pipeline.results.comparator_file import read_comparator
 from synthetic_images.frame import frame_truth
 from synthetic_images.scene import BoardField, ChipMark, DrawnMark
 from synthetic_images.targets import field_targets

@@ -14,9 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-from made_records import FOLDER, changed, content, dump, failed, kept_result, measured_scan, stored
+from projects import FOLDER, changed, content, dump, failed, kept_result, made_record, stored
 
-from measure.flags import Code, Reason, Status
+from measure import Code, Reason, Status
+from pipeline import InputError
 from pipeline.archive.checked_statuses import (
     CheckedResult,
     Judging,
@@ -32,13 +33,12 @@ from pipeline.archive.checked_statuses import (
 from pipeline.archive.results_database import Store, merge
 from pipeline.archive.schema import MIGRATIONS, VERSION, opened
 from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict, scan_verdict
-from pipeline.errors import InputError
 from pipeline.provenance import content_hash, file_state, options_hash, parts_hash, result_key, shard_number
 from pipeline.results.comparator_file import mark_rows
 from pipeline.results.measured_record import MeasuredScan
 
 LOOK = Reason("look", Code.PITCH)
-LOOKED_AT = measured_scan(problems=(LOOK,))
+LOOKED_AT = made_record(problems=(LOOK,))
 
 
 def contents(store: Store, judging: Judging) -> list[tuple[object, ...]]:
@@ -56,8 +56,8 @@ def test_a_record_comes_back_without_loss(path: Path) -> None:
         row = store.keep(kept_result(3), "box/3")
         other = store.keep(kept_result(4))
     with Store(path) as store:
-        assert stored(store, row, "3") == content(measured_scan(3))
-        assert stored(store, other, "4") == content(measured_scan(4))
+        assert stored(store, row, "3") == content(made_record(3))
+        assert stored(store, other, "4") == content(made_record(4))
         assert store.fingerprints() == {kept_result(3).fingerprint: row, kept_result(4).fingerprint: other}
         assert store.identities() == {"scans/3.tif": kept_result(3).identity, "scans/4.tif": kept_result(4).identity}
 
@@ -72,14 +72,14 @@ def test_a_result_that_is_there_is_not_kept_twice(path: Path) -> None:
 def test_the_view_has_the_columns_and_numbers_of_comparator_csv(path: Path) -> None:
     with Store(path) as store:
         row = store.keep(kept_result(3), "box/3")
-        judge(store, {}, "input", [CheckedResult(row, measured_scan(3, image="box/3"))])
+        judge(store, {}, "input", [CheckedResult(row, made_record(3, image="box/3"))])
     with sqlite3.connect(path) as db:
         view = db.execute("select * from mark_view")
         names = [column[0] for column in view.description]
         rows = view.fetchall()
     assert names == ["image", "point", "kind", "x_mm", "y_mm", "sx_mm", "sy_mm", "rho", "col_px", "row_px", "status",
                      "reason"]  # fmt: skip
-    mark = measured_scan(3).frame.marks[0]
+    mark = made_record(3).frame.marks[0]
     assert mark.center_px is not None
     assert mark.covariance_px2 is not None
     (variance_x, covariance), (_, variance_y) = mark.covariance_px2.tolist()
@@ -93,8 +93,8 @@ def test_the_view_has_the_columns_and_numbers_of_comparator_csv(path: Path) -> N
 def test_a_judging_changes_what_is_visible_and_not_what_was_measured(path: Path) -> None:
     with Store(path) as store:
         rows = [store.keep(kept_result(seed), str(seed)) for seed in (1, 2)]
-        doubted = changed(measured_scan(1), [2], Status.WEAK, Reason("the others say otherwise", Code.OFF_GIVEN))
-        now = [doubted, measured_scan(2, problems=(Reason("it is the frame of 1.", Code.COPY),))]
+        doubted = changed(made_record(1), [2], Status.WEAK, Reason("the others say otherwise", Code.OFF_GIVEN))
+        now = [doubted, made_record(2, problems=(Reason("it is the frame of 1.", Code.COPY),))]
         frames = [CheckedResult(row, scan) for row, scan in zip(rows, now, strict=True)]
         digest = judge(store, {"settings": "a"}, "input", frames)
         judging = find_judging(store, digest)
@@ -102,8 +102,8 @@ def test_a_judging_changes_what_is_visible_and_not_what_was_measured(path: Path)
         assert judging.made_from == {"settings": "a"}
         assert contents(store, judging) == [content(scan) for scan in now]
         assert [stored(store, row, name) for row, name in zip(rows, "12", strict=True)] == [
-            content(measured_scan(1)),
-            content(measured_scan(2)),
+            content(made_record(1)),
+            content(made_record(2)),
         ]
         measured_marks = store.connection.execute(
             "select image, status from mark_view where status = 'weak'"
@@ -119,7 +119,7 @@ def test_a_lot_whose_input_was_tested_is_not_tested_again(path: Path) -> None:
         def frames() -> Iterator[CheckedResult]:
             requests.append(input_hash)
             for seed in seeds:
-                now = changed(measured_scan(seed), [seed], Status.WEAK, Reason(f"by {input_hash}", Code.OFF_GIVEN))
+                now = changed(made_record(seed), [seed], Status.WEAK, Reason(f"by {input_hash}", Code.OFF_GIVEN))
                 yield CheckedResult(store.keep(kept_result(seed), str(seed)), now)
 
         return Lot(input_hash, frames)
@@ -153,8 +153,8 @@ def test_a_lot_whose_input_was_tested_is_not_tested_again(path: Path) -> None:
 def test_one_judging_takes_the_place_of_another(path: Path) -> None:
     with Store(path) as store:
         row = store.keep(kept_result(1), "1")
-        first = judge(store, {}, "a", [CheckedResult(row, measured_scan())])
-        same = judge(store, {}, "a", [CheckedResult(row, measured_scan())])
+        first = judge(store, {}, "a", [CheckedResult(row, made_record())])
+        same = judge(store, {}, "a", [CheckedResult(row, made_record())])
         second = judge(store, {}, "a", [CheckedResult(row, LOOKED_AT)])
         assert first == same != second
         assert find_judging(store, first) is not None
@@ -177,7 +177,7 @@ def test_a_store_of_an_earlier_version_is_brought_to_this_one(path: Path, versio
     with Store(path) as store:
         assert store.connection.execute("pragma user_version").fetchone() == (VERSION,)
         row = store.keep(kept_result(1), "1")
-        assert stored(store, row) == content(measured_scan())
+        assert stored(store, row) == content(made_record())
         assert store.connection.execute("select count(*) from options").fetchone() == (1 + bool(version),)
 
 
@@ -205,7 +205,7 @@ def test_results_of_an_earlier_version_get_their_digests(has_secret: bool, path:
         db.execute("create view mark_view as select 1")
         db.execute("pragma user_version = 3")
     with Store(path) as store:
-        assert stored(store, row) == content(measured_scan())
+        assert stored(store, row) == content(made_record())
         judging = find_judging(store, digest)
         assert (judging is None) == has_secret  # it is made anew
         if judging is not None:
@@ -232,7 +232,7 @@ def test_a_step_to_a_later_version_is_made_whole_or_not_at_all(path: Path, monke
     with Store(path) as store:
         assert store.connection.execute("select name, box from scan").fetchall() == [("1", "a")]
         assert store.connection.execute("pragma user_version").fetchone() == (VERSION + 1,)
-        assert stored(store, row) == content(measured_scan())
+        assert stored(store, row) == content(made_record())
 
 
 def test_a_file_of_another_kind_or_of_a_later_version_is_refused(path: Path) -> None:
@@ -256,7 +256,7 @@ def test_a_file_of_another_kind_or_of_a_later_version_is_refused(path: Path) -> 
 WRITER = """
 import sys
 from pathlib import Path
-from made_records import kept
+from projects import kept
 from pipeline.archive.results_database import Store
 with Store(Path(sys.argv[1])) as store:
     for seed in range(100_000):
@@ -266,7 +266,7 @@ with Store(Path(sys.argv[1])) as store:
 
 
 def test_what_was_kept_survives_a_kill_and_nothing_is_half(path: Path) -> None:
-    paths = os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parents[2])])
+    paths = os.pathsep.join(sys.path)
     writer = subprocess.Popen(
         [sys.executable, "-c", WRITER, str(path)], env=os.environ | {"PYTHONPATH": paths}, stdout=subprocess.PIPE
     )
@@ -325,22 +325,22 @@ def test_shards_are_the_same_everywhere() -> None:
 
 
 def test_verdicts_of_scans() -> None:
-    good, counts = measured_scan(), {"ann": 1}
+    good, counts = made_record(), {"ann": 1}
     answered = changed(good, [0], Status.REJECTED, Reason("rejected by ann", Code.DECIDED))
     assert good.frame.pose is not None
     verdicts: list[tuple[MeasuredScan, Verdict]] = [
         (good, Verdict.GOOD),
-        (measured_scan(status=Status.WEAK), Verdict.LOOK),
-        (measured_scan(problems=(LOOK,)), Verdict.LOOK),
-        (measured_scan(pose=replace(good.frame.pose, decided=False)), Verdict.LOOK),
-        (measured_scan(status=Status.ABSENT), Verdict.POOR),
-        (measured_scan(pixel_from_camera=None), Verdict.POOR),
+        (made_record(status=Status.WEAK), Verdict.LOOK),
+        (made_record(problems=(LOOK,)), Verdict.LOOK),
+        (made_record(pose=replace(good.frame.pose, decided=False)), Verdict.LOOK),
+        (made_record(status=Status.ABSENT), Verdict.POOR),
+        (made_record(pixel_from_camera=None), Verdict.POOR),
         (changed(good, range(2, 8), Status.REJECTED, LOOK), Verdict.POOR),
         (failed(), Verdict.FAILED),
         (replace(answered, decided_by=counts), Verdict.DECIDED),
         (replace(answered, frame=replace(answered.frame, problems=(LOOK,)), decided_by=counts), Verdict.LOOK),
         (replace(good, decided_by=counts), Verdict.DECIDED),
-        (replace(measured_scan(status=Status.WEAK), decided_by=counts), Verdict.LOOK),
+        (replace(made_record(status=Status.WEAK), decided_by=counts), Verdict.LOOK),
     ]
     assert [scan_verdict(scan) for scan, _ in verdicts] == [verdict for _, verdict in verdicts]
     assert set(MEANING) == set(NEXT_STEP) == set(Verdict)
@@ -409,4 +409,4 @@ def test_a_judging_that_is_lost_is_not_taken_for_none(change: str, path: Path) -
             latest(store)
         store.forget_damaged()
         assert latest(store) is None
-        assert stored(store, row) == content(measured_scan())
+        assert stored(store, row) == content(made_record())

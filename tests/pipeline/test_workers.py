@@ -1,17 +1,22 @@
-"""The processes that measure end with the one that started them, whatever they do and however it ends."""
+"""Processes and clusters that measure: what is lost with a killed one, and when they end."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from range_server import range_server
 
-from pipeline.workers import worker_pool
+from pipeline import InputError, workers
+from pipeline.workers import LocalPool, SubmittedAgain, WorkerKilled, cluster_executor, worker_pool
 
 WAIT_S = 60.0
 
@@ -57,7 +62,7 @@ def begin(kind: str, told: Path) -> None:
 def test_a_worker_ends_with_the_process_that_started_it(kind: str, tmp_path: Path) -> None:
     result = tmp_path / "pid"
     program = f"from pathlib import Path; from test_workers import begin; begin({kind!r}, Path({str(result)!r}))"
-    paths = os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parents[2])])
+    paths = os.pathsep.join(sys.path)
     parent = subprocess.Popen([sys.executable, "-c", program], env=os.environ | {"PYTHONPATH": paths})
     _wait(lambda: result.is_file() and result.read_text(encoding="utf-8") != "", 120.0)
     worker = int(result.read_text(encoding="utf-8"))
@@ -82,3 +87,215 @@ def is_alive(pid: int) -> bool:
     except FileNotFoundError:
         return False
     return state != "Z"
+
+
+def square(number: int) -> int:
+    return number * number
+
+
+def killed_times(times: int, folder: Path, number: int) -> int:
+    """Ends its process the first times that it is called."""
+    marks = len(list(folder.iterdir()))
+    if marks < times:
+        (folder / f"{marks}").touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def process() -> int:
+    return os.getpid()
+
+
+def test_a_killed_process_is_replaced_and_its_task_begun_again(tmp_path: Path) -> None:
+    with worker_pool(2, workers=2) as pool:
+        others = [pool.submit(square, number) for number in range(6)]
+        assert pool.submit(killed_times, 1, tmp_path, 7).result(60) == 7
+        assert [other.result(60) for other in others] == [0, 1, 4, 9, 16, 25]
+        assert list(pool.map(square, range(4))) == [0, 1, 4, 9]
+
+
+@pytest.mark.study
+def test_a_task_that_kills_its_process_twice_is_given_up_and_none_else(tmp_path: Path) -> None:
+    with worker_pool(2, workers=2) as pool:
+        bad = pool.submit(killed_times, 99, tmp_path, 7)
+        others = [pool.submit(square, number) for number in range(6)]
+        with pytest.raises(WorkerKilled, match="its process was ended, most likely because the memory was full"):
+            bad.result(60)
+        assert [other.result(60) for other in others] == [0, 1, 4, 9, 16, 25]
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_process_killed_without_a_task_is_replaced() -> None:
+    with worker_pool(1, workers=1) as pool:
+        first = pool.submit(process).result(60)
+        os.kill(first, signal.SIGKILL)
+        time.sleep(0.2)
+        assert pool.submit(process).result(60) != first
+
+
+def test_a_process_killed_on_its_way_says_nothing_of_the_task(tmp_path: Path) -> None:
+    with worker_pool(1, workers=1) as pool:
+        killed = {pool.submit(process).result(60)}
+        task = pool.submit(killed_times, 1, tmp_path, 7)
+        for _ in range(2):
+            while not (coming := [child for child in multiprocessing.active_children() if child.pid not in killed]):
+                assert not task.done()
+                time.sleep(0.001)
+            killed.add(coming[0].pid or 0)
+            coming[0].kill()
+        assert task.result(60) == 7
+
+
+@pytest.mark.study
+def test_where_no_process_stands_tasks_are_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.workers.prepare", os.abort)
+    with worker_pool(1, workers=1) as pool:
+        for task in [pool.submit(square, number) for number in range(2)]:
+            with pytest.raises(WorkerKilled):
+                task.result(60)
+
+
+def test_what_a_task_raises_is_its_own() -> None:
+    with worker_pool(1, workers=1) as pool:
+        with pytest.raises(ValueError, match="invalid literal"):
+            pool.submit(int, "a").result(60)
+        assert pool.submit(square, 3).result(60) == 9
+
+
+def test_a_process_that_is_begun_while_the_pool_ends_is_ended_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    begin = LocalPool._start
+
+    def late(pool: LocalPool) -> ProcessPoolExecutor:
+        time.sleep(0.4)
+        return begin(pool)
+
+    def interrupted() -> None:
+        with worker_pool(1, workers=1) as pool:
+            pool.submit(time.sleep, 20.0)
+            time.sleep(0.1)  # its thread has seen that the pool goes on
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(LocalPool, "_start", late)
+    start = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert time.monotonic() - start < 15.0
+    assert not multiprocessing.active_children()
+
+
+def cluster_process(number: int, seconds: float = 0.0) -> tuple[int, int]:
+    time.sleep(seconds)
+    return number, os.getpid()
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.study
+def test_a_killed_worker_loses_nothing_and_is_replaced(tmp_path: Path) -> None:
+    (tmp_path / "scan.tif").write_bytes(b"scan")
+    with cluster_executor("local", [str(tmp_path / "scan.tif")], workers=2) as executor:
+        futures = [executor.submit(cluster_process, number, 0.03) for number in range(40)]
+        first = futures[0].result(60)[1]
+        os.kill(first, signal.SIGKILL)
+        results = [future.result(60) for future in futures]
+        assert [number for number, _ in results] == list(range(40))
+        end, view = time.monotonic() + 60, set[int]()
+        while len(view - {first}) < 2:
+            assert time.monotonic() < end
+            pair = [executor.submit(cluster_process, number, 0.05) for number in range(2)]  # one for each worker
+            view = {future.result(60)[1] for future in pair}
+        assert first not in view
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"reseau\[cluster\]"), cluster_executor("local", []):
+        pass
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_scheduler_that_does_not_answer_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "_ANSWER_S", 0.5)
+    with pytest.raises(InputError, match="no scheduler answers there"), cluster_executor("tcp://127.0.0.1:9", []):
+        pass
+
+
+class Answers:
+    """A client whose workers answer so."""
+
+    def __init__(self, answers: dict[str, Any]) -> None:
+        self.answers = answers
+
+    def wait_for_workers(self, *_: Any, **__: Any) -> None:
+        pass
+
+    def run(self, *_: Any, **__: Any) -> dict[str, Any]:
+        return self.answers
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_workers_are_requested_their_versions_and_their_way_to_the_scans() -> None:
+    same = workers.versions()
+    good = (same, list[tuple[str, str]]())
+    workers._check_workers(Answers({"a": good}), "x", [])
+    other = ({**same, "numpy": "1.0"}, list[tuple[str, str]]())
+    cases = {
+        "b: has numpy 1.0, here": other,
+        r"b: cannot read /scans/1.tif \(No such file\). Give it the same path": (
+            same,
+            [("/scans/1.tif", "No such file")],
+        ),
+        r"b: cannot read s3://x/1.tif \(403\). Give it the extra, the credentials": (same, [("s3://x/1.tif", "403")]),
+        "b: does not answer .*is reseau installed": ModuleNotFoundError("pipeline"),
+    }
+    for words, answer in cases.items():
+        with pytest.raises(InputError, match=words):
+            workers._check_workers(Answers({"a": good, "b": answer}), "x", [])
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_one_scan_a_folder_is_inspected_for(tmp_path: Path) -> None:
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        for name in "12":
+            (tmp_path / folder / name).write_bytes(b"1")
+    scans = [str(tmp_path / place) for place in ("a/0", "a/1", "a/2", "b/1", "c/1")]
+    assert workers._one_a_folder([*scans, ""]) == [str(tmp_path / "a/1"), str(tmp_path / "b/1")]
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_addresses_are_inspected_for_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("measure.scans.remote._WAITS_S", (0.01,))
+    for name in ("a/1.tif", "a/2.tif", "closed/1.tif", "closed/2.tif"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"1")
+    with range_server(tmp_path) as server:
+        scans = [f"{server.url}/{name}" for name in ("closed/1.tif", "a/1.tif", "closed/2.tif", "a/2.tif")]
+        assert workers._one_a_folder(scans) == [f"{server.url}/a/1.tif"]
+        _, missing = workers._versions_and_unreachable(scans[:2])
+        ((scan, why),) = missing
+    assert scan == scans[0]
+    assert "forbids to read it (403)" in why
+
+
+class Loses(Executor):
+    """Loses the first tasks that it is given."""
+
+    def __init__(self, times: int) -> None:
+        self.times = times
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        self.times -= 1
+        if self.times >= 0:
+            future.set_exception(ValueError("not enough values to unpack"))
+        else:
+            future.set_result(fn(*args, **kwargs))
+        return future
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_what_an_executor_loses_is_submitted_again_once() -> None:
+    assert SubmittedAgain(Loses(1)).submit(cluster_process, 3).result()[0] == 3
+    with pytest.raises(WorkerKilled):
+        SubmittedAgain(Loses(2)).submit(cluster_process, 3).result()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kept_scans import keep_scans
+from projects import keep_scans
 from rich.console import Console
 
 from measure.annotations import text as networks_module
@@ -17,9 +17,8 @@ from measure.flags import Cause, Code, Reason, Status
 from measure.geometry import POSES, pose_in_camera
 from measure.marks.shapes import Side, WrittenPlace
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
-from pipeline.archive.measurement import read_measurement
+from pipeline import InputError, read_measurement
 from pipeline.cli import run
-from pipeline.errors import InputError
 from pipeline.files.camera_file import camera_text, parse_camera, read_camera
 from pipeline.files.images_file import WRITTEN, fill_images, read_images
 from pipeline.measuring.camera_identification import Identification, Trial, add_plates, contradictions, parse_plate

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.polynomial.legendre import legval2d, legvander2d
 from numpy.typing import NDArray
 
-from measure.flags import Status
-from pipeline.archive.measurement import read_measurement
+from measure import Status
+from pipeline import read_measurement
 from pipeline.results.measured_record import MeasuredScan
 
 Array = NDArray[np.float64]

@@ -1,0 +1,454 @@
+"""Projects that tests make: drawn, simulated, exported, damaged; scans and records that nobody has measured."""
+
+import hashlib
+import io
+import json
+import math
+import random
+import shutil
+import zipfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+from drawn_frames import ALIKE, CORNERS, PITCH_UM, frame_picture, pixel_from_camera
+from networks import Truth, affine, camera_point, rotation, simulated, torlegard
+from numpy.typing import NDArray
+
+from adjust import Network, Prior
+from measure import FiducialLayout
+from measure.flags import Cause, Code, Reason, Status
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
+from pipeline.archive.checked_statuses import CheckedResult, checked_scans, find_judging, judge
+from pipeline.archive.measurement import remember_place
+from pipeline.archive.results_database import Kept, Store
+from pipeline.cli import DONE, LOOK, run
+from pipeline.files.project_file import Project
+from pipeline.measuring.scan_measurement import measured_scan
+from pipeline.measuring.scan_task import scan_tasks
+from pipeline.provenance import FileState, Identity, file_state, parts_hash
+from pipeline.results.comparator_file import read_measurement_hash
+from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan, mark_row, scan_detail
+
+CAMERA = (
+    'name = "K"\nframe_mm = [17.0, 17.0]\nprincipal_distance_mm = 30.0\n'
+    + "".join(
+        f'[[fiducial]]\nid = "{number}"\nxy_mm = [{x}, {y}]\nsigma_mm = 0.01\nmark = "m"\n'
+        for number, (x, y) in enumerate(CORNERS, 1)
+    )
+    + '[mark.m]\nkind = "ring-cross"\nring_mm = 0.5\nring_line_mm = 0.1\narm_mm = 0.8\nline_mm = 0.1\n'
+)
+PROJECT = f'camera = "camera.toml"\nscans = ["*.tif"]\npitch_um = {PITCH_UM}\n[measure]\npose = "0"\n'
+
+
+def write_project(folder: Path, names: Sequence[str], project: str = PROJECT, layout: FiducialLayout = ALIKE) -> Path:
+    """project.toml with its camera and its scans, which show that layout; the frames differ in noise and turn."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "camera.toml").write_text(CAMERA, encoding="utf-8")
+    for seed, name in enumerate(names, 1):
+        grey = frame_picture(layout, pixel_from_camera("0", 0.004 * seed), seed)
+        tifffile.imwrite(folder / f"{name}.tif", np.clip(np.rint(grey), 0, 65535).astype(np.uint16))
+    (folder / "project.toml").write_text(project, encoding="utf-8")
+    return folder / "project.toml"
+
+
+def write_network_project(network: Network, folder: Path) -> Path:
+    """camera.toml, points.csv, comparator.csv and project.toml; the path of the last."""
+    camera, points, observed = network.cameras[0], network.points, network.observations
+    c, x0, y0 = camera.principal_distance_mm, camera.x0_mm, camera.y0_mm
+    assert c is not None
+    assert x0 is not None
+    assert y0 is not None
+    given = camera.distortion.parameters
+    lines = [
+        f'name = "{camera.name}"',
+        "frame_mm = [228.0, 228.0]",
+        f"principal_distance_mm = {c.value!r}",
+        f"principal_point_mm = [{x0.value!r}, {y0.value!r}]",
+        "[sigma]",
+        f"principal_distance_mm = {sigma(c)}",
+        f"principal_point_mm = [{sigma(x0)}, {sigma(y0)}]",
+        "[distortion]",
+        f'family = "{camera.distortion.family}"',
+        f"r0_dm = {camera.distortion.r0_mm / 100.0!r}"
+        if camera.distortion.family == "juhl"
+        else f"r0_mm = {camera.distortion.r0_mm!r}",
+        "[distortion.value]",
+        *(f"{name} = {prior.value!r}" for name, prior in given.items()),
+        "[distortion.sigma]",
+        *(f"{name} = {sigma(prior)}" for name, prior in given.items()),
+    ]
+    for id, mark in camera.fiducials.items():
+        x, y = mark.x_mm, mark.y_mm
+        lines += ["[[fiducial]]", f'id = "{id}"', f"xy_mm = [{x.value!r}, {y.value!r}]"]
+        lines.append(f"sigma_mm = [{sigma(x)}, {sigma(y)}]")
+    (folder / "camera.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    rows = ["point,X,Y,Z,sX,sY,sZ"]
+    for point in points:
+        axes = [axis for axis in (point.X, point.Y, point.Z) if axis is not None]
+        rows.append(",".join([point.id, *(repr(a.value) for a in axes), *(bare(a.sigma) for a in axes)]))
+    (folder / "points.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    rows = ["image,point,kind,x_mm,y_mm,sx_mm,sy_mm"]
+    for i, (x_mm, y_mm) in enumerate(observed.xy_mm.tolist()):
+        sx, sy = np.sqrt(np.diag(observed.covariance_mm2[i])).tolist()
+        rows.append(f"{observed.image[i]},{observed.point[i]},{observed.kind[i]},{x_mm!r},{y_mm!r},{sx!r},{sy!r}")
+    (folder / "comparator.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    (folder / "project.toml").write_text(
+        'camera = "camera.toml"\n[object]\npoints = "points.csv"\n'
+        f'[adjust]\ntransformation = "{network.images[0].transformation}"\n',
+        encoding="utf-8",
+    )
+    return folder / "project.toml"
+
+
+def sigma(prior: Prior) -> str:
+    return repr(prior.sigma) if np.isfinite(prior.sigma) else '"free"'
+
+
+def bare(value: float) -> str:
+    return repr(value) if np.isfinite(value) else ""
+
+
+Array = NDArray[np.float64]
+
+PITCH_MM = 0.1
+SIZE_PX = 2500
+IMAGES = range(4)
+MIRRORED = 2
+LENS = {"k3": 4e-8, "k5": -1e-12, "p1": 8e-8, "p2": -6e-8}
+TRUTH = Truth(distortion=LENS, mirrored=(False, False, True, False), middle_mm=(125.0, -125.0))
+POINTS = np.random.default_rng(8).uniform((-700.0, -700.0, -150.0), (700.0, 700.0, 150.0), (100, 3))
+
+
+def adjusted_project(folder: Path, truth: Truth = TRUTH, crs: str = "", kind: str = "affine") -> Path:
+    """project.toml of an adjusted project, with scans that have a size and nothing in them."""
+    network, _ = simulated(np.random.default_rng(1), truth, kind, points=POINTS, noise=False)
+    return make_project(network, folder, crs)
+
+
+def make_project(network: Network, folder: Path, crs: str = "") -> Path:
+    """The same of a network of four images f0 to f3."""
+    path = write_network_project(network, folder)
+    text = path.read_text(encoding="utf-8")
+    more = f'crs = "{crs}"\n' if crs else ""
+    text = text.replace("[object]\n", f"[object]\n{more}")
+    path.write_text(f'scans = ["scans/*.tif"]\npitch_um = {1000.0 * PITCH_MM}\n{text}', encoding="utf-8")
+    comparator = folder / "comparator.csv"
+    marks = comparator.read_text(encoding="utf-8")
+    comparator.write_text(f"# comparator coordinates, reseau\n{marks}", encoding="utf-8")
+    (folder / "scans").mkdir()
+    for i in IMAGES:
+        empty = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
+        tifffile.imwrite(folder / "scans" / f"f{i}.tif", empty, compression="deflate")
+    assert run(["adjust", str(path)]) in (DONE, LOOK)  # a network may show points beyond its frame
+    return path
+
+
+def camera_mm(image: int, truth: Truth = TRUTH) -> Array:
+    """Where the points (100, 2) are in the camera."""
+    return camera_point(truth, image, POINTS)
+
+
+def ideal_mm(image: int, truth: Truth = TRUTH) -> Array:
+    """The same without the lens."""
+    u, v, w = rotation(*truth.attitudes[image]) @ (POINTS - np.array(truth.stations[image])).T
+    return np.column_stack([truth.x0 - truth.c * u / w, truth.y0 - truth.c * v / w])
+
+
+def scan_px(image: int, places_mm: Array, truth: Truth = TRUTH) -> Array:
+    """Columns and rows (n, 2) of camera places in the scan."""
+    a1, a2, a3, b1, b2, b3 = affine(truth, image, "affine")
+    comparator = np.linalg.solve(np.array([[a2, a3], [b2, b3]]), (places_mm - (a1, b1)).T).T
+    return np.asarray(comparator * (1.0, -1.0) / PITCH_MM)
+
+
+def frame_px(image: int, places_mm: Array, ideal: bool = False, truth: Truth = TRUTH) -> Array:
+    """Columns and rows (n, 2) of camera places in the resampled frame: its pixels lie at whole multiples of the pitch,
+    and it holds the whole outline of the scan."""
+    side = np.linspace(-0.5, SIZE_PX - 0.5, 65)
+    edge = np.concatenate(
+        [np.stack(np.broadcast_arrays(side, end), 1) for end in (side[0], side[-1])]
+        + [np.stack(np.broadcast_arrays(end, side), 1) for end in (side[0], side[-1])]
+    )
+    x, y = (edge * (PITCH_MM, -PITCH_MM)).T
+    a1, a2, a3, b1, b2, b3 = affine(truth, image, "affine")
+    outline = np.column_stack([a1 + a2 * x + a3 * y, b1 + b2 * x + b3 * y])
+    if ideal:
+        outline = outline - np.column_stack(torlegard(truth, *outline.T))
+    left = PITCH_MM * math.ceil(outline[:, 0].min() / PITCH_MM)
+    top = PITCH_MM * math.floor(outline[:, 1].max() / PITCH_MM)
+    return np.asarray((places_mm - (left, top)) * (1.0, -1.0) / PITCH_MM)
+
+
+FILES = ("project.toml", "camera.toml", "points.csv", "images.csv", "distances.csv", "comparator.csv",
+         "earlier/adjustment.json", "earlier/adjustment.npz")  # fmt: skip
+HOSTILE = (
+    "9" * 5000, "-1", "0", "1e999", "nan", "-inf", "0x" + "f" * 5000, "10000000000", "1e-320", '""', '"\\u0000"',
+    "\x00", '"' + "n" * 5000 + '"', "[" * 5000, "{a=" * 2000, "a." * 3000 + "b", '"/dev/zero"', '"\x1b[31mred"',
+    "=cmd|' /C calc'!A0", "true", "null", "[]", "{}", "{", '"', "'", ",", "\n", "\n\n[x]\n", "#", "é", "\ufeff",
+    "\u202e", "x" * 200_000,
+)  # fmt: skip
+
+
+def make_table_project(folder: Path) -> Path:
+    """A project that names every kind of table, adjusted once, with that as the camera's earlier calibration."""
+    truth = Truth()
+    network, _ = simulated(np.random.default_rng(5), truth, free={"k3": np.inf, "p1": np.inf})
+    project = write_network_project(network, folder)
+    assert run(["adjust", str(project)]) in (0, 1)
+    (folder / "out").rename(folder / "earlier")
+    _replace(folder / "camera.toml", "[sigma]\n", '[sigma]\ncalibration = "earlier/adjustment.json"\n')
+    _replace(project, "[object]\n", '[object]\nimages = "images.csv"\ndistances = "distances.csv"\n')
+    rows = ["image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg"]
+    for i, (station, angles) in enumerate(zip(truth.stations, truth.attitudes, strict=True)):
+        rows.append(",".join([f"f{i}", *(f"{value:.1f}" for value in (*station, *np.degrees(angles)))]))
+    (folder / "images.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    length = float(np.linalg.norm(np.array(_place(network, "0")) - np.array(_place(network, "1"))))
+    (folder / "distances.csv").write_text(f"from,to,distance,sigma\n0,1,{length:.3f},0.01\n", encoding="utf-8")
+    return project
+
+
+def _replace(path: Path, old: str, new: str) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+
+
+def _place(network: Network, id: str) -> list[float]:
+    point = network.point_by_id[id]
+    return [axis.value for axis in (point.X, point.Y, point.Z) if axis is not None]
+
+
+def damaged(data: bytes, name: str, rng: random.Random) -> bytes:
+    """The content of a file with one mishap: of its bytes, of its words, or of what it says."""
+    kinds: list[Callable[[bytes, random.Random], bytes]] = [_bits, _lost, _cut, _doubled, _strange]
+    if name.endswith(".npz"):
+        kinds += [_array] * 6
+    else:
+        kinds += [_word] * 4 + [_lines] * 2
+    if name.endswith(".json"):
+        kinds += [_value] * 6
+    return rng.choice(kinds)(data, rng)
+
+
+def _bits(data: bytes, rng: random.Random) -> bytes:
+    changed = bytearray(data)
+    for _ in range(rng.choice((1, 1, 3, 30))):
+        changed[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+    return bytes(changed)
+
+
+def _lost(data: bytes, rng: random.Random) -> bytes:
+    at = rng.randrange(len(data))
+    return data[:at] + data[at + rng.choice((1, 30, 1000)) :]
+
+
+def _cut(data: bytes, rng: random.Random) -> bytes:
+    return data[: rng.randrange(len(data))]
+
+
+def _doubled(data: bytes, rng: random.Random) -> bytes:
+    at, length = rng.randrange(len(data)), rng.choice((1, 50, 3000))
+    return data[: at + length] + data[at:]
+
+
+def _strange(_: bytes, rng: random.Random) -> bytes:
+    return rng.choice((b"", b"\x00" * 100, b"PK\x03\x04", rng.randbytes(3000), b"\xff\xfe", b"\x89PNG\r\n\x1a\n"))
+
+
+def _word(data: bytes, rng: random.Random) -> bytes:
+    """One word, number or sign, replaced."""
+    text = data.decode("utf-8")
+    at = rng.randrange(len(text))
+    end = at + 1
+    while end < len(text) and text[end] not in ' ,"\n=[]':
+        end += 1
+    return (text[:at] + rng.choice(HOSTILE) + text[end:]).encode("utf-8", "replace")
+
+
+def _lines(data: bytes, rng: random.Random) -> bytes:
+    lines = data.split(b"\n")
+    i, j = rng.randrange(len(lines)), rng.randrange(len(lines))
+    how = rng.randrange(3)
+    if how == 0:
+        lines[i], lines[j] = lines[j], lines[i]
+    elif how == 1:
+        lines.insert(i, lines[j])
+    else:
+        del lines[i]
+    return b"\n".join(lines)
+
+
+def _value(data: bytes, rng: random.Random) -> bytes:
+    """One value or key of a JSON file replaced."""
+    content = json.loads(data)
+    node, key = content, rng.choice(list(content))
+    while isinstance(node[key], dict | list) and node[key] and rng.random() < 0.9:
+        node = node[key]
+        key = rng.choice(list(node)) if isinstance(node, dict) else rng.randrange(len(node))
+    new: Any = rng.choice((None, -1, 0, 1e308, "9", [], {}, True, [[]] * 9, "\x1b[2J", 10**400, float("nan"), 2.5))
+    if isinstance(node, dict) and rng.random() < 0.3:
+        node["other"] = node.pop(key)
+    elif isinstance(node[key], float) and rng.random() < 0.5:
+        node[key] *= 1.001
+    else:
+        node[key] = new
+    return json.dumps(content).encode()
+
+
+def _array(data: bytes, rng: random.Random) -> bytes:
+    """One array of an npz file replaced, or the file packed otherwise."""
+    with np.load(io.BytesIO(data)) as arrays:
+        content: dict[str, Any] = dict(arrays)
+    name = rng.choice(("names", "values", "matrix"))
+    array = content[name]
+    where = tuple(rng.randrange(size) for size in array.shape)
+    how = rng.randrange(9)
+    if how == 0:
+        del content[name]
+    elif how == 1:
+        content[name] = array.astype(object)
+    elif how == 2:
+        content[name] = array.astype(str) if array.dtype.kind == "f" else np.zeros(array.shape, complex)
+    elif how == 3:
+        content[name] = array[..., :-1]
+    elif how == 4:
+        array[where] = (
+            rng.choice(("nobody", "")) if array.dtype.kind == "U" else rng.choice((np.inf, np.nan, 1e308, -1))
+        )
+    elif how == 5:
+        array[where] = array.flat[rng.randrange(array.size)]
+    elif how == 6:
+        plain = io.BytesIO()
+        np.save(plain, array)
+        return plain.getvalue()
+    elif how == 7:
+        return _bomb(name)
+    else:
+        content[name] = array * 1.001 if array.dtype.kind == "f" else array[::-1]
+    packed = io.BytesIO()
+    np.savez_compressed(packed, **content)
+    return packed.getvalue()
+
+
+def _bomb(name: str) -> bytes:
+    """An array of a gigabyte and more of zeros, in a megabyte; its header claims still more."""
+    packed = io.BytesIO()
+    head = io.BytesIO()
+    np.lib.format.write_array_header_1_0(head, {"descr": "<f8", "fortran_order": False, "shape": (10**6, 10**6)})
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive, archive.open(f"{name}.npy", "w") as member:
+        member.write(head.getvalue())
+        for _ in range(300):
+            member.write(bytes(1_000_000))
+    return packed.getvalue()
+
+
+def copied(source: Path, folder: Path) -> Path:
+    shutil.copytree(source, folder)
+    return folder / "project.toml"
+
+
+FOLDER = Path("/project")
+
+
+def made_record(seed: int = 1, marks: int = 8, status: Status = Status.MEASURED, **changes: Any) -> MeasuredScan:
+    """A frame of so many fiducials. changes: of the frame."""
+    rng = random.Random(seed)
+    matrix = np.array([[rng.uniform(40, 60), rng.gauss(0, 1), 2500.0], [rng.gauss(0, 1), -50.0, 2000.0]])
+    own = tuple(mark(rng, str(number), status) for number in range(1, marks + 1))
+    frame = FrameMeasurement(str(seed), own, Pose("90m", True, ("its number says so.",)), matrix)
+    path, notes = str(FOLDER / f"scans/{seed}.tif"), ("Light was taken to grow as the grey value.",)
+    return MeasuredScan(path, 5000, 4000, (20.0, 20.5), replace(frame, **changes), notes, seconds=0.5)
+
+
+def mark(rng: random.Random, point: str, status: Status = Status.MEASURED) -> MarkMeasurement:
+    noise = np.array([[rng.uniform(1e-4, 2e-4), 1e-5], [1e-5, rng.uniform(1e-4, 2e-4)]])
+    film = np.array([[rng.uniform(1e-3, 2e-3), 0.0], [0.0, 1e-3]])
+    place = np.array([rng.uniform(0, 5000), rng.uniform(0, 4000)])
+    quality = {"snr": rng.uniform(5, 50), "contrast_dn": np.nan, "blur_px": rng.uniform(1, 2)}
+    reason = Reason() if status is Status.MEASURED else Reason("it is faint", Code.CONTRAST)
+    return MarkMeasurement(
+        point, "fiducial", place, Covariance({Cause.NOISE: noise, Cause.FILM: film}), status, reason, quality
+    )
+
+
+def changed(scan: MeasuredScan, numbers: Iterable[int], status: Status, reason: Reason) -> MeasuredScan:
+    """The scan with another status of some marks."""
+    marks = list(scan.frame.marks)
+    for number in numbers:
+        marks[number] = replace(marks[number], status=status, reason=reason)
+    return replace(scan, frame=replace(scan.frame, marks=tuple(marks)))
+
+
+def failed(seed: int = 1) -> MeasuredScan:
+    sentence = f"scans/{seed}.tif is damaged or truncated"
+    frame = made_record(seed, 2, Status.ABSENT, pose=None, pixel_from_camera=None).frame
+    frame = replace(frame, problems=(Reason(sentence, Code.FAILED_SCAN),))
+    return MeasuredScan.failed(str(FOLDER / f"scans/{seed}.tif"), frame, Failure(FailureCode.UNREADABLE, sentence))
+
+
+def kept_result(seed: int = 1, options: str = "{}", mtime_ns: int = 1, scan: MeasuredScan | None = None) -> Kept:
+    """A result of a scan of its own."""
+    state = FileState(f"scans/{seed}.tif", 1000 + seed, mtime_ns)
+    parts = hashlib.sha256(str(seed).encode()).hexdigest()
+    return Kept(Identity(state, parts), options, scan or made_record(seed), camera="camera.toml")
+
+
+def content(scan: MeasuredScan) -> tuple[object, ...]:
+    """All of a scan, by which it can be compared."""
+    codes = [problem.code for problem in scan.frame.problems]
+    return (scan.frame.image, scan_detail(scan, scan.scan), codes, *map(mark_row, scan.frame.marks))
+
+
+def stored(store: Store, row: int, image: str = "1") -> tuple[object, ...]:
+    """The content of a result of a store."""
+    return content(store.scan(row, image, FOLDER))
+
+
+def dump(path: Path) -> list[str]:
+    """All that a store holds, but times, and which rows came first."""
+    with Store(path) as store:
+        db = store.connection
+        results = db.execute(
+            "select fingerprint, uri, bytes, mtime_ns, identity_hash, hash, result.id from result "
+            "join scan on scan.id = result.scan join options on options.id = result.options order by fingerprint"
+        ).fetchall()
+        return [f"{row[:-1]} {stored(store, row[-1])}" for row in results]
+
+
+def keep_scans(path: Path, scans: Sequence[MeasuredScan], made_from: Mapping[str, str] | None = None) -> str:
+    """In the store at `path` of the project whose folder is above its own; the digest of their judging."""
+    folder = path.parent.parent.resolve()
+    with Store(path) as store:
+        remember_place(store, folder)
+        frames = []
+        for scan in scans:
+            identity = Identity(file_state(Path(scan.scan), folder), parts_hash(Path(scan.scan)))
+            row = store.keep(Kept(identity, "{}", scan), scan.frame.image, current=True)
+            frames.append(CheckedResult(row, scan))
+        return judge(store, made_from or {}, "kept", frames)
+
+
+def scan_content(file: Path) -> bytes:
+    """Of a result; of a store what it says of the marks that stand in comparator.csv, and not which page it stands on
+    nor when it was measured; of thumbnails, which may be deleted, nothing."""
+    if file.name.startswith("thumbnails"):
+        return b""
+    if file.suffix != ".db":
+        return file.read_bytes()
+    comparator = file.parents[1] / "comparator.csv"
+    with Store(file) as store:
+        judging = find_judging(store, read_measurement_hash(comparator)) if comparator.exists() else None
+        scans = () if judging is None else checked_scans(store, judging, file.parent)
+        kept = [[scan_detail(scan, ""), *map(mark_row, scan.frame.marks)] for scan in scans]
+        return b"" if judging is None else repr([judging.digest, *kept]).encode()
+
+
+def measure_scan(project: Project, name: str) -> MeasuredScan:
+    (task,) = scan_tasks(project, [name])
+    scan = measured_scan(task)
+    assert not scan.failure
+    return scan

@@ -1,0 +1,299 @@
+"""Camera files: made from templates, saved for later projects, self-calibration sets, what they may have meant."""
+
+import json
+import shutil
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from networks import LENSES, Truth, field_points, lens_network, simulated
+from projects import write_network_project
+from studies import parametrize_with_studies
+from test_lens_comparison import two_networks
+
+from measure import FiducialOptions, FrameMeasurement, Status, measure_fiducials, open_scan
+from pipeline import InputError, read_adjustment, read_project
+from pipeline.cli import DONE, LOOK, run
+from pipeline.exchange.saved_cameras import _archive_variances, save_cameras
+from pipeline.files.camera_file import CameraFile, read_camera
+from pipeline.files.camera_template import MARK_KINDS, CameraSizes, camera_template
+from pipeline.measuring.target_identification import misplaced_principal_point
+from pipeline.rendered.scene_file import render_project
+from pipeline.results.adjustment_record import CameraRecord, Quantity
+from pipeline.results.measured_record import MeasuredScan
+from pipeline.review.camera_drawing import CameraDrawing, ClickedMark, place_frame
+from pipeline.review.drawing_view import fit_drawing
+
+SIZE_MM = 20.0
+SCENE = """name = "one"
+seed = 4
+camera = "camera.toml"
+[field]
+kind = "natural"
+unit = "m"
+[picture]
+background = "plain"
+pad_mm = {pad_mm}
+[picture.tones]
+dark_mark = 0.06
+border = 0.06
+[film]
+transformation = "affine"
+dust = 0
+scratches = 0
+hairs = 0
+[scan]
+pitch_um = 40.0
+margin_mm = 1.5
+[[image]]
+name = "one"
+position = [0.0, 0.0, 5.0]
+angles_deg = [0.0, 0.0, 0.0]
+"""
+POLARITY = {"notch": "light", "wedge": "dark", "wing": "dark"}
+
+
+def sizes(kind: str, place: str) -> CameraSizes:
+    size = (SIZE_MM, SIZE_MM)
+    return CameraSizes((kind,), size if place == "square" else None, size if place == "side" else None, None, 30.0)
+
+
+def image_camera(folder: Path, made: CameraSizes) -> CameraFile:
+    (folder / "camera.toml").write_text(camera_template(made), encoding="utf-8")
+    return read_camera(folder / "camera.toml")
+
+
+@pytest.mark.parametrize("kind", [kind for kind in MARK_KINDS if kind != "learned"])
+def test_a_rendered_frame_of_each_kind_is_measured_with_its_template(kind: str, tmp_path: Path) -> None:
+    """The scene shows the marks light or dark, as they are on film; the file that measures them leaves that open."""
+    place = MARK_KINDS[kind].at[-1]
+    given = image_camera(tmp_path, sizes(kind, place))
+    text = (tmp_path / "camera.toml").read_text(encoding="utf-8")
+    (tmp_path / "camera.toml").write_text(
+        text.replace('polarity = "auto"', f'polarity = "{POLARITY.get(kind, "light")}"'), encoding="utf-8"
+    )
+    pad_mm = 0.0 if MARK_KINDS[kind].edge_mm is not None else 1.6
+    (tmp_path / "scene.toml").write_text(SCENE.format(pad_mm=pad_mm), encoding="utf-8")
+    render_project(tmp_path / "scene.toml", tmp_path / "out", lambda *_: None)
+    truth = json.loads((tmp_path / "out" / "truth.json").read_text(encoding="utf-8"))["images"]["one"]["fiducials"]
+    with open_scan(next((tmp_path / "out" / "scans").iterdir())) as scan:
+        frame = measure_fiducials(scan, given.layout(), scan.pitch_um, FiducialOptions(pose="0", writing="none"))
+    for mark in frame.marks:
+        true = np.array([truth[mark.point]["col_px"], truth[mark.point]["row_px"]])
+        assert mark.status is Status.MEASURED or kind == "frame-corner", mark  # the ground there is no even edge
+        assert mark.covariance_px2 is not None
+        off_px = np.asarray(mark.center_px) - true
+        assert off_px @ np.linalg.solve(mark.covariance_px2, off_px) < 20.0, (mark, true)  # one in 20,000
+
+
+def test_a_wing_is_fitted_on_the_review_page_as_far_as_it_is_true(tmp_path: Path) -> None:
+    """Beyond the frame's edge it merges into the border. Clicked 3 px off."""
+    given = image_camera(tmp_path, sizes("wing", "side"))
+    text = (tmp_path / "camera.toml").read_text(encoding="utf-8").replace('"auto"', '"dark"')
+    (tmp_path / "camera.toml").write_text(text, encoding="utf-8")
+    (tmp_path / "scene.toml").write_text(SCENE.format(pad_mm=0.0), encoding="utf-8")
+    render_project(tmp_path / "scene.toml", tmp_path / "out", lambda *_: None)
+    truth = json.loads((tmp_path / "out" / "truth.json").read_text(encoding="utf-8"))["images"]["one"]["fiducials"]
+    true = {one.id: np.array([truth[one.id]["col_px"], truth[one.id]["row_px"]]) for one in given.fiducials}
+    marks = tuple(ClickedMark(id, (float(px[0]) + 2.0, float(px[1]) - 2.0)) for id, px in true.items())
+    wing = tomllib.loads(text)["mark"]["side"]
+    drawn = {key: wing[key] for key in ("kind", "vertices_mm", "rotate")}
+    drawing = CameraDrawing("one", drawn, marks, "5", frame_mm=given.frame_mm or (0.0, 0.0))
+    with open_scan(next((tmp_path / "out" / "scans").iterdir())) as scan:
+        placement = place_frame(drawing, (scan.width_px, scan.height_px), scan.pitch_um, "")
+        fitted = fit_drawing(drawing, placement, scan)
+    for one in fitted.marks:
+        assert not one.unfitted
+        assert np.hypot(*(np.array(one.px) - true[one.id])) < 0.02, one
+
+
+def test_eight_marks_of_an_aerial_camera_have_the_places_and_names_of_calibration_reports() -> None:
+    text = camera_template(CameraSizes(("cross", "ring-cross"), (212.0, 212.0), (220.0, 220.0)))
+    assert len(text.splitlines()) < 40
+    for line in (
+        "frame_mm = [228, 228]",
+        '{id = "1", xy_mm = [-106, -106], sigma_mm = 1.0, mark = "corner"}',
+        '{id = "2", xy_mm = [106, 106], sigma_mm = 1.0, mark = "corner"}',
+        '{id = "6", xy_mm = [110, 0], sigma_mm = 1.0, mark = "side"}',
+        '{id = "8", xy_mm = [0, -110], sigma_mm = 1.0, mark = "side"}',
+    ):
+        assert line in text
+
+
+def test_marks_to_be_learned_ask_for_clicks(tmp_path: Path) -> None:
+    camera = image_camera(tmp_path, sizes("learned", "square"))
+    assert len(camera.learned) == 4
+    assert camera.needs_clicks
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("croos", "212", None, None), "Did you mean 'cross'?"),
+        (("cross", None, None, None), "--square 212 for four marks in the corners, --side 226"),
+        (("wedge", "212", None, None), "--marks wedge goes with --side, not with --square"),
+        (("cross", "212 m", None, None), "--square '212 m' is no distance in mm"),
+        (("cross,dot,cross", "212", "220", None), "two are for --square and --side"),
+        (("cross", "212", None, "100"), "--frame 100: smaller than the distances of the marks"),
+    ],
+)
+def test_what_makes_no_camera_is_stated(words: tuple[str, str | None, str | None, str | None], message: str) -> None:
+    marks, square, side, frame = words
+    with pytest.raises(InputError) as refused:
+        CameraSizes.from_words(marks, square, side, frame, None, "x")
+    assert message in str(refused.value)
+
+
+def test_the_command_prints_a_file_that_loads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["template", "camera", "--marks", "ring-cross", "--square", "212", "--side", "226x220"]) == 0
+    (tmp_path / "camera.toml").write_text(capsys.readouterr().out, encoding="utf-8")
+    assert [one.xy_mm for one in read_camera(tmp_path / "camera.toml").fiducials][4:6] == [(-113.0, 0.0), (113.0, 0.0)]
+    assert run(["template", "project", "--marks", "cross"]) == 2
+    assert "--c go with `reseau template camera --marks KIND`" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def archives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Projects a, b and both together, adjusted."""
+    folder = tmp_path_factory.mktemp("archives")
+    for name, (network, _) in zip("ab+", two_networks("affine", 1.0), strict=True):
+        (folder / name).mkdir()
+        assert run(["adjust", str(write_network_project(network, folder / name))]) in (0, 1)
+    return folder
+
+
+def adjust_network(folder: Path) -> CameraRecord:
+    return read_adjustment(folder / "out" / "adjustment.json").cameras["K"]
+
+
+def quantities(camera: CameraRecord) -> dict[str, Quantity]:
+    fiducials = {f"{id} {axis}": q for id, m in camera.fiducials.items() for axis, q in (("x", m.x_mm), ("y", m.y_mm))}
+    return {**camera.interior, **fiducials}
+
+
+def test_a_second_project_with_the_saved_camera_is_both_together(
+    archives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["cameras", "--save", str(archives / "a" / "project.toml"), "--out", str(tmp_path / "saved")]) == 0
+    output = " ".join(capsys.readouterr().out.split())
+    frames = len(read_adjustment(archives / "a" / "out" / "adjustment.json").images)
+    assert f"adjusted from {frames} frames of 1 scanner in a" in output
+    camera = read_camera(tmp_path / "saved" / "camera.toml")
+    assert camera.source is not None
+    assert (camera.source.frames, camera.source.scanners, camera.source.archives) == (frames, 1, 1)
+    first = quantities(adjust_network(archives / "a"))
+    assert camera.principal_distance_mm == pytest.approx(first["c"].value, abs=1e-12)
+    later = shutil.copytree(archives / "b", tmp_path / "later", ignore=shutil.ignore_patterns("out"))
+    text = (later / "project.toml").read_text(encoding="utf-8").replace("camera.toml", "../saved/camera.toml", 1)
+    (later / "project.toml").write_text(text, encoding="utf-8")
+    assert run(["adjust", str(later / "project.toml")]) in (0, 1)
+    second, joint = quantities(adjust_network(later)), quantities(adjust_network(archives / "+"))
+    for name, both in joint.items():
+        if both.sigma > 0.0:
+            assert second[name].value == pytest.approx(both.value, abs=0.1 * both.sigma), name
+            assert second[name].sigma == pytest.approx(both.sigma, rel=0.1), name
+    assert second["c"].sigma < 0.9 * first["c"].sigma
+
+
+def test_two_archives_are_joined_to_what_both_together_give(archives: Path, tmp_path: Path) -> None:
+    projects = [read_project(archives / name / "project.toml") for name in "ab"]
+    (saved,) = save_cameras(projects, tmp_path)
+    assert (saved.source.archives, saved.source.text.split(" in ")[1]) == (2, "a, b")
+    joint, camera = quantities(adjust_network(archives / "+")), read_camera(saved.path)
+    assert camera.calibration is not None
+    held = dict(zip((one.quantity for one in camera.calibration.parameters), camera.calibration.values, strict=True))
+    for name in ("c", "k3", "x0"):
+        spread = saved.source.spread_mm[name]
+        assert held[name] == pytest.approx(joint[name].value, abs=0.1 * joint[name].sigma), name
+        sigma = np.sqrt(camera.calibration.covariance.diagonal())[list(held).index(name)]
+        assert sigma == pytest.approx(np.hypot(joint[name].sigma, spread / np.sqrt(2)), rel=0.15), name
+
+
+def test_the_spread_between_archives_is_what_their_own_sigmas_do_not_explain() -> None:
+    """Of 4,000 quantities in five archives, by simulation: 2 between them, 1 in each; and none."""
+    rng = np.random.default_rng(5)
+    for true in (2.0, 0.0):
+        values = true * rng.normal(size=(5, 4000)) + rng.normal(size=(5, 4000))
+        between = _archive_variances(values, np.ones((5, 4000)))
+        assert float(between.mean()) == pytest.approx(true**2, rel=0.06, abs=0.3)
+
+
+def test_what_cannot_be_saved_is_refused(archives: Path, tmp_path: Path) -> None:
+    project = read_project(archives / "a" / "project.toml")
+    (tmp_path / "camera.toml").write_text('name = "own"\n')
+    with pytest.raises(InputError, match="is there already, and was not saved so"):
+        save_cameras([project], tmp_path)
+    other = shutil.copytree(archives / "b", tmp_path / "b", ignore=shutil.ignore_patterns("out"))
+    with pytest.raises(InputError, match="no adjustment that converged"):
+        save_cameras([read_project(other / "project.toml")], tmp_path / "c")
+
+
+EBNER = {"b3": 0.02, "b5": -0.03, "b6": 0.015, "b7": 0.04, "b10": -0.02, "b11": 0.03}
+
+
+@pytest.mark.study
+def test_ebners_set_from_the_camera_file_to_the_report(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    free = {f"b{i}": np.inf for i in range(3, 13)}
+    truth = Truth(family="ebner", distortion=dict.fromkeys(free, 0.0) | EBNER)
+    network, _ = simulated(rng, truth, points=field_points(rng, 40), free=free)
+    project = write_network_project(network, tmp_path)
+    assert run(["run", str(project)]) in (DONE, LOOK)
+    result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    distortion = result["cameras"]["K"]["distortion"]
+    assert (distortion["family"], distortion["half_mm"]) == ("ebner", [114.0, 114.0])
+    assert 0.8 < result["sigma0"] < 1.2
+    for name, value in truth.distortion.items():
+        assert abs(distortion[name]["value"] - value) < 4.0 * distortion[name]["sigma"], name
+    check = json.loads((tmp_path / "out" / "check.json").read_text(encoding="utf-8"))
+    assert check["verdict"] == "not possible"
+    assert check["reason"] == "OpenCV has no counterpart of the distortion family ebner."
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "Distortion vectors over the camera frame" in page
+    assert "Distortion over the radius with its 95 % band" in page
+    assert "effect in the frame (µm)" in page
+
+
+@parametrize_with_studies("name", list(LENSES), quick=(2,))
+def test_a_lens_from_the_camera_file_to_the_report(name: str, tmp_path: Path) -> None:
+    """Noisy images, nothing known of the lens; what OpenCV can and cannot compare is said."""
+    project = write_network_project(lens_network(name, np.random.default_rng(4)), tmp_path)
+    assert run(["run", str(project)]) in (DONE, LOOK)
+    result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    distortion = result["cameras"]["L"]["distortion"]
+    assert (distortion["family"], distortion["r0_mm"]) == (name, 13.0)
+    assert ("axes" in distortion) == name.startswith("opencv")
+    assert 0.8 < result["sigma0"] < 1.2
+    for each, value in LENSES[name][1].items():
+        assert abs(distortion[each]["value"] - value) < 4.0 * distortion[each]["sigma"], each
+    check = json.loads((tmp_path / "out" / "check.json").read_text(encoding="utf-8"))["cameras"]["L"]
+    # A skew is none of cv2.calibrateCamera's models; cv2.fisheye has one.
+    assert check["verdict"] == ("agrees" if name == "opencv_fisheye" else "not possible"), check["reason"]
+    assert ("OpenCV's model cannot take this lens" in check["reason"]) == (name != "opencv_fisheye")
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert ("refer to its axes, x right and y down" in page) == name.startswith("opencv")
+    assert "Distortion over the radius with its 95 % band" in page
+
+
+MEASURED = MeasuredScan("v.tif", 2001, 1801, (20.0, 20.0), FrameMeasurement("v", ()))
+FIDUCIALS = '[[fiducial]]\nid = "1"\nxy_mm = [18.0, -16.0]\nmark = "dot"\n[mark.dot]\nkind = "dot"\nradius_mm = 0.2\n'
+
+
+@pytest.mark.parametrize(
+    ("given", "rest", "is_told"),
+    [
+        ("principal_point_mm = [0.0, 0.0]", "", True),
+        ("principal_point_mm = [20.3, 18.1]", "", True),  # y counted downwards
+        ("principal_point_mm = [20.3, -18.1]", "", False),
+        ("", "", False),
+        ("principal_point_mm = [0.0, 0.0]", FIDUCIALS, False),
+    ],
+)
+def test_a_principal_point_that_counts_from_elsewhere_is_reported(
+    given: str, rest: str, is_told: bool, tmp_path: Path
+) -> None:
+    path = tmp_path / "camera.toml"
+    path.write_text(f'name = "c"\nframe_mm = [40.0, 36.0]\nprincipal_distance_mm = 60.0\n{given}\n{rest}')
+    result = misplaced_principal_point(read_camera(path), MEASURED)
+    assert ("the middle of this scan is [20, -18]" in result) == is_told
