@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import tifffile
-from drawn_frames import paint
+from drawn import paint
 from scipy.ndimage import gaussian_filter
 
 from benchmarks.harness import Row

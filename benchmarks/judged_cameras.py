@@ -5,7 +5,7 @@ given coordinates and scanner errors, and false-alarm rates.
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from test_judgement import EIGHT, FILM_MM, FOUR, PX_PER_MM, SIGMA_PX, make_frames, make_layout, shift_mark, weak
+from test_across_frames import EIGHT, FILM_MM, FOUR, PX_PER_MM, SIGMA_PX, make_frames, make_layout, shift_mark, weak
 
 from benchmarks.harness import Row
 from measure.fiducials.across_frames import CheckedFrames, check_frames

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from test_judgement import FOUR, PX_PER_MM, make_layout
+from test_across_frames import FOUR, PX_PER_MM, make_layout
 
 from measure.fiducials.across_frames import check_frames
 from measure.flags import Status

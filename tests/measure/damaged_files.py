@@ -9,14 +9,10 @@ from typing import Any
 import numpy as np
 import PIL.Image
 import tifffile
-from drawn_frames import NUMBERED, PITCH_UM, frame_picture, pixel_from_camera
+from drawn import NUMBERED, PITCH_UM, frame_picture, pixel_from_camera
 from numpy.typing import NDArray
 
-from measure.errors import MeasurementError
-from measure.fiducials.measurement import measure_fiducials
-from measure.flags import Status
-from measure.results import FrameMeasurement
-from measure.scans.opening import open_scan
+from measure import FrameMeasurement, MeasurementError, Status, measure_fiducials, open_scan
 
 Damage = Callable[[bytearray, np.random.Generator], None]
 

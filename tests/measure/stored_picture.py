@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.scans.opening import open_scan
+from measure import open_scan
 
 HEIGHT, WIDTH = 203, 317
 

@@ -7,14 +7,15 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from drawn import drawn, scan_of
-from drawn_boards import (
+from drawn import (
     board_from_pixel,
     chessboard_dark,
     circles_dark,
+    drawn,
     errors_px,
     mapped,
     read_truth,
+    scan_of,
     squares_dark,
     take_picture,
     tile_boards,
@@ -25,6 +26,7 @@ from scipy.io import loadmat
 from scipy.spatial import KDTree
 from studies import parametrize_with_studies
 
+from measure import Status, open_scan
 from measure.boards.corners import one_definition
 from measure.boards.find import is_even, whole_pattern
 from measure.boards.measure import measure_board
@@ -37,9 +39,7 @@ from measure.boards.specs import (
     CircleGridSpec,
     SquareGridSpec,
 )
-from measure.flags import Status
 from measure.results import Covariance, MarkMeasurement
-from measure.scans.opening import open_scan
 
 Array = NDArray[np.float64]
 

@@ -8,20 +8,24 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from brute_marks import Array, written_scan
-from drawn_frames import CORNERS, NUMBERED, RING_CROSS, assert_right, frame_picture, layout_of, pixel_from_camera
+from drawn import (
+    CORNERS,
+    NUMBERED,
+    RING_CROSS,
+    Array,
+    assert_right,
+    frame_picture,
+    layout_of,
+    pixel_from_camera,
+    written_scan,
+)
 from studies import parametrize_with_studies
 
-from measure.fiducials.measurement import measure_fiducials
-from measure.fiducials.options import FiducialOptions
+from measure import FiducialOptions, FrameMeasurement, Scan, Status, measure_fiducials, open_scan
 from measure.fiducials.search import FrameSearch, PitchHypothesis, is_lattice, room_mm
-from measure.flags import Status
 from measure.marks.shapes import FiducialLayout, MarkShape, ring_cross
-from measure.results import FrameMeasurement
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS, Samples
-from measure.scans.opening import open_scan
-from measure.scans.scan import Scan
 
 PITCH_UM = (50.0, 50.0)
 

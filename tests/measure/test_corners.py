@@ -8,10 +8,10 @@ from scipy.special import ndtr
 from scipy.stats import multivariate_normal
 from studies import parametrize_with_studies
 
+from measure import ScanWindow
 from measure.array_types import Single
 from measure.boards.corner_surfaces import Surface, crossing, quarter
 from measure.boards.corners import Corner, CornerStart, fit_corners
-from measure.matching.window import ScanWindow
 
 Array = NDArray[np.float64]
 SIZE, NOISE, CONTRAST = 25, 4.0, 100.0

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from brute_marks import Array, brute_picture, placed
+from drawn import Array, brute_picture, placed
 
 from measure.marks.coverage import CELLS, cell_coverage
 from measure.marks.rendering import picture, render

@@ -1,8 +1,171 @@
-"""What residuals show of dust and scratches, on specks whose pixels are known."""
+"""Marks in damaged files, and what residuals show of dust and scratches."""
+
+import multiprocessing
+import resource
+import time
+from collections import Counter
+from collections.abc import Iterator
+from io import BytesIO
+from multiprocessing.connection import Connection
+from pathlib import Path
 
 import numpy as np
+import pytest
+import tifffile
+from damaged_files import DAMAGES, measure_file, outcome, stored
+from numpy.typing import NDArray
 
+from measure import MeasurementError, Status, open_scan
+from measure.fiducials.rows import with_damage
 from measure.noise.robust_estimation import damage
+
+CASES = 20  # of each damage in each kind of file, in the study
+LONGEST_S = 20.0  # of the processor
+WAITED_S = 300.0  # until a case is a hang: the machine may have other work
+MOST_BYTES = 1 << 30
+
+
+def damaged(name: str, kind: str, case: int) -> bytes:
+    """The file damaged; the case decides where, the same in every run."""
+    rng = np.random.default_rng([case, list(stored()).index(name), list(DAMAGES).index(kind)])
+    data = bytearray(stored()[name])
+    DAMAGES[kind](data, rng)
+    return bytes(data)
+
+
+@pytest.mark.study
+def test_a_share_of_the_damaged_files(tmp_path: Path) -> None:
+    """Some kinds of files, each with another damage that leaves marks to be measured."""
+    path = tmp_path / "s"
+    cases = {"jpeg": "flipped", "tiff zstd": "zeroed", "tiff uncompressed": "flipped"}
+    for name, kind in cases.items():
+        path.write_bytes(stored()[name])
+        whole = measure_file(path)
+        path.write_bytes(damaged(name, kind, 1))
+        assert outcome(path, whole) in ("message", "right"), name
+
+
+def test_every_damage_is_reported_or_leaves_each_pixel_at_its_place(tmp_path: Path) -> None:
+    """A checksum tells all; else a changed byte may leave another grey value where nobody can know it. A picture that
+    is not where it was differs nearly everywhere, but for a changed brightness of what follows in a JPEG stream."""
+    path = tmp_path / "s"
+    for name, whole in stored().items():
+        path.write_bytes(whole)
+        with open_scan(path) as scan:
+            right = scan.samples(0, 0, scan.width_px, scan.height_px).astype(float)
+        for kind in DAMAGES:
+            for case in range(2):
+                path.write_bytes(damaged(name, kind, case))
+                found = known_samples(path)
+                if found is None or found[0].shape != right.shape:
+                    continue
+                off = np.abs(detail(found[0]) - detail(right))[found[1]].ravel()
+                moved = (off > 20 * right.max() / 255).mean() if off.size else 0.0
+                assert moved <= (0.0 if name in ("tiff deflate", "png") else 0.05), (name, kind, case)
+
+
+def known_samples(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]] | None:
+    """Of a scan, and which of its pixels are known; None where it is refused."""
+    try:
+        with open_scan(path) as scan:
+            place = 0, 0, scan.width_px, scan.height_px
+            return scan.samples(*place).astype(float), scan.inside(*place)
+    except MeasurementError:
+        return None
+
+
+def detail(samples: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Steps from pixel to pixel: a changed brightness of all leaves them as they are."""
+    return np.asarray(np.diff(samples, axis=1, append=samples[:, -1:]))
+
+
+@pytest.mark.parametrize("kind", ["jpeg", "jpeg progressive"])
+def test_thirty_bytes_lost_from_a_jpeg_stream(tmp_path: Path, kind: str) -> None:
+    data = stored()[kind]
+    (tmp_path / "s.jpg").write_bytes(data[: len(data) // 2] + data[len(data) // 2 + 30 :])
+    with open_scan(tmp_path / "s.jpg") as scan:
+        frame = with_damage(scan, measure_file(tmp_path / "s.jpg"))
+    assert {mark.status for mark in frame.marks} == {Status.ABSENT}
+    assert all("nothing of it can be trusted" in mark.reason for mark in frame.marks)
+    assert "file is damaged" in frame.problems[0]
+
+
+@pytest.mark.parametrize("kept", [0.3, 0.97])
+def test_a_jpeg_cut_short_with_its_end_marker_kept(tmp_path: Path, kept: float) -> None:
+    data = stored()["jpeg"]
+    (tmp_path / "s.jpg").write_bytes(data[: int(kept * len(data))] + data[-2:])
+    with open_scan(tmp_path / "s.jpg") as scan:
+        assert "premature end" in scan.damage
+
+
+def test_a_mark_in_a_damaged_tile_is_absent_and_the_others_are_measured(tmp_path: Path) -> None:
+    data = bytearray(stored()["tiff jpeg tiles"])
+    with tifffile.TiffFile(BytesIO(data)) as file:
+        offset, count = file.pages.first.dataoffsets[0], file.pages.first.databytecounts[0]
+    data[offset + count // 2 : offset + count - 2] = bytes(count - 2 - count // 2)
+    (tmp_path / "s.tif").write_bytes(bytes(data))
+    frame = measure_file(tmp_path / "s.tif")
+    result = {mark.point: mark.status for mark in frame.marks}
+    assert result == {"1": "measured", "2": "measured", "3": "absent", "4": "measured"}
+    assert "file is damaged at its place: tile 0" in frame.marks[2].reason
+
+
+@pytest.mark.study
+def test_damaged_files_by_the_thousand(tmp_path: Path) -> None:
+    """In a process of its own, which has so much memory and no more. (python -m pytest -m study -s says the counts.)"""
+    counts: dict[str, Counter[str]] = {name: Counter() for name in stored()}
+    bad = []
+    for name, kind, case, own_outcome in _outcomes(tmp_path):
+        counts[name][own_outcome.split(":")[0]] += 1
+        if own_outcome not in ("message", "right"):
+            bad.append((name, kind, case, own_outcome))
+            print(*bad[-1], flush=True)
+    for name, counted in counts.items():
+        print(f"{name:25} {dict(counted)}")
+    assert sum(counted.total() for counted in counts.values()) == CASES * len(DAMAGES) * len(stored()) >= 2000
+    assert not bad
+
+
+def _outcomes(folder: Path) -> Iterator[tuple[str, str, int, str]]:
+    """Of every case, from processes that are ended where one hangs."""
+    cases = [(name, kind, case) for name in stored() for kind in DAMAGES for case in range(CASES)]
+    first = 0
+    while first < len(cases):
+        here, there = multiprocessing.Pipe()
+        worker = multiprocessing.get_context("spawn").Process(target=_work, args=(there, folder, cases[first:]))
+        worker.start()
+        there.close()
+        for each in cases[first:]:
+            first += 1
+            try:
+                result = here.recv() if here.poll(WAITED_S) else "hang"
+            except EOFError:
+                result = "died"
+            yield *each, result
+            if result in ("hang", "died"):
+                break
+        worker.kill()
+        worker.join()
+
+
+def _work(out: Connection, folder: Path, cases: list[tuple[str, str, int]]) -> None:
+    whole = {}
+    path = folder / "s"
+    for name in dict.fromkeys(name for name, _, _ in cases):
+        path.write_bytes(stored()[name])
+        whole[name] = measure_file(path)
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    most = pages * resource.getpagesize() + MOST_BYTES
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    for name, kind, case in cases:
+        path.write_bytes(damaged(name, kind, case))
+        start = time.process_time()
+        try:
+            own_outcome = outcome(path, whole[name])
+        except Exception as error:
+            own_outcome = f"traceback: {error!r}"
+        took_s = time.process_time() - start
+        out.send(own_outcome if took_s < LONGEST_S else f"hang: {took_s:.0f} s")
 
 
 def test_damage_lies_about_its_speck_on_all_sides_alike() -> None:

@@ -12,9 +12,8 @@ import pytest
 import tifffile
 from stored_picture import HEIGHT, WIDTH, picture
 
-from measure.errors import MeasurementError
+from measure import MeasurementError, open_scan
 from measure.scans.jpeg import stream_damage
-from measure.scans.opening import open_scan
 from measure.scans.parallel import map_in_threads
 
 

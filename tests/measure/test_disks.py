@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 
-from measure.scans.scan import Scan
+from measure import Scan
 from measure.targets.block_search import Candidate, search_blocks
 from measure.targets.disk_detection import DiskSearch, disk_candidates, disk_octaves
 from measure.targets.disks import FittedDisk, fit_disk, fit_plain_disks

@@ -1,16 +1,27 @@
-"""Faint marks on texture: seen where they are, with honest sigmas, and nowhere else."""
+"""Faint marks on texture, what is worth a fit, and marks that touch stronger edges."""
 
+import gc
+import weakref
 from pathlib import Path
 
 import numpy as np
 import pytest
-from brute_marks import Array, brute_picture, written_scan
+from drawn import Array, brute_picture, layout_of, paint, placed, scan_of, written_scan
+from scipy import ndimage
 from scipy.ndimage import gaussian_filter
+from true_marks import KIND, some_mark
 
+from measure import FiducialOptions, MatchOptions, Scan, measure_fiducials
+from measure.detection.correlation import CLOSE, GRAINY, WIDE, Map, Surroundings, correlation
 from measure.detection.faint_marks import FaintMark, detect_faint
-from measure.detection.localisation import MarkPrediction
+from measure.detection.localisation import MarkPrediction, localise
+from measure.detection.responses import FULL, ByteCache, Dilation, ResponseMap, Responses, ScanMaps, TemplateSet
+from measure.fiducials.mark_fit import detect_mark
 from measure.flags import Cause
-from measure.marks.shapes import Bar, MarkShape, cross, dot
+from measure.marks.shapes import Bar, MarkShape, cross, dot, polygon, ring_cross
+from measure.matching.window import pixels_beyond_edge
+from measure.scans.cache import WholePicture
+from measure.scans.metadata import NO_TAGS
 from measure.tone.curve import Tone, power
 
 CROSS = MarkShape(cross(0.5, 0.05), "dark")
@@ -141,3 +152,247 @@ def test_what_the_tone_curve_moves_a_faint_mark_by_is_in_its_covariance(tmp_path
     )
     np.testing.assert_allclose(detection.fit.center_px, ends[0].fit.center_px + half, atol=0.002)
     assert Cause.TONE not in ends[0].fit.place_covariance.parts
+
+
+GROUND, CONTRAST = 25000.0, 15000.0
+
+
+@pytest.mark.parametrize("texture_px", [0.0, 1.0, 3.0])
+def test_noise_is_rarely_worth_a_fit_however_coarse_it_is(texture_px: float) -> None:
+    rng = np.random.default_rng(1)
+    marks = [some_mark(KIND[name], 1.0, rng) for name in ("cross", "ring-dot", "dot")]
+    tries, answers = 20, 0
+    for mark in marks * tries:
+        noise = rng.standard_normal((mark.size, mark.size))
+        if texture_px:
+            noise = gaussian_filter(noise, texture_px) * texture_px * 3
+        expected = MarkPrediction(mark.kind.shape, mark.place, 3.0, 1)
+        answers += localise(scan_of(GROUND + 3000 * noise), expected) is not None
+    assert answers <= 13  # of sixty at a twentieth, sharp or soft: more in one run of a thousand
+
+
+def test_a_soft_mark_that_hardly_stands_out_of_the_noise_is_measured() -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(3):
+        mark = some_mark(KIND["gap cross"], 2.5, rng)
+        grey = GROUND + CONTRAST * (mark.picture + rng.standard_normal((mark.size, mark.size)) / 5)
+        start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + rng.uniform(-1, 1, 2)])
+        fit = detect_mark(scan_of(grey), MarkPrediction(mark.kind.shape, start, 3.0, 1), FiducialOptions().match).fit
+        assert fit is not None
+        error = fit.center_px - mark.place[:, 2]
+        assert error @ np.linalg.solve(fit.covariance_px2, error) < 13.8  # one in a thousand
+        assert np.trace(fit.covariance_px2) < 1.5**2 * np.trace(mark.bound(0.2))
+
+
+def test_a_line_far_thinner_than_a_pixel_is_not_detected_in_noise_and_warns_of_nothing() -> None:
+    mark = MarkShape(cross(1.5, 0.06), "dark")
+    noise = np.random.default_rng(3).standard_normal((60, 60))
+    place = np.array([[1.5, 0.0, 30.0], [0.0, -1.5, 30.0]])  # 0.67 mm a pixel
+    assert localise(scan_of(GROUND + 3000 * noise), MarkPrediction(mark, place, 3.0, -1)) is None
+
+
+def test_a_solid_mark_at_the_frames_border_is_visible_however_far_about_it_is_sought() -> None:
+    """Its ground is that of the frame, not that of the border, of which the more is seen the smaller the window is."""
+    rng, size, center = np.random.default_rng(4), 400, np.array([200.3, 199.6])
+    block = MarkShape(polygon(((0.0, 0.0), (2.8, 0.0), (2.8, -1.4), (0.56, -1.4))), known_mm=((-9.0, -9.0), (1.9, 9.0)))
+    place = np.column_stack([np.diag([36.0, -36.0]), center])
+    x, y = np.moveaxis((np.stack(np.meshgrid(*[np.arange(size)] * 2), axis=-1) - center) / (36.0, -36.0), -1, 0)
+    exposed = (x < 1.9) & ~((y < 0) & (y > -1.4) & (x > -0.4 * y))
+    ground = 30000 + 2500 * 14 * gaussian_filter(rng.standard_normal((size, size)), 4.0)
+    border = 14000 + 3000 * rng.standard_normal((size, size))
+    light = gaussian_filter(exposed.astype(float), 1.0)
+    scan = scan_of(light * ground + (1 - light) * border)
+    for search_px in (5.0, 24.0):
+        start = np.column_stack([place[:, :2], center + np.array([3.0, -2.0])])
+        observation = localise(scan, MarkPrediction(block, start, search_px, -1))
+        assert observation is not None
+        assert observation[1] < 1e-3
+        assert np.hypot(*(observation[0] - center)) < 6.0
+
+
+PX_PER_MM = 30.0
+BEYOND_EDGE_GROUND, EDGE, NOISE = 55000.0, 5000.0, 600.0
+WING = MarkShape(polygon(((0.0, 0.0), (0.8, 0.35), (0.8, -0.35))))
+
+
+def test_a_wing_is_measured_whose_base_is_the_frames_edge() -> None:
+    place = placed(PX_PER_MM, (60.3, 59.7))
+    grey = BEYOND_EDGE_GROUND + 5500.0 * brute_picture(WING, place, 121, 121, 1.0)
+    grey[:, 84:] = EDGE
+    grey += np.random.default_rng(1).normal(0.0, NOISE, grey.shape)
+    detection = detect_mark(scan_of(grey), MarkPrediction(WING, place, 4.0, 1, surroundings=CLOSE), MatchOptions())
+    assert detection.fit is not None
+    assert np.hypot(*(detection.fit.center_px - place[:, 2])) < 0.2
+
+
+def test_a_faint_light_cross_is_measured_whose_dark_pad_ends_next_to_it_in_a_light_landscape() -> None:
+    mark, place = MarkShape(cross(0.5, 0.05, 0.07, 45.0), "light"), placed(PX_PER_MM, (60.3, 59.7))
+    rng = np.random.default_rng(4)
+    row, col = np.mgrid[:121, :121]
+    landscape = 30000.0 + 6000.0 * gaussian_filter(rng.normal(size=(121, 121)), 3.0) * 10.0
+    grey = np.where(np.hypot(col - 60.3, row - 59.7) < 20.0, 4000.0, landscape)
+    grey += 3500.0 * brute_picture(mark, place, 121, 121, 0.7) + rng.normal(0.0, 900.0, grey.shape)
+    detection = detect_mark(scan_of(grey), MarkPrediction(mark, place, 4.0, 1, surroundings=CLOSE), MatchOptions())
+    assert detection.fit is not None, detection.reason
+    assert np.hypot(*(detection.fit.center_px - place[:, 2])) < 0.3
+
+
+def test_the_marks_own_ground_is_never_beyond_an_edge() -> None:
+    place = placed(PX_PER_MM, (60.3, 59.7))
+    mark = brute_picture(WING, place, 121, 121, 1.0)
+    for contrast in (30000.0, -30000.0):  # the mark itself is the strongest edge of its window
+        grey = 30000.0 + contrast * mark + np.random.default_rng(2).normal(0.0, NOISE, mark.shape)
+        assert not pixels_beyond_edge(grey, WING, place).any()
+
+
+def test_a_cross_that_dust_touches_is_visible_where_the_others_put_it() -> None:
+    mark, size, rng = MarkShape(cross(0.5, 0.1)), 440, np.random.default_rng(5)
+    corners = [(x, y) for x in (-4.4, 4.4) for y in (-4.4, 4.4)]
+    layout, matrix = layout_of([mark] * 4, corners, (11.0, 11.0)), placed(PX_PER_MM, (220.3, 220.3))
+    grey = np.full((size, size), BEYOND_EDGE_GROUND)
+    for corner in corners:
+        paint(grey, mark, corner, matrix, 6000.0, blur_px=1.0)
+    row, col = np.mgrid[:size, :size]
+    dusty = matrix @ (*corners[3], 1.0)
+    grey[np.hypot(col - dusty[0] + 13, row - dusty[1]) < 5] = EDGE
+    grey += rng.normal(0.0, 1200.0, grey.shape)
+    result = measure_fiducials(
+        scan_of(grey), layout, (1000 / PX_PER_MM,) * 2, FiducialOptions(pose="0", pitch_is_right=True)
+    )
+    for found, corner in zip(result.marks, corners, strict=True):
+        assert found.center_px is not None
+        assert found.status.is_observation, found
+        assert np.hypot(*(found.center_px - matrix @ (*corner, 1.0))) < 0.3
+
+
+ORIGIN = np.array([7, 3])
+MAP = np.random.default_rng(5).normal(size=(40, 50)).astype(np.float32)
+
+
+def responses_to(
+    surroundings: Surroundings, grey: np.ndarray, template: np.ndarray, detail_px: float, faint_dn: float
+) -> Map:
+    """The correlation of a picture, freed of its ground, with a template."""
+    flat = surroundings.flattened(grey.astype(np.float32), detail_px, faint_dn)
+    return correlation(flat, *surroundings.pattern(template, detail_px, flat))
+
+
+def response_map(map_: Map, cache: ByteCache[Dilation]) -> ResponseMap:
+    return Responses({(0, 1): map_}, (0,), 1, cache, ORIGIN[None]).by_key[0, 1]
+
+
+def test_share_of_a_place_is_its_rank() -> None:
+    exact = response_map(MAP, ByteCache(1 << 30)).dilated(0.0)
+    for rank, place in enumerate(np.argsort(-MAP, axis=None)[:60]):
+        row, col = divmod(int(place), MAP.shape[1])
+        assert np.isclose(exact.share(np.array([col + 0.3, row - 0.4]) + ORIGIN), (rank + 1) / MAP.size)
+
+
+def test_places_about_the_strongest_answer_as_it_does() -> None:
+    single = np.zeros_like(MAP)
+    single[20, 30] = 1.0
+    near = response_map(single, ByteCache(1 << 30)).dilated(2.0)
+    assert np.isclose(near.share(np.array([31.0, 19.0]) + ORIGIN), near.area_px / MAP.size)
+    assert near.share(np.array([34.0, 20.0]) + ORIGIN) == 1.0
+
+
+def test_only_the_dilations_used_last_are_cached() -> None:
+    cache = ByteCache[Dilation](2 * MAP.nbytes)
+    layers = [response_map(k * MAP, cache) for k in range(3)]
+    first, second, third = (each.dilated(4.0) for each in layers)
+    assert layers[2].dilated(4.0) is third
+    assert layers[1].dilated(4.0) is second
+    assert layers[0].dilated(4.0) is not first
+    np.testing.assert_array_equal(layers[0].dilated(4.0).map, first.map)
+    assert layers[2].dilated(4.0) is not third
+
+
+def test_responses_are_freed_with_the_search_and_not_by_the_next_garbage_collection() -> None:
+    responses = Responses({(0, 1): MAP}, (0,), 1, ByteCache[Dilation](1 << 30))
+    assert responses.by_key[0, 1].dilated(2.0).map.shape == MAP.shape
+    alive = weakref.ref(responses)
+    gc.disable()
+    try:
+        del responses
+        assert alive() is None
+    finally:
+        gc.enable()
+
+
+RNG = np.random.default_rng(4)
+SCAN = Scan(Path("noise.tif"), WholePicture(RNG.integers(0, 65535, (90, 110, 3), np.uint16)), NO_TAGS)
+CHIPS = RNG.normal(size=(2, 9, 9))
+TURNED = [np.rot90(chip, turn) for turn in range(4) for chip in CHIPS]  # in one pose after another
+SET = TemplateSet(TURNED, [2.0, 3.0] * 4, (1, -1), WIDE, 100.0)
+MAP_BYTES = 4 * 90 * 110
+
+
+def test_a_small_scan_caches_a_few_maps_of_its_size_and_a_large_one_what_the_effort_allows() -> None:
+    assert FULL.scan_cache_bytes(1000**2) == 32 * 4 * 1000**2
+    assert FULL.scan_cache_bytes(20_000**2) == FULL.cache_bytes
+
+
+def maps(cache: ByteCache[Map]) -> ScanMaps:
+    return ScanMaps(SCAN, 1, SET, cache)
+
+
+def test_a_map_is_the_strongest_correlation_of_all_channels() -> None:
+    given, inner = maps(ByteCache(100 * MAP_BYTES)), (slice(20, 60), slice(20, 80))
+    for (kind, sign), map_ in given.items():
+        whole = [SCAN.window(-4, -4, 118, 98, weights) for weights in np.eye(3).tolist()]
+        detail = SET.details_px[kind]
+        answers = [responses_to(WIDE, each, TURNED[kind], detail, 100.0) for each in whole]
+        assert map_.shape == (90, 110)
+        np.testing.assert_array_equal(map_[inner], np.max([sign * each[inner] for each in answers], axis=0))
+
+
+def test_what_is_not_cached_any_more_is_made_again() -> None:
+    every, few = maps(ByteCache(100 * MAP_BYTES)), maps(ByteCache(5 * MAP_BYTES))
+    assert few[0, 1] is few[0, 1]
+    first = few[0, 1]
+    for key, map_ in every.items():
+        np.testing.assert_array_equal(few[key], map_)
+    assert few[0, 1] is not first
+
+
+def test_a_faint_mark_next_to_the_frames_edge_is_what_answers_most() -> None:
+    """The edge is nine times as strong as the mark on overexposed film."""
+    rng = np.random.default_rng(1)
+    mark = MarkShape(ring_cross(0.5, 0.1, 0.8, 0.1), "light")
+    linear = np.diag([12.0, -12.0])
+    grey = np.full((180, 180), 2000.0)
+    grey[30:, 30:] = 56000.0
+    place = np.array([46.0, 47.0])  # its ring ends six pixels from both edges
+    grey += 6000.0 * brute_picture(mark, np.column_stack([linear, place]), 180, 180, 0.8)
+    grey += rng.normal(0.0, 1000.0, grey.shape)
+    template = brute_picture(mark, np.column_stack([linear, [12.0, 12.0]]), 25, 25, 0.6)
+    response = responses_to(WIDE, grey, template, 1.2, 130.0)
+    row, col = np.unravel_index(int(response.argmax()), response.shape)
+    assert abs(col + 12 - place[0]) <= 1
+    assert abs(row + 12 - place[1]) <= 1
+    highest = response.max()
+    response[row - 3 : row + 4, col - 3 : col + 4] = 0.0
+    assert response.max() < 0.6 * highest
+
+
+def test_lines_as_fine_as_the_grain_answer_at_closer_matching_by_what_the_grain_hides_least() -> None:
+    """Pixels are alike about the crosses, which hides what is coarse of them."""
+    rng = np.random.default_rng(2)
+    mark, linear = MarkShape(cross(1.75, 0.12, 0.25, 45.0), "light"), np.diag([7.8, -7.8])
+    places = np.array([[60.3, 60.0], [60.1, 240.4], [239.8, 60.2], [240.0, 239.7]])
+    grain = ndimage.gaussian_filter(rng.standard_normal((300, 300)), 1.0)
+    grey = 20000.0 + 1300.0 * grain / grain.std() + rng.normal(0.0, 300.0, grain.shape)
+    for place in places:
+        grey += 3100.0 * brute_picture(mark, np.column_stack([linear, place]), 300, 300, 0.6)
+    template = brute_picture(mark, np.column_stack([linear, [16.0, 16.0]]), 33, 33, 0.6)
+
+    def stronger_elsewhere(surroundings: Surroundings) -> int:
+        response = responses_to(surroundings, grey, template, 1.0, 130.0)
+        near = [np.s_[round(y) - 18 : round(y) - 13, round(x) - 18 : round(x) - 13] for x, y in places]
+        weakest = min(response[each].max() for each in near)
+        for each in near:
+            response[each] = 0.0
+        return int((response > weakest).sum())
+
+    assert stronger_elsewhere(GRAINY) <= 2
+    assert stronger_elsewhere(CLOSE) > 50

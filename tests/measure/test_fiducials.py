@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from brute_marks import written_scan
-from drawn_frames import (
+from drawn import (
     ALIKE,
     CORNERS,
     FRAME_PX,
@@ -20,12 +19,12 @@ from drawn_frames import (
     measured,
     paint,
     pixel_from_camera,
+    written_scan,
 )
 from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 
-from measure.fiducials.options import FiducialOptions
-from measure.flags import Code, Status
+from measure import Code, FiducialOptions, Status
 from measure.geometry import POSES
 from measure.marks.shapes import (
     Disk,

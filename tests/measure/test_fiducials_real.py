@@ -8,15 +8,10 @@ from drawn import scan_of
 from numpy.typing import NDArray
 from real_data import DATA, needs
 
-from measure.fiducials.measurement import measure_fiducials
-from measure.fiducials.options import FiducialOptions
-from measure.flags import Status
+from measure import FiducialOptions, FrameMeasurement, Scan, Status, measure_fiducials, open_scan
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross, ring_cross
-from measure.results import FrameMeasurement
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
-from measure.scans.opening import open_scan
-from measure.scans.scan import Scan
 from measure.tone.curve import Tone
 
 SCANS = DATA / "film_scans"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from measure.errors import MeasurementError
+from measure import MeasurementError
 from measure.scans import jpeg
 from measure.scans.opening import open_scan, read_head
 

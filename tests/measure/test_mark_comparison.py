@@ -1,11 +1,17 @@
-"""What marks tell of one another's blur, size and rotation, against such drawn at random about the scan's own."""
+"""What marks tell of one another, and a faint mark in its frame."""
 
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from true_marks import KIND, TrueMark, some_mark
 
+from measure import FiducialLayout, FiducialOptions, LayoutMark, Scan
+from measure.fiducials.constellation import Placement
+from measure.fiducials.frame import Frame, orient_frame
 from measure.fiducials.mark_comparison import (
     SharedBlur,
     SharedShape,
@@ -14,6 +20,14 @@ from measure.fiducials.mark_comparison import (
     shared_shapes,
     touch_of_round,
 )
+from measure.fiducials.mark_fit import not_found
+from measure.fiducials.measure_frame import measure_frame
+from measure.fiducials.rows import absent_frame
+from measure.flags import Cause, Status
+from measure.matching.gauss_newton import UNSETTLED
+from measure.results import Covariance
+from measure.scans.cache import WholePicture
+from measure.scans.metadata import NO_TAGS
 
 PIXEL = 1 / 12
 
@@ -159,3 +173,157 @@ def test_a_mark_with_another_shape_than_the_others_is_distinguished() -> None:
         found += odd is not None and odd.differs
     assert doubted <= 6
     assert found > 95
+
+
+PX_PER_MM, SIDE_PX, AT_MM = 10.0, 600, 20.0
+PLACES = [(x, y) for y in (-AT_MM, 0.0, AT_MM) for x in (-AT_MM, 0.0, AT_MM) if x or y]
+GROUND, CONTRAST, NOISE = 30000.0, 16000.0, 800.0  # 20 times the noise
+FAINT = (0, 3, 6)
+
+
+def make_frame(
+    rng: np.random.Generator, blur_px: float, share: float
+) -> tuple[Frame, list[tuple[TrueMark, np.ndarray]]]:
+    """A frame of eight crosses with gaps, three of them with a share of the others' contrast: as it was measured, and
+    each mark with its first pixel."""
+    kind, middle = KIND["gap cross"], SIDE_PX / 2 + rng.uniform(-0.5, 0.5, 2)
+    layout = tuple(LayoutMark(str(n), place, (0.005, 0.005), kind.shape) for n, place in enumerate(PLACES))
+    linear = PX_PER_MM * np.diag([1.0, -1.0])
+    grey, marks = GROUND + NOISE * rng.standard_normal((SIDE_PX, SIDE_PX)), []
+    for number, place in enumerate(PLACES):
+        some = some_mark(kind, blur_px * float(np.exp(rng.normal(0, 0.05))), rng)
+        corner = np.rint(linear @ place + middle).astype(int) - some.size // 2
+        mark = replace(some, place=np.column_stack([linear, linear @ place + middle - corner]))
+        contrast = CONTRAST * (share if number in FAINT else 1.0)
+        grey[corner[1] :, corner[0] :][: mark.size, : mark.size] += contrast * mark.picture
+        marks.append((mark, corner))
+    scan = Scan(Path("faint.tif"), WholePicture(np.rint(grey).astype(np.uint16)[..., None]), NO_TAGS)
+    pixel_from_camera = np.column_stack([1.001 * linear, middle + np.array([1.0, -1.0])])
+    placement = Placement("0", pixel_from_camera, 8.0, 8, 1, 1, (1 / PX_PER_MM, 1 / PX_PER_MM))
+    return measure_frame(scan, FiducialLayout(layout, (50.0, 50.0)), placement, FiducialOptions()), marks
+
+
+@pytest.mark.study
+def test_faint_marks_are_matched_with_the_others_blur() -> None:
+    frame, marks = make_frame(np.random.default_rng(3), 2.5, 0.25)
+    squares, to_bound = [], []
+    for index in FAINT:
+        fit, (mark, corner) = frame.detections[index].fit, marks[index]
+        assert fit is not None
+        assert frame.verdict(index)[0] is Status.WEAK
+        error = fit.center_px - corner - mark.place[:, 2]
+        squares.append(float(error @ np.linalg.solve(fit.covariance_px2, error)) / 2)
+        to_bound.append(float(np.sqrt(np.trace(fit.covariance_px2) / np.trace(mark.bound(4 * NOISE / CONTRAST)))))
+    assert np.sqrt(np.mean(squares)) < 1.7
+    assert np.mean(to_bound) < 1.15  # of what is only seen it is 1.3
+
+
+def test_a_faint_mark_in_plain_noise_is_measured_with_the_standard_deviation_that_it_has() -> None:
+    """In white noise a claim of 0.2 px is one; on a landscape it knows of the noise in part."""
+    frame, _ = make_frame(np.random.default_rng(3), 1.0, 1.0)
+    detection = frame.detections[0]
+    assert detection.fit is not None
+    known = Covariance.from_noise(0.2**2 * np.eye(2))
+    for is_white, status in ((True, Status.MEASURED), (False, Status.WEAK)):
+        fit = replace(detection.fit, place_covariance=known, covariance_is_white=is_white)
+        one = replace(frame, detections=(replace(detection, fit=fit), *frame.detections[1:]))
+        assert one.verdict(0)[0] is status
+
+
+def test_what_all_marks_lack_alike_is_the_drawings_and_no_damage() -> None:
+    frame, _ = make_frame(np.random.default_rng(3), 1.0, 1.0)
+
+    def status(own: float, others: float) -> Status:
+        detections = [
+            replace(each, fit=replace(each.fit, damaged_fraction=own if index == 0 else others))
+            for index, each in enumerate(frame.detections)
+            if each.fit is not None
+        ]
+        return replace(frame, detections=tuple(detections)).verdict(0)[0]
+
+    assert status(0.27, 0.0) is Status.WEAK
+    assert status(0.27, 0.2) is Status.MEASURED
+    assert status(0.4, 0.4) is Status.WEAK
+
+
+def test_what_widens_a_mark_is_added_to_its_covariance_under_its_cause() -> None:
+    frame, _ = make_frame(np.random.default_rng(3), 1.0, 1.0)
+    before, added = frame.detections[2].fit, np.array([[4e-3, 1e-3], [1e-3, 2e-3]])
+    assert before is not None
+    widened = frame.amend(2, parts={Cause.TOUCHED: added}).amend(2, parts={Cause.TOUCHED: added})
+    after = widened.detections[2].fit
+    assert after is not None
+    np.testing.assert_allclose(after.covariance_px2 - before.covariance_px2, 2 * added, atol=1e-12)
+    np.testing.assert_allclose(after.place_covariance.parts[Cause.TOUCHED], 2 * added, atol=1e-12)
+
+
+def test_a_mark_whose_place_hangs_on_a_remnant_is_weak_however_little_of_it_is_damaged() -> None:
+    frame, _ = make_frame(np.random.default_rng(3), 1.0, 1.0)
+    detection = frame.detections[0]
+    assert detection.fit is not None
+    for lost, status in ((0.5, Status.MEASURED), (0.95, Status.WEAK)):
+        one = replace(detection, fit=replace(detection.fit, damaged_fraction=0.05, lost_fraction=lost))
+        assert replace(frame, detections=(one, *frame.detections[1:])).verdict(0)[0] is status
+
+
+def test_a_frame_in_which_marks_lie_as_they_should_but_differ_from_their_drawings_says_so() -> None:
+    frame, _ = make_frame(np.random.default_rng(3), 1.0, 1.0)
+    assert frame.accepted
+    unlike = [
+        replace(detection, fit=replace(detection.fit, likeness=0.4)) if detection.fit and number > 1 else detection
+        for number, detection in enumerate(frame.detections)
+    ]
+    refused = replace(frame, detections=tuple(unlike))
+    assert not refused.accepted
+    assert refused.misfit("12345678").startswith(
+        "8 of 8 marks were found where the others put them, but only 2 of them match"
+    )
+
+
+def test_a_frame_whose_marks_do_not_converge_says_so_and_not_that_camera_and_pitch_are_wrong() -> None:
+    frame, _ = make_frame(np.random.default_rng(3), 1.0, 1.0)
+    failed = [replace(each, fit=None, reason=UNSETTLED) for each in frame.detections[2:]]
+    refused = orient_frame(replace(frame, detections=(*frame.detections[:2], *failed)))
+    assert refused.failed_fits == [2, 3, 4, 5, 6, 7]
+    reason = refused.misfit("12345678")
+    assert "only 2 of 8 marks" in reason
+    assert "the fit of 3, 4, 5, 6, 7, 8 did not converge" in reason
+    (problem,) = absent_frame(frame.scan, frame.layout, reason, 6.0, None).problems
+    assert "set tone under [measure]" in problem
+    assert "pitch" not in problem
+    nothing = [replace(each, fit=None, reason=not_found(4.0)) for each in frame.detections[2:]]
+    refused = orient_frame(replace(frame, detections=(*frame.detections[:2], *nothing)))
+    assert "pitch right" in absent_frame(frame.scan, frame.layout, refused.misfit("12345678"), 6.0, None).problems[0]
+
+
+@pytest.mark.parametrize(("significance", "status"), [(9.0, Status.WEAK), (15.0, Status.MEASURED)])
+def test_a_contrast_within_that_of_the_texture_is_plain_where_all_of_the_mark_tells_it(
+    significance: float, status: Status
+) -> None:
+    frame, _ = make_frame(np.random.default_rng(3), 1.0, 1.0)
+    fit = frame.detections[0].fit
+    assert fit is not None
+    on_texture = replace(fit, noise_dn=abs(fit.contrast_dn) / 2.0, significance=significance)
+    assert frame.replace_fits({0: on_texture}).verdict(0)[0] is status
+
+
+def test_wings_of_three_marks_under_wrong_names_claim_no_more_than_the_stretch_that_these_make() -> None:
+    """Given coordinates are stretched by 1 % and the marks are not: three marks cannot tell it from film."""
+    rng, kind, linear = np.random.default_rng(5), KIND["wing"], PX_PER_MM * np.diag([1.0, -1.0])
+    places, middle = np.array([(-AT_MM, -AT_MM), (AT_MM, -AT_MM), (AT_MM, AT_MM)]), np.full(2, SIDE_PX / 2)
+    given = places * (1.01, 0.99)
+    layout = tuple(LayoutMark(str(n), (x, y), (0.005, 0.005), kind.shape) for n, (x, y) in enumerate(given.tolist()))
+    grey, true_px = GROUND + NOISE / 4 * rng.standard_normal((SIDE_PX, SIDE_PX)), []
+    for place in places:
+        some = some_mark(kind, 1.0, rng)
+        corner = np.rint(linear @ place + middle).astype(int) - some.size // 2
+        mark = replace(some, place=np.column_stack([linear, linear @ place + middle - corner]))
+        grey[corner[1] :, corner[0] :][: mark.size, : mark.size] += CONTRAST * mark.picture
+        true_px.append(linear @ place + middle)
+    scan = Scan(Path("three.tif"), WholePicture(np.rint(grey).astype(np.uint16)[..., None]), NO_TAGS)
+    placement = Placement("0", np.column_stack([linear, middle]), 8.0, 3, 1, 1, (1 / PX_PER_MM, 1 / PX_PER_MM))
+    frame = measure_frame(scan, FiducialLayout(layout, (50.0, 50.0)), placement, FiducialOptions())
+    for fit, place in zip(frame.fits, true_px, strict=True):
+        assert fit is not None
+        error = fit.center_px - place
+        assert error @ np.linalg.solve(fit.covariance_px2, error) < 16.0

@@ -5,8 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from drawn import scan_of
-from drawn_boards import (
+from drawn import (
     WIDTH,
     april_grid_dark,
     board_from_pixel,
@@ -15,11 +14,13 @@ from drawn_boards import (
     mapped,
     printed,
     read_truth,
+    scan_of,
     take_picture,
 )
 from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
+from measure import Status
 from measure.boards.markers import ReadMarkers, charuco_board, find_aruco, find_charuco, off_corners
 from measure.boards.measure import BoardMeasurement, measure_board
 from measure.boards.specs import (
@@ -29,7 +30,6 @@ from measure.boards.specs import (
     FoundCorner,
     aruco_dictionary,
 )
-from measure.flags import Status
 
 Array = NDArray[np.float64]
 OLDER = CharucoSpec("4X4_50", 6, 6, 32.0, 24.0, legacy=True)

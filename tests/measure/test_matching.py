@@ -5,14 +5,12 @@ from functools import cache
 
 import numpy as np
 import pytest
-from brute_marks import Array, brute_picture, placed
+from drawn import Array, brute_picture, placed
 from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 
+from measure import MarkFit, MatchOptions, ScanWindow, match
 from measure.marks.shapes import Mark, MarkShape, MarkTemplate, cross, dot, polygon, ring_cross, ring_dot
-from measure.matching.match import MatchOptions, match
-from measure.matching.window import ScanWindow
-from measure.results import MarkFit
 
 SIZE, SCALE, CONTRAST, GROUND = 41, 10.0, 500.0, 1000.0
 MARKS = {

@@ -1,8 +1,21 @@
-"""What residuals tell of the noise that made them."""
+"""What residuals tell of the noise that made them: its model, grain, rounding, clipping."""
 
 import numpy as np
+import pytest
+from drawn import scan_of
+from scipy.ndimage import gaussian_filter
+from studies import parametrize_with_studies
+from true_marks import KIND, TrueMark, some_mark, whitened_rms
 
-from measure.noise.noise_model import influence_covariances, noise_model
+from measure import FiducialOptions, MarkFit, MatchOptions, match
+from measure.detection.localisation import MarkPrediction
+from measure.fiducials.mark_fit import detect_mark
+from measure.matching.covariance import second_order
+from measure.matching.window import Coding, censored, clipped_sides, noise_scale, read_window
+from measure.noise.grain import _KERNELS, GRAIN_PX, PATCH_PX, PLANE, grain_model
+from measure.noise.noise_model import influence_covariances, noise_model, steadiness
+from measure.targets.disks import fit_disk
+from measure.tone.curve import Tone, power
 
 
 def test_the_variance_of_noise_is_that_before_the_fit_took_its_share() -> None:
@@ -16,3 +29,263 @@ def test_the_variance_of_noise_is_that_before_the_fit_took_its_share() -> None:
         of_many = influence_covariances(np.ones((1, 1, 8, 8)), left[None], used[None], unknowns)[1]
         variances.append((noise_model(left, used, unknowns).variance_dn2, of_many.item()))
     np.testing.assert_allclose(np.mean(variances, axis=0), sigma**2, rtol=0.03)
+
+
+FULL = 65535.0
+
+
+@pytest.mark.parametrize("grows", [0.0, 0.25, 0.5])
+@pytest.mark.parametrize("damaged", [0.0, 0.2])
+def test_how_noise_grows_with_light_is_known_by_residuals_and_damage_hardly_counts(
+    grows: float, damaged: float
+) -> None:
+    rng = np.random.default_rng(2)
+    ground = np.ones((60, 60), bool)
+    ground[20:32, 10:50] = False
+    light = np.where(ground, 0.04, 0.64)
+    residuals = (light / 0.04) ** grows * rng.standard_normal(light.shape)
+    residuals[~ground & (rng.random(light.shape) < damaged)] += 30.0
+    found = steadiness(residuals, light, ground, np.ones_like(ground))
+    assert np.all(found[ground] == 1.0)
+    assert found[~ground] == pytest.approx(16.0**-grows, rel=0.25 if not damaged else 0.4)
+
+
+def test_noise_that_is_alike_everywhere_says_nothing_else() -> None:
+    residuals = np.random.default_rng(3).standard_normal((30, 30))
+    same = np.ones((30, 30), bool)
+    assert np.all(steadiness(residuals, 0.5 * np.ones((30, 30)), same, same) == 1.0)
+
+
+@parametrize_with_studies("alike_in", ["code", "light"])
+def test_a_light_mark_is_not_damaged_for_its_noise(alike_in: str) -> None:
+    """Noise that is alike in grey values is in light several times as large on the mark as about it."""
+    rng = np.random.default_rng(4)
+    errors, covariances, damaged = [], [], []
+    for _ in range(24):
+        mark = some_mark(KIND["ring-cross"], 0.8, rng)
+        noise = rng.standard_normal(mark.picture.shape)
+        light = 0.02 + 0.7 * mark.picture
+        if alike_in == "light":
+            code = np.clip(light + 0.004 * noise, 0.0, 1.0) ** (1 / 2.2)
+        else:
+            code = light ** (1 / 2.2) + 0.02 * noise
+        scan = scan_of(FULL * code).replace_tone(Tone(power(2.2)))
+        window = read_window(scan, (0, 0, mark.size, mark.size))
+        fit = match(window, mark.kind.shape, mark.place, MatchOptions(linear_sigma=0.05))
+        assert fit.converged, fit.reason
+        damaged.append(fit.damaged_fraction)
+        errors.append(fit.center_px - mark.place[:, 2])
+        covariances.append(fit.covariance_px2)
+    assert np.mean(damaged) < 0.05
+    assert 0.75 < whitened_rms(errors, covariances) < 1.3
+
+
+@pytest.mark.parametrize("grain_px", [0.6, 0.8, 1.1])
+def test_variance_and_power_of_grain_are_found_behind_a_fit_that_took_most_of_it(grain_px: float) -> None:
+    rng = np.random.default_rng(1)
+    size = 19
+    y, x = np.mgrid[:size, :size] - 9.0
+    used = np.hypot(x, y) < 8.0
+    edge = np.exp(-((np.hypot(x, y) - 5.0) ** 2))
+    shapes = [np.ones_like(x), x, y, x * x + y * y, edge, edge * x, edge * y, edge * x * y, edge * (x * x - y * y)]
+    design = np.stack(shapes) * used
+    directions, _ = np.linalg.qr(design[:, used].T)
+    reach = np.arange(-9, 10)
+    correlation = np.exp(-(reach[:, None] ** 2 + reach[None, :] ** 2) / (4.0 * grain_px**2))
+    white = 0.4
+    models, naive = [], []
+    for _ in range(60):
+        grain = gaussian_filter(rng.standard_normal((60, 60)), grain_px)[20 : 20 + size, 20 : 20 + size]
+        noise = grain * 2.0 * grain_px * np.sqrt(np.pi) + white * rng.standard_normal((size, size))
+        residuals = np.zeros((size, size))
+        residuals[used] = noise[used] - directions @ (directions.T @ noise[used])
+        models.append(grain_model(residuals, used, design, 0.5))
+        naive.append(noise_model(residuals, used, len(design)))
+    variance = np.median([model.variance_dn2 for model in models])
+    power = np.median([model.autocovariance_dn2.sum() for model in models])
+    assert variance == pytest.approx(1.0 + white**2, rel=0.15)
+    assert power == pytest.approx(correlation.sum() + white**2, rel=0.25)
+    # Without the model nearly all of the power at low frequencies is lost: that is what it is for.
+    assert np.median([model.autocovariance_dn2.sum() for model in naive]) < 0.5 * power
+
+
+def test_the_autocorrelations_are_those_of_noise_smeared_by_gaussians() -> None:
+    """That of a Gaussian with itself, by sums over a fine grid."""
+    x = np.arange(-400, 401) / 20.0
+    for grain_px, kernel in zip(GRAIN_PX, _KERNELS[1:], strict=True):
+        smear = np.exp(-(x**2) / (2.0 * grain_px**2))
+        of_lag = [float(smear[: len(x) - 20 * lag] @ smear[20 * lag :]) / float(smear @ smear) for lag in range(4)]
+        middle = len(kernel) // 2
+        np.testing.assert_allclose(kernel[middle, middle : middle + 4], of_lag, atol=1e-6)
+        np.testing.assert_allclose(kernel[middle + 1, middle + 1], of_lag[1] ** 2, atol=1e-6)
+
+
+@pytest.mark.parametrize(("grain_px", "is_grain"), [(1.5, True), (2.8, False)])
+def test_coarse_grain_is_distinguished_from_a_landscape(grain_px: float, is_grain: bool) -> None:
+    """By how alike neighbours are: in noise smeared by a Gaussian of s px by exp(-1 / (4 s²)); 1.8 px is film's end.
+    Nine directions of a fit take little of what is so coarse in a window so wide."""
+    rng = np.random.default_rng(4)
+    size, reach = 8 * PATCH_PX, 12
+    grain = gaussian_filter(rng.standard_normal((size + 2 * reach,) * 2), grain_px)[reach:-reach, reach:-reach]
+    grain /= grain.std()
+    neighbours = float(np.mean(grain[:, 1:] * grain[:, :-1]))
+    assert neighbours == pytest.approx(np.exp(-1 / (4 * grain_px**2)), abs=0.02)
+    flat = grain.reshape(8, PATCH_PX, 8, PATCH_PX).swapaxes(1, 2).reshape(-1, PATCH_PX * PATCH_PX)
+    patches = (flat - flat @ PLANE @ PLANE.T).reshape(-1, PATCH_PX, PATCH_PX)
+    window = grain[:19, :19] - grain[:19, :19].mean()
+    used, design = np.ones((19, 19), dtype=bool), np.ones((1, 19, 19))
+    model = grain_model(window, used, design, neighbours, patches)
+    assert model.is_grain is is_grain
+    if is_grain:  # blank film that holds more pixels than the window alone tells how strong it is
+        assert model.variance_dn2 == pytest.approx(1.0, rel=0.1)
+        assert grain_model(3.0 * window, used, design, neighbours, patches).variance_dn2 == model.variance_dn2
+
+
+def test_disks_in_whole_grey_values_are_as_far_off_as_they_say() -> None:
+    rng = np.random.default_rng(3)
+    errors, covariances = [], []
+    for _ in range(20):
+        mark = some_mark(KIND["ellipse"], 1.0, rng)
+        ground = 60 + rng.uniform(-0.5, 0.5) + 1.5 * rng.uniform() * np.arange(mark.size) / mark.size
+        disk = fit_disk(scan_of(ground + 120 * mark.picture, 255), mark.place[:, 2] + 0.3, mark.place[:, :2])
+        errors.append(disk.center_px - mark.place[:, 2])
+        covariances.append(disk.covariance_px2)
+    assert np.sqrt(np.mean(np.square(errors))) < 0.0025
+    assert 0.7 < whitened_rms(errors, covariances) < 1.3
+
+
+def test_the_step_is_that_of_all_grey_values() -> None:
+    for grey, step in (([60.0, 61, 64, 60], 1.0), ([514.0, 257, 1028], 257.0)):
+        steps = Coding(np.array(grey)).steps_dn(np.ones(len(grey), bool))
+        assert steps is not None
+        assert np.all(steps == step)
+    for grey in ([0.3, 1.0, 1.1, 1.5], [60.0] * 4):
+        assert Coding(np.array(grey)).steps_dn(np.ones(4, bool)) is None
+
+
+@pytest.mark.parametrize("noise_dn", [1.0, 10.0])
+def test_second_order_of_a_gaussian_spot(noise_dn: float) -> None:
+    """Of a spot of known width s its place and gain are unknown. With V the variance of a coordinate that of the gain
+    is V / 2 s² of its square, and by the integrals of a Gaussian's derivatives the curvature is 3/2 V / s²."""
+    gain, width = 100.0, 6.0
+    row, col = np.mgrid[-70:71, -70:71].astype(float)
+    col, row = col - 0.3, row + 0.2
+    spot = np.exp(-(col**2 + row**2) / (2 * width**2))
+    slopes = gain * spot * np.stack([col, row]) / width**2
+    design = np.concatenate([slopes, np.stack([spot, np.ones_like(spot), col / 50, row / 50])])
+    flat = design.reshape(len(design), -1)
+    covariance = noise_dn**2 * np.linalg.inv(flat @ flat.T)
+    variance = 2 * noise_dn**2 / (np.pi * gain**2)
+    assert covariance[0, 0] == pytest.approx(variance, rel=0.01)
+    share = second_order(design, np.ones_like(spot), np.ones(spot.shape, bool), covariance, np.zeros(len(design)))
+    assert share == pytest.approx((3 / 2 + 2 / 2) * variance / width**2, rel=0.03)
+
+
+CLIPPING_FULL, CONTRAST = 65535.0, 20000.0
+
+
+def dark_mark(name: str, beyond: float, snr: float, rng: np.random.Generator) -> tuple[TrueMark, np.ndarray]:
+    """A mark and its picture on a ground that lies beyond the range by so much of the contrast."""
+    mark = some_mark(KIND[name], 1.0, rng)
+    noise = rng.standard_normal((mark.size, mark.size)) / snr
+    return mark, CLIPPING_FULL + CONTRAST * (beyond - mark.picture + noise)
+
+
+def sighted(mark: TrueMark, grey: np.ndarray, polarity: int = -1) -> MarkFit:
+    start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + (0.7, -0.6)])
+    frame_sigma = mark.kind.known if np.isfinite(mark.kind.known) else None
+    fit = detect_mark(
+        scan_of(grey), MarkPrediction(mark.kind.shape, start, 3.0, polarity), FiducialOptions().match, frame_sigma
+    ).fit
+    assert fit is not None
+    return fit
+
+
+@pytest.mark.parametrize("name", ["cross", "ring-dot", "wing", "notch"])
+@pytest.mark.parametrize("beyond", [0.0, 0.3])
+def test_clipping_does_not_move_a_mark(name: str, beyond: float) -> None:
+    rng = np.random.default_rng(1)
+    mark, grey = dark_mark(name, beyond, np.inf, rng)
+    np.testing.assert_allclose(sighted(mark, grey).center_px, mark.place[:, 2], atol=0.002)
+    np.testing.assert_allclose(sighted(mark, CLIPPING_FULL - grey, 1).center_px, mark.place[:, 2], atol=0.002)
+
+
+@parametrize_with_studies("name", ["ring-dot", "wing"], quick=(1,))
+def test_the_sigma_of_a_clipped_mark_says_what_was_lost(name: str) -> None:
+    rng = np.random.default_rng(2)
+    errors, covariances, whole = [], [], []
+    for _ in range(8):
+        mark, grey = dark_mark(name, 0.3, 20.0, rng)
+        fit = sighted(mark, grey)
+        errors.append(fit.center_px - mark.place[:, 2])
+        covariances.append(fit.covariance_px2)
+        whole.append(np.trace(mark.bound(1 / 20.0)))
+    assert 0.7 < whitened_rms(errors, covariances) < 1.3
+    assert np.mean([np.trace(each) for each in covariances]) > 1.4 * np.mean(whole)
+
+
+def test_a_censored_residual_is_twice_the_log_probability_and_derivatives_agree() -> None:
+    residuals, step = np.array([-30.0, -2.0, -0.3, 0.0, 0.8, 5.0, 300.0]), 1e-6
+    upper = np.ones(len(residuals), np.int8)
+    value, slope, information = censored(residuals, upper, 2.0)
+    (more, steeper, _), (less, flatter, _) = (censored(residuals + off, upper, 2.0) for off in (step, -step))
+    np.testing.assert_allclose(slope, (more - less) / (2 * step), atol=1e-5)
+    np.testing.assert_allclose(information, (more * steeper - less * flatter) / (2 * step), atol=1e-3)
+    assert value[3] == pytest.approx(2.0 * np.sqrt(2 * np.log(2)))
+    np.testing.assert_allclose((value[0], value[-1]), (0.0, 300.0), atol=0.1)
+    np.testing.assert_allclose(censored(-residuals, np.negative(upper), 2.0)[0], -value)
+
+
+@pytest.mark.parametrize("within", [-1.0, 0.0, 1.0])
+def test_noise_is_distinguished_from_what_is_visible_of_it_and_little_dust_does_not_change_that(within: float) -> None:
+    noise = 3 * np.random.default_rng(4).standard_normal(20000)
+    sides = (noise >= 3 * within).astype(np.int8)
+    residuals = np.minimum(noise, 3 * within)
+    assert noise_scale(residuals, sides, 4.0, 0.3) == pytest.approx(3.0, rel=0.02)
+    residuals[:200], sides[:200] = -40.0, 0
+    assert noise_scale(residuals, sides, 4.0, 0.3) == pytest.approx(3.0, rel=0.02)
+
+
+def test_the_sigma_of_a_mark_on_ground_just_at_the_end_of_the_range_is_honest() -> None:
+    rng = np.random.default_rng(5)
+    mark = some_mark(KIND["ring-dot"], 1.0, rng)
+    errors, covariances, best = [], [], []
+    for _ in range(24):
+        noise = rng.standard_normal((mark.size, mark.size)) / 20
+        fit = sighted(mark, CLIPPING_FULL + CONTRAST * (noise - mark.picture))
+        errors.append(fit.center_px - mark.place[:, 2])
+        covariances.append(fit.covariance_px2)
+        best.append(mark.best_errors(-noise, 1 / 20))
+    claimed = np.sqrt(np.trace(np.mean(covariances, axis=0)) / np.trace(mark.bound(1 / 20)))
+    assert 0.97 < claimed < 1.08
+    assert np.mean(np.square(np.subtract(errors, best))) < 0.05 * np.trace(mark.bound(1 / 20)) / 2
+
+
+def test_ends_of_the_range_are_those_of_the_converter() -> None:
+    grey = np.full((40, 40), 9000.0)
+    grey[3, 4], grey[5, 6] = 4095 << 4, 0
+    sides = clipped_sides(scan_of(grey), 0, 0, 40, 40, None)
+    assert sides[3, 4] == 1
+    assert sides[5, 6] == -1
+    assert np.count_nonzero(sides) == 2
+    assert not clipped_sides(scan_of(grey), 10, 10, 20, 20, None).any()
+
+
+def test_whites_cut_off_below_the_end_of_the_range_are_limits_too() -> None:
+    rng = np.random.default_rng(3)
+    for beyond in (-0.05, 0.3):
+        mark = some_mark(KIND["wing"], 1.0, rng)
+        natural = 250 + 100 * (beyond - mark.picture + rng.standard_normal((mark.size, mark.size)) / 20)
+        scan = scan_of(np.minimum(natural, 250), 255)
+        sides = clipped_sides(scan, 0, 0, mark.size, mark.size, None)
+        np.testing.assert_array_equal(sides == 1, np.rint(natural) >= 250)
+        start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + (0.7, -0.6)])
+        fit = detect_mark(
+            scan, MarkPrediction(mark.kind.shape, start, 3.0, -1), FiducialOptions().match, mark.kind.known
+        ).fit
+        assert fit is not None
+        error = fit.center_px - mark.place[:, 2]
+        assert error @ np.linalg.solve(fit.covariance_px2, error) < 13.8  # one in a thousand
+    for sigma in np.geomspace(0.2, 20, 40):
+        grey = 128 + sigma * rng.standard_normal((60, 60)) - 40 * (np.arange(60) > 40)
+        assert not clipped_sides(scan_of(grey, 255), 0, 0, 60, 60, None).any()

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
+from measure import Scan
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
 from measure.scans.parallel import map_in_threads, map_or_replace
-from measure.scans.scan import Scan
 from measure.targets.disk_detection import DiskSearch, disk_candidates
 
 

@@ -1,33 +1,50 @@
-"""Scans whose pixels are not as given: what is found nevertheless, and what is not believed."""
+"""Frames of other pitches, in the middle of large scans, clicked, in colour, photographed obliquely."""
 
+import re
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tifffile
-from brute_marks import written_scan
-from drawn_frames import (
+from drawn import (
     ALIKE,
+    CORNERS,
+    FRAME_PX,
+    NOISE_DN,
+    NUMBERED,
     PITCH_UM,
     RING_CROSS,
+    Array,
     assert_right,
     frame_picture,
     layout_of,
     measured,
     paint,
     pixel_from_camera,
+    written_scan,
 )
 from scipy.ndimage import gaussian_filter
+from small_scene import hidden_field
+from studies import parametrize_with_studies
 
 from measure.fiducials.constellation import NARROW, Placement
-from measure.fiducials.measure_frame import measure_frame
-from measure.fiducials.measurement import measure_fiducials
-from measure.fiducials.options import FiducialOptions
+from measure.fiducials.measure_frame import best_weights, measure_frame
+from measure.fiducials.measurement import measure_fiducials, second_frame
+from measure.fiducials.options import CLICK_SIGMA_PX, Click, FiducialOptions
 from measure.fiducials.rows import pitch_problem
 from measure.fiducials.search import PitchHypothesis, slightly_longer
 from measure.fiducials.stages import _pitch_to_try
-from measure.marks.shapes import MarkShape
-from measure.scans.opening import open_scan
+from measure.flags import Cause, Code, Reason, Status
+from measure.geometry import POSES
+from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape
+from measure.marks.templates import cut
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement, moved_frame
+from measure.scans.opening import crop_scan, open_scan
+from measure.tone.curve import LINEAR
+from synthetic_images.areas import disk
+from synthetic_images.render import render_scene
+from synthetic_images.scene import DrawnMark, Film, Scanner, Scene, SceneCamera, SceneFiducial, SceneImage, Tones
 
 AERIAL = ((106.0, -106.0), (-106.0, -106.0), (-106.0, 106.0), (106.0, 106.0))
 # A frame of 14 mm with a hundredth of the usual tolerances bends as little as one of 140 mm.
@@ -134,3 +151,220 @@ def test_closer_matching_tries_pixels_slightly_longer_one_way_so_that_no_mark_li
         true = np.array([1 + stretch / 2, 1 - stretch / 2])
         off_mm = np.hypot(*((true / tried - 1) * AERIAL[0]).T).min()
         assert off_mm < NARROW * options.search_mm(layout)
+
+
+FAR_TURN_RAD = 0.35  # twenty degrees: no search looks for a frame that is laid so
+
+
+def make_clicks(matrix: Array, points: str, off_px: tuple[float, float] = (1.2, -0.9)) -> tuple[Click, ...]:
+    """As a person clicks, a pixel or so off."""
+    return tuple(Click(point, *(matrix @ (*CORNERS[int(point) - 1], 1.0) + off_px)) for point in points)
+
+
+@pytest.mark.parametrize("pose", POSES)
+def test_three_clicks_find_a_frame_in_any_pose_that_no_search_finds(pose: str, tmp_path: Path) -> None:
+    matrix = pixel_from_camera(pose, FAR_TURN_RAD)
+    grey = frame_picture(ALIKE, matrix)
+    result = measured(grey, ALIKE, tmp_path, FiducialOptions(clicks=make_clicks(matrix, "124")))
+    assert result.pose is not None
+    assert (result.pose.name, result.pose.decided) == (pose, True)
+    assert_right(result, ALIKE, matrix)
+
+
+@pytest.mark.study
+def test_no_search_finds_a_frame_that_lies_so(tmp_path: Path) -> None:
+    grey = frame_picture(ALIKE, pixel_from_camera("0", FAR_TURN_RAD))
+    assert not any(mark.status.is_observation for mark in measured(grey, ALIKE, tmp_path).marks)
+
+
+def test_clicks_that_contradict_the_set_pose_give_no_observation(tmp_path: Path) -> None:
+    """As in a viewer that turns the picture: the names would be those of other marks."""
+    matrix = pixel_from_camera("180")
+    grey = frame_picture(ALIKE, matrix)
+    result = measured(grey, ALIKE, tmp_path, FiducialOptions("0", clicks=make_clicks(matrix, "124")))
+    assert {mark.status for mark in result.marks} == {Status.REJECTED}
+    assert "show the scan orientation 180, and 0 is set" in result.problems[0]
+    assert_right(
+        measured(grey, ALIKE, tmp_path, FiducialOptions("180", clicks=make_clicks(matrix, "124"))), ALIKE, matrix
+    )
+
+
+def test_clicks_tell_the_pitch_where_nothing_else_does(tmp_path: Path) -> None:
+    matrix = pixel_from_camera("0", FAR_TURN_RAD)
+    options = FiducialOptions(clicks=make_clicks(matrix, "123"))
+    result = measured(frame_picture(ALIKE, matrix), ALIKE, tmp_path, options, pitch=False)
+    assert result.px_per_mm == pytest.approx(20.0, rel=1e-3)
+    assert_right(result, ALIKE, matrix)
+
+
+def test_marks_on_a_line_do_not_tell_the_pose(tmp_path: Path) -> None:
+    places = (*CORNERS, (0.0, 0.0))
+    layout = layout_of([MarkShape(RING_CROSS)] * 5, places)
+    matrix = pixel_from_camera("0")
+    clicks = tuple(Click(str(k), *(matrix @ (*places[k - 1], 1.0))) for k in (1, 3, 5))
+    result = measured(frame_picture(layout, matrix), layout, tmp_path, FiducialOptions(clicks=clicks))
+    assert result.pose is not None
+    assert not result.pose.decided
+
+
+@pytest.mark.study
+def test_a_click_where_nothing_is_matched_counts_as_well_as_one_points(tmp_path: Path) -> None:
+    """The mark's corner is bare ground: with the others' frame alone it would only be predicted."""
+    matrix = pixel_from_camera("0")
+    result = bare_corner(matrix, tmp_path, ())
+    assert row(result, "3").status is Status.PREDICTED
+    (click,) = make_clicks(matrix, "3", (0.0, 0.0))
+    mark = row(bare_corner(matrix, tmp_path, (click,)), "3")
+    assert mark.status is Status.WEAK
+    assert mark.center_px is not None
+    np.testing.assert_array_equal(mark.center_px, (click.col_px, click.row_px))
+    assert mark.covariance is not None
+    np.testing.assert_array_equal(mark.covariance.parts[Cause.CLICK], CLICK_SIGMA_PX**2 * np.eye(2))
+
+
+def test_a_click_says_which_of_two_marks_is_meant(tmp_path: Path) -> None:
+    """A mark as good as any lies a millimetre and a half from where the others put it."""
+    matrix = pixel_from_camera("0")
+    grey = frame_picture(ALIKE, matrix)
+    meant = matrix.copy()
+    meant[:, 2] += (30.0, 0.0)
+    grey_neighbour = frame_picture(ALIKE, meant)
+    col, line = np.rint(meant @ (*CORNERS[3], 1.0)).astype(int)
+    grey[line - 25 : line + 26, col - 10 : col + 26] = grey_neighbour[line - 25 : line + 26, col - 10 : col + 26]
+    click = Click("4", *(meant @ (*CORNERS[3], 1.0)))
+    mark = row(measured(grey, ALIKE, tmp_path, FiducialOptions(clicks=(click,))), "4")
+    assert mark.center_px is not None
+    assert mark.status.is_observation, mark.reason
+    np.testing.assert_allclose(mark.center_px, (click.col_px, click.row_px), atol=0.1)
+
+
+def bare_corner(matrix: Array, folder: Path, clicks: tuple[Click, ...]) -> FrameMeasurement:
+    grey = frame_picture(ALIKE, matrix)
+    col, line = np.rint(matrix @ (*CORNERS[2], 1.0)).astype(int)
+    rng = np.random.default_rng(4)
+    grey[line - 40 : line + 41, col - 40 : col + 41] = 3000 + rng.normal(0, NOISE_DN, (81, 81))
+    return measured(grey, ALIKE, folder, FiducialOptions(clicks=clicks))
+
+
+def row(result: FrameMeasurement, point: str) -> MarkMeasurement:
+    return next(mark for mark in result.marks if mark.point == point)
+
+
+RED, GREEN, BLUE = np.eye(3)
+AS_LIGHT = 0.299 / 0.587  # of green that is lost for a mark of more red to be as light as its ground
+MATRIX = pixel_from_camera("90", center=(202.2, 197.6))
+
+
+def red_on_grey() -> Array:
+    rng = np.random.default_rng(9)
+    planes = np.full((3, FRAME_PX, FRAME_PX), 26000.0)
+    for mark in NUMBERED.marks:
+        paint(planes[0], mark.mark, mark.xy_mm, MATRIX, 16000.0)
+        paint(planes[1], mark.mark, mark.xy_mm, MATRIX, -16000.0 * AS_LIGHT)
+    return np.moveaxis(planes + rng.normal(0.0, 200.0, planes.shape), 0, -1)
+
+
+def test_red_marks_as_light_as_their_grey_ground_are_found_and_right(tmp_path: Path) -> None:
+    """The search answers to the green here, in which they are dark."""
+    result = measured(red_on_grey(), NUMBERED, tmp_path)
+    assert result.pose is not None
+    assert (result.pose.name, result.pose.decided) == ("90", True)
+    assert_right(result, NUMBERED, MATRIX)
+    assert result.weights is not None
+    np.testing.assert_allclose(result.weights, RED, atol=0.06)
+
+
+def test_channels_are_those_of_the_polarity_or_of_the_better_one(tmp_path: Path) -> None:
+    places = [(mark.mark, np.column_stack([MATRIX[:, :2], MATRIX @ (*mark.xy_mm, 1.0)])) for mark in NUMBERED.marks]
+    with written_scan(red_on_grey(), tmp_path) as scan:
+        dark, light = ([(*place, sign) for place in places] for sign in (-1, 1))
+        for marks, signs, weights, sign in (
+            (dark, (1,), GREEN, 1),
+            (light, (1,), RED, 1),
+            (dark, (1, -1), RED, -1),
+            (light, (1, -1), RED, 1),
+        ):
+            best = best_weights(scan, marks, signs)
+            assert best is not None
+            np.testing.assert_allclose(best[0], weights, atol=0.06)  # noise makes it some 0.02
+            assert best[1] == sign
+        assert best_weights(scan, [], (1, -1)) is None
+
+
+def test_learned_marks_are_cut_in_the_channels_they_are_measured_in(tmp_path: Path) -> None:
+    """Else the same mark has another contrast there, which counts as changed light."""
+    place = np.column_stack([MATRIX[:, :2], MATRIX @ (*NUMBERED.marks[0].xy_mm, 1.0)])
+    with written_scan(red_on_grey(), tmp_path) as scan:
+        red, grey = (cut(scan, place, 2.0, weights).grey for weights in (RED.tolist(), None))
+    assert np.ptp(red) > 14000.0
+    assert np.ptp(grey) < 2000.0
+
+
+PLACES = {f"{x}{y}": (106.0 * x, 106.0 * y) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y}
+RADIUS_MM, OBLIQUE_FILM_PITCH_UM, FRAME_MM = 1.5, 150.0, (228.0, 228.0)
+
+
+def test_balls_under_a_perspective_are_found_and_the_perspective_is_named(tmp_path: Path) -> None:
+    ball = DrawnMark((disk((0.0, 0.0), RADIUS_MM),))
+    camera = SceneCamera(
+        "film", FRAME_MM, 150.0, fiducials=tuple(SceneFiducial(k, xy, ball) for k, xy in PLACES.items())
+    )
+    film = Film("projective", tilt_deg=float(np.degrees(np.arcsin(0.04 * 600.0 / 212.0))), tilt_direction_deg=40.0)
+    scanner = Scanner((OBLIQUE_FILM_PITCH_UM, OBLIQUE_FILM_PITCH_UM), margin_mm=6.0, noise=0.01)
+    image = SceneImage("f", (0.0, 0.0, 3.0, 0.0, 0.0, 0.0))
+    scene = Scene("film", 1, camera, hidden_field(), (image,), scanner, film, Tones(contrast=0.0))
+    (truth,) = render_scene(scene, tmp_path).frames
+    shape = MarkShape((Disk((0.0, 0.0), RADIUS_MM),), "light")
+    layout = FiducialLayout(tuple(LayoutMark(k, xy, (0.002, 0.002), shape) for k, xy in PLACES.items()), FRAME_MM)
+    with open_scan(tmp_path / "scans" / "f.tif") as scan:
+        frame = measure_fiducials(
+            scan.replace_tone(LINEAR), layout, (OBLIQUE_FILM_PITCH_UM, OBLIQUE_FILM_PITCH_UM), FiducialOptions("0")
+        )
+    assert {mark.status for mark in frame.marks} == {Status.MEASURED}
+    for mark in frame.marks:
+        assert mark.center_px is not None
+        assert np.abs(mark.center_px - truth.fiducials[mark.point].center_px).max() < 0.05
+    (said,) = (problem for problem in frame.problems if Code.PERSPECTIVE in problem.codes)
+    assert 'transformation = "projective"' in said
+
+
+@parametrize_with_studies(("second", "is_named"), [("0", True), ("90", True), (None, False)])
+def test_a_second_frame_is_named_with_the_windows_of_both(second: str | None, is_named: bool, tmp_path: Path) -> None:
+    """Above the one that was measured, in any pose; bare ground is none."""
+    first = frame_picture(ALIKE, pixel_from_camera("0"))
+    other = frame_picture(ALIKE, pixel_from_camera(second), 7) if second else first[::-1, :1] * np.ones((1, FRAME_PX))
+    options = FiducialOptions()
+    with written_scan(np.vstack([other, first]), tmp_path) as scan:
+        window = (0, FRAME_PX, FRAME_PX, FRAME_PX)
+        frame = measure_fiducials(crop_scan(scan, window), ALIKE, (PITCH_UM, PITCH_UM), options)
+        result = second_frame(scan, ALIKE, moved_frame(frame, np.array([0.0, FRAME_PX])), options)
+    assert bool(result) == is_named
+    if is_named:
+        windows = re.findall(r'"(\d+) (\d+) (\d+) (\d+)"', result)
+        (_, lower, _, _), (_, upper, _, height) = [tuple(map(int, window)) for window in windows]
+        assert lower == pytest.approx(FRAME_PX + 27, abs=6)  # 17 mm about the middle, row 197.6
+        assert upper == pytest.approx(27, abs=6)
+        assert height == pytest.approx(343, abs=8)
+
+
+NOISE = Covariance.from_noise(np.diag([0.04, 0.09]))
+FOUND = MarkMeasurement("1", "fiducial", np.array([10.0, 20.0]), NOISE, Status.MEASURED)
+ABSENT = MarkMeasurement("2", "fiducial", None, None, Status.ABSENT, Reason("outside the scan", Code.OUTSIDE))
+FRAME = FrameMeasurement("a", (FOUND, ABSENT))
+
+
+def test_it_has_a_row_for_every_mark() -> None:
+    pytest.importorskip("pandas", reason="pandas is missing: make test installs it")
+    table = FRAME.to_pandas()
+    assert list(table.point) == ["1", "2"]
+    assert list(table.status) == ["measured", "absent"]
+    numbers = table[["column_px", "row_px", "sigma_column_px", "sigma_row_px"]]
+    np.testing.assert_allclose(numbers.iloc[0], [10.0, 20.0, 0.2, 0.3])
+    assert table.column_px.isna().tolist() == [False, True]
+    assert table.reason[1] == "outside the scan"
+
+
+def test_without_pandas_one_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match="Install: pip install pandas"):
+        FRAME.to_pandas()

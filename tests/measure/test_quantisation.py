@@ -6,18 +6,14 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
-from brute_marks import brute_picture, placed
+from drawn import brute_picture, placed
 from numpy.typing import NDArray
 
-from measure.marks.shapes import MarkShape, ring_cross
-from measure.matching.match import match
-from measure.matching.window import ScanWindow
+from measure import MarkShape, Scan, ScanWindow, match, open_scan, ring_cross
 from measure.scans.cache import WholePicture
 from measure.scans.compression import covariance_of_compression
 from measure.scans.jpeg import UNKNOWN_DN, rounding_step_dn
 from measure.scans.metadata import NO_TAGS
-from measure.scans.opening import open_scan
-from measure.scans.scan import Scan
 
 # Annex K of ITU-T T.81, luminance, the first 15 in zigzag order: what "quality 50" is.
 COARSE = (16, 11, 12, 14, 12, 10, 16, 14, 13, 14, 18, 17, 16, 19, 24)

@@ -6,9 +6,7 @@ import numpy as np
 from drawn import Array, scan_of
 from scipy.special import ndtr
 
-from measure.fiducials.measurement import measure_fiducials
-from measure.fiducials.options import FiducialOptions
-from measure.flags import Status
+from measure import FiducialOptions, Status, measure_fiducials
 from measure.marks.shapes import Bar, Disk, FiducialLayout, LayoutMark, MarkShape, known_outline_mm, limit_to_crossings
 from measure.tone.curve import LINEAR
 

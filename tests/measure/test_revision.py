@@ -9,16 +9,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from drawn import drawn, ellipse, scan_of
-from drawn_frames import NUMBERED, frame_picture, layout_of, measured, pixel_from_camera
+from drawn import NUMBERED, drawn, ellipse, frame_picture, layout_of, measured, pixel_from_camera, scan_of
 from scipy.ndimage import gaussian_filter
 
+from measure import FiducialOptions, TargetPrediction, measure_disks
 from measure.boards.measure import measure_board
 from measure.boards.specs import ChessboardSpec
-from measure.fiducials.options import FiducialOptions
 from measure.marks.shapes import MarkShape, polygon, turned_part
 from measure.results import MEASURE_REVISION, MarkMeasurement
-from measure.targets.identification import TargetPrediction, measure_disks
 
 TABLE = Path(__file__).with_name("revision.json")
 PLACE_PX, SIGMA = 1e-4, 0.01  # which processors may make of rounding; SIGMA is a share

@@ -13,7 +13,7 @@ import pytest
 import tifffile
 from stored_picture import HEIGHT, WIDTH, picture, whole
 
-from measure.errors import MeasurementError
+from measure import MeasurementError
 from measure.scans.opening import open_scan, read_head
 
 

@@ -10,9 +10,8 @@ import pytest
 import tifffile
 from stored_picture import HEIGHT, WIDTH, picture
 
-from measure.scans.opening import open_scan
+from measure import Scan, open_scan
 from measure.scans.parallel import map_in_threads
-from measure.scans.scan import Scan
 from measure.targets.block_search import Block, Octave, Patches, search_blocks
 
 

@@ -7,11 +7,8 @@ from drawn import drawn, ellipse, scan_of, transformed, whitened
 from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
-from measure.flags import Status
-from measure.results import MarkMeasurement
-from measure.scans.scan import Scan
+from measure import MarkMeasurement, Scan, Status, TargetOptions, TargetPrediction, measure_crosses, measure_disks
 from measure.targets.crosses import CrossSearch, cross_candidates
-from measure.targets.identification import TargetOptions, TargetPrediction, measure_crosses, measure_disks
 
 Array = NDArray[np.float64]
 CONTRAST, NOISE, GROUND = 20000.0, 500.0, 12000.0

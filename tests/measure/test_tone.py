@@ -8,16 +8,13 @@ from drawn import scan_of
 from studies import parametrize_with_studies
 from true_marks import KIND, Kind, TrueMark, some_mark, whitened_rms
 
+from measure import MarkFit, MarkShape, MatchOptions, match, polygon
 from measure.detection.localisation import MarkPrediction
 from measure.fiducials.mark_fit import detect_mark, options_for
-from measure.marks.shapes import MarkShape, polygon
 from measure.matching.covariance import Landscape, LinearFit
-from measure.matching.match import match
-from measure.matching.models import MatchOptions
 from measure.matching.tone_information import mark_tone_information
 from measure.matching.window import Coding, read_window
 from measure.noise.noise_model import NoiseModel
-from measure.results import MarkFit
 from measure.tone.curve import LINEAR, Tone, ToneInformation, power, sampled_curve, srgb
 from measure.tone.estimate import FrameTone, MarkTone, tone_score
 from synthetic_images.tone_curve import coded

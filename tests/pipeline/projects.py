@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import tifffile
-from drawn_frames import ALIKE, CORNERS, PITCH_UM, frame_picture, pixel_from_camera
+from drawn import ALIKE, CORNERS, PITCH_UM, frame_picture, pixel_from_camera
 from networks import Truth, affine, camera_point, rotation, simulated, torlegard
 from numpy.typing import NDArray
 

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 import tifffile
-from brute_marks import Array
-from drawn_frames import ALIKE, CORNERS, NOISE_DN, frame_picture, pixel_from_camera
+from drawn import ALIKE, CORNERS, NOISE_DN, Array, frame_picture, pixel_from_camera
 from playwright.sync_api import Page
 from projects import CAMERA, PROJECT
 

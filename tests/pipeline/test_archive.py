@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from drawn_frames import PITCH_UM, layout_of
+from drawn import PITCH_UM, layout_of
 from projects import CAMERA, write_project
 from studies import parametrize_with_studies
 

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 import tifffile
 from browser import browser_page, needs_browser
-from brute_marks import Array
-from drawn_frames import ALIKE, CORNERS, PITCH_UM, frame_picture, pixel_from_camera
+from drawn import ALIKE, CORNERS, PITCH_UM, Array, frame_picture, pixel_from_camera
 from playwright.sync_api import Browser, Page, expect
 from projects import PROJECT, write_project
 from real_data import DATA, needs

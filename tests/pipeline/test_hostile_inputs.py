@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from brute_marks import brute_picture, placed
+from drawn import brute_picture, placed
 from projects import adjusted_project, write_project
 
 from adjust import AdjustmentError

@@ -1,4 +1,4 @@
-"""Reasons and their codes: one table, checked against the documentation and against every place that gives a reason."""
+"""Reasons, false-alarm limits and the revision of what measuring gives."""
 
 import ast
 import pickle
@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from measure.flags import NO_REASON, Code, Reason, Status
-from measure.results import FrameMeasurement, MarkMeasurement
+from measure import FrameMeasurement, MarkMeasurement
+from measure.flags import LIMITS, NO_REASON, Code, Reason, Status
+from measure.geometry import Affine
 
 ROOT = Path(__file__).parents[2]
 
@@ -81,3 +82,35 @@ def test_marks_are_filtered_by_their_codes() -> None:
     frame = FrameMeasurement("f", tuple(marks))
     assert [mark.point for mark in frame.marks_because(Code.SIZE)] == ["1", "3"]
     assert frame.marks_because(Code.BLUR) == ()
+
+
+def test_the_page_has_every_limit_with_its_words() -> None:
+    page = (ROOT / "docs" / "method" / "search.md").read_text(encoding="utf-8")
+    result = page.split("| limit | of | beyond it |\n|---|---|---|\n")[1].split("\n\n")[0].splitlines()
+    assert result == [f"| {float(limit):g} | {limit.of} | {limit.decides} |" for limit in LIMITS.values()]
+
+
+def test_every_limit_is_used_and_none_stands_elsewhere() -> None:
+    files = [file for package in ("measure", "pipeline") for file in (ROOT / package).rglob("*.py")]
+    text = {file: file.read_text(encoding="utf-8") for file in files if file.name != "flags.py"}
+    unused = [name for name in LIMITS if not any(re.search(rf"\b{name}\b", each) for each in text.values())]
+    assert not unused
+    own = [file.name for file, each in text.items() if re.search(r"^_?CHANCE = ", each, re.MULTILINE)]
+    assert not own
+
+
+QUARTER = Affine(np.array([[0.0, -2.0, 5.0], [2.0, 0.0, 1.0]]))  # a quarter turn at twice the size, then (5, 1) farther
+
+
+def test_an_affine_transformation_takes_points_there_and_back() -> None:
+    points = np.array([[[1.0, 0.0], [0.0, 3.0]]])
+    np.testing.assert_allclose(QUARTER.apply(points), [[[5.0, 3.0], [-1.0, 1.0]]])
+    np.testing.assert_allclose(QUARTER.inverse.apply(QUARTER.apply(points)), points)
+    assert QUARTER.scale == pytest.approx(2.0)
+    assert Affine.from_linear(np.diag([4.0, -1.0])).scale == pytest.approx(2.0)
+
+
+def test_of_two_in_turn_the_first_is_taken_first() -> None:
+    stretch, point = Affine.from_linear(np.diag([3.0, 1.0]), (0.0, 1.0)), np.array([1.0, 1.0])
+    np.testing.assert_allclose(QUARTER.compose(stretch).apply(point), [1.0, 7.0])
+    np.testing.assert_allclose(stretch.compose(QUARTER).apply(point), [9.0, 4.0])

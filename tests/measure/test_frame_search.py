@@ -1,0 +1,372 @@
+"""The search for a frame: the list of attempts, hypotheses, and what is found at a closer look or not believed."""
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from drawn import ALIKE, layout_of, paint, placed, scan_of
+from numpy.typing import NDArray
+
+from measure import FiducialOptions, Scan, measure_fiducials
+from measure.detection.correlation import CLOSE, GRAINY, WIDE, Surroundings, local_maxima
+from measure.detection.responses import ByteCache, Responses
+from measure.fiducials import measure_frame, stages
+from measure.fiducials.constellation import NARROW, Bounds, Placement, PlacementSearch, same_picture
+from measure.fiducials.frame import Frame
+from measure.fiducials.mark_fit import Detection
+from measure.fiducials.rows import pitch_problem
+from measure.fiducials.search import FrameSearch, PitchHypothesis, pitch_hypotheses
+from measure.fiducials.stages import Attempt, Found, Kind, find_frame
+from measure.flags import FRAMES_BY_CHANCE, NO_REASON, Reason, Status
+from measure.geometry import POSES, up_from_camera
+from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, dot, polygon, turned_part
+from measure.results import Covariance, FrameMeasurement, MarkFit, MarkMeasurement
+from measure.tone.curve import Tone
+
+DOT = MarkShape(dot(0.3), "light")
+PLACES = ((100.0, -100.0), (-100.0, -100.0), (-100.0, 100.0), (100.0, 100.0), (0.0, -103.0), (0.0, 95.0))
+MARKS = [LayoutMark(str(index), place, (0.01, 0.01), DOT) for index, place in enumerate(PLACES)]
+BOUNDS = Bounds(0.04, 0.1, 0.6)
+NEAR_MM = 0.06
+PITCH_MM = 0.5
+
+
+def responses(places_px: NDArray[np.float64], heights: NDArray[np.float64], seed: int = 1) -> Responses:
+    """A faint noisy map with peaks two pixels wide."""
+    rng = np.random.default_rng(seed)
+    light = rng.normal(0, 0.06, (520, 540)).astype(np.float32)
+    for (col, row), height in zip(np.rint(places_px).astype(int), heights, strict=True):
+        light[row - 1 : row + 2, col - 1 : col + 2] = 0.6 * height
+        light[row, col] = height
+    return Responses({(0, 1): light}, (0,), 1, ByteCache(1 << 30))
+
+
+def placements(pose: str, answers: Responses) -> list[Placement]:
+    return PlacementSearch(MARKS, answers, (PITCH_MM, PITCH_MM), BOUNDS).find_placements(pose, [0] * 6)
+
+
+def view_marks(pose: str, scale: float = 1.015, angle: float = 0.03) -> NDArray[np.float64]:
+    c, s = np.cos(angle), np.sin(angle)
+    up = np.array(PLACES) @ (scale * np.array([[c, -s], [s, c]]) @ up_from_camera(pose)).T
+    return np.asarray(up * (1, -1) / PITCH_MM + (265.0, 255.0))
+
+
+def predicted(placement: Placement) -> NDArray[np.float64]:
+    return np.asarray(np.array(PLACES) @ placement.pixel_from_camera[:, :2].T + placement.pixel_from_camera[:, 2])
+
+
+def test_the_place_is_found_among_brighter_false_answers() -> None:
+    """Text, dials and trees answer more strongly than the marks; only the marks answer together."""
+    rng = np.random.default_rng(3)
+    for pose in POSES:
+        true = view_marks(pose)
+        false = rng.uniform(20, 500, (40, 2))
+        places = np.concatenate([true, false])
+        heights = np.concatenate([np.full(6, 0.6), rng.uniform(0.5, 0.9, 40)])
+        found = placements(pose, responses(places, heights))
+        assert np.abs(predicted(found[0]) - true).max() < 1.5
+        assert found[0].supported == 6
+
+
+def test_missing_marks_do_not_hinder() -> None:
+    true = view_marks("0")
+    found = placements("0", responses(true[:4], np.full(4, 0.5)))
+    assert np.abs(predicted(found[0]) - true).max() < 2.0
+
+
+def test_a_lattice_of_more_marks_than_candidates_is_not_a_step_off() -> None:
+    """The hundred strongest answers, all in one corner, tell how it lies and not where it begins."""
+    steps = 9.0 * (np.arange(23) - 11)
+    lattice = [LayoutMark(f"{x}, {y}", (float(x), float(y)), (0.01, 0.01), DOT) for x in steps for y in steps]
+    camera = np.array([mark.xy_mm for mark in lattice])
+    true = camera @ np.array([[1.01, 0.02], [0.02, -1.01]]) / PITCH_MM + (268.0, 257.0)
+    heights = np.interp(camera.min(axis=1), [-99.0, 99.0], [0.4, 0.7])
+    answers = responses(true, heights)
+    search = PlacementSearch(lattice, answers, (PITCH_MM, PITCH_MM), BOUNDS)
+    best = search.find_placements("0", [0] * len(lattice))[0]
+    found = camera @ best.pixel_from_camera[:, :2].T + best.pixel_from_camera[:, 2]
+    assert np.abs(found - true).max() < 1.5
+
+
+def test_nothing_that_answers_gives_no_placement() -> None:
+    assert placements("0", Responses({(0, 1): np.zeros((300, 300), np.float32)}, (0,), 1, ByteCache(0))) == []
+
+
+def test_peaks_come_in_order_and_apart() -> None:
+    map_ = np.zeros((50, 60), np.float32)
+    for col, row, height in ((10, 20, 0.5), (40, 30, 0.9), (12, 20, 0.4)):
+        map_[row, col] = height
+    map_[30:32, 40:42] = 0.9  # as high in four pixels: one peak
+    places, heights = local_maxima(map_, 10, 0.1)
+    assert places.tolist() == [[40, 30], [10, 20]]
+    np.testing.assert_allclose(heights, [0.9, 0.5], rtol=1e-6)
+
+
+def test_a_square_is_alike_in_all_poses_and_six_marks_do_not() -> None:
+    first = ("0", [0] * 4)
+    assert all(same_picture(MARKS[:4], first, (pose, [0] * 4), NEAR_MM) for pose in POSES)
+    others = [pose for pose in POSES if not same_picture(MARKS, ("0", [0] * 6), (pose, [0] * 6), NEAR_MM)]
+    assert set(others) == set(POSES) - {"0", "0m"}
+
+
+def test_a_posed_placement_keeps_its_place() -> None:
+    placement = Placement("0", np.array([[2.0, 0.1, 50.0], [0.1, -2.0, 60.0]]), 1.0, 4, 1, 1, (0.5, 0.5))
+    turned = placement.posed("90m", np.array([mark.xy_mm for mark in MARKS[:4]]))
+    assert turned.same_place(placement)
+    center = turned.pixel_from_camera @ (10.0, 0.0, 1.0)
+    np.testing.assert_allclose(center, placement.pixel_from_camera @ (*(up_from_camera("90m") @ (10.0, 0.0)), 1.0))
+
+
+def test_a_posed_placement_is_moved_by_what_the_coordinates_differ() -> None:
+    """Marks opposite each other whose coordinates are not: shifted, turned and larger, as the names are changed."""
+    camera_mm = np.array([(-109.0, 0.3), (109.4, 0.0), (0.0, 109.2), (0.2, -109.0)])
+    placement = Placement("0", np.array([[16.0, 0.3, 2350.0], [0.3, -16.0, 2340.0]]), 1.0, 4, 1, 4, (0.0625, 0.0625))
+    turned = placement.posed("180", camera_mm)
+    opposite = [1, 0, 3, 2]
+    before, after = placement.places_px(camera_mm), turned.places_px(camera_mm)[opposite]
+    assert turned.names(before, camera_mm).tolist() == opposite
+    plain = camera_mm[opposite] @ (-placement.pixel_from_camera[:, :2]).T + placement.pixel_from_camera[:, 2]
+    assert np.hypot(*(plain - before).T).min() > 3.0
+    # What no similarity takes up is left: the sides' lengths differ by 0.2 mm.
+    assert np.hypot(*(after - before).T).max() < 2.5
+    np.testing.assert_allclose((after - before).mean(axis=0), 0.0, atol=1e-9)
+
+
+GIVEN = PitchHypothesis((0.05, 0.05), 0.04, (0.05, 0.05))
+SCAN = scan_of(np.zeros((400, 400)))
+
+
+class Stand:
+    """What an attempt finds, in a frame's stead."""
+
+    def __init__(self, name: str) -> None:
+        self.name, self.is_complete, self.accepted, self.measured_count = name, False, False, 0
+        self.is_sure, self.agrees, self.scan = False, False, SCAN
+        self.failed_fits: list[int] = []
+        self.inliers, self.pixel_from_camera = np.ones(3, bool), np.eye(2, 3)
+
+    def misfit(self, ids: Sequence[str]) -> Reason:
+        return Reason(f"not {self.name}")
+
+    def is_nearer_than(self, other: "Stand | None") -> bool:
+        return other is None
+
+
+def search_attempts(
+    monkeypatch: pytest.MonkeyPatch, *expected: float | None, given: int = 1, at_given: int | None = None
+) -> tuple[Found, list[int]]:
+    """What a list of attempts comes to, each of two hypotheses and with so many frames that chance is expected to make
+    a hypothesis, and how many hypotheses each was judged by. given: how many of them believe what they find; at_given:
+    which of the others is under the given pitch."""
+    checked: list[int] = []
+
+    def attempt(number: int) -> Attempt:
+        kind = "given" if number < given else "pitch" if number != at_given else "faint"
+        return Attempt(
+            cast(Kind, kind), cast(FrameSearch, SimpleNamespace(number=number)), [GIVEN, GIVEN], number == at_given
+        )
+
+    def make(attempt: Attempt, tried: int) -> Any:
+        number = cast(Any, attempt.search).number
+        each = expected[number]
+        checked.append(tried)
+        return [], [] if each is None else [(tried * each, cast(Frame, Stand(str(number))))]
+
+    monkeypatch.setattr(stages, "list_attempts", lambda *_: [attempt(number) for number in range(len(expected))])
+    monkeypatch.setattr(stages, "make_attempt", make)
+    monkeypatch.setattr(stages, "doubt_frame", lambda *_: NO_REASON)
+    return find_frame(SCAN, ALIKE, [[GIVEN]], True, FiducialOptions()), checked
+
+
+def name(found: Found) -> str:
+    return cast(Stand, found.frame).name if found.frame else ""
+
+
+def test_each_attempt_is_tested_by_all_hypotheses_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What would be taken by itself may be chance after so many others; its pitch is worth to be given then."""
+    found, checked = search_attempts(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 5)
+    assert checked == [2, 4, 6]
+    assert name(found) == ""
+    assert [cast(Stand, frame).name for frame in found.unsure] == ["2"]
+    assert found.misfit.startswith("not 0; under another pitch 3 of them fit")
+    found, _ = search_attempts(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 7)
+    assert (name(found), found.is_taken) == ("2", True)
+
+
+def test_attempts_under_the_given_pitch_are_tested_by_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, checked = search_attempts(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 5, at_given=2)
+    assert checked == [2, 4, 4]
+    assert name(found) == "2"
+    found, _ = search_attempts(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 3, at_given=2)
+    assert (name(found), found.unsure) == ("", ())
+    assert "3 faint marks fit, where 0.01 such false alarms are expected" in found.misfit
+    assert "another pitch does not separate them; click the visible marks in `reseau review`" in found.misfit
+    found, _ = search_attempts(monkeypatch, np.inf, 1.0, 0.3, at_given=2)
+    assert found.misfit == "not 0"  # chance makes more than one
+
+
+def test_what_is_settled_is_not_inspected_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, checked = search_attempts(monkeypatch, np.inf, 1e-5, 1e-9)
+    assert checked == [2, 4]
+    assert name(found) == "1"
+
+
+def test_where_nothing_was_detected_the_reason_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, _ = search_attempts(monkeypatch, None, None)
+    assert name(found) == ""
+    assert found.misfit == "no two of the camera's marks were found in the scan"
+
+
+@pytest.mark.parametrize(("times", "looks"), [(1.0, 7), (2.0, 8), (0.5, 8), (None, 4)])
+def test_the_attempts_in_their_order(times: float | None, looks: int) -> None:
+    """As given, longer one way and filling the scan, at a closer look as given and slightly longer, with what grain
+    hides and without it; a small scan is searched as a whole at once.
+    Where no pitch is given, or one at which the frame is far from filling the scan, pixels of any size may be longer
+    one way, too."""
+    filling_um = 1000 * max(ALIKE.frame_mm) / SCAN.width_px
+    given_um, is_given = None if times is None else (times * filling_um,) * 2, times is not None
+    hypotheses = pitch_hypotheses(SCAN, ALIKE, given_um, FiducialOptions())
+    listed = stages.list_attempts(FrameSearch(SCAN, ALIKE, FiducialOptions()), hypotheses, is_given)
+    assert len(listed) == looks
+    assert [each.is_given for each in listed] == [True, *[False] * (looks - 1)]
+    assert [each.hypotheses for each in listed[: len(hypotheses)]] == hypotheses
+    close = listed[len(hypotheses) :]
+    closer_each = [True, False] if is_given else [False]
+    assert [each.search.surroundings for each in close] == [CLOSE for _ in closer_each] + [GRAINY for _ in closer_each]
+    assert [each.at_given for each in close] == 2 * closer_each
+
+
+def test_marks_are_fitted_from_other_tone_curves_only_where_their_fits_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    scan, options = SCAN.replace_tone(Tone.unknown()), FiducialOptions(pose="0")
+    place = Placement("0", np.eye(2, 3), 1.0, 4, 1, 1, GIVEN.mm)
+    monkeypatch.setattr(FrameSearch, "search_scan", lambda *_: [place])
+    monkeypatch.setattr(stages, "_likely_placements", lambda *_: [place])
+    monkeypatch.setattr(stages, "doubt_frame", lambda *_: NO_REASON)
+    for failed, expected in (([1], [1.6, 1.0, 0.5]), ([], [1.6, 1.6, 1.6])):
+        begun: list[float] = []
+
+        def measure(scan: Scan, *_: object, begun: list[float] = begun, failed: list[int] = failed) -> Any:
+            begun.append(round(scan.tone.equivalent_power(0.1, 0.9)[0], 1))
+            frame = Stand("right")
+            frame.failed_fits, frame.accepted, frame.measured_count = failed, begun[-1] < 0.7, 4
+            frame.is_sure = frame.is_complete = frame.accepted
+            return frame
+
+        monkeypatch.setattr(stages, "measure_frame", measure)
+        found = find_frame(scan, ALIKE, [[GIVEN], [GIVEN]], True, options)
+        assert found.is_taken == bool(failed)
+        assert begun[:3] == expected
+
+
+PX_PER_MM = 20.0
+HALF_MM = 5.5
+AT_MM = 4.4
+MIDDLE_PX = 150.3
+WING = polygon(((0.0, 0.0), (0.8, 0.35), (0.8, -0.35)))
+CLOSER_LOOK_PLACES = [(x, y) for x in (-AT_MM, AT_MM) for y in (-AT_MM, AT_MM)]
+
+
+def wing(x: float, y: float) -> MarkShape:
+    """It points away from the frame's middle."""
+    return MarkShape(tuple(turned_part(part, float(np.degrees(np.arctan2(y, x)))) for part in WING))
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("contrast", [4500.0, 0.0])
+def test_wings_are_found_next_to_an_edge_that_is_nine_times_as_strong(contrast: float) -> None:
+    rng = np.random.default_rng(3)
+    grey = np.full((300, 300), 55000.0)
+    edge = slice(round(MIDDLE_PX - HALF_MM * PX_PER_MM), round(MIDDLE_PX + HALF_MM * PX_PER_MM))
+    grey[edge, edge] = 13000.0
+    matrix = placed(PX_PER_MM, (MIDDLE_PX, MIDDLE_PX))
+    layout = layout_of([wing(*place) for place in CLOSER_LOOK_PLACES], CLOSER_LOOK_PLACES, (2 * HALF_MM, 2 * HALF_MM))
+    for mark in layout.marks:
+        paint(grey, mark.mark, mark.xy_mm, matrix, -contrast, blur_px=0.9)
+    grey += rng.normal(0.0, 900.0, grey.shape)
+    result = measure_fiducials(
+        scan_of(grey), layout, (1000 / PX_PER_MM,) * 2, FiducialOptions(pose="0", pitch_is_right=True)
+    )
+    if not contrast:
+        assert {mark.status for mark in result.marks} == {Status.ABSENT}
+        return
+    for found, given in zip(result.marks, layout.marks, strict=True):
+        assert found.status is Status.WEAK, found
+        assert found.center_px is not None
+        assert np.hypot(*(found.center_px - matrix @ (*given.xy_mm, 1.0))) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("surroundings", "chance", "is_taken"), [(CLOSE, 5e-4, True), (CLOSE, 5e-3, False), (WIDE, 5e-4, False)]
+)
+def test_at_closer_matching_marks_are_taken_that_noise_seldom_makes_for_all_together_decide(
+    surroundings: Surroundings, chance: float, is_taken: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    faint = cast(MarkFit, SimpleNamespace(likeness=0.1, significance=3.0))
+    monkeypatch.setattr(
+        measure_frame,
+        "detect_mark",
+        lambda _, expected, __: Detection(expected.center_px, True, faint, false_alarms=chance),
+    )
+    matrix = placed(PX_PER_MM, (MIDDLE_PX, MIDDLE_PX))
+    layout = layout_of([wing(*place) for place in CLOSER_LOOK_PLACES], CLOSER_LOOK_PLACES, (2 * HALF_MM, 2 * HALF_MM))
+    placement = Placement("0", matrix, 1.0, 4, 1, 1, (1 / PX_PER_MM,) * 2, surroundings)
+    frame = Frame.from_placement(scan_of(np.zeros((300, 300))), layout, placement, FiducialOptions())
+    frame = measure_frame._detect(frame, range(4), frame.first_search_px(NARROW))
+    assert [detection.fit is faint for detection in frame.detections] == [is_taken] * 4
+
+
+def layout(sigma_mm: float) -> FiducialLayout:
+    places = [(-106.0, -106.0), (106.0, 106.0), (-106.0, 106.0), (106.0, -106.0)]
+    marks = [LayoutMark(str(k), place, (sigma_mm, sigma_mm), MarkShape(dot(0.1))) for k, place in enumerate(places)]
+    return FiducialLayout(tuple(marks), (228.0, 228.0))
+
+
+def frame(across_um: float, down_um: float) -> FrameMeasurement:
+    """A frame turned by 90 degrees."""
+    matrix = np.array([[0.0, 1000.0 / across_um, 5000.0], [1000.0 / down_um, 0.0, 5000.0]])
+    marks = [
+        MarkMeasurement(
+            mark.id, "fiducial", matrix @ (*mark.xy_mm, 1.0), Covariance.from_noise(np.eye(2)), Status.MEASURED
+        )
+        for mark in layout(1.0).marks
+    ]
+    return FrameMeasurement("a", tuple(marks), None, matrix)
+
+
+def test_a_pitch_that_film_and_separations_allow_is_no_problem() -> None:
+    assert pitch_problem(frame(20.1, 19.9), layout(0.01), (20.0, 20.0), "the project") is None
+
+
+def test_a_wrong_pitch_is_named() -> None:
+    problem = pitch_problem(frame(21.17, 20.0), layout(0.01), (20.0, 20.0), "the project")
+    assert problem is not None
+    assert "the project gives a pitch of 20.00 x 20.00 µm" in problem
+    assert "set pitch_um = [21.17, 20.00]" in problem
+
+
+def test_separations_known_to_a_few_millimetres_say_little() -> None:
+    assert pitch_problem(frame(20.6, 20.6), layout(3.0), (20.0, 20.0), "the project") is None
+    assert pitch_problem(frame(20.6, 20.6), layout(0.1), (20.0, 20.0), "the project") is not None
+
+
+def test_right_pitches_are_called_wrong_as_rarely_as_is_stated() -> None:
+    """Eight marks of a small camera whose given places are known to a millimetre: 1 of 100, and less what film does."""
+    generator = np.random.default_rng(5)
+    true = np.array([(x, y) for x in (-16.0, 0.0, 16.0) for y in (-11.5, 0.0, 11.5) if (x, y) != (0.0, 0.0)])
+    wrong = 0
+    for _ in range(700):
+        given = true + generator.normal(0, 1, true.shape)
+        marks = [
+            LayoutMark(str(k), (place[0], place[1]), (1.0, 1.0), MarkShape(dot(0.1))) for k, place in enumerate(given)
+        ]
+        design = np.column_stack([given, np.ones(len(given))])
+        matrix = np.asarray(np.linalg.lstsq(design, true * (50.0, -50.0), rcond=None)[0].T, float)
+        view = [
+            MarkMeasurement(mark.id, "fiducial", np.zeros(2), Covariance.from_noise(np.eye(2)), Status.MEASURED)
+            for mark in marks
+        ]
+        small = FiducialLayout(tuple(marks), (33.0, 24.0))
+        wrong += pitch_problem(FrameMeasurement("a", tuple(view), None, matrix), small, (20.0, 20.0), "x") is not None
+    assert 1 <= wrong <= 14, wrong  # 7 are expected at most, more than 14 in one run of 170

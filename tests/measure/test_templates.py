@@ -1,0 +1,322 @@
+"""Marks that nobody has drawn: learned, symmetric, of own figures."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drawn import brute_picture, frame_picture, layout_of, measured, pixel_from_camera
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+from scipy.special import ndtr
+
+from measure import ScanWindow
+from measure.detection.recurrence import recurrence
+from measure.fiducials.across_frames import check_frames
+from measure.fiducials.mark_comparison import OwnFigure, check_own_figures, unlike_blur, unlike_others
+from measure.flags import Cause, Code, Reason, Status
+from measure.geometry import POSES, up_from_camera
+from measure.marks.shapes import Bar, MarkShape, MarkTemplate, cross, polygon
+from measure.marks.templates import Chip, learn_template, share_origins
+from measure.matching.covariance import honest_covariance
+from measure.matching.match import MatchOptions, match, measure_arms
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
+
+Array = NDArray[np.float64]
+
+WEDGE = MarkShape(polygon([(0.0, 0.0), (0.9, 1.2), (0.9, -1.2)]))
+PX_PER_MM, SIDE, NOISE_DN, SIZE_MM = 12.0, 61, 20.0, 2.8
+SHIFT = MatchOptions(freedom="shift", estimate_blur=False)
+
+
+def pictures(
+    count: int, seed: int, dust: bool = False, blurs: Sequence[float] = (), scale: int = 1, noise_dn: float = NOISE_DN
+) -> tuple[list[Chip], Array]:
+    """Chips of the wedge, each with a gain of its own and placed half a pixel wrong, and the true places (n, 2).
+    blurs: of each one, px; all alike where it has none. scale: times the wedge's size."""
+    rng = np.random.default_rng(seed)
+    true = 30 * scale + rng.uniform(-0.5, 0.5, (count, 2))
+    chips, side = [], scale * (SIDE - 1) + 1
+    for index, place in enumerate(true):
+        linear = scale * PX_PER_MM * np.array([[1.0, 0.004], [0.003, -1.0]])
+        shown = brute_picture(WEDGE, np.column_stack([linear, place]), side, side, blurs[index] if blurs else 0.8)
+        grey = rng.uniform(1500, 2500) + rng.uniform(700, 1300) * shown + rng.normal(0, noise_dn, shown.shape)
+        if dust and index == 0:
+            grey[26:32, 34:40] += 4000.0
+        taken = np.column_stack([linear, place + rng.normal(0, 0.4, 2)])
+        chips.append(Chip(f"frame{index}", grey, (0, 0), taken))
+    return chips, true
+
+
+def measure_picture(chips: list[Chip], options: MatchOptions = SHIFT) -> tuple[Array, Array]:
+    """Places (n, 2) and standard deviations (n, 2) with the template that the chips give."""
+    template = learn_template(chips, SIZE_MM)
+    fits = [match(ScanWindow(chip.grey), template, chip.pixel_from_mark, options) for chip in chips]
+    covariances = [honest_covariance(template, chip.scan, fit).px2 for chip, fit in zip(chips, fits, strict=True)]
+    return np.array([fit.center_px for fit in fits]), np.sqrt(np.array(covariances)[:, [0, 1], [0, 1]])
+
+
+def test_a_learned_template_measures_as_its_standard_deviations_say() -> None:
+    """Places differ from the true ones by one common offset, and by no more than is claimed: 2 x 6 x 2 coordinates."""
+    scores = []
+    for seed in (1, 2):
+        chips, true = pictures(6, seed)
+        places, sigma = measure_picture(chips)
+        off = places - true
+        scores.append((off - off.mean(axis=0)) / sigma / np.sqrt(1 - 1 / 6))
+        assert sigma.max() < 0.04
+    assert 0.7 < float(np.sqrt(np.mean(np.square(scores)))) < 1.35
+
+
+@pytest.mark.study
+def test_pictures_of_unlike_blur_show_an_unsymmetric_mark_at_one_place() -> None:
+    """Whichever is the sharp one, and however soft the others: 2 x 5 x 2 coordinates. With a mean of them as template
+    the sharp one lies 1 px off the others."""
+    scores = []
+    for seed, blurs in ((1, (0.7, 2.0, 1.8, 1.9, 1.7)), (2, (1.9, 3.0, 1.1, 0.7, 0.8))):
+        chips, true = pictures(5, seed, blurs=blurs, scale=2)
+        places, sigma = measure_picture(chips, MatchOptions(freedom="shift"))
+        off = places - true
+        off -= off.mean(axis=0)
+        assert np.abs(off).max() < 0.05
+        scores.append(off / sigma / np.sqrt(1 - 1 / 5))
+    assert 0.6 < float(np.sqrt(np.mean(np.square(scores)))) < 1.35
+
+
+@pytest.mark.study
+def test_noise_in_the_template_is_not_taken_for_slopes_of_the_mark() -> None:
+    """A fifth of the contrast: of 2 x 5 x 2 coordinates, twice what is claimed where it is."""
+    scores = []
+    for seed in range(2):
+        chips, true = pictures(5, seed, scale=2, noise_dn=10 * NOISE_DN)
+        places, sigma = measure_picture(chips)
+        off = places - true
+        scores.append((off - off.mean(axis=0)) / sigma / np.sqrt(1 - 1 / 5))
+    assert 0.7 < float(np.sqrt(np.mean(np.square(scores)))) < 1.65
+
+
+def test_dust_on_one_picture_stays_out_of_the_template() -> None:
+    clean, _ = pictures(5, 3)
+    dusty, _ = pictures(5, 3, dust=True)
+    with_dust, without = (learn_template(chips, SIZE_MM).image.ravel() for chips in (dusty, clean))
+    gain, offset = np.polyfit(with_dust, without, 1)  # of a template they do not matter
+    assert np.abs(gain * with_dust + offset - without).max() < 4 * NOISE_DN
+
+
+def test_one_picture_alone_is_its_own_template_and_keeps_an_honest_sigma() -> None:
+    chips, _ = pictures(1, 4)
+    template = learn_template(chips, SIZE_MM)
+    assert dict(template.shares) == {"frame0": 1.0}
+    fit = match(ScanWindow(chips[0].grey), template, chips[0].pixel_from_mark, SHIFT)
+    np.testing.assert_allclose(fit.center_px, chips[0].pixel_from_mark[:, 2], atol=0.02)
+    sigma = np.sqrt(np.diag(honest_covariance(template, "frame0", fit).px2))
+    assert 0.005 < sigma.min() < sigma.max() < 0.2  # the residuals, which are nothing, would say nothing
+
+
+def test_no_picture_gives_no_template() -> None:
+    with pytest.raises(ValueError, match="needs a picture"):
+        learn_template([], 3.0)
+
+
+def test_what_recurs_is_found_among_what_changes() -> None:
+    rng = np.random.default_rng(5)
+    mark = np.zeros((24, 24), np.float32)
+    mark[8:16, 11:13] = mark[11:13, 8:16] = 4.0
+    windows = []
+    for right, down in ((0, 0), (3, -2), (-2, 4), (1, 1)):
+        window = rng.normal(0, 1, (73, 73)).astype(np.float32)
+        window[18 + down : 42 + down, 30 + right : 54 + right] += mark
+        windows.append(window)
+    found = recurrence(windows[0], windows[1:], size_mm=2.4)
+    assert found.excess > 0.3
+    np.testing.assert_allclose(found.offset_mm, (0.55, 0.65), atol=0.11)  # its middle, (41.5, 29.5), from (36, 36)
+    assert recurrence(windows[0], [rng.normal(0, 1, (73, 73)).astype(np.float32)] * 3, 2.4).excess < 0.15
+
+
+def test_a_corner_of_the_border_next_to_a_lighter_landscape_is_known_less_surely() -> None:
+    """Learned beside a landscape of 150, seen beside one of 230, each rough in its own way, whose glow on the border
+    does not grow with it: both edges seem to lie elsewhere, as the standard deviations have to say."""
+    rng = np.random.default_rng(6)
+    template = learn_template([corner(rng, 150.0, 30 + rng.uniform(-0.5, 0.5, 2)) for _ in range(3)], SIZE_MM)
+    errors = []
+    for place in 30 + rng.uniform(-0.5, 0.5, (4, 2)):
+        view = corner(rng, 230.0, place)
+        start = np.column_stack([view.pixel_from_mark[:, :2], np.rint(place)])
+        fit = match(ScanWindow(view.grey), template, start, MatchOptions(freedom="shift"))
+        error = fit.center_px - place
+        assert fit.converged
+        errors.append(error)
+        assert error @ np.linalg.solve(fit.covariance_px2, error) < 3.0**2
+    assert float(np.sqrt(np.mean(np.square(errors)))) < 0.5
+
+
+def corner(rng: np.random.Generator, level_dn: float, place: Array) -> Chip:
+    """A landscape's corner, right of and below a place, in a border on which it glows."""
+    right, below = np.arange(SIDE) - place[0], (np.arange(SIDE) - place[1])[:, None]
+    share, glow = (ndtr(right / blur_px) * ndtr(below / blur_px) for blur_px in (0.8, 3.0))
+    landscape = level_dn + 13.0 * gaussian_filter(rng.normal(0, 6.0, share.shape), 1.7)
+    grey = (1 - share) * (30.0 + 80.0 * glow) + share * landscape + rng.normal(0, 1.5, share.shape)
+    return Chip("frame", grey, (0, 0), np.column_stack([PX_PER_MM * np.diag([1.0, -1.0]), place]))
+
+
+PLACES = np.array([(6.0, -6.0), (-6.0, -6.0), (-6.0, 6.0), (6.0, 6.0)])
+SYMMETRY_SIDE, SYMMETRY_PX_PER_MM = 61, 20.0
+
+
+def clicked(shape: MarkShape, off_mm: np.ndarray, rng: np.random.Generator) -> MarkTemplate:
+    """A picture of the mark whose origin, in its middle, lies beside the mark's own by off_mm."""
+    middle = np.full(2, SYMMETRY_SIDE // 2)
+    place = np.column_stack(
+        [SYMMETRY_PX_PER_MM * np.diag([1.0, -1.0]), middle - SYMMETRY_PX_PER_MM * np.array([1.0, -1.0]) * off_mm]
+    )
+    grey = 100.0 * brute_picture(shape, place, SYMMETRY_SIDE, SYMMETRY_SIDE, 1.0) + rng.normal(
+        0, 4.0, (SYMMETRY_SIDE, SYMMETRY_SIDE)
+    )
+    return MarkTemplate(grey, 1000 / SYMMETRY_PX_PER_MM, (SYMMETRY_SIDE // 2, SYMMETRY_SIDE // 2), learned_mm=3.0)
+
+
+def test_origins_of_crosses_are_laid_in_their_middles() -> None:
+    rng = np.random.default_rng(1)
+    off = rng.normal(0, 0.1, (4, 2))
+    templates, moves = share_origins([clicked(MarkShape(cross(1.0, 0.2)), each, rng) for each in off], PLACES, POSES)
+    assert templates[0].alike == POSES[1:]
+    np.testing.assert_allclose(moves, -off, atol=0.05 / SYMMETRY_PX_PER_MM)
+    for template, move in zip(templates, moves, strict=True):
+        shift = (np.array(template.origin_px) - SYMMETRY_SIDE // 2) / SYMMETRY_PX_PER_MM * (1.0, -1.0)
+        np.testing.assert_allclose(shift, move, atol=1e-9)
+
+
+def test_marks_that_are_each_turned_with_their_place_keep_what_nothing_tells() -> None:
+    """Half-wedges of a frame that looks alike turned by quarters: their origins come to lie alike, at no tips."""
+    rng = np.random.default_rng(2)
+    outline = np.array([(0.0, 0.0), (1.0, 0.1), (1.0, 0.9)])
+    quarters = [up_from_camera(pose) for pose in ("0", "270", "180", "90")]  # from one corner to the next
+    off = rng.normal(0, 0.1, (4, 2))
+    shapes = [MarkShape(polygon(tuple(map(tuple, (outline @ turn.T).tolist())))) for turn in quarters]
+    templates, moves = share_origins([clicked(*each, rng) for each in zip(shapes, off, strict=True)], PLACES, POSES)
+    assert templates[0].alike == ("90", "180", "270")
+    left = off + moves  # of the origins from the tips: alike once each is turned back
+    turned_back = np.array([turn.T @ each for turn, each in zip(quarters, left, strict=True)])
+    np.testing.assert_allclose(
+        turned_back, np.broadcast_to(turned_back.mean(axis=0), (4, 2)), atol=0.15 / SYMMETRY_PX_PER_MM
+    )
+
+
+@pytest.mark.parametrize("places", [PLACES, PLACES * (1.0, 0.5)])
+def test_marks_that_differ_stay_as_they_were(places: np.ndarray) -> None:
+    rng = np.random.default_rng(3)
+    shapes = [MarkShape(cross(1.0, 0.2)), *(MarkShape(polygon(((0.0, 0.0), (1.1, 0.2), (0.4, 0.8)))) for _ in range(3))]
+    marks = [clicked(shape, np.zeros(2), rng) for shape in shapes]
+    templates, moves = share_origins(marks, places, POSES)
+    assert templates == marks
+    assert not moves.any()
+
+
+GIVEN = MarkShape(cross(0.8, 0.1))
+SHORT = MarkShape((Bar((-0.7, 0.0), (0.7, 0.0), 0.1), Bar((0.0, -0.8), (0.0, 0.7), 0.1)))
+COVERED = MarkShape((Bar((-0.8, 0.0), (0.8, 0.0), 0.1), Bar((0.0, -0.8), (0.0, 0.5), 0.1)))
+OWN_FIGURES_PLACES = tuple((7.0 * x, 7.0 * y) for y in (1, 0, -1) for x in (-1, 0, 1))
+LAYOUT, PITCH = layout_of([GIVEN] * 9, OWN_FIGURES_PLACES), (50.0, 50.0)
+
+
+def plate_frame(number: int, folder: Path, covered: bool = False) -> FrameMeasurement:
+    """A frame of a plate whose third cross has three short arms; an arm of the sixth one may be covered."""
+    plate = layout_of(
+        [SHORT if k == 2 else COVERED if k == 5 and covered else GIVEN for k in range(9)], OWN_FIGURES_PLACES
+    )
+    matrix = pixel_from_camera("0", 0.008 + 0.001 * number, (202.3 + 0.3 * number, 197.6 - 0.4 * number))
+    return replace(measured(frame_picture(plate, matrix, seed=number), LAYOUT, folder), image=str(number))
+
+
+def test_what_is_alike_in_all_frames_is_the_plates_and_what_one_has_is_damage(tmp_path: Path) -> None:
+    frames = [plate_frame(number, tmp_path, covered=number == 3) for number in range(1, 4)]
+    assert any("times as large as the other marks" in frame.marks[2].reason for frame in frames)
+    checked = check_frames(frames, LAYOUT, [PITCH] * 3).frames
+    assert [frame.marks[2].status for frame in checked] == [Status.MEASURED] * 3
+    weak = {(frame.image, mark.point): mark.reason for frame in checked for mark in frame.marks if mark.reason}
+    assert list(weak) == [("3", "6")]
+    assert "one of its arms is 0." in weak["3", "6"]
+    assert "what it is" not in weak["3", "6"]
+    assert Code.COVERED in weak["3", "6"].codes
+    pair = check_frames(frames[:2], LAYOUT, [PITCH] * 2).frames
+    assert [frame.marks[2].status for frame in pair] == [frame.marks[2].status for frame in frames[:2]]
+
+
+def test_lengths_of_arms_are_those_drawn_and_known_as_well_as_they_are_said_to_be() -> None:
+    rng, place = np.random.default_rng(1), np.array([[27.0, 0.3, 40.3], [0.25, -27.0, 39.6]])
+    drawn = MarkShape((Bar((-0.8, 0.0), (0.72, 0.0), 0.1), Bar((0.0, -0.8), (0.0, 0.64), 0.1)))
+    truth, shown = np.array((1.0, 0.9, 1.0, 0.8)), 6000 * brute_picture(drawn, place, 80, 80, 1.0) + 3000
+    errors, normalised = list[NDArray[np.float64]](), list[NDArray[np.float64]]()
+    for _ in range(12):
+        window = ScanWindow(shown + rng.normal(0.0, 500.0, shown.shape))
+        lengths, sigmas = measure_arms(window, GIVEN, place, match(window, GIVEN, place))
+        errors.append(lengths - truth)
+        normalised.append(errors[-1] / sigmas)
+    assert np.abs(errors).max() < 0.05
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.016  # the estimate is linear in the lengths
+    assert 0.7 < np.std(normalised, axis=0).mean() < 1.3
+
+
+def test_good_figures_are_doubted_as_seldom_as_stated_and_frames_that_do_not_agree_tell_nothing() -> None:
+    rng, off = np.random.default_rng(2), list[float]()
+    for _ in range(300):
+        sigmas = rng.uniform(0.005, 0.03, 8)
+        own = OwnFigure.from_frames(rng.normal(-0.1, np.hypot(sigmas, 0.014)), sigmas, is_blur=False)
+        assert own is not None
+        assert own.value == pytest.approx(-0.1, abs=5 * own.sigma)
+        off += (own.off / own.off_sigma).tolist()
+    assert 0.85 < np.std(off) < 1.15
+    apart, sigmas = np.array([-0.1, 0.0, 0.1, 0.2]), np.full(4, 0.01)
+    assert OwnFigure.from_frames(apart, sigmas, is_blur=False) is None
+    assert OwnFigure.from_frames(np.full(2, -0.1), sigmas[:2], is_blur=False) is None
+
+
+@pytest.mark.parametrize(("poses", "agree"), [(("0", "0", "0m"), True), (("0", "0", "0"), False)])
+def test_a_turn_is_compared_as_the_camera_has_it(poses: tuple[str, ...], agree: bool) -> None:
+    """Two frames have the mark turned by 3 degrees to the left, one to the right: the same turn if that is mirrored."""
+    frames = []
+    for pose, turn_rad in zip(poses, (0.051, 0.054, -0.054), strict=True):
+        quality = {"size_ratio": 1.0, "size_sigma": 0.002, "turn_rad": turn_rad, "turn_sigma": 0.002}
+        place = Covariance({Cause.NOISE: 0.01 * np.eye(2)})
+        mark = MarkMeasurement("1", "fiducial", np.zeros(2), place, Status.MEASURED, quality=quality)
+        frames.append(FrameMeasurement(pose, (mark,), Pose(pose, True)))
+    assert [frame.marks[0].status is Status.MEASURED for frame in check_own_figures(frames)] == [True, True, agree]
+
+
+def make_frames(figures: Sequence[Mapping[str, float]], doubt: Reason) -> list[FrameMeasurement]:
+    """A frame for each of these figures of a mark, weak for that doubt, beside two crosses as drawn."""
+    place, arms = Covariance({Cause.NOISE: 0.01 * np.eye(2)}), {f"arm{k}_ratio": 1.0 for k in range(1, 5)}
+    sigmas = {f"{name}_sigma": 0.01 for name in ("size", "blur", "arm1", "arm2", "arm3", "arm4")}
+    frames = []
+    for number, own in enumerate(figures):
+        longer = own.get("arm1_ratio", 1.0) if own.get("arm1_ratio", 1.0) > 1 else 1.0
+        others = {"size_ratio": 1.0, "blur_ratio": 1.0, **dict.fromkeys(arms, longer)}
+        marks = [
+            MarkMeasurement("1", "fiducial", np.zeros(2), place, Status.WEAK, doubt, {**others, **own, **sigmas}),
+            *(
+                MarkMeasurement(name, "fiducial", np.ones(2), place, Status.MEASURED, quality={**others, **sigmas})
+                for name in "23"
+            ),
+        ]
+        frames.append(FrameMeasurement(str(number), tuple(marks), Pose("0", True)))
+    return frames
+
+
+@pytest.mark.parametrize(
+    ("figures", "doubt", "status"),
+    [
+        # Its arms are as drawn in all frames: they do not explain a small cross, which another thing makes then.
+        ([{"size_ratio": 0.83}] * 3, unlike_others(0.83, None), Status.WEAK),
+        ([{"size_ratio": 0.9, "arm2_ratio": 0.88}] * 3, unlike_others(0.9, None), Status.MEASURED),
+        ([{"blur_ratio": 1.6}] * 3, unlike_blur(1.6), Status.MEASURED),
+        ([{"blur_ratio": 1.6}, {}, {}], unlike_blur(1.6), Status.WEAK),
+        # More light makes the arms of a whole frame longer.
+        ([{"size_ratio": 0.9, "arm1_ratio": 1.1, "arm2_ratio": 0.97}, *[{"arm2_ratio": 0.88}] * 2],
+         unlike_others(0.9, None), Status.MEASURED),
+    ],
+)  # fmt: skip
+def test_a_doubt_is_dropped_where_the_plate_explains_it(
+    figures: Sequence[Mapping[str, float]], doubt: Reason, status: Status
+) -> None:
+    assert check_own_figures(make_frames(figures, doubt))[0].marks[0].status is status
