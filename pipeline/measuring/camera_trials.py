@@ -17,7 +17,7 @@ from measure.fiducials.frame import Frame
 from measure.fiducials.options import FiducialOptions
 from measure.fiducials.search import Hypotheses, PitchHypothesis, longer, pitch_hypotheses
 from measure.flags import CAMERA_BY_CHANCE
-from measure.marks.shapes import FiducialLayout, LayoutMark, limit_to_frame, thinnest_mm
+from measure.marks.shapes import FiducialLayout, LayoutMark, finest_detail_mm, limit_to_frame, thinnest_mm
 from measure.scans.opening import open_scan, thumbnail
 from measure.scans.scan import Scan
 from pipeline.files.camera_file import CameraFile
@@ -38,6 +38,7 @@ _LARGEST_PX = 1600  # px, size of the searched image: for aerial film 1/7 mm per
 _COARSE_PX = 1024  # px, while the pitch is unknown: fine lines are then half a pixel wide
 _SOLID_PX = 800  # px, for solid marks, which have a size of some millimetres
 _COARSE_SOLID_PX = 512  # px, for solid marks while the pitch is unknown
+_LEAST_DETAIL_PX = 0.25  # width of the finest detail of marks below which nothing in a picture is one of them
 _PITCH_TOLERANCE = 0.02  # relative, of the pitch found by the coarse search
 _STRETCHES = (-0.025, 0.025)  # affinity of the pixels; each covers 1.1 to 3.9 % for an aerial camera
 _ALIKE_MM = 0.1  # mm: cameras whose marks lie closer to one another cannot be distinguished in a scan
@@ -383,7 +384,9 @@ def _alike(cameras: Mapping[str, CameraFile]) -> list[Names]:
 def _trial(search: LayoutSearch, names: Names, each: Tried, close: float) -> Trial:
     """Measure the marks of one layout. close: score below which the stretched layout need not be compared."""
     start, expected = time.perf_counter(), each.answer.expected
-    frame = search.recognise(each)
+    frame, reason = search.recognise(each), "fewer than three of its marks at the best constellation"
+    if frame and (width_px := _finest_px(frame, each.layout)) < _LEAST_DETAIL_PX:
+        frame, reason = None, f"too coarse: the finest detail of its marks would be {width_px:.2f} px wide there"
     fits = [fit for fit in frame.fits if fit] if frame else []
     residual = _residual(frame, each.layout) if frame else None
     score = likeness(frame) if frame else 0.0
@@ -397,7 +400,7 @@ def _trial(search: LayoutSearch, names: Names, each: Tried, close: float) -> Tri
         chance=_score_by_chance(search, each) if score > close and expected > CAMERA_BY_CHANCE else None,
         residual_sigmas=None if residual is None else residual[0],
         residual_mm=None if residual is None else residual[1],
-        reason="" if frame else "fewer than three of its marks at the best constellation",
+        reason="" if frame else reason,
         seconds=time.perf_counter() - start,
         expected=expected,
         pixel_um=1000 / _px_per_mm(frame) if frame else None,
@@ -411,6 +414,11 @@ def _score_by_chance(search: LayoutSearch, each: Tried) -> float:
         return 0.0
     frame = search.recognise(wrong)
     return likeness(frame) if frame else 0.0
+
+
+def _finest_px(frame: Frame, layout: FiducialLayout) -> float:
+    """Width of the finest detail of a layout's marks in the picture."""
+    return _px_per_mm(frame) * min(finest_detail_mm(mark.mark) for mark in layout.marks)
 
 
 def _px_per_mm(frame: Frame) -> float:

@@ -344,6 +344,20 @@ def test_a_camera_too_large_for_the_scan_is_reported_so_in_words_and_json(
     assert trials[1]["reason"] == "not measured: no constellation of its marks correlates anywhere in the scan"
 
 
+def test_marks_finer_than_the_pixels_are_not_those_of_a_camera(tmp_path: Path) -> None:
+    """Diagonal crosses as far apart as they should be, at 600 µm a pixel, but with lines five times too wide."""
+    few = {"wild-rc5-153": LIBRARY["wild-rc5-153"]}
+    grey = np.random.default_rng(1).normal(150.0, 4.0, (400, 400))
+    for mark in few["wild-rc5-153"].layout().marks:
+        column, row = np.rint(200.0 + np.array([1.0, -1.0]) * mark.xy_mm / 0.6).astype(int)
+        for step in (-2, -1, 1, 2):
+            grey[row + step, column + step] = grey[row - step, column + step] = 230.0
+    tifffile.imwrite(tmp_path / "coarse.tif", grey.clip(0, 255).astype(np.uint8))
+    found = identify(tmp_path / "coarse.tif", few, None, Reporter(quiet=True))
+    assert found.best == ()
+    assert found.trials[0].reason == "too coarse: the finest detail of its marks would be 0.20 px wide there"
+
+
 @pytest.mark.study
 def test_what_noise_answers_as_well_is_not_matched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nor are marks reckoned with that a constellation puts outside of the scan."""
