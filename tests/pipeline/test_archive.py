@@ -277,7 +277,7 @@ def test_an_interrupt_keeps_what_is_done(
     measured.clear()
     assert measure(tmp_path / "p") == 0
     assert len(measured) == 1
-    assert "2 of 3 scans measured already (1 to measure)" in capsys.readouterr().err
+    assert "2 of 3 scans measured in an earlier run (1 to measure)" in capsys.readouterr().err
 
 
 def test_a_full_disk_is_reported_and_costs_nothing_that_was_measured(
@@ -453,11 +453,13 @@ def test_the_tone_of_a_scanner_stays_when_scans_come_and_go(tmp_path: Path, caps
     mark = f'[mark.m]\nkind = "polygon"\nvertices_mm = {[*map(list, TIP_MM)]}\n'
     (folder / "camera.toml").write_text(CAMERA.split("[mark.m]")[0] + mark, encoding="utf-8")
     measure(folder)
-    assert "0 of 2 scans measured already" in capsys.readouterr().err  # this call asked them for the curve itself
+    assert (
+        "0 of 2 scans measured in an earlier run" in capsys.readouterr().err
+    )  # this call asked them for the curve itself
     measured.clear()
     measure(folder)
     assert not measured
-    assert "2 of 2 scans measured already" in capsys.readouterr().err
+    assert "2 of 2 scans measured in an earlier run" in capsys.readouterr().err
     one_more(folder)
     (folder / "a.tif").unlink()
     measure(folder)

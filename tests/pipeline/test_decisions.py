@@ -374,7 +374,9 @@ def test_decisions_that_were_not_taken_in_are_reported_until_measure_takes_them(
     assert "Decisions were made" in capsys.readouterr().out
     run(["measure", str(project)])
     captured = capsys.readouterr()
-    assert "2 of 2 scans measured already\n" in captured.err  # a mark that is no mark is judged, and not measured, anew
+    assert (
+        "2 of 2 scans measured in an earlier run\n" in captured.err
+    )  # a mark that is no mark is judged, and not measured, anew
     assert "Decisions were made" not in captured.out
     assert "Decisions stand behind these marks: 1 of ann" in " ".join(captured.out.split())
     assert "rejected by ann" in project.with_name("comparator.csv").read_text(encoding="utf-8")

@@ -332,7 +332,7 @@ def test_a_folder_is_measured_by_one_command_and_by_the_same_again(
     assert run(["run", str(drawn_library), "--json", "--workers", "1"]) in (0, 1)  # the project that stands there
     again = capsys.readouterr()
     assert set(json.loads(again.out)["frames"]) == {"a"}
-    assert "1 of 1 scan measured already" in again.err
+    assert "1 of 1 scan measured in an earlier run" in again.err
 
 
 def test_a_folder_of_photographs_alone_is_refused_with_the_command_that_takes_it(tmp_path: Path, capsys: SAID) -> None:

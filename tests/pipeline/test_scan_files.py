@@ -250,7 +250,7 @@ def test_a_bucket_and_a_server_give_the_rows_of_the_disk(
     assert rows(named) == rows(local)
     capsys.readouterr()
     assert measure_remote_picture(bucket) == 0
-    assert "2 of 2 scans measured already" in capsys.readouterr().err
+    assert "2 of 2 scans measured in an earlier run" in capsys.readouterr().err
 
 
 def test_names_are_those_below_the_common_folder_and_contents_tell_copies(
@@ -331,7 +331,7 @@ def test_credentials_and_signatures_are_used_and_reported_nowhere(
             folder = write_scan_project(tmp_path / "p", f'"{url}/a.tif?{query}", "{url}/b.tif?{query}"')
             code = measure_remote_picture(folder, "--workers", "2")
             captured = capsys.readouterr()
-            assert f"{left} scans measured already" in captured.err or not left
+            assert f"{left} scans measured in an earlier run" in captured.err or not left
             assert code == (0 if left else 2)  # where no scan can be read
             run(["report", str(folder / "project.toml")])
             run(["status", str(folder / "project.toml"), "--csv"])
