@@ -124,7 +124,7 @@ def _corrections(data: ReportData) -> dict[str, tuple[str, Sequence[Distance]]]:
     uncalibrated = [name for name, camera in stored.cameras.items() if not camera.is_calibrated]
     found = {name: figure(name, stored, covariance) for name in uncalibrated}
     return {
-        name: (correction_sentence(form, stored.cameras[name].fiducials, data.given_by_of(name)), form.distances)
+        name: (correction_sentence(form, stored.cameras[name].fiducials, data.coordinates_source(name)), form.distances)
         for name, form in found.items()
         if form is not None
     }

@@ -1,9 +1,5 @@
 """Explain residuals larger than the given standard deviations by errors of the model or of the noise.
 
-The residuals are then pure noise: normally distributed, of equal variance in all images, and independent of their
-neighbours. With a standard deviation added to that of all marks, of targets alone or of fiducials alone, every group of
-observations agrees.
-
 A hypothesis adds k unknowns to the model. One linearised step from the end of the adjustment without them gives the
 decrease of v'Pv to first order. Likely hypotheses are adjusted and tested by the actual decrease,
 
@@ -13,6 +9,11 @@ chi-square over k where s² = 1. Groups of a partition selected from the data ar
 Scheffé's, with the unknowns of all contrasts, and Bonferroni's, over all partitions. All hypotheses of a round share
 the level LEVEL. Hypotheses are compared with each other, and with gross errors of single observations, by v'Pv plus
 twice the unknowns and the logarithm of the choices (Akaike); those within TOLD_APART of the best are reported with it.
+
+What is left may be noise that is larger than given: residuals that are normally distributed, of equal variance in all
+images, and independent of their neighbours, where a standard deviation added to that of all marks, of targets alone or
+of fiducials alone makes every group of observations agree.
+
 Nothing is reported unless all that is reported removes more than half of the excess of v'Pv over its redundancy.
 
 Where a standard deviation of unmodelled errors was estimated from the residuals, v'Pv equals its redundancy whatever

@@ -1,11 +1,11 @@
 """Hypotheses on errors of a network's model, each as the same problem with additional unknowns.
 
-With orientation and film of one image eliminated from its rows, the shift (c, x0', y0') of that image alone has normal
-equations N d = g. Two groups with separate shifts lower v'Pv by the sum of g' N⁻¹ g of both. The best partition is
-found by weighted two-means, started from the best thresholds of the shifts in some directions.
-
 Lens terms, non-square pixels, different interior orientations of images, a bent board. Each problem starts where the
 adjustment without its unknowns ended, so that one linearised step estimates the fall of v'Pv.
+
+Two groups of images: with orientation and film of one image eliminated from its rows, the shift (c, x0', y0') of that
+image alone has normal equations N d = g. Separate shifts of two groups lower v'Pv by the sum of g' N⁻¹ g of both. The
+best partition is found by weighted two-means, started from the best thresholds of the shifts in some directions.
 """
 
 from collections.abc import Callable, Iterator, Sequence

@@ -63,13 +63,13 @@ MEANING = {
 About = tuple[str, str, str]  # image, point, kind; of a pose: image, "", ""; of marks to be learned: image, "", LEARNED
 
 
-def _one_of(*words: str) -> AfterValidator:
-    def checked(word: str) -> str:
+def _word_validator(*words: str) -> AfterValidator:
+    def check(word: str) -> str:
         if word and word not in words:
             raise ValueError(word)
         return word
 
-    return AfterValidator(checked)
+    return AfterValidator(check)
 
 
 @lru_cache(maxsize=4096)
@@ -106,10 +106,10 @@ class Decision:
     image: Text
     decision: Choice
     point: Text = ""
-    kind: Annotated[Text, _one_of(*KINDS, LEARNED)] = ""
+    kind: Annotated[Text, _word_validator(*KINDS, LEARNED)] = ""
     col_px: Pixels | None = None
     row_px: Pixels | None = None
-    pose: Annotated[Text, _one_of(*POSES)] = ""
+    pose: Annotated[Text, _word_validator(*POSES)] = ""
     note: Text = ""
     who: Text = ""
     when: Annotated[Text, AfterValidator(_checked_time)] = ""
@@ -144,7 +144,7 @@ _MUST_BE = {
 }
 
 
-def _checked(decision: Decision) -> Decision:
+def _check_decision(decision: Decision) -> Decision:
     """Decision of a line without what its kind has no use for. Raises WrongKey where a key is missing."""
     kind = decision.decision
     for key in _REQUIRED[kind]:
@@ -163,7 +163,7 @@ def _checked(decision: Decision) -> Decision:
     return replace(decision, pose="") if decision.pose and kind is not Choice.POSE else decision
 
 
-_DECISIONS = TypeAdapter(list[Annotated[Decision, AfterValidator(_checked)]])
+_DECISIONS = TypeAdapter(list[Annotated[Decision, AfterValidator(_check_decision)]])
 
 
 def decision_line(decision: Decision) -> str:

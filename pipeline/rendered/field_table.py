@@ -35,7 +35,7 @@ class _Plane(ABC):
             raise WrongKey("up", "must not be parallel to right: the two steps span the plane of the targets.")
 
     @abstractmethod
-    def drawn(self, generator: np.random.Generator) -> list[DiskTarget]:
+    def draw_targets(self, generator: np.random.Generator) -> list[DiskTarget]:
         """Targets, with the random numbers of a generator."""
 
     def targets(self, across: Array, along: Array, height: Array) -> list[DiskTarget]:
@@ -60,7 +60,7 @@ class _Grid(_Plane):
     rows: _Count
     jitter: NotNegative = 0.0
 
-    def drawn(self, generator: np.random.Generator) -> list[DiskTarget]:
+    def draw_targets(self, generator: np.random.Generator) -> list[DiskTarget]:
         row, column = np.divmod(np.arange(self.rows * self.columns), self.columns)
         across = column - (self.columns - 1) / 2 + generator.uniform(-self.jitter, self.jitter, len(row))
         along = row - (self.rows - 1) / 2 + generator.uniform(-self.jitter, self.jitter, len(row))
@@ -73,7 +73,7 @@ class _Scatter(_Plane):
 
     points: _Count
 
-    def drawn(self, generator: np.random.Generator) -> list[DiskTarget]:
+    def draw_targets(self, generator: np.random.Generator) -> list[DiskTarget]:
         across, along, height = generator.uniform(-0.5, 0.5, (self.points, 3)).T
         return self.targets(across, along, 2.0 * height)
 
@@ -135,7 +135,7 @@ class _Figures(FieldTable):
 
     def figures(self, seed: int, diameter: float, figure: CrossFigure | None = None) -> DiskField:
         generator = np.random.default_rng([seed, 10])
-        targets = [target for part in (*self.grid, *self.scatter) for target in part.drawn(generator)]
+        targets = [target for part in (*self.grid, *self.scatter) for target in part.draw_targets(generator)]
         targets += [DiskTarget(each.id, each.xyz, each.normal) for each in self.target]
         return DiskField(tuple(targets), diameter, self.surround, figure)
 

@@ -127,7 +127,7 @@ def _view(data: ReportData, stored: AdjustmentRecord, name: str, camera: CameraR
         observed=len(places),
         maps=list(_uncertainty_maps(camera, on, data.unit)) if on is not None else [],
         corrections=figure,
-        corrections_sentence=fiducials.correction_sentence(figure, camera.fiducials, data.given_by_of(name))
+        corrections_sentence=fiducials.correction_sentence(figure, camera.fiducials, data.coordinates_source(name))
         if figure
         else "",
         corrections_plot=fiducials.figure_plot(figure) if figure else None,

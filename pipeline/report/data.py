@@ -133,7 +133,7 @@ class ReportData:
             return {}
         return {name: ImageUnit(min(each)) for name, each in sizes.items()}
 
-    def given_by_of(self, camera: str) -> str:
+    def coordinates_source(self, camera: str) -> str:
         """Source of the given fiducial coordinates of a camera."""
         return self.given_by.get(camera, "the given coordinates")
 

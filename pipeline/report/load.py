@@ -65,7 +65,7 @@ def measured_data(
         pitch_um=pitch_um,
         frame_mm={camera.name: camera.frame_mm for camera in project.cameras.values() if camera.frame_mm is not None},
         unit=project.unit,
-        given_by={camera.name: _given_by(camera) for camera in project.cameras.values()},
+        given_by={camera.name: _coordinates_source(camera) for camera in project.cameras.values()},
         notes=tuple(filter(None, [outside_note(project), describe_decisions(read_decision_counts(comparator))])),
         made_from={project.comparator.name: hash_file(comparator)},
     )
@@ -99,7 +99,7 @@ def measured_data(
     return _add_problems(data, *damaged, *idle, *unlike)
 
 
-def _given_by(camera: CameraFile) -> str:
+def _coordinates_source(camera: CameraFile) -> str:
     """Source of the given fiducial coordinates, from the camera file."""
     if camera.source is None:
         return "the certificate"

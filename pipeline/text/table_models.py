@@ -235,28 +235,28 @@ def table_model(model: type[Model]) -> type[Model]:
     for name, field in given.items():
         if name not in vars(model) and field.default_factory is not dataclasses.MISSING:
             setattr(model, name, dataclasses.field(default_factory=field.default_factory))
-    model.__annotations__ = {name: _with_key(hint) for name, hint in hints.items()}
+    model.__annotations__ = {name: _add_key(hint) for name, hint in hints.items()}
     config = ConfigDict(extra="forbid", arbitrary_types_allowed=True, validate_by_name=True, validate_by_alias=True)
     made: Any = pydantic_dataclass(frozen=True, kw_only=True, config=config)(model)
     return made  # type: ignore[no-any-return]
 
 
-def _with_key(hint: Any) -> Any:
+def _add_key(hint: Any) -> Any:
     """Annotation of a field, with the usual `Key` of its type if it has none."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
         has_key = any(isinstance(each, Key) for each in arguments[1:])
-        return hint if has_key else Annotated[_with_key(arguments[0]), *arguments[1:]]
+        return hint if has_key else Annotated[_add_key(arguments[0]), *arguments[1:]]
     if origin in (Union, UnionType) and NoneType in arguments and len(arguments) == 2:
-        return _with_key(next(each for each in arguments if each is not NoneType)) | None
+        return _add_key(next(each for each in arguments if each is not NoneType)) | None
     if origin is Literal:
         return Annotated[hint, choice(*arguments)]
     if hint in _USUAL:
         return Annotated[hint, _USUAL[hint]]
     if origin is tuple and arguments[1:] == (...,):
-        return tuple[_with_key(arguments[0]), ...]  # type: ignore[misc]
+        return tuple[_add_key(arguments[0]), ...]  # type: ignore[misc]
     if isinstance(origin, type) and issubclass(origin, Mapping):
-        return Mapping[str, _with_key(arguments[1])]  # type: ignore[misc]
+        return Mapping[str, _add_key(arguments[1])]  # type: ignore[misc]
     if isinstance(hint, type) and dataclasses.is_dataclass(hint) and not is_pydantic_dataclass(hint):
         own: Any = table_model(type(hint.__name__, (hint,), {"__module__": hint.__module__}))
         return Annotated[own, AfterValidator(lambda value: hint(**vars(value)))]
@@ -289,7 +289,7 @@ def read_kind(table: Table, models: Mapping[str, type[Model]], key: str = "kind"
     return read_model(table, models[word])
 
 
-_adapter: Callable[[Any], TypeAdapter[Any]] = cache(lambda model: TypeAdapter(_with_key(model)))
+_adapter: Callable[[Any], TypeAdapter[Any]] = cache(lambda model: TypeAdapter(_add_key(model)))
 
 
 def _message(root: Table, model: type, error: ValidationError) -> str:
