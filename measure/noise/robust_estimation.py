@@ -116,13 +116,6 @@ def robust_scale(values: Array) -> float:
     return SIGMA_OF_DEVIATION * _median(np.abs(values - _median(values)))
 
 
-def robust_scales(values: NDArray[np.floating]) -> Array:
-    """(n,) robust standard deviation of each row of values (n, many)."""
-    middle = values.shape[1] // 2
-    off = np.abs(values - np.partition(values, middle, axis=1)[:, middle, None])
-    return np.asarray(SIGMA_OF_DEVIATION * np.partition(off, middle, axis=1)[:, middle], float)
-
-
 def _median(values: Array) -> float:
     middle = values.size // 2  # np.median is many times slower for a small window
     parted = np.partition(values, middle, axis=None)

@@ -24,6 +24,7 @@ Image = NDArray[np.float32]
 Record = TypeVar("Record", bound="DataclassInstance")
 Array = NDArray[np.float64]
 
+_WIDEST_PX = 1536  # width of a part that is searched with one level of texture and noise
 ROW_BYTES, BLOCK_BYTES = 1 << 14, 1 << 24  # largest block, without its margin; strips are not divided
 
 
@@ -138,12 +139,11 @@ PatchTest = Callable[[Block, Patches], Patches]
 
 @dataclass(frozen=True)
 class Octave:
-    """Search in the scan reduced by a factor. margin: border of a part, reduced px; widest_px: largest width of a part,
-    px of the scan; find: returns the patches within the margin of a reduced image, in its pixels."""
+    """Search in the scan reduced by a factor. margin: border of a part, reduced px; find: returns the patches within the
+    margin of a reduced image, in its pixels."""
 
     factor: int
     margin: int
-    widest_px: int
     find: Callable[[Image], Patches]
 
     @property
@@ -212,7 +212,7 @@ def _octave_patches(block: Block, octaves: Sequence[Octave]) -> Iterator[Patches
         factor, small = octave.factor, reductions[octave.factor]
         margin, spare = octave.margin, block.margin_px // factor - octave.margin
         rows = slice(spare, spare + height // factor + 2 * margin)
-        part = _part_size(width, octave.widest_px, factor) // factor
+        part = _part_size(width, _WIDEST_PX, factor) // factor
         for col0 in range(0, width // factor, part):
             first, last = spare + col0, spare + min(col0 + part, width // factor) + 2 * margin
             place = np.array(block.place_px) + factor * np.array([first, spare]) + (factor - 1) / 2

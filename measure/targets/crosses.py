@@ -20,7 +20,6 @@ Mask = NDArray[np.bool_]
 
 _SEARCHED_ARM_PX = 12.0  # half length of a cross in the reduced scan, provided that its lines stay...
 _THINNEST_PX = 1.5  # ...this wide
-_WIDEST_PX = 1536  # width of a part with one noise level, reduced px
 _OCTAVE = 2.0  # longest over shortest half cross found in one reduction
 _NOISE_SIGMAS = 5.0  # threshold above the noise of the top-hat image: one noise pixel in a million exceeds it
 _STEPS_DEG = 5.0  # step of the bar directions that are tried
@@ -66,7 +65,7 @@ def _octaves(search: CrossSearch, full_scale_dn: float) -> list[Octave]:
         finest = max(min(shortest / _SEARCHED_ARM_PX, search.line * shortest / _THINNEST_PX), 1.0)
         factor = int(2 ** np.floor(np.log2(finest)))
         half, margin = (shortest / factor, upper / factor), int(np.ceil(2.0 * upper / factor + 4))
-        octaves.append(Octave(factor, margin, _WIDEST_PX, partial(_patches, half, margin, search, full_scale_dn)))
+        octaves.append(Octave(factor, margin, partial(_patches, half, margin, search, full_scale_dn)))
         shortest = upper
     return octaves
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.marks.shapes import Polarity
-from measure.noise.robust_estimation import robust_scales
+from measure.noise.robust_estimation import robust_scale
 from measure.scans.scan import Scan
 from measure.targets.block_search import Block, Candidate, Octave, Patches, concatenate, search_blocks
 from measure.targets.disk_fit_batch import fit_disks
@@ -34,7 +34,6 @@ _CHUNK = 1 << 18  # samples taken at a time: a few MiB
 _PEAK_OF_DISK = 2 / math.e
 _RESPONSE_SIGMAS = 5.0  # above the background texture at that scale
 _TEXTURE_PX = 1024  # side, px of the scan: a smaller one may be full of disks, which must not count as texture or noise
-_CELL_PX = 1536  # side of a cell with one texture and one noise level, px of the scan
 _EVERY = 8  # sampling step for the texture and noise estimates
 _WORST_MISFIT = 0.075  # rms distance of an outline from its ellipse, in radii, without noise
 _NOISE_SIGMAS = 1.5  # factor on the expected misfit from noise, an rms over many rays
@@ -43,7 +42,6 @@ LEAST_SNR = 4.0  # of a disk that is measured
 _LEAST_FLAT = 0.05  # shorter over longer half axis, squared
 _SCALE_STEP = 1.5  # ratio of consecutive radii: between them the response falls by a tenth
 _SIZE_TOLERANCE = 1.4  # factor on the stated sizes
-_WIDEST_PX = 12288  # widest part that is searched in one piece
 _SEARCH_RADIUS_PX = 2.0  # smallest radius of an octave after reduction
 
 
@@ -192,54 +190,22 @@ def _margin(radii: list[float]) -> int:
 
 def _patches(radii: list[float], search: DiskSearch, full_scale_dn: float, factor: int, small: Image) -> Patches:
     """Elliptical patches in a reduced image, within its margin."""
-    small, scan_px2 = np.ascontiguousarray(small), small.size * factor**2
-    cells = Cells.divide(small.shape[1], round(scan_px2 / _CELL_PX**2))
-    is_textured = scan_px2 >= _TEXTURE_PX**2
-    noise = cells.scales(_fine_structure(small)) if is_textured else np.zeros(len(cells.ends))
+    small = np.ascontiguousarray(small)
+    is_textured = small.size * factor**2 >= _TEXTURE_PX**2
+    noise = robust_scale(_fine_structure(small)) if is_textured else 0.0
     found = []
-    for sign, own in _blobs(small, radii, search, full_scale_dn, cells, is_textured):
+    for sign, own in _blobs(small, radii, search, full_scale_dn, is_textured):
         outlines = blob_outlines(small if sign > 0 else -small, own)
-        found.append(_elliptical_patches(outlines, noise[cells.index(outlines.centers[:, 0])], factor, sign))
+        found.append(_elliptical_patches(outlines, noise, factor, sign))
     return concatenate(Patches.collect(()), *found)
 
 
-@dataclass(frozen=True, eq=False)
-class Cells:
-    """Vertical strips of an image, each with its own noise and texture; ends (n,): columns where they end."""
-
-    ends: NDArray[np.intp]
-
-    @classmethod
-    def divide(cls, width: int, count: int) -> "Cells":
-        """Divide a width into strips of equal width; fewer than count where they would hold too few samples."""
-        count = max(min(count, width // (2 * _EVERY)), 1)
-        return cls(np.linspace(0, width, count + 1).astype(np.intp)[1:])
-
-    def scales(self, samples: Image) -> Array:
-        """(n,) robust standard deviation in each cell of samples (rows, columns) that cover the whole image."""
-        count, rows = len(self.ends), len(samples)
-        wide = samples.shape[1] // count
-        own = samples[:, : count * wide].reshape(rows, count, wide).swapaxes(0, 1)
-        return robust_scales(own.reshape(count, -1))
-
-    def index(self, columns: Array) -> NDArray[np.intp]:
-        """Cell of each column."""
-        return np.searchsorted(self.ends[:-1], columns, side="right")
-
-    def cut(self, picture: Image, levels: Array) -> Image:
-        """Set the image to 0 where it is not above its cell's level, in place."""
-        for first, last, level in zip((0, *self.ends), self.ends, levels.tolist(), strict=False):
-            cv2.threshold(picture[:, first:last], level, 0.0, cv2.THRESH_TOZERO, picture[:, first:last])
-        return picture
-
-
 def _blobs(
-    small: Image, radii: list[float], search: DiskSearch, full_scale_dn: float, cells: Cells, is_textured: bool
+    small: Image, radii: list[float], search: DiskSearch, full_scale_dn: float, is_textured: bool
 ) -> Iterator[tuple[int, Blobs]]:
     """Yield -1 with the dark blobs and 1 with the light ones, within the image's margin. is_textured: whether a blob
-    must exceed the texture of its cell."""
-    contrasts: list[Image] = []
-    levels: list[Array] = []
+    must exceed the background's texture."""
+    contrasts, levels = list[Image](), list[float]()
     smooth, blurred = small, 0.0
     for radius in radii:
         sigma = radius / np.sqrt(2)
@@ -248,14 +214,14 @@ def _blobs(
         blurred = sigma
         contrast = cv2.Laplacian(smooth, cv2.CV_32F, ksize=1, scale=-(sigma**2) / _PEAK_OF_DISK)
         contrasts.append(np.asarray(contrast, np.float32))
-        textures = cells.scales(contrasts[-1][::_EVERY, ::_EVERY]) if is_textured else np.zeros(len(cells.ends))
-        levels.append(np.maximum(_RESPONSE_SIGMAS * textures, search.least_contrast * full_scale_dn))
+        texture = robust_scale(contrasts[-1][::_EVERY, ::_EVERY].astype(float)) if is_textured else 0.0
+        levels.append(max(_RESPONSE_SIGMAS * texture, search.least_contrast * full_scale_dn))
     neighbourhood = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, 2 * (2 * max(int(radii[0]), 1) + 1,))
     margin = _margin(radii)
     for sign, polarity in ((-1, "dark"), (1, "light")):  # the light ones last: they overwrite the contrasts
         if search.polarity in (polarity, "auto"):
             standing = [
-                cells.cut(contrast if sign > 0 else -contrast, level)
+                cv2.threshold(contrast if sign > 0 else -contrast, level, 0.0, cv2.THRESH_TOZERO)[1]
                 for contrast, level in zip(contrasts, levels, strict=True)
             ]
             strongest = reduce(np.maximum, standing)
@@ -266,17 +232,17 @@ def _blobs(
             yield sign, Blobs(np.stack([cols, rows], axis=1), radius, contrast)
 
 
-def _fine_structure(small: Image) -> Image:
+def _fine_structure(small: Image) -> Array:
     """Samples of the image's second differences, scaled to the standard deviation of white noise (Immerkaer, 1996, Fast
     noise variance estimation)."""
     above, row, below = (small[first : len(small) - 2 + first : _EVERY] for first in range(3))
     rows = above - 2 * row + below
     left, column, right = (rows[:, first : rows.shape[1] - 2 + first : _EVERY] for first in range(3))
-    return np.asarray((left - 2 * column + right) / 6)
+    return np.asarray((left - 2 * column + right) / 6, float)
 
 
-def _elliptical_patches(found: Outlines, noise: Array, factor: int, sign: int) -> Patches:
-    """Outlines that are ellipses within their noise (n,), as patches; sign: 1 for light ones, -1 for dark ones.
+def _elliptical_patches(found: Outlines, noise: float, factor: int, sign: int) -> Patches:
+    """Outlines that are ellipses within their noise, as patches; sign: 1 for light ones, -1 for dark ones.
 
     The least SNR refers to single pixels of the scan; means over factor² pixels raise it by the factor.
     """
@@ -315,6 +281,6 @@ def disk_octaves(search: DiskSearch, full_scale_dn: float) -> list[Octave]:
         factor = max(1, int(2 ** np.floor(np.log2(max(radius / _SEARCH_RADIUS_PX, 1.0)))))
         by_factor.setdefault(factor, []).append(radius / factor)
     return [
-        Octave(factor, _margin(radii), _WIDEST_PX, partial(_patches, radii, search, full_scale_dn, factor))
+        Octave(factor, _margin(radii), partial(_patches, radii, search, full_scale_dn, factor))
         for factor, radii in by_factor.items()
     ]

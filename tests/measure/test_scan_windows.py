@@ -126,6 +126,6 @@ def test_a_search_by_blocks_decodes_each_segment_once(
     tifffile.imwrite(tmp_path / "s.tif", picture(), photometric="minisblack", compression="lzw", **layout)
     with open_scan(tmp_path / "s.tif") as scan:
         reads = recorded_reads(scan, monkeypatch)
-        search_blocks(scan, [Octave(4, 2, 100, lambda _: Patches.collect(()))])
+        search_blocks(scan, [Octave(4, 2, lambda _: Patches.collect(()))])
         tall, wide = scan.segment_px
         assert len(reads) == len(set(reads)) == -(-HEIGHT // tall) * -(-WIDTH // wide)
