@@ -139,8 +139,8 @@ PatchTest = Callable[[Block, Patches], Patches]
 
 @dataclass(frozen=True)
 class Octave:
-    """Search in the scan reduced by a factor. margin: border of a part, reduced px; find: returns the patches within the
-    margin of a reduced image, in its pixels."""
+    """Search in the scan reduced by a factor. margin: border of a part, reduced px; find: returns the patches of a
+    reduced image within its margin, in its pixels."""
 
     factor: int
     margin: int
