@@ -294,12 +294,12 @@ _adapter: Callable[[Any], TypeAdapter[Any]] = cache(lambda model: TypeAdapter(_a
 
 def _message(root: Table, model: type, error: ValidationError) -> str:
     """Message of the first wrong or missing value; else of all unknown keys."""
-    unknown: list[str] = []
+    unknown: list[tuple[Table, type, str]] = []
     for each in error.errors(include_url=False, include_input=False):
         kind, (table, own, rest) = each["type"], _place(root, model, each["loc"])
         key = str(rest[0]) if rest else ""
         if kind == "unexpected_keyword_argument":
-            unknown += table.unknown_keys(_keys(own), [key])
+            unknown.append((table, own, key))
             continue
         if kind == "missing":
             return _missing(table, key, _keys(own))
@@ -308,9 +308,11 @@ def _message(root: Table, model: type, error: ValidationError) -> str:
         key = cause.key if isinstance(cause, WrongKey) else key
         text = text.replace("{key}", key).replace("{table}", table.inside(key))
         return str(table.error(key, text)) if key else f"{root.file}: {text}. Correct the file."
+    # Only what is shown: each message searches the file for its line.
+    lines = [line for table, own, key in unknown[:LISTED] for line in table.unknown_keys(_keys(own), [key])]
     if len(unknown) > LISTED:
-        unknown[LISTED:] = [f"{root.file}: {len(unknown) - LISTED} more keys are not known."]
-    return "\n".join(unknown) or f"{root.file}: {error}"
+        lines.append(f"{root.file}: {len(unknown) - LISTED} more keys are not known.")
+    return "\n".join(lines) or f"{root.file}: {error}"
 
 
 def _wrong_form(kind: str, value: Any) -> str:

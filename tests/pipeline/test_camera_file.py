@@ -252,7 +252,7 @@ def test_ebners_set_from_the_camera_file_to_the_report(tmp_path: Path) -> None:
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "Distortion vectors over the camera frame" in page
     assert "Distortion over the radius with its 95 % band" in page
-    assert "effect in the frame (µm)" in page
+    assert "effect (µm)" in page
 
 
 @parametrize_with_studies("name", list(LENSES), quick=(2,))

@@ -94,6 +94,7 @@ def whole(number: str) -> str:
             "99992 more keys are not known",
             marks=pytest.mark.study,
         ),
+        ("project.toml", "".join(f"[t{i}]\n" for i in range(10_000)), "9992 more keys are not known"),
         ("project.toml", "#" * 5_000_000, "has more than 4 MB"),
         ("points.csv", "point,X,Y,Z\n" + "x" * 200_000 + ",1,2,3\n", "line 2: is no line of CSV (field larger than"),
         ("points.csv", "point,X,Y,Z\n\x1b[31mred,1,2,3\n", r"line 2, column point: '\x1b[31mred' can be no name"),

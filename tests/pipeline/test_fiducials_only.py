@@ -331,7 +331,7 @@ def test_a_gross_error_is_named_in_file_and_report(adjust: str, removed: bool, t
     assert "of an undetected error in" in report
     if "variance" in adjust:
         assert result["variance_sigmas"].keys() == {"target", "fiducial"}
-        assert "Variance components: what the variances" in report
+        assert "Variance components: factors of the variances" in report
 
 
 @pytest.mark.study

@@ -363,7 +363,7 @@ def test_what_noise_answers_as_well_is_not_matched(tmp_path: Path, monkeypatch: 
     """Nor are marks reckoned with that a constellation puts outside of the scan."""
     grey = np.random.default_rng(3).normal(120.0, 25.0, (600, 600)).clip(0, 255).astype(np.uint8)
     tifffile.imwrite(tmp_path / "noise.tif", grey, resolution=(25, 25), resolutionunit=3)
-    monkeypatch.setattr("measure.fiducials.camera_recognition.detect_clear_marks", pytest.fail)
+    monkeypatch.setattr("measure.fiducials.camera_recognition.detect_frame", pytest.fail)
     few = {name: LIBRARY[name] for name in (RENDERED, "fairchild-t5-153", "wild-18x18-115")}
     found = identify(tmp_path / "noise.tif", few, None, Reporter())
     assert found.best == ()
