@@ -8,8 +8,8 @@ from enum import StrEnum
 from typing import Self
 
 
-class _Meaningful(StrEnum):
-    """Table of values, each with its meaning, a sentence for the user."""
+class MeaningfulWord(StrEnum):
+    """Words of a table, each with its meaning: a sentence for the user."""
 
     meaning: str
 
@@ -19,7 +19,7 @@ class _Meaningful(StrEnum):
         return member
 
 
-class Status(_Meaningful):
+class Status(MeaningfulWord):
     """Status of a mark. Only `measured` and `weak` marks are observations of the adjustment."""
 
     MEASURED = (
@@ -36,7 +36,7 @@ class Status(_Meaningful):
         return self in (Status.MEASURED, Status.WEAK)
 
 
-class Code(_Meaningful):
+class Code(MeaningfulWord):
     """Code of a reason."""
 
     OUTSIDE = "outside", "Its place lies outside of the scan, or behind the camera."
@@ -121,7 +121,7 @@ class Reason(str):
 NO_REASON = Reason()
 
 
-class Cause(_Meaningful):
+class Cause(MeaningfulWord):
     """Cause of a part of a covariance, in the order in which the parts are listed."""
 
     NOISE = "noise", "Film grain and scanner noise, estimated from the image."

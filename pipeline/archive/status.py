@@ -24,7 +24,7 @@ from pipeline.archive.review_decisions import (
     shortened,
     unknown_images,
 )
-from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict, scan_counts
+from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_counts
 from pipeline.files.project_file import Project
 from pipeline.files.scan_files import as_named
 from pipeline.provenance import FileStates
@@ -164,7 +164,7 @@ def status_json(status: ArchiveStatus) -> dict[str, object]:
     return {
         "scans": len(status.scans),
         "verdicts": {
-            str(verdict): {"scans": count, "meaning": MEANING[verdict], "next_step": NEXT_STEP[verdict]}
+            str(verdict): {"scans": count, "meaning": verdict.meaning, "next_step": NEXT_STEP[verdict]}
             for verdict, count in status.counts.items()
         },
         "images": {
@@ -200,7 +200,7 @@ def print_status(status: ArchiveStatus, console: Console, every: bool = False) -
     table = Table("verdict", "scans", "what it means", "remedy")
     for verdict, count in status.counts.items():
         if count:
-            table.add_row(str(verdict), str(count), Text(MEANING[verdict]), Text(NEXT_STEP[verdict]))
+            table.add_row(str(verdict), str(count), Text(verdict.meaning), Text(NEXT_STEP[verdict]))
     console.print(Text(status.sentence))
     console.print(table)
     named, more = worst_named(status.scans, len(status.scans) if every else NAMED, every)

@@ -1,38 +1,27 @@
 """Verdicts on scans, in one table: source of the documentation and of `reseau status`."""
 
 from collections.abc import Collection, Mapping, Sequence
-from enum import StrEnum
 
-from measure.flags import Code, Status
+from measure.flags import Code, MeaningfulWord, Status
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.wording import count_sentence
 
 
-class Verdict(StrEnum):
+class Verdict(MeaningfulWord):
     """Verdict on a scan: the worst of its marks and problems, ordered from the best to not yet known."""
 
-    GOOD = "good"
-    DECIDED = "decided"
-    LOOK = "look"
-    POOR = "poor"
-    FAILED = "failed"
-    WAITING = "waiting"
-    OLD = "old"
+    GOOD = "good", "All marks are measured and passed all checks."
+    DECIDED = "decided", "Good after review decisions: nothing is open."
+    LOOK = "look", "Usable, but a mark is weak, missing or rejected, or the frame has a problem (assumed pose, ...)."
+    POOR = "poor", "Hardly usable: too few marks for an interior orientation, or for a check of it."
+    FAILED = "failed", "Nothing was measured: the file is missing, damaged or not a scan, or its process was killed."
+    WAITING = "waiting", "Not measured yet."
+    OLD = "old", "Stale: the file, the options or the review decisions have changed since it was measured."
 
     @property
     def needs_look(self) -> bool:
         return self not in (Verdict.GOOD, Verdict.DECIDED)
 
-
-MEANING = {
-    Verdict.GOOD: "All marks are measured and passed all checks.",
-    Verdict.DECIDED: "Good after review decisions: nothing is open.",
-    Verdict.LOOK: "Usable, but a mark is weak, missing or rejected, or the frame has a problem (assumed pose, ...).",
-    Verdict.POOR: "Hardly usable: too few marks for an interior orientation, or for a check of it.",
-    Verdict.FAILED: "Nothing was measured: the file is missing, damaged or not a scan, or its process was killed.",
-    Verdict.WAITING: "Not measured yet.",
-    Verdict.OLD: "Stale: the file, the options or the review decisions have changed since it was measured.",
-}
 
 NEXT_STEP = {
     Verdict.GOOD: "Nothing.",

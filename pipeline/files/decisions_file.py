@@ -11,13 +11,13 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
-from enum import StrEnum
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO
 
 from pydantic import AfterValidator, ConfigDict, Field, Strict, TypeAdapter, ValidationError, with_config
 
+from measure.flags import MeaningfulWord
 from measure.geometry import POSES
 from pipeline.errors import InputError
 from pipeline.provenance import NO_FINGERPRINT
@@ -39,27 +39,18 @@ KINDS = ("fiducial", "target", "tie")
 LEARNED = "learned"  # kind of decisions about the appearance of a camera's marks, not about their places
 
 
-class Choice(StrEnum):
+class Choice(MeaningfulWord):
     """Kinds of decisions."""
 
-    ACCEPT = "accept"
-    REJECT = "reject"
-    ABSENT = "absent"
-    PLACE = "place"
-    POSE = "pose"
-    LEARN = "learn"
-    UNDO = "undo"
+    ACCEPT = "accept", "The mark is right as it was measured: it counts as `measured`."
+    REJECT = "reject", "What was measured is not this mark: it counts as `rejected`."
+    ABSENT = "absent", "The scan does not show this mark: it counts as `absent`."
+    PLACE = "place", "The mark is here (`col_px`, `row_px`): matching starts there."
+    POSE = "pose", "The scan lies as `pose` says."
+    LEARN = "learn", "The camera's marks look as at these places of this scan (`px`, column and row by fiducial)."
+    UNDO = "undo", "The last decision about this mark, or this pose, is taken back."
 
 
-MEANING = {
-    Choice.ACCEPT: "The mark is right as it was measured: it counts as `measured`.",
-    Choice.REJECT: "What was measured is not this mark: it counts as `rejected`.",
-    Choice.ABSENT: "The scan does not show this mark: it counts as `absent`.",
-    Choice.PLACE: "The mark is here (`col_px`, `row_px`): matching starts there.",
-    Choice.POSE: "The scan lies as `pose` says.",
-    Choice.LEARN: "The camera's marks look as at these places of this scan (`px`, column and row by fiducial).",
-    Choice.UNDO: "The last decision about this mark, or this pose, is taken back.",
-}
 About = tuple[str, str, str]  # image, point, kind; of a pose: image, "", ""; of marks to be learned: image, "", LEARNED
 
 

@@ -4,14 +4,13 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from enum import StrEnum
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
 
 from measure.annotations.fields import Line, Reading
-from measure.flags import Cause, Reason, Status
+from measure.flags import Cause, MeaningfulWord, Reason, Status
 from measure.results import Covariance, FrameMeasurement, Kind, MarkMeasurement, Pose
 from measure.tone.curve import Tone, ToneInformation, power, srgb
 from measure.tone.estimate import FrameTone
@@ -27,31 +26,18 @@ _KINDS: Mapping[str, Kind] = {kind: kind for kind in get_args(Kind)}
 _TONE_NUMBERS = ("least", "greatest", "scatter", "apart")
 
 
-class FailureCode(StrEnum):
+class FailureCode(MeaningfulWord):
     """Reason code of a scan that could not be measured."""
 
-    MISSING = "missing"
-    UNREACHABLE = "unreachable"
-    UNREADABLE = "unreadable"
-    TOO_LARGE = "too-large"
-    PITCH = "pitch"
-    MEMORY = "memory"
-    ENDED = "ended"
-    DAMAGED = "damaged"
-    FAULT = "fault"
-
-
-MEANING = {
-    FailureCode.MISSING: "There is no such file.",
-    FailureCode.UNREACHABLE: "A server did not deliver it, after some tries. It may be whole: `--retry`.",
-    FailureCode.UNREADABLE: "The file is damaged, or no picture that is read, or the system refused it.",
-    FailureCode.TOO_LARGE: "The file claims more pixels than are read without `--max-pixels`.",
-    FailureCode.PITCH: "Neither the project nor the file says what a pixel measures, and no marks tell it.",
-    FailureCode.MEMORY: "The memory was full.",
-    FailureCode.ENDED: "The process that measured it was ended, most likely because the memory was full.",
-    FailureCode.DAMAGED: "What is stored of it was changed or is damaged, and is not used: `--retry`.",
-    FailureCode.FAULT: "A fault of the program itself.",
-}
+    MISSING = "missing", "There is no such file."
+    UNREACHABLE = "unreachable", "A server did not deliver it, after some tries. It may be whole: `--retry`."
+    UNREADABLE = "unreadable", "The file is damaged, or no picture that is read, or the system refused it."
+    TOO_LARGE = "too-large", "The file claims more pixels than are read without `--max-pixels`."
+    PITCH = "pitch", "Neither the project nor the file says what a pixel measures, and no marks tell it."
+    MEMORY = "memory", "The memory was full."
+    ENDED = "ended", "The process that measured it was ended, most likely because the memory was full."
+    DAMAGED = "damaged", "What is stored of it was changed or is damaged, and is not used: `--retry`."
+    FAULT = "fault", "A fault of the program itself."
 
 
 @dataclass(frozen=True)

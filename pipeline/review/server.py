@@ -29,7 +29,7 @@ from measure.errors import MeasurementError
 from measure.fiducials.options import Click
 from measure.geometry import POSES
 from pipeline.errors import InputError
-from pipeline.files.decisions_file import MEANING, Decision, LineError, decisions_of_lines
+from pipeline.files.decisions_file import Choice, Decision, LineError, decisions_of_lines
 from pipeline.files.mark_table import MARK_TABLES
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_task import sample_names
@@ -215,7 +215,7 @@ class _Answers:
             "file": session.camera_name,
             "cameras": len(session.project.cameras),
             "choices": session.choices(),
-            "meaning": {str(choice): meaning for choice, meaning in MEANING.items()},
+            "meaning": {str(choice): choice.meaning for choice in Choice},
         }
 
     def queue(self, query: Query, body: Any) -> Any:

@@ -26,7 +26,7 @@ from pipeline.archive.measurement import picture_sizes_mm
 from pipeline.archive.results_integrity import add_digests
 from pipeline.archive.schema import Schema, opened
 from pipeline.archive.status import archive_status
-from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict
+from pipeline.archive.verdicts import NEXT_STEP, Verdict
 from pipeline.cli import run
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.roll import CheckedScan, check_scans
@@ -369,7 +369,7 @@ def test_status_says_why_a_scan_needs_attention(folder: Path) -> None:
 
 def test_the_page_of_results_has_the_table_of_verdicts() -> None:
     text = (Path(__file__).parents[2] / "docs" / "reference" / "results.md").read_text(encoding="utf-8")
-    assert all(f"| `{verdict}` | {MEANING[verdict]} | {NEXT_STEP[verdict]} |" in text for verdict in Verdict)
+    assert all(f"| `{verdict}` | {verdict.meaning} | {NEXT_STEP[verdict]} |" in text for verdict in Verdict)
 
 
 BOARD = '[targets]\nkind = "chessboard"\nrows = 5\ncolumns = 7\nsquare_mm = 20.0\n'

@@ -32,7 +32,7 @@ from pipeline.archive.checked_statuses import (
 )
 from pipeline.archive.results_database import Store, merge
 from pipeline.archive.schema import MIGRATIONS, VERSION, opened
-from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict, scan_verdict
+from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_verdict
 from pipeline.provenance import content_hash, file_state, options_hash, parts_hash, result_key, shard_number
 from pipeline.results.comparator_file import mark_rows
 from pipeline.results.measured_record import MeasuredScan
@@ -343,7 +343,7 @@ def test_verdicts_of_scans() -> None:
         (replace(made_record(status=Status.WEAK), decided_by=counts), Verdict.LOOK),
     ]
     assert [scan_verdict(scan) for scan, _ in verdicts] == [verdict for _, verdict in verdicts]
-    assert set(MEANING) == set(NEXT_STEP) == set(Verdict)
+    assert set(NEXT_STEP) == set(Verdict)
 
 
 def test_the_key_depends_on_all_that_it_names() -> None:
