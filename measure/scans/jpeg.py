@@ -1,21 +1,32 @@
-"""JPEG files and streams: decoded whole, and what their segments say.
+"""JPEG files and streams: decoded whole, with a check that a stream holds what its header says.
 
 A decoder goes on through a damaged stream: behind a lost or a changed byte it soon reads right codes again, but of
-blocks that belong elsewhere. At the end, or at a restart marker, codes are then missing or left over: libjpeg-turbo
-warns of it, and simplejpeg tells its warnings.
+blocks that belong elsewhere. At the end there are then blocks too many or too few. So the picture is decoded as if it
+were taller. Of an intact stream the first block below its end is what the bits that fill its last byte make, and no
+others are there: a decoder leaves them grey (ITU-T T.81, B.1.1.5 and F.1.2.3; libjpeg's `insufficient_data`). The rows
+of the picture itself come out as they would without.
+
+Streams of several scans, as progressive ones are, and streams with restart markers have many such ends, of which this
+shows the last. There a second decoder is asked, libjpeg-turbo by simplejpeg, which tells what libjpeg warns of: codes
+that are missing or left over before a marker.
 """
 
+import re
 import struct
+from collections.abc import Callable
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 
 import imagecodecs
 import numpy as np
 import simplejpeg
+from numpy.typing import NDArray
 from tifffile import TiffFile, TiffPage
 
 from measure.errors import MeasurementError
 from measure.scans.cache import OpenedPicture, WholePicture
+from measure.scans.compression import BLOCK_PX
 from measure.scans.metadata import (
     DECODING_ERRORS,
     JFIF_UNIT,
@@ -35,21 +46,75 @@ from measure.scans.metadata import (
 )
 from measure.tone.declared import ColourTags
 
+Decode = Callable[[bytes], NDArray[np.generic]]
+
 JPEG_START = b"\xff\xd8\xff"
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # markers of frame headers
+_HUFFMAN_FRAMES = (0xC0, 0xC1, 0xC2)  # sequential and progressive: others than lossless and arithmetic ones
 _END = b"\xff\xd9"
+_SCAN_OR_RESTART = re.compile(rb"\xff[\xda\xd0-\xd7]")  # markers: behind such a byte 255 a scan's data have a byte 0
+_MORE = "its stream holds more blocks than the picture"
 _OF_DAMAGE = ("Corrupt JPEG data", "Premature end")  # how libjpeg's warnings of it begin
+_BLEED_PX = 2  # that the decoder's interpolation of colour takes from the blocks beside
+_BELOW = 2  # rows of blocks added: a picture of one block a row has further ones below its first, too
+_TAIL = bytes(range(64, 192)) * 2  # codes of some blocks, none of them a marker
 _DQT = 0xDB
 UNKNOWN_DN = 15.0  # where a file does not say it: as at quality 50, which no scan should be below
 _INKS = 4  # components
 _COARSE = 15  # coefficients in the order of the table: up to two periods in a block of 8 px, as blurred edges have them
 
 
-def stream_damage(data: bytes, tables: bytes | None = None) -> str:
-    """Why a stream's samples cannot be trusted, a part of a sentence; empty where libjpeg-turbo warns of nothing.
+@dataclass(frozen=True)
+class _Blocks:
+    """Where the height of a stream's picture stands, its size and that of a unit of blocks, px, and the grey of a block
+    without codes."""
 
-    tables: a stream of those tables that the other leaves to its file.
-    """
+    height_at: int
+    height_px: int
+    width_px: int
+    unit_height_px: int
+    unit_width_px: int
+    grey: int
+
+    @property
+    def rows(self) -> int:
+        """Of pixels, in whole units."""
+        return -(-self.height_px // self.unit_height_px) * self.unit_height_px
+
+    @property
+    def interpolates_rows(self) -> bool:
+        """Whether rows of colour are fewer than those of the picture."""
+        return self.unit_height_px > BLOCK_PX
+
+    def taller(self, data: bytes) -> bytes:
+        """A stream of a picture with further rows of blocks."""
+        height_px = self.rows + _BELOW * self.unit_height_px
+        return data[: self.height_at] + height_px.to_bytes(2, "big") + data[self.height_at + 2 :]
+
+
+def decode_checked(data: bytes, decode: Decode, tables: bytes | None = None) -> tuple[NDArray[np.generic], str]:
+    """The samples (height, width) or (height, width, channels) that a stream holds, and why they are not to be trusted;
+    empty where they are. decode: a decoder of streams, which may raise what it will. tables: a stream of those tables
+    that the other leaves to its file."""
+    blocks = _blocks(data)
+    if blocks is None:
+        return decode(data), ""
+    taller = decode(blocks.taller(data))
+    why = "" if _has_one_end(data) else _libjpeg_warning(data, tables)
+    if not why and _has_more_blocks(taller, blocks):
+        why = _MORE
+    elif not why and _has_one_end(data) and _ends_early(data, blocks, taller, decode):
+        why = "its stream ends before the picture does"
+    return decode(data) if blocks.interpolates_rows else taller[: blocks.height_px], why
+
+
+def _has_one_end(data: bytes) -> bool:
+    """Whether it is of one scan, without restart markers."""
+    start = _header_bytes(data)
+    return len(_SCAN_OR_RESTART.findall(data, start, data.find(_END, start))) == 1
+
+
+def _libjpeg_warning(data: bytes, tables: bytes | None) -> str:
     whole = data if tables is None else data[:2] + tables[2 : tables.rfind(_END)] + data[2:]
     try:
         simplejpeg.decode_jpeg(whole, "GRAY", min_factor=8, strict=True)
@@ -66,6 +131,47 @@ def picture_form(data: bytes) -> tuple[int, int, int, int] | None:
         if marker in _FRAMES and len(body) >= 6:
             return int.from_bytes(body[3:5], "big"), int.from_bytes(body[1:3], "big"), body[5], body[0]
     return None
+
+
+def _blocks(data: bytes) -> _Blocks | None:
+    """None for streams whose blocks say nothing: lossless and arithmetic ones, and those too tall to be made taller."""
+    position = 2
+    for marker, body in jpeg_headers(data):
+        if marker in _HUFFMAN_FRAMES and len(body) >= 6 and len(body) >= 6 + 3 * body[5]:
+            factors = body[7 : 7 + 3 * body[5] : 3]
+            across, down = max(f >> 4 for f in factors), max(f & 15 for f in factors)
+            if len(factors) == 1:  # its blocks stand by themselves, whatever its factors say
+                across = down = 1
+            height, width = int.from_bytes(body[1:3], "big"), int.from_bytes(body[3:5], "big")
+            if not (across and down and height and width) or height > 0xFFFF - (_BELOW + 1) * BLOCK_PX * down:
+                return None
+            return _Blocks(position + 5, height, width, BLOCK_PX * down, BLOCK_PX * across, 2 ** (body[0] - 1))
+        position += 4 + len(body)
+    return None
+
+
+def _has_more_blocks(taller: NDArray[np.generic], blocks: _Blocks) -> bool:
+    """Whether there are further blocks below the picture than the first."""
+    below = taller[blocks.rows + _BLEED_PX :] != blocks.grey
+    return bool(below[:, blocks.unit_width_px + _BLEED_PX :].any() or below[blocks.unit_height_px :].any())
+
+
+def _ends_early(data: bytes, blocks: _Blocks, taller: NDArray[np.generic], decode: Decode) -> bool:
+    """Whether the first block below the picture has no codes, nor the picture's last one.
+
+    The bits that fill the last byte may be one more block. Where that is grey, further codes at the end of the stream
+    leave the picture as it is; where blocks are missing, they would be taken for these.
+    """
+    rows, tall, wide = blocks.rows, blocks.unit_height_px, blocks.unit_width_px
+    first = taller[rows + _BLEED_PX :][: tall - 2 * _BLEED_PX, : wide - _BLEED_PX]
+    if (first != blocks.grey).any():
+        return False
+    last = taller[rows - tall : rows, (blocks.width_px - 1) // wide * wide :]
+    if (last != blocks.grey).any():
+        return True
+    end = data.rfind(_END)
+    again = decode(blocks.taller(data[:end] + _TAIL + data[end:]))
+    return not np.array_equal(again[: rows - _BLEED_PX], taller[: rows - _BLEED_PX])
 
 
 def jpeg_headers(data: bytes) -> list[tuple[int, bytes]]:
@@ -131,7 +237,8 @@ def _jpeg_samples(path: Path, data: bytes, max_pixels: int | None) -> tuple[Samp
     if _END not in data[_header_bytes(data) :]:
         raise damage_error(path, "its end marker is missing")
     try:
-        return grey_or_colour(imagecodecs.jpeg_decode(data)), stream_damage(data)
+        samples, damage = decode_checked(data, imagecodecs.jpeg_decode)
+        return grey_or_colour(samples), damage
     except DECODING_ERRORS as error:
         if not width * height:
             raise damage_error(path, str(error)) from error

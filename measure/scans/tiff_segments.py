@@ -15,7 +15,7 @@ from tifffile import TIFF, TiffFile, TiffPage
 from tifffile.tifffile import jpeg_decode_colorspace
 
 from measure.scans.cache import LostPart, Place, Segments
-from measure.scans.jpeg import stream_damage
+from measure.scans.jpeg import decode_checked
 from measure.scans.metadata import (
     DECODING_ERRORS,
     JPEG_COMPRESSIONS,
@@ -161,18 +161,20 @@ class TiffSegments(Segments):
         page = self._page
         colours = jpeg_decode_colorspace(page.photometric, page.planarconfig, page.extrasamples, page.is_jfif)
 
-        samples = np.asarray(
-            imagecodecs.jpeg_decode(
-                data,
-                bitspersample=page.bitspersample,
-                tables=page.jpegtables,
-                header=page.jpegheader,
-                colorspace=colours[0],
-                outcolorspace=colours[1],
-                shape=(self.segment_height_px, self.segment_width_px),
+        def decode(stream: bytes) -> NDArray[np.generic]:
+            return np.asarray(
+                imagecodecs.jpeg_decode(
+                    stream,
+                    bitspersample=page.bitspersample,
+                    tables=page.jpegtables,
+                    header=page.jpegheader,
+                    colorspace=colours[0],
+                    outcolorspace=colours[1],
+                    shape=(self.segment_height_px, self.segment_width_px),
+                )
             )
-        )
-        damage = stream_damage(data, page.jpegtables)
+
+        samples, damage = decode_checked(data, decode, page.jpegtables)
         if damage:
             raise ValueError(damage)
         right = (height_px, width_px), (self.segment_height_px, self.segment_width_px)

@@ -95,7 +95,7 @@ def test_a_jpeg_cut_short_with_its_end_marker_kept(tmp_path: Path, kept: float) 
     data = stored()["jpeg"]
     (tmp_path / "s.jpg").write_bytes(data[: int(kept * len(data))] + data[-2:])
     with open_scan(tmp_path / "s.jpg") as scan:
-        assert "premature end" in scan.damage
+        assert "ends before the picture does" in scan.damage
 
 
 def test_a_mark_in_a_damaged_tile_is_absent_and_the_others_are_measured(tmp_path: Path) -> None:

@@ -71,7 +71,7 @@ def test_no_picture_is_decoded_for_its_head(tmp_path: Path, monkeypatch: pytest.
     def refuse(*_: object) -> None:
         raise AssertionError("decoded")
 
-    monkeypatch.setattr(jpeg, "stream_damage", refuse)
+    monkeypatch.setattr(jpeg, "decode_checked", refuse)
     assert read_head(written(tmp_path / "a.jpg", GREY)).width_px == 90
 
 
