@@ -121,7 +121,7 @@ class ProjectionField:
         self._lens = adjusted_lens(estimates, camera.name)
         self.calibration = [Parameter.interior(camera.name, name) for name in self._lens.quantities]
         self.films = list[Parameter]()
-        self._marks = _MarkFrame.of(estimates, camera)
+        self._marks = _MarkFrame.from_camera(estimates, camera)
         if self._marks is not None:
             self.calibration += [Parameter.fiducial(camera.name, id, axis) for id in camera.fiducials for axis in "xy"]
         self._align(estimates)
@@ -200,7 +200,7 @@ class _MarkFrame:
     by_marks: Array
 
     @classmethod
-    def of(cls, estimates: Estimates, camera: Camera) -> "_MarkFrame | None":
+    def from_camera(cls, estimates: Estimates, camera: Camera) -> "_MarkFrame | None":
         """From the first image of a camera on film; None for a digital camera."""
         images = (image for image in estimates.network.images if image.camera == camera.name)
         image = next((image for image in images if image.transformation != "none"), None)

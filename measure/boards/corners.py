@@ -297,8 +297,10 @@ class _CornerFits:
         self._refuse(numbers[~shown.all(axis=1)], UNDETERMINED)
         away = np.linalg.norm(self.center - self.start, axis=1) > self.max_shift_px
         turned = np.abs(self.edges - self.start_edges).max(axis=1) > _MOST_TURN_RAD
-        self._refuse(numbers[away[numbers]], Reason("the fit ran away to something else", Code.NO_FIT))
-        self._refuse(numbers[turned[numbers]], Reason("the edges here run otherwise than they should", Code.SIZE))
+        self._refuse(numbers[away[numbers]], Reason("the fit did not stay at this corner", Code.NO_FIT))
+        self._refuse(
+            numbers[turned[numbers]], Reason("the edges here have other directions than those of the board", Code.SIZE)
+        )
         return np.hypot(step[:, 0], step[:, 1])
 
 

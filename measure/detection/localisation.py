@@ -57,7 +57,7 @@ class MarkPrediction:
         """(2,) predicted place."""
         return self.pixel_from_mark[:, 2]
 
-    def moved(self, center_px: Array) -> Self:
+    def shift_to(self, center_px: Array) -> Self:
         """Copy of the prediction at another place."""
         return replace(self, pixel_from_mark=np.column_stack([self.linear, center_px]))
 

@@ -36,7 +36,7 @@ class Recurrence:
     excess: float
 
 
-def about(scan: Scan, pixel_from_camera: Array, xy_mm: Array, size_mm: float, reach_mm: float) -> Window:
+def resample_square(scan: Scan, pixel_from_camera: Array, xy_mm: Array, size_mm: float, reach_mm: float) -> Window:
     """Resample the square around a place of the frame to the camera's axes (x right, y up), _SIDE samples per size_mm,
     with the background subtracted."""
     pitch_mm = size_mm / _SIDE

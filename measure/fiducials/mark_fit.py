@@ -64,7 +64,7 @@ def detect_mark(
     if not inside:
         return Detection(predicted, False, None, Reason("its place is outside of the scan", Code.OUTSIDE))
     fit, false_alarms = _localise_and_fit(scan, expected, options, frame_sigma)
-    if lost := _lost(scan, expected if fit is None or not fit.converged else expected.moved(fit.center_px)):
+    if lost := _lost(scan, expected if fit is None or not fit.converged else expected.shift_to(fit.center_px)):
         return Detection(predicted, False, None, lost)
     if fit is None:
         return Detection(predicted, True, None, not_found(expected.search_px))
@@ -133,7 +133,7 @@ def _fit_from(
     scan: Scan, expected: MarkPrediction, center_px: Array, options: MatchOptions, frame_sigma: float | None
 ) -> MarkFit:
     """Match the mark from an initial place."""
-    mark, start = expected.mark, expected.moved(center_px).pixel_from_mark
+    mark, start = expected.mark, expected.shift_to(center_px).pixel_from_mark
     coded = scan.replace_tone(LINEAR) if isinstance(mark, MarkTemplate) else scan  # stored values
     window = read_window(coded, mark_window(mark, start, options.margin_px + BESIDE_PX), expected.weights)
     if expected.surroundings.robust and isinstance(mark, MarkShape):

@@ -68,7 +68,7 @@ def rename_frame(scan: Scan, frame: Frame, pose: str) -> Frame:
     places = {name: place for name, place in zip(names, found, strict=True) if name >= 0}
     renamed = orient_frame(
         renamed.replace_detections(
-            {name: _detection(renamed, renamed.prediction(name, 0.0).moved(place)) for name, place in places.items()}
+            {name: _detection(renamed, renamed.prediction(name, 0.0).shift_to(place)) for name, place in places.items()}
         )
     )
     unclear = [index for index in range(len(frame.detections)) if not renamed.is_clear(index)]
@@ -171,7 +171,7 @@ def choose_channels(frame: Frame) -> Frame:
         ]
         place, height = max(peaks, key=lambda peak: peak[1])
         if height > _CLEAR_PEAK:
-            places.append((expected.mark, expected.moved(place).pixel_from_mark, expected.polarity))
+            places.append((expected.mark, expected.shift_to(place).pixel_from_mark, expected.polarity))
     unsaid = all(mark.mark.polarity == "auto" for mark in marks)
     best = best_weights(frame.scan, places, (1, -1) if unsaid else (1,))
     if best is None:

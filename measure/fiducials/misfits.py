@@ -67,7 +67,7 @@ class FrameMisfit:
         return np.asarray((2 * self.sites[:, None] + np.arange(2)).ravel())
 
     @cached_property
-    def widened(self) -> FrameMarks:
+    def enlarged_marks(self) -> FrameMarks:
         """Marks with variances enlarged by their gross errors."""
         off = np.zeros(len(self.sites))
         off[list(self.off_mm)] = list(self.off_mm.values())
@@ -100,7 +100,7 @@ class Pattern:
     ) -> "Pattern":
         information, right = np.zeros((2 * len(sigma_mm),) * 2), np.zeros(2 * len(sigma_mm))
         for place, frame in frames.items():
-            weight = frame.widened.precision(films_mm[place])
+            weight = frame.enlarged_marks.precision(films_mm[place])
             information[np.ix_(frame.places, frame.places)] += weight
             right[frame.places] += weight @ frame.marks.off_mm.ravel()
         return cls(places_mm, sigma_mm, free_mm, information, right)
@@ -108,14 +108,14 @@ class Pattern:
     def expected_marks(self, frame: FrameMisfit, film_mm: float, is_pooled: bool = False) -> FrameMarks:
         """Marks of a frame less the pattern of all other frames. is_pooled: remove the affinity from the pattern; it
         cannot be separated from the mean affinity of the frames, and is counted there."""
-        weight, own = frame.widened.precision(film_mm), np.ix_(frame.places, frame.places)
+        weight, own = frame.enlarged_marks.precision(film_mm), np.ix_(frame.places, frame.places)
         information, right = self._posterior.copy(), self.right.copy()
         information[own] -= weight
         right[frame.places] -= weight @ frame.marks.off_mm.ravel()
         covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
         if is_pooled:
             covariance = self._beyond_affine @ covariance @ self._beyond_affine
-        return frame.widened.expecting((covariance @ right)[frame.places].reshape(-1, 2), covariance[own])
+        return frame.enlarged_marks.expecting((covariance @ right)[frame.places].reshape(-1, 2), covariance[own])
 
     @cached_property
     def mm(self) -> Array:
@@ -169,7 +169,7 @@ class Explanation:
     def log_evidence(self) -> float:
         """Log evidence of the explanation. Each outlying frame or mark has the prior probability `FALSE_DOUBT`."""
         odd = sum((each.film_mm is not None) + len(each.off_mm) for each in self.frames.values())
-        alone = sum(each.widened.log_density(each.film_mm or self.film.sigma) for each in self.frames.values())
+        alone = sum(each.enlarged_marks.log_density(each.film_mm or self.film.sigma) for each in self.frames.values())
         return alone + self.pattern.log_density + odd * float(np.log(FALSE_DOUBT))
 
 

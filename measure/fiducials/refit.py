@@ -288,5 +288,5 @@ def _fit_again(frame: Frame, index: int, options: MatchOptions) -> MarkFit | Non
     before = frame.detections[index].fit
     if before is None:
         return None
-    expected = frame.prediction(index, _REFIT_PX).moved(before.center_px)
+    expected = frame.prediction(index, _REFIT_PX).shift_to(before.center_px)
     return detect_mark(frame.scan, expected, options, _linear_sigma(frame)).fit

@@ -392,7 +392,7 @@ def _doubt_by_neighbourhood(search: FrameSearch, frame: Frame, inside: Sequence[
 
 def _response(search: FrameSearch, frame: Frame, index: int, place: Array, radius_px: float) -> float:
     """Highest correlation of a mark, by index, within a radius of a place in the scan."""
-    return highest_peak(search.scan, frame.prediction(index, radius_px).moved(place))[1]
+    return highest_peak(search.scan, frame.prediction(index, radius_px).shift_to(place))[1]
 
 
 def _share(hits: int, places: int) -> float:

@@ -75,7 +75,7 @@ class LinearFit:
             place, left = correlated(place, self.noise, 0.5), correlated(left, self.noise, -0.5)
             expected = products(place, place)
         shares = place * left
-        about = _about(shares, _ALIKE_PX) * (2 * np.pi * _ALIKE_PX**2)
+        about = _smooth(shares, _ALIKE_PX) * (2 * np.pi * _ALIKE_PX**2)
         more = products(about, shares) - expected
         sizes, axes = eigh((more + more.T) / 2, by_noise)
         axes = by_noise @ axes
@@ -85,7 +85,7 @@ class LinearFit:
         """(2, 2) covariance of the place due to damage that continues undetected around the masked pixels, damaged
         (height, width). Each region is assumed to leave a uniformly distributed fraction of the limited, smoothed
         residuals."""
-        about = _about(np.where(self.used, self.by_grey[:2], 0.0), _BESIDE_DAMAGE_PX)
+        about = _smooth(np.where(self.used, self.by_grey[:2], 0.0), _BESIDE_DAMAGE_PX)
         _, regions = cv2.connectedComponents(damaged.astype(np.uint8), connectivity=4)
         by_region = np.stack([np.bincount(regions.ravel(), each.ravel()) for each in about * self._uncut])[:, 1:]
         return np.asarray(by_region @ by_region.T / 3)  # 1/3: mean square of a uniform distribution from 0 to 1
@@ -203,7 +203,7 @@ class Landscape:
         return _positive(products(moved, correlated(moved, NoiseModel(float(lags[reach, reach]), lags, 1.0))))
 
 
-def _about(images: Array, sigma_px: float) -> Array:
+def _smooth(images: Array, sigma_px: float) -> Array:
     """Smooth images (n, height, width) by a Gaussian, with zeros beyond their borders."""
     return np.asarray(gaussian_filter(images, (0.0, sigma_px, sigma_px), mode="constant"))
 

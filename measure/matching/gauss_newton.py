@@ -151,7 +151,7 @@ class PictureFit:
         model, begun = self.model, self.state
         self.choose_area()
         if not self.reason and np.ptp(model.grey[self.area]) == 0.0:
-            self.reason = Reason("the picture is even there: nothing stands out", Code.CONTRAST)
+            self.reason = Reason("the image is uniform there: nothing stands out", Code.CONTRAST)
         if self.reason:
             return
         model.bent = ROUGHLY_BENT

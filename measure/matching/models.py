@@ -279,7 +279,7 @@ class PictureModel:
         if moved > self.options.max_shift_px:
             return Reason(f"the fit ran {moved:.1f} px away from where the mark was expected", Code.NO_FIT)
         if np.abs(self._distortion).max() > _MOST_DISTORTION:
-            return Reason("the fit wants a mark of another size or direction than the one drawn", Code.SIZE)
+            return Reason("the fitted size or rotation differs too much from the drawing", Code.SIZE)
         return NO_REASON
 
     def blur_is_held(self, step: Array) -> bool:

@@ -220,7 +220,7 @@ class _Fit:
             grey = ndimage.map_coordinates(spline, places[..., ::-1].transpose(2, 0, 1), order=3, prefilter=False)
             self.gains[index] = float(np.std(grey[self.used]))
             if not self.gains[index] > _EVEN * np.abs(grey).max():
-                self.reasons[index] = Reason("the picture is even there", Code.CONTRAST)
+                self.reasons[index] = Reason("the image is uniform there", Code.CONTRAST)
                 continue
             self.values[index] = (grey - grey[self.used].mean()) / self.gains[index]
 

@@ -85,7 +85,7 @@ class Sharpening:
         by_radius = -2 * self.amount * smooth * np.log(np.maximum(smooth, 1e-30))
         return _filtered(codes, np.stack([1 - smooth, by_radius]) / (1 + self.amount * (1 - smooth)))
 
-    def moved(self, step: Array, covariance: Array) -> "Sharpening":
+    def apply_step(self, step: Array, covariance: Array) -> "Sharpening":
         """Apply a step (2,) of amount and logarithm of the radius, limited in length."""
         step = step / max(float((np.abs(step) / _LONGEST).max()), 1.0)
         amount = float(np.clip(self.amount + step[0], *_AMOUNTS))
@@ -185,14 +185,14 @@ def estimate_sharpening(before: Sharpening, scores: Sequence[SharpeningScore], d
     tone, count = list(range(departures)), len(scores[0].value) - departures
     if before:
         found = _estimate(scores, tone, [departures, departures + 1], before)
-        after = before.moved(found.step, found.covariance)
+        after = before.apply_step(found.step, found.covariance)
         return after if after.amount > _LEAST_AMOUNT else None
     each = [_estimate(scores, tone, [departures + radius], before) for radius in range(count)]
     best = int(np.argmax([one.log_odds for one in each]))
     if each[best].log_odds < _EVIDENCE or each[best].step[0] < _LEAST_AMOUNT:
         return None
     start, variance = Sharpening(0.0, RADII_PX[best]), each[best].covariance[0, 0]
-    return start.moved(np.array([each[best].step[0], 0.0]), np.diag([variance, _SIGMAS[1] ** 2]))
+    return start.apply_step(np.array([each[best].step[0], 0.0]), np.diag([variance, _SIGMAS[1] ** 2]))
 
 
 def _estimate(

@@ -80,7 +80,7 @@ def scene_setup(scene_file: SceneFile) -> Setup:
     targets = field_targets(scene_file.scene.field)
     if not targets:
         raise InputError(
-            f"{scene_file.path}: [field] has no targets, and nobody knows beforehand where natural points will be. "
+            f"{scene_file.path}: [field] has no targets, and where natural points will be is not known beforehand. "
             "To plan such a field, give as many targets as points are hoped for, in a [[field.scatter]]."
         )
     unknown = set(settings.control_points) - {target.id for target in targets}

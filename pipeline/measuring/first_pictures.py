@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from measure.detection.recurrence import Recurrence, Window, about, recurrence
+from measure.detection.recurrence import Recurrence, Window, recurrence, resample_square
 from measure.errors import MeasurementError
 from measure.fiducials.clicked_frame import LEAST_CLICKS, are_collinear
 from measure.fiducials.interior_orientation import fit_frame
@@ -167,7 +167,7 @@ def _view(task: ScanTask) -> _View | None:
             if placement is None:
                 placement = _central_frame(task.options, scan)
             windows = {
-                one.id: about(scan, placement, np.array(one.xy_mm), one.learned_mm, _REACH * one.learned_mm)
+                one.id: resample_square(scan, placement, np.array(one.xy_mm), one.learned_mm, _REACH * one.learned_mm)
                 for one in camera.learned
             }
     except MeasurementError:

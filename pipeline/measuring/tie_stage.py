@@ -30,7 +30,7 @@ _FEWEST = 3  # joins needed to estimate the transformation between two scans
 _TIE_NAME = re.compile(r"tie\d+")
 
 _NO_FRAME = Reason(
-    "No natural points are sought here: without fiducials nobody knows where the frame lies.", Code.NO_FRAME
+    "No natural points are sought here: without fiducials there is no interior orientation.", Code.NO_FRAME
 )
 TiedScan = NewType("TiedScan", MeasuredScan)  # after the checks against all others of its project
 

@@ -115,7 +115,7 @@ def test_another_picture_stands_out_by_its_variance() -> None:
 SLOPE = np.add.outer(np.zeros(55), np.arange(55.0))
 
 
-@pytest.mark.parametrize(("grey", "words"), [(np.full((55, 55), 7.0), "even"), (SLOPE, "texture")])
+@pytest.mark.parametrize(("grey", "words"), [(np.full((55, 55), 7.0), "uniform"), (SLOPE, "texture")])
 def test_what_has_no_texture_is_refused(grey: Array, words: str) -> None:
     matched = match_pieces([Piece(grey, (-HALF, -HALF), matrix) for matrix in (MAPS[0],) * 3], 0)
     assert all(words in each.reason for each in matched)
