@@ -98,6 +98,20 @@ def test_errors_of_each_image_are_no_two_groups(seed: int) -> None:
 
 
 @pytest.mark.study
+def test_two_cameras_are_named_more_often_than_a_scatter_of_images_is_taken_for_them() -> None:
+    named = {True: 0, False: 0}
+    for seed in range(40):
+        made, rng = scene(seed, flat=True), np.random.default_rng([5, seed])
+        for are_groups in named:
+            shown = made if are_groups else replace(made, groups=rng.normal(size=len(made.groups)))
+            effects = Effects(crop=0.5, zoom=0.2) if are_groups else Effects(zoom=0.3)
+            result = adjust_unmodelled(misfit_network(shown, effects, SOUND, rng), adjust)
+            named[are_groups] += any(each.kind == "groups" for each in result.explanations)
+    assert named[False] == 0
+    assert named[True] >= 20
+
+
+@pytest.mark.study
 def test_gross_errors_of_single_marks_are_no_fault_of_the_model() -> None:
     given = misfit_network(scene(6, flat=True), Effects(), SOUND, np.random.default_rng(1))
     result = adjust(with_errors(given, dict.fromkeys((3, 40, 90), np.array([0.05, -0.04]))))
