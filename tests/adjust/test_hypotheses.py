@@ -97,6 +97,14 @@ def test_errors_of_each_image_are_no_two_groups(seed: int) -> None:
     assert result.explanations == ()
 
 
+def test_a_small_effect_is_no_fault_of_the_model_where_errors_of_an_image_are_correlated() -> None:
+    """Significant if errors were independent: 3 % of v'Pv, p = 1e-6."""
+    kind = MISFITS["lens: k1 alone"]
+    effects = replace(kind.effect(1.5), noise=4.0)
+    result = adjust_unmodelled(misfit_network(scene(4, flat=True), effects, kind, np.random.default_rng(4)), adjust)
+    assert result.explanations == ()
+
+
 @pytest.mark.study
 def test_two_cameras_are_named_more_often_than_a_scatter_of_images_is_taken_for_them() -> None:
     named = {True: 0, False: 0}
