@@ -10,8 +10,19 @@ import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_origin, get_type_hints
+from types import GenericAlias, NoneType, UnionType
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    TypeVar,
+    Union,
+    cast,
+    dataclass_transform,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from pydantic import AfterValidator, ConfigDict, PlainValidator, TypeAdapter, ValidationError, ValidationInfo
 from pydantic.dataclasses import dataclass as pydantic_dataclass
@@ -237,8 +248,7 @@ def table_model(model: type[Model]) -> type[Model]:
             setattr(model, name, dataclasses.field(default_factory=field.default_factory))
     model.__annotations__ = {name: _add_key(hint) for name, hint in hints.items()}
     config = ConfigDict(extra="forbid", arbitrary_types_allowed=True, validate_by_name=True, validate_by_alias=True)
-    made: Any = pydantic_dataclass(frozen=True, kw_only=True, config=config)(model)
-    return made  # type: ignore[no-any-return]
+    return cast(type[Model], pydantic_dataclass(frozen=True, kw_only=True, config=config)(model))
 
 
 def _add_key(hint: Any) -> Any:
@@ -254,9 +264,9 @@ def _add_key(hint: Any) -> Any:
     if hint in _USUAL:
         return Annotated[hint, _USUAL[hint]]
     if origin is tuple and arguments[1:] == (...,):
-        return tuple[_add_key(arguments[0]), ...]  # type: ignore[misc]
+        return GenericAlias(tuple, (_add_key(arguments[0]), ...))
     if isinstance(origin, type) and issubclass(origin, Mapping):
-        return Mapping[str, _add_key(arguments[1])]  # type: ignore[misc]
+        return GenericAlias(Mapping, (str, _add_key(arguments[1])))
     if isinstance(hint, type) and dataclasses.is_dataclass(hint) and not is_pydantic_dataclass(hint):
         own: Any = table_model(type(hint.__name__, (hint,), {"__module__": hint.__module__}))
         return Annotated[own, AfterValidator(lambda value: hint(**vars(value)))]

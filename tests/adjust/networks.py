@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from math import pi
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -20,7 +20,7 @@ from adjust.problem.network import Approximations, Image, Network, ObjectPoint, 
 from adjust.problem.observations import ObservationKind, Observations
 from synthetic_images.projection import camera_from_object
 from synthetic_images.scene import Distortion as SceneDistortion
-from synthetic_images.scene import SceneCamera
+from synthetic_images.scene import Family, SceneCamera
 
 Array = NDArray[np.float64]
 
@@ -925,7 +925,8 @@ POSES = [(0.0, 0.0, 0.1), (0.5, 0.1, 1.6), (-0.5, 0.2, 3.1), (0.1, 0.5, -1.5), (
 
 def scene_camera(name: str) -> SceneCamera:
     c, values = LENSES[name]
-    return SceneCamera("L", (80.0, 80.0), c, (0.12, -0.07), SceneDistortion(name, values, LENS_R0_MM))  # type: ignore[arg-type]
+    distortion = SceneDistortion(cast(Family, name), values, LENS_R0_MM)
+    return SceneCamera("L", (80.0, 80.0), c, (0.12, -0.07), distortion)
 
 
 def lens_network(name: str, rng: np.random.Generator | None = None) -> Network:

@@ -1,6 +1,7 @@
 """What a scan's head says, held against the scan as it is opened and decoded."""
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,9 +18,9 @@ WIDE = GREY.astype(np.uint16) * 257
 GREYS = np.tile(np.arange(256, dtype=np.uint16) * 257, (3, 1))
 
 
-def written(path: Path, picture: np.ndarray, **tags: object) -> Path:
+def written(path: Path, picture: np.ndarray, **tags: Any) -> Path:
     if path.suffix == ".tif":
-        tifffile.imwrite(path, picture, **tags)  # type: ignore[arg-type]
+        tifffile.imwrite(path, picture, **tags)
     else:
         cv2.imwrite(str(path), picture)
     return path

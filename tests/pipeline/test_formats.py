@@ -148,8 +148,7 @@ def fisheye_project(folder: Path) -> Path:
     network = lens_network("opencv_fisheye")
     shift = np.array([18.0, -12.0])
     observations = replace(network.observations, xy_mm=network.observations.xy_mm + shift)
-    middle = {"x0_mm": Prior(18.0, np.inf), "y0_mm": Prior(-12.0, np.inf)}
-    camera = replace(network.cameras[0], **middle)  # type: ignore[arg-type]
+    camera = replace(network.cameras[0], x0_mm=Prior(18.0, np.inf), y0_mm=Prior(-12.0, np.inf))
     path = write_network_project(replace(network, cameras=(camera,), observations=observations), folder)
     text = path.read_text(encoding="utf-8")
     path.write_text(f'scans = ["scans/*.tif"]\npitch_um = {1e3 * FISHEYE_PITCH_MM}\n{text}', encoding="utf-8")

@@ -61,8 +61,8 @@ def test_marks_come_back_as_they_went(format: str, project: Path, tmp_path: Path
     here = {(m.image, m.point, m.kind): m for m in read_comparator(project.parent / "comparator.csv")}
     assert there.keys() == {key for key in here if format == "mmvii" or key[2] == "fiducial"}
     for key, mark in there.items():
-        np.testing.assert_allclose(mark.xy_mm, here[key].xy_mm, atol=1e-9)  # type: ignore[arg-type]
-        np.testing.assert_allclose(mark.sigma_mm, here[key].sigma_mm, rtol=1e-9)  # type: ignore[arg-type]
+        np.testing.assert_allclose(np.array([mark.xy_mm], float), np.array([here[key].xy_mm], float), atol=1e-9)
+        np.testing.assert_allclose(np.array([mark.sigma_mm], float), np.array([here[key].sigma_mm], float), rtol=1e-9)
     assert read_pitches(folder / "comparator.csv")["f3"] == (100.0, 100.0)
     if format == "micmac":
         given = {one.id: one.xy_mm for one in read_camera(folder / "camera.toml").fiducials}

@@ -1,4 +1,4 @@
-"""Faint marks on texture, what is worth a fit, and marks that touch stronger edges."""
+"""Detection: correlation maps and their cache, faint marks on texture, marks that touch stronger edges."""
 
 import gc
 import weakref
