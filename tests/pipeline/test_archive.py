@@ -33,7 +33,7 @@ from pipeline.measuring.roll import CheckedScan, check_scans
 from pipeline.measuring.scan_measurement import MeasuredFile, measure_file
 from pipeline.measuring.scan_task import Measure, ScanTask
 from pipeline.results.comparator_file import read_measurement_hash
-from pipeline.results.measured_record import MeasuredScan, pose_record
+from pipeline.results.measured_record import FailureCode, MeasuredScan, pose_record
 
 SAID = pytest.CaptureFixture[str]
 
@@ -370,6 +370,11 @@ def test_status_says_why_a_scan_needs_attention(folder: Path) -> None:
 def test_the_page_of_results_has_the_table_of_verdicts() -> None:
     text = (Path(__file__).parents[2] / "docs" / "reference" / "results.md").read_text(encoding="utf-8")
     assert all(f"| `{verdict}` | {verdict.meaning} | {NEXT_STEP[verdict]} |" in text for verdict in Verdict)
+
+
+def test_the_page_of_scans_has_the_table_of_failures() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "reference" / "scans.md").read_text(encoding="utf-8")
+    assert all(f"| `{code}` | {code.meaning} |" in text for code in FailureCode)
 
 
 BOARD = '[targets]\nkind = "chessboard"\nrows = 5\ncolumns = 7\nsquare_mm = 20.0\n'
