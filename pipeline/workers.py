@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
 from itertools import islice
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import cv2
 
@@ -54,13 +54,8 @@ Made = TypeVar("Made")
 class WorkerKilled(BrokenExecutor):
     """The process of a task was killed on each attempt."""
 
-    def __init__(self, what: str = "its process was ended, most likely because the memory was full") -> None:
-        super().__init__(what)
-
-
-def processes(scans: int) -> int:
-    """Number of scans measured in parallel: one per core."""
-    return min(scans, os.cpu_count() or 1)
+    def __init__(self) -> None:
+        super().__init__("its process was ended, most likely because the memory was full")
 
 
 @contextmanager
@@ -70,7 +65,7 @@ def worker_pool(scans: int, workers: int | None = None) -> Iterator[Executor]:
     Each scan is measured by one process, so the result does not depend on their number. If the block ends early, the
     processes are ended.
     """
-    pool = LocalPool(min(max(scans, 1), workers) if workers else processes(max(scans, 1)))
+    pool = LocalPool(max(min(scans, workers or os.cpu_count() or 1), 1))
     try:
         yield pool
     except BaseException:
@@ -155,17 +150,10 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-class Submits(Protocol):
-    """Executor of `concurrent.futures`, or one with the same `submit`."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> "Future[Any]":
-        """Schedule a call of `fn`."""
-
-
 def iterate_results(
     function: Callable[[Task], Made],
     tasks: Iterable[Task],
-    executor: Submits | None = None,
+    executor: Executor | None = None,
     in_flight: int | None = None,
 ) -> Iterator[tuple[Task, Made | Exception]]:
     """Yield each task with its result, or with the exception of an executor that lost it, in order of completion.
@@ -179,33 +167,19 @@ def iterate_results(
     left, running = iter(tasks), dict[Future[Made], Task]()
     try:
         while True:
-            for task in islice(left, window - len(running)):
-                running[_submitted(executor, function, task)] = task
+            running |= {executor.submit(function, task): task for task in islice(left, window - len(running))}
             if not running:
                 return
             for future in wait(running, return_when=FIRST_COMPLETED).done:
-                task, result = running.pop(future), _result(future)
+                task = running.pop(future)
+                try:  # tasks themselves raise nothing
+                    result: Made | Exception = future.result()
+                except Exception as error:
+                    result = error
                 yield task, result
     finally:
         for future in running:
             future.cancel()
-
-
-def _submitted(executor: Submits, function: Callable[[Task], Made], task: Task) -> "Future[Made]":
-    try:
-        return executor.submit(function, task)
-    except BrokenExecutor as error:
-        future: Future[Made] = Future()
-        future.set_exception(error)
-        return future
-
-
-def _result(future: "Future[Made]") -> Made | Exception:
-    """Result of a future. Tasks themselves raise nothing: an exception means that the executor lost its process."""
-    try:
-        return future.result()
-    except Exception as error:
-        return error
 
 
 @dataclass(frozen=True)
@@ -255,19 +229,22 @@ def cluster_executor(address: str, scans: Sequence[str], workers: int | None = N
         raise missing_extra("--cluster", "Dask", "cluster") from None
     with ExitStack() as stack:
         if address == LOCAL:
-            count = workers or processes(len(scans) or 1)
+            count = workers or max(min(len(scans), os.cpu_count() or 1), 1)
             cluster = LocalCluster(
                 n_workers=count, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
             )
             stack.callback(cluster.close)
-            client = Client(cluster, timeout=_ANSWER_S)
-        else:
-            client = _client(Client, address)
+        try:
+            client = Client(cluster if address == LOCAL else address, timeout=_ANSWER_S)
+        except (OSError, ValueError) as error:
+            raise InputError(
+                f"--cluster {address}: no scheduler answers there ({' '.join(str(error).split())}). Start one, such as "
+                "`dask scheduler` with `dask worker`s, and give its address, such as tcp://host:8786."
+            ) from None
         stack.callback(client.close)
         _check_workers(client, address, _one_a_folder(scans))
         client.register_plugin(_alone_plugin(), name="reseau")
-        executor = client.get_executor(retries=_RETRIES, pure=False)
-        yield SubmittedAgain(executor)
+        yield SubmittedAgain(client.get_executor(retries=_RETRIES, pure=False))
 
 
 class SubmittedAgain(Executor):
@@ -307,16 +284,6 @@ class SubmittedAgain(Executor):
             outer.set_exception(WorkerKilled())
 
 
-def _client(client: "type[Client]", address: str) -> "Client":
-    try:
-        return client(address, timeout=_ANSWER_S)
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"--cluster {address}: no scheduler answers there ({' '.join(str(error).split())}). Start one, such as "
-            "`dask scheduler` with `dask worker`s, and give its address, such as tcp://host:8786."
-        ) from None
-
-
 def _check_workers(client: "Client", address: str, scans: Sequence[str]) -> None:
     """Check versions and access to the scans on every worker before the first task."""
     try:
@@ -351,19 +318,8 @@ def _check_workers(client: "Client", address: str, scans: Sequence[str]) -> None
 
 def versions() -> dict[str, str]:
     """Versions that a result depends on in addition to scan and options; they must agree on all machines."""
-    return {
-        "Python": platform.python_version(),
-        **{name: version(name) for name in _LIBRARIES if _is_installed(name)},
-        "the revision of measuring": str(MEASURE_REVISION),
-    }
-
-
-def _is_installed(name: str) -> bool:
-    try:
-        version(name)
-    except ModuleNotFoundError:
-        return False
-    return True
+    libraries = {name: version(name) for name in _LIBRARIES}
+    return {"Python": platform.python_version(), **libraries, "the revision of measuring": str(MEASURE_REVISION)}
 
 
 def _versions_and_unreachable(scans: Sequence[str]) -> tuple[dict[str, str], list[tuple[str, str]]]:

@@ -2,9 +2,10 @@
 
 import glob
 import os
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +17,10 @@ from measure.scans.remote import Address, is_address, scan_path
 from pipeline.archive.scan_groups import (
     CANDIDATES,
     Catalogue,
-    GroupedScans,
     ScanGroup,
     catalogue,
+    identify_sample,
     name_cameras,
-    trial_of_cameras,
 )
 from pipeline.errors import InputError
 from pipeline.files.camera_file import read_camera
@@ -98,7 +98,7 @@ class NewProject:
 
     def remarks(self) -> Iterator[tuple[str, list[str]]]:
         """Yield what needs a look, with its cases."""
-        yield "cannot be read, and are left out", list(self.found.broken.values())
+        yield "cannot be read, and are left out", list(self.found.unread.values())
         yield (
             "show no known camera" + ("" if self.named else ": draw it, or have its marks learned"),
             [
@@ -154,7 +154,8 @@ class NewProject:
             yield f"Cameras' numbers on plates in the samples: {', '.join(plates)}."
         if self.found.endings:
             others = sorted(self.found.endings.items(), key=lambda item: -item[1])[:_SHOWN]
-            yield f"Not examined: {', '.join(f'{count} files {_ending(ending)}' for ending, count in others)}."
+            named = (f"{count} files {f'that end in {end}' if end else 'without an ending'}" for end, count in others)
+            yield f"Not examined: {', '.join(named)}."
 
     def as_json(self) -> Mapping[str, object]:
         return {
@@ -162,11 +163,18 @@ class NewProject:
             "images": str(self.folder / "images.csv"),
             "scans": len(self.cameras),
             "kinds": [
-                {"folder": str(group.folder), **_head_json(group.head), **group.as_json()}
+                {
+                    "folder": str(group.folder),
+                    "format": group.head.file_format,
+                    "bits": group.head.bits,
+                    "channels": group.head.channels,
+                    "pitch_um": group.head.pitch.um,
+                    **group.as_json(),
+                }
                 for group in self.found.groups
             ],
             "left_out": {reason: [str(path) for path in paths] for reason, paths in self.left_out.items()},
-            "broken": {str(path): reason for path, reason in self.found.broken.items()},
+            "broken": {str(path): reason for path, reason in self.found.unread.items()},
             "copies": {str(path): str(first) for path, first in self.found.copies.items()},
             "digital": {str(group.folder): group.calibrate_command for group in self.digital},
             "needs_a_look": {what: cases for what, cases in self.remarks() if cases},
@@ -206,10 +214,14 @@ def init_project(given: Sequence[Path], folder: Path, reporter: Reporter, max_pi
             found = catalogue(given, count, max_pixels)
         except MeasurementError as error:
             raise InputError(str(error)) from error
-    found = _identify_cameras(found, reporter, max_pixels)
+    trial = partial(identify_sample, cameras=read_library(), pitch_um=None, max_pixels=max_pixels)
+    with worker_pool(sum(len(group.to_try) for group in found.groups)) as workers:
+        found = name_cameras(found, trial, reporter, workers)
     new = NewProject(folder, tuple(given), found, _left_out(found))
     if new.digital and not new.cameras:
-        raise InputError(_only_digital(new))
+        lines = [f"{_place(group)}, {group.digital}: {group.calibrate_command}" for group in new.digital]
+        where = listed(list(map(str, given)))
+        raise InputError("\n".join([f"{where}: no scan of film. SIZE: of a square, as 25mm.", *lines]))
     write_atomically(folder / "project.toml", project_text(new))
     write_atomically(folder / "images.csv", images_text(new))
     return new
@@ -224,31 +236,14 @@ def _given_paths(given: Path) -> list[Path]:
     return [scan_path(line) if is_address(line) else given.parent / line for line in named]
 
 
-def _identify_cameras(found: Catalogue, reporter: Reporter, max_pixels: int | None) -> Catalogue:
-    """Catalogue with the cameras of the library identified on samples, in parallel processes."""
-    with worker_pool(sum(len(group.to_try) for group in found.groups)) as workers:
-        grouped = GroupedScans(found.groups, found.broken)
-        named = name_cameras(grouped, trial_of_cameras(read_library(), None, max_pixels), reporter, workers)
-    return replace(found, groups=named.groups, broken=named.unread)
-
-
-def _only_digital(new: NewProject) -> str:
-    """Message that lists groups of digital images, each with its command."""
-    lines = [f"{_place(group)}, {group.digital}: {group.calibrate_command}" for group in new.digital]
-    return "\n".join([f"{listed(list(map(str, new.given)))}: no scan of film. SIZE: of a square, as 25mm.", *lines])
-
-
 def project_text(new: NewProject) -> str:
     """Content of project.toml. Raises InputError where no scan is left."""
     cameras = new.cameras
     if not cameras:
-        given, reason = ", ".join(map(str, new.given)), next(iter(new.found.broken.values()), "")
+        given, reason = ", ".join(map(str, new.given)), next(iter(new.found.unread.values()), "")
         raise InputError(f"{given}: of {counted(new.found.files, 'file')} none can be read as a scan. {reason}".strip())
-    names = defaultdict[str, int](int)
-    for camera in cameras.values():
-        names[camera] += 1
-    usual = max(names, key=lambda name: names[name])
-    camera = f"camera = {quoted(PREFIX + usual)}    # of {names[usual]} scans; images.csv has each one's own"
+    ((usual, count),) = Counter(cameras.values()).most_common(1)
+    camera = f"camera = {quoted(PREFIX + usual)}    # of {count} scans; images.csv has each one's own"
     if not usual:
         camera = f'# camera = "camera.toml"    # draw it: {TEMPLATE_COMMAND}'
     lines = [
@@ -297,15 +292,16 @@ def _left_out(found: Catalogue) -> dict[str, list[Path]]:
     """{reason: files}."""
     # Without any identified camera, the camera file to be added covers all scans: none is left out for it.
     is_named = any(group.camera for group in found.groups)
-    broken = [path for path in found.broken if isinstance(path, Address) or path.exists() or path.is_symlink()]
-    unknown = [
-        path for group in found.groups if is_named and not group.camera and not group.digital for path in group.paths
-    ]
-    digital = [path for group in found.groups if group.digital for path in group.paths]
-    taken = {*broken, *unknown, *digital}
-    whole = [(path, group.head) for group in found.groups for path in group.paths if path not in taken]
+    unknown, digital, whole = list[Path](), list[Path](), list[tuple[Path, ScanHead]]()
+    for group in found.groups:
+        if group.digital:
+            digital += group.paths
+        elif is_named and not group.camera:
+            unknown += group.paths
+        else:
+            whole += [(path, group.head) for path in group.paths if path not in found.unread]
     return {
-        _BROKEN: broken,
+        _BROKEN: [path for path in found.unread if isinstance(path, Address) or path.exists() or path.is_symlink()],
         _COPIES: list(found.copies),
         _NAMESAKES: _namesakes(whole),
         _UNKNOWN: unknown,
@@ -410,11 +406,3 @@ def _form(head: ScanHead) -> str:
     )
     colours = "colour" if head.channels > 1 else "grey"
     return f"{head.file_format} {head.bits} bit {colours}, about {head.width_px} x {head.height_px} px, {pitch}"
-
-
-def _head_json(head: ScanHead) -> Mapping[str, object]:
-    return {"format": head.file_format, "bits": head.bits, "channels": head.channels, "pitch_um": head.pitch.um}
-
-
-def _ending(ending: str) -> str:
-    return f"that end in {ending}" if ending else "without an ending"

@@ -7,8 +7,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -64,19 +63,20 @@ class ScanGroup:
         return [self.paths[index] for index in chosen]
 
     @property
-    def cameras(self) -> tuple[str, ...]:
-        """Cameras that are common to the samples with a result, if most have one, without those that a sample's plate
-        contradicts."""
+    def _common(self) -> frozenset[str]:
+        """Cameras that are common to the samples with a result, if most have one."""
         named = [names for names in self._named if names]
-        if 2 * len(named) <= len(self.samples):
-            return ()
-        against = frozenset(name for sample in self.samples for name in sample.contradicted)
-        return tuple(sorted(frozenset.intersection(*named) - against))
+        return frozenset.intersection(*named) if 2 * len(named) > len(self.samples) else frozenset()
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Cameras common to most samples, without those that a sample's plate contradicts."""
+        return tuple(sorted(self._common.difference(*(sample.contradicted for sample in self.samples))))
 
     @property
     def candidates(self) -> tuple[str, ...]:
         """The few cameras that most samples show; among equals, those with the most calibration reports."""
-        counts, reports = Counter(name for names in self._named for name in names), self._reports
+        counts, reports = self._counts, self._reports
         ranked = sorted(counts, key=lambda name: (-counts[name], -reports.get(name, 0), name))
         return tuple(ranked[:CANDIDATES])
 
@@ -166,11 +166,10 @@ class ScanGroup:
                 f"perhaps {' or '.join(self.candidates)}, {found} of {drawn} marks found, but that rests on the form "
                 f"of its marks alone, and {against}: compare the drawings with a scan"
             )
-        counts = Counter(name for names in self._named for name in names)
-        if not counts:
+        if not self._counts:
             return f"no camera stands out in {len(self.samples)} of them"
-        counts_text = ", ".join(f"{name} in {counts[name]}" for name in self.candidates)
-        if 2 * sum(map(bool, self._named)) > len(self.samples) and frozenset.intersection(*filter(None, self._named)):
+        counts_text = ", ".join(f"{name} in {self._counts[name]}" for name in self.candidates)
+        if self._common:
             return f"the marks are those of {counts_text}, but the camera's plate in the picture names another camera"
         return f"of {len(self.samples)} samples not all show the same camera ({counts_text})"
 
@@ -181,7 +180,12 @@ class ScanGroup:
     @property
     def _named(self) -> list[frozenset[str]]:
         """Cameras that each sample names."""
-        return [frozenset(name for trial in sample.best for name in trial.cameras) for sample in self.samples]
+        return [frozenset(sample.best_names()) for sample in self.samples]
+
+    @property
+    def _counts(self) -> Counter[str]:
+        """Number of samples that name each camera."""
+        return Counter(name for names in self._named for name in names)
 
     def as_json(self) -> Mapping[str, object]:
         """Content for JSON output."""
@@ -198,12 +202,27 @@ class ScanGroup:
         }
 
 
-@dataclass(frozen=True)
-class GroupedScans:
-    """Groups of scans. unread: {path: why a scan cannot be read}."""
+@dataclass(frozen=True, eq=False)
+class Catalogue:
+    """Catalogue of scans.
+
+    Attributes
+    ----------
+    groups : groups of readable scans, without copies.
+    unread : {file: why it cannot be read}.
+    copies : {file: the file with the same bytes that stands for it}.
+    endings : number of files that are not scans, by file name ending.
+    """
 
     groups: tuple[ScanGroup, ...]
     unread: Mapping[Path, str]
+    copies: Mapping[Path, Path] = field(default_factory=dict)
+    endings: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def files(self) -> int:
+        """Number of files that were examined."""
+        return sum(len(group.paths) for group in self.groups) + len(self.unread) + len(self.copies)
 
     @property
     def all_named(self) -> bool:
@@ -216,13 +235,24 @@ class GroupedScans:
         return {"kinds": [group.as_json() for group in self.groups], "unread": unread}
 
 
-def group_scans(
-    files: Sequence[Path], count: Count, max_pixels: int | None = None, by_folder: bool = True
-) -> GroupedScans:
-    """Group scans by format, channels, bits, camera, resolution and approximate size. Some kilobytes of each are read.
+def catalogue(given: Sequence[Path], count: Count, max_pixels: int | None = None, by_folder: bool = True) -> Catalogue:
+    """Catalogue the scans given as files, addresses and folders (with all subfolders), including stores and servers.
 
-    by_folder: form separate groups for each folder.
+    Scans are grouped by format, channels, bits, camera, resolution and approximate size. Some kilobytes of each are
+    read, and only the files' names are held in memory.
+
+    Parameters
+    ----------
+    by_folder : form separate groups for each folder, and leave out copies.
+
+    Raises
+    ------
+    InputError
+        There is no scan.
+    MeasurementError
+        An address cannot be listed.
     """
+    files, endings = find_scan_files(given)
     heads, unread = defaultdict[tuple[object, ...], list[tuple[int, ScanHead]]](list), dict[Path, str]()
     members = defaultdict[tuple[Path, int], list[tuple[Path, ScanHead]]](list)
     number = 0
@@ -240,11 +270,12 @@ def group_scans(
             own, number = number, number + 1
             alike.append((own, head))
         members[path.parent if by_folder else Path(), own].append((path, head))
+    copies = dict(_copies([path for path in files if path not in unread], max_pixels)) if by_folder else {}
     groups = (
-        ScanGroup(some[0][0].parent, some[0][1], tuple(path for path, _ in some))
+        ScanGroup(some[0][0].parent, some[0][1], tuple(path for path, _ in some if path not in copies))
         for _, some in sorted(members.items(), key=lambda item: item[0])
     )
-    return GroupedScans(tuple(groups), unread)
+    return Catalogue(tuple(group for group in groups if group.paths), unread, copies, endings)
 
 
 def _is_like(one: ScanHead, other: ScanHead) -> bool:
@@ -265,7 +296,7 @@ Sample = tuple[Path, tuple[str, ...]]  # a scan, and the cameras that another on
 Try = Callable[[Sample], Identification | str]
 
 
-def name_cameras(grouped: GroupedScans, identified: Try, reporter: Reporter, workers: Executor | None) -> GroupedScans:
+def name_cameras(grouped: Catalogue, identified: Try, reporter: Reporter, workers: Executor | None) -> Catalogue:
     """Identify the cameras of groups from samples.
 
     identified: identification of a scan, or why it cannot be read. Cameras found in the first sample of a group are
@@ -277,21 +308,20 @@ def name_cameras(grouped: GroupedScans, identified: Try, reporter: Reporter, wor
     with reporter.stage("tried") as count:
         for is_first in (True, False):
             samples: list[Sample] = [
-                (path, () if is_first else _camera_names(answers[group.to_try[0]]))
+                (path, () if is_first or isinstance(found := answers[group.to_try[0]], str) else found.best_names())
                 for group in grouped.groups
                 for path in (group.to_try[:1] if is_first else group.to_try[1:])
             ]
             for (path, _), answer in zip(samples, map_items(workers, identified, samples), strict=True):
                 answers[path] = answer
                 count(of_groups, len(answers), total)
-    groups = [
-        replace(
-            group, samples=tuple(answer for path in group.to_try if isinstance(answer := answers[path], Identification))
-        )
-        for group in grouped.groups
-    ]
     unread = {path: answer for path, answer in answers.items() if isinstance(answer, str)}
-    return GroupedScans(tuple(part for group in groups for part in _split_cameras(group)), {**grouped.unread, **unread})
+    known = {path: answer for path, answer in answers.items() if not isinstance(answer, str)}
+    groups = [
+        replace(group, samples=tuple(known[path] for path in group.to_try if path in known)) for group in grouped.groups
+    ]
+    parts = tuple(part for group in groups for part in _split_cameras(group))
+    return replace(grouped, groups=parts, unread={**grouped.unread, **unread})
 
 
 def _split_cameras(group: ScanGroup) -> list[ScanGroup]:
@@ -304,20 +334,10 @@ def _split_cameras(group: ScanGroup) -> list[ScanGroup]:
     return [replace(group, paths=tuple(one.scan for one in own), samples=tuple(own)) for own in parts.values()]
 
 
-def _camera_names(answer: Identification | str) -> tuple[str, ...]:
-    """Cameras that a sample shows."""
-    best = answer.best if isinstance(answer, Identification) else ()
-    return tuple(name for trial in best for name in trial.cameras)
-
-
-def trial_of_cameras(cameras: Mapping[str, CameraFile], pitch_um: float | None, max_pixels: int | None) -> Try:
-    """Function that tries cameras on a scan; it can be sent to other processes."""
-    return partial(_identified, cameras=cameras, pitch_um=pitch_um, max_pixels=max_pixels)
-
-
-def _identified(
+def identify_sample(
     sample: Sample, cameras: Mapping[str, CameraFile], pitch_um: float | None, max_pixels: int | None
 ) -> Identification | str:
+    """Try cameras on a scan; return why it cannot be read otherwise."""
     path, likely = sample
     try:
         head = read_head(path, max_pixels)
@@ -336,7 +356,7 @@ def _board(path: Path, max_pixels: int | None) -> str:
         return recognise_board(scan)
 
 
-def print_groups(grouped: GroupedScans, console: Console) -> None:
+def print_groups(grouped: Catalogue, console: Console) -> None:
     """Print every group with its samples."""
     for group in grouped.groups:
         console.print(group.sentence(), style="bold", highlight=False, soft_wrap=True)
@@ -346,63 +366,21 @@ def print_groups(grouped: GroupedScans, console: Console) -> None:
         console.print(f"not tried: {reason}", highlight=False, soft_wrap=True)
 
 
-@dataclass(frozen=True, eq=False)
-class Catalogue:
-    """Catalogue of scans.
-
-    Attributes
-    ----------
-    groups : groups of readable scans, per folder, without copies.
-    broken : {file: why it cannot be read}.
-    copies : {file: the file with the same bytes that stands for it}.
-    endings : number of files that are not scans, by file name ending.
-    """
-
-    groups: tuple[ScanGroup, ...]
-    broken: Mapping[Path, str]
-    copies: Mapping[Path, Path]
-    endings: Mapping[str, int]
-
-    @property
-    def files(self) -> int:
-        """Number of files that were examined."""
-        return sum(len(group.paths) for group in self.groups) + len(self.broken) + len(self.copies)
-
-
-def catalogue(given: Sequence[Path], count: Count, max_pixels: int | None = None) -> Catalogue:
-    """Catalogue the scans given as files, addresses and folders (with all subfolders), including stores and servers.
-
-    Only the files' names are held in memory.
-
-    Raises
-    ------
-    InputError
-        There is no scan.
-    MeasurementError
-        An address cannot be listed.
-    """
-    files, endings = find_scan_files(given)
-    found = group_scans(files, count, max_pixels)
-    copies = dict(_copies([path for path in files if path not in found.unread], max_pixels))
-    groups = (replace(one, paths=tuple(path for path in one.paths if path not in copies)) for one in found.groups)
-    return Catalogue(tuple(group for group in groups if group.paths), found.unread, copies, endings)
-
-
 def find_scan_files(given: Sequence[Path]) -> tuple[list[Path], Counter[str]]:
     """Return the given files and all scans in and below the folders, sorted by name, and a count of other files by
     ending.
 
     Hidden files are skipped. Raises InputError where there is no scan.
     """
-    files, endings = dict[Path, None](), Counter[str]()
+    files, endings = set[Path](), Counter[str]()
     for path in given:
         is_listed = isinstance(path, Address) and path.suffix.lower() not in SCAN_ENDINGS
         if not is_listed and not path.is_dir():
-            files[path] = None
+            files.add(path)
             continue
         for file in list_addresses(path) if isinstance(path, Address) else _files_below(path):
             if file.suffix.lower() in SCAN_ENDINGS:
-                files[file] = None
+                files.add(file)
             else:
                 endings[file.suffix] += 1
     if not files:
@@ -425,18 +403,14 @@ def _files_below(folder: Path) -> Iterator[Path]:
 def _copies(files: Sequence[Path], max_pixels: int | None) -> Iterator[tuple[Path, Path]]:
     """Yield (copy, original) for files with identical bytes; size and a hash of parts are compared first."""
     # The original has the shortest name, since copies are called `Copy of 0001` or `0001 (1)`.
-    for of_one_size in _equal_groups(lambda path: path.stat().st_size, files):
-        for alike in _equal_groups(lambda path: parts_hash(path, max_pixels), of_one_size):
-            for same in _equal_groups(content_hash, alike):
-                original, *others = sorted(same, key=lambda path: len(path.name))
-                yield from ((path, original) for path in others)
-
-
-def _equal_groups(value: Callable[[Path], object], paths: Sequence[Path]) -> list[list[Path]]:
-    """Group files by a value; a single file is returned without computing it."""
-    if len(paths) == 1:
-        return [list(paths)]
-    groups = defaultdict[object, list[Path]](list)
-    for path in paths:
-        groups[value(path)].append(path)
-    return list(groups.values())
+    alike = [list(files)]
+    values = (lambda path: path.stat().st_size), (lambda path: parts_hash(path, max_pixels)), content_hash
+    for value in values:
+        parts = defaultdict[tuple[int, object], list[Path]](list)
+        for number, group in enumerate(alike):
+            for path in group:
+                parts[number, value(path)].append(path)
+        alike = [group for group in parts.values() if len(group) > 1]
+    for group in alike:
+        original, *others = sorted(group, key=lambda path: len(path.name))
+        yield from ((path, original) for path in others)

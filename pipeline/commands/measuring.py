@@ -345,7 +345,7 @@ def _name_cameras(
     given: Sequence[Path], project: "Project | None", pitch_um: float | None, max_pixels: int | None, as_json: bool
 ) -> int:
     """Identify the cameras of scans: all trials of a single scan, or some scans of each group."""
-    from pipeline.archive.scan_groups import find_scan_files, group_scans, name_cameras, print_groups, trial_of_cameras
+    from pipeline.archive.scan_groups import catalogue, identify_sample, name_cameras, print_groups
     from pipeline.files.library import PREFIX, read_library
     from pipeline.measuring.camera_identification import print_identification
     from pipeline.measuring.camera_trials import identify
@@ -360,8 +360,9 @@ def _name_cameras(
         print_next(as_json, *(steps or [LIBRARY_STEP]))
         return DONE if identification.best else LOOK
     with reporter.stage("examined") as count:
-        found = group_scans(find_scan_files(given)[0], count, max_pixels, by_folder=False)
-    grouped = name_cameras(found, trial_of_cameras(tried, pitch_um, max_pixels), reporter, None)
+        found = catalogue(given, count, max_pixels, by_folder=False)
+    trial = partial(identify_sample, cameras=tried, pitch_um=pitch_um, max_pixels=max_pixels)
+    grouped = name_cameras(found, trial, reporter, None)
     if not grouped.groups:
         raise InputError("\n".join(grouped.unread.values()))
     show(as_json, grouped.as_json, lambda console: print_groups(grouped, console))

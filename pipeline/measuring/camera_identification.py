@@ -234,21 +234,22 @@ class Identification:
             text += f" {' or '.join(self.best[1].cameras)} comes close with {self.best[1].score:.2f}."
         elif len(first.cameras) > 1:
             text += " Their marks are alike; the data strip or the focal length must decide."
-        named = [name for name in self._best_names() if name in self.unreported]
+        named = [name for name in self.best_names() if name in self.unreported]
         text += "".join(f" {name} rests on no calibration report: {self.unreported[name]}." for name in named)
         against = self.against_pitch()
         return text + self._form_remark() + self._plate_remark() + (f" {against}" if against else "")
 
-    def _best_names(self) -> list[str]:
-        return [name for trial in self.best for name in trial.cameras]
+    def best_names(self) -> tuple[str, ...]:
+        """Names of the cameras of the best trials."""
+        return tuple(name for trial in self.best for name in trial.cameras)
 
     def names_by_plate(self) -> list[str]:
         """Names of the best cameras that the plate does not contradict."""
-        return [name for name in self._best_names() if name not in self.contradicted]
+        return [name for name in self.best_names() if name not in self.contradicted]
 
     def much_alike(self) -> tuple[str, ...]:
         """Other cameras whose marks resemble those of the best trials."""
-        best = self._best_names()
+        best = self.best_names()
         others = (other for name in best for other in self.alike.get(name, ()) if other not in best)
         return tuple(dict.fromkeys(others))
 
@@ -270,7 +271,7 @@ class Identification:
         left = self.names_by_plate()
         if not left:
             return f" Its plate says {read}, which none of them is."
-        agree = f"; of these that is {' or '.join(left)}" if len(left) < len(self._best_names()) else ""
+        agree = f"; of these that is {' or '.join(left)}" if len(left) < len(self.best_names()) else ""
         return f" Its plate says {read}{agree}."
 
     def against_pitch(self) -> str:
@@ -288,7 +289,7 @@ class Identification:
 
     def as_json(self) -> Mapping[str, object]:
         trials = [{**asdict(trial), "stands_out": trial.stands_out} for trial in self.trials]
-        head = {"scan": str(self.scan), "best": self._best_names(), "sentence": self.sentence(), "trials": trials}
+        head = {"scan": str(self.scan), "best": self.best_names(), "sentence": self.sentence(), "trials": trials}
         return {**head, "plate": dict(self.plate), "contradicted": sorted(self.contradicted)}
 
 

@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -19,13 +20,12 @@ from measure.scans.opening import open_scan, read_head
 from pipeline import read_project, stages
 from pipeline.archive import new_project
 from pipeline.archive.scan_groups import (
-    GroupedScans,
+    Catalogue,
     Sample,
     ScanGroup,
     catalogue,
-    group_scans,
+    identify_sample,
     name_cameras,
-    trial_of_cameras,
 )
 from pipeline.cli import run
 from pipeline.files import library
@@ -78,7 +78,7 @@ def test_files_are_sorted_into_kinds_copies_and_broken_ones(box: Path) -> None:
         ("1958", 30): ["0001.tiff"],
     }
     assert found.copies == {box / "1952/0002 Kopie.tif": box / "1952/0002.tif"}
-    assert [path.name for path in found.broken] == ["broken.tif"]
+    assert [path.name for path in found.unread] == ["broken.tif"]
     assert found.endings == {".txt": 1}
     assert found.files == 9
 
@@ -142,7 +142,7 @@ def test_a_camera_is_known_by_most_samples_and_by_what_its_plate_does_not_contra
 def fake_identification(monkeypatch: pytest.MonkeyPatch) -> None:
     """What samples say, by where they stand: those of 1952 are of one camera, all others of none that is known."""
 
-    def samples(grouped: GroupedScans, *_: object) -> GroupedScans:
+    def samples(grouped: Catalogue, *_: object) -> Catalogue:
         groups = []
         for group in grouped.groups:
             names = ("wild-rc10-153",) if group.folder.name in ("1952", "sub") else ()
@@ -208,8 +208,8 @@ def test_of_each_group_in_each_folder_three_are_tried(box: Path) -> None:
 
     for number in range(5, 9):
         scan(box / "1952" / f"000{number}.tif")
-    found = catalogue([box], no_count)
-    named = name_cameras(GroupedScans(found.groups, {}), identified, Reporter(), None)
+    found = replace(catalogue([box], no_count), unread={})
+    named = name_cameras(found, identified, Reporter(), None)
     tried = {(group.folder.name, group.head.height_px): len(group.samples) for group in named.groups}
     assert tried == {("1952", 60): 3, ("1952", 120): 0, ("sub", 60): 1, ("1958", 60): 1, ("1958", 30): 1}
     samples = next(group.samples for group in named.groups if len(group.paths) > 3)
@@ -218,11 +218,11 @@ def test_of_each_group_in_each_folder_three_are_tried(box: Path) -> None:
     assert likely["0005.tif"] == likely["0008.tif"] == ("wild-rc5-153",)
 
 
-def test_init_and_cameras_group_scans_alike(box: Path) -> None:
+def test_init_and_cameras_catalogue_alike(box: Path) -> None:
     """`cameras --scan` has one group where `init` has one in each folder."""
     (whole,) = [group for group in catalogue([box / "1952"], no_count).groups if len(group.paths) == 3]
     files = [path for path in sorted(box.rglob("*.tif")) if path.name[0] == "0" and " " not in path.name]
-    first = group_scans(files, no_count, by_folder=False).groups[0]
+    first = catalogue(files, no_count, by_folder=False).groups[0]
     assert set(whole.paths) <= set(first.paths)
     assert {path.parent.name for path in first.paths} == {"1952", "sub"}
 
@@ -292,7 +292,7 @@ def drawn_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (cameras / "small.toml").write_text(f"{CAMERA}{source}", encoding="utf-8")
     monkeypatch.setattr(library, "FOLDER", cameras)
 
-    def samples(grouped: GroupedScans, *_: object) -> GroupedScans:
+    def samples(grouped: Catalogue, *_: object) -> Catalogue:
         groups = []
         for group in grouped.groups:
             names = () if group.head.camera or group.head.height_px < 100 else ("small",)
@@ -366,8 +366,8 @@ def test_a_chessboard_is_recognised_with_its_count(board: tuple[int, int] | None
 
 def test_photographs_and_pictures_of_boards_are_not_tried_on_the_library(tmp_path: Path) -> None:
     photograph(tmp_path / "a.jpg", board=(9, 6))
-    identified = trial_of_cameras({}, None, None)
-    found = name_cameras(group_scans([tmp_path / "a.jpg"], lambda *_: None), identified, Reporter(quiet=True), None)
+    identified = partial(identify_sample, cameras={}, pitch_um=None, max_pixels=None)
+    found = name_cameras(catalogue([tmp_path / "a.jpg"], lambda *_: None), identified, Reporter(quiet=True), None)
     (group,) = found.groups
     assert (group.camera, group.board) == ("", "--board 9x6")
     assert group.digital == "taken by Canon EOS 80D, 35 mm"
@@ -400,7 +400,7 @@ def test_scans_that_were_all_tried_have_each_its_own_camera(tmp_path: Path) -> N
         return identify_camera(path, "wild-rc5-153" if path.stem == "0" else "zeiss-rmk-a-153")
 
     found = catalogue([tmp_path], lambda *_: None)
-    named = name_cameras(GroupedScans(found.groups, {}), identified, Reporter(quiet=True), None)
+    named = name_cameras(found, identified, Reporter(quiet=True), None)
     assert {(group.camera, *(path.stem for path in group.paths)) for group in named.groups} == {
         ("wild-rc5-153", "0"),
         ("zeiss-rmk-a-153", "1"),

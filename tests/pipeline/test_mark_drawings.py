@@ -1,5 +1,6 @@
 """The library's drawings against pictures of real marks, and drawn cameras found among all others."""
 
+from functools import partial
 from importlib import resources
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from studies import parametrize_with_studies
 
 from measure.marks.rendering import known_picture
 from measure.marks.shapes import Mark, MarkShape, Polygon
-from pipeline.archive.scan_groups import group_scans, name_cameras, trial_of_cameras
+from pipeline.archive.scan_groups import catalogue, identify_sample, name_cameras
 from pipeline.files.library import read_library
 from pipeline.measuring.camera_trials import _alike, identify
 from pipeline.progress import Reporter
@@ -121,8 +122,10 @@ def test_scans_of_wings_are_named_where_the_scan_tells_their_form(tmp_path: Path
     (tmp_path / "scene.toml").write_text(scene_text(name), encoding="utf-8")
     render_project(tmp_path / "scene.toml", tmp_path)
     forms = {each: camera for each, camera in LIBRARY.items() if "k17" in each or each == "zeiss-rmk-a-153"}
-    grouped = group_scans(sorted((tmp_path / "scans").iterdir()), lambda *_: None)
-    (group,) = name_cameras(grouped, trial_of_cameras(forms, None, None), Reporter(), None).groups
+    grouped = catalogue([tmp_path / "scans"], lambda *_: None)
+    (group,) = name_cameras(
+        grouped, partial(identify_sample, cameras=forms, pitch_um=None, max_pixels=None), Reporter(), None
+    ).groups
     assert group.camera == name, group.sentence()
 
 

@@ -6,7 +6,7 @@ import os
 import pickle
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Future
+from concurrent.futures import Executor, Future
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import MISSING, fields, is_dataclass, replace
 from itertools import pairwise
@@ -146,7 +146,7 @@ def test_few_of_many_scans_are_the_same_when_another_one_comes() -> None:
     assert sample_names(names[:3], 4) == names[:3]
 
 
-class Watched:
+class Watched(Executor):
     """An executor that holds some tasks: then, and when it has got its last, it does the one that waits longest. A
     broken task's process ends."""
 
@@ -154,7 +154,7 @@ class Watched:
         self.left, self.holds, self.broken, self.most = total, holds, broken, 0
         self.waiting: list[tuple[Future[Any], Callable[..., Any], Any]] = []
 
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **_: Any) -> "Future[Any]":
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> "Future[Any]":
         future: Future[Any] = Future()
         self.waiting.append((future, fn, pickle.loads(pickle.dumps(args))))
         self.most, self.left = max(self.most, len(self.waiting)), self.left - 1

@@ -20,7 +20,7 @@ from range_server import range_server
 from measure import Status
 from measure.scans import remote
 from pipeline import InputError, read_comparator, read_project
-from pipeline.archive.scan_groups import GroupedScans, catalogue
+from pipeline.archive.scan_groups import Catalogue, catalogue
 from pipeline.cli import LOOK, WRONG_INPUT, run
 from pipeline.files.scan_files import find_scans, found_names
 from pipeline.measuring.scan_measurement import measured_scan
@@ -88,7 +88,7 @@ def test_a_link_that_leads_nowhere_is_a_scan_that_cannot_be_read(folder: Path) -
 
 def test_init_reads_each_folder_once(folder: Path) -> None:
     (folder / "scans" / "up").symlink_to("..")
-    files = catalogue([folder / "scans"], lambda *_: None).broken
+    files = catalogue([folder / "scans"], lambda *_: None).unread
     assert len(files) == 3  # empty files, which no scan is
 
 
@@ -280,7 +280,7 @@ def test_init_makes_a_project_of_a_bucket(
     store.put_object(Bucket="boxes", Key="1952/broken.tif", Body=b"no scan")
     store.put_object(Bucket="boxes", Key="1952/notes.txt", Body=b"by hand")
 
-    def unnamed(grouped: GroupedScans, *_: Any) -> GroupedScans:
+    def unnamed(grouped: Catalogue, *_: Any) -> Catalogue:
         return grouped
 
     monkeypatch.setattr("pipeline.archive.new_project.name_cameras", unnamed)
