@@ -118,7 +118,7 @@ def run_measure(project: Project, reporter: Reporter, work: WorkOptions | None =
 def run_merge(project: Project, stores: Sequence[Path], reporter: Reporter) -> tuple[list[Merged], Summary]:
     """Merge the stores of shards into that of the project; if they hold all its scans, run the cross-scan checks and
     write comparator.csv."""
-    with Store(project.measurement_path) as store, ThumbnailStore.open(store.path) as thumbnails:
+    with Store(project.measurement_path) as store, ThumbnailStore(store.path) as thumbnails:
         taken = merge(store, stores)
         thumbnails.take(stores)
     try:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from measure.flags import Code, Reason
 from measure.results import FrameMeasurement
@@ -19,11 +19,11 @@ from pipeline.archive.results_database import Store, places
 from pipeline.archive.results_integrity import (
     FRAMES_DIGEST,
     MARKS,
-    DamagedError,
     check_judging,
     check_judgings,
     checked_marks_digest,
     damaged_judging,
+    damaged_result,
     is_sound,
     row_digest,
 )
@@ -208,26 +208,11 @@ def latest(store: Store) -> Judging | None:
     return judging
 
 
-class CheckedFrame(NamedTuple):
-    """Frame of a judging as stored.
-
-    Attributes
-    ----------
-    measured, changed : JSON of the raw result, and of what the checks changed.
-    rows : marks after the checks.
-    is_sound : whether all of it matches its digests.
-    """
-
-    name: str
-    uri: str
-    measured: str
-    changed: str | None
-    rows: list[Sequence[Any]]
-    is_sound: bool
-
-
-def _frames(store: Store, judging: Judging, images: Collection[str] | None) -> Iterator[CheckedFrame]:
-    """Yield frames sorted by name. images: only these; None for all, after a check that none is missing."""
+def _frames(
+    store: Store, judging: Judging, images: Collection[str] | None
+) -> Iterator[tuple[str, tuple[str, str, str | None], list[Sequence[Any]] | None]]:
+    """Yield name, (uri, JSON of the raw result and of what the checks changed) and marks after the checks, which are
+    None where anything is damaged. images: only these; None for all, after a check that none is missing."""
     db = store.connection
     if images is None:
         check_judging(db, judging.row, store.path)
@@ -241,9 +226,9 @@ def _frames(store: Store, judging: Judging, images: Collection[str] | None) -> I
     marks = f"select number, {MARKS} from checked_mark where judging = ? and scan = ? order by number"
     for (scan,) in found:
         rows = db.execute(marks, (judging.row, scan)).fetchall()
-        name, uri, measured, changed, digest, is_whole = db.execute(frame, (judging.row, scan)).fetchone()
-        is_whole = bool(is_whole) and row_digest(*rows) == digest
-        yield CheckedFrame(name, uri, measured, changed, [row[1:] for row in rows], is_whole)
+        name, *result, digest, is_whole = db.execute(frame, (judging.row, scan)).fetchone()
+        is_whole = is_whole and row_digest(*rows) == digest
+        yield name, tuple(result), [row[1:] for row in rows] if is_whole else None
 
 
 def checked_scans(
@@ -261,15 +246,15 @@ def checked_scans(
     DamagedError
         The list of frames is damaged.
     """
-    for one in _frames(store, judging, images):
+    for name, (uri, measured, changed), rows in _frames(store, judging, images):
         try:
-            if not one.is_sound:
+            if rows is None:
                 raise ValueError
-            detail = json.loads(one.measured) | json.loads(one.changed or "{}")
-            yield read_scan(one.name, detail, list(map(read_mark_row, one.rows)), scan_location(one.uri, folder))
+            detail = json.loads(measured) | json.loads(changed or "{}")
+            yield read_scan(name, detail, list(map(read_mark_row, rows)), scan_location(uri, folder))
         except (ValueError, TypeError, KeyError):
-            sentence = str(DamagedError.from_image(one.name, store.path))
-            frame = FrameMeasurement(one.name, (), problems=(Reason(sentence, Code.FAILED_SCAN),))
+            sentence = str(damaged_result(name, store.path))
+            frame = FrameMeasurement(name, (), problems=(Reason(sentence, Code.FAILED_SCAN),))
             yield MeasuredScan.failed("", frame, Failure(FailureCode.DAMAGED, sentence))
 
 
@@ -292,12 +277,12 @@ def checked_marks(store: Store, judging: Judging, images: Collection[str] | None
 
     images: only these; None for all. Raises DamagedError where a frame is damaged.
     """
-    for one in _frames(store, judging, images):
-        if not one.is_sound:
-            raise DamagedError.from_image(one.name, store.path)
-        for point, kind, col, row, *spread, causes, status, _, reason, _ in one.rows:
+    for name, _, rows in _frames(store, judging, images):
+        if rows is None:
+            raise damaged_result(name, store.path)
+        for point, kind, col, row, *spread, causes, status, _, reason, _ in rows:
             center = None if col is None else (col, row)
-            yield MarkRow(one.name, point, kind, center, _covariance(spread, causes), status, reason)
+            yield MarkRow(name, point, kind, center, _covariance(spread, causes), status, reason)
 
 
 def _covariance(spread: Sequence[float | None], causes: str | None) -> tuple[float, float, float] | None:

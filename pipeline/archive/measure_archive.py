@@ -134,7 +134,7 @@ def measure_archive(
         No scan could be measured; single failures are results.
     """
     names = check_measurable(project)
-    with open_executor(project, options) as executor, ThumbnailStore.open(store.path) as thumbnails:
+    with open_executor(project, options) as executor, ThumbnailStore(store.path) as thumbnails:
         # After all checks that could prevent a new measurement.
         lost = store.forget_damaged() if options.retry or store.has_damaged_rows() else 0
         if lost:

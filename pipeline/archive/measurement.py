@@ -5,13 +5,9 @@ import math
 import os
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any, NamedTuple
 
 from pipeline.archive.checked_statuses import (
     Judging,
@@ -27,19 +23,8 @@ from pipeline.archive.verdicts import Verdict
 from pipeline.errors import InputError
 from pipeline.results.comparator_file import CameraPerson, ComparatorPoint, comparator_points, read_measurement_hash
 from pipeline.results.measured_record import MeasuredScan
-from pipeline.types import Array
 
 _PLACE = "project folder"
-
-_AT_A_TIME = 50_000  # rows fetched at once
-
-
-def read_measurement(path: Path, digest: str = "") -> tuple[MeasuredScan, ...]:
-    """Scans of a store after the cross-scan checks, sorted by name. digest: of the judging; "" for the latest.
-
-    Raises InputError where there is no such store, or no judging in it.
-    """
-    return tuple(measured_scans(path, digest))
 
 
 def read_inputs(path: Path, digest: str) -> Mapping[str, str] | None:
@@ -101,6 +86,14 @@ def remember_place(store: Store, project_folder: Path) -> None:
         store.remember(_PLACE, {"path": relative})
 
 
+def read_measurement(path: Path, digest: str = "") -> tuple[MeasuredScan, ...]:
+    """Scans of a store after the cross-scan checks, sorted by name. digest: of the judging; "" for the latest.
+
+    Raises InputError where there is no such store, or no judging in it.
+    """
+    return tuple(measured_scans(path, digest))
+
+
 def measured_scans(path: Path, digest: str = "", images: Collection[str] | None = None) -> Iterator[MeasuredScan]:
     """Yield the scans of a store one by one; see `read_measurement`. images: only these; None for all."""
     if not path.exists():
@@ -115,28 +108,7 @@ def measured_scans(path: Path, digest: str = "", images: Collection[str] | None 
         yield from checked_scans(store, judging, folder, images)
 
 
-@dataclass(frozen=True, eq=False)
-class MarkColumns:
-    """Marks of frames by column.
-
-    Attributes
-    ----------
-    frame : (n,) index of the frame.
-    kind, status : (n,) indices into kinds and statuses.
-    center_px : (n, 2) column and row; NaN where there is none.
-    kinds, statuses : their names.
-    """
-
-    frame: NDArray[np.int64]
-    kind: NDArray[np.int64]
-    status: NDArray[np.int64]
-    center_px: Array
-    kinds: tuple[str, ...]
-    statuses: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class StoredFrame:
+class StoredFrame(NamedTuple):
     """Frame that needs no look: its name, its scan's file and the row of its result."""
 
     image: str
@@ -186,23 +158,12 @@ class StoredMarks:
             rows = store.connection.execute(_PLAIN, (self._judging.row, str(Verdict.GOOD)))
             return tuple(StoredFrame(*row) for row in rows)
 
-    def columns(self) -> MarkColumns:
-        """Marks of the plain frames."""
-        place = {frame.result: number for number, frame in enumerate(self.plain)}
-        kinds, statuses = dict[str, int](), dict[str, int]()
-        parts: list[Array] = [np.empty((0, 5))]
+    def plain_marks(self) -> Iterator[tuple[int, str, str, float | None, float | None]]:
+        """Row of the result, kind, status, column and row of each mark of the plain frames."""
+        plain = {frame.result for frame in self.plain}
         with Store(self._path) as store:
-            found = store.connection.execute(_MARKS, (self._judging.row, str(Verdict.GOOD)))
-            while rows := found.fetchmany(_AT_A_TIME):
-                numbers = [
-                    (place[result], kinds.setdefault(kind, len(kinds)), statuses.setdefault(status, len(statuses)), *px)
-                    for result, kind, status, *px in rows
-                    if result in place
-                ]
-                parts.append(np.array(numbers, dtype=np.float64).reshape(-1, 5))
-        every = np.concatenate(parts)
-        frame, kind, status = every[:, :3].T.astype(np.int64)
-        return MarkColumns(frame, kind, status, every[:, 3:5], tuple(kinds), tuple(statuses))
+            marks = store.connection.execute(_MARKS, (self._judging.row, str(Verdict.GOOD)))
+            yield from (mark for mark in marks if mark[0] in plain)
 
 
 _PLAIN = """

@@ -20,6 +20,7 @@ from pipeline.archive.results_integrity import (
     COLUMNS,
     MARKS,
     DamagedError,
+    damaged_result,
     is_result_sound,
     is_sound,
     measured_marks_digest,
@@ -161,7 +162,7 @@ class Store(Database):
             "select coalesce(name, uri) from scan where result = ?1 or id = (select scan from result where id = ?1)",
             (result,),
         ).fetchone()
-        return DamagedError.from_image(str(found[0]) if found else "(unknown)", self.path)
+        return damaged_result(str(found[0]) if found else "(unknown)", self.path)
 
     def has_damaged_rows(self) -> bool:
         """Whether a row of a scan, result, judging or value kept for other scans is damaged; marks are not checked."""

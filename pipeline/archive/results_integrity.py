@@ -114,14 +114,9 @@ def add_digests(db: sqlite3.Connection) -> None:
 class DamagedError(InputError):
     """Stored content does not match its digest."""
 
-    @classmethod
-    def from_image(cls, image: str, path: object) -> "DamagedError":
-        return cls(damaged_sentence(image, path))
 
-
-def damaged_sentence(image: str, path: object) -> str:
-    """Message about a scan whose stored result is damaged."""
-    return (
+def damaged_result(image: str, path: object) -> DamagedError:
+    return DamagedError(
         f"{path}: what is stored of image {image!r} is not what was measured: the file was changed or is damaged. "
         "This result is not used. Run `reseau measure --retry`, which measures the image again."
     )

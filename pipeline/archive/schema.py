@@ -175,10 +175,13 @@ class Schema:
     what: str
 
 
+MEASUREMENTS = Schema(APPLICATION, MIGRATIONS, "measurements")
+
+
 class Database:
     """Open SQLite file of a project; closed at the end of the `with` block."""
 
-    schema: Schema | None = None  # None: that of measurements
+    schema = MEASUREMENTS
 
     def __init__(self, path: Path) -> None:
         """Open or create a file. Raises InputError for a file that is no such database."""
@@ -193,7 +196,7 @@ class Database:
         cause one."""
         self.close()
         if isinstance(error, STORE_ERRORS):
-            raise store_error(self.path, (self.schema or _measurements()).what, error) from error
+            raise store_error(self.path, self.schema, error) from error
 
     def close(self) -> None:
         self.connection.close()
@@ -211,12 +214,11 @@ class Database:
             raise
 
 
-def opened(path: Path, schema: Schema | None = None) -> sqlite3.Connection:
+def opened(path: Path, schema: Schema = MEASUREMENTS) -> sqlite3.Connection:
     """Open a file and migrate it to this version; create it where there is none.
 
-    schema: None for that of measurements. Raises InputError for a file of another kind or of a later version.
+    Raises InputError for a file of another kind or of a later version.
     """
-    schema = schema or _measurements()
     path.parent.mkdir(parents=True, exist_ok=True)
     connection = _connection(path)
     try:
@@ -230,11 +232,10 @@ def opened(path: Path, schema: Schema | None = None) -> sqlite3.Connection:
         if schema.application == APPLICATION:
             add_triggers(connection)
             connection.execute(_CHECKED_FRAMES)
-    except STORE_ERRORS as error:
+    except BaseException as error:
         connection.close()
-        raise store_error(path, schema.what, error) from error
-    except BaseException:
-        connection.close()
+        if isinstance(error, STORE_ERRORS):
+            raise store_error(path, schema, error) from error
         raise
     return connection
 
@@ -290,14 +291,10 @@ def forget(connection: sqlite3.Connection, results: Collection[int], scans: Coll
     return len(lost)
 
 
-def _measurements() -> Schema:
-    return Schema(APPLICATION, MIGRATIONS, "measurements")
-
-
-def store_error(path: Path, what: str, error: Exception) -> InputError:
+def store_error(path: Path, schema: Schema, error: Exception) -> InputError:
     """Error for a file that cannot be read or written as a store."""
     next_step = what_to_do_about_store(error) or _MOVE
-    return InputError(f"{path}: cannot be used as a database of {what} ({error}). {next_step}")
+    return InputError(f"{path}: cannot be used as a database of {schema.what} ({error}). {next_step}")
 
 
 _MOVE = "Move it away, and run `reseau measure` again."

@@ -31,7 +31,6 @@ create table thumbnail (
 );
 """
 _DIGESTS = "alter table thumbnail add column digest text"  # BLAKE2b of the thumbnail and its location; null: unknown
-_SCHEMA = Schema(0x52455354, (_FIRST, _DIGESTS), "thumbnails")  # "REST"
 _DIGEST = "row_digest(point, kind, col_px, row_px, step_px, jpeg)"
 _COLUMNS = "point, kind, col_px, row_px, step_px, jpeg"
 _OFF_MIDDLE = 0.25  # fraction of a thumbnail's width: a mark farther off its middle was measured again since
@@ -40,12 +39,11 @@ _OFF_MIDDLE = 0.25  # fraction of a thumbnail's width: a mark farther off its mi
 class ThumbnailStore(Database):
     """Open store of thumbnails beside a results database; closed at the end of the `with` block."""
 
-    schema = _SCHEMA
+    schema = Schema(0x52455354, (_FIRST, _DIGESTS), "thumbnails")  # "REST"
 
-    @classmethod
-    def open(cls, measurement: Path) -> "ThumbnailStore":
+    def __init__(self, measurement: Path) -> None:
         """Open the thumbnails of a results database."""
-        return cls(thumbnails_path(measurement))
+        super().__init__(thumbnails_path(measurement))
 
     def keep(self, fingerprint: str, thumbnails: Sequence[StoredThumbnail]) -> None:
         """Store the thumbnails of one result, all or none."""
@@ -80,14 +78,15 @@ class ThumbnailStore(Database):
 
     def take(self, measurements: Sequence[Path]) -> None:
         """Import the thumbnails of other results databases that have some."""
-        for path in filter(Path.is_file, map(thumbnails_path, measurements)):
-            ThumbnailStore(path).close()
-            self.connection.execute("attach ? as other", (str(path),))
-            columns = f"fingerprint, {_COLUMNS}, digest"
-            self.connection.execute(
-                f"insert or ignore into thumbnail ({columns}) select {columns} from other.thumbnail"
-            )
-            self.connection.execute("detach other")
+        columns = f"fingerprint, {_COLUMNS}, digest"
+        for measurement in measurements:
+            if (path := thumbnails_path(measurement)).is_file():
+                ThumbnailStore(measurement).close()
+                self.connection.execute("attach ? as other", (str(path),))
+                self.connection.execute(
+                    f"insert or ignore into thumbnail ({columns}) select {columns} from other.thumbnail"
+                )
+                self.connection.execute("detach other")
 
 
 def thumbnails_path(measurement: Path) -> Path:
@@ -115,11 +114,10 @@ class Thumbnails:
             (s.frame.image, mark.point, mark.kind == "fiducial"): mark for s in scans for mark in s.frame.marks
         }
         self._fingerprints = fingerprints or {}
-        is_kept = measurement is not None and thumbnails_path(measurement).exists()
         self._kept: ThumbnailStore | None = None
-        if is_kept and measurement is not None:
+        if measurement is not None and thumbnails_path(measurement).exists():
             with suppress(InputError):  # a damaged file: thumbnails are cut from the scans instead
-                self._kept = ThumbnailStore.open(measurement)
+                self._kept = ThumbnailStore(measurement)
         self._open: tuple[Path, Scan] | None = None
 
     def __enter__(self) -> Self:

@@ -10,7 +10,7 @@ from operator import itemgetter
 import numpy as np
 
 from measure.flags import Status
-from pipeline.archive.measurement import MarkColumns, StoredFrame, StoredMarks
+from pipeline.archive.measurement import StoredMarks
 from pipeline.archive.verdicts import Verdict, frame_verdict, has_problem, scan_counts
 from pipeline.report.data import Frame, FrameTotals, Problem, ReportData, frames
 from pipeline.report.frame_problems import (
@@ -31,6 +31,7 @@ MOST_FRAMES = 200  # largest number of frames shown with their marks
 _MOST_PROBLEMS = 50  # largest number of different problems listed
 _ROWS = 200  # largest number of rows (camera and kind of file)
 _BEST_FIRST = (Verdict.GOOD, Verdict.DECIDED, Verdict.LOOK, Verdict.POOR, Verdict.FAILED)
+_OBSERVED = {str(status) for status in Status if status.is_observation}
 
 
 @dataclass
@@ -51,23 +52,20 @@ class _Totals:
         for center in centers_px(frame):
             self.centers_px.extend(center.tolist())
 
-    def add_plain(self, plain: Sequence[StoredFrame], columns: MarkColumns, camera_of: Callable[[str], str]) -> None:
-        """Add frames without problems from stored columns."""
-        for frame in plain:
+    def add_plain(self, stored: StoredMarks, camera_of: Callable[[str], str]) -> None:
+        """Add the stored frames without problems."""
+        counts = {frame.result: Counter[str]() for frame in stored.plain}
+        for result, kind, status, col_px, row_px in stored.plain_marks():
+            counts[result][status] += 1
+            if kind != "fiducial":
+                self.of_targets[kind, status] += 1
+            if status in _OBSERVED and col_px is not None and row_px is not None:
+                self.centers_px.extend((col_px, row_px))
+        alike = dict[frozenset[tuple[str, int]], Counter[str]]()  # one object for all frames with equal counts
+        for frame in stored.plain:
             self.verdicts[camera_of(frame.image), _ending(frame.scan)][Verdict.GOOD] += 1
-        counts = np.zeros((len(plain), len(columns.statuses)), dtype=np.int64)
-        np.add.at(counts, (columns.frame, columns.status), 1)
-        rows = list(map(tuple, counts.tolist()))
-        alike = {row: Counter(dict(zip(columns.statuses, row, strict=True))) for row in set(rows)}
-        self.marks |= {frame.image: alike[row] for frame, row in zip(plain, rows, strict=True)}
-        for kind, name in enumerate(columns.kinds):
-            for status, word in enumerate(columns.statuses):
-                if name != "fiducial":
-                    here = (columns.kind == kind) & (columns.status == status)
-                    self.of_targets[name, word] += int(here.sum())
-        used = np.array([Status(word).is_observation for word in columns.statuses], dtype=bool)[columns.status]
-        is_known = np.isfinite(columns.center_px).all(axis=1)
-        self.centers_px.frombytes(columns.center_px[used & is_known].tobytes())
+            count = counts[frame.result]
+            self.marks[frame.image] = alike.setdefault(frozenset(count.items()), count)
 
     def result(self) -> FrameTotals:
         return FrameTotals(
@@ -95,7 +93,7 @@ def reduced(
     """
     totals = _Totals()
     if stored is not None:
-        totals.add_plain(stored.plain, stored.columns(), camera_of)
+        totals.add_plain(stored, camera_of)
     suspect = {row.image for row in suspect_rows(data.adjustment)} if data.adjustment else set[str]()
 
     def frames_to_show() -> Iterator[tuple[tuple[float, float], ReportData]]:
@@ -165,54 +163,30 @@ def _listed(problems: Gathered) -> Iterator[Problem]:
         yield Problem(f"{counted(rest, 'more problem')} of frames, all different.", "`reseau status --csv` has them.")
 
 
-@dataclass(frozen=True)
-class TotalsView:
-    """Numbers of frames by verdict.
-
-    Attributes
-    ----------
-    sentence : summary of all frames.
-    shown : number of frames that the report shows, None if all.
-    verdicts : those that occur.
-    rows : camera, kind of file, and the number for each verdict.
-    left_out : number of further rows.
-    all : number of frames for each verdict.
-    """
-
-    sentence: str
-    shown: int | None
-    verdicts: tuple[str, ...]
-    rows: tuple[tuple[str, str, tuple[int, ...]], ...]
-    left_out: int
-    all: tuple[int, ...]
-
-
-def totals_view(data: ReportData, shots: Sequence[Frame]) -> TotalsView | None:
-    """Totals, if the report does not show all frames or only fiducials were adjusted; else None."""
+def totals_view(data: ReportData, shots: Sequence[Frame]) -> Mapping[str, object] | None:
+    """Totals for the template, if the report does not show all frames or only fiducials were adjusted; else None."""
     if data.totals is None and not data.is_film_alone:
         return None
-    counts, total = _verdicts(data, shots), frame_counts(data, shots)
-    verdicts = tuple(each for each in _BEST_FIRST if total[each])
-    rows = tuple((*kind, tuple(row.get(each, 0) for each in verdicts)) for kind, row in sorted(counts.items()))
-    return TotalsView(
-        sentence=f"{scan_counts(total)}.",
-        shown=len({*(data.measurement or {}), *(row.image for row in data.comparator)}) if data.totals else None,
-        verdicts=tuple(map(str, verdicts)),
-        rows=rows[:_ROWS],
-        left_out=max(len(rows) - _ROWS, 0),
-        all=tuple(total[each] for each in verdicts),
-    )
+    counts, total = verdict_counts(data, shots), frame_counts(data, shots)
+    return {
+        "sentence": f"{scan_counts(total)}.",
+        "shown": len({*(data.measurement or {}), *(row.image for row in data.comparator)}) if data.totals else None,
+        "verdicts": [each for each in _BEST_FIRST if total[each]],
+        "rows": sorted(counts.items())[:_ROWS],
+        "left_out": max(len(counts) - _ROWS, 0),
+        "all": total,
+    }
 
 
 def frame_counts(data: ReportData, shots: Sequence[Frame]) -> Counter[Verdict]:
     """Numbers of all frames by verdict, for the report and the terminal. shots: the frames shown."""
     total = Counter[Verdict]()
-    for row in _verdicts(data, shots).values():
+    for row in verdict_counts(data, shots).values():
         total.update({Verdict(verdict): count for verdict, count in row.items()})
     return total
 
 
-def _verdicts(data: ReportData, shots: Sequence[Frame]) -> Mapping[tuple[str, str], Mapping[str, int]]:
+def verdict_counts(data: ReportData, shots: Sequence[Frame]) -> Mapping[tuple[str, str], Mapping[str, int]]:
     """Numbers of frames by (camera, kind of file) and verdict."""
     if data.totals is not None:
         return data.totals.verdicts

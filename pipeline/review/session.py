@@ -19,7 +19,7 @@ from typing import Any
 from measure.flags import Code, Status
 from measure.scans.remote import fetch_location
 from pipeline.archive.results_database import Store
-from pipeline.archive.results_integrity import check_judging, damaged_frames, damaged_sentence
+from pipeline.archive.results_integrity import check_judging, damaged_frames, damaged_result
 from pipeline.archive.verdicts import Verdict
 from pipeline.errors import InputError
 from pipeline.files.decisions_file import (
@@ -106,15 +106,8 @@ def build_queue(project: Project, db: sqlite3.Connection | None, judging: int) -
     frames = {frame.result: frame for frame in _frames(db, judging) if frame.result not in damaged} if db else {}
     marks = sorted(_marks(db, judging, frames), key=_badness) if db else []
     bare = [
-        Entry(
-            Question.FRAME,
-            (image,),
-            ("",),
-            "",
-            str(Verdict.FAILED),
-            0,
-            damaged_sentence(image, project.measurement_path.name),
-        )
+        Entry(Question.FRAME, (image,), ("",), "", str(Verdict.FAILED), 0, str(damaged_result(image, name)))
+        for name in [project.measurement_path.name]
         for image in sorted(damaged.values())
     ]
     bare += [

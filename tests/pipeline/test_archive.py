@@ -24,7 +24,7 @@ from measure import MarkShape, Pose, polygon
 from pipeline import read_project
 from pipeline.archive.measurement import picture_sizes_mm
 from pipeline.archive.results_integrity import add_digests
-from pipeline.archive.schema import Schema, opened
+from pipeline.archive.schema import MEASUREMENTS, Schema, opened
 from pipeline.archive.status import archive_status
 from pipeline.archive.verdicts import NEXT_STEP, Verdict
 from pipeline.cli import run
@@ -286,7 +286,7 @@ def test_a_full_disk_is_reported_and_costs_nothing_that_was_measured(
     before = marks(folder)
     one_more(folder)
 
-    def full(path: Path, schema: Schema | None = None) -> sqlite3.Connection:
+    def full(path: Path, schema: Schema = MEASUREMENTS) -> sqlite3.Connection:
         store = opened(path, schema)
         store.execute("pragma max_page_count = 1")  # no page more than there are
         return store

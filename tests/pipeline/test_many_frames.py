@@ -306,7 +306,7 @@ def grey(pixels: np.ndarray) -> np.ndarray:
 def test_every_mark_has_the_picture_that_its_scan_shows(folder: Path) -> None:
     found = keys(folder)
     assert set(found) == {"a", "b", "c"}
-    with ThumbnailStore.open(folder / "out" / "measurement.db") as store:
+    with ThumbnailStore(folder / "out" / "measurement.db") as store:
         for scan in read_measurement(folder / "out" / "measurement.db"):
             with open_scan(scan.scan) as opened:
                 for mark in scan.frame.marks:
@@ -323,7 +323,7 @@ def test_every_mark_has_the_picture_that_its_scan_shows(folder: Path) -> None:
 
 
 def test_the_whole_scan_is_kept_where_measuring_saw_it(folder: Path) -> None:
-    with ThumbnailStore.open(folder / "out" / "measurement.db") as store:
+    with ThumbnailStore(folder / "out" / "measurement.db") as store:
         stored = store.get(keys(folder)["a"])
     assert stored is not None
     assert stored.is_whole
@@ -375,7 +375,7 @@ def test_pictures_follow_results_that_are_moved_or_merged(folder: Path) -> None:
     with Store(folder / "out" / "measurement.db") as store:
         now = set(store.fingerprints()) - set(before.values())
     assert len(now) == 1
-    with ThumbnailStore.open(folder / "out" / "measurement.db") as thumbnails:
+    with ThumbnailStore(folder / "out" / "measurement.db") as thumbnails:
         assert thumbnails.get(now.pop(), "1", "fiducial") is not None
         assert thumbnails.get(before["a"], "1", "fiducial") is None
 
@@ -389,7 +389,7 @@ def test_stores_of_shards_bring_their_pictures(measured_folder: Path, tmp_path: 
         run(["measure", project, "--shard", f"{k}/5", "--workers", "1"])
     run(["merge", project, *(str(parts / "out" / f"measurement.{k}-of-5.db") for k in (1, 2))])
     assert thumbnails_path(parts / "out" / "measurement.1-of-5.db").exists()
-    with ThumbnailStore.open(parts / "out" / "measurement.db") as thumbnails:
+    with ThumbnailStore(parts / "out" / "measurement.db") as thumbnails:
         assert all(thumbnails.get(key, "1", "fiducial") for key in keys(parts).values())
     assert len(keys(parts)) == 3
 

@@ -31,7 +31,7 @@ from pipeline.archive.checked_statuses import (
     latest,
 )
 from pipeline.archive.results_database import Store, merge
-from pipeline.archive.schema import MIGRATIONS, VERSION, opened
+from pipeline.archive.schema import MEASUREMENTS, MIGRATIONS, VERSION, opened
 from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_verdict
 from pipeline.provenance import content_hash, file_state, options_hash, parts_hash, result_key, shard_number
 from pipeline.results.comparator_file import mark_rows
@@ -225,10 +225,11 @@ def test_a_step_to_a_later_version_is_made_whole_or_not_at_all(path: Path, monke
     with Store(path) as store:
         row = store.keep(kept_result(1), "1")
     step = "alter table scan add column box text; update scan set box = 'a'"
-    monkeypatch.setattr("pipeline.archive.schema.MIGRATIONS", (*MIGRATIONS, f"{step}; insert into nowhere values (1)"))
+    broken = f"{step}; insert into nowhere values (1)"
+    monkeypatch.setattr(Store, "schema", replace(MEASUREMENTS, migrations=(*MIGRATIONS, broken)))
     with pytest.raises(InputError, match="nowhere"):
         Store(path)
-    monkeypatch.setattr("pipeline.archive.schema.MIGRATIONS", (*MIGRATIONS, step))
+    monkeypatch.setattr(Store, "schema", replace(MEASUREMENTS, migrations=(*MIGRATIONS, step)))
     with Store(path) as store:
         assert store.connection.execute("select name, box from scan").fetchall() == [("1", "a")]
         assert store.connection.execute("pragma user_version").fetchone() == (VERSION + 1,)
