@@ -94,7 +94,7 @@ def _frames(project: Project, store: Store, home: Path) -> Iterator[CheckedResul
         scan = stand_in(task).scan
         scan, path = _lose_marks(scan) if number % _LOSES == 1 else scan, Path(task.scan)
         identity = Identity(file_state(path, home), parts_hash(path))
-        yield CheckedResult(store.keep(Kept(identity, "{}", scan), task.name, current=True), scan)
+        yield CheckedResult(store.keep(Kept(identity, "{}", scan), task.name), scan)
 
 
 def _lose_marks(scan: MeasuredScan) -> MeasuredScan:

@@ -5,6 +5,7 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence, Set
+from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,7 +30,7 @@ _PIECE_BYTES = 1 << 20
 
 def fingerprint(value: object) -> str:
     """SHA-256 of a value made of dataclasses, mappings, sequences, arrays, numbers and text."""
-    return hash_content(canonical_json(value).encode("utf-8", "surrogateescape"))
+    return hash_text(canonical_json(value))
 
 
 def canonical_json(value: object) -> str:
@@ -43,8 +44,13 @@ def canonical_json(value: object) -> str:
 
 
 def hash_content(data: bytes) -> str:
-    """SHA-256 of a file's content."""
+    """SHA-256 (hexadecimal) of a file's content."""
     return hashlib.sha256(data).hexdigest()
+
+
+def hash_text(text: str) -> str:
+    """SHA-256 (hexadecimal) of a text, such as a task's options."""
+    return hash_content(text.encode("utf-8", "surrogateescape"))
 
 
 def hash_file(path: Path) -> str:
@@ -133,31 +139,24 @@ class FileStates:
 
     def get(self, path: str | Path) -> FileState:
         """State of a file or an object; one that does not respond counts as missing."""
+        uri = str(path) if isinstance(path, Address) else self._relative(str(path))
         try:
             if isinstance(path, Address):
-                stat = path.stat()
-                return FileState(str(path), stat.st_size, etag=path.etag)
+                return FileState(uri, path.stat().st_size, etag=path.etag)
             stat = os.stat(whole_file(str(path)))
         except (OSError, MissingError, UnreachableError):
-            return FileState(self.uri(path), -1)
-        return FileState(self.uri(path), stat.st_size, stat.st_mtime_ns)
+            return FileState(uri, -1)
+        return FileState(uri, stat.st_size, stat.st_mtime_ns)
 
-    def uri(self, path: str | Path) -> str:
-        """Path relative to the project's folder if possible, with `/`; addresses are unchanged."""
-        if isinstance(path, Address):
-            return str(path)
-        parent, sign, name = str(path).rpartition(os.sep)
-        below = self._below.get(parent)
-        if below is None:
-            below = self._below[parent] = self._before_names(os.path.abspath(parent + sign))
-        return below + name
-
-    def _before_names(self, parent: str) -> str:
-        try:
-            relative = os.path.relpath(parent, self._folder)
-        except ValueError:  # on another drive
-            relative = parent
-        return "" if relative == os.curdir else f"{Path(relative).as_posix().removesuffix('/')}/"
+    def _relative(self, path: str) -> str:
+        """Path relative to the project's folder if possible, with `/`."""
+        parent, sign, name = path.rpartition(os.sep)
+        if parent not in self._below:
+            folder = os.path.abspath(parent + sign)
+            with suppress(ValueError):  # on another drive
+                folder = os.path.relpath(folder, self._folder)
+            self._below[parent] = "" if folder == os.curdir else f"{Path(folder).as_posix().removesuffix('/')}/"
+        return self._below[parent] + name
 
 
 def file_state(path: Path, folder: Path) -> FileState:
@@ -208,17 +207,12 @@ def content_hash(path: Path) -> str:
 
 def _tables(path: Path) -> bytes:
     """Offsets and byte counts of the tiles or strips of all pages of a TIFF file; empty for other files."""
-    if not _is_tiff(path):
-        return b""
+    with path.open("rb") as start:
+        if start.read(2) not in (b"II", b"MM"):
+            return b""
     with tiff_file(path) as file:
         pages = [page.aspage() for page in file.pages]
-        tables = [np.array([*page.dataoffsets, *page.databytecounts], dtype="<u8") for page in pages]
-    return b"".join(table.tobytes() for table in tables)
-
-
-def _is_tiff(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(2) in (b"II", b"MM")
+        return b"".join(np.array([*page.dataoffsets, *page.databytecounts], "<u8").tobytes() for page in pages)
 
 
 def _middle(scan: Scan) -> bytes:
@@ -229,14 +223,7 @@ def _middle(scan: Scan) -> bytes:
 def result_key(identity: Identity, options_hash: str, revision: int = MEASURE_REVISION) -> str:
     """SHA-256 (hexadecimal) of a scan's identity, the hash of its options, and the revision of `measure`. It is the
     same on every machine, so results can be merged."""
-    state = identity.state
-    values = [state.uri, state.bytes, state.mtime_ns, state.etag, identity.parts_hash, options_hash, revision]
-    return hashlib.sha256(json.dumps(values).encode()).hexdigest()
-
-
-def options_hash(options_json: str) -> str:
-    """SHA-256 (hexadecimal) of a task's options."""
-    return hashlib.sha256(options_json.encode("utf-8", "surrogateescape")).hexdigest()
+    return hash_text(json.dumps([*identity.state, identity.parts_hash, options_hash, revision]))
 
 
 def shard_number(name: str, shards: int) -> int:

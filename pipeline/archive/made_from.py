@@ -1,14 +1,13 @@
 """Provenance of results: fingerprints of their inputs by name, which a later stage compares with the present inputs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from pipeline.archive.results_database import known_identities
-from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
-from pipeline.provenance import FileStates, Identity, fingerprint, hash_content, parts_hash
+from pipeline.provenance import FileStates, Identity, fingerprint, hash_text, parts_hash
 from pipeline.results.comparator_file import ComparatorPoint
 
 MadeFrom = dict[str, str]
@@ -21,18 +20,9 @@ PLACES = "points, orientations or lenses"
 
 # Fields of a project that are not settings; all others, including future ones, are.
 _FILES = {
-    "path",
-    "cameras",
-    "scans",
-    "comparator",
-    "output",
-    "given_points",
-    "given_images",
-    "given_distances",
-    "images_path",
-    "decisions",
-    "decisions_cut_short",
-}
+    "path", "cameras", "scans", "comparator", "output", "given_points", "given_images", "given_distances",
+    "images_path", "decisions", "decisions_cut_short",
+}  # fmt: skip
 _NO_MATTER = {"max_pixels", "crs"}
 # Fields of a camera that determine where its targets are expected, not what its marks look like.
 _LENS = {
@@ -51,21 +41,23 @@ def measured_from(project: Project) -> MadeFrom:
         coordinates,
         project.given_points and project.given_points.normals,
         project.given_images and project.given_images.exterior,
-        {camera.name: {name: _field_values(camera)[name] for name in _LENS} for camera in project.cameras.values()},
+        {camera.name: {name: getattr(camera, name) for name in _LENS} for camera in project.cameras.values()},
         project.film,
         *([project.given_images.part_of] if project.given_images and project.has_parts else []),
     ]
-
-    def scan_hash(image: str, path: Path) -> str:
-        text = f"{_parts(path, project, known, files)} {project.image_camera(image).name}"
-        return hash_content(text.encode("utf-8", "surrogateescape"))
 
     return {
         SETTINGS: fingerprint({name: value for name, value in _settings(project).items() if name != "adjust"}),
         PLACES: fingerprint(places),
         **({DECISIONS: project.decisions_hash} if project.decisions else {}),
-        **{f"{CAMERA}{camera.name}": fingerprint(_sought(camera)) for camera in project.cameras.values()},
-        **{f"{SCAN}{image}": scan_hash(image, path) for image, path in project.scans.items()},
+        **{
+            f"{CAMERA}{camera.name}": fingerprint(_fields_except(camera, _LENS | _ORIGIN))
+            for camera in project.cameras.values()
+        },
+        **{
+            f"{SCAN}{image}": hash_text(f"{_parts(path, project, known, files)} {project.image_camera(image).name}")
+            for image, path in project.scans.items()
+        },
     }
 
 
@@ -90,7 +82,7 @@ def _parts(path: Path, project: Project, known: Mapping[str, Identity], files: F
     state = files.get(path)
     found = known.get(state.uri)
     is_known = found is not None and found.state == state
-    return state.bytes, found.parts_hash if found is not None and is_known else parts_hash(path, project.max_pixels)
+    return state.bytes, found.parts_hash if found and is_known else parts_hash(path, project.max_pixels)
 
 
 def differing(made: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
@@ -104,12 +96,8 @@ def _numbers(mark: ComparatorPoint) -> tuple[Any, ...]:
 
 
 def _settings(project: Project) -> dict[str, object]:
-    return {name: value for name, value in _field_values(project).items() if name not in _FILES | _NO_MATTER}
+    return _fields_except(project, _FILES | _NO_MATTER)
 
 
-def _sought(camera: CameraFile) -> dict[str, object]:
-    return {name: value for name, value in _field_values(camera).items() if name not in _LENS | _ORIGIN}
-
-
-def _field_values(value: Any) -> dict[str, object]:
-    return {field.name: getattr(value, field.name) for field in fields(value)}
+def _fields_except(value: Any, names: Set[str]) -> dict[str, object]:
+    return {field.name: getattr(value, field.name) for field in fields(value) if field.name not in names}

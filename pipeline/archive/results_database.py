@@ -29,7 +29,7 @@ from pipeline.archive.results_integrity import (
 from pipeline.archive.schema import Database, forget
 from pipeline.archive.verdicts import Verdict, scan_verdict
 from pipeline.errors import InputError
-from pipeline.provenance import FileState, Identity, options_hash, result_key
+from pipeline.provenance import FileState, Identity, hash_text, result_key
 from pipeline.results.measured_record import (
     MeasuredScan,
     finite_or_none,
@@ -68,7 +68,7 @@ class Kept:
 
     @property
     def fingerprint(self) -> str:
-        return result_key(self.identity, options_hash(self.options_json))
+        return result_key(self.identity, hash_text(self.options_json))
 
 
 class Store(Database):
@@ -110,20 +110,19 @@ class Store(Database):
 
     # --- results
 
-    def keep(self, kept: Kept, name: str | None = None, current: bool = False, asked: str | None = None) -> int:
+    def keep(self, kept: Kept, name: str | None = None, asked: str | None = None) -> int:
         """Store a result, completely or not at all, and return its row.
 
         Parameters
         ----------
-        name : image of the project; None if the scan is not one of it.
-        current : whether it is the scan's own result by its present file and options, not an auxiliary one for other
-            scans.
+        name : image of the project whose own result this is, by its present file and options; None for an auxiliary
+            result for other scans.
         asked : hash of the request.
         """
         with self.writing():
             scan = self._scan(kept, name)
             result = self._result(kept, scan)
-            if current:
+            if name is not None:
                 values = (result, asked, scan)
                 self.connection.execute("update scan set result = ?, is_current = 1, asked = ? where id = ?", values)
             return result
@@ -323,7 +322,7 @@ class Store(Database):
         return result
 
     def _options(self, options_json: str) -> int:
-        hashed = options_hash(options_json)
+        hashed = hash_text(options_json)
         self.connection.execute("insert or ignore into options (hash, json) values (?, ?)", (hashed, options_json))
         return int(self.connection.execute("select id from options where hash = ?", (hashed,)).fetchone()[0])
 

@@ -4,7 +4,7 @@ effect."""
 import json
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +18,7 @@ from pipeline.archive.results_integrity import row_digest
 from pipeline.files.decisions_file import LEARNED, About, Choice, Decision, push_decision, standing
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_task import ScanTask, image_options
-from pipeline.provenance import fingerprint, options_hash
+from pipeline.provenance import fingerprint, hash_text
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.wording import did_you_mean
 
@@ -46,26 +46,16 @@ def request_hasher(project: Project) -> Callable[[str], str]:
     def request_hash(image: str) -> str:
         own = options(image)
         if id(own) not in hashes:
-            hashes[id(own)] = options_hash(f"{own.json} {MEASURE_REVISION}")
+            hashes[id(own)] = hash_text(f"{own.json} {MEASURE_REVISION}")
         own_decisions = decisions_of.get(image)
         return fingerprint([hashes[id(own)], own_decisions]) if own_decisions else hashes[id(own)]
 
     return request_hash
 
 
-# Review decisions as input of the measurement: which ones apply to a scan, and what they change.
-#
 # A decision applies to the result that was reviewed, which its fingerprint identifies: after a change of the scan's
 # file, the options or the revision of measuring, the scan has to be reviewed again. Places and poses change the
 # measurement; results that follow from earlier decisions still belong to the same scan.
-
-
-@dataclass(frozen=True)
-class ReviewedTask:
-    """Task of a scan after decisions, and the decisions that apply, by subject."""
-
-    task: ScanTask
-    counting: Mapping[About, Decision]
 
 
 def group_decisions(decisions: Sequence[Decision]) -> Mapping[str, Sequence[Decision]]:
@@ -88,8 +78,10 @@ def decisions_hash(decisions: Sequence[Decision]) -> str:
     return row_digest(*values)
 
 
-def apply_decisions(task: ScanTask, decisions: Sequence[Decision], key_of: KeyOf, pose_of: PoseOf) -> ReviewedTask:
-    """Apply decisions to the task of their scan.
+def apply_decisions(
+    task: ScanTask, decisions: Sequence[Decision], key_of: KeyOf, pose_of: PoseOf
+) -> tuple[ScanTask, Mapping[About, Decision]]:
+    """Apply decisions to the task of their scan; return it, and the decisions that apply, by subject.
 
     Parameters
     ----------
@@ -98,8 +90,6 @@ def apply_decisions(task: ScanTask, decisions: Sequence[Decision], key_of: KeyOf
     key_of : fingerprint of a task's result.
     pose_of : from the fingerprint of a result, the pose under which its marks are named; None where it is unknown.
     """
-    if not decisions:
-        return ReviewedTask(task, {})
     counted, now, key = list[Decision](), task, key_of(task)
     current_keys = {key}  # of the results that a decision may refer to
     ever = set(current_keys)
@@ -112,7 +102,7 @@ def apply_decisions(task: ScanTask, decisions: Sequence[Decision], key_of: KeyOf
         key = key_of(now)
         current_keys = current_keys | {key} if _names_alike(before, now, pose_of(old_key)) else {key}
         ever |= current_keys
-    return ReviewedTask(now, standing(counted))
+    return now, standing(counted)
 
 
 def _names_alike(before: ScanTask, now: ScanTask, pose: str | None) -> bool:
@@ -148,9 +138,8 @@ def _apply_to_task(task: ScanTask, decisions: Iterable[Decision]) -> ScanTask:
 
 
 def _changed(scan: MeasuredScan, counting: Mapping[About, Decision]) -> MeasuredScan:
-    image = scan.frame.image
-    marks = [_apply_to_mark(mark, counting.get((image, mark.point, mark.kind))) for mark in scan.frame.marks]
-    return scan.changed(marks)
+    image, marks = scan.frame.image, scan.frame.marks
+    return scan.changed([_apply_to_mark(mark, counting.get((image, mark.point, mark.kind))) for mark in marks])
 
 
 def _apply_to_mark(mark: MarkMeasurement, decision: Decision | None) -> MarkMeasurement:

@@ -23,12 +23,12 @@ from pipeline.files.project_file import Project
 from pipeline.measuring.scan_measurement import MeasuredFile, ended_scan, measure_file, reads_writing
 from pipeline.measuring.scan_task import ScanTask
 from pipeline.progress import Reporter
-from pipeline.provenance import FileState, FileStates, Identity, options_hash, parts_hash, result_key
+from pipeline.provenance import FileState, FileStates, Identity, hash_text, parts_hash, result_key
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.wording import count_sentence, counted, drop_file_name, listed
 from pipeline.workers import TASKS_A_CORE, NotMeasured, WorkOptions, iterate_results
 
-_hash_of = lru_cache(maxsize=4096)(options_hash)
+_hash_of = lru_cache(maxsize=4096)(hash_text)
 
 
 class ExpectedTime:
@@ -63,11 +63,6 @@ class ExpectedTime:
         return f"{done} of {counted(len(self._left), 'group')}"
 
 
-def file_state(task: ScanTask, files: FileStates) -> FileState:
-    """State of a task's file."""
-    return files.get(scan_path(task.scan)) if task.scan else FileState(f"(none) {task.name}", -1)
-
-
 class Work:
     """Measurement of scans on request: stored results are read, missing ones measured and stored at once."""
 
@@ -98,13 +93,13 @@ class Work:
         (`before_checks`): a `Measure`."""
         missing = []
         for task in map(self._reviewed_task, tasks):
-            row = self._row(task)
-            if row is None:
+            if (row := self._row(task)) is None:
                 missing.append(task)
             else:
-                yield self._read_row(task, row)
-        for task, row, _ in self._measure(missing):
-            yield self._read_row(task, row)
+                self.results[task.name] = row
+                yield self.read(task.name)
+        for task, _ in self._measure(missing):
+            yield self.read(task.name)
 
     def complete(self, tasks: Sequence[ScanTask], reporter: Reporter) -> None:
         """Measure the missing scans of the project and report how many there are. The scans are not held in memory."""
@@ -150,9 +145,17 @@ class Work:
 
     def state(self, task: ScanTask) -> FileState:
         """State of the task's file when it was first requested."""
-        if task.scan not in self._states or not task.scan:
-            self._states[task.scan] = file_state(task, self._files)
+        if not task.scan:
+            return FileState(f"(none) {task.name}", -1)
+        if task.scan not in self._states:
+            self._states[task.scan] = self._files.get(scan_path(task.scan))
         return self._states[task.scan]
+
+    def _identity(self, task: ScanTask) -> Identity | None:
+        """Stored identity of the task's file; None if it is unknown or has changed."""
+        state = self.state(task)
+        known = self._identities.get(state.uri)
+        return known if known is not None and known.state == state else None
 
     def _complete(self, tasks: Sequence[ScanTask], scans: int, reporter: Reporter) -> None:
         """Measure the missing scans. scans: number of all scans; those measured earlier count as done."""
@@ -160,12 +163,11 @@ class Work:
         expected = ExpectedTime(tasks, cameras, self._at_a_time)
         failed = defaultdict[str, list[str]](list)
         with reporter.stage("measured") as count:
-            for done, (task, row, kept) in enumerate(self._measure(tasks, as_scans=True), 1):
+            for done, (task, scan) in enumerate(self._measure(tasks, as_scans=True), 1):
                 measured = scans - len(tasks) + done
-                self.results[task.name] = row
-                expected.is_done(task.name, kept.scan.seconds)
-                if kept.scan.failure:
-                    same = drop_file_name(kept.scan.failure.sentence, task.shown_scan)
+                expected.is_done(task.name, scan.seconds)
+                if scan.failure:
+                    same = drop_file_name(scan.failure.sentence, task.shown_scan)
                     if same not in failed:  # one message for all scans with the same failure
                         reporter.say(f"failed: {task.name}: {same}")
                     failed[same].append(task.name)
@@ -181,59 +183,39 @@ class Work:
         decisions = self.decisions.get(task.name)
         if decisions is None:
             return task
-        state = self.state(task)
-        known = self._identities.get(state.uri)
-        if known is None or known.state != state:
-            known = Identity(state, parts_hash(scan_path(task.scan), task.max_pixels))
-        identity = known
-        now = apply_decisions(
+        identity = self._identity(task) or Identity(self.state(task), parts_hash(scan_path(task.scan), task.max_pixels))
+        task, self.counting[task.name] = apply_decisions(
             task,
             decisions,
             lambda one: result_key(identity, _hash_of(_options_json(one))),
             lambda key: None if (row := self._rows.get(key)) is None else self._store.pose_name(row),
         )
-        self.counting[task.name] = now.counting
-        return now.task
+        return task
 
     def _row(self, task: ScanTask) -> int | None:
         """Row of the stored result for the task's present file and options; None if there is none."""
-        state = self.state(task)
-        known = self._identities.get(state.uri)
-        if known is None or known.state != state:
-            return None
-        return self._rows.get(result_key(known, _hash_of(_options_json(task))))
+        known = self._identity(task)
+        return None if known is None else self._rows.get(result_key(known, _hash_of(_options_json(task))))
 
-    def _read_row(self, task: ScanTask, row: int) -> MeasuredScan:
-        self.results[task.name] = row
-        return self.read(task.name)
-
-    def _measure(self, tasks: Sequence[ScanTask], as_scans: bool = False) -> Iterator[tuple[ScanTask, int, Kept]]:
+    def _measure(self, tasks: Sequence[ScanTask], as_scans: bool = False) -> Iterator[tuple[ScanTask, MeasuredScan]]:
         """Measure tasks, and store each result at once. as_scans: as results of the project's own scans."""
         if tasks and self._only_kept:
             raise NotMeasured
-        states = {task.name: self.state(task) for task in tasks}
+        for task in tasks:
+            self.state(task)  # before the measurement
         for task, result in iterate_results(measure_file, tasks, self._executor, TASKS_A_CORE * self._at_a_time):
             file = result if isinstance(result, MeasuredFile) else MeasuredFile(ended_scan(task, result), "", -1)
-            kept = self._result(task, states[task.name], file)
+            identity, camera = Identity(self.state(task), file.parts_hash), self._project.image_camera(task.name)
+            if not file.parts_hash:  # the process was lost
+                identity = self._identity(task) or identity
+            kept = Kept(identity, _options_json(task), file.scan, file.bytes_read, camera.path.name)
             if self._thumbnails is not None and file.thumbnails:
                 self._thumbnails.keep(kept.fingerprint, file.thumbnails)
-            request_hash = self._asked(task.name) if as_scans else None
-            row = self._store.keep(kept, task.name if as_scans else None, as_scans, request_hash)
-            self._identities[kept.identity.state.uri], self._rows[kept.fingerprint] = kept.identity, row
+            row = self._store.keep(kept, *((task.name, self._asked(task.name)) if as_scans else ()))
+            self._identities[identity.state.uri], self._rows[kept.fingerprint] = identity, row
             self._now.add(row)
-            yield task, row, kept
-
-    def _result(self, task: ScanTask, state: FileState, file: MeasuredFile) -> Kept:
-        known = self._identities.get(state.uri)
-        lost = not file.parts_hash and known is not None and known.state == state
-        parts = known.parts_hash if lost and known is not None else file.parts_hash
-        return Kept(
-            Identity(state, parts),
-            _options_json(task),
-            file.scan,
-            file.bytes_read,
-            self._project.image_camera(task.name).path.name,
-        )
+            self.results[task.name] = row
+            yield task, file.scan
 
 
 def _options_json(task: ScanTask) -> str:

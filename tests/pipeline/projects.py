@@ -427,7 +427,7 @@ def keep_scans(path: Path, scans: Sequence[MeasuredScan], made_from: Mapping[str
         frames = []
         for scan in scans:
             identity = Identity(file_state(Path(scan.scan), folder), parts_hash(Path(scan.scan)))
-            row = store.keep(Kept(identity, "{}", scan), scan.frame.image, current=True)
+            row = store.keep(Kept(identity, "{}", scan), scan.frame.image)
             frames.append(CheckedResult(row, scan))
         return judge(store, made_from or {}, "kept", frames)
 

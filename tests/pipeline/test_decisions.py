@@ -275,17 +275,17 @@ def test_the_last_line_counts_and_undo_takes_back_the_one_before() -> None:
 def test_decisions_of_another_result_do_not_count() -> None:
     old = mark_decision(Choice.ACCEPT, fingerprint="another file")
     own = mark_decision(Choice.REJECT, "2", fingerprint=task_key(TASK))
-    assert list(apply_decisions(TASK, [old, own], task_key, result_pose).counting.values()) == [own]
+    assert list(apply_decisions(TASK, [old, own], task_key, result_pose)[1].values()) == [own]
 
 
 def test_decisions_count_for_what_follows_from_those_before_them() -> None:
     """Accepted, then another mark placed, then, on what was measured from that, one more rejected."""
     accept = mark_decision(Choice.ACCEPT, "1", fingerprint=task_key(TASK))
     placed = place("2", 7.0, fingerprint=task_key(TASK))
-    now = apply_decisions(TASK, [accept, placed], task_key, result_pose)
-    assert now.task.options.fiducials.clicks == (Click("2", 7.0, 2.0),)
-    reject = mark_decision(Choice.REJECT, "3", fingerprint=task_key(now.task))
-    assert set(apply_decisions(TASK, [accept, placed, reject], task_key, result_pose).counting.values()) == {
+    now, _ = apply_decisions(TASK, [accept, placed], task_key, result_pose)
+    assert now.options.fiducials.clicks == (Click("2", 7.0, 2.0),)
+    reject = mark_decision(Choice.REJECT, "3", fingerprint=task_key(now))
+    assert set(apply_decisions(TASK, [accept, placed, reject], task_key, result_pose)[1].values()) == {
         accept,
         placed,
         reject,
@@ -296,13 +296,13 @@ def test_what_was_settled_about_marks_does_not_count_in_another_pose() -> None:
     placed = place("2", 7.0, fingerprint=task_key(TASK))
     pose = Decision("a", Choice.POSE, pose="90", fingerprint=task_key(TASK))
     late = mark_decision(Choice.ACCEPT, "3", fingerprint=task_key(TASK))  # on a page that was not measured anew yet
-    now = apply_decisions(TASK, [pose, late], task_key, result_pose)
-    assert now.task.options.fiducials.pose == "90"
-    assert list(now.counting.values()) == [pose]
+    now, counting = apply_decisions(TASK, [pose, late], task_key, result_pose)
+    assert now.options.fiducials.pose == "90"
+    assert list(counting.values()) == [pose]
     other = replace(pose, pose="180")  # somebody thinks again, on that page
-    assert apply_decisions(TASK, [pose, other], task_key, result_pose).task.options.fiducials.pose == "180"
+    assert apply_decisions(TASK, [pose, other], task_key, result_pose)[0].options.fiducials.pose == "180"
     undone = Decision("a", Choice.UNDO, fingerprint="whatever is shown")
-    assert apply_decisions(TASK, [placed, pose, undone], task_key, result_pose).task.options.fiducials.pose == "auto"
+    assert apply_decisions(TASK, [placed, pose, undone], task_key, result_pose)[0].options.fiducials.pose == "auto"
 
 
 def test_what_was_settled_about_marks_counts_on_in_the_pose_in_which_they_were_found() -> None:
@@ -310,11 +310,11 @@ def test_what_was_settled_about_marks_counts_on_in_the_pose_in_which_they_were_f
     early, late = (mark_decision(Choice.ACCEPT, point, fingerprint=task_key(TASK)) for point in "13")
     pose = Decision("a", Choice.POSE, pose="90", fingerprint=task_key(TASK))
     found = {task_key(TASK): "90"}
-    now = apply_decisions(TASK, [early, pose, late], task_key, found.get)
-    assert now.task.options.fiducials.pose == "90"
-    assert set(now.counting.values()) == {early, pose, late}
+    now, counting = apply_decisions(TASK, [early, pose, late], task_key, found.get)
+    assert now.options.fiducials.pose == "90"
+    assert set(counting.values()) == {early, pose, late}
     found = {task_key(TASK): "180"}
-    assert set(apply_decisions(TASK, [pose, late], task_key, found.get).counting.values()) == {pose}
+    assert set(apply_decisions(TASK, [pose, late], task_key, found.get)[1].values()) == {pose}
 
 
 def make_scan(*marks: MarkMeasurement) -> MeasuredScan:

@@ -33,7 +33,7 @@ from pipeline.archive.checked_statuses import (
 from pipeline.archive.results_database import Store, merge
 from pipeline.archive.schema import MEASUREMENTS, MIGRATIONS, VERSION, opened
 from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_verdict
-from pipeline.provenance import content_hash, file_state, options_hash, parts_hash, result_key, shard_number
+from pipeline.provenance import content_hash, file_state, hash_text, parts_hash, result_key, shard_number
 from pipeline.results.comparator_file import mark_rows
 from pipeline.results.measured_record import MeasuredScan
 
@@ -186,12 +186,12 @@ def test_results_of_an_earlier_version_get_their_digests(has_secret: bool, path:
     """Of a store whose rows had none: all is taken as it stands but for addresses with a secret; a later change
     is noticed."""
     with Store(path) as store:
-        row = store.keep(kept_result(1), "1", current=True)
+        row = store.keep(kept_result(1), "1")
         digest = judge(store, {}, "a", [CheckedResult(row, LOOKED_AT)])
     secret = "https://ann:hunter2@h.org/2.tif?sig=hunter2"
     with Store(path) as store:
         if has_secret:
-            store.keep(kept_result(2), "2", current=True)
+            store.keep(kept_result(2), "2")
     with sqlite3.connect(path) as db:
         db.execute("update scan set uri = ? where name = '2'", (secret,))
         db.execute("drop view mark_view")
@@ -351,7 +351,7 @@ def test_the_key_depends_on_all_that_it_names() -> None:
     base = kept_result(1)
     others = [kept_result(1, options="[1]"), kept_result(1, mtime_ns=2), kept_result(2)]
     keys = {base.fingerprint, *(other.fingerprint for other in others)}
-    keys.add(result_key(base.identity, options_hash("{}"), revision=-1))
+    keys.add(result_key(base.identity, hash_text("{}"), revision=-1))
     assert len(keys) == 5
     assert base.fingerprint == kept_result(1, scan=failed()).fingerprint
 
@@ -401,7 +401,7 @@ def test_a_store_in_a_folder_that_cannot_be_written_is_read(path: Path, monkeypa
 def test_a_judging_that_is_lost_is_not_taken_for_none(change: str, path: Path) -> None:
     """Else what each scan gave would stand for what all together say of it."""
     with Store(path) as store:
-        row = store.keep(kept_result(1), "1", current=True)
+        row = store.keep(kept_result(1), "1")
         judge(store, {}, "a", [CheckedResult(row, LOOKED_AT)])
     with sqlite3.connect(path) as db:
         db.execute(change)
