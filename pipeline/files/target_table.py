@@ -1,20 +1,18 @@
 """The tables [targets] and [ties] of project.toml: what is to be measured in addition to the fiducials."""
 
 import dataclasses
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any, ClassVar
 
 from adjust.functional_model.lens import Prior
 from adjust.problem.network import ObjectPoint
+from measure.boards import specs
+from measure.boards.specs import BoardSpec
 from measure.marks.shapes import Polarity
+from measure.targets.ring_codes import RingCode
+from measure.tie_points.find_points import TieOptions
 from pipeline.text.table_models import NotNegative, Positive, WrongKey, read_kind, read_model, table_model, whole
 from pipeline.text.tables import Table
-
-if TYPE_CHECKING:
-    from measure.boards.specs import BoardSpec
-    from measure.targets.ring_codes import RingCode
-    from measure.tie_points.find_points import TieOptions
 
 _MOST_OF_A_BOARD = 500  # limit of columns and of rows
 _Count = Annotated[int, whole(1, _MOST_OF_A_BOARD)]
@@ -43,22 +41,24 @@ class TargetSettings:
     arm_mm: float | None = None
     cross_line: float | None = None
     polarity: Polarity = "auto"
-    board: "BoardSpec | None" = None
-    code: "RingCode | None" = None
+    board: BoardSpec | None = None
+    code: RingCode | None = None
     numbers: Mapping[int, str] = dataclasses.field(default_factory=dict)
     transparent: bool = False
 
 
 @table_model
-class TargetTable(ABC):
+class TargetTable:
     """Keys of every table [targets]."""
 
     kind: Annotated[str, "What the targets are."]
     transparent: Annotated[bool, "Whether a flat field is visible from both sides."] = False
 
-    @abstractmethod
     def settings(self, table: Table) -> TargetSettings:
-        """Settings of the targets. table: for messages. Raises ValueError where they are impossible."""
+        """Settings of the targets, by the names of the keys. table: for messages. Raises ValueError where they are
+        impossible."""
+        names = (field.name for field in dataclasses.fields(TargetSettings))
+        return TargetSettings(**{name: getattr(self, name) for name in names if hasattr(self, name)})
 
 
 @table_model
@@ -74,9 +74,6 @@ class DiskTable(SingleTargetTable):
 
     diameter_mm: Annotated[Positive, "In object space, for the eccentricity correction."]
 
-    def settings(self, table: Table) -> TargetSettings:
-        return TargetSettings(self.kind, self.diameter_mm, polarity=self.polarity, transparent=self.transparent)
-
 
 @table_model
 class CrossTable(SingleTargetTable):
@@ -89,8 +86,7 @@ class CrossTable(SingleTargetTable):
         arm, line = self.arm_mm, self.line_mm
         if line >= arm:
             raise table.error("line_mm", f"a line of {line:g} mm is no line for arms of {arm:g} mm. Give its width.")
-        share, polarity = line / arm, self.polarity
-        return TargetSettings(self.kind, arm_mm=arm, cross_line=share, polarity=polarity, transparent=self.transparent)
+        return dataclasses.replace(super().settings(table), cross_line=line / arm)
 
 
 @table_model
@@ -105,8 +101,6 @@ class CodedRingTable(SingleTargetTable):
     ] = dataclasses.field(default_factory=dict)
 
     def settings(self, table: Table) -> TargetSettings:
-        from measure.targets.ring_codes import RingCode
-
         usual = RingCode()
         code = RingCode(usual.bits if self.bits is None else self.bits, self.ring or usual.ring)
         codes, numbers = table.table("codes"), dict[int, str]()  # by the number as decoded from an image
@@ -119,43 +113,30 @@ class CodedRingTable(SingleTargetTable):
                     point, f"{written} is, turned, the code of {numbers[number]} too. Codes are to differ."
                 )
             numbers[number] = point
-        return TargetSettings(
-            self.kind,
-            self.diameter_mm,
-            polarity=self.polarity,
-            code=code,
-            numbers=numbers,
-            transparent=self.transparent,
-        )
+        return dataclasses.replace(super().settings(table), code=code, numbers=numbers)
 
 
 @table_model
 class BoardTable(TargetTable):
-    """Keys of every board."""
+    """Keys of every board; the other keys are those of its specification."""
 
+    spec: ClassVar[type[BoardSpec]]
     columns: Annotated[_Count, "Inner corners, squares, dots or markers."]
     rows: Annotated[_Count, "As columns."]
 
-    def settings(self, table: Table) -> TargetSettings:
-        board = self.board()
-        diameter_mm = getattr(board, "diameter_mm", None)
-        return TargetSettings(self.kind, diameter_mm, board=board, transparent=self.transparent)
-
-    @abstractmethod
-    def board(self) -> "BoardSpec":
+    @property
+    def board(self) -> BoardSpec:
         """Specification of the board. Raises ValueError where it is impossible."""
+        keys: dict[str, Any] = {field.name: getattr(self, field.name) for field in dataclasses.fields(self.spec)}
+        return self.spec(**keys)
 
 
 @table_model
 class ChessboardTable(BoardTable):
     """[targets] of a chessboard."""
 
+    spec: ClassVar[type[BoardSpec]] = specs.ChessboardSpec
     square_mm: Annotated[Positive, "Side of a square."]
-
-    def board(self) -> "BoardSpec":
-        from measure.boards.specs import ChessboardSpec
-
-        return ChessboardSpec(self.columns, self.rows, self.square_mm)
 
 
 @table_model
@@ -167,56 +148,42 @@ class CircleGridTable(BoardTable):
     asymmetric: Annotated[bool, "Whether every second row is staggered."] = False
     row_spacing_mm: Annotated[Positive | None, "Between rows, where it is another."] = None
 
-    def board(self) -> "BoardSpec":
-        from measure.boards.specs import CircleGridSpec
-
+    @property
+    def board(self) -> BoardSpec:
         counts_dots = self.kind == "asymmetric-circle-grid"  # dots per row, as in OpenCV; else grid places
         columns, staggered = self.columns * (2 if counts_dots else 1), self.asymmetric or counts_dots
-        return CircleGridSpec(columns, self.rows, self.spacing_mm, self.diameter_mm, staggered, self.row_spacing_mm)
+        sizes_mm = self.spacing_mm, self.diameter_mm
+        return specs.CircleGridSpec(columns, self.rows, *sizes_mm, staggered, self.row_spacing_mm)
 
 
 @table_model
 class SquaresTable(ChessboardTable):
     """[targets] of a grid of single squares."""
 
+    spec = specs.SquareGridSpec
     gap_mm: Annotated[Positive, "Between squares."]
-
-    def board(self) -> "BoardSpec":
-        from measure.boards.specs import SquareGridSpec
-
-        return SquareGridSpec(self.columns, self.rows, self.square_mm, self.gap_mm)
 
 
 @table_model
 class CharucoTable(ChessboardTable):
     """[targets] of a ChArUco board."""
 
+    spec = specs.CharucoSpec
     dictionary: Annotated[str, 'Of the markers, such as "4X4_50".']
     marker_mm: Annotated[Positive, "Side of a marker."]
     legacy: Annotated[bool | None, "The older layout; absent: both are tried."] = None
     first_id: Annotated[int, "Number of the first marker."] = 0
-
-    def board(self) -> "BoardSpec":
-        from measure.boards.specs import CharucoSpec
-
-        size = self.columns, self.rows, self.square_mm, self.marker_mm
-        return CharucoSpec(self.dictionary, *size, self.legacy, self.first_id)
 
 
 @table_model
 class ArucoTable(BoardTable):
     """[targets] of a grid of ArUco markers."""
 
+    spec = specs.ArucoSpec
     dictionary: Annotated[str, 'Of the markers, such as "4X4_50".']
     marker_mm: Annotated[Positive, "Side of a marker."]
     gap_mm: Annotated[Positive, "Between markers."]
     first_marker: Annotated[int, "Number of the first marker."] = 0
-
-    def board(self) -> "BoardSpec":
-        from measure.boards.specs import ArucoSpec
-
-        size = self.columns, self.rows, self.marker_mm, self.gap_mm
-        return ArucoSpec(self.dictionary, *size, self.first_marker)
 
 
 @table_model
@@ -228,11 +195,10 @@ class AprilGridTable(BoardTable):
     first_id: Annotated[int, "Number of the tag at the lower left."] = 0
     dictionary: Annotated[str, "Of the tags."] = "APRILTAG_36h11"
 
-    def board(self) -> "BoardSpec":
-        from measure.boards.specs import AprilGridSpec
-
+    @property
+    def board(self) -> BoardSpec:
         size = self.columns, self.rows, self.marker_mm, self.spacing * self.marker_mm
-        return AprilGridSpec(self.dictionary, *size, self.first_id)
+        return specs.AprilGridSpec(self.dictionary, *size, self.first_id)
 
 
 TARGET_TABLES: Mapping[str, type[TargetTable]] = {
@@ -279,7 +245,7 @@ class TieSettings:
     """Settings of the natural points. height: of the ground on which they lie, with its standard deviation, object
     units; None if unknown."""
 
-    options: "TieOptions"
+    options: TieOptions
     height: Prior | None = None
 
     def point(self, id: str) -> ObjectPoint:
@@ -289,8 +255,6 @@ class TieSettings:
 
 def read_ties(table: Table) -> TieSettings:
     """Read the table. Raises InputError with the key that is wrong."""
-    from measure.tie_points.find_points import TieOptions
-
     given = read_model(table, TieTable)
     try:
         options = TieOptions(**{key: getattr(given, key) for key in ("wanted", "images") if key in table})
