@@ -25,7 +25,7 @@ from scipy.ndimage import map_coordinates
 from adjust.functional_model.transformation import Film
 from pipeline.resampling.canvas import FrameChain
 from pipeline.resampling.interpolation import Degree
-from pipeline.resampling.resample_stage import BEST, FAST, ResampleTask, resampled
+from pipeline.resampling.resample_stage import BEST, FAST, FrameScan, ResampleTask, resampled
 
 Array = NDArray[np.float64]
 Method = Callable[[Array, Array, Array], Array]
@@ -197,7 +197,8 @@ def make_scan(path: Path, side: int) -> None:
 
 def resample_reseau(folder: Path, degree: Degree) -> str:
     chain = FrameChain((1000.0 * PITCH_MM,) * 2, Film("affine", TURNED, np.zeros(2)))
-    task = ResampleTask("a", "K", folder / "scan.tif", chain, "90", PITCH_MM, degree, None, folder / "a.tif")
+    scans = (FrameScan("a", folder / "scan.tif", chain),)
+    task = ResampleTask("a", "K", "90", PITCH_MM, degree, None, folder / "a.tif", scans)
     done = resampled(task)
     return done.problem or f"{done.width_px} x {done.height_px}"
 

@@ -99,12 +99,10 @@ def write_pictures(
 
 
 def _scans(task: ResampleTask) -> tuple[BlockScan, ...]:
-    given = [(task.part or task.image, task.scan, task.chain)]
-    given += [(other.image, other.scan, other.chain) for other in task.others]
     scans = []
-    for image, path, chain in given:
-        with open_scan(path, task.max_pixels) as scan:
-            scans.append(BlockScan(image, chain, scan.width_px, scan.height_px))
+    for each in task.scans:
+        with open_scan(each.scan, task.max_pixels) as scan:
+            scans.append(BlockScan(each.image, each.chain, scan.width_px, scan.height_px))
     return tuple(scans)
 
 

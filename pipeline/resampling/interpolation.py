@@ -5,7 +5,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,21 +22,11 @@ Degree = Literal[3, 5]
 MARGIN_PX = 16  # around a tile: there the prefilter of a spline of degree 5, with pole 0.43, has decayed to 1e-6
 
 
-class Source(Protocol):
-    """Source of the interpolation: its size, and windows (height, width, channels) that repeat its edge outside."""
+class Source:
+    """A scan whose file allows windows (height, width, channels) to be read without decoding the rest. Outside of the
+    scan its edge is repeated."""
 
-    width_px: int
-    height_px: int
-    channels: int
-    dtype: type[np.uint8] | type[np.uint16]
-
-    def window(self, col0: int, row0: int, width: int, height: int) -> Samples: ...
-
-    def valid_mask(self, col0: int, row0: int, width: int, height: int) -> Mask: ...
-
-
-class _ByWindows:
-    """A scan whose file allows windows to be read without decoding the rest."""
+    is_decoded = False
 
     def __init__(self, scan: Scan) -> None:
         self.scan = scan
@@ -47,11 +37,17 @@ class _ByWindows:
         return self.scan.samples(col0, row0, width, height)
 
     def valid_mask(self, col0: int, row0: int, width: int, height: int) -> Mask:
-        return self.scan.inside(col0, row0, width, height) | ~_inside_mask(self, col0, row0, width, height)
+        """Mask (height, width) of the pixels that are not lost; True outside of the scan."""
+        inside = self.scan.inside(col0, row0, width, height, is_read=self.is_decoded)
+        cols, rows = np.arange(col0, col0 + width), np.arange(row0, row0 + height)
+        in_rows = (rows >= 0) & (rows < self.height_px)
+        return np.asarray(inside | ~(in_rows[:, None] & (cols >= 0) & (cols < self.width_px)))
 
 
-class _Decoded(_ByWindows):
+class _Decoded(Source):
     """A scan decoded into an uncompressed file that is read row by row; mapping the file would count as used memory."""
+
+    is_decoded = True
 
     def __init__(self, scan: Scan, file: int) -> None:
         super().__init__(scan)
@@ -71,16 +67,6 @@ class _Decoded(_ByWindows):
         inside = np.array([np.frombuffer(read[row], self.dtype).reshape(-1, self.channels) for row in rows.tolist()])
         return inside[:, np.clip(np.arange(col0, col0 + width), left, right) - left]
 
-    def valid_mask(self, col0: int, row0: int, width: int, height: int) -> Mask:
-        inside = self.scan.inside(col0, row0, width, height, is_read=True)
-        return inside | ~_inside_mask(self, col0, row0, width, height)
-
-
-def _inside_mask(source: _ByWindows, col0: int, row0: int, width: int, height: int) -> Mask:
-    cols, rows = np.arange(col0, col0 + width), np.arange(row0, row0 + height)
-    in_rows = (rows >= 0) & (rows < source.height_px)
-    return np.asarray(in_rows[:, None] & (cols >= 0) & (cols < source.width_px))
-
 
 @contextmanager
 def open_source(scan: Scan, rows_at_a_time: int, scratch: Path) -> Iterator[Source]:
@@ -94,7 +80,7 @@ def open_source(scan: Scan, rows_at_a_time: int, scratch: Path) -> Iterator[Sour
     """
     wide = scan.segment_px[1] >= scan.width_px
     if not wide or rows_at_a_time <= scan.rows_kept:
-        yield _ByWindows(scan)
+        yield Source(scan)
         return
     with tempfile.TemporaryFile(dir=scratch, prefix=".decoded-") as file:
         yield _Decoded(scan, file.fileno())

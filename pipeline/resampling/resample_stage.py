@@ -37,8 +37,8 @@ FAST: Degree = 3
 
 
 @dataclass(frozen=True)
-class OtherScan:
-    """A further partial scan of the same frame."""
+class FrameScan:
+    """Scan of a frame, whole or a part of it, by the name of its image."""
 
     image: str
     scan: Path
@@ -53,28 +53,24 @@ class ResampleTask:
     ----------
     pitch_mm : of the result.
     max_pixels : limit for `open_scan`.
-    part, others : name of this scan and the other scans, for a frame scanned in parts.
+    scans : one, named as the frame, or several partial ones.
     """
 
     image: str
     camera: str
-    scan: Path
-    chain: FrameChain
     pose: str
     pitch_mm: float
     degree: Degree
     max_pixels: int | None
     target: Path
-    part: str = ""
-    others: tuple[OtherScan, ...] = ()
+    scans: tuple[FrameScan, ...]
 
     @property
     def fingerprint(self) -> str:
         """Fingerprint of the scans' files and everything else that the result depends on; a frame with an equal one is
         up to date."""
-        own = self._scan_fingerprint(self.scan, self.chain)
-        others = [self._scan_fingerprint(other.scan, other.chain) for other in self.others]
-        return hashlib.sha256("".join([own, *others]).encode()).hexdigest() if others else own
+        first, *others = (self._scan_fingerprint(each.scan, each.chain) for each in self.scans)
+        return hashlib.sha256("".join([first, *others]).encode()).hexdigest() if others else first
 
     def _scan_fingerprint(self, scan: Path, chain: FrameChain) -> str:
         numbers = [*chain.film.parameters, *chain.bend_parameters, *chain.pitch_um, self.pitch_mm, float(self.degree)]
@@ -151,22 +147,20 @@ def resample_tasks(
         if isinstance(chain, str):
             failed.append(Resampled(image, None, problem=chain))
             continue
+        scan = FrameScan(image, scan_path(measured.scan), chain)
         if frame in tasks:
-            other = OtherScan(image, scan_path(measured.scan), chain)
-            tasks[frame] = replace(tasks[frame], others=(*tasks[frame].others, other))
+            tasks[frame] = replace(tasks[frame], scans=(*tasks[frame].scans, scan))
             continue
         pitch_mm = (pitch_um or float(np.sqrt(np.prod(measured.pitch_um)))) / 1000.0
         tasks[frame] = ResampleTask(
             image=frame,
             camera=project.image_camera(image).name,
-            scan=scan_path(measured.scan),
-            chain=chain,
             pose=measured.frame.pose.name if measured.frame.pose else "0",
             pitch_mm=pitch_mm,
             degree=degree,
             max_pixels=project.max_pixels,
             target=path_below(folder, frame, ".tif"),
-            part=image if frame != image else "",
+            scans=(scan,),
         )
     return list(tasks.values()), failed
 
@@ -202,9 +196,8 @@ def resampled(task: ResampleTask) -> Resampled:
 
 def _resampled(task: ResampleTask) -> Resampled:
     before = read_description(task.target)
-    given = [(task.scan, task.chain), *((other.scan, other.chain) for other in task.others)]
     with ExitStack() as opened:
-        scans = [(opened.enter_context(open_scan(path, task.max_pixels)), chain) for path, chain in given]
+        scans = [(opened.enter_context(open_scan(each.scan, task.max_pixels)), each.chain) for each in task.scans]
         canvas = outline_canvas([(chain, scan.part_px) for scan, chain in scans], task.pitch_mm)
         done = Resampled(task.image, task.target, canvas.width_px, canvas.height_px)
         fingerprint = task.fingerprint
@@ -216,9 +209,9 @@ def _resampled(task: ResampleTask) -> Resampled:
             rows = _rows_at_a_time(chain, task.pitch_mm, canvas.width_px)
             parts.append(Part(opened.enter_context(open_source(scan, rows, task.target.parent)), chain))
         parts = find_inner_edges(parts)
-        names = (task.part, *(other.image for other in task.others)) if task.part else ()
-        has_lens = task.chain.lens is not None
-        seams = seams_mm(parts, canvas) if task.others else ()
+        names = [each.image for each in task.scans if each.image != task.image]
+        has_lens = task.scans[0].chain.lens is not None
+        seams = seams_mm(parts, canvas) if len(parts) > 1 else ()
         described = Description(task.image, task.camera, canvas, task.pose, has_lens, fingerprint, names, seams)
 
         def make_tile(col0: int, row0: int) -> Tile:

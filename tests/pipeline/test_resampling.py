@@ -20,7 +20,7 @@ from measure import MeasurementError, open_scan
 from pipeline.cli import run
 from pipeline.resampling.canvas import FrameChain, outline_canvas, scan_places
 from pipeline.resampling.interpolation import open_source
-from pipeline.resampling.resample_stage import BEST, FAST, OtherScan, ResampleTask, resampled
+from pipeline.resampling.resample_stage import BEST, FAST, FrameScan, ResampleTask, resampled
 
 Array = NDArray[np.float64]
 
@@ -74,7 +74,8 @@ def marked() -> tuple[Array, Array]:
 
 
 def task(scan: Path, folder: Path, chain: FrameChain, degree: int = BEST) -> ResampleTask:
-    return ResampleTask("a", "K", scan, chain, "0", 0.02, BEST if degree == BEST else FAST, None, folder / "a.tif")
+    scans = (FrameScan("a", scan, chain),)
+    return ResampleTask("a", "K", "0", 0.02, BEST if degree == BEST else FAST, None, folder / "a.tif", scans)
 
 
 def described(path: Path) -> dict[str, Any]:
@@ -141,9 +142,8 @@ def test_marks_of_both_scans_of_a_frame_lie_where_their_transformations_put_them
         parameters = transformation.parameters + np.array([neighbour, 0.0, 0.0, 0.0, 0.0, 0.0])
         ways.append((replace(transformation, parameters=parameters), matrix, shift + np.array([neighbour, 0.0]), side))
     one, two = (FrameChain(PITCH_UM, way[0]) for way in ways)
-    both = replace(
-        task(tmp_path / "scan.tif", tmp_path, one), part="l", others=(OtherScan("r", tmp_path / "scan.tif", two),)
-    )
+    scans = tuple(FrameScan(name, tmp_path / "scan.tif", chain) for name, chain in (("l", one), ("r", two)))
+    both = replace(task(tmp_path / "scan.tif", tmp_path, one), scans=scans)
     assert resampled(both).problem == ""
     with tifffile.TiffFile(tmp_path / "a.tif") as file:
         frame = file.pages[0].asarray().astype(float)

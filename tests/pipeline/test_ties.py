@@ -31,7 +31,7 @@ from pipeline.exchange.incoming import fiducial_camera
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.tie_stage import check_tie_names
 from pipeline.resampling.canvas import FrameChain
-from pipeline.resampling.resample_stage import FAST, ResampleTask, resampled
+from pipeline.resampling.resample_stage import FAST, FrameScan, ResampleTask, resampled
 from pipeline.results.comparator_file import ComparatorPoint, points_text, read_comparator
 from synthetic_images.film import FrameGeometry
 from synthetic_images.render import render_scene
@@ -373,7 +373,8 @@ def test_pictures_lie_where_the_lattice_says(tmp_path: Path) -> None:
     cols, rows = np.meshgrid(np.arange(2500.0), np.arange(2500.0))
     spot = 9000.0 * np.exp(-((cols - col) ** 2 + (rows - row) ** 2) / (2 * 2.5**2))
     tifffile.imwrite(tmp_path / "f2.tif", np.rint(4000.0 + 14.0 * cols + spot).astype(np.uint16), compression="deflate")
-    task = ResampleTask("f2", "K", tmp_path / "f2.tif", chain(2), "0m", PITCH_MM, FAST, None, tmp_path / "frame.tif")
+    scans = (FrameScan("f2", tmp_path / "f2.tif", chain(2)),)
+    task = ResampleTask("f2", "K", "0m", PITCH_MM, FAST, None, tmp_path / "frame.tif", scans)
     assert resampled(task).problem == ""
     (picture,) = write_pictures([task], {"K": BLOCK_CAMERA}, tmp_path)
     image = np.asarray(cv2.imread(str(tmp_path / "pictures" / picture.name), cv2.IMREAD_UNCHANGED), dtype=float)
