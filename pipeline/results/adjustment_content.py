@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from importlib.metadata import version
 
 import numpy as np
@@ -58,6 +58,7 @@ from pipeline.results.assessment_record import (
 )
 from pipeline.results.covariance_file import covariance_note
 from pipeline.results.joined_frames import joined_frames
+from pipeline.results.record_json import record_from
 from pipeline.types import Array
 
 ANGLES = ("omega", "phi", "kappa", "angle")
@@ -76,18 +77,12 @@ def adjustment_record(
     used = {image.camera for image in network.images}
     sizes_mm = frames_mm or {}
     reliability = adjustment.reliability
-    return AdjustmentRecord(
+    return record_from(
+        AdjustmentRecord,
+        adjustment,
         reseau=version("reseau"),
         made_from=dict(made_from or {}),
-        converged=adjustment.converged,
-        termination=adjustment.termination,
-        iterations=adjustment.iterations,
         observations=adjustment.conditions,
-        conditions=adjustment.conditions,
-        unknowns=adjustment.unknowns,
-        redundancy=adjustment.redundancy,
-        vpv=adjustment.vpv,
-        sigma0=adjustment.sigma0,
         sigma0_from=Sigma0Record(variance.redundancy, variance.is_a_priori, variance.left_out),
         covariance=covariance_note(adjustment),
         singular=tuple(
@@ -97,13 +92,6 @@ def adjustment_record(
             CorrelationRecord(_texts(each.parameters), each.rho, each.cause, each.remedy)
             for each in adjustment.correlations
         ),
-        warnings=adjustment.warnings,
-        notes=adjustment.notes,
-        left_out=adjustment.left_out,
-        unmodelled_mm=adjustment.unmodelled_mm,
-        variance_factors=adjustment.variance_factors,
-        variance_sigmas=adjustment.variance_sigmas,
-        explanations=adjustment.explanations,
         suspects=tuple(map(_suspect, adjustment.suspects)),
         reliability=None if reliability is None else _reliability(reliability, len(network.observations)),
         cameras={
@@ -136,8 +124,6 @@ def adjustment_record(
         calibrations=_observed(adjustment, "calibration"),
         calibration_tests=tuple(map(_contradiction, adjustment.contradictions)),
         antennas=_observed(adjustment, "antenna"),
-        groups=adjustment.groups,
-        history=adjustment.history,
     )
 
 
@@ -170,7 +156,7 @@ def _camera(adjustment: Adjustment, camera: Camera, frame_mm: tuple[float, float
             for id, mark in camera.fiducials.items()
             for x, y in [[Parameter.fiducial(camera.name, id, axis) for axis in "xy"]]
         },
-        lens_known=None if reach is None else LensReachRecord(**asdict(reach), share=reach.share),
+        lens_known=None if reach is None else record_from(LensReachRecord, reach),
         projection=() if reach is None else tuple(_projection(adjustment, camera.name)),
     )
 
@@ -328,19 +314,10 @@ def _distances(adjustment: Adjustment) -> tuple[DistanceRecord, ...]:
 
 def _fiducial_distances(adjustment: Adjustment) -> tuple[FiducialDistanceRecord, ...]:
     rows = (row for row in adjustment.further if row.group == "fiducial distance")
+    in_um = (replace(row, v=UM_PER_MM * row.v, detectable=UM_PER_MM * row.detectable) for row in rows)
     return tuple(
-        FiducialDistanceRecord(
-            camera,
-            each.start,
-            each.end,
-            row.observed,
-            row.sigma,
-            1e3 * row.v,
-            row.redundancy,
-            row.w,
-            1e3 * row.detectable,
-        )
-        for (camera, each), row in zip(adjustment.network.observed_distances, rows, strict=True)
+        FiducialDistanceRecord(camera, each.start, each.end, *_numbers(row))
+        for (camera, each), row in zip(adjustment.network.observed_distances, in_um, strict=True)
     )
 
 
@@ -362,18 +339,13 @@ def _contradiction(test: CalibrationTest) -> ContradictionRecord:
 
 def _reliability(result: Reliability, marks: int) -> ReliabilityRecord:
     """Record of the reliability without its first units, the marks: those are in the residuals."""
+    given = [(unit, axis) for unit in range(marks, len(result.tested)) for axis in range(result.sizes[unit])]
     return ReliabilityRecord(
-        result.probabilities.alpha,
-        result.probabilities.power,
-        result.probabilities.family,
+        *(result.probabilities.alpha, result.probabilities.power, result.probabilities.family),
         result.critical_tau,
         tuple(OuterRecord(each.parameter.text, each.effect, each.in_sigmas, each.cause) for each in result.outer),
         result.unchecked,
-        tuple(
-            _tested_given(result, unit, axis)
-            for unit in range(marks, len(result.tested))
-            for axis in range(len(result.tested[unit].coordinates))
-        ),
+        tuple(_tested_given(result, unit, axis) for unit, axis in given),
     )
 
 
@@ -400,19 +372,5 @@ def _scale(tested: Tested, axis: int) -> float:
 
 def _suspect(suspect: Suspect) -> SuspectRecord:
     tested = suspect.tested
-    return SuspectRecord(
-        name=tested.name,
-        group=tested.group,
-        owner=tested.owner,
-        point=tested.point,
-        coordinates=tested.coordinates,
-        statistic=suspect.statistic,
-        size=suspect.size,
-        critical=suspect.critical,
-        w=suspect.w,
-        tau=suspect.tau,
-        critical_tau=suspect.critical_tau,
-        error=tuple(_scale(tested, axis) * value for axis, value in enumerate(suspect.error)),
-        alike=suspect.alike,
-        removed=suspect.removed,
-    )
+    error = tuple(_scale(tested, axis) * value for axis, value in enumerate(suspect.error))
+    return record_from(SuspectRecord, suspect, error=error, name=tested.name, **vars(tested))

@@ -1,18 +1,14 @@
 """`choose.json`: the models compared, their tests, the chosen model and the reasons."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 
 from adjust.model_selection.candidates import Candidate, Model
 from adjust.model_selection.cross_validation import CrossValidation
 from adjust.model_selection.model_choice import Choice
-from pipeline.results.record_json import read_record
-
-STATISTICS = (
-    "observations", "unknowns", "redundancy", "vpv", "sigma0", "aic", "aicc", "cross_validation", "warnings",
-)  # fmt: skip
+from pipeline.results.record_json import read_record, record_from
 
 
 @dataclass(frozen=True)
@@ -26,7 +22,7 @@ class ModelRecord:
 
     @classmethod
     def from_model(cls, model: Model) -> "ModelRecord":
-        return cls(model.transformation, model.family, model.parameters, dict(model.bends))
+        return record_from(cls, model, bends=dict(model.bends))
 
 
 @dataclass(frozen=True)
@@ -60,12 +56,11 @@ class CandidateRecord:
 
     @classmethod
     def from_candidate(cls, candidate: Candidate) -> "CandidateRecord":
-        model = vars(ModelRecord.from_model(candidate.model))
-        known = cls(name=candidate.model.name, **model, problem=candidate.problem)
+        model = {"name": candidate.model.name, **vars(ModelRecord.from_model(candidate.model))}
         if candidate.problem:
-            return known
+            return cls(**model, problem=candidate.problem)
         correlated = tuple(ParameterCorrelation((a, b), rho) for a, b, rho in candidate.correlated)
-        return replace(known, **{name: getattr(candidate, name) for name in STATISTICS}, correlated=correlated)
+        return record_from(cls, candidate, **model, correlated=correlated)
 
 
 @dataclass(frozen=True)

@@ -61,6 +61,13 @@ def plain_json(record: object) -> Any:
     return json.loads("".join(json_text(record)))
 
 
+def record_from(kind: type[Record], source: object, **changes: object) -> Record:
+    """Record with an object's attributes of the same names as its fields, but for the changes."""
+    key: Any = kind
+    names = (name for name, _, _ in _fields(key) if name not in changes and hasattr(source, name))
+    return kind(**{name: getattr(source, name) for name in names}, **changes)
+
+
 def read_record(kind: type[Record], path: Path, remedy: str) -> Record:
     """Read a record from a file. remedy: sentence appended to the error message.
 
