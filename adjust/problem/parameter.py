@@ -220,3 +220,8 @@ def _unescape_dots(name: str) -> str:
 def enumeration(names: Sequence[str]) -> str:
     """Join words with commas, and `and` before the last one."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def shortened(names: Sequence[str], most: int) -> str:
+    """Join the first names with commas, and say how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

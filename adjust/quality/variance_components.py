@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.sparse import csr_array
 from scipy.special import fdtr
 
@@ -128,6 +129,19 @@ def _split_sources(positions: Indices, sigma: Array) -> list[Indices]:
     order = np.argsort(sigma, kind="stable")
     leaps = np.flatnonzero(sigma[order][1:] > APART * sigma[order][:-1]) + 1
     return [part for part in np.split(positions[order], leaps) if len(part)]
+
+
+def added_variance(squares: Array, variances: Array, redundancy: float) -> float | None:
+    """Variance that makes v'Pv equal the redundancy when added to those of residuals of given squares.
+
+    Förstner's condition for a variance component, here an additive one; None where no such variance exists.
+    """
+    most = 2.0 * float(squares.sum()) / redundancy if redundancy > 0.0 else 0.0
+
+    def excess(added: float) -> float:
+        return float((squares / np.maximum(variances + added, 1e-300)).sum()) - redundancy
+
+    return float(brentq(excess, 0.0, most)) if most > 0.0 and excess(0.0) > 0.0 else None
 
 
 COLUMNS_AT_ONCE = 500  # columns of the cofactor matrix of the shared unknowns held at a time

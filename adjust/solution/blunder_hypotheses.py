@@ -6,17 +6,18 @@ distance.
 Such a blunder leaves residuals everywhere, and tests of single observations would reject good ones.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations
+from itertools import chain, combinations
 
 import numpy as np
 from scipy.special import chdtrc
 
 from adjust.array_types import Array, Mask
 from adjust.functional_model.lens import Prior
-from adjust.problem.camera import Camera, Fiducial
-from adjust.problem.network import EXTERIOR_NAMES, Exterior, Network, ObjectPoint
+from adjust.problem.camera import Camera
+from adjust.problem.estimates import adjusted_image, adjusted_places
+from adjust.problem.network import Network, ObjectPoint
 from adjust.problem.parameter import Parameter
 from adjust.solution.left_out_images import leave_out
 from adjust.solution.result import Adjustment
@@ -64,8 +65,8 @@ class NetworkHypothesis:
     """
 
     words: str
-    remedy: str
     network: Network
+    remedy: str = "Correct it."
     moved: Array = field(default_factory=lambda: np.eye(3))
     distance: tuple[str, float] = ("", 0.0)
 
@@ -81,16 +82,14 @@ def network_hypotheses(
     given : adjustment of the network as given, None where it cannot start
     trials : adjusts trial networks
     """
-    mirrored = (NetworkHypothesis(words, "Correct it.", _move_points(bare, by), by) for words, by in AXES.items())
+    mirrored = (NetworkHypothesis(words, _move_points(bare, by), moved=by) for words, by in AXES.items())
     yield [*mirrored, *_y_down(bare, given)]
-    if network.distances:
-        for factor in FACTORS:
-            by = factor * np.eye(3)
-            remedy = "Give both in the unit that [object] unit names."
-            yield [NetworkHypothesis(unit_words(factor), remedy, _move_points(network, by), by)]
-    yield from ([each] for each in _exchanged_frames(network, given))
-    yield from ([each] for each in _mirrored_images(network, given, trials))
-    yield from ([each] for each in _distances(network))
+    for factor in FACTORS if network.distances else ():
+        by = factor * np.eye(3)
+        remedy = "Give both in the unit that [object] unit names."
+        yield [NetworkHypothesis(unit_words(factor), _move_points(network, by), remedy, by)]
+    alone = _exchanged_frames(network, given), _mirrored_images(network, given, trials), _distances(network)
+    yield from ([each] for each in chain(*alone))
 
 
 def unit_words(factor: float) -> str:
@@ -100,50 +99,46 @@ def unit_words(factor: float) -> str:
     return f"the coordinates of the points are {times:.4g} times too {how} for the stations or distances: another unit"
 
 
+def _scaled(prior: Prior | None, factor: float) -> Prior | None:
+    return prior and Prior(factor * prior.value, abs(factor) * prior.sigma)
+
+
 def _move_points(network: Network, by: Array) -> Network:
     """Transform all points by a matrix with one entry per row."""
-    axes = np.abs(by).argmax(axis=1)
-    factors = [float(row[axis]) for row, axis in zip(by, axes, strict=True)]
-
-    def move(point: ObjectPoint) -> ObjectPoint:
-        given = [(point.X, point.Y, point.Z)[axis] for axis in axes]
-        priors = zip(given, factors, strict=True)
-        return ObjectPoint(point.id, *(prior and Prior(f * prior.value, abs(f) * prior.sigma) for prior, f in priors))
-
-    return replace(network, points=tuple(move(point) for point in network.points))
+    axes = np.abs(by).argmax(axis=1).tolist()
+    factors = by[range(3), axes].tolist()
+    points = []
+    for point in network.points:
+        given = point.X, point.Y, point.Z
+        moved = (_scaled(given[axis], factor) for axis, factor in zip(axes, factors, strict=True))
+        points.append(ObjectPoint(point.id, *moved))
+    return replace(network, points=tuple(points))
 
 
 def _y_down(network: Network, given: Adjustment | None) -> Iterator[NetworkHypothesis]:
     """Hypothesis: y points down, in the camera frame if all films are mirrored, or in comparators of digital images."""
     films = [image for image in network.images if image.transformation != "none"]
-    if films and given is not None and any(image.name not in given.mirrored for image in films):
-        return
-    turned = np.array([image.transformation == "none" for image in network.images])[network.image_numbers]
-    xy_mm = network.observations.xy_mm * np.where(turned[:, None], [1.0, -1.0], 1.0)
-    where = "the y' axis of the camera's fiducial marks" if films else "the y axis of the comparator coordinates"
-    cameras = tuple(_turn_camera(camera) for camera in network.cameras)
-    other = replace(network, cameras=cameras, observations=replace(network.observations, xy_mm=xy_mm))
-    yield NetworkHypothesis(f"{where} points down, and it has to point up", "Correct it.", other)
+    if not films or given is None or all(image.name in given.mirrored for image in films):
+        where = "the y' axis of the camera's fiducial marks" if films else "the y axis of the comparator coordinates"
+        yield NetworkHypothesis(f"{where} points down, and it has to point up", reversed_y(network))
 
 
-def _turn_camera(camera: Camera) -> Camera:
-    """Reverse y' of a camera."""
-    marks = {id_: Fiducial(mark.x_mm, _opposite(mark.y_mm)) for id_, mark in camera.fiducials.items()}
-    y0_mm = camera.y0_mm and _opposite(camera.y0_mm)
-    return replace(camera, y0_mm=y0_mm, fiducials=marks, center_mm=(camera.center_mm[0], -camera.center_mm[1]))
+def reversed_y(network: Network, keeps_given: bool = False) -> Network:
+    """Reverse y of the comparator coordinates of digital images, and y' of the cameras.
 
-
-def _opposite(prior: Prior) -> Prior:
-    return Prior(-prior.value, prior.sigma)
-
-
-def y_downward(network: Network) -> Network | None:
-    """Reverse y of the comparator coordinates of a network without films; None where there are films."""
-    if any(image.transformation != "none" for image in network.images):
-        return None
-    cameras = tuple(each if each.y0_mm else _turn_camera(each) for each in network.cameras)
-    xy_mm = network.observations.xy_mm * [1.0, -1.0]
-    return replace(network, cameras=cameras, observations=replace(network.observations, xy_mm=xy_mm))
+    keeps_given: whether given principal points stay.
+    """
+    digital = np.array([image.transformation == "none" for image in network.images])[network.image_numbers]
+    xy_mm = network.observations.xy_mm * np.where(digital[:, None], [1.0, -1.0], 1.0)
+    cameras = []
+    for camera in network.cameras:
+        marks = {
+            id_: replace(mark, y_mm=Prior(-mark.y_mm.value, mark.y_mm.sigma)) for id_, mark in camera.fiducials.items()
+        }
+        center_mm, y0_mm = (camera.center_mm[0], -camera.center_mm[1]), _scaled(camera.y0_mm, -1.0)
+        turned = replace(camera, y0_mm=y0_mm, fiducials=marks, center_mm=center_mm)
+        cameras.append(camera if keeps_given and camera.y0_mm else turned)
+    return replace(network, cameras=tuple(cameras), observations=replace(network.observations, xy_mm=xy_mm))
 
 
 def _mirrored_images(network: Network, given: Adjustment | None, trials: Trials) -> Iterator[NetworkHypothesis]:
@@ -154,7 +149,7 @@ def _mirrored_images(network: Network, given: Adjustment | None, trials: Trials)
         rest = None if others is None else trials.adjust(others)
         if rest is not None and trials.explains(rest):
             remedy = "Mirror its picture and measure it again, or its coordinates in comparator.csv."
-            yield NetworkHypothesis(f"image {name} is mirrored", remedy, _mirrored_image(network, name, rest))
+            yield NetworkHypothesis(f"image {name} is mirrored", _mirrored_image(network, name, rest), remedy)
             return
 
 
@@ -196,8 +191,8 @@ def mirrored_images(network: Network, names: Sequence[str]) -> Network:
 
 def _middle_mm(network: Network, camera: Camera) -> float:
     """Centre of the camera's images in x, mm."""
-    own = np.array([image.camera == camera.name for image in network.images])[network.image_numbers]
-    x_mm = network.observations.xy_mm[own, 0]
+    own = [image.camera == camera.name for image in network.images]
+    x_mm = network.observations.xy_mm[np.array(own)[network.image_numbers], 0]
     if not len(x_mm):
         return 0.0
     middle = float(x_mm.min() + x_mm.max()) / 2.0
@@ -216,8 +211,8 @@ def _distances(network: Network) -> Iterator[NetworkHypothesis]:
             free = replace(camera, principal_distance_mm=None)
             yield NetworkHypothesis(
                 f"the principal distance of camera {camera.name} is not the {given.value:g} mm that are given",
-                "Correct it, or give it with the standard deviation that it has.",
                 replace(network, cameras=tuple(free if each is camera else each for each in network.cameras)),
+                "Correct it, or give it with the standard deviation that it has.",
                 distance=(camera.name, given.value),
             )
 
@@ -233,22 +228,21 @@ def _exchanged_frames(network: Network, given: Adjustment | None) -> Iterator[Ne
         image = tuple(name if is_fiducial else other.get(name, name) for name, is_fiducial in rows)
         yield NetworkHypothesis(
             f"the targets of the frames {min(first, second)} and {max(first, second)} are exchanged",
-            "Exchange them, or the frames' fiducial marks.",
             replace(network, observations=replace(observations, image=image)),
+            "Exchange them, or the frames' fiducial marks.",
         )
 
 
 def _worst_images(network: Network, given: Adjustment | None, films: bool) -> dict[str, float]:
     """Sums of squared residuals by image, largest first, of films or of digital images with object points."""
-    # The sums are 0 without an adjustment.
-    v_mm = np.zeros((len(network.image_numbers), 2)) if given is None else given.residuals.v_mm
-    sums = np.bincount(network.image_numbers, (v_mm**2).sum(axis=1), len(network.images))
-    images = [
-        (-float(size), image.name)
+    squares = np.zeros(len(network.image_numbers)) if given is None else (given.residuals.v_mm**2).sum(axis=1)
+    sums = np.bincount(network.image_numbers, squares, len(network.images)).tolist()
+    images = {
+        image.name: size
         for image, size in zip(network.images, sums, strict=True)
         if (image.transformation != "none") == films and image.name not in network.objectless_images
-    ]
-    return {name: -size for size, name in sorted(images)}
+    }
+    return dict(sorted(images.items(), key=lambda each: (-each[1], each[0])))
 
 
 CLEARLY = 3.0  # factor by which an explanation must reduce sigma0
@@ -319,32 +313,26 @@ def _as_stations_are_given(
     given = _given_stations(network)
     if len(alike) == 1 or not given:
         return alike
-    back = np.linalg.inv(alike[0].moved)
     stations, depths = _stations(found, given)
-    places = np.array(list(given.values()))
-    return [each for each in alike if _near(stations @ (each.moved @ back).T, places, depths).all()] or alike
+    unmoved, places = stations @ np.linalg.inv(alike[0].moved).T, np.array(list(given.values()))
+    return [each for each in alike if _near(unmoved @ each.moved.T, places, depths).all()] or alike
 
 
 def _given_stations(network: Network) -> dict[str, Array]:
-    exteriors: dict[str, Exterior | None] = {image.name: image.exterior for image in network.images}
-    return {
-        name: exterior.center
-        for name, exterior in exteriors.items()
-        if exterior is not None and name not in network.unoriented
-    }
+    images = (image for image in network.images if image.name not in network.unoriented)
+    return {image.name: image.exterior.center for image in images if image.exterior is not None}
 
 
-def _stations(result: Adjustment, images: dict[str, Array]) -> tuple[Array, Array]:
+def _stations(result: Adjustment, images: Iterable[str]) -> tuple[Array, Array]:
     """Adjusted stations (n, 3) of some images, and their distances (n,) from the centre of the points."""
-    frames = [result.network.image_by_name[name].frame for name in images]
-    exterior = (Parameter.exterior(frame, element) for frame in frames for element in EXTERIOR_NAMES[:3])
-    stations = result.values_of(exterior).reshape(-1, 3)
+    stations = np.array([adjusted_image(result, name).station for name in images])
     return stations, np.linalg.norm(stations - _points(result).mean(axis=0), axis=1)
 
 
 def _points(result: Adjustment) -> Array:
-    ids = [point.id for point in result.network.points if point.id in result.network.observed_points]
-    return result.values_of(Parameter.point(id_, axis) for id_ in ids for axis in "XYZ").reshape(-1, 3)
+    return adjusted_places(
+        result, [each.id for each in result.network.points if each.id in result.network.observed_points]
+    )
 
 
 def _near(stations: Array, given: Array, depths: Array) -> Mask:
@@ -370,22 +358,17 @@ def stations_elsewhere(network: Network, result: Adjustment) -> str:
         )
     if 2 * len(off) <= len(names):
         return ""
-    for words, candidate, scale in _moved_stations(result, stations):
+    moved = [(unit_words(factor), factor * stations, factor) for factor in FACTORS]
+    points = _points(result)
+    middle = points.mean(axis=0)
+    _, extents, axes = np.linalg.svd(points - middle, full_matrices=False)
+    if extents[-1] <= FLAT * extents[0]:
+        reflected = stations - 2.0 * np.outer((stations - middle) @ axes[-1], axes[-1])
+        moved += [(words, reflected @ by.T, 1.0) for words, by in AXES.items()]
+    for words, candidate, scale in moved:
         if _near(candidate, places, scale * depths).all():
             return (
                 f"By the points the stations lie nowhere near where they are given, but all {len(names)} would with "
                 f"another reading of the points: {words}. Correct the points, or the stations."
             )
     return ""
-
-
-def _moved_stations(result: Adjustment, stations: Array) -> Iterator[tuple[str, Array, float]]:
-    """Generate blunders in words, with the stations without them and the scale."""
-    for factor in FACTORS:
-        yield unit_words(factor), factor * stations, factor
-    points = _points(result)
-    middle = points.mean(axis=0)
-    _, extents, axes = np.linalg.svd(points - middle, full_matrices=False)
-    if extents[-1] <= FLAT * extents[0]:
-        reflected = stations - 2.0 * np.outer((stations - middle) @ axes[-1], axes[-1])
-        yield from ((words, reflected @ by.T, 1.0) for words, by in AXES.items())

@@ -21,12 +21,11 @@ the model lacks, and errors are correlated within an image. A hypothesis then ha
 groups of images must be clearer than a normal scatter of the images' interior orientations makes them.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.optimize import brentq
 from scipy.spatial import KDTree
 from scipy.special import chdtr, chdtrc, fdtrc, ndtr
 
@@ -35,148 +34,12 @@ from adjust.least_squares.iteration import linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.problem.problem import Problem
 from adjust.problem.tested import Probabilities
-from adjust.quality.run import GrossError, Run, residuals
+from adjust.quality.run import UM_PER_MM, GrossError, Run, residuals
 from adjust.quality.snooping import TOLD_APART, Snooping
+from adjust.quality.variance_components import added_variance
 from adjust.rank_defect.diagnosis import singular_directions
-from adjust.solution.model_hypotheses import GROUPS, ModelHypothesis, model_hypotheses, separate_lenses
+from adjust.solution.model_hypotheses import ModelHypothesis, model_hypotheses, separate_lenses
 from adjust.solution.reweighting import again
-
-FEWEST = 30  # coordinates needed to test the distribution of residuals
-CHANCE = 0.001  # significance level of each test of the noise hypothesis
-NEIGHBOURS = 8  # nearest neighbours searched for one in the same, or in another, image
-UNCHECKED = 0.05  # redundancy number below which a residual is not tested
-KINDS = (("marks", ("target", "tie", "fiducial")), ("targets", ("target", "tie")), ("fiducials", ("fiducial",)))
-UM_PER_MM = 1000.0
-
-
-def added_noise(run: Run, redundancy: int) -> tuple[tuple[str, str], Run] | None:
-    """Adjust with a standard deviation added to those of marks that explains all residuals; None where none does.
-
-    Also returns the cause in words, and the remedy.
-    """
-    if not _is_noise(run):
-        return None
-    network = run.problem.network
-    kind, covariance = np.array(network.observations.kind), network.observations.covariance_mm2
-    for marks, kinds in KINDS:
-        members = np.isin(kind, kinds)
-        if marks != "marks" and members.all():
-            continue
-        sigma_mm = _added_sigma(run, members, redundancy)
-        if sigma_mm is None:
-            continue
-        larger = covariance + np.where(members, sigma_mm**2, 0.0)[:, None, None] * np.eye(2)
-        observations = replace(network.observations, covariance_mm2=larger)
-        problem = replace(run.problem, network=replace(network, observations=observations))
-        noisy = again(replace(run, problem=problem), run.weighting, STEPS, run.end.state)
-        if noisy.converged and noisy.is_tested and _groups_agree(noisy):
-            return _noise_words(marks, sigma_mm, covariance), noisy
-    return None
-
-
-def _noise_words(marks: str, sigma_mm: float, covariance_mm2: Array) -> tuple[str, str]:
-    """Cause and remedy of noise added to marks of given covariances (n, 2, 2)."""
-    given_um = UM_PER_MM * float(np.sqrt(np.median(np.trace(covariance_mm2, axis1=1, axis2=2) / 2.0)))
-    added_um = UM_PER_MM * sigma_mm
-    key = "sigma_fiducial_um" if marks == "fiducials" else "sigma_target_um"
-    return (
-        f"The standard deviations given to the {marks} are too small everywhere: the residuals are plain "
-        f"noise, alike in all images; {added_um:.3g} µm added to the {given_um:.3g} µm given (in quadrature) "
-        "explains all",
-        f"Give film_sigma_um = {added_um:.3g} under [adjust], which is added to the sigma of every mark, or larger "
-        f"sigmas in comparator.csv or {key}.",
-    )
-
-
-def _is_noise(run: Run) -> bool:
-    """Whether standardised residuals are normal, homogeneous over images and independent of neighbours."""
-    v = residuals(run)
-    checked = (v.redundancy > UNCHECKED).all(axis=1)
-    if 2 * checked.sum() < FEWEST:
-        return False
-    w, images = v.w[checked], run.problem.image_numbers[checked]
-    places = run.end.computed_mm[checked]
-    points = np.array(run.problem.network.observations.point)[checked]
-    in_object = np.einsum("nji,nj->ni", run.end.state.rotations[images][:, :2], w)
-    return (
-        _is_normal(w)
-        and _is_alike(w, v.redundancy[checked], images)
-        and not _is_shared(w, places, images, same_image=True)
-        and not _is_shared(w, places, images, same_image=False)
-        and not _is_shared_by_point(in_object, points, images)
-    )
-
-
-def _is_normal(w: Array) -> bool:
-    """Test the kurtosis of all coordinates, with its standard deviation √(24 / n)."""
-    w = w.ravel()
-    kurtosis = np.mean(w**4) / np.mean(w**2) ** 2 - 3.0
-    return bool(ndtr(-abs(kurtosis) / np.sqrt(24.0 / len(w))) > 0.5 * CHANCE)
-
-
-def _is_alike(w: Array, redundancy: Array, images: Indices) -> bool:
-    """Test by chi-square whether all images have the same mean square."""
-    shares = np.bincount(images, (w**2 * redundancy).sum(axis=1))
-    freedom = np.bincount(images, redundancy.sum(axis=1))
-    present = freedom > 1.0
-    if present.sum() < 2:
-        return True
-    variance = shares.sum() / freedom.sum()
-    square = ((shares[present] / variance - freedom[present]) ** 2 / (2.0 * freedom[present])).sum()
-    return bool(chdtrc(present.sum() - 1, square) > CHANCE)
-
-
-def _is_shared(w: Array, places: Array, images: Indices, same_image: bool) -> bool:
-    """Whether the residuals of nearest neighbours, in the same image or in others, are positively correlated."""
-    if same_image:  # a third coordinate separates the images in the tree
-        apart = 10.0 * float(np.ptp(places, axis=0).max())
-        places = np.column_stack([places, apart * images])
-    near = np.asarray(KDTree(places).query(places, min(NEIGHBOURS, len(places)))[1])
-    wanted = (images[near] == images[:, None]) == same_image
-    wanted &= near != np.arange(len(w))[:, None]
-    rows = np.flatnonzero(wanted.any(axis=1))
-    nearest = near[rows, wanted[rows].argmax(axis=1)]
-    return len(rows) > 2 and _is_positive((w[rows] * w[nearest]).sum(axis=1))
-
-
-def _is_shared_by_point(in_object: Array, points: NDArray[np.str_], images: Indices) -> bool:
-    """Whether a point's residuals, rotated into object axes, are positively correlated between images."""
-    order = np.lexsort((images, points))
-    follows = points[order][1:] == points[order][:-1]
-    products = (in_object[order][1:] * in_object[order][:-1]).sum(axis=1)[follows]
-    return len(products) > 2 and _is_positive(products)
-
-
-def _is_positive(products: Array) -> bool:
-    """Whether the sum of products of residuals, of expectation 0 if independent, is significantly positive."""
-    z = products.sum() / np.sqrt(2.0 * (products**2).sum())  # factor 2: most pairs of neighbours occur twice
-    return bool(ndtr(-z) < 0.5 * CHANCE)
-
-
-def _added_sigma(run: Run, members: Mask, redundancy: int) -> float | None:
-    """Standard deviation in mm with which v'Pv of the same residuals equals the redundancy."""
-    given = run.problem.network.observations.covariance_mm2 / run.weighting.weights[: len(members), None, None]
-    v = run.end.v_mm
-    rest = run.end.vpv - float(np.einsum("ni,nij,nj->n", v, np.linalg.inv(given), v)[members].sum())
-
-    def excess(variance: float) -> float:
-        weight = np.linalg.inv(given[members] + variance * np.eye(2))
-        return float(np.einsum("ni,nij,nj->", v[members], weight, v[members])) + rest - redundancy
-
-    largest = float((v**2).max())
-    if excess(largest) >= 0.0:
-        return None
-    return float(np.sqrt(brentq(excess, 0.0, largest, rtol=1e-6)))
-
-
-def _groups_agree(run: Run) -> bool:
-    """Whether every group of observations agrees with its standard deviations in a two-sided test."""
-    for name in np.unique(run.units.groups):
-        vpv, freedom = run.group_sums((run.units.groups == name) & run.weighting.used)
-        if freedom > 1.0 and min(chdtr(freedom, vpv), chdtrc(freedom, vpv)) < CHANCE:
-            return False
-    return True
-
 
 LEVEL = 0.001  # probability of reporting anything where the model is correct
 CHECKED = 10  # smallest redundancy for an explanation
@@ -216,9 +79,8 @@ def explain(
     There are none where the adjustment has no solution, nor where sigma0 is at most 1, unless the standard deviation of
     unmodelled errors was estimated from the residuals (is_noise_fitted).
     """
-    if not run.converged or not run.is_tested or redundancy < CHECKED:
-        return (), run
-    if run.end.vpv <= redundancy and not is_noise_fitted:
+    is_large = is_noise_fitted or run.end.vpv > redundancy
+    if not (run.converged and run.is_tested and redundancy >= CHECKED and is_large):
         return (), run
     first = last = _Model(run, redundancy, probabilities, is_noise_fitted)
     found: list[Explanation] = []
@@ -233,7 +95,7 @@ def explain(
         last = following or alike[0]
         if following is None:
             break
-    if last.exceeds(LEVEL) and not last.gross_errors and (noise := added_noise(last.run, last.redundancy)):
+    if last.exceeds(LEVEL) and not last.gross_errors and (noise := _added_noise(last.run, last.redundancy)):
         words, with_noise = noise
         noisy = replace(last, run=with_noise)
         found.append(_explanation("noise", words, float(chdtrc(last.redundancy, last.vpv)), last, noisy))
@@ -286,19 +148,19 @@ class _Model:
 
     def criterion(self, variance: float) -> float:
         """v'Pv over a variance without gross errors, plus the cost of removing and choosing these."""
-        if not self.gross_errors:
-            return self.vpv / variance
-        chosen_from = len(self.gross_errors) * float(np.log(len(self._snooping.critical)))
-        return self.rest[0] / variance + 2.0 * (self.redundancy - self.rest[1] + chosen_from)
+        vpv, redundancy = self.rest
+        chosen_from = len(self.gross_errors) * float(np.log(len(self.run.units)))
+        return vpv / variance + 2.0 * (self.redundancy - redundancy + chosen_from)
 
     @property
     def costs(self) -> float:
         """Cost of the unknowns and the choice of the hypothesis."""
         return 2.0 * (len(self.hypothesis.added) + self.hypothesis.choices) if self.hypothesis else 0.0
 
-    def is_large(self, hypothesis: ModelHypothesis, fall: float) -> bool:
-        """Whether a decrease of v'Pv is larger than errors correlated within images cause."""
-        return not self.is_noise_fitted or (fall > LEAST_SHARE * self.vpv and hypothesis.p_scatter() < LEVEL)
+    def is_significant(self, hypothesis: ModelHypothesis, fall: float, level: float) -> bool:
+        """Whether a decrease of v'Pv is significant, and larger than errors correlated within images cause."""
+        is_large = not self.is_noise_fitted or (fall > LEAST_SHARE * self.vpv and hypothesis.p_scatter() < LEVEL)
+        return is_large and self.probability(hypothesis, fall) < level
 
     def probability(self, hypothesis: ModelHypothesis, fall: float) -> float:
         """p-value of a decrease of v'Pv by a hypothesis."""
@@ -315,20 +177,29 @@ class _Model:
         variance = (self.vpv - fall) / left
         return float(fdtrc(count, left, fall / (count * variance)) if variance > 1.0 else chdtrc(count, fall))
 
+    def adjusted(self, problem: Problem) -> Run | None:
+        """Adjust a larger problem from its start with the same weights; None without a solution."""
+        larger = again(replace(self.run, problem=problem), self.run.weighting, STEPS, problem.start())
+        return larger if larger.converged and larger.is_tested else None
+
+    def extended(self, hypothesis: ModelHypothesis) -> "_Model | None":
+        """Add a hypothesis to the model; None without a solution."""
+        if (run := self.adjusted(hypothesis.problem)) is None:
+            return None
+        p = self.probability(hypothesis, self.vpv - run.end.vpv)
+        left, has_suspects = self.redundancy - len(hypothesis.added), bool(self.gross_errors)
+        return _Model(run, left, self.probabilities, self.is_noise_fitted, has_suspects, hypothesis, p)
+
 
 def _best(model: _Model) -> tuple[list[_Model], bool]:
     """Models with the best significant hypotheses, several where these are not distinguished."""
     # Also returns whether gross errors of single observations explain the residuals as well.
-    falls = [(_first_order_fall(model.run, each), each) for each in model_hypotheses(model.run)]
+    falls = [(_first_order_fall(model.run, each.problem), each) for each in model_hypotheses(model.run)]
     level = LEVEL / max(len(falls), 1)
     worth = WORTH * max((fall for fall, _ in falls), default=0.0)
-    likely = [
-        (fall, each)
-        for fall, each in falls
-        if fall > worth and model.is_large(each, fall) and model.probability(each, fall) < level
-    ]
+    likely = [(fall, each) for fall, each in falls if fall > worth and model.is_significant(each, fall, level)]
     likely.sort(key=lambda each: -each[0])
-    candidates = [_larger_model(model, each) for _, each in likely[:MOST_ADJUSTED]]
+    candidates = [model.extended(each) for _, each in likely[:MOST_ADJUSTED]]
     found = [each for each in candidates if each is not None and each.p < level]
     if not found:
         return [], False
@@ -341,9 +212,9 @@ def _best(model: _Model) -> tuple[list[_Model], bool]:
     return alike, bool(without < TOLD_APART)
 
 
-def _first_order_fall(run: Run, hypothesis: ModelHypothesis) -> float:
-    """First-order decrease of v'Pv by the added unknowns; 0 where they are not determined."""
-    weighted, covariance = run.weighting.applied(hypothesis.problem)
+def _first_order_fall(run: Run, problem: Problem) -> float:
+    """First-order decrease of v'Pv in a larger problem; 0 where it is singular."""
+    weighted, covariance = run.weighting.applied(problem)
     numbering = Numbering(weighted)
     at = linearise(numbering, covariance, weighted.start())
     if at is None or singular_directions(weighted, at.state, numbering.free, at.factor):
@@ -351,39 +222,23 @@ def _first_order_fall(run: Run, hypothesis: ModelHypothesis) -> float:
     return at.factor.length() ** 2
 
 
-def _larger_model(model: _Model, hypothesis: ModelHypothesis) -> _Model | None:
-    """Adjust a hypothesis; None without a solution."""
-    run = _refit(model.run, hypothesis.problem)
-    if run is None:
-        return None
-    left = model.redundancy - len(hypothesis.added)
-    p = model.probability(hypothesis, model.vpv - run.end.vpv)
-    return _Model(run, left, model.probabilities, model.is_noise_fitted, bool(model.gross_errors), hypothesis, p)
-
-
 def _following(model: _Model) -> _Model | None:
     """Return the adjustment for the next round: groups of images get separate lenses; None without a solution."""
-    if model.hypothesis is None or model.hypothesis.kind != GROUPS:
+    if model.hypothesis is None or not model.hypothesis.contrasts:
         return model
     problem = separate_lenses(model.run)
-    run = None if problem is None else _refit(model.run, problem)
+    run = None if problem is None else model.adjusted(problem)
     if run is None:
         return None
     added = len(run.numbering.free) - len(model.run.numbering.free)
     return replace(model, run=run, redundancy=model.redundancy - added)
 
 
-def _refit(run: Run, problem: Problem) -> Run | None:
-    """Adjust a larger problem from its start with the same weights; None without a solution."""
-    larger = again(replace(run, problem=problem), run.weighting, STEPS, problem.start())
-    return larger if larger.converged and larger.is_tested else None
-
-
 def _model_explanation(larger: _Model, model: _Model) -> Explanation:
     assert larger.hypothesis is not None
     hypothesis, coordinates = larger.hypothesis, 2 * len(model.run.end.v_mm)
     covariance = model.run.problem.network.observations.covariance_mm2
-    sigma_um = 1000.0 * float(np.sqrt(np.mean(np.trace(covariance, axis1=1, axis2=2)) / 2.0))
+    sigma_um = UM_PER_MM * float(np.sqrt(np.mean(np.trace(covariance, axis1=1, axis2=2)) / 2.0))
     explained_um = sigma_um * float(np.sqrt(max(model.vpv - larger.vpv, 0.0) / coordinates))
     words = hypothesis.words(larger.run, hypothesis.added, explained_um)
     return _explanation(hypothesis.kind, words, larger.p, model, larger)
@@ -394,3 +249,111 @@ def _explanation(kind: str, words: tuple[str, str], p: float, without: _Model, l
     chance = f"p = {p:.1g}" if p > 1e-99 else "p < 1e-99"
     figures = f"with this in the model σ₀ falls from {sigma0[0]:.3g} to {sigma0[1]:.3g} ({chance})"
     return Explanation(kind, f"{words[0]}; {figures}.", words[1], p, sigma0)
+
+
+FEWEST = 30  # coordinates needed to test the distribution of residuals
+CHANCE = 0.001  # significance level of each test of the noise hypothesis
+NEIGHBOURS = 8  # nearest neighbours searched for one in the same, or in another, image
+UNCHECKED = 0.05  # redundancy number below which a residual is not tested
+KINDS = (("marks", ("target", "tie", "fiducial")), ("targets", ("target", "tie")), ("fiducials", ("fiducial",)))
+
+
+def _added_noise(run: Run, redundancy: int) -> tuple[tuple[str, str], Run] | None:
+    """Adjust with a standard deviation added to those of marks that explains all residuals; None where none does."""
+    # Also returns cause and remedy.
+    if not _is_noise(run):
+        return None
+    network, v_mm = run.problem.network, run.end.v_mm
+    kind, covariance = np.array(network.observations.kind), network.observations.covariance_mm2
+    variances, axes = np.linalg.eigh(covariance / run.weighting.weights[: len(v_mm), None, None])
+    squares = np.einsum("nij,ni->nj", axes, v_mm) ** 2
+    for marks, kinds in KINDS:
+        members = np.isin(kind, kinds)
+        if marks != "marks" and members.all():
+            continue
+        others = run.end.vpv - float((squares[members] / variances[members]).sum())
+        added = added_variance(squares[members], variances[members], redundancy - others)
+        if added is None:
+            continue
+        larger = covariance + np.where(members, added, 0.0)[:, None, None] * np.eye(2)
+        observations = replace(network.observations, covariance_mm2=larger)
+        problem = replace(run.problem, network=replace(network, observations=observations))
+        noisy = again(replace(run, problem=problem), run.weighting, STEPS, run.end.state)
+        if noisy.converged and noisy.is_tested and _groups_agree(noisy):
+            return _noise_words(marks, UM_PER_MM * float(np.sqrt(added)), covariance), noisy
+    return None
+
+
+def _noise_words(marks: str, added_um: float, covariance_mm2: Array) -> tuple[str, str]:
+    given_um = UM_PER_MM * float(np.sqrt(np.median(np.trace(covariance_mm2, axis1=1, axis2=2) / 2.0)))
+    key = "sigma_fiducial_um" if marks == "fiducials" else "sigma_target_um"
+    return (
+        f"The standard deviations given to the {marks} are too small everywhere: the residuals are plain "
+        f"noise, alike in all images; {added_um:.3g} µm added to the {given_um:.3g} µm given (in quadrature) "
+        "explains all",
+        f"Give film_sigma_um = {added_um:.3g} under [adjust], which is added to the sigma of every mark, or larger "
+        f"sigmas in comparator.csv or {key}.",
+    )
+
+
+def _is_noise(run: Run) -> bool:
+    """Whether standardised residuals are normal, homogeneous over images and independent of neighbours."""
+    v = residuals(run)
+    checked: Mask = np.asarray((v.redundancy > UNCHECKED).all(axis=1))
+    if 2 * checked.sum() < FEWEST:
+        return False
+    w, images = v.w[checked], run.problem.image_numbers[checked]
+    if not (_is_normal(w) and _is_alike(w, v.redundancy[checked], images)):
+        return False
+    return not any(_is_positive(products) for products in _neighbour_products(run, checked, w, images))
+
+
+def _is_normal(w: Array) -> bool:
+    """Test the kurtosis of all coordinates, with its standard deviation √(24 / n)."""
+    kurtosis = np.mean(w**4) / np.mean(w**2) ** 2 - 3.0
+    return bool(ndtr(-abs(kurtosis) / np.sqrt(24.0 / w.size)) > 0.5 * CHANCE)
+
+
+def _is_alike(w: Array, redundancy: Array, images: Indices) -> bool:
+    """Test by chi-square whether all images have the same mean square."""
+    shares, freedom = (np.bincount(images, each.sum(axis=1)) for each in (w**2 * redundancy, redundancy))
+    present = freedom > 1.0
+    variance = shares.sum() / freedom.sum()
+    square = ((shares[present] / variance - freedom[present]) ** 2 / (2.0 * freedom[present])).sum()
+    return bool(present.sum() < 2 or chdtrc(present.sum() - 1, square) > CHANCE)
+
+
+def _neighbour_products(run: Run, checked: Mask, w: Array, images: Indices) -> Iterator[Array]:
+    """Products of residuals (n, 2) of neighbours in an image, in different images, and of a point in different images.
+
+    The residuals of a point are rotated into object axes.
+    """
+    places = run.end.computed_mm[checked]
+    apart = 10.0 * float(np.ptp(places, axis=0).max())
+    for at, same_image in ((np.column_stack([places, apart * images]), True), (places, False)):
+        near = np.asarray(KDTree(at).query(at, min(NEIGHBOURS, len(at)))[1])
+        wanted = (images[near] == images[:, None]) == same_image
+        wanted &= near != np.arange(len(w))[:, None]
+        rows = np.flatnonzero(wanted.any(axis=1))
+        yield (w[rows] * w[near[rows, wanted[rows].argmax(axis=1)]]).sum(axis=1)
+    points = np.array(run.problem.network.observations.point)[checked]
+    order = np.lexsort((images, points))
+    in_object = np.einsum("nji,nj->ni", run.end.state.rotations[images][:, :2], w)[order]
+    yield (in_object[1:] * in_object[:-1]).sum(axis=1)[points[order][1:] == points[order][:-1]]
+
+
+def _is_positive(products: Array) -> bool:
+    """Whether the sum of products of residuals, of expectation 0 if independent, is significantly positive."""
+    if len(products) <= 2:
+        return False
+    z = products.sum() / np.sqrt(2.0 * (products**2).sum())  # factor 2: most pairs of neighbours occur twice
+    return bool(ndtr(-z) < 0.5 * CHANCE)
+
+
+def _groups_agree(run: Run) -> bool:
+    """Whether every group of observations agrees with its standard deviations in a two-sided test."""
+    for name in np.unique(run.units.groups):
+        vpv, freedom = run.group_sums((run.units.groups == name) & run.weighting.used)
+        if freedom > 1.0 and min(chdtr(freedom, vpv), chdtrc(freedom, vpv)) < CHANCE:
+            return False
+    return True

@@ -22,55 +22,41 @@ def leave_out(network: Network, frames: Collection[str]) -> Network | None:
     left = {image.frame for image in network.images if image.frame not in frames}
     if len(left) <= len(frames):
         return None
-    images = tuple(image for image in network.images if image.frame in left)
+    images, observations = tuple(image for image in network.images if image.frame in left), network.observations
     names = {image.name for image in images}
-    observations = network.observations
-    rows = zip(observations.image, observations.point, observations.is_fiducial, strict=True)
-    shown = [(image, point, on_film) for image, point, on_film in rows if image in names]
+    shown = np.isin(observations.image, list(names))
     frames_of = defaultdict[str, set[str]](set)
-    for image, point, on_film in shown:
-        if not on_film:
-            frames_of[point].add(network.image_by_name[image].frame)
+    for row in np.flatnonzero(shown & ~observations.is_fiducial):
+        frames_of[observations.point[row]].add(network.image_by_name[observations.image[row]].frame)
     located = {
         point.id
         for point in network.points
         if len(frames_of[point.id]) >= (FEWEST_RAYS if point.X is point.Y is point.Z is None else 1)
     }
-    gone = network.observed_points - located
-    kept = [
-        row
-        for row, (image, point) in enumerate(zip(observations.image, observations.point, strict=True))
-        if image in names and (observations.is_fiducial[row] or point in located)
-    ]
-    ends = located | names
+    kept = shown & (observations.is_fiducial | np.isin(observations.point, list(located)))
     return replace(
         network,
         images=images,
-        points=tuple(point for point in network.points if point.id not in gone),
-        observations=observations.only(np.array(kept, dtype=np.intp)),
-        distances=tuple(each for each in network.distances if {each.start, each.end} <= ends),
+        points=tuple(
+            point for point in network.points if point.id in located or point.id not in network.observed_points
+        ),
+        observations=observations.only(np.flatnonzero(kept)),
+        distances=tuple(each for each in network.distances if {each.start, each.end} <= located | names),
     )
 
 
 def adopt_lens(network: Network, result: Adjustment) -> Network:
     """Replace the cameras of a network by those adjusted from a part of it."""
     used = {image.camera for image in result.network.images} - result.network.idle_cameras
-    return replace(
-        network,
-        cameras=tuple(_adopt_camera(camera, result) if camera.name in used else camera for camera in network.cameras),
-    )
+    cameras = (_adopt_camera(camera, result) if camera.name in used else camera for camera in network.cameras)
+    return replace(network, cameras=tuple(cameras))
 
 
 def fitting(result: Adjustment, frames: Collection[str], sigma0: float) -> set[str]:
     """Select the frames whose residuals agree with sigma0 of the others."""
-    squares, weights = defaultdict[str, float](float), defaultdict[str, float](float)
-    network = result.network
-    of_rows = zip(network.observations.image, result.residuals.w, result.weights, strict=True)
-    for image, w, weight in of_rows:
-        frame = network.image_by_name[image].frame
-        squares[frame] += float(weight * np.nan_to_num(w) @ np.nan_to_num(w))
-        weights[frame] += 2.0 * float(weight)
-    return {frame for frame in frames if squares[frame] <= (FITTING * sigma0) ** 2 * weights[frame]}
+    of_mark = np.array([image.frame for image in result.network.images])[result.network.image_numbers]
+    excess = (np.nan_to_num(result.residuals.w) ** 2).sum(axis=1) - 2.0 * (FITTING * sigma0) ** 2
+    return {frame for frame in frames if (result.weights * excess)[of_mark == frame].sum() <= 0.0}
 
 
 def _adopt_camera(camera: Camera, result: Adjustment) -> Camera:

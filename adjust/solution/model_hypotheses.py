@@ -8,7 +8,7 @@ image alone has normal equations N d = g. Separate shifts of two groups lower v'
 best partition is found by weighted two-means, started from the best thresholds of the shifts in some directions.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -22,6 +22,7 @@ from adjust.least_squares.iteration import linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Board, Network, Scanner
+from adjust.problem.parameter import shortened
 from adjust.problem.problem import Problem, number
 from adjust.quality.cofactor import free_cofactor
 from adjust.quality.run import Run
@@ -162,7 +163,6 @@ def _solved(normal: Array, right: Array) -> Array:
 FREE = Prior(0.0, np.inf)
 TERMS_TOGETHER = 2  # radial terms tested jointly
 OTHERS = " (other images)"  # suffix of a camera's name for the images with a different interior orientation
-SCANNER, BOARD, GROUPS = "scanner", "board", "groups"
 NAMED = 5  # images named in a message
 ALIKE = 7.0  # difference of chi-square plus twice the unknowns below which two readings are not distinguished
 
@@ -188,40 +188,29 @@ def model_hypotheses(run: Run) -> Iterator[ModelHypothesis]:
     network = run.problem.network
     used = run.problem.unknowns.camera.keys() - network.idle_cameras
     cameras = [camera for camera in network.cameras if camera.name in used]
-    for hypotheses in (_radial_terms, _decentering_terms, _digital_pixels):
+    is_grouped = any(each.name.endswith(OTHERS) for each in network.cameras)
+    for hypotheses in (_lens_terms,) if is_grouped else (_lens_terms, _second_interior_orientation):
         for camera in cameras:
             yield from hypotheses(run, camera)
     yield from _scanner_pixels(run)
-    if not any(each.name.endswith(OTHERS) for each in network.cameras):
-        for camera in cameras:
-            yield from _second_interior_orientation(run, camera)
     yield from _bent_board(run)
 
 
-def _radial_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
-    """The next radial terms that the camera lacks."""
-    free = _free_terms(camera)
-    count = sum(name in free for name in (*_own_terms(camera, "radial"), *RADIAL))
-    first = min(count, len(RADIAL) - TERMS_TOGETHER)
-    terms = RADIAL[first : first + TERMS_TOGETHER]
-    degrees = ", ".join(name.removeprefix("+r") for name in terms)
-    pattern = f"a radial pattern, of the degrees {degrees} in r"
-    yield _extended_lens(run, camera, terms, "radial", partial(_lens_words, camera, "radial", pattern))
-
-
-def _decentering_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
-    """Decentering distortion, or its next terms."""
-    free = _free_terms(camera)
-    if not free.intersection(DECENTERING[1]):
-        has_decentering = any(name in free for name in (*_own_terms(camera, "decentering"), *DECENTERING[0]))
+def _lens_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
+    """The next radial terms that a camera lacks, its next decentering terms, and non-square pixels."""
+    free, own = _free_terms(camera), partial(_own_terms, camera)
+    first = min(len(free.intersection((*own("radial"), *RADIAL))), len(RADIAL) - TERMS_TOGETHER)
+    radial = RADIAL[first : first + TERMS_TOGETHER]
+    pattern = f"a radial pattern, of the degrees {', '.join(name.removeprefix('+r') for name in radial)} in r"
+    yield _extended_lens(run, camera, radial, "radial", partial(_lens_words, camera, "radial", pattern))
+    lower, higher = DECENTERING
+    if not free.intersection(higher):
+        terms = higher if free.intersection((*own("decentering"), *lower)) else lower
         words = partial(_lens_words, camera, "decentering", "a tangential pattern (decentering)")
-        yield _extended_lens(run, camera, DECENTERING[int(has_decentering)], "decentering", words)
-
-
-def _digital_pixels(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
+        yield _extended_lens(run, camera, terms, "decentering", words)
     images = run.problem.network.images
     digital = all(image.transformation == "none" for image in images if image.camera == camera.name)
-    if digital and not _free_terms(camera).intersection({*_own_terms(camera, "affinity")[:1], "+b1"}):
+    if digital and not free.intersection((*own("affinity")[:1], "+b1")):
         half_mm = _lens_half_mm(run.problem.network, camera)[0]
         yield _extended_lens(run, camera, ("+b1",), "pixels", partial(_pixel_words, camera.name, 1.0 / half_mm))
 
@@ -233,13 +222,13 @@ def _scanner_pixels(run: Run) -> Iterator[ModelHypothesis]:
     if not films or network.scanners or not all(is_left(image.transformation, "stretch") for image in films):
         return
     extents = [network.extent_by_image[image.name] for image in films]
-    middle = np.mean([extent.center_mm for extent in extents], axis=0)
+    x, y = np.mean([extent.center_mm for extent in extents], axis=0).tolist()
     half_mm = max(extent.half_mm for extent in extents)
-    scanner = Scanner(SCANNER, {"stretch": FREE}, (float(middle[0]), float(middle[1])), (half_mm, half_mm))
-    images = tuple(replace(image, scanner=SCANNER) if image in films else image for image in network.images)
+    scanner = Scanner("scanner", {"stretch": FREE}, (x, y), (half_mm, half_mm))
+    images = tuple(replace(image, scanner=scanner.name) if image in films else image for image in network.images)
     problem = _continued(run, replace(network, images=images, scanners=(scanner,)))
     words = partial(_pixel_words, films[0].camera, 2.0 / half_mm)
-    yield ModelHypothesis("pixels", words, problem, problem.unknowns.scanner[SCANNER])
+    yield ModelHypothesis("pixels", words, problem, problem.unknowns.scanner[scanner.name])
 
 
 def _second_interior_orientation(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
@@ -247,14 +236,13 @@ def _second_interior_orientation(run: Run, camera: Camera) -> Iterator[ModelHypo
     network, groups = run.problem.network, two_groups(run, camera.name)
     if groups is None:
         return
-    others = camera.name + OTHERS
-    images = tuple(replace(each, camera=others) if each.name in groups.images else each for each in network.images)
-    cameras = (*network.cameras, replace(camera, name=others))
-    problem = _continued(run, replace(network, images=images, cameras=cameras), {others: camera.name})
-    added = problem.unknowns.camera[others][: len(INTERIOR_NAMES)]
-    contrasts = len(INTERIOR_NAMES) * (groups.count - 1)
-    words = partial(_group_words, camera.name, groups)
-    yield ModelHypothesis(GROUPS, words, problem, added, groups.choices, contrasts, groups.p_scatter)
+    others = replace(camera, name=camera.name + OTHERS)
+    images = tuple(replace(each, camera=others.name) if each.name in groups.images else each for each in network.images)
+    apart = replace(network, images=images, cameras=(*network.cameras, others))
+    problem = _continued(run, apart, {others.name: camera.name})
+    added = problem.unknowns.camera[others.name][: len(INTERIOR_NAMES)]
+    words, contrasts = partial(_group_words, camera.name, groups), len(INTERIOR_NAMES) * (groups.count - 1)
+    yield ModelHypothesis("groups", words, problem, added, groups.choices, contrasts, groups.p_scatter)
 
 
 def _bent_board(run: Run) -> Iterator[ModelHypothesis]:
@@ -264,20 +252,24 @@ def _bent_board(run: Run) -> Iterator[ModelHypothesis]:
     if network.boards or not places or len(places) < len(network.observed_points):
         return
     try:
-        board = Board(BOARD, places, (FREE, FREE))
+        board = Board("board", places, (FREE, FREE))
     except ValueError:
         return
     problem = _continued(run, replace(network, boards=(board,)))
-    yield ModelHypothesis(BOARD, _board_words, problem, problem.unknowns.board[BOARD])
+    yield ModelHypothesis("board", _board_words, problem, problem.unknowns.board[board.name])
 
 
 def _free_terms(camera: Camera) -> set[str]:
     return {name for name, prior in camera.distortion.parameters.items() if prior.sigma > 0.0}
 
 
+def _own_family(camera: Camera) -> str:
+    return camera.distortion.family.removesuffix(EXTENDED)
+
+
 def _own_terms(camera: Camera, group: str) -> tuple[str, ...]:
     """Terms of a group in the camera's own family."""
-    return tuple(dict(family(camera.distortion.family.removesuffix(EXTENDED)).groups).get(group, ()))
+    return tuple(dict(family(_own_family(camera)).groups).get(group, ()))
 
 
 def _lens_half_mm(network: Network, camera: Camera) -> tuple[float, float]:
@@ -289,12 +281,12 @@ def _lens_half_mm(network: Network, camera: Camera) -> tuple[float, float]:
 
 
 def _extended_lens(run: Run, camera: Camera, terms: Sequence[str], kind: str, words: Words) -> ModelHypothesis:
-    network, distortion = run.problem.network, camera.distortion
-    extended = distortion.family.removesuffix(EXTENDED) + EXTENDED
-    parameters = dict(distortion.parameters) | dict.fromkeys(terms, FREE)
-    distortion = replace(distortion, family=extended, parameters=parameters, half_mm=_lens_half_mm(network, camera))
-    cameras = (replace(each, distortion=distortion) if each is camera else each for each in network.cameras)
-    problem = _continued(run, replace(network, cameras=tuple(cameras)))
+    network, extended = run.problem.network, _own_family(camera) + EXTENDED
+    parameters = dict(camera.distortion.parameters) | dict.fromkeys(terms, FREE)
+    half_mm = _lens_half_mm(network, camera)
+    lens = replace(camera.distortion, family=extended, parameters=parameters, half_mm=half_mm)
+    cameras = tuple(replace(each, distortion=lens) if each is camera else each for each in network.cameras)
+    problem = _continued(run, replace(network, cameras=cameras))
     names = family(extended).parameters
     added = problem.unknowns.camera[camera.name][[3 + names.index(term) for term in terms]]
     return ModelHypothesis(kind, words, problem, added)
@@ -313,7 +305,7 @@ def separate_lenses(run: Run) -> Problem | None:
     return replace(problem, unknowns=replace(unknowns, sigma=sigma, start=start))
 
 
-def _continued(run: Run, network: Network, like: dict[str, str] | None = None) -> Problem:
+def _continued(run: Run, network: Network, like: Mapping[str, str] | None = None) -> Problem:
     """Number a network with additional unknowns; start where an adjustment ended, in its datum."""
     # like: cameras that share distortion and fiducial marks with another one and start with its interior orientation.
     old, values, like, count = run.problem.unknowns, run.end.state.values, like or {}, len(INTERIOR_NAMES)
@@ -349,13 +341,12 @@ def _continued(run: Run, network: Network, like: dict[str, str] | None = None) -
 
 def _lens_words(camera: Camera, group: str, what: str, run: Run, added: Indices, rms_um: float) -> tuple[str, str]:
     cause = f"The lens model of camera {camera.name} is too simple: the residuals have {what}, {rms_um:.2g} µm rms"
-    denominator = family(camera.distortion.family.removesuffix(EXTENDED)).alike_at_zero  # asked for by nobody at first
-    terms = [name for name in _own_terms(camera, group) if name not in denominator]
-    fixed = [name for name in terms if name not in _free_terms(camera)]
-    if camera.distortion.family.removesuffix(EXTENDED) == "none":
+    if _own_family(camera) == "none":
         names = "k1 and k2" if group == "radial" else "p1 and p2"
         return cause, f'Give the camera a [distortion] of the family "brown", say, with {names} free.'
-    if fixed:
+    denominator = family(_own_family(camera)).alike_at_zero  # asked for by nobody at first
+    known = {*denominator, *_free_terms(camera)}
+    if fixed := [name for name in _own_terms(camera, group) if name not in known]:
         return cause, f'Free {", ".join(fixed)} under [distortion.sigma] of the camera ("free").'
     return cause, "Choose a distortion family with more terms, legendre(5) say; `reseau adjust --choose` compares some."
 
@@ -391,9 +382,7 @@ def _group_words(camera: str, groups: ImageGroups, run: Run, added: Indices, _: 
     base, difference = values[3:], values[:3] - values[3:]
     by_both = np.hstack([np.eye(3), -np.eye(3)])
     spread = by_both @ covariance @ by_both.T
-    shown = ", ".join(groups.images[:NAMED])
-    more = f" and {len(groups.images) - NAMED} more" if len(groups.images) > NAMED else ""
-    who = f"the images {shown}{more} ({len(groups.images)} of {groups.count}) of camera {camera}"
+    who = f"the images {shortened(groups.images, NAMED)} ({len(groups.images)} of {groups.count}) of camera {camera}"
     sigma = np.sqrt(np.diag(spread))
     scale = 1.0 + float(difference @ base) / float(base @ base)
     readings = (

@@ -8,16 +8,17 @@ reported where it explains all observations.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.special import chdtri
 
 from adjust.array_types import Array, Indices, Mask
 from adjust.problem.camera import Camera
+from adjust.problem.condition_equations import observed_in_camera
 from adjust.problem.estimates import adjusted_image
-from adjust.problem.network import Network
-from adjust.problem.parameter import Parameter
-from adjust.solution.blunder_hypotheses import Trials, mirrored_images, y_downward
+from adjust.problem.parameter import Parameter, shortened
+from adjust.solution.blunder_hypotheses import Trials, mirrored_images, reversed_y
 from adjust.solution.result import Adjustment
 
 MARGIN = 0.01  # fraction of the frame that a mark may lie outside: edge of the outermost pixel, rounded frame size
@@ -31,26 +32,13 @@ def check_plausibility(result: Adjustment, trials: Trials) -> Adjustment:
     """Add remarks on contradictions with the geometry of photographs to a result."""
     if result.termination == "singular" or not result.network.observed_points:
         return result
-    views = _views(result.network, result)
+    views = _views(result)
     outside = [row for view in views for row in view.outside]
     remarks = [*_marks_outside(result, sorted(outside), trials)]
     misread = tuple(_both_sides(result, trials))
     if result.converged and not outside:
         remarks += [each for view in views for each in _principal_point(view, result, trials.family)]
     return replace(result, misread=misread, remarks=(*result.remarks, *remarks))
-
-
-@dataclass(frozen=True)
-class _Picture:
-    """Image area of a camera in mm, by two opposite corners."""
-
-    low: Array
-    high: Array
-
-    def outside(self, xy_mm: Array) -> Mask:
-        """Mask of points (n, 2) outside the image."""
-        margin = MARGIN * float((self.high - self.low).max())
-        return np.asarray((xy_mm < self.low - margin).any(axis=1) | (xy_mm > self.high + margin).any(axis=1))
 
 
 @dataclass(frozen=True)
@@ -66,9 +54,9 @@ class _View:
     rows: Indices
     xy_mm: Array
 
-    @property
-    def picture(self) -> _Picture | None:
-        """Image area, None where its size is unknown.
+    @cached_property
+    def picture(self) -> Array | None:
+        """Image area in mm, by two opposite corners (2, 2); None where its size is unknown.
 
         That of a digital camera starts at the first pixel, like the comparator coordinates. That of a film camera is
         centred on the fiducial marks. It is centred on the origin where nearly all marks lie inside then, and more than
@@ -80,9 +68,9 @@ class _View:
         marks = [[mark.x_mm.value, mark.y_mm.value] for mark in self.camera.fiducials.values()]
         middle_mm = (np.min(marks, axis=0) + np.max(marks, axis=0)) / 2.0 if marks else np.zeros(2)
         low = size * [0.0, -1.0] if self.digital else middle_mm - size / 2.0
-        usual, middle = _Picture(low, low + size), _Picture(-size / 2.0, size / 2.0)
-        outside = middle.outside(self.xy_mm).mean()
-        return middle if outside < min(1.0 - NEARLY_ALL, usual.outside(self.xy_mm).mean()) else usual
+        usual, middle = np.array([low, low + size]), np.array([-size / 2.0, size / 2.0])
+        outside = _is_outside(middle, self.xy_mm).mean()
+        return middle if outside < min(1.0 - NEARLY_ALL, _is_outside(usual, self.xy_mm).mean()) else usual
 
     @property
     def outside(self) -> list[int]:
@@ -91,26 +79,25 @@ class _View:
         For a digital camera of unknown size these are all rows, if all marks lie above and right of the first pixel.
         """
         if self.picture is not None:
-            return [int(row) for row in self.rows[self.picture.outside(self.xy_mm)]]
+            return [int(row) for row in self.rows[_is_outside(self.picture, self.xy_mm)]]
         return self.rows.tolist() if self.digital and (self.xy_mm > 0.0).all() else []
 
 
-def _views(network: Network, result: Adjustment) -> list[_View]:
+def _is_outside(picture: Array, xy_mm: Array) -> Mask:
+    """Mask of points (n, 2) outside an image area."""
+    margin = MARGIN * float(np.ptp(picture, axis=0).max())
+    return np.asarray(((xy_mm < picture[0] - margin) | (xy_mm > picture[1] + margin)).any(axis=1))
+
+
+def _views(result: Adjustment) -> list[_View]:
     """Views of the cameras whose images show object points."""
-    numbers, views = network.image_numbers, []
+    network, run = result.network, result.run
+    xy_mm, views = observed_in_camera(run.problem, run.end.state), []
     for camera in network.cameras:
-        own = np.array([image.camera == camera.name for image in network.images])
-        rows = np.flatnonzero(own[numbers] & ~network.observations.is_fiducial)
-        xy_mm = network.straight_xy_mm[rows].copy()
-        digital = all(image.transformation == "none" for image in network.images if image.camera == camera.name)
-        order = np.argsort(numbers[rows], kind="stable")
-        shown_numbers, first = np.unique(numbers[rows[order]], return_index=True)
-        for number, shown in zip(shown_numbers, np.split(order, first[1:]), strict=True):
-            image = network.images[number]
-            if image.transformation != "none":
-                xy_mm[shown] = adjusted_image(result, image.name).film.camera_from_comparator(xy_mm[shown])
-        if len(rows):
-            views.append(_View(camera, digital, rows, xy_mm))
+        images = [image for image in network.images if image.camera == camera.name]
+        rows = run.problem.targets_by_camera.get(camera.name)
+        if rows is not None and len(rows):
+            views.append(_View(camera, all(image.transformation == "none" for image in images), rows, xy_mm[rows]))
     return views
 
 
@@ -123,12 +110,13 @@ def _marks_outside(result: Adjustment, rows: Sequence[int], trials: Trials) -> I
     where = f"(frame_mm = {list(sized[0].frame_mm)})" if sized else "above its first row of pixels"
     words = f"{len(rows)} of {count} marks lie outside the picture{' ' if sized else ', '}{where}"
     if len(rows) < NEARLY_ALL * count:
-        shown = _listed([f"{observations.image[row]}/{observations.point[row]}" for row in rows])
+        shown = shortened([f"{observations.image[row]}/{observations.point[row]}" for row in rows], NAMED)
         yield f"{words}: {shown}. Their coordinates, frame_mm or the pitch is wrong. Correct it."
         return
-    other = y_downward(network)
-    turned = None if other is None else trials.adjust(other)
-    if other is None or turned is None or any(view.outside for view in _views(other, turned)):
+    other = reversed_y(network, keeps_given=True)
+    is_digital = all(image.transformation == "none" for image in network.images)
+    turned = trials.adjust(other) if is_digital else None
+    if turned is None or any(view.outside for view in _views(turned)):
         yield (
             f"{words}: the comparator counts x to the right and y up, from the first pixel. Correct the coordinates, "
             "frame_mm or the pitch."
@@ -159,17 +147,13 @@ def _both_sides(result: Adjustment, trials: Trials) -> Iterator[str]:
             f" (σ₀ = {turned.sigma0:.2f}; as it stands {result.sigma0:.2f})."
         )
     yield (
-        f"{'Image' if one else 'The images'} {_listed(fewer)}{even}"
+        f"{'Image' if one else 'The images'} {shortened(fewer, NAMED)}{even}"
         f" {'is' if one else 'are'} mirrored, or the flat board of the given points is transparent: "
         f"{'its station lies' if one else 'their stations lie'} on the other side of it than those of the "
         f"{len(sides) - len(fewer)} other images, which an opaque board hides.{figures} Mirror "
         f"{'the image' if one else 'the images'} and measure again, or write transparent = true under [targets] or "
         "[object]."
     )
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
 
 
 def _sides(result: Adjustment) -> dict[str, float]:
@@ -197,11 +181,12 @@ def _principal_point(view: _View, result: Adjustment, family: float) -> Iterator
         return
     if picture is None:
         reach = AROUND * np.ptp(view.xy_mm, axis=0).max()
-        low, high = view.xy_mm.min(axis=0) - reach, view.xy_mm.max(axis=0) + reach
-        picture = _Picture(np.minimum(low, 0.0), np.maximum(high, 0.0)) if view.digital else _Picture(low, high)
+        picture = np.array([view.xy_mm.min(axis=0) - reach, view.xy_mm.max(axis=0) + reach])
+        if view.digital:
+            picture = np.array([np.minimum(picture[0], 0.0), np.maximum(picture[1], 0.0)])
         kind = "outside all that the marks cover"
-    if picture.outside(found[None])[0]:
-        (left, lower), (right, upper) = picture.low, picture.high
+    if _is_outside(picture, found[None])[0]:
+        (left, lower), (right, upper) = picture
         yield (
             f"{words}, {kind} (x from {left:g} to {right:g}, y from {lower:g} to {upper:g} mm), where no lens has it: "
             "the images do not tell it from their tilts, or points are misnamed or misplaced. Give principal_point_mm "

@@ -4,10 +4,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import brentq
+from numpy.typing import NDArray
 
-from adjust.array_types import Array
 from adjust.problem.network import Network
+from adjust.quality.variance_components import added_variance
 from adjust.solution.result import Adjustment
 
 ROUNDS = 6  # two or three suffice: nearly equal weights hardly change the residuals
@@ -40,18 +40,16 @@ def adjust_unmodelled(network: Network, adjusted: Callable[[Network], Adjustment
     AdjustmentError
         As `adjusted` does.
     """
-    sigma_mm = {each.name: FIRST * float(np.hypot(*each.frame_mm)) for each in network.cameras}
+    diagonal_mm = {each.name: float(np.hypot(*each.frame_mm)) for each in network.cameras}
+    sigma_mm = {each: FIRST * diagonal_mm[each] for each in diagonal_mm}
     result = adjusted(add_unmodelled(network, sigma_mm))
     for _ in range(ROUNDS):
         if not result.converged:
             break
-        found = {camera: _component_mm(result, sigma_mm, camera) for camera in sigma_mm}
-        settled = all(abs(found[each] - sigma_mm[each]) <= SETTLED * found[each] for each in found)
-        sigma_mm = found
-        if settled:
+        before, sigma_mm = sigma_mm, _components_mm(result, sigma_mm)
+        if all(abs(sigma_mm[each] - before[each]) <= SETTLED * sigma_mm[each] for each in sigma_mm):
             break
         result = adjusted(add_unmodelled(network, sigma_mm))
-    diagonal_mm = {each.name: float(np.hypot(*each.frame_mm)) for each in network.cameras}
     large = [each for each in sigma_mm if sigma_mm[each] > PLAUSIBLE * diagonal_mm[each] > 0.0]
     warnings = (
         f"Camera {each}: errors of {1000.0 * sigma_mm[each]:.3g} µm are not modelled, one part in "
@@ -69,31 +67,20 @@ def add_unmodelled(network: Network, sigma_mm: Mapping[str, float]) -> Network:
     return replace(network, observations=replace(network.observations, covariance_mm2=covariance_mm2))
 
 
-def _cameras(network: Network) -> list[str]:
+def _cameras(network: Network) -> NDArray[np.str_]:
     """Camera of every target and tie point; "" for other marks."""
-    camera, observations = {image.name: image.camera for image in network.images}, network.observations
-    shown = zip(observations.image, observations.kind, strict=True)
-    return [camera[image] if kind in ("target", "tie") else "" for image, kind in shown]
+    cameras = np.array([image.camera for image in network.images])[network.image_numbers]
+    return np.where(np.isin(network.observations.kind, ("target", "tie")), cameras, "")
 
 
-def _component_mm(result: Adjustment, before_mm: Mapping[str, float], camera: str) -> float:
-    """Standard deviation with which v'Pv of a camera's marks equals their redundancy, for the current residuals."""
-    rows = np.array(_cameras(result.network)) == camera
-    if not rows.any():
-        return 0.0
-    residuals = result.residuals
-    square = residuals.v_mm[rows] ** 2
-    given = np.diagonal(result.network.observations.covariance_mm2[rows], axis1=1, axis2=2) - before_mm[camera] ** 2
-    redundancy = float(residuals.redundancy[rows].sum())
-
-    def excess(variance: float) -> float:
-        return float((square / np.maximum(given + variance, 1e-300)).sum()) - redundancy
-
-    if redundancy < 1.0 or excess(0.0) <= 0.0:
-        return 0.0
-    return float(np.sqrt(brentq(excess, 0.0, _upper(square, redundancy))))
-
-
-def _upper(square: Array, redundancy: float) -> float:
-    """Upper bound: a variance with which v'Pv is below the redundancy."""
-    return 2.0 * float(square.sum()) / redundancy
+def _components_mm(result: Adjustment, before_mm: Mapping[str, float]) -> dict[str, float]:
+    """Standard deviations by camera with which v'Pv of its marks equals their redundancy, for the current residuals."""
+    found, cameras, residuals = dict[str, float](), _cameras(result.network), result.residuals
+    variances = np.diagonal(result.network.observations.covariance_mm2, axis1=1, axis2=2)
+    for camera, before in before_mm.items():
+        rows = cameras == camera
+        redundancy = float(residuals.redundancy[rows].sum())
+        squares, given = residuals.v_mm[rows] ** 2, variances[rows] - before**2
+        added = added_variance(squares, given, redundancy) if redundancy >= 1.0 else None
+        found[camera] = float(np.sqrt(added or 0.0))
+    return found

@@ -1,5 +1,6 @@
 """Warnings about a result, each with its remedy."""
 
+from collections import defaultdict
 from collections.abc import Iterator
 from itertools import combinations
 
@@ -11,7 +12,7 @@ from adjust.least_squares.iteration import factorise
 from adjust.problem.condition_equations import computed_observations
 from adjust.problem.estimates import Cofactor
 from adjust.problem.observations import Observations
-from adjust.problem.parameter import description
+from adjust.problem.parameter import description, shortened
 from adjust.problem.problem import Problem
 from adjust.quality.run import Residuals, Run
 from adjust.rank_defect.diagnosis import loose_principal_distances, undetermined, weak_directions
@@ -81,10 +82,7 @@ def _weak_parameters(run: Run, cofactor: Cofactor) -> Iterator[str]:
 def _points_without_image(problem: Problem) -> list[str]:
     """Warn of given points without an image."""
     points = [point.id for point in problem.network.points if point.id not in problem.unknowns.point]
-    if not points:
-        return []
-    shown = ", ".join(points[:5]) + (f" and {len(points) - 5} more" if len(points) > 5 else "")
-    return [f"No image shows the object points {shown}: they take no part."]
+    return [f"No image shows the object points {shortened(points, 5)}: they take no part."] if points else []
 
 
 def _films_by_targets(problem: Problem) -> list[str]:
@@ -118,15 +116,13 @@ def _swapped_numbers(run: Run, residuals: Residuals) -> list[str]:
     started = computed_observations(problem, problem.start())
     if started is None:
         return []
-    found = []
-    v_mm = started - observations.xy_mm
-    gross = _is_gross(observations, v_mm)
+    found, gross = [], _is_gross(observations, started - observations.xy_mm)
     for rows in _rows_by_image(observations).values():
         fiducial = observations.is_fiducial[rows]
         for kind in (False, True):
             marks = rows[fiducial == kind]
-            pairs = combinations([int(row) for row in marks[gross[marks]]], 2)
-            crossed = [(i, j) for i, j in pairs if _cross(observations, v_mm, i, j)]
+            pairs = combinations(marks[gross[marks]].tolist(), 2)
+            crossed = [(i, j) for i, j in pairs if _cross(observations.xy_mm, started, i, j)]
             if 2 * len({row for pair in crossed for row in pair}) < len(marks):
                 found += [_swapped(observations, i, j) for i, j in crossed]
     return found
@@ -147,18 +143,16 @@ def _unchecked_orientations(observations: Observations, residuals: Residuals) ->
 
 def _rows_by_image(observations: Observations) -> dict[str, Indices]:
     """Group the rows by image, in order of first appearance."""
-    number = {name: i for i, name in enumerate(dict.fromkeys(observations.image))}
-    of = np.array([number[name] for name in observations.image], dtype=np.intp)
-    rows = np.split(np.argsort(of, kind="stable"), np.cumsum(np.bincount(of))[:-1])
-    return dict(zip(number, rows, strict=True))
+    rows = defaultdict[str, list[int]](list)
+    for row, image in enumerate(observations.image):
+        rows[image].append(row)
+    return {image: np.array(own, dtype=np.intp) for image, own in rows.items()}
 
 
-def _cross(observations: Observations, v: Array, i: int, j: int) -> bool:
+def _cross(observed_mm: Array, expected_mm: Array, i: int, j: int) -> bool:
     """Whether two marks each lie where the other is expected."""
-    xy = observations.xy_mm
-    apart = np.linalg.norm(xy[i] - xy[j])
-    off = max(np.linalg.norm(xy[i] + v[i] - xy[j]), np.linalg.norm(xy[j] + v[j] - xy[i]))
-    return bool(off < NEARER * apart)
+    off = np.linalg.norm(expected_mm[[i, j]] - observed_mm[[j, i]], axis=1)
+    return bool(off.max() < NEARER * np.linalg.norm(observed_mm[i] - observed_mm[j]))
 
 
 def _swapped(observations: Observations, i: int, j: int) -> str:
