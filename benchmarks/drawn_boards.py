@@ -96,7 +96,7 @@ def main() -> None:
             marks = measure_board(scan, case.spec).marks
             own += [np.asarray(mark.center_px) - truth[mark.point] for mark in marks if mark.status.is_observation]
             places = np.array(list(visible.values()))
-            found = _found_by_opencv(picture, case.spec)
+            found = found_by_opencv(picture, case.spec)
             if len(found):
                 far, nearest = KDTree(places).query(found)
                 other += list((found - places[nearest])[np.asarray(far) < NEAR_PX])
@@ -141,7 +141,7 @@ def _rays() -> Array:
     return np.asarray(rays)
 
 
-def _found_by_opencv(picture: Bytes, spec: BoardSpec) -> Array:
+def found_by_opencv(picture: Bytes, spec: BoardSpec) -> Array:
     """(n, 2) points found by OpenCV; the asymmetric grid, not included in the check, by findCirclesGrid; for ChArUco
     the better of both layouts."""
     if isinstance(spec, CircleGridSpec) and spec.asymmetric:
