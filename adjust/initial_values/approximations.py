@@ -64,9 +64,10 @@ def _initial_values(network: Network) -> Approximations:
     mirrored = frozenset(name for name, (_, is_mirrored) in films.items() if is_mirrored)
     frames = camera_frames(network, transformation, mirrored)
     used = [camera for camera in network.cameras if camera.name not in network.idle_cameras]
-    interior = {camera.name: _interior(camera, frames) for camera in used}
+    resected = dict[str, Pose]()
+    interior = {camera.name: _interior(camera, frames, resected) for camera in used}
     sights = {name: sight for camera in used for name, sight in _sights(camera, frames, interior[camera.name]).items()}
-    poses, points = orient(network, sights)
+    poses, points = orient(network, sights, resected)
     return Approximations(
         interior=interior,
         exterior={image.name: _exterior(image, poses[image.name]) for image in network.images if image.name in poses},
@@ -116,23 +117,32 @@ def _film_transformations(network: Network) -> dict[str, Film]:
     return films
 
 
-def _interior(camera: Camera, frames: Frames) -> Array:
-    """c, x0', y0' (3,) in mm."""
+def _interior(camera: Camera, frames: Frames, resected: dict[str, Pose]) -> Array:
+    """c, x0', y0' (3,) in mm; adds the poses found together with the principal distance, by image."""
     x0, y0 = (
         center if prior is None else prior.value
         for prior, center in zip((camera.x0_mm, camera.y0_mm), camera.center_mm, strict=True)
     )
     if camera.principal_distance_mm is not None:
         return np.array([camera.principal_distance_mm.value, x0, y0])
-    fields = _known_fields(camera, frames, np.array([x0, y0]))
+    of_images = _known_fields(camera, frames, np.array([x0, y0]))
+    fields = list(of_images.values())
     if family(camera.distortion.family).is_pinhole_at_zero:
-        found = find_principal_distance(fields)
+        found, poses = find_principal_distance(fields)
+        if not camera.distortion.values.any() and not _has_approximate_points(frames.network):
+            resected |= {name: poses[field] for name, field in of_images.items() if field in poses}
     else:
         found = find_wide_distance(fields, camera.distortion)
     if found is None:
         why = _why_no_distance(fields)
         raise AdjustmentError(f"the principal distance of camera {camera.name} cannot be found from its images: {why}")
     return np.array([found, x0, y0])
+
+
+def _has_approximate_points(network: Network) -> bool:
+    """Whether coordinates are given that the adjustment does not observe."""
+    given = (prior for point in network.points for prior in (point.X, point.Y, point.Z) if prior is not None)
+    return any(prior.sigma == np.inf for prior in given)
 
 
 def _why_no_distance(fields: Sequence[KnownField]) -> str:
@@ -154,16 +164,17 @@ def _why_no_distance(fields: Sequence[KnownField]) -> str:
     )
 
 
-def _known_fields(camera: Camera, frames: Frames, principal_point_mm: Array) -> list[KnownField]:
+def _known_fields(camera: Camera, frames: Frames, principal_point_mm: Array) -> dict[str, KnownField]:
     """For each image of a camera, sorted by name, the points of which X, Y and Z are known."""
     network = frames.network
     names, number = network.observations.numbered_points
     xyz = np.array([_known_place(network, name) for name in names])[number[frames.rows]]
     is_known = ~np.isnan(xyz).any(axis=1)
-    fields = []
+    fields = {}
     for i in sorted(frames.camera_images(camera.name), key=lambda i: network.images[i].name):
         part, known = frames.part(i), is_known[frames.part(i)]
-        fields.append(KnownField(xyz[part][known], frames.xy_mm[part][known] - principal_point_mm, frames.sigma_mm[i]))
+        xy_mm = frames.xy_mm[part][known] - principal_point_mm
+        fields[network.images[i].name] = KnownField(xyz[part][known], xy_mm, frames.sigma_mm[i])
     return fields
 
 

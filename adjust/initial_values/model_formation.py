@@ -279,7 +279,7 @@ def extend(block: Block) -> None:
         block.points = intersected(block, WELL_DETERMINED)
         waiting = [name for name in sorted(block.sights) if name not in block.poses]
         new: dict[str, Pose] = {}
-        for fewest in (SURE_RESECTION, 4, 3):
+        for fewest in (SURE_RESECTION, 4, 3) if waiting else ():
             new = new or _resected(block, waiting, fewest)
         if not new:
             return

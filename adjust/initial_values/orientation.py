@@ -22,8 +22,12 @@ from adjust.problem.observations import Distance
 CLEARLY_WORSE = 5.0  # ratio of the median residuals above which a resection replaces a given orientation
 
 
-def orient(network: Network, sights: Mapping[str, Sight]) -> tuple[dict[str, Pose], dict[str, Array]]:
+def orient(
+    network: Network, sights: Mapping[str, Sight], resected: Mapping[str, Pose]
+) -> tuple[dict[str, Pose], dict[str, Array]]:
     """Determine the poses of all images, and the coordinates (3,) of all points that are observed or fully known.
+
+    resected: poses of images that are known already; a given orientation comes first.
 
     Raises
     ------
@@ -32,7 +36,8 @@ def orient(network: Network, sights: Mapping[str, Sight]) -> tuple[dict[str, Pos
     AdjustmentError
         If a point cannot be intersected.
     """
-    block = Block(sights, _coordinates(network, firm=True), _coordinates(network, firm=False))
+    firm, rough = (_coordinates(network, firm) for firm in (True, False))
+    block = Block(sights, firm, rough, dict(resected))
     for image in network.images:
         if image.exterior is not None and image.name in sights:
             block.poses[image.name] = _given_or_resected(image.exterior, block, image.name)

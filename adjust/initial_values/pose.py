@@ -96,7 +96,7 @@ def refined_poses(
 
 def refined_distance(
     rotations: Array, shifts: Array, points: Array, xy_mm: Array, weights: Array, distance_mm: float, sigma_mm: float
-) -> tuple[float, float]:
+) -> tuple[float, float, Array, Array, Array]:
     """Estimate one principal distance from all images together.
 
     Parameters
@@ -108,7 +108,8 @@ def refined_distance(
 
     Returns
     -------
-    Principal distance in mm, and the standard deviation of its logarithm: infinite if the points do not determine it.
+    Principal distance in mm, and the standard deviation of its logarithm: infinite if the points do not determine it;
+    rotations, shifts, and image coordinates over c without distortion (k, n, 2).
 
     Raises
     ------
@@ -140,7 +141,7 @@ def refined_distance(
     squares = float((weights * squared_residuals(rotations, shifts, points, tangents)).sum())
     variance = max(squares / max(2.0 * float(weights.sum()) - 6 * len(points) - 2, 1.0), noise**2)
     cofactor = float(np.linalg.inv(reduced)[0, 0])
-    return c, float(np.sqrt(variance * cofactor)) if cofactor > 0 else np.inf
+    return c, float(np.sqrt(variance * cofactor)) if cofactor > 0 else np.inf, rotations, shifts, tangents
 
 
 def squared_residuals(rotations: Array, shifts: Array, points: Array, tangents: Array) -> Array:

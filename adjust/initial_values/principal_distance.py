@@ -10,13 +10,13 @@ import numpy as np
 
 from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.projection import rays
-from adjust.initial_values.pose import KnownField
-from adjust.initial_values.resection import distance_together, resections
+from adjust.initial_values.pose import KnownField, Pose
+from adjust.initial_values.resection import distance_together, plausible_pose, resections, trial_misfits
 
-GRID = np.geomspace(0.35, 16.0, 14)  # principal distances tried, in radii of the imaged field: 140 to 7 degrees
+GRID = np.geomspace(0.35, 16.0, 10)  # principal distances tried, in radii of the imaged field: 140 to 7 degrees
 FEWEST = 4  # known points of an image
-COARSE_IMAGES, COARSE_POINTS = 5, 30
-FINE_IMAGES = 12
+COARSE_IMAGES, COARSE_POINTS = 4, 30
+FINE_IMAGES = 50
 LARGEST_RELATIVE_SIGMA = 0.15
 ANGLES_DEG = np.arange(88.0, 8.0, -4.0)  # trial angles between the axis and the outermost point of all images
 WIDE_IMAGES = 5
@@ -24,32 +24,37 @@ FEWEST_WIDE = 6  # known points of an image
 HALVES = 4  # halvings of the step between trial angles in the fine search
 
 
-def find_principal_distance(fields: Sequence[KnownField]) -> float | None:
-    """Estimate the principal distance of a pinhole camera, in mm; None if it is not determined.
+def find_principal_distance(fields: Sequence[KnownField]) -> tuple[float | None, dict[KnownField, Pose]]:
+    """Estimate the principal distance of a pinhole camera, in mm, together with poses of its images.
 
-    The images are resected with principal distances on a logarithmic grid. The best one starts a least-squares estimate
-    over all images. A standard deviation above 15 % counts as not determined: on a flat field parallel to the image, a
-    change of the principal distance cannot be separated from a change of the height.
+    Returns
+    -------
+    Principal distance, None if it is not determined; plausible poses of the images used.
+
+    Notes
+    -----
+    A few images are resected with principal distances on a logarithmic grid. The best one starts a least-squares
+    estimate over many images. A standard deviation above 15 % counts as not determined: on a flat field parallel to the
+    image, a change of the principal distance cannot be separated from a change of the height.
     """
     fields = _largest_fields(fields, FEWEST, FINE_IMAGES)
     if not fields:
-        return None
-    coarse = [_thin_field(each) for each in fields[:COARSE_IMAGES]]
+        return None, {}
     tried = GRID * _radius_mm(fields)
-    found = resections(len(tried) * coarse, np.repeat(tried, len(coarse)).tolist(), only_quick=True)
-    squares_mm2 = np.array([np.nan if each is None else len(each.inliers) * each.sigma_mm**2 for each in found])
-    costs = np.nansum(squares_mm2.reshape(len(tried), -1), axis=1)
-    costs[np.isnan(squares_mm2.reshape(len(tried), -1)).all(axis=1)] = np.inf
-    c, sigma = float(tried[int(np.argmin(costs))]), np.inf
+    misfits = trial_misfits([_thin_field(each) for each in fields[:COARSE_IMAGES]], tried)
+    c, sigma = float(tried[int(np.argmin(misfits))]), np.inf
+    found = resections(fields, [c] * len(fields))
     for _ in range(2):
-        resected = resections(fields, [c] * len(fields))
-        together = distance_together(fields, resected, c)
+        together = distance_together(fields, found, c)
         if together is None:
-            return None
-        c, sigma = together
-        if all(each is not None and each.inliers.all() for each in resected):
-            break  # all points are inliers: another round would use the same ones
-    return c if sigma < LARGEST_RELATIVE_SIGMA else None
+            return None, {}
+        c, sigma, refined = together
+        found = resections(fields, [c] * len(fields), refined)
+        if all(each is other for each, other in zip(found, refined, strict=True)):
+            break  # all images agree
+    poses = {field: plausible_pose(each, c) for field, each in zip(fields, found, strict=True)}
+    determined = c if sigma < LARGEST_RELATIVE_SIGMA else None
+    return determined, {field: pose for field, pose in poses.items() if pose is not None}
 
 
 def find_wide_distance(fields: Sequence[KnownField], distortion: Distortion) -> float | None:

@@ -6,7 +6,7 @@ these on all inliers. A few triples suffice where most points agree on a pose; o
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from math import comb
 from typing import NamedTuple
@@ -34,6 +34,7 @@ EXACT = 1e-12  # largest squared residual of an exact solution for three points
 SAME_PLACE = 1e-4  # in extents of the points: poses nearer than this are the same
 LINE = 1e-5  # width over length of collinear points: the camera may rotate around their line
 POINTS_AT_ONCE = 20_000
+REWEIGHTINGS = 2  # largest number of estimates of a principal distance, each from the inliers of the one before
 
 
 class Effort(NamedTuple):
@@ -45,7 +46,7 @@ class Effort(NamedTuple):
     rounds: int  # number of refinements
 
 
-QUICK, THOROUGH = Effort(5, 30, 2, 1), Effort(MAX_TRIPLES, 200, 16, 2)
+TRIAL, QUICK, THOROUGH = Effort(5, 30, 1, 0), Effort(5, 30, 2, 1), Effort(MAX_TRIPLES, 200, 16, 2)
 
 
 @dataclass(frozen=True)
@@ -76,8 +77,15 @@ def resect_images(fields: Sequence[KnownField], principal_distances_mm: Sequence
             candidates = three_point_poses(field.xyz, field.xy_mm, c)
             poses.append(candidates[0] if len(candidates) == 1 else None)
         else:
-            poses.append(None if resection is None or resection.sigma_mm > IMPLAUSIBLE * c else resection.pose)
+            poses.append(plausible_pose(resection, c))
     return poses
+
+
+def plausible_pose(resection: Resection | None, principal_distance_mm: float) -> Pose | None:
+    """The pose of a resection; None where the residuals are so large that points must have been misidentified."""
+    if resection is None or resection.sigma_mm > IMPLAUSIBLE * principal_distance_mm:
+        return None
+    return resection.pose
 
 
 def resect(xyz: Array, xy_mm: Array, principal_distance_mm: float, floor_mm: float = 1e-4) -> Resection | None:
@@ -97,13 +105,15 @@ def resect(xyz: Array, xy_mm: Array, principal_distance_mm: float, floor_mm: flo
 
 
 def resections(
-    fields: Sequence[KnownField], principal_distances_mm: Sequence[float], only_quick: bool = False
+    fields: Sequence[KnownField],
+    principal_distances_mm: Sequence[float],
+    found: Sequence[Resection | None] | None = None,
 ) -> list[Resection | None]:
     """Resect images with at least four known points.
 
     Parameters
     ----------
-    only_quick : do not repeat the resection with more effort for images whose points do not agree.
+    found : optional; earlier resections, of which only those are repeated whose points do not agree.
 
     Returns
     -------
@@ -112,15 +122,14 @@ def resections(
     Notes
     -----
     Points agree if the residuals match their standard deviations, or those of most images: a still unknown lens causes
-    residuals everywhere.
+    residuals everywhere. Where they do not, the resection is repeated with more effort.
     """
     c = np.array(principal_distances_mm, dtype=np.float64)
-    found: list[Resection | None] = [None] * len(fields)
-    quick = [i for i, field in enumerate(fields) if len(field.xyz) >= (4 if only_quick else FEWEST_QUICK)]
-    for i, each in zip(quick, _resected([fields[i] for i in quick], c[quick], QUICK), strict=True):
-        found[i] = each
-    if only_quick:
-        return found
+    if found is None:
+        quick = [i for i, field in enumerate(fields) if len(field.xyz) >= FEWEST_QUICK]
+        of_quick = dict(zip(quick, _resected([fields[i] for i in quick], c[quick], QUICK), strict=True))
+        found = [of_quick.get(i) for i in range(len(fields))]
+    result = list(found)
     sigmas = [each.sigma_mm / c[i] for i, each in enumerate(found) if each is not None]
     typical = float(np.median(sigmas)) if len(sigmas) >= TYPICAL else 0.0
     typical = typical if typical < LARGEST_TYPICAL else 0.0
@@ -130,8 +139,21 @@ def resections(
         if len(field.xyz) >= 4 and (each is None or each.sigma_mm > WORSE * max(field.sigma_mm, typical * c[i]))
     ]
     for i, each in zip(again, _resected([fields[i] for i in again], c[again], THOROUGH), strict=True):
-        found[i] = each
-    return found
+        result[i] = each
+    return result
+
+
+def trial_misfits(fields: Sequence[KnownField], principal_distances_mm: Array) -> Array:
+    """Misfits (m,) in mm² of images, at least four points each, with trial principal distances (m,).
+
+    Each is the sum over the images of the robust variance of a coordinate, for the best pose from a few triples.
+    """
+    c = np.repeat(principal_distances_mm, len(fields))
+    variances = c**2  # of images without a pose
+    for some, batch, rotations, shifts, image in _best_poses(len(principal_distances_mm) * list(fields), c, TRIAL):
+        sigma = _robust_sigmas(batch.squared(rotations, shifts, image), batch.counts[image])
+        variances[some[image]] = (sigma * batch.c[image]) ** 2
+    return np.asarray(variances.reshape(len(principal_distances_mm), -1).sum(axis=1))
 
 
 def three_point_poses(xyz: Array, xy_mm: Array, principal_distance_mm: float) -> list[Pose]:
@@ -142,8 +164,7 @@ def three_point_poses(xyz: Array, xy_mm: Array, principal_distance_mm: float) ->
     rotations, shifts = refined_poses(rotations, shifts, points, tangents, np.ones(points.shape[:2]))
     exact = squared_residuals(rotations, shifts, points, tangents).max(axis=1) < EXACT
     poses: list[Pose] = []
-    for rotation, shift in zip(rotations[exact], shifts[exact], strict=True):
-        pose = field.pose(0, rotation, shift)
+    for pose in field.poses(rotations[exact], shifts[exact], np.zeros(exact.sum(), dtype=np.intp)):
         if all(np.linalg.norm(pose.center - other.center) > SAME_PLACE * field.size[0] for other in poses):
             poses.append(pose)
     return poses
@@ -151,27 +172,38 @@ def three_point_poses(xyz: Array, xy_mm: Array, principal_distance_mm: float) ->
 
 def distance_together(
     fields: Sequence[KnownField], found: Sequence[Resection | None], principal_distance_mm: float
-) -> tuple[float, float] | None:
+) -> tuple[float, float, list[Resection | None]] | None:
     """Estimate a principal distance by least squares over all images resected with an approximate one.
 
-    Returns the principal distance in mm and the standard deviation of its logarithm; None if no image was resected or
-    the estimate fails.
+    The inliers are chosen again by their residuals, free of the distortion that is estimated with it. Returns the
+    principal distance in mm, the standard deviation of its logarithm, and the resections; None if no image was resected
+    or the estimate fails.
     """
-    pairs = [(field, each) for field, each in zip(fields, found, strict=True) if each is not None]
-    if not pairs:
+    resected = [i for i, each in enumerate(found) if each is not None]
+    known = [each for each in found if each is not None]
+    if not known:
         return None
-    batch = _Fields.from_fields([field for field, _ in pairs], np.full(len(pairs), principal_distance_mm))
-    rotations = np.array([each.pose.rotation for _, each in pairs])
-    centers = (np.array([each.pose.center for _, each in pairs]) - batch.origin) / batch.size[:, None]
-    weights = np.zeros(batch.present.shape)
-    for own, (_, each) in zip(weights, pairs, strict=True):
-        own[: len(each.inliers)] = each.inliers
-    xy_mm, sigma_mm = batch.tangents * principal_distance_mm, max(field.sigma_mm for field, _ in pairs)
+    batch = _Fields.from_fields([fields[i] for i in resected], np.full(len(known), principal_distance_mm))
+    rotations = np.array([each.pose.rotation for each in known])
+    centers = (np.array([each.pose.center for each in known]) - batch.origin) / batch.size[:, None]
     shifts = -np.einsum("kij,kj->ki", rotations, centers)
-    try:
-        return refined_distance(rotations, shifts, batch.points, xy_mm, weights, principal_distance_mm, sigma_mm)
-    except np.linalg.LinAlgError:
-        return None
+    xy_mm, inliers = batch.tangents * principal_distance_mm, np.zeros_like(batch.present)
+    inliers[batch.present] = np.concatenate([each.inliers for each in known])
+    c, floor_mm, every = principal_distance_mm, batch.floor * principal_distance_mm, np.arange(len(known))
+    for _ in range(REWEIGHTINGS):
+        try:
+            c, spread, rotations, shifts, tangents = refined_distance(
+                rotations, shifts, batch.points, xy_mm, inliers.astype(np.float64), c, float(floor_mm.max())
+            )
+        except np.linalg.LinAlgError:
+            return None
+        batch = replace(batch, tangents=tangents, c=np.full(len(known), c), floor=floor_mm / c)
+        before = inliers
+        sigma, inliers = batch.inliers(rotations, shifts, every)
+        if (inliers == before).all():
+            break
+    refined = dict(zip(resected, batch.resections(rotations, shifts, every, sigma, inliers), strict=True))
+    return c, spread, [refined.get(i) for i in range(len(fields))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,23 +222,33 @@ class _Fields:
     @classmethod
     def from_fields(cls, fields: Sequence[KnownField], c: Array) -> "_Fields":
         counts = np.array([len(field.xyz) for field in fields])
-        points, tangents = np.zeros((len(fields), counts.max(), 3)), np.zeros((len(fields), counts.max(), 2))
-        origin, size = np.empty((len(fields), 3)), np.empty(len(fields))
-        for k, field in enumerate(fields):
-            origin[k] = field.xyz.mean(axis=0)
-            size[k] = max(float(np.linalg.norm(np.ptp(field.xyz, axis=0))), np.finfo(float).tiny)
-            points[k, : counts[k]], tangents[k, : counts[k]] = (field.xyz - origin[k]) / size[k], field.xy_mm / c[k]
         present = np.arange(counts.max()) < counts[:, None]
-        return cls(points, tangents, present, origin, size, c, np.array([field.sigma_mm for field in fields]) / c)
+        points, tangents = np.zeros((*present.shape, 3)), np.zeros((*present.shape, 2))
+        points[present] = np.concatenate([field.xyz for field in fields])
+        tangents[present] = np.concatenate([field.xy_mm for field in fields])
+        origin = points.sum(axis=1) / counts[:, None]
+        points = np.where(present[..., None], points - origin[:, None], 0.0)
+        size = np.maximum(np.linalg.norm(np.ptp(points, axis=1), axis=1), np.finfo(float).tiny)
+        floor = np.array([field.sigma_mm for field in fields]) / c
+        return cls(points / size[:, None, None], tangents / c[:, None, None], present, origin, size, c, floor)
 
     @property
     def counts(self) -> Indices:
         """(k,) numbers of points."""
         return np.asarray(self.present.sum(axis=1))
 
-    def pose(self, k: int, rotation: Array, shift: Array) -> Pose:
-        """Pose of image k in object units."""
-        return Pose(rotation, self.origin[k] - self.size[k] * rotation.T @ shift)
+    def poses(self, rotations: Array, shifts: Array, image: Indices) -> list[Pose]:
+        """Poses of the given images in object units."""
+        centers = self.origin[image] - self.size[image, None] * (shifts[:, None] @ rotations)[:, 0]
+        return [Pose(rotation, center) for rotation, center in zip(rotations, centers, strict=True)]
+
+    def resections(
+        self, rotations: Array, shifts: Array, image: Indices, sigma: Array, inliers: Mask
+    ) -> list[Resection]:
+        """Resections of the given images, from their poses, standard deviations of a tangent and inliers."""
+        poses, counts, sigmas_mm = self.poses(rotations, shifts, image), self.counts[image], sigma * self.c[image]
+        rows = zip(poses, inliers, counts, sigmas_mm.tolist(), strict=True)
+        return [Resection(pose, mask[:count], sigma_mm) for pose, mask, count, sigma_mm in rows]
 
     def sample(self, most: int) -> "_Fields":
         """Draw `most` points per image at random, if some image has more."""
@@ -221,6 +263,12 @@ class _Fields:
         """Squared residuals (c, n) of c poses, each of one image (c,); inf for the padding."""
         squared = squared_residuals(rotations, shifts, self.points[image], self.tangents[image])
         return np.where(self.present[image], squared, np.inf)
+
+    def inliers(self, rotations: Array, shifts: Array, image: Indices) -> tuple[Array, Mask]:
+        """Robust standard deviations (c,) of the tangents of c poses, and their inliers (c, n)."""
+        squared = self.squared(rotations, shifts, image)
+        sigma = np.maximum(_robust_sigmas(squared, self.counts[image]), self.floor[image])
+        return sigma, squared < REJECTION * sigma[:, None] ** 2
 
     def triples(self, most: int) -> Indices:
         """Triples of points (k, m, 3): all, or random ones without slender triangles, which give poor poses."""
@@ -263,9 +311,10 @@ def _batches(fields: Sequence[KnownField]) -> Iterator[Indices]:
         order = order[alike:]
 
 
-def _resected(fields: Sequence[KnownField], c: Array, effort: Effort) -> list[Resection | None]:
-    """Resect all fields, of at least four points each, with the same effort."""
-    found: list[Resection | None] = [None] * len(fields)
+def _best_poses(
+    fields: Sequence[KnownField], c: Array, effort: Effort
+) -> Iterator[tuple[Indices, "_Fields", Array, Array, Indices]]:
+    """Yield batches of fields with the best pose of each: numbers of the fields, batch, rotations, shifts, image."""
     for some in _batches(fields):
         batch = _Fields.from_fields([fields[i] for i in some], c[some])
         sample = batch.sample(effort.points)
@@ -276,18 +325,21 @@ def _resected(fields: Sequence[KnownField], c: Array, effort: Effort) -> list[Re
             kept = (rank < _trimmed_counts(sample.counts[image])[:, None]).astype(np.float64)
             rotations, shifts = refined_poses(rotations, shifts, sample.points[image], sample.tangents[image], kept)
         best = sample.best(rotations, shifts, image, 1)
-        rotations, shifts, image = rotations[best], shifts[best], image[best]
-        squared = batch.squared(rotations, shifts, image)
-        sigma = np.maximum(_robust_sigmas(squared, batch.counts[image]), batch.floor[image])
-        inliers = squared < REJECTION * sigma[:, None] ** 2
+        yield some, batch, rotations[best], shifts[best], image[best]
+
+
+def _resected(fields: Sequence[KnownField], c: Array, effort: Effort) -> list[Resection | None]:
+    """Resect all fields, of at least four points each, with the same effort."""
+    found: list[Resection | None] = [None] * len(fields)
+    for some, batch, rotations, shifts, image in _best_poses(fields, c, effort):
+        sigma, inliers = batch.inliers(rotations, shifts, image)
         points, weights = batch.points[image], inliers.astype(np.float64)
         rotations, shifts = refined_poses(rotations, shifts, points, batch.tangents[image], weights)
         middle = (weights[..., None] * points).sum(axis=1, keepdims=True) / weights.sum(axis=1)[:, None, None]
         extents = np.linalg.svd(weights[..., None] * (points - middle), compute_uv=False)
+        resected = batch.resections(rotations, shifts, image, sigma, inliers)
         for row in np.flatnonzero(extents[:, 1] >= LINE * extents[:, 0]):
-            k, count = int(image[row]), len(fields[some[image[row]]].xyz)
-            pose = batch.pose(k, rotations[row], shifts[row])
-            found[some[k]] = Resection(pose, inliers[row, :count], float(sigma[row] * batch.c[k]))
+            found[some[image[row]]] = resected[row]
     return found
 
 
