@@ -16,7 +16,6 @@ from scipy.special import chdtrc, fdtrc
 from adjust.array_types import Array, Mask
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.scanner import carriage_terms, smooth_terms
-from adjust.problem.estimates import adjusted_image
 from adjust.problem.network import Network, Scanner
 from adjust.problem.parameter import Parameter
 from adjust.quality.significance import LEVEL
@@ -87,9 +86,7 @@ def choose_bends(
         equations = _equations(trial, scanner)
         chosen[scanner.name] = _needed(equations, smooth)
         undetermined_terms = [term for term in equations.undetermined_terms(chosen[scanner.name]) if term in smooth]
-        images = [image.name for image in network.images if image.scanner == scanner.name]
-        center = np.array([scanner.center_mm])
-        poses = scan_poses(adjusted_image(trial, name).camera_by_comparator(center)[0] for name in images)
+        poses = scan_poses(trial.run.problem, trial.run.end.state, scanner.name)
         with_lens = _equations(trial, scanner, _free_distortion(trial)).undetermined_terms(chosen[scanner.name])
         remarks += undetermined_term_sentences(
             scanner.name, undetermined_terms, set(undetermined_terms) - set(with_lens), poses

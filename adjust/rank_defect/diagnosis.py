@@ -11,13 +11,12 @@ from adjust.problem.parameter import Parameter, description
 from adjust.problem.problem import Problem, State
 from adjust.rank_defect.datum import free_coordinates, object_datum
 from adjust.rank_defect.directions import (
-    camera_directions,
     datum_sentence,
     field_geometry,
     followers,
     many_sentence,
+    named_directions,
     own_sentence,
-    scanner_directions,
     unnamed_sentence,
 )
 from adjust.rank_defect.flat_valleys import trading_off
@@ -167,7 +166,7 @@ def _named_directions(
     # Add as much of the free datum as keeps the object points in place.
     points = np.isin(free, free_coordinates(problem))
     still = np.asarray(rest - datum @ np.linalg.lstsq(datum[points], rest[points])[0])
-    leads = [*scanner_directions(problem, state), *camera_directions(problem, state)]
+    leads = named_directions(problem, state)
     functionals = np.array([lead.functional[free] for lead in leads]).reshape(len(leads), len(free)) / factor.scale
     lengths = np.linalg.norm(functionals, axis=1, keepdims=True)
     visibility = (functionals / np.where(lengths > 0.0, lengths, 1.0)) @ rest

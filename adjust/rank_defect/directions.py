@@ -13,8 +13,7 @@ from adjust.functional_model.scanner import is_left, term_degree
 from adjust.functional_model.transformation import follows_tilts
 from adjust.linear_algebra.factor import Factor
 from adjust.problem.estimates import Cofactor
-from adjust.problem.network import Image
-from adjust.problem.parameter import Kind, Parameter, enumeration
+from adjust.problem.parameter import Kind, Parameter, enumeration, shortened
 from adjust.problem.problem import Problem, State
 
 FLAT = 0.01  # ratio of smallest and largest extent below which the field is flat
@@ -106,44 +105,48 @@ def datum_sentence(number: int) -> tuple[str, str]:
 _X0, _Y0, _C = ("x0", "x0' (F7)"), ("y0", "y0' (F8)"), ("c", "the principal distance (F9)")
 _LEVER = "one coordinate of a fiducial mark that has a lever arm (F5, F6)"
 _TWO, _THREE = (f"x' and y' of {number} fiducial marks (F5, F6)" for number in ("two", "three"))
+_FOUR = "x' and y' of four fiducial marks (F5, F6), or to the attitude of an image"
 _TURNED = "add images turned by 90 degrees about their axes or tilted in other directions"
-# Joint motions of all fiducial marks of a camera: rank; coefficients of dx' and dy' for 1, x and y about the mean;
-# motion; prior that fixes it; interior quantity whose prior would fix it too, if it moves along; other remedies.
+_TILT = (
+    "Tilt {0}: all fiducial marks of camera {{camera}} can move by {0}' times x' and y', as with one tilt of all "
+    "cameras about {1}'"
+)
+# Joint motions of all fiducial marks of a camera: rank; coefficients of dx' and dy' for 1, x, y, x², xy and y² about
+# the mean; motion; prior that fixes it; interior quantity whose prior would fix it too, if it moves along; other
+# remedies. A tilt of all images, which every film transformation of the camera can compensate, has rank -1: its
+# functional takes the part that is not an affinity.
 FIDUCIAL_MOTIONS = (
-    (0, (1, 0, 0), (0, 0, 0), "Shift x: {} shift together in x'", "x' of one fiducial mark (F5)", _X0, ""),
-    (0, (0, 0, 0), (1, 0, 0), "Shift y: {} shift together in y'", "y' of one fiducial mark (F6)", _Y0, ""),
-    (0, (0, 0, -1), (0, 1, 0), "Rotation: {} turn together about the principal point", _LEVER, None, ""),
-    (0, (0, 1, 0), (0, 0, 1), "Scale: {} grow together", _TWO, _C, ""),
-    (1, (0, 1, 0), (0, 0, -1), "Affinity: {} stretch in x' against y'", _THREE, None, _TURNED),
-    (1, (0, 0, 1), (0, 1, 0), "Shear: {} shear", _THREE, None, _TURNED),
+    (0, (1,), (), "Shift x: {marks} shift together in x'", "x' of one fiducial mark (F5)", _X0, ""),
+    (0, (), (1,), "Shift y: {marks} shift together in y'", "y' of one fiducial mark (F6)", _Y0, ""),
+    (0, (0, 0, -1), (0, 1), "Rotation: {marks} turn together about the principal point", _LEVER, None, ""),
+    (0, (0, 1), (0, 0, 1), "Scale: {marks} grow together", _TWO, _C, ""),
+    (1, (0, 1), (0, 0, -1), "Affinity: {marks} stretch in x' against y'", _THREE, None, _TURNED),
+    (1, (0, 0, 1), (0, 1), "Shear: {marks} shear", _THREE, None, _TURNED),
+    (-1, (0, 0, 0, 1), (0, 0, 0, 0, 1), _TILT.format("x", "y"), _FOUR, None, "choose an affine transformation"),
+    (-1, (0, 0, 0, 0, 1), (0, 0, 0, 0, 0, 1), _TILT.format("y", "x"), _FOUR, None, "choose an affine transformation"),
+)
+# Interior orientation: number of the quantity, motion, and the prior that fixes it.
+INTERIOR_MOTIONS = (
+    (1, "The principal point's x0' of camera {} can shift", "x0' (F7)"),
+    (2, "The principal point's y0' of camera {} can shift", "y0' (F8)"),
+    (0, "The principal distance of camera {} can change", "it (F9)"),
 )
 
 
-def camera_directions(problem: Problem, state: State) -> list[NamedDirection]:
-    """Named directions of all cameras.
+def named_directions(problem: Problem, state: State) -> list[NamedDirection]:
+    """Named directions of all scanners and cameras.
 
-    Ranks: -2 bend of a scanner (see `scanner_directions`), -1 tilt, 0 change of the camera's axes, 1 other changes of
-    its fiducials, 2 interior orientation, 3 distortion. The more a direction moves along, the lower its rank.
+    Ranks: -2 bend of a scanner, -1 tilt, 0 change of the camera's axes, 1 other changes of its fiducials, 2 interior
+    orientation, 3 distortion. The more a direction moves along, the lower its rank.
     """
-    directions: list[NamedDirection] = []
-    for name, positions in problem.unknowns.camera.items():
-        directions += _fiducial_directions(problem, state, name)
-        geometry = field_geometry(problem, state, name)
-        for_point = geometry.remedy
-        if geometry.known != "points" and not geometry.flat:
-            for_point = "add images turned by 180 degrees about their axes"
-        for number, motion, given, otherwise in (
-            (1, f"The principal point's x0' of camera {name} can shift", "x0' (F7)", for_point),
-            (2, f"The principal point's y0' of camera {name} can shift", "y0' (F8)", for_point),
-            (0, f"The principal distance of camera {name} can change", "it (F9)", geometry.remedy),
-        ):
-            functional = changed(problem, positions[number], 1.0)
-            directions.append(NamedDirection(2, functional, motion, Reason(geometry.because, given, otherwise)))
-        directions += _distortion_directions(problem, name, positions[3:])
-    return directions
+    scanners, cameras = problem.unknowns.scanner, problem.unknowns.camera
+    found = [each for name in scanners for each in _scanner_directions(problem, state, name)]
+    for name in cameras:
+        found += [*_fiducial_directions(problem, state, name), *_lens_directions(problem, state, name)]
+    return found
 
 
-def changed(problem: Problem, positions: Indices | int, values: Array | float) -> Array:
+def _functional(problem: Problem, positions: Indices | int, values: Array | float = 1.0) -> Array:
     """(n,) functional with given values at some positions."""
     functional = np.zeros(len(problem.unknowns))
     functional[positions] = values
@@ -151,43 +154,37 @@ def changed(problem: Problem, positions: Indices | int, values: Array | float) -
 
 
 def _fiducial_directions(problem: Problem, state: State, camera: str) -> Iterator[NamedDirection]:
-    """Shift, rotation, scale, affinity and shear of all fiducials of a camera, with the joins of its frames; and a tilt
-    of all images about x' or y', where every film transformation of the camera can compensate it.
-
-    A tilt moves the fiducials by t (x'², x'y'); the functional takes the part that is not an affinity.
-    """
+    """Joint motions of all fiducials of a camera, with the joins of its frames."""
     images = [image for image in problem.network.images if image.camera == camera]
     places = [positions for (owner, _), positions in problem.unknowns.fiducial.items() if owner == camera]
     if not places:
         return
     frames = {image.frame for image in images}
     marks = np.array(places + [at for (frame, _), at in problem.unknowns.join.items() if frame in frames])
-    centred = state.values[marks] - state.values[marks].mean(axis=0)
-    affine = np.column_stack([np.ones(len(centred)), centred])
+    x, y = (state.values[marks] - state.values[marks].mean(axis=0)).T
+    affine, bends = np.column_stack([np.ones(len(x)), x, y]), np.column_stack([x * x, x * y, y * y])
+    moves = np.hstack([affine, bends - affine @ np.linalg.lstsq(affine, bends)[0]])
+    least_bend = LEAST_BEND * max(np.abs(x).max(), np.abs(y).max()) ** 2
+    words = {"marks": f"all fiducial marks of camera {camera} can", "camera": camera}
     for rank, dx, dy, motion, given, partner, otherwise in FIDUCIAL_MOTIONS:
-        functional = changed(problem, marks, affine @ np.array([dx, dy]).T)
-        words = motion.format(f"all fiducial marks of camera {camera} can")
-        with_partner = partner and (Parameter.interior(camera, partner[0]), partner[1])
-        yield NamedDirection(rank, functional, words, Reason("", given, otherwise), with_partner)
-    if not all(follows_tilts(image.transformation) for image in images):
-        return
-    given = "x' and y' of four fiducial marks (F5, F6), or to the attitude of an image"
-    for axis, other in ("xy", "yx"):
-        bend = centred[:, ["xy".index(axis)]] * centred
-        bend -= affine @ np.linalg.lstsq(affine, bend)[0]
-        if np.abs(bend).max() >= LEAST_BEND * np.abs(centred).max() ** 2:
-            motion = (
-                f"Tilt {axis}: all fiducial marks of camera {camera} can move by {axis}' times x' and y', as with one "
-                f"tilt of all cameras about {other}'"
-            )
-            reason = Reason("", given, "choose an affine transformation")
-            yield NamedDirection(-1, changed(problem, marks, bend), motion, reason)
+        moved = np.column_stack([moves[:, : len(each)] @ np.array(each, dtype=float) for each in (dx, dy)])
+        bent = all(follows_tilts(image.transformation) for image in images) and np.abs(moved).max() >= least_bend
+        if rank >= 0 or bent:
+            with_partner = partner and (Parameter.interior(camera, partner[0]), partner[1])
+            functional, reason = _functional(problem, marks, moved), Reason("", given, otherwise)
+            yield NamedDirection(rank, functional, motion.format(**words), reason, with_partner)
 
 
-def _distortion_directions(problem: Problem, camera: str, positions: Indices) -> Iterator[NamedDirection]:
-    """Directions named after the distortion parameters of a camera."""
+def _lens_directions(problem: Problem, state: State, camera: str) -> Iterator[NamedDirection]:
+    """Directions named after interior orientation and distortion parameters of a camera."""
+    positions, field = problem.unknowns.camera[camera], field_geometry(problem, state, camera)
+    turned = "add images turned by 180 degrees about their axes"
+    of_point = field.remedy if field.known == "points" or field.flat else turned
+    for number, motion, given in INTERIOR_MOTIONS:
+        reason = Reason(field.because, given, of_point if number else field.remedy)
+        yield NamedDirection(2, _functional(problem, positions[number]), motion.format(camera), reason)
     own_family = family(problem.network.camera_by_name[camera].distortion.family)
-    named = dict(zip(own_family.parameters, positions, strict=True))
+    named = dict(zip(own_family.parameters, positions[3:], strict=True))
     free = [each for each in own_family.alike_at_zero if np.isinf(problem.unknowns.sigma[named[each]])]
     because, remedy = "the targets do not tell it from the other unknowns", "spread the targets better over the frame"
     if free:
@@ -196,7 +193,7 @@ def _distortion_directions(problem: Problem, camera: str, positions: Indices) ->
     for name, position in named.items():
         motion = f"The distortion parameter {name} of camera {camera} can change"
         reason = Reason(because, name, f"fix it, or {remedy}")
-        yield NamedDirection(3, changed(problem, position, 1.0), motion, reason)
+        yield NamedDirection(3, _functional(problem, position), motion, reason)
 
 
 @dataclass(frozen=True)
@@ -229,44 +226,37 @@ class FieldGeometry:
 
 def field_geometry(problem: Problem, state: State, camera: str) -> FieldGeometry:
     """Geometry of the observed points and of the axes of a camera's images."""
-    positions = np.array(list(problem.unknowns.point.values()), dtype=np.intp).reshape(-1, 3)
-    xyz = state.values[positions]
+    xyz = state.values[np.array(list(problem.unknowns.point.values()), dtype=np.intp).reshape(-1, 3)]
     extents = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False) if len(xyz) > 2 else np.zeros(3)
     axes = state.rotations[[image.camera == camera for image in problem.network.images], 2]
     mean = axes.mean(axis=0)
     off = np.linalg.norm(np.cross(axes, mean / (np.linalg.norm(mean) or 1.0)), axis=1)
-    given = problem.network.points
-    heights = sum(point.Z is not None and np.isfinite(point.Z.sigma) for point in given)
-    whole = sum(all(q is not None and np.isfinite(q.sigma) for q in (point.X, point.Y, point.Z)) for point in given)
+    given = [[p is not None and np.isfinite(p.sigma) for p in (q.X, q.Y, q.Z)] for q in problem.network.points]
+    whole, heights = (sum(all(point[first:]) for point in given) for first in (0, 2))
     known = "points" if whole >= FIELD else "heights" if heights >= FIELD else "nothing"
     return FieldGeometry(bool(extents[-1] <= FLAT * extents[0]), bool(off.max() < PARALLEL_RAD), known)
 
 
 Pose = tuple[int, bool]  # rotation of a frame in its scan, degrees, and whether it is mirrored
 
-SCANNER_RANK = -2
 ALIKE_DEG = 20.0  # rotations that differ by less count as equal
 HARDLY = 20.0  # ratio of a term's standard deviation to that with all else known, above which it is weak
 
 
-def scanner_directions(problem: Problem, state: State) -> list[NamedDirection]:
-    """Directions named after the terms of every scanner's deformation."""
-    directions = []
-    for name, positions in problem.unknowns.scanner.items():
-        poses = _scanner_poses(problem, state, name)
-        kinds = [image.transformation for image in problem.network.images if image.scanner == name]
-        for position in positions:
-            term = problem.unknowns.parameters[position].quantity
-            film = next((kind for kind in kinds if not is_left(kind, term)), "")
-            reason = term_reason(term, poses, "")
-            by_companion = {each: term_reason(term, poses, each) for each in ("lens", "marks")}
-            if film:
-                because = f"the {film} transformation of its films does the same"
-                reason, by_companion = Reason(because, "the term itself", "leave it out"), {}
-            motion = f"The term {term} of the bend of scanner {name} can change"
-            functional = changed(problem, int(position), 1.0)
-            directions.append(NamedDirection(SCANNER_RANK, functional, motion, reason, by_companion=by_companion))
-    return directions
+def _scanner_directions(problem: Problem, state: State, scanner: str) -> Iterator[NamedDirection]:
+    """Directions named after the terms of a scanner's deformation."""
+    poses = scan_poses(problem, state, scanner)
+    kinds = [image.transformation for image in problem.network.images if image.scanner == scanner]
+    for position in problem.unknowns.scanner[scanner].tolist():
+        term = problem.unknowns.parameters[position].quantity
+        film = next((kind for kind in kinds if not is_left(kind, term)), "")
+        reason, *others = (term_reason(term, poses, each) for each in ("", "lens", "marks"))
+        by_companion = dict(zip(("lens", "marks"), others, strict=True))
+        if film:
+            because = f"the {film} transformation of its films does the same"
+            reason, by_companion = Reason(because, "the term itself", "leave it out"), {}
+        motion = f"The term {term} of the bend of scanner {scanner} can change"
+        yield NamedDirection(-2, _functional(problem, position), motion, reason, by_companion=by_companion)
 
 
 def term_reason(term: str, poses: Sequence[Pose], confused_with: str) -> Reason:
@@ -309,22 +299,20 @@ def weak_term_sentences(
     determined, but weakly. factor: of the free unknowns; cofactor: of all.
     """
     unknowns = problem.unknowns
-    places = {int(position): i for i, position in enumerate(free)}
-    for name, positions in unknowns.scanner.items():
-        open_ = [int(position) for position in positions if int(position) in places]
-        ratios = np.sqrt(cofactor.variances[open_]) * factor.scale[[places[position] for position in open_]]
-        hardly = [position for position, ratio in zip(open_, ratios, strict=True) if ratio > HARDLY]
-        if not hardly:
-            continue
-        lens = [int(i) for camera in unknowns.camera.values() for i in camera[3:] if int(i) in places]
-        held = held_variances(cofactor.part(np.array([*hardly, *lens])), len(hardly))
-        scale = factor.scale[[places[position] for position in hardly]]
-        names = [unknowns.parameters[position].quantity for position in hardly]
-        by_lens = [term for term, ratio in zip(names, np.sqrt(held) * scale, strict=True) if ratio <= HARDLY]
-        yield from undetermined_term_sentences(name, names, by_lens, _scanner_poses(problem, state, name))
+    alone = np.zeros(len(unknowns))  # inverse of the standard deviation with all else known; 0 where fixed
+    alone[free] = factor.scale
+    lens = np.concatenate([positions[3:] for positions in unknowns.camera.values()])
+    for name, terms in unknowns.scanner.items():
+        hardly = terms[np.sqrt(cofactor.variances[terms]) * alone[terms] > HARDLY]
+        if len(hardly):
+            held = _held_variances(cofactor.part(np.array([*hardly, *lens[alone[lens] > 0.0]])), len(hardly))
+            names = [unknowns.parameters[position].quantity for position in hardly]
+            ratios = np.sqrt(held) * alone[hardly]
+            by_lens = [term for term, ratio in zip(names, ratios, strict=True) if ratio <= HARDLY]
+            yield from undetermined_term_sentences(name, names, by_lens, scan_poses(problem, state, name))
 
 
-def held_variances(cofactor: Array, count: int) -> Array:
+def _held_variances(cofactor: Array, count: int) -> Array:
     """Conditional variances of the first quantities of a cofactor matrix (n, n), given all others."""
     own, by_others, others = cofactor[:count, :count], cofactor[:count, count:], cofactor[count:, count:]
     scale = np.sqrt(np.diag(others))
@@ -357,25 +345,18 @@ def _are_half_turns(poses: Sequence[Pose]) -> bool:
     return all(abs((turn - first + 90) % 180 - 90) < ALIKE_DEG and m == mirrored for turn, m in poses)
 
 
-def _scanner_poses(problem: Problem, state: State, scanner: str) -> list[Pose]:
-    gradients = []
-    for films in problem.films:
-        of_films = films.kind.gradient(state.values[films.positions], films.center_mm)
-        own = [problem.network.images[i].scanner == scanner for i in films.images]
-        gradients += [gradient for gradient, is_own in zip(of_films, own, strict=True) if is_own]
-    return scan_poses(gradients)
-
-
-def scan_poses(gradients: Iterable[Array]) -> list[Pose]:
-    """Distinct poses of frames in their scans, from derivatives (2, 2) of camera by comparator coordinates."""
+def scan_poses(problem: Problem, state: State, scanner: str) -> list[Pose]:
+    """Distinct poses of frames in their scans, from the gradients of their film transformations."""
     poses: list[Pose] = []
-    for gradient in gradients:
-        mirrored = bool(np.linalg.det(gradient) < 0.0)
-        upright = gradient * [1.0, -1.0] if mirrored else gradient
-        turn = np.degrees(np.arctan2(upright[1, 0] - upright[0, 1], upright[0, 0] + upright[1, 1]))
-        pose = round(float(turn)) % 360, mirrored
-        if not any(mirrored == m and abs((pose[0] - t + 180) % 360 - 180) < ALIKE_DEG for t, m in poses):
-            poses.append(pose)
+    for films in problem.films:
+        gradients = films.kind.gradient(state.values[films.positions], films.center_mm)
+        for i, gradient in zip(films.images, gradients, strict=True):
+            mirrored = bool(np.linalg.det(gradient) < 0.0)
+            upright = gradient * [1.0, -1.0] if mirrored else gradient
+            turn = round(np.degrees(np.arctan2(upright[1, 0] - upright[0, 1], upright[0, 0] + upright[1, 1]))) % 360
+            known = (mirrored == m and abs((turn - t + 180) % 360 - 180) < ALIKE_DEG for t, m in poses)
+            if problem.network.images[i].scanner == scanner and not any(known):
+                poses.append((turn, mirrored))
     return sorted(poses)
 
 
@@ -423,9 +404,8 @@ UNNAMED: Mapping[str, tuple[str, str]] = {
 
 def unnamed_sentence(most: Parameter, followers: str) -> tuple[str, str]:
     """Cause and remedy of an unnamed direction, by the unknown that moves most."""
-    words = most._asdict() | {"followers": followers}
-    cause, remedy = UNNAMED[most.kind]
-    return cause.format(**words), remedy.format(**words)
+    cause, remedy = (text.format(**most._asdict(), followers=followers) for text in UNNAMED[most.kind])
+    return cause, remedy
 
 
 def many_sentence(count: int, followers: str) -> tuple[str, str]:
@@ -442,69 +422,51 @@ def own_sentence(problem: Problem, state: State, parameter: Parameter) -> tuple[
     """Cause and remedy of an undetermined image or point; parameter: one of its unknowns."""
     if parameter.kind == "point":
         return _point_sentence(problem, state, parameter.id)
-    parts = _parts(problem, parameter.owner)
-    return _parts_sentence(problem, parts) if parts else _image_sentence(problem, parameter.owner)
-
-
-def _parts(problem: Problem, frame: str) -> list[Image]:
-    """Scans of a frame that was scanned in parts; frame: its name or that of one of its scans."""
-    image = problem.network.image_by_name.get(frame)
-    frame = image.part_of if image is not None else frame
-    return [image for image in problem.network.images if image.part_of and image.part_of == frame]
-
-
-def _parts_sentence(problem: Problem, parts: Sequence[Image]) -> tuple[str, str]:
-    common = sum(frame == parts[0].part_of for frame, _ in problem.network.joins)
+    network, name = problem.network, parameter.owner
+    frame = network.image_by_name[name].part_of if name in network.image_by_name else name
+    parts = [image.name for image in network.images if frame and image.part_of == frame]
+    if not parts:
+        return _image_sentence(problem, name)
+    common = sum(joined == frame for joined, _ in network.joins)
     return (
-        f"The marks of frame {parts[0].part_of} do not determine its orientation and the transformations of its scans "
-        f"{_listed([part.name for part in parts])}, which {common} points join.",
+        f"The marks of frame {frame} do not determine its orientation and the transformations of its scans "
+        f"{shortened(parts, SHOWN)}, which {common} points join.",
         "Measure more fiducial marks and more common points, spread over what the scans have in common, choose a "
         "transformation with fewer parameters, or leave the frame out.",
     )
 
 
 def _point_sentence(problem: Problem, state: State, point: str) -> tuple[str, str]:
-    position = problem.unknowns.point[point][0]
-    numbers = problem.image_numbers[(problem.places[:, 0] == position) & ~problem.is_fiducial]
-    images = _listed([problem.network.images[i].name for i in numbers])
+    position = problem.unknowns.point[point]
+    numbers = problem.image_numbers[(problem.places[:, 0] == position[0]) & ~problem.is_fiducial]
+    images = shortened([problem.network.images[i].name for i in numbers], SHOWN)
     stations = state.values[problem.exterior[numbers, :3]]
-    distances = np.linalg.norm(stations - state.values[problem.unknowns.point[point]], axis=1)
-    apart = np.linalg.norm(stations - stations[0], axis=1).max()
+    distances = np.linalg.norm(stations - state.values[position], axis=1)
     where = "from another station"
     if len(numbers) == 1:
         cause = f"Only image {images} shows point {point}: one ray does not tell where on it the point lies."
-    elif apart <= IN_LINE * distances.max():
+    elif np.linalg.norm(stations - stations[0], axis=1).max() <= IN_LINE * distances.max():
         cause = f"The images that show point {point} ({images}) were taken from one station: their rays are one ray."
     else:
+        where = "from a station off that line"
         cause = (
             f"Point {point} lies in line with the stations of the images that show it ({images}): their rays are one "
             "ray."
         )
-        where = "from a station off that line"
     return cause, f"Measure it in an image {where}, give its coordinates, or leave it out."
 
 
 def _image_sentence(problem: Problem, image: str) -> tuple[str, str]:
-    xy_mm = problem.network.observations.xy_mm
+    xy_mm, why = problem.network.observations.xy_mm, []
     own = np.array(problem.network.observations.image) == image
-    why = [
-        f"all its {what} lie on one line"
-        for what, rows in (("targets", own & ~problem.is_fiducial), ("fiducial marks", own & problem.is_fiducial))
-        if rows.any() and _are_collinear(xy_mm[rows])
-    ]
+    for what, rows in (("targets", own & ~problem.is_fiducial), ("fiducial marks", own & problem.is_fiducial)):
+        if rows.any():
+            extents = np.linalg.svd(xy_mm[rows] - xy_mm[rows].mean(axis=0), compute_uv=False)
+            if len(extents) < 2 or extents[-1] <= IN_LINE * extents[0]:
+                why.append(f"all its {what} lie on one line")
     cause = f"The marks of image {image} do not determine its own orientation and transformation"
     where = "off that line" if why else "spread over the frame"
     return (
         f"{cause}{': ' if why else ''}{' and '.join(why)}.",
         f"Measure more marks in this image, {where}, give its orientation in images.csv, or leave the image out.",
     )
-
-
-def _are_collinear(xy_mm: Array) -> bool:
-    extents = np.linalg.svd(xy_mm - xy_mm.mean(axis=0), compute_uv=False)
-    return len(extents) < 2 or bool(extents[-1] <= IN_LINE * extents[0])
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = len(names) - SHOWN
-    return ", ".join(names[:SHOWN]) + (f" and {more} more" if more > 0 else "")
