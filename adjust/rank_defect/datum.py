@@ -48,21 +48,15 @@ def object_datum(problem: Problem, state: State, tolerance: float = EXACT) -> Ob
     moved = generators.copy()
     moved[problem.exterior[:, 3:]] *= extent  # angles to lengths
     hindered = moved[np.isfinite(problem.unknowns.sigma)]
-    rows = np.vstack([hindered / np.sqrt(max(len(hindered), 1)), _further_motions(problem, state, generators)])
-    _, singular, right = np.linalg.svd(rows, full_matrices=False)
-    return ObjectDatum(center, extent, generators, right[singular <= tolerance].T)
-
-
-def _further_motions(problem: Problem, state: State, generators: Array) -> Array:
-    """(m, 7) changes of the further observations, normalised, so that short distances count like long ones."""
-    rows = [np.zeros((7, 7))]
-    for further in problem.further:
+    rows = [np.zeros((7, 7)), hindered / np.sqrt(max(len(hindered), 1))]
+    for further in problem.further:  # normalised, so that short distances count like long ones
         by_unknowns = further.jacobian(state.values)
         motions = by_unknowns @ generators[further.positions]
         lengths = np.linalg.norm(motions, axis=1, keepdims=True)
         strength = lengths[:, 0] > EXACT * np.linalg.norm(by_unknowns, axis=1)
         rows.append(motions[strength] / lengths[strength])
-    return np.vstack(rows)
+    _, singular, right = np.linalg.svd(np.vstack(rows), full_matrices=False)
+    return ObjectDatum(center, extent, generators, right[singular <= tolerance].T)
 
 
 def _point_positions(problem: Problem) -> Indices:
@@ -205,7 +199,16 @@ def chosen_coordinates(problem: Problem, coordinates: Sequence[str]) -> Indices:
     Raises DatumError where one is unknown or has a prior, and where they fix less than the free datum or over-constrain
     it.
     """
-    positions = np.array([_position(problem, text) for text in coordinates], dtype=np.intp)
+    wanted = [object_coordinate(text) for text in coordinates]
+    _check_points(problem, [parameter.id for parameter in wanted])
+    of, sigma = problem.unknowns.point, problem.unknowns.sigma
+    positions = np.array([of[each.id]["XYZ".index(each.quantity)] for each in wanted], dtype=np.intp)
+    for text, given in zip(coordinates, sigma[positions], strict=True):
+        if np.isfinite(given):
+            raise DatumError(
+                f"The datum coordinate {text} is given with the standard deviation {given:g}: it holds the network as "
+                "it is. Leave it out of the datum coordinates, or leave its standard deviation blank."
+            )
     datum = object_datum(problem, problem.start(), FLAT)
     motions = datum.motions(positions)
     least = DEPENDENT * np.maximum(np.linalg.norm(motions, axis=1), DEPENDENT)
@@ -221,19 +224,6 @@ def chosen_coordinates(problem: Problem, coordinates: Sequence[str]) -> Indices:
         )
     _check_complete(datum, basis, f"The datum coordinates {', '.join(coordinates)}")
     return positions
-
-
-def _position(problem: Problem, coordinate: str) -> int:
-    parameter = object_coordinate(coordinate)
-    _check_points(problem, [parameter.id])
-    position = int(problem.unknowns.point[parameter.id]["XYZ".index(parameter.quantity)])
-    if np.isfinite(problem.unknowns.sigma[position]):
-        raise DatumError(
-            f"The datum coordinate {coordinate} is given with the standard deviation "
-            f"{problem.unknowns.sigma[position]:g}: it holds the network as it is. Leave it out of the datum "
-            f"coordinates, or leave its standard deviation blank."
-        )
-    return position
 
 
 def chosen_points(problem: Problem, points: Sequence[str]) -> Indices:

@@ -1,10 +1,12 @@
 """Rank defects: null directions of the observation equations, named, with cause and remedy."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain
 
 import numpy as np
 
-from adjust.array_types import Array, Indices
+from adjust.array_types import Array, Indices, Mask
+from adjust.least_squares.numbering import Numbering
 from adjust.linear_algebra.factor import Factor
 from adjust.problem.estimates import NullDirection
 from adjust.problem.parameter import Parameter, description
@@ -34,18 +36,23 @@ LOOSE = 0.05  # relative standard deviation of a principal distance above which 
 UNDETERMINED = 0.99  # ratio of posterior and prior standard deviation above which a quantity is undetermined
 
 
-def singular_directions(problem: Problem, state: State, free: Indices, factor: Factor) -> tuple[NullDirection, ...]:
+def singular_directions(numbering: Numbering, state: State, factor: Factor) -> tuple[NullDirection, ...]:
     """Null directions of the factor at a state; none where it is regular."""
     if factor.steady:
         return ()
-    blind = blind_blocks(factor)
+    blind, parameters = blind_blocks(factor), numbering.problem.unknowns.parameters
     null, _ = null_space(factor, blind, SINGULAR)
-    named, left = _named_directions(problem, state, free, factor, blind, null, PURE)
-    return (*_block_directions(problem, state, free, blind), *named, *left)
+    named, left = _named_directions(numbering, state, factor, blind, null, PURE)
+    within_blocks = []  # within the unknowns of one image or point
+    for block in blind:
+        for vector in block.right.T:
+            moved = tuple(parameters[numbering.free[block.own[i]]] for i in _largest(vector))
+            within_blocks.append(NullDirection(moved, *own_sentence(numbering.problem, state, moved[0])))
+    return (*within_blocks, *named, *left)
 
 
 def weak_directions(
-    problem: Problem, state: State, free: Indices, factor: Factor, singular: Sequence[NullDirection] = ()
+    numbering: Numbering, state: State, factor: Factor, singular: Sequence[NullDirection] = ()
 ) -> tuple[NullDirection, ...]:
     """Weak directions: hardly determined by the observations and not settled by priors, so that noise decides.
 
@@ -59,29 +66,32 @@ def weak_directions(
     factor : without the priors of cameras and scanners.
     singular : null directions, which are not repeated.
     """
+    problem, free = numbering.problem, numbering.free
     blind = blind_blocks(factor)
     hardly, visibility = null_space(factor, blind, WEAK)
     if singular and (visibility <= SINGULAR).all():
         return ()
-    marks = np.isin(free, [i for pair in problem.unknowns.fiducial.values() for i in pair])
-    cameras_and_scanners = np.isin(
-        free, [i for some in (problem.unknowns.camera, problem.unknowns.scanner) for own in some.values() for i in own]
+    unknowns, calibrated = problem.unknowns, [each.positions for each in problem.further if each.group == "calibration"]
+
+    def is_among(*positions: Iterable[Indices | Sequence[int]]) -> Mask:
+        """Mask of the free unknowns at some positions."""
+        return np.isin(free, np.concatenate([[], *chain(*positions)]))
+
+    placed = is_among(unknowns.fiducial.values()) & (np.isfinite(unknowns.sigma[free]) | is_among(calibrated))
+    kept = _complement(hardly[placed | is_among(trading_off(problem).values())], MIXED)
+    of_unit_weight = (
+        hardly @ kept @ np.linalg.inv(np.linalg.qr(np.maximum(visibility, SINGULAR)[:, None] * kept, mode="r"))
     )
-    sigma = np.where(cameras_and_scanners, problem.unknowns.sigma[free], np.inf)
-    calibrated = [each.positions for each in problem.further if each.group == "calibration"]
-    placed = marks & (np.isfinite(problem.unknowns.sigma[free]) | np.isin(free, np.concatenate([[], *calibrated])))
-    placed |= np.isin(free, np.concatenate([[], *trading_off(problem).values()]))
-    kept = _complement(hardly[placed], MIXED)
-    weights = np.maximum(visibility, SINGULAR)[:, None] * kept
-    of_unit_weight = hardly @ kept @ np.linalg.inv(np.linalg.qr(weights, mode="r"))
+    cameras_and_scanners = is_among(unknowns.camera.values(), unknowns.scanner.values())
+    sigma = np.where(cameras_and_scanners, unknowns.sigma[free], np.inf)
     _, weight, right = np.linalg.svd(of_unit_weight / (factor.scale * sigma)[:, None], full_matrices=False)
     unsettled = of_unit_weight @ right[weight < SETTLED].T
-    found = _named_directions(problem, state, free, factor, blind, np.linalg.qr(unsettled)[0], MIXED)
+    found = _named_directions(numbering, state, factor, blind, np.linalg.qr(unsettled)[0], MIXED)
     again = {_motion(each) for each in singular}
-    named, left = (tuple(each for each in some if _motion(each) not in again) for some in found)
+    named, left = ([each for each in some if _motion(each) not in again] for some in found)
     if len(left) > NAMES_SHOWN:  # many directions that have no name, as one
         moved = tuple(dict.fromkeys(moved for each in left for moved in each.parameters))
-        left = (NullDirection(_collapsed(moved), *many_sentence(len(left), followers(moved))),)
+        left = [NullDirection(_collapsed(moved), *many_sentence(len(left), followers(moved)))]
     return (*named, *left)
 
 
@@ -138,31 +148,19 @@ def _collapsed(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
     return tuple(shown)
 
 
-def _block_directions(
-    problem: Problem, state: State, free: Indices, blind: Sequence[BlindBlock]
-) -> Iterable[NullDirection]:
-    """Null directions within the unknowns of one image or point."""
-    for block in blind:
-        for vector in block.right.T:
-            moved = tuple(problem.unknowns.parameters[free[block.own[i]]] for i in _largest(vector))
-            yield NullDirection(moved, *own_sentence(problem, state, moved[0]))
-
-
 def _named_directions(
-    problem: Problem,
-    state: State,
-    free: Indices,
-    factor: Factor,
-    blind: Sequence[BlindBlock],
-    null: Array,
-    part: float,
-) -> tuple[Sequence[NullDirection], Sequence[NullDirection]]:
-    """Describe the vectors (n, d) of a null space: named directions, the object datum first and then those of cameras;
-    and unnamed ones, described by the unknown that moves most."""
+    numbering: Numbering, state: State, factor: Factor, blind: Sequence[BlindBlock], null: Array, part: float
+) -> tuple[list[NullDirection], list[NullDirection]]:
+    """Describe the vectors (n, d) of a null space: named directions, the object datum first, and unnamed ones."""
     if null.shape[1] == 0:
-        return (), ()
+        return [], []
+    problem, free = numbering.problem, numbering.free
     parameters = [problem.unknowns.parameters[i] for i in free]
-    datum, sentences, rest = _datum_part(problem, state, free, factor, blind, null)
+    datum, numbers, rest = _datum_part(numbering, state, factor, blind, null)
+    named = [
+        NullDirection(_collapsed([parameters[i] for i in _largest(vector)]), *datum_sentence(number))
+        for vector, number in zip(datum.T, numbers, strict=True)
+    ]
     # Add as much of the free datum as keeps the object points in place.
     points = np.isin(free, free_coordinates(problem))
     still = np.asarray(rest - datum @ np.linalg.lstsq(datum[points], rest[points])[0])
@@ -174,47 +172,37 @@ def _named_directions(
     axes = (functionals[ranks == 0] * factor.scale**2).T  # as motions of the scaled unknowns
     chosen = _independent_rows(visibility, part, ranks, _axes_projector(axes, rest, part))
     vectors = _object_fixed(parameters, still @ np.linalg.pinv(visibility[chosen]), ranks[chosen])
-    left = still @ _complement(visibility[chosen], PURE)
-    moved = [[parameters[i] for i in _largest(vector)] for vector in np.hstack([datum, vectors, left]).T]
-    of_leads = moved[datum.shape[1] : len(moved) - left.shape[1]]
-    for own, i in zip(of_leads, chosen, strict=True):  # always list the unknowns that give the name, however small
-        own += [parameters[k] for k in np.flatnonzero(functionals[i]) if parameters[k] not in own]
-    sentences += [leads[i].sentence(own) for i, own in zip(chosen, of_leads, strict=True)]
-    for vector, own in zip(left.T, moved[len(moved) - left.shape[1] :], strict=True):
-        sentences.append(_sentence_without_name(problem, state, parameters[int(np.argmax(np.abs(vector)))], own))
-    named = zip(moved, sentences, strict=True)
-    directions = [NullDirection(_collapsed(own), *sentence) for own, sentence in named]
-    count = len(directions) - left.shape[1]
-    return directions[:count], directions[count:]
-
-
-def _sentence_without_name(
-    problem: Problem, state: State, most: Parameter, moved: Sequence[Parameter]
-) -> tuple[str, str]:
-    """Cause and remedy of an unnamed direction, by the unknown that moves most: of one point or image, or of many."""
-    owners = {(each.owner, each.id) for each in moved}
-    if len(owners) == 1 and most.kind in ("point", "exterior", "film"):
-        return own_sentence(problem, state, most)
-    return unnamed_sentence(most, followers(set(moved) - {most}))
+    for vector, i in zip(vectors.T, chosen, strict=True):
+        # Always list the unknowns that give the name, however small.
+        moved = [parameters[k] for k in dict.fromkeys([*_largest(vector), *np.flatnonzero(functionals[i]).tolist()])]
+        named.append(NullDirection(_collapsed(moved), *leads[i].sentence(moved)))
+    unnamed = []
+    for vector in (still @ _complement(visibility[chosen], PURE)).T:
+        # By the unknown that moves most: of one point or image, or of many.
+        most, moved = parameters[int(np.argmax(np.abs(vector)))], [parameters[i] for i in _largest(vector)]
+        if len({(each.owner, each.id) for each in moved}) == 1 and most.kind in ("point", "exterior", "film"):
+            sentence = own_sentence(problem, state, most)
+        else:
+            sentence = unnamed_sentence(most, followers(set(moved) - {most}))
+        unnamed.append(NullDirection(_collapsed(moved), *sentence))
+    return named, unnamed
 
 
 def _datum_part(
-    problem: Problem, state: State, free: Indices, factor: Factor, blind: Sequence[BlindBlock], null: Array
-) -> tuple[Array, list[tuple[str, str]], Array]:
-    """Split off the object datum: its vectors (n, k) in a null space, their sentences, and the rest (n, d - k)."""
+    numbering: Numbering, state: State, factor: Factor, blind: Sequence[BlindBlock], null: Array
+) -> tuple[Array, list[int], Array]:
+    """Split off the object datum: its vectors (n, k) in a null space, their numbers, and the rest (n, d - k)."""
     # All vectors are free of the blocks' own null directions.
-    datum = object_datum(problem, state)
-    motion = (datum.generators @ datum.free)[free] * factor.scale[:, None]
+    datum = object_datum(numbering.problem, state)
+    motion = datum.motions(numbering.free) * factor.scale[:, None]
     for block in blind:
         motion[block.own] -= block.right @ (block.right.T @ motion[block.own])
-    orthonormal = np.linalg.qr(motion)[0]
-    left, cosines, _ = np.linalg.svd(null.T @ orthonormal)
+    left, cosines, _ = np.linalg.svd(null.T @ np.linalg.qr(motion)[0])
     count = int((cosines > 1.0 - INSIDE).sum())
     if count < datum.free.shape[1]:
-        return np.zeros((len(free), 0)), [], null
+        return np.zeros((len(motion), 0)), [], null
     chosen = _independent_rows(datum.free, PURE, np.zeros(7, dtype=np.intp))
-    vectors = motion @ np.linalg.pinv(datum.free[chosen])
-    return vectors, [datum_sentence(i) for i in chosen], null @ left[:, count:]
+    return motion @ np.linalg.pinv(datum.free[chosen]), chosen, null @ left[:, count:]
 
 
 def _object_fixed(parameters: Sequence[Parameter], vectors: Array, ranks: Indices) -> Array:

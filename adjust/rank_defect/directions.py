@@ -11,6 +11,7 @@ from adjust.functional_model.families import family
 from adjust.functional_model.lens import INTERIOR_NAMES
 from adjust.functional_model.scanner import is_left, term_degree
 from adjust.functional_model.transformation import follows_tilts
+from adjust.least_squares.numbering import Numbering
 from adjust.linear_algebra.factor import Factor
 from adjust.problem.estimates import Cofactor
 from adjust.problem.parameter import Kind, Parameter, enumeration, shortened
@@ -290,17 +291,15 @@ def term_reason(term: str, poses: Sequence[Pose], confused_with: str) -> Reason:
     return Reason(because, given, otherwise)
 
 
-def weak_term_sentences(
-    problem: Problem, state: State, free: Indices, factor: Factor, cofactor: Cofactor
-) -> Iterator[str]:
+def weak_term_sentences(numbering: Numbering, state: State, factor: Factor, cofactor: Cofactor) -> Iterator[str]:
     """Sentences on terms that a regular network hardly separates from films, marks and lenses.
 
     Frames never lie exactly alike, and given fiducial marks have a standard deviation: a deformation is then
     determined, but weakly. factor: of the free unknowns; cofactor: of all.
     """
-    unknowns = problem.unknowns
+    problem, unknowns = numbering.problem, numbering.problem.unknowns
     alone = np.zeros(len(unknowns))  # inverse of the standard deviation with all else known; 0 where fixed
-    alone[free] = factor.scale
+    alone[numbering.free] = factor.scale
     lens = np.concatenate([positions[3:] for positions in unknowns.camera.values()])
     for name, terms in unknowns.scanner.items():
         hardly = terms[np.sqrt(cofactor.variances[terms]) * alone[terms] > HARDLY]

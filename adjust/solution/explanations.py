@@ -217,7 +217,7 @@ def _first_order_fall(run: Run, problem: Problem) -> float:
     weighted, covariance = run.weighting.applied(problem)
     numbering = Numbering(weighted)
     at = linearise(numbering, covariance, weighted.start())
-    if at is None or singular_directions(weighted, at.state, numbering.free, at.factor):
+    if at is None or singular_directions(numbering, at.state, at.factor):
         return 0.0
     return at.factor.length() ** 2
 

@@ -188,7 +188,7 @@ def _iterate(problem: Problem, weighting: Weighting, state: State, limit: int) -
     numbering = Numbering(weighted)
 
     def singular_at(at: Linearised) -> tuple[NullDirection, ...]:
-        return singular_directions(weighted, at.state, numbering.free, at.factor)
+        return singular_directions(numbering, at.state, at.factor)
 
     solution = iterate(numbering, covariance, state, limit, lambda start: bool(singular_at(start)))
     if solution is None:

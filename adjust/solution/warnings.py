@@ -69,14 +69,14 @@ def _largest_residuals(run: Run) -> str:
 
 
 def _weak_parameters(run: Run, cofactor: Cofactor) -> Iterator[str]:
-    problem, state, free = run.numbering.problem, run.end.state, run.numbering.free
+    problem, state = run.numbering.problem, run.end.state
     without_priors = factorise(run.numbering, run.end, camera_priors=False)
-    for each in weak_directions(problem, state, free, without_priors, run.singular):
+    for each in weak_directions(run.numbering, state, without_priors, run.singular):
         yield f"Practically singular without priors: {description(each.parameters)}. {each.cause} {each.remedy}"
     if run.converged:
         yield from filter(None, [undetermined(problem, state, cofactor.variances)])
         yield from loose_principal_distances(problem, state, cofactor.variances)
-        yield from weak_term_sentences(problem, state, free, run.factor, cofactor)
+        yield from weak_term_sentences(run.numbering, state, run.factor, cofactor)
 
 
 def _points_without_image(problem: Problem) -> list[str]:
