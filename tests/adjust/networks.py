@@ -1,6 +1,6 @@
 """Networks simulated with formulas of their own or projected by OpenCV: nothing comes from the code under test."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from math import pi
@@ -127,10 +127,12 @@ def simulated(
     """
     truth = truth or Truth()
     points = field_points(rng, 12) if points is None else points
-    rows: list[tuple[str, str, str, Array, float]] = []
+    rows: list[ObservedRow] = []
     for i in range(len(truth.stations)):
         film = film_parameters(truth, i, kind)
-        marks = [(id_, "fiducial", np.array(xy), 0.003) for id_, xy in FIDUCIALS.items()] if kind != "none" else []
+        marks: list[tuple[str, ObservationKind, Array, float]] = []
+        if kind != "none":
+            marks = [(id_, "fiducial", np.array(xy), 0.003) for id_, xy in FIDUCIALS.items()]
         marks += [(str(j), "target", xy, 0.004) for j, xy in enumerate(camera_point(truth, i, points))]
         observed = comparator_point(kind, film, truth.mirrored[i], np.array([xy for _, _, xy, _ in marks]))
         for (id_, what, _, sigma), xy in zip(marks, observed, strict=True):
@@ -139,9 +141,7 @@ def simulated(
     spread = fiducial_sigma * noise
     camera = Camera(
         "K",
-        Prior(truth.c + noise * rng.normal(0.0, 1.0), 1.0),
-        Prior(truth.x0 + noise * rng.normal(0.0, 1.0), 1.0),
-        Prior(truth.y0 + noise * rng.normal(0.0, 1.0), 1.0),
+        *given_interior(np.array([truth.c, truth.x0, truth.y0]) + noise * rng.normal(0.0, 1.0, 3)),
         Distortion(truth.family, given, truth.decentering, half_mm=(HALF_MM, HALF_MM)),
         {
             id_: Fiducial(*(Prior(value + spread * rng.normal(), fiducial_sigma) for value in xy))
@@ -153,15 +153,33 @@ def simulated(
         ObjectPoint(str(j), *(Prior(float(value + offset * rng.normal()), point_sigma) for value in xyz))
         for j, xyz in enumerate(points)
     )
-    observations = Observations(
-        tuple(row[0] for row in rows),
-        tuple(row[1] for row in rows),
-        tuple("fiducial" if row[2] == "fiducial" else "target" for row in rows),
-        np.array([row[3] for row in rows]),
-        np.array([row[4] ** 2 * np.eye(2) for row in rows]),
-    )
     images = tuple(Image(f"f{i}", "K", kind) for i in range(len(truth.stations)))
-    return Network((camera,), images, object_points, observations), start_of(truth, kind, points)
+    return Network((camera,), images, object_points, make_observations(rows)), start_of(truth, kind, points)
+
+
+ObservedRow = tuple[
+    str, str, ObservationKind, Array, float
+]  # image, point, kind, comparator coordinates, standard deviation
+
+
+def make_observations(rows: Sequence[ObservedRow]) -> Observations:
+    images, points, kinds, xy_mm, sigmas = zip(*rows, strict=True)
+    return Observations(images, points, kinds, np.array(xy_mm), np.array([sigma**2 * np.eye(2) for sigma in sigmas]))
+
+
+def known_points(xyz: Mapping[str, Array]) -> tuple[ObjectPoint, ...]:
+    return tuple(ObjectPoint(id_, *(Prior(float(value)) for value in place)) for id_, place in xyz.items())
+
+
+def given_interior(values_mm: Sequence[float] | Array, sigma: float = 1.0) -> tuple[Prior, Prior, Prior]:
+    """c, x0' and y0' with one standard deviation."""
+    c, x0, y0 = (Prior(float(value), sigma) for value in values_mm)
+    return c, x0, y0
+
+
+def given_marks(places_mm: Mapping[str, Sequence[float] | Array], sigma: float) -> dict[str, Fiducial]:
+    """Fiducials given with one standard deviation."""
+    return {id_: Fiducial(*(Prior(float(value), sigma) for value in place)) for id_, place in places_mm.items()}
 
 
 def row_of(network: Network, kind: ObservationKind, image: str, point: str) -> int:
@@ -191,14 +209,14 @@ def digital_network(
     camera: Camera, rows: Sequence[tuple[str, str, Array]], xyz: dict[str, Array], sigma: float
 ) -> Network:
     """Known points in images of a digital camera; rows: image, point and comparator coordinates of its marks."""
-    images, points, xy_mm = zip(*rows, strict=True)
-    kinds: tuple[ObservationKind, ...] = tuple("target" for _ in rows)
-    return Network(
-        (camera,),
-        tuple(Image(name, camera.name, "none") for name in dict.fromkeys(images)),
-        tuple(ObjectPoint(id_, *(Prior(float(value)) for value in place)) for id_, place in xyz.items()),
-        Observations(images, points, kinds, np.array(xy_mm), np.tile(sigma**2 * np.eye(2), (len(rows), 1, 1))),
-    )
+    images = tuple(Image(name, camera.name, "none") for name in dict.fromkeys(row[0] for row in rows))
+    observations = make_observations([(image, point, "target", xy, sigma) for image, point, xy in rows])
+    return Network((camera,), images, known_points(xyz), observations)
+
+
+def view_rows(views: Iterable[Array], names: Sequence[str]) -> list[tuple[str, str, Array]]:
+    """Rows of a digital network that shows the same points in every picture, which are called i0, i1 and so on."""
+    return [(f"i{i}", name, xy) for i, view in enumerate(views) for name, xy in zip(names, view, strict=True)]
 
 
 def join_observations(*parts: Observations) -> Observations:
@@ -478,7 +496,7 @@ def halves(
     """
     truth = Truth()
     points = field_points(rng, targets)
-    rows: list[tuple[str, str, ObservationKind, Array, float]] = []
+    rows: list[ObservedRow] = []
     films: dict[str, Array] = {}
     joins: dict[tuple[str, str], Array] = {}
     for i in range(len(truth.stations)):
@@ -500,32 +518,17 @@ def halves(
             own = [mark for mark in view if side * mark[2][0] > -overlap_mm / 2]
             observed = comparator_point("affine", film, False, np.array([mark[2] for mark in own]))
             for (kind, id_, _, sigma), xy in zip(own, observed, strict=True):
-                rows.append((name, id_, kind, xy + rng.normal(0.0, sigma, 2), sigma))
+                rows.append((name, id_, kind, xy + rng.normal(0.0, sigma, 2), max(sigma, 1e-4)))
     sigma = 0.001 if known_fiducials else 1.0
     camera = Camera(
         "K",
-        Prior(truth.c + rng.normal(), 1.0),
-        Prior(truth.x0 + rng.normal(), 1.0),
-        Prior(truth.y0 + rng.normal(), 1.0),
+        *given_interior(np.array([truth.c, truth.x0, truth.y0]) + rng.normal(size=3)),
         Distortion(truth.family, {name: Prior(value) for name, value in truth.distortion.items()}),
-        {
-            id_: Fiducial(*(Prior(value + rng.normal(0.0, sigma), sigma) for value in xy))
-            for id_, xy in FIDUCIALS.items()
-        },
+        given_marks({id_: xy + rng.normal(0.0, sigma, 2) for id_, xy in FIDUCIALS.items()}, sigma),
     )
-    network = Network(
-        (camera,),
-        tuple(Image(name, "K", "affine", part_of=name.split(".")[0]) for name in films),
-        tuple(ObjectPoint(str(j), *(Prior(float(value)) for value in xyz)) for j, xyz in enumerate(points)),
-        Observations(
-            tuple(row[0] for row in rows),
-            tuple(row[1] for row in rows),
-            tuple(row[2] for row in rows),
-            np.array([row[3] for row in rows]),
-            np.array([max(row[4], 1e-4) ** 2 * np.eye(2) for row in rows]),
-        ),
-    )
-    return Halves(network, films, joins, truth)
+    images = tuple(Image(name, "K", "affine", part_of=name.split(".")[0]) for name in films)
+    targets_xyz = known_points({str(j): xyz for j, xyz in enumerate(points)})
+    return Halves(Network((camera,), images, targets_xyz, make_observations(rows)), films, joins, truth)
 
 
 def drop_images(network: Network, drop: str) -> Network:
@@ -618,37 +621,28 @@ def bent_films(
         linear = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ film
         frames.append(f"f{i}")
         rows.append(places @ linear.T + SCAN_MIDDLE_MM + scatter * chance.uniform(-1.5, 1.5, 2))
-    straight_mm = np.concatenate(rows)
-    names = [(frame, mark) for frame in frames for mark in marks_mm]
     given = places + (0.0 if rng is None else sigma_given_mm * rng.normal(size=places.shape))
-    network = Network(
-        cameras=(
-            Camera(
-                "K",
-                Prior(153.0),
-                Prior(0.0),
-                Prior(0.0),
-                fiducials={
-                    mark: Fiducial(Prior(float(x), sigma_given_mm), Prior(float(y), sigma_given_mm))
-                    for mark, (x, y) in zip(marks_mm, given, strict=True)
-                },
-            ),
-        ),
-        images=tuple(Image(frame, "K", kind) for frame in frames),
-        points=(),
-        observations=Observations(
-            tuple(frame for frame, _ in names),
-            tuple(mark for _, mark in names),
-            tuple("fiducial" for _ in names),
-            straight_mm,
-            np.broadcast_to(FILM_SIGMA_MM**2 * np.eye(2), (len(names), 2, 2)),
-        ),
-    )
-    network = bend_in_scanner(network, truth, terms)
+    fiducials = given_marks(dict(zip(marks_mm, given, strict=True)), sigma_given_mm)
+    camera = Camera("K", Prior(153.0), Prior(0.0), Prior(0.0), fiducials=fiducials)
+    network = bend_in_scanner(film_network(camera, kind, frames, np.array(rows), FILM_SIGMA_MM), truth, terms)
     if rng is None:
         return network
+    straight_mm = network.observations.xy_mm
     noise = rng.normal(0.0, FILM_SIGMA_MM, straight_mm.shape)
-    return replace(network, observations=replace(network.observations, xy_mm=network.observations.xy_mm + noise))
+    return replace(network, observations=replace(network.observations, xy_mm=straight_mm + noise))
+
+
+def film_network(
+    camera: Camera, kind: Transformation, frames: Sequence[str], comparator_mm: Array, sigma: float
+) -> Network:
+    """Frames that show all m fiducials of a camera and no more; comparator_mm (n, m, 2)."""
+    rows: list[ObservedRow] = [
+        (frame, id_, "fiducial", xy, sigma)
+        for frame, own in zip(frames, comparator_mm, strict=True)
+        for id_, xy in zip(camera.fiducials, own, strict=True)
+    ]
+    images = tuple(Image(frame, camera.name, kind) for frame in frames)
+    return Network((camera,), images, (), make_observations(rows))
 
 
 FILM_CAMERA = "K"
@@ -697,22 +691,9 @@ def draw_frames(
 
 def fiducial_network(kind: Transformation, given_mm: Array, stated_mm: float, comparator_mm: Array) -> Network:
     """Of marks (m, 2) as given, and as measured in n frames (n, m, 2)."""
-    count, marks = comparator_mm.shape[:2]
-    ids, images = tuple(str(i + 1) for i in range(marks)), frame_names(count)
-    fiducials = {i: Fiducial(Prior(x, stated_mm), Prior(y, stated_mm)) for i, (x, y) in zip(ids, given_mm, strict=True)}
-    kinds: tuple[ObservationKind, ...] = tuple("fiducial" for _ in range(count * marks))
-    return Network(
-        (Camera(FILM_CAMERA, None, None, None, fiducials=fiducials),),
-        tuple(Image(name, FILM_CAMERA, kind) for name in images),
-        (),
-        Observations(
-            tuple(np.repeat(images, marks).tolist()),
-            ids * count,
-            kinds,
-            comparator_mm.reshape(-1, 2),
-            np.tile(FRAME_NOISE_MM**2 * np.eye(2), (len(kinds), 1, 1)),
-        ),
-    )
+    fiducials = given_marks({str(i): xy for i, xy in enumerate(given_mm, 1)}, stated_mm)
+    camera = Camera(FILM_CAMERA, None, None, None, fiducials=fiducials)
+    return film_network(camera, kind, frame_names(len(comparator_mm)), comparator_mm, FRAME_NOISE_MM)
 
 
 def frame_names(count: int) -> tuple[str, ...]:
@@ -760,6 +741,7 @@ def _film_kind(name: str) -> str:
 
 
 PROJECTED_C_MM, X0_MM, Y0_MM = 152.0, 0.05, -0.03
+PROJECTED_SIGMA_MM = 0.005
 SIX_MARKS_MM = {
     str(i + 1): 106.0 * np.array(xy) for i, xy in enumerate([(1, -1), (-1, -1), (-1, 1), (1, 1), (-1, 0), (1, 0)])
 }
@@ -779,20 +761,21 @@ def project_field(
     *,
     kind: Transformation = "affine",
     mirrored: bool = False,
-    noise_mm: float = 0.005,
+    noise_mm: float = PROJECTED_SIGMA_MM,
     outliers: float = 0.0,
     distortion: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
+    aspect: float = 1.0,
     seed: int = 1,
 ) -> Projected:
     """A network of known points as OpenCV projects them, scanned with any turn; all points within 115 mm are seen."""
     rng = np.random.default_rng(seed)
-    rows: list[tuple[str, str, ObservationKind, Array]] = []
+    rows: list[ObservedRow] = []
     rotations, centers = {}, {}
     for number, station in enumerate(stations):
         image = f"f{number + 1}"
         rotation = Rotation.from_euler("XYZ", station[3:]).as_matrix().T
         rotations[image], centers[image] = rotation, np.array(station[:3])
-        projected = camera_coordinates(xyz, rotation, centers[image], distortion)
+        projected = camera_coordinates(xyz, rotation, centers[image], distortion, aspect)
         marks = np.array(list(SIX_MARKS_MM.values()))
         scan = scan_from_camera(kind, mirrored, rng)
         inside = np.flatnonzero((np.abs(projected) < 115.0).all(axis=1))
@@ -800,41 +783,29 @@ def project_field(
         wrong = rng.random(len(inside)) < outliers
         targets[wrong] += rng.uniform(-40.0, 40.0, (int(wrong.sum()), 2))
         fiducials = marks @ scan[0].T + scan[1] + rng.normal(0.0, noise_mm, marks.shape)
-        rows += [(image, f"t{k}", "target", xy) for k, xy in zip(inside, targets, strict=True)]
+        rows += [(image, f"t{k}", "target", xy, PROJECTED_SIGMA_MM) for k, xy in zip(inside, targets, strict=True)]
         if kind != "none":
-            rows += [(image, name, "fiducial", xy) for name, xy in zip(SIX_MARKS_MM, fiducials, strict=True)]
-    names = [f"k{i}" for i in (1, 2)] + ["p1", "p2"]
+            marks_of_image = zip(SIX_MARKS_MM, fiducials, strict=True)
+            rows += [(image, name, "fiducial", xy, PROJECTED_SIGMA_MM) for name, xy in marks_of_image]
+    lens = zip(("k1", "k2", "p1", "p2"), distortion, strict=False)
     camera = Camera(
         "rc20",
-        Prior(PROJECTED_C_MM, 1.0),
-        Prior(X0_MM, 1.0),
-        Prior(Y0_MM, 1.0),
-        Distortion("opencv", {name: Prior(value) for name, value in zip(names, distortion, strict=True)}),
-        {name: Fiducial(Prior(x, 1.0), Prior(y, 1.0)) for name, (x, y) in SIX_MARKS_MM.items()}
-        if kind != "none"
-        else {},
+        *given_interior((PROJECTED_C_MM, X0_MM, Y0_MM)),
+        Distortion("opencv", {name: Prior(value) for name, value in lens}),
+        given_marks(SIX_MARKS_MM, 1.0) if kind != "none" else {},
     )
-    points = tuple(ObjectPoint(f"t{k}", *(Prior(float(v)) for v in row)) for k, row in enumerate(xyz))
-    observations = Observations(
-        tuple(row[0] for row in rows),
-        tuple(row[1] for row in rows),
-        tuple(row[2] for row in rows),
-        np.array([row[3] for row in rows]),
-        np.tile(np.eye(2) * 0.005**2, (len(rows), 1, 1)),
-    )
+    points = {f"t{k}": place for k, place in enumerate(xyz)}
     images = tuple(Image(name, "rc20", kind) for name in rotations)
-    return Projected(
-        Network((camera,), images, points, observations),
-        rotations,
-        centers,
-        {p.id: xyz[k] for k, p in enumerate(points)},
-    )
+    network = Network((camera,), images, known_points(points), make_observations(rows))
+    return Projected(network, rotations, centers, points)
 
 
-def camera_coordinates(xyz: Array, rotation: Array, center: Array, distortion: Sequence[float]) -> Array:
+def camera_coordinates(
+    xyz: Array, rotation: Array, center: Array, distortion: Sequence[float], aspect: float = 1.0
+) -> Array:
     """Camera coordinates (n, 2), y up, by cv2.projectPoints; far outside the frame what is behind the camera."""
     downward = np.diag([1.0, -1.0, -1.0]) @ rotation
-    matrix = np.array([[PROJECTED_C_MM, 0.0, X0_MM], [0.0, PROJECTED_C_MM, -Y0_MM], [0.0, 0.0, 1.0]])
+    matrix = np.array([[aspect * PROJECTED_C_MM, 0.0, X0_MM], [0.0, PROJECTED_C_MM, -Y0_MM], [0.0, 0.0, 1.0]])
     projected, _ = cv2.projectPoints(
         xyz, cv2.Rodrigues(downward)[0], -downward @ center, matrix, np.array(distortion, dtype=np.float64)
     )
@@ -880,36 +851,21 @@ def board_network(
     """Marks with errors of sigma_mm, to which given_mm is given; of each picture its own tilt and shift."""
     points = np.array([[25.0 * column, 25.0 * row, 0.0] for row in range(6) for column in range(9)])
     matrix = np.array([[BOARD_TRUTH["c"], 0, BOARD_TRUTH["x0"]], [0, BOARD_TRUTH["c"], -BOARD_TRUTH["y0"]], [0, 0, 1]])
-    names, places = [f"p{number}" for number in range(images)], []
-    for _ in names:
+    places = []
+    for _ in range(images):
         turn = rng.uniform(-0.5, 0.5, 3)
         rotation = np.asarray(cv2.Rodrigues(turn)[0]) @ np.diag([1.0, -1.0, -1.0])
         shift = np.array([*rng.uniform(-40, 40, 2), rng.uniform(300, 420)]) - rotation @ points.mean(axis=0)
         lens = np.array([BOARD_TRUTH["k1"], BOARD_TRUTH["k2"], 0.0, 0.0, k3])
         projected = cv2.projectPoints(points, cv2.Rodrigues(rotation)[0], shift, matrix, lens)[0]
         places.append(np.asarray(projected, float).reshape(-1, 2) * [1.0, -1.0])
-    count = len(points)
-    xy_mm = np.concatenate(places) + sigma_mm * rng.normal(size=(images * count, 2))
-    covariance = np.broadcast_to(np.eye(2) * (given_mm or sigma_mm) ** 2, (images * count, 2, 2)).copy()
-    ids = [f"b{number}" for number in range(count)]
+    views = np.array(places) + sigma_mm * rng.normal(size=(images, len(points), 2))
+    xyz = {f"b{number}": place for number, place in enumerate(points)}
     free = Prior(0.0, np.inf)
     distortion = Distortion("opencv", {"k1": free, "k2": free})
     middle = (BOARD_FRAME_MM[0] / 2, -BOARD_FRAME_MM[1] / 2)
     camera = Camera("desk", None, None, None, distortion, center_mm=middle, frame_mm=BOARD_FRAME_MM)
-    return Network(
-        cameras=(camera,),
-        images=tuple(Image(name, "desk", "none") for name in names),
-        points=tuple(
-            ObjectPoint(id, *(Prior(float(value), 0.0) for value in xyz)) for id, xyz in zip(ids, points, strict=True)
-        ),
-        observations=Observations(
-            image=tuple(name for name in names for _ in ids),
-            point=tuple(ids) * images,
-            kind=tuple("target" for _ in range(images * count)),
-            xy_mm=xy_mm,
-            covariance_mm2=covariance,
-        ),
-    )
+    return digital_network(camera, view_rows(views, list(xyz)), xyz, given_mm or sigma_mm)
 
 
 LENS_R0_MM = 13.0

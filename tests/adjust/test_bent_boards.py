@@ -5,6 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from networks import digital_network, view_rows
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -13,8 +14,7 @@ from adjust.functional_model.board import board_form
 from adjust.model_selection.model_choice import choose
 from adjust.problem.condition_equations import compute, computed_observations, derivatives
 from adjust.problem.estimates import adjusted_places
-from adjust.problem.network import Board, Image, Network, ObjectPoint
-from adjust.problem.observations import ObservationKind, Observations
+from adjust.problem.network import Board, Network, ObjectPoint
 from adjust.problem.problem import number
 
 Array = NDArray[np.float64]
@@ -51,25 +51,12 @@ def make_network(rng: np.random.Generator | None, turned: Array | None = None, b
         matrix = np.array([[C_MM, 0.0, 0.1], [0.0, C_MM, 0.05], [0.0, 0.0, 1.0]])
         projected, _ = cv2.projectPoints(real, cv2.Rodrigues(rotation)[0], shift, matrix, np.array([K1, 0.0, 0.0, 0.0]))
         places.append(np.reshape(projected, (-1, 2)) * [1.0, -1.0])
-    xy = np.concatenate(places)
-    xy = xy if rng is None else xy + rng.normal(0.0, SIGMA_MM, xy.shape)
-    names = [f"p{k}" for k in range(len(flat))]
-    kinds: list[ObservationKind] = ["target"] * len(xy)
-    points = {name: turn @ place for name, place in zip(names, flat, strict=True)}
+    views = np.array(places)
+    views = views if rng is None else views + rng.normal(0.0, SIGMA_MM, views.shape)
+    points = {f"p{k}": turn @ place for k, place in enumerate(flat)}
     camera = Camera("C", Prior(20.5, np.inf), None, None, Distortion("opencv", {"k1": Prior(0.0, np.inf)}))
-    return Network(
-        (camera,),
-        tuple(Image(f"i{i}", "C", "none") for i in range(len(TURNS))),
-        tuple(ObjectPoint(name, *(Prior(float(v)) for v in place)) for name, place in points.items()),
-        Observations(
-            tuple(f"i{i}" for i in range(len(TURNS)) for _ in names),
-            tuple(name for _ in TURNS for name in names),
-            tuple(kinds),
-            xy,
-            np.tile(SIGMA_MM**2 * np.eye(2), (len(xy), 1, 1)),
-        ),
-        boards=(Board("board", points),) if bent else (),
-    )
+    network = digital_network(camera, view_rows(views, list(points)), points, SIGMA_MM)
+    return replace(network, boards=(Board("board", points),) if bent else ())
 
 
 def bends(found: Adjustment) -> Array:

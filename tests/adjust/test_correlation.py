@@ -6,12 +6,25 @@ import cv2
 import numpy as np
 import pytest
 from faults import MISHAPS, sentences
-from networks import CONVERGENT, FREE, STATIONS, Setup, Truth, field_points, give_values, simulated, vertical
+from networks import (
+    CONVERGENT,
+    FREE,
+    STATIONS,
+    Setup,
+    Truth,
+    digital_network,
+    field_points,
+    give_values,
+    given_interior,
+    simulated,
+    vertical,
+    view_rows,
+)
 from numpy.typing import NDArray
 from scipy import stats
 from studies import parametrize_with_studies
 
-from adjust import Adjustment, AdjustmentError, Camera, Image, Network, ObjectPoint, Observations, adjust
+from adjust import Adjustment, AdjustmentError, Camera, Network, ObjectPoint, adjust
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Lens, Prior
 from adjust.quality.significance import SignificanceTest
@@ -118,27 +131,12 @@ def board_network(
         turn = np.array([np.cos(azimuth) * tilt, np.sin(azimuth) * tilt, 0.2 * rng.normal()])
         shift = np.array([*rng.uniform(-60.0, 60.0, 2), rng.uniform(550.0, 800.0)])
         view.append(cv2.projectPoints(board, turn, shift, matrix, LENS)[0].reshape(-1, 2) * [1.0, -1.0])
-    places = np.concatenate(view)
-    count = len(places)
-    camera = Camera(
-        "cam",
-        Prior(1.02 * C, np.inf),
-        Prior(FRAME_MM[0] / 2.0, np.inf),
-        Prior(-FRAME_MM[1] / 2.0, np.inf),
-        Distortion("opencv", {name: Prior(0.0, np.inf) for name in free}),
-    )
-    return Network(
-        (camera,),
-        tuple(Image(f"i{i}", "cam", "none") for i in range(images)),
-        tuple(ObjectPoint(f"c{k}", *(Prior(float(each)) for each in xyz)) for k, xyz in enumerate(board)),
-        Observations(
-            tuple(f"i{i}" for i in range(images) for _ in range(54)),
-            tuple(f"c{k}" for _ in range(images) for k in range(54)),
-            tuple("target" for _ in range(count)),
-            places + noise * rng.normal(0.0, SIGMA_MM, places.shape),
-            np.tile(SIGMA_MM**2 * np.eye(2), (count, 1, 1)),
-        ),
-    )
+    views = np.array(view)
+    interior = given_interior((1.02 * C, FRAME_MM[0] / 2.0, -FRAME_MM[1] / 2.0), np.inf)
+    camera = Camera("cam", *interior, Distortion("opencv", {name: Prior(0.0, np.inf) for name in free}))
+    points = {f"c{k}": xyz for k, xyz in enumerate(board)}
+    rows = view_rows(views + noise * rng.normal(0.0, SIGMA_MM, views.shape), list(points))
+    return digital_network(camera, rows, points, SIGMA_MM)
 
 
 def true_ideal(from_principal_point: Array) -> Array:
@@ -321,9 +319,6 @@ def test_coordinates_that_count_from_the_middle_of_the_picture_have_its_corners_
     assert other is not None
     assert other.share == pytest.approx(one.share, rel=1e-6)
     assert other.frame_mm == ((-6.4, -4.8), (6.4, 4.8))
-
-
-ESTIMATED = dict.fromkeys(("k3", "k5", "p1", "p2"), np.inf)
 
 
 def free_all(network: Network, *names: str) -> Network:

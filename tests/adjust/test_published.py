@@ -1,16 +1,17 @@
 """Published calibrations: Bouguet's chessboard, and a self-calibration of a strong lens."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from networks import digital_network
 from numpy.typing import NDArray
 from real_data import DATA, needs
 from scipy.io import loadmat
 
-from adjust import Adjustment, Camera, Distortion, Image, Network, ObjectPoint, Options, Prior, adjust, approximate
-from adjust.problem.observations import ObservationKind, Observations
+from adjust import Adjustment, Camera, Distortion, Network, ObjectPoint, Options, Prior, adjust, approximate
 
 Array = NDArray[np.float64]
 
@@ -18,7 +19,6 @@ FILE = DATA / "chessboards" / "bouguet" / "Calib_Results.mat"
 
 PITCH_MM = 0.01
 IMAGES = tuple(str(i) for i in range(1, 21))
-CORNERS = 156
 
 
 @pytest.fixture(scope="module")
@@ -35,22 +35,14 @@ def adjustment(published: dict[str, Any]) -> Adjustment:
 def make_network(published: dict[str, Any]) -> Network:
     free = {name: Prior(0.0, np.inf) for name in ("k1", "k2", "p1", "p2", "b1")}
     camera = Camera("camera", None, None, None, Distortion("opencv", free), center_mm=(3.195, -2.395))
-    corners_px = np.concatenate([published[f"x_{image}"].T for image in IMAGES])
     board = published["X_1"].T
-    kinds: list[ObservationKind] = ["target"] * (CORNERS * len(IMAGES))
     assert all((board == published[f"X_{image}"].T).all() for image in IMAGES)
-    return Network(
-        (camera,),
-        tuple(Image(image, "camera", "none") for image in IMAGES),
-        tuple(ObjectPoint(str(k), *(Prior(float(v)) for v in xyz)) for k, xyz in enumerate(board)),
-        Observations(
-            tuple(image for image in IMAGES for _ in range(CORNERS)),
-            tuple(str(k) for _ in IMAGES for k in range(CORNERS)),
-            tuple(kinds),
-            corners_px * [PITCH_MM, -PITCH_MM],
-            np.tile((0.15 * PITCH_MM) ** 2 * np.eye(2), (CORNERS * len(IMAGES), 1, 1)),
-        ),
-    )
+    rows = [
+        (image, str(k), xy * [PITCH_MM, -PITCH_MM])
+        for image in IMAGES
+        for k, xy in enumerate(published[f"x_{image}"].T)
+    ]
+    return digital_network(camera, rows, {str(k): xyz for k, xyz in enumerate(board)}, 0.15 * PITCH_MM)
 
 
 def pixel_intrinsics(adjustment: Adjustment) -> tuple[Array, Array]:
@@ -114,27 +106,14 @@ def network() -> Network:
 
 
 def network_of_demo() -> Network:
-    known = {row[0]: [float(value) for value in row[2:5]] for row in table(FOLDER / "reference" / "camcal-fixed.txt")}
+    known = {row[0]: np.array(row[2:5], float) for row in table(FOLDER / "reference" / "camcal-fixed.txt")}
     marks = table(FOLDER / "measurements" / "markpts.txt")
-    images, points = [row[0] for row in marks], [row[1] for row in marks]
-    kinds: list[ObservationKind] = ["target"] * len(marks)
     free = {name: Prior(0.0, np.inf) for name in ("k1", "k2", "k3", "p1", "p2", "b1")}
-    return Network(
-        (Camera("C4040Z", None, None, None, Distortion("brown", free), center_mm=(3.6265, -2.7188)),),
-        tuple(Image(name, "C4040Z", "none") for name in sorted(set(images))),
-        tuple(ObjectPoint(p, *(Prior(v) for v in known[p])) if p in known else unknown(p) for p in sorted(set(points))),
-        Observations(
-            tuple(images),
-            tuple(points),
-            tuple(kinds),
-            np.array([[float(row[2]), -float(row[3])] for row in marks]) * PIXEL_MM,
-            np.tile((SIGMA_PX * PIXEL_MM[1]) ** 2 * np.eye(2), (len(marks), 1, 1)),
-        ),
-    )
-
-
-def unknown(point: str) -> ObjectPoint:
-    return ObjectPoint(point, None, None, None)
+    camera = Camera("C4040Z", None, None, None, Distortion("brown", free), center_mm=(3.6265, -2.7188))
+    rows = [(row[0], row[1], np.array([float(row[2]), -float(row[3])]) * PIXEL_MM) for row in marks]
+    network = digital_network(camera, rows, known, SIGMA_PX * PIXEL_MM[1])
+    unknown = sorted({row[1] for row in marks} - known.keys())
+    return replace(network, points=(*network.points, *(ObjectPoint(point, None, None, None) for point in unknown)))
 
 
 def table(file: Path) -> list[list[str]]:

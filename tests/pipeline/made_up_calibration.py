@@ -9,12 +9,12 @@ from tempfile import TemporaryDirectory
 from typing import Any, cast
 
 import numpy as np
+from networks import ObservedRow, given_interior, given_marks, make_observations
 from numpy.typing import NDArray
 
-from adjust import Adjustment, Camera, Distortion, Exterior, Fiducial, Image, Network, ObjectPoint, Parameter, Prior
+from adjust import Adjustment, Camera, Distortion, Exterior, Image, Network, ObjectPoint, Parameter, Prior
 from adjust.least_squares.iteration import Iteration
 from adjust.problem.estimates import NullDirection, VarianceFactor
-from adjust.problem.observations import ObservationKind, Observations
 from adjust.problem.tested import Probabilities
 from adjust.quality.run import Group, Residuals
 from measure.flags import Cause, Status
@@ -157,28 +157,22 @@ def _unknowns(points: tuple[str, ...], rng: np.random.Generator) -> tuple[tuple[
 
 
 def _network(points: tuple[str, ...], targets_mm: Array, rng: np.random.Generator) -> Network:
+    fiducials = {str(i): np.array(xy) for i, xy in enumerate(MARKS, 1)}
     camera = Camera(
         CAMERA,
-        Prior(153.6, 1.0),
-        Prior(0.0, 1.0),
-        Prior(0.0, 1.0),
+        *given_interior((153.6, 0.0, 0.0)),
         Distortion("torlegard", {name: Prior(0.0, np.inf) for name in ("k3", "k5", "p1", "p2")}),
-        {str(i): Fiducial(Prior(x, 1.0), Prior(y, 1.0)) for i, (x, y) in enumerate(MARKS, 1)},
+        given_marks(fiducials, 1.0),
     )
-    fiducials = np.array(MARKS)
-    rows: list[tuple[str, str, ObservationKind, Array]] = []
+    rows: list[ObservedRow] = []
     for image in FRAMES:
         turn = -1.0 if image == "f2" else 1.0
-        rows += [(image, str(i), "fiducial", xy * (turn, 1.0)) for i, xy in enumerate(fiducials, 1)]
-        rows += [(image, point, "target", xy * (turn, 1.0)) for point, xy in zip(points, targets_mm, strict=True)]
-    xy = np.array([row[3] for row in rows]) + 0.004 * rng.standard_normal((len(rows), 2))
-    observations = Observations(
-        tuple(row[0] for row in rows),
-        tuple(row[1] for row in rows),
-        tuple(row[2] for row in rows),
-        xy,
-        np.broadcast_to(np.eye(2) * SIGMA_MM**2, (len(rows), 2, 2)),
-    )
+        rows += [(image, id, "fiducial", xy * (turn, 1.0), SIGMA_MM) for id, xy in fiducials.items()]
+        targets = zip(points, targets_mm, strict=True)
+        rows += [(image, point, "target", xy * (turn, 1.0), SIGMA_MM) for point, xy in targets]
+    observations = make_observations(rows)
+    noise = 0.004 * rng.standard_normal((len(rows), 2))
+    observations = replace(observations, xy_mm=observations.xy_mm + noise)
     exterior = Exterior(np.array([0.0, 0.0, 1500.0, 0.0, 0.0, 0.0]), np.array([np.inf] * 3 + [0.5] * 3))
     return Network(
         (camera,),

@@ -8,16 +8,29 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from networks import LENSES, lens_network
+from networks import (
+    CONVERGENT_STATIONS,
+    LENSES,
+    PROJECTED_C_MM,
+    PROJECTED_SIGMA_MM,
+    SIX_MARKS_MM,
+    X0_MM,
+    Y0_MM,
+    given_interior,
+    given_marks,
+    lens_network,
+    project_field,
+    relief_field,
+)
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from studies import parametrize_with_studies
 
-from adjust import Camera, Fiducial, Image, Network, ObjectPoint, Options, adjust, approximate
+from adjust import Camera, Network, ObjectPoint, Options, adjust, approximate
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Lens, Prior
 from adjust.functional_model.lens_conversion import convert_lens
-from adjust.problem.observations import ObservationKind, Observations
+from adjust.problem.network import Transformation
+from adjust.problem.observations import Observations
 from pipeline.opencv_check.check import check_against_opencv
 from pipeline.opencv_check.opencv_calibration import (
     FISHEYE,
@@ -36,19 +49,7 @@ from pipeline.results.record_json import plain_json
 
 Array = NDArray[np.float64]
 
-C_MM, X0_MM, Y0_MM = 152.0, 0.05, -0.03
-SIGMA_MM = 0.004
-MARKS_MM = {
-    str(i): 106.0 * np.array(xy) for i, xy in enumerate([(1, -1), (-1, -1), (-1, 1), (1, 1), (-1, 0), (1, 0)], 1)
-}
 MODERATE = (-0.002, 0.001, 5e-5, -3e-5, 0.0)  # 150 um in the frame's corner
-CONVERGENT = [
-    (0.0, 0.0, 1530.0, 0.0, 0.0, 0.0),
-    (700.0, 100.0, 1400.0, -0.07, 0.45, 1.6),
-    (-600.0, 80.0, 1600.0, -0.05, -0.4, 3.1),
-    (50.0, 700.0, 1480.0, -0.45, 0.03, -1.6),
-    (-80.0, -650.0, 1650.0, 0.4, -0.05, 0.4),
-]
 VERTICAL = [(0.0, 0.0, 1530.0, 0.0, 0.0, 0.3)]
 STRONG = (-0.06, 0.02, 1e-4, -5e-5, 0.0)  # 4 mm in the frame's corner
 FREE = np.inf
@@ -63,56 +64,24 @@ def simulated(
     film: bool = True,
     lens: Sequence[float] = MODERATE,
     aspect: float = 1.0,
-    noise_mm: float = SIGMA_MM,
+    noise_mm: float = PROJECTED_SIGMA_MM,
     distortion: Distortion = NO_DISTORTION,
-    seed: int = 1,
 ) -> Network:
-    """Frames of a test field through a known lens, scanned with an affinity each, priors of 1 mm on the interior."""
-    rng = np.random.default_rng(seed)
-    xyz = rng.uniform(-1.0, 1.0, (60, 3)) * [900.0, 900.0, relief_m]
-    matrix = np.array([[aspect * C_MM, 0.0, X0_MM], [0.0, C_MM, -Y0_MM], [0.0, 0.0, 1.0]])
-    rows: list[tuple[str, str, ObservationKind, Array]] = []
-    for number, station in enumerate(stations, 1):
-        downward = np.diag([1.0, -1.0, -1.0]) @ Rotation.from_euler("XYZ", station[3:]).as_matrix().T
-        center = np.array(station[:3])
-        projected, _ = cv2.projectPoints(xyz, cv2.Rodrigues(downward)[0], -downward @ center, matrix, np.array(lens))
-        camera_mm = projected.reshape(-1, 2) * [1.0, -1.0]
-        inside = np.flatnonzero((np.abs(camera_mm) < 112.0).all(axis=1))
-        scan = np.eye(2) + rng.normal(0.0, 0.05 if film else 0.0, (2, 2))
-
-        def scanned(xy_mm: Array, scan: Array = scan) -> Array:
-            return xy_mm @ scan.T + rng.normal(0.0, noise_mm, xy_mm.shape)
-
-        rows += [
-            (f"f{number}", f"t{k}", "target", xy) for k, xy in zip(inside, scanned(camera_mm[inside]), strict=True)
-        ]
-        if film:
-            marks = scanned(np.array(list(MARKS_MM.values())))
-            rows += [(f"f{number}", name, "fiducial", xy) for name, xy in zip(MARKS_MM, marks, strict=True)]
-    camera = Camera(
-        "rc20",
-        Prior(C_MM + 0.3, 1.0),
-        Prior(0.0, 1.0),
-        Prior(0.0, 1.0),
-        distortion,
-        {name: Fiducial(Prior(x, 0.001), Prior(y, 0.001)) for name, (x, y) in MARKS_MM.items()} if film else {},
-    )
-    return Network(
-        (camera,),
-        tuple(Image(f"f{n}", "rc20", "affine" if film else "none") for n in range(1, len(stations) + 1)),
-        tuple(ObjectPoint(f"t{k}", *(Prior(float(v)) for v in row)) for k, row in enumerate(xyz)),
-        Observations(
-            tuple(row[0] for row in rows),
-            tuple(row[1] for row in rows),
-            tuple(row[2] for row in rows),
-            np.array([row[3] for row in rows]),
-            np.tile(SIGMA_MM**2 * np.eye(2), (len(rows), 1, 1)),
-        ),
-    )
+    """Frames of a test field through a known lens, with priors of 1 mm on the interior; marks all but fixed."""
+    kind: Transformation = "affine" if film else "none"
+    network = project_field(
+        relief_field(relief_m, n=60), stations, kind=kind, noise_mm=noise_mm, distortion=lens, aspect=aspect
+    ).network
+    marks = given_marks(SIX_MARKS_MM, 0.001) if film else {}
+    camera = Camera("rc20", *given_interior((PROJECTED_C_MM + 0.3, 0.0, 0.0)), distortion, marks)
+    return replace(network, cameras=(camera,))
 
 
 def free(family: str, *names: str) -> Distortion:
     return Distortion(family, {name: Prior(0.0, FREE) for name in names})
+
+
+FREE_LENS = free("torlegard", "k3", "k5", "k7", "p1", "p2")
 
 
 def check_network(network: Network) -> CameraCheck:
@@ -122,7 +91,7 @@ def check_network(network: Network) -> CameraCheck:
 @pytest.mark.parametrize(
     ("distortion", "aspect"),
     [
-        (free("torlegard", "k3", "k5", "k7", "p1", "p2"), 1.0),
+        (FREE_LENS, 1.0),
         (free("brown", "k1", "k2", "k3", "p1", "p2", "b1"), 1.0003),
         (free("opencv", "k1", "k2", "p1", "p2", "k3"), 1.0),
         (free("opencv", "k1", "k2", "p1", "p2", "b1"), 1.0003),
@@ -131,7 +100,7 @@ def check_network(network: Network) -> CameraCheck:
 )
 @pytest.mark.parametrize("film", [True, False], ids=["film", "digital"])
 def test_a_moderate_lens_agrees_to_a_tenth_of_a_sigma(distortion: Distortion, aspect: float, film: bool) -> None:
-    check = check_network(simulated(CONVERGENT, film=film, distortion=distortion, aspect=aspect))
+    check = check_network(simulated(CONVERGENT_STATIONS, film=film, distortion=distortion, aspect=aspect))
     assert check.verdict == "agrees", check.reason
     assert check.images == 5
     assert check.refit_residual_um < 0.02
@@ -146,7 +115,7 @@ def test_a_moderate_lens_agrees_to_a_tenth_of_a_sigma(distortion: Distortion, as
 @pytest.mark.parametrize("unit", [1e-6, 1e3])
 def test_the_unit_of_the_object_costs_opencv_no_digits(unit: float) -> None:
     """Objects of half a millimetre made its standard deviations wrong by factors of thousands."""
-    network = simulated(CONVERGENT, film=False, distortion=free("opencv", "k1", "k2", "p1", "p2", "k3"))
+    network = simulated(CONVERGENT_STATIONS, film=False, distortion=free("opencv", "k1", "k2", "p1", "p2", "k3"))
     network = replace(network, cameras=tuple(replace(each, fiducials={}) for each in network.cameras))
     points = tuple(
         ObjectPoint(each.id, *(prior and Prior(unit * prior.value, prior.sigma) for prior in (each.X, each.Y, each.Z)))
@@ -160,18 +129,9 @@ def test_the_unit_of_the_object_costs_opencv_no_digits(unit: float) -> None:
 
 
 def test_parameters_found_are_those_simulated() -> None:
-    check = check_network(simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2")))
-    truth = {
-        "fx": C_MM,
-        "cx": X0_MM,
-        "cy": Y0_MM,
-        "k1": MODERATE[0],
-        "k2": MODERATE[1],
-        "p1": MODERATE[2],
-        "p2": MODERATE[3],
-    }
-    rows = {row.name: row for row in check.rows}
-    for name, value in truth.items():
+    rows = {row.name: row for row in check_network(simulated(CONVERGENT_STATIONS, distortion=FREE_LENS)).rows}
+    truth = (PROJECTED_C_MM, X0_MM, Y0_MM, *MODERATE[:4])
+    for name, value in zip(("fx", "cx", "cy", "k1", "k2", "p1", "p2"), truth, strict=True):
         # the marks carry a part of the uncertainty that both programs take as known
         assert abs(rows[name].reseau.value - value) < 5 * rows[name].reseau.sigma
         assert abs(rows[name].opencv.value - value) < 5 * rows[name].opencv.sigma
@@ -179,7 +139,7 @@ def test_parameters_found_are_those_simulated() -> None:
 
 def test_fixed_distortion_stays_fixed() -> None:
     fixed = Distortion("opencv", {name: Prior(v) for name, v in zip(("k1", "k2", "p1", "p2"), MODERATE, strict=False)})
-    check = check_network(simulated(CONVERGENT, distortion=fixed))
+    check = check_network(simulated(CONVERGENT_STATIONS, distortion=fixed))
     assert check.verdict == "agrees", check.reason
     assert [row.name for row in check.rows] == ["fx", "cx", "cy"]
     assert max(row.difference_sigmas for row in check.rows) < 0.1
@@ -194,7 +154,7 @@ def test_a_tilted_sensor_agrees(known: bool) -> None:
     }
     given = free("opencv", "k1", "k2")
     distortion = replace(given, parameters={**given.parameters, **priors})
-    network = simulated(CONVERGENT, lens=lens, distortion=distortion)
+    network = simulated(CONVERGENT_STATIONS, lens=lens, distortion=distortion)
     # A tilted sensor is all but another principal point.
     held = replace(network.cameras[0], x0_mm=Prior(X0_MM), y0_mm=Prior(Y0_MM))
     check = check_network(replace(network, cameras=(held,)))
@@ -205,7 +165,7 @@ def test_a_tilted_sensor_agrees(known: bool) -> None:
 
 def test_exact_observations_agree_as_far_as_single_precision_goes() -> None:
     distortion = free("opencv", "k1", "k2", "p1", "p2")
-    check = check_network(simulated(CONVERGENT, noise_mm=0.0, distortion=distortion))
+    check = check_network(simulated(CONVERGENT_STATIONS, noise_mm=0.0, distortion=distortion))
     assert check.verdict == "agrees", check.reason
     assert check.rms_opencv_um < 0.02
 
@@ -218,7 +178,7 @@ def test_one_flat_vertical_frame_is_not_possible_and_the_reason_is_reported() ->
 
 
 def test_unknown_points_are_reported() -> None:
-    network = simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2"))
+    network = simulated(CONVERGENT_STATIONS, distortion=FREE_LENS)
     points = tuple(
         ObjectPoint(p.id, None, None, None) if int(p.id[1:]) >= 30 and count_rays(network, p.id) > 1 else p
         for p in network.points
@@ -236,7 +196,7 @@ def count_rays(network: Network, point: str) -> int:
 
 
 def test_different_standard_deviations_are_reported() -> None:
-    network = simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2"))
+    network = simulated(CONVERGENT_STATIONS, distortion=FREE_LENS)
     covariance = network.observations.covariance_mm2.copy()
     covariance[::2] *= 9.0
     check = check_network(replace(network, observations=replace(network.observations, covariance_mm2=covariance)))
@@ -244,15 +204,15 @@ def test_different_standard_deviations_are_reported() -> None:
 
 
 def test_a_prior_that_contradicts_the_observations_differs() -> None:
-    network = simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2"))
-    camera = replace(network.cameras[0], principal_distance_mm=Prior(C_MM + 0.2, 0.002))
+    network = simulated(CONVERGENT_STATIONS, distortion=FREE_LENS)
+    camera = replace(network.cameras[0], principal_distance_mm=Prior(PROJECTED_C_MM + 0.2, 0.002))
     check = check_network(replace(network, cameras=(camera,)))
     assert check.verdict == "differs"
     assert "Priors or weights move c" in check.reason
 
 
 def test_wrong_values_in_an_adjustment_differ() -> None:
-    network = simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2"))
+    network = simulated(CONVERGENT_STATIONS, distortion=FREE_LENS)
     adjustment = adjust(network, approximate(network))
     values = adjustment.values.copy()
     values[adjustment.index("IO.rc20.c")] += 0.5
@@ -262,8 +222,8 @@ def test_wrong_values_in_an_adjustment_differ() -> None:
 @pytest.mark.parametrize("family", ["torlegard", "brown"])
 def test_a_strong_lens_agrees_by_way_of_the_same_model(family: str) -> None:
     names = {"torlegard": ("k3", "k5", "k7", "p1", "p2"), "brown": ("k1", "k2", "k3", "p1", "p2")}[family]
-    network = simulated(CONVERGENT * 4, film=False, lens=STRONG, noise_mm=0.002, distortion=free(family, *names))
-    check = check_network(network)
+    stations, lens = CONVERGENT_STATIONS * 4, free(family, *names)
+    check = check_network(simulated(stations, film=False, lens=STRONG, noise_mm=0.002, distortion=lens))
     assert check.verdict == "agrees", check.reason
     assert check.reason.startswith("Given the very same model both programs agree.")
     assert max(row.difference_sigmas for row in check.rows) > 1.0
@@ -301,7 +261,7 @@ def test_another_solution_of_opencv_differs(monkeypatch: pytest.MonkeyPatch, wha
         return replace(found, parameters=found.parameters + 1.5 * found.sigmas)
 
     monkeypatch.setattr("pipeline.opencv_check.check.calibrate", shifted)
-    check = check_network(simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2")))
+    check = check_network(simulated(CONVERGENT_STATIONS, distortion=FREE_LENS))
     assert check.verdict == "differs"
     assert ("factor of 1.4" if what == "sigmas" else "by 1.5") in check.reason
 
@@ -324,7 +284,7 @@ def test_every_run_gets_the_same_digits_of_opencv(monkeypatch: pytest.MonkeyPatc
     before = cv2.getNumThreads()
     cv2.setNumThreads(4)
     try:
-        check_network(simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2")))
+        check_network(simulated(CONVERGENT_STATIONS, distortion=FREE_LENS))
         found = [given[0]() for _ in range(40)]
         assert cv2.getNumThreads() == 4
     finally:
@@ -336,7 +296,7 @@ def test_every_run_gets_the_same_digits_of_opencv(monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.study
 def test_what_robust_estimation_set_aside_is_left_out() -> None:
-    network = simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2"))
+    network = simulated(CONVERGENT_STATIONS, distortion=FREE_LENS)
     xy_mm = network.observations.xy_mm.copy()
     targets = [row for row, kind in enumerate(network.observations.kind) if kind == "target"]
     xy_mm[targets[::40]] += 0.5
@@ -349,7 +309,7 @@ def test_what_robust_estimation_set_aside_is_left_out() -> None:
 
 
 def test_images_with_too_few_points_are_left_out() -> None:
-    network = simulated(CONVERGENT, distortion=free("opencv", "k1", "k2"))
+    network = simulated(CONVERGENT_STATIONS, distortion=free("opencv", "k1", "k2"))
     few = replace(network, observations=keeping(network.observations, {"f2": 5}))
     check = check_network(few)
     assert check.images == 4
@@ -370,13 +330,7 @@ def keeping(observations: Observations, targets: dict[str, int]) -> Observations
             if left[image] < 0:
                 continue
         rows.append(row)
-    return Observations(
-        tuple(observations.image[row] for row in rows),
-        tuple(observations.point[row] for row in rows),
-        tuple(observations.kind[row] for row in rows),
-        observations.xy_mm[rows],
-        observations.covariance_mm2[rows],
-    )
+    return observations.only(np.array(rows))
 
 
 def test_what_opencv_has_no_model_for() -> None:
@@ -401,7 +355,7 @@ def test_verdict_on_the_whole() -> None:
 
 
 def test_json_has_the_documented_keys_and_no_nan() -> None:
-    network = simulated(CONVERGENT, distortion=free("opencv", "k1", "k2", "p1", "p2"))
+    network = simulated(CONVERGENT_STATIONS, distortion=free("opencv", "k1", "k2", "p1", "p2"))
     check = check_against_opencv(adjust(network, approximate(network)))
     written = plain_json(check)
     assert set(written) == {"reseau", "made_from", "verdict", "reason", "cameras"}

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from networks import field_points, simulated
+from networks import field_points, film_network, given_marks, simulated
 from numpy.typing import NDArray
 from projects import write_network_project as write_network
 from reference_cases import CASES
@@ -17,9 +17,9 @@ from scipy.stats import chi2
 from studies import parametrize_with_studies
 from test_adjust_stage import write_project
 
-from adjust import Adjustment, Camera, Fiducial, Image, Network, Parameter, Prior, adjust, approximate
+from adjust import Adjustment, Camera, Parameter, adjust, approximate
 from adjust.problem.estimates import adjusted_image
-from adjust.problem.observations import ObservationKind, Observations
+from adjust.problem.network import Transformation
 from pipeline import InputError, read_project
 from pipeline.cli import run
 from pipeline.report.fiducials import Figure, figure_of_films
@@ -227,7 +227,7 @@ def stored(result: Adjustment) -> dict[str, FiducialRecord]:
     }
 
 
-def form(kind: str, seed: int) -> Figure:
+def form(kind: Transformation, seed: int) -> Figure:
     """Frames that bear little of what such a film can, with noise."""
     rng = np.random.default_rng(seed)
     names = tuple(f"f{i}" for i in range(FRAMES))
@@ -239,21 +239,8 @@ def form(kind: str, seed: int) -> Figure:
     if kind == "projective":
         xy_mm /= 1.0 + np.einsum("nki,ni->nk", xy_mm, rng.normal(0.0, 1e-5, (FRAMES, 2)))[..., None]
     xy_mm = xy_mm + rng.normal(0.0, MARK_SIGMA_MM, xy_mm.shape)
-    marks = {id: Fiducial(Prior(x, 1.0), Prior(y, 1.0)) for id, (x, y) in zip(IDS, GIVEN_MM.tolist(), strict=True)}
-    count = FRAMES * len(IDS)
-    kinds: tuple[ObservationKind, ...] = tuple("fiducial" for _ in range(count))
-    network = Network(
-        (Camera("K", None, None, None, fiducials=marks),),
-        tuple(Image(name, "K", kind) for name in names),
-        (),
-        Observations(
-            tuple(np.repeat(names, len(IDS)).tolist()),
-            IDS * FRAMES,
-            kinds,
-            xy_mm.reshape(-1, 2),
-            np.tile(MARK_SIGMA_MM**2 * np.eye(2), (count, 1, 1)),
-        ),
-    )
+    marks = given_marks(dict(zip(IDS, GIVEN_MM, strict=True)), 1.0)
+    network = film_network(Camera("K", None, None, None, fiducials=marks), kind, names, xy_mm, MARK_SIGMA_MM)
     result = adjust(network, approximate(network))
     films = {name: adjusted_image(result, name).film for name in names}
     found = figure_of_films("K", stored(result), Known(result), films)  # type: ignore[arg-type]
