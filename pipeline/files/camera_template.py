@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from measure.marks.shapes import Point
@@ -20,88 +20,85 @@ _PLACES: Mapping[str, Mapping[str, Point]] = {  # in units of the distances, num
 _NAMES = {"square": "corner", "side": "side"}  # of the tables [mark.NAME]
 
 
+# Lines of the tables [mark.NAME], for aerial cameras; sizes in <> are scaled with the distances of the marks.
+_CROSS = """arm_mm = <1.75>  # half its length
+line_mm = <0.12>
+gap_mm = <0.25>  # half the gap in its middle; 0: none
+angle_deg = {angle}  # 0 upright, 45 diagonal
+"""
+_RING = """ring_mm = <0.8>  # mean radius
+ring_line_mm = <0.17>
+"""
+_PARTS = """[[mark.{name}.part]]
+shape = "ring"
+radius_mm = <1.6>
+line_mm = <0.17>
+[[mark.{name}.part]]
+shape = "bar"
+from_mm = [<-1.2>, 0.0]
+to_mm = [<1.2>, 0.0]
+line_mm = <0.12>
+[[mark.{name}.part]]
+shape = "bar"
+from_mm = [0.0, <-1.2>]
+to_mm = [0.0, <1.2>]
+line_mm = <0.12>
+[[mark.{name}.part]]
+shape = "disk"
+center_mm = [<2.4>, 0.0]
+radius_mm = <0.25>
+"""
+
+
 @dataclass(frozen=True)
 class MarkKind:
     """How the template draws a kind of mark.
 
     Attributes
     ----------
-    lines : function of the scale and the angle of a cross, deg, to the lines of [mark.NAME].
+    lines : of the table [mark.NAME].
     reach_mm : extent from the mark's point.
     edge_mm : distance of the frame's edge beyond the point of a side mark; None for free-standing marks.
     at : where the kind is used: "square" (corners), "side".
     """
 
-    lines: Callable[[float, float], Sequence[str]]
+    lines: str
     reach_mm: float = 0.0
     edge_mm: float | None = None
     at: tuple[str, ...] = ("square", "side")
 
-
-def _mm(value: float) -> str:
-    return f"{value:.3g}"
+    def drawn(self, scale: float, **words: str) -> list[str]:
+        """Lines of the table at a scale, with words in the place of their names."""
+        text = self.lines
+        for name, word in words.items():
+            text = text.replace(f"{{{name}}}", word)
+        text = re.sub("<([-.0-9]+)>", lambda size: f"{scale * float(size[1]):.3g}", text)
+        return [_line(*line.split("  # ")) if "#" in line else line for line in text.splitlines()]
 
 
 def _line(text: str, comment: str) -> str:
     return f"{text:39} # {comment}"
 
 
-def _cross(scale: float, angle_deg: float) -> list[str]:
-    return [
-        _line(f"arm_mm = {_mm(1.75 * scale)}", "half its length"),
-        f"line_mm = {_mm(0.12 * scale)}",
-        _line(f"gap_mm = {_mm(0.25 * scale)}", "half the gap in its middle; 0: none"),
-        _line(f"angle_deg = {angle_deg:g}", "0 upright, 45 diagonal"),
-    ]
-
-
-def _ring(scale: float) -> list[str]:
-    return [_line(f"ring_mm = {_mm(0.8 * scale)}", "mean radius"), f"ring_line_mm = {_mm(0.17 * scale)}"]
-
-
 def _polygon(*vertices_mm: Point) -> MarkKind:
     """Solid mark of a side, drawn for the right side."""
-
-    def lines(scale: float, _: float) -> list[str]:
-        corners = ", ".join(f"[{_mm(scale * x)}, {_mm(scale * y)}]" for x, y in vertices_mm)
-        return [f"vertices_mm = [{corners}]", _line('rotate = "radial"', "drawn as on the right, x outwards")]
-
-    outermost = max(x for x, _ in vertices_mm)
-    return MarkKind(lines, 0.0, outermost or min(x for x, _ in vertices_mm), ("side",))
-
-
-def _parts(scale: float, _: float) -> list[str]:
-    arm, line = 1.2 * scale, 0.12 * scale
-    ends = (f"[{-arm:.3g}, 0.0]", f"[{arm:.3g}, 0.0]"), (f"[0.0, {-arm:.3g}]", f"[0.0, {arm:.3g}]")
-    lines = [
-        "[[mark.{name}.part]]",
-        'shape = "ring"',
-        f"radius_mm = {_mm(1.6 * scale)}",
-        f"line_mm = {_mm(0.17 * scale)}",
-    ]
-    for start, end in ends:
-        lines += [
-            "[[mark.{name}.part]]",
-            'shape = "bar"',
-            f"from_mm = {start}",
-            f"to_mm = {end}",
-            f"line_mm = {_mm(line)}",
-        ]
-    dot = f"center_mm = [{2.4 * scale:.3g}, 0.0]"
-    return [*lines, "[[mark.{name}.part]]", 'shape = "disk"', dot, f"radius_mm = {_mm(0.25 * scale)}"]
+    corners = ", ".join(f"[<{x}>, <{y}>]" for x, y in vertices_mm)
+    edge_mm = max(x for x, _ in vertices_mm) or min(x for x, _ in vertices_mm)
+    lines = f'vertices_mm = [{corners}]\nrotate = "radial"  # drawn as on the right, x outwards\n'
+    return MarkKind(lines, 0.0, edge_mm, ("side",))
 
 
 MARK_KINDS: Mapping[str, MarkKind] = {
-    "cross": MarkKind(_cross, 1.75),
-    "dot": MarkKind(lambda scale, _: [f"radius_mm = {_mm(0.25 * scale)}"], 0.25),
-    "ring-cross": MarkKind(lambda scale, angle_deg: [*_ring(scale), *_cross(scale, angle_deg)], 1.75),
-    "ring-dot": MarkKind(lambda scale, _: [*_ring(scale), f"radius_mm = {_mm(0.2 * scale)}"], 0.9),
+    "cross": MarkKind(_CROSS, 1.75),
+    "dot": MarkKind("radius_mm = <0.25>", 0.25),
+    "ring-cross": MarkKind(_RING + _CROSS, 1.75),
+    "ring-dot": MarkKind(_RING + "radius_mm = <0.2>", 0.9),
     "wedge": _polygon((0.0, 0.0), (3.0, 1.8), (3.0, -1.8)),
     "notch": _polygon((0.0, 0.0), (-2.5, 1.5), (-2.5, -1.5)),
     "wing": _polygon((0.0, 0.0), (0.0, 4.1), (3.15, 6.4), (3.15, -6.4), (-3.1, -2.0), (-3.15, -1.8), (-3.15, 0.0)),
-    "parts": MarkKind(_parts, 2.65),
-    "frame-corner": MarkKind(lambda scale, _: [], 0.0, 0.0, ("square",)),
-    "learned": MarkKind(lambda scale, _: [_line(f"size_mm = {_mm(6 * scale)}", "width of its picture")], 3.0),
+    "parts": MarkKind(_PARTS, 2.65),
+    "frame-corner": MarkKind("", 0.0, 0.0, ("square",)),
+    "learned": MarkKind("size_mm = <6>  # width of its picture", 3.0),
 }
 _WRITTEN = {"wedge": "polygon", "notch": "polygon", "wing": "polygon"}  # names in the camera file
 
@@ -229,6 +226,6 @@ def camera_template(sizes: CameraSizes) -> str:
         lines += ["", f"[mark.{_NAMES[place]}]", f"kind = {quoted(_WRITTEN.get(kind, kind))}"]
         if kind != "learned":
             lines.append(_line('polarity = "auto"', "light or dark, where all scans have it so"))
-        own = MARK_KINDS[kind].lines(sizes.scale, 45.0 if place == "square" else 0.0)
-        lines += [line.replace("{name}", _NAMES[place]) for line in own]
+        angle = "45" if place == "square" else "0"
+        lines += MARK_KINDS[kind].drawn(sizes.scale, name=_NAMES[place], angle=angle)
     return "\n".join(lines) + "\n"
