@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import nnls
 
+from adjust.initial_values.intersection import intersect
+from adjust.initial_values.model_formation import absolute_orientation
 from adjust.problem.network import ObjectPoint
 from measure.flags import Status
 from pipeline.blocks.mapping import Mapped, Sight
@@ -146,31 +148,37 @@ def oriented_by_control(
     InputError
         Fewer than three control points are observed in two oriented images each.
     """
-    places: dict[str, dict[str, Array]] = defaultdict(dict)
+    given = {id: np.array([prior.value for prior in (p.X, p.Y, p.Z) if prior is not None]) for id, p in points.items()}
+    rays: dict[str, dict[str, tuple[Array, Array]]] = defaultdict(dict)
     scans = {scan.image: (picture.image, scan) for picture in pictures for scan in picture.scans}
     for mark in marks:
-        if mark.kind == "target" and mark.status.is_observation and mark.point in points and mark.image in scans:
+        if mark.kind == "target" and mark.status.is_observation and mark.image in scans:
             frame, scan = scans[mark.image]
-            if frame in mapped.poses:
-                places[mark.point].setdefault(frame, _camera_mm(mark, scan))
-    theirs, ours = [], []
-    for point, own in sorted(places.items()):
-        given = points[point]
-        if len(own) < 2 or given.X is None or given.Y is None or given.Z is None:
-            continue
-        theirs.append(_intersection(mapped, own, camera_rays))
-        ours.append([given.X.value, given.Y.value, given.Z.value])
-    if len(ours) < FEWEST_CONTROL:
+            if frame in mapped.poses and len(given.get(mark.point, ())) == 3:
+                rays[mark.point].setdefault(
+                    frame, _ray(mapped.poses[frame], _camera_mm(mark, scan), camera_rays[frame])
+                )
+    control = sorted(point for point, own in rays.items() if len(own) > 1)
+    if len(control) < FEWEST_CONTROL:
         raise InputError(
-            f"{len(ours)} points with coordinates are marked in two of the frames that COLMAP oriented; "
+            f"{len(control)} points with coordinates are marked in two of the frames that COLMAP oriented; "
             f"{FEWEST_CONTROL} are needed to place the block. Mark more control points, as targets in comparator.csv."
         )
-    scale, turn, shift = similarity(np.array(theirs), np.array(ours))
-    placed = {}
-    for image, (rotation, translation) in mapped.poses.items():
-        station = shift + scale * turn @ (-rotation.T @ translation)
-        placed[image] = (np.asarray(Y_DOWN_Z_FORWARD @ rotation @ turn.T), np.asarray(station))
-    return placed
+    numbered = [(number, *ray) for number, point in enumerate(control) for ray in rays[point].values()]
+    numbers, centers, directions = (np.array(each) for each in zip(*numbered, strict=True))
+    theirs, _ = intersect(centers, directions, numbers, np.full((len(control), 3), np.nan))
+    ours = np.array([given[point] for point in control])
+    stations = {image: -rotation.T @ translation for image, (rotation, translation) in mapped.poses.items()}
+    found = np.isfinite(theirs).all(axis=1)
+    block = absolute_orientation(theirs[found], ours[found], np.array(list(stations.values())))
+    if block is None:
+        raise InputError(
+            "The control points that COLMAP's frames show do not determine how the block lies. Mark others."
+        )
+    return {
+        image: (np.asarray(Y_DOWN_Z_FORWARD @ rotation @ block.rotation.T), block.apply(stations[image]))
+        for image, (rotation, _) in mapped.poses.items()
+    }
 
 
 def _camera_mm(mark: ComparatorPoint, scan: BlockScan) -> Array:
@@ -180,29 +188,8 @@ def _camera_mm(mark: ComparatorPoint, scan: BlockScan) -> Array:
     return np.asarray(scan.chain.film.camera_from_comparator(straight)[0])
 
 
-def _intersection(mapped: Mapped, places: Mapping[str, Array], camera_rays: Mapping[str, Array]) -> Array:
-    """Intersect the rays of a point observed in several images: the nearest point (3,), in COLMAP's coordinates."""
-    normal, right = np.zeros((3, 3)), np.zeros(3)
-    for image, place in places.items():
-        c, x0, y0 = camera_rays[image]
-        rotation, translation = mapped.poses[image]
-        ray = rotation.T @ np.array([(place[0] - x0) / c, -(place[1] - y0) / c, 1.0])
-        ray /= np.linalg.norm(ray)
-        across = np.eye(3) - np.outer(ray, ray)
-        normal += across
-        right += across @ (-rotation.T @ translation)
-    return np.asarray(np.linalg.solve(normal, right))
-
-
-def similarity(start: Array, end: Array) -> tuple[float, Array, Array]:
-    """Scale, rotation (3, 3) and shift (3,) of the least-squares similarity between points (n, 3).
-
-    Source: S. Umeyama, Least-squares estimation of transformation parameters between two point patterns, PAMI 13
-    (1991).
-    """
-    a, b = start - start.mean(axis=0), end - end.mean(axis=0)
-    u, d, vt = np.linalg.svd(b.T @ a)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
-    turn = u @ np.diag(signs) @ vt
-    scale = float((d * signs).sum() / (a**2).sum())
-    return scale, turn, end.mean(axis=0) - scale * turn @ start.mean(axis=0)
+def _ray(pose: tuple[Array, Array], place_mm: Array, interior: Array) -> tuple[Array, Array]:
+    """Projection centre (3,) and direction (3,) of the ray to a place (2,) of the camera frame, in COLMAP's
+    coordinates."""
+    (rotation, translation), (c, x0, y0) = pose, interior
+    return -rotation.T @ translation, rotation.T @ np.array([(place_mm[0] - x0) / c, (y0 - place_mm[1]) / c, 1.0])

@@ -26,7 +26,7 @@ from pipeline import InputError, build_network, read_images, read_project
 from pipeline.blocks.block_stage import written_block
 from pipeline.blocks.mapping import Mapped, Sight, camera_params
 from pipeline.blocks.pictures import BlockPicture, BlockScan, camera_lattice, write_pictures
-from pipeline.blocks.ties import A_CELL, CELLS, feature_precision, oriented_by_control, similarity, tie_marks
+from pipeline.blocks.ties import A_CELL, CELLS, feature_precision, oriented_by_control, tie_marks
 from pipeline.exchange.incoming import fiducial_camera
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.tie_stage import check_tie_names
@@ -226,15 +226,6 @@ def disagree(block: Mapped, off_px: float) -> Mapped:
     """The same places, but points that do not quite agree with them."""
     tracks = {j: [replace(sight, off_px=off_px) for sight in track] for j, track in block.tracks.items()}
     return replace(block, tracks=tracks)
-
-
-def test_a_similarity_is_found() -> None:
-    scale, turn, shift = similarity(POINTS, SCALE * POINTS @ TURN.T + SHIFT)
-    assert scale == pytest.approx(SCALE)
-    np.testing.assert_allclose(turn, TURN, atol=1e-12)
-    np.testing.assert_allclose(shift, SHIFT, atol=1e-12)
-    mirrored = similarity(POINTS, POINTS * (1, 1, -1))[1]
-    assert np.linalg.det(mirrored) == pytest.approx(1.0)
 
 
 def place_mm(point: ComparatorPoint) -> NDArray[np.float64]:
