@@ -21,7 +21,7 @@ conformal(1) is a similarity, polynomial(1) an affine transformation.
 
 import re
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from math import comb
 
@@ -401,11 +401,9 @@ class Film:
         """Compute comparator coordinates (n, 2) from camera coordinates (n, 2), mm, and the mask of those found."""
         return self._kind.inverse(self.parameters, xy_mm, self.center_mm)
 
-    def changed(self, parameter: int, by: float) -> "Film":
-        """Return a copy with one parameter changed; parameter: its number."""
-        parameters = self.parameters.copy()
-        parameters[parameter] += by
-        return replace(self, parameters=parameters)
+    def design(self, xy_mm: Array) -> Array:
+        """Derivatives (n, 2, k) of the camera coordinates with respect to the parameters."""
+        return self._kind.design(self.parameters, xy_mm, np.zeros(2), np.ones(()))
 
     @property
     def _kind(self) -> FilmKind:

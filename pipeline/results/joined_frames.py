@@ -13,7 +13,6 @@ from pipeline.results.adjustment_record import JoinedFrameRecord, JoinRecord, Pa
 from pipeline.types import Array, Indices
 
 _UM_PER_MM = 1000.0
-_STEP = 1e-6  # relative step of central differences; film transformations are linear in their parameters, or nearly
 
 
 def joined_frames(adjustment: Adjustment) -> dict[str, JoinedFrameRecord]:
@@ -90,12 +89,7 @@ class _Part:
 
     def _film_covariances(self, xy_mm: Array) -> Array:
         """(n, 2, 2) covariances of camera coordinates at (n, 2), propagated from the film transformation."""
-        film = self.model.film
-        by_parameters = np.empty((len(xy_mm), 2, len(film.parameters)))
-        for k, value in enumerate(film.parameters.tolist()):
-            step = _STEP * max(abs(value), _STEP)
-            ends = [film.changed(k, way * step).camera_from_comparator(xy_mm) for way in (1.0, -1.0)]
-            by_parameters[:, :, k] = (ends[0] - ends[1]) / (2.0 * step)
+        by_parameters = self.model.film.design(xy_mm)
         return np.asarray(by_parameters @ self.film_covariance @ by_parameters.swapaxes(1, 2))
 
 
