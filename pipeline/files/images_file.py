@@ -46,10 +46,6 @@ class GivenImages:
     part_of: Mapping[str, str] = field(default_factory=dict)
     cuts: Mapping[str, tuple[int | None, Window | None]] = field(default_factory=dict)
 
-    def frame_parts(self, frame: str) -> tuple[str, ...]:
-        """Scans of a frame that was scanned in parts, sorted by name."""
-        return tuple(sorted(image for image, whole in self.part_of.items() if whole and whole == frame))
-
 
 def read_images(path: Path, antenna: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> GivenImages:
     """Read images.csv. Images may be named with or without the file's ending. Raises InputError with the line.

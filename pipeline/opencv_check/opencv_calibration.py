@@ -30,13 +30,19 @@ OBJECT_EXTENT = 100.0  # rms distance of object points from their centroid: with
 CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 300, 1e-15)
 FLAT = 1e-3  # squared ratio of the smallest to the middle extent, below which OpenCV treats a field as a plane
 FEWEST_FLAT, FEWEST_DEEP = 4, 6  # points that OpenCV needs for the initial orientation of an image
-RADIAL_FLAGS = {
+FIXED = {  # flags that hold parameters; those of a group are held together
+    "fx": cv2.CALIB_FIX_FOCAL_LENGTH,
+    "cx": cv2.CALIB_FIX_PRINCIPAL_POINT,
     "k1": cv2.CALIB_FIX_K1,
     "k2": cv2.CALIB_FIX_K2,
     "k3": cv2.CALIB_FIX_K3,
     "k4": cv2.CALIB_FIX_K4,
     "k5": cv2.CALIB_FIX_K5,
     "k6": cv2.CALIB_FIX_K6,
+    "p1": cv2.CALIB_FIX_TANGENT_DIST,
+    "s1": cv2.CALIB_FIX_S1_S2_S3_S4,
+    "tau_x": cv2.CALIB_FIX_TAUX_TAUY,
+    "alpha": cv2.CALIB_FIX_SKEW,
 }
 
 
@@ -50,6 +56,11 @@ class Freedom:
     def held_interior(self) -> tuple[str, ...]:
         """Those of c, x0 and y0 that are held."""
         return tuple(own for own, name in (("c", "fx"), ("x0", "cx"), ("y0", "cy")) if name not in self.names)
+
+    def fixed_flags(self, names: Sequence[str]) -> int:
+        """OpenCV's flags for an initial camera matrix of which parameters of the model are held."""
+        held = (flag for name, flag in FIXED.items() if name in names and name not in self.names)
+        return cv2.CALIB_USE_INTRINSIC_GUESS | sum(held)
 
     @property
     def distortion(self) -> tuple[str, ...]:
@@ -156,6 +167,9 @@ def calibrate(images: Sequence[ImagePoints], freedom: Freedom, start: Array) -> 
     objects = [each.astype(np.float32) for each in pixels.objects]
     tilted = "tau_x" in freedom.names or bool(start[-2:].any())
     lens = start[4:] if tilted else start[4:-2]
+    flags = freedom.fixed_flags(NAMES) | cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_THIN_PRISM_MODEL
+    flags |= cv2.CALIB_TILTED_MODEL if tilted else 0
+    flags |= 0 if {"fx", "fy"} <= set(freedom.names) else cv2.CALIB_FIX_ASPECT_RATIO
     with one_opencv_thread():  # several threads sum the images in the order they finish, which is not reproducible
         rms_px, adjusted_matrix, distortion, _, _, sigmas, _, _ = cv2.calibrateCameraExtended(
             objects,
@@ -163,7 +177,7 @@ def calibrate(images: Sequence[ImagePoints], freedom: Freedom, start: Array) -> 
             pixels.size,
             pixels.matrix(start),
             lens.copy(),
-            flags=_flags(freedom, tilted),
+            flags=flags,
             criteria=CRITERIA,
         )
     values = np.zeros(len(NAMES) - 4)
@@ -186,12 +200,6 @@ def calibrate_fisheye(images: Sequence[ImagePoints], freedom: Freedom, start: Ar
     where OpenCV fails.
     """
     pixels = _Pixels.from_images(images, start)
-    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_RECOMPUTE_EXTRINSIC
-    flags |= 0 if "alpha" in freedom.names else cv2.CALIB_FIX_SKEW
-    flags |= 0 if "fx" in freedom.names else cv2.CALIB_FIX_FOCAL_LENGTH
-    flags |= 0 if "cx" in freedom.names else cv2.CALIB_FIX_PRINCIPAL_POINT
-    for name in FISHEYE_NAMES[4:-1]:
-        flags |= 0 if name in freedom.names else RADIAL_FLAGS[name]
     begun = pixels.matrix(start)
     begun[0, 1] = start[-1] * begun[0, 0]
     with one_opencv_thread():
@@ -201,7 +209,7 @@ def calibrate_fisheye(images: Sequence[ImagePoints], freedom: Freedom, start: Ar
             pixels.size,
             begun,
             start[4:-1].copy(),
-            flags=flags,
+            flags=freedom.fixed_flags(FISHEYE_NAMES) | cv2.CALIB_RECOMPUTE_EXTRINSIC,
             criteria=CRITERIA,
         )
     matrix = np.asarray(ended, dtype=np.float64)
@@ -280,21 +288,6 @@ class _Pixels:
     def interior_mm(self, matrix: Array) -> Array:
         """fx, fy, cx, cy (4,), y up, from a camera matrix in px."""
         return np.concatenate([np.diag(matrix)[:2], (matrix[:2, 2] + self.offset) * Y_UP]) * self.mm
-
-
-def _flags(freedom: Freedom, tilted: bool) -> int:
-    free = set(freedom.names)
-    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_THIN_PRISM_MODEL
-    flags |= cv2.CALIB_TILTED_MODEL if tilted else 0
-    flags |= 0 if "tau_x" in free else cv2.CALIB_FIX_TAUX_TAUY
-    flags |= 0 if "fx" in free else cv2.CALIB_FIX_FOCAL_LENGTH
-    flags |= 0 if {"fx", "fy"} <= free else cv2.CALIB_FIX_ASPECT_RATIO
-    flags |= 0 if "cx" in free else cv2.CALIB_FIX_PRINCIPAL_POINT
-    flags |= 0 if "p1" in free else cv2.CALIB_FIX_TANGENT_DIST
-    flags |= 0 if "s1" in free else cv2.CALIB_FIX_S1_S2_S3_S4
-    for name, flag in RADIAL_FLAGS.items():
-        flags |= 0 if name in free else flag
-    return flags
 
 
 def _sigmas(sigmas: Array, freedom: Freedom, start: Array, pixel_mm: float) -> Array:

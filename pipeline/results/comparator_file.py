@@ -20,7 +20,7 @@ from measure.flags import Status
 from measure.results import FrameMeasurement
 from pipeline.errors import InputError
 from pipeline.text.atomic import atomic_path
-from pipeline.text.csv_table import Row, csv_line, csv_rows
+from pipeline.text.csv_table import Row, csv_line, read_csv
 from pipeline.text.names import image_name
 from pipeline.text.text_file import read_bytes
 from pipeline.types import Array
@@ -241,7 +241,7 @@ def read_comparator(path: Path, pitch_um: tuple[float, float] | None = None) -> 
         Names the line of a duplicate mark, an unknown kind, an invalid number, or a mark with neither mm nor pixels.
     """
     points: dict[tuple[str, str, str], ComparatorPoint] = {}
-    for row in csv_rows(path, COLUMNS[:2], COLUMNS[2:] + PIXEL_SIGMAS):
+    for row in read_csv(path, COLUMNS[:2], COLUMNS[2:] + PIXEL_SIGMAS):
         point = _point(row, pitch_um)
         key = (point.image, point.point, "fiducial" if point.kind == "fiducial" else "object")
         if key in points:
@@ -257,7 +257,7 @@ def read_comparator(path: Path, pitch_um: tuple[float, float] | None = None) -> 
 
 def has_pixels_alone(path: Path) -> bool:
     """Whether a comparator file has pixel columns but no mm columns. Raises InputError if it has neither."""
-    row = next(csv_rows(path, COLUMNS[:2], COLUMNS[2:] + PIXEL_SIGMAS), None)
+    row = next(read_csv(path, COLUMNS[:2], COLUMNS[2:] + PIXEL_SIGMAS), None)
     return row is not None and _has_pixels_alone(row)
 
 

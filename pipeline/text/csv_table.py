@@ -92,29 +92,15 @@ def _quoted(cell: str) -> str:
     return '"' + cell.replace('"', '""') + '"' if cell.startswith("#") or any(c in cell for c in ',"\n') else cell
 
 
-def read_csv(path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> tuple[Row, ...]:
-    """Read the rows of a CSV file. Raises InputError for a missing file, a missing or unknown column, or an incomplete
+def read_csv(path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> Iterator[Row]:
+    """Yield the rows of a CSV file. Raises InputError for a missing file, a missing or unknown column, or an incomplete
     line."""
-    return tuple(csv_rows(path, required, optional))
-
-
-def csv_rows(path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> Iterator[Row]:
-    """Yield the rows of a CSV file one by one, as `read_csv` reads them, for large files."""
     try:
         data = read_bytes(path)
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file. Looked for {path.resolve()}.") from None
     except IsADirectoryError:
         raise InputError(f"{path}: is a folder; a CSV file is needed here. Name one.") from None
-    yield from _rows(data, path, required, optional)
-
-
-def parse_csv(data: bytes, path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> tuple[Row, ...]:
-    """Read the rows of the content of a CSV file. path: for messages."""
-    return tuple(_rows(data, path, required, optional))
-
-
-def _rows(data: bytes, path: Path, required: Sequence[str], optional: Sequence[str]) -> Iterator[Row]:
     lines = _content_lines(data, path)
     first = next(lines, None)
     if first is None:

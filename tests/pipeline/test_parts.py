@@ -348,5 +348,5 @@ def test_one_part_tells_the_orientation_of_all(tmp_path: Path) -> None:
         "image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg,part_of\na,,,,,,,f\nb,1,0,9,0,0,0,f\n", encoding="utf-8"
     )
     given = read_images(path)
-    assert given.frame_parts("f") == ("a", "b")
+    assert given.part_of == {"a": "f", "b": "f"}
     assert given.exterior["a"] is given.exterior["b"] is not None
