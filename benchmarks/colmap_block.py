@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import synthetic_images
+from adjust.initial_values.model_formation import absolute_orientation
 from pipeline.blocks.mapping import quiet_colmap
-from pipeline.blocks.ties import similarity
 from pipeline.rendered.scene_file import read_scene, render_project
 from pipeline.results.comparator_file import comparator_from_pixel
 from synthetic_images.film import frame_geometry
@@ -255,11 +255,12 @@ def tell_alone(folder: Path, scene: Scene) -> None:
     turns = [pose.rotation.matrix() for pose in poses.values()]
     stations = np.array([-turn.T @ pose.translation for turn, pose in zip(turns, poses.values(), strict=True)])
     true = np.array([truth[name][:3] for name in poses])
-    scale, turn, shift = similarity(stations, true)
-    off = shift + scale * stations @ turn.T - true
+    found = absolute_orientation(stations, true, stations)
+    assert found is not None
+    off = found.apply(stations) - true
     angles = []
     for name, own in zip(poses, turns, strict=True):
-        rotation = np.diag([1.0, -1.0, -1.0]) @ own @ turn.T
+        rotation = np.diag([1.0, -1.0, -1.0]) @ own @ found.rotation.T
         angles.append(np.arccos(np.clip((np.trace(rotation @ object_rotation(*truth[name][3:]).T) - 1.0) / 2.0, -1, 1)))
     plan, height = (float(np.sqrt((part**2).mean())) for part in (off[:, :2], off[:, 2]))
     print(f"COLMAP alone, {len(poses)} images laid on the true stations: rms {plan:.3f} m in plan, {height:.3f} m in "

@@ -245,22 +245,21 @@ def read_decisions(path: Path) -> tuple[Decision, ...]:
     return parse_decisions(path, decisions_bytes(path))
 
 
-def decisions_bytes(path: Path, start: int = 0) -> bytes:
-    """Content of the file from byte `start` on, without lines of an unfinished write; empty where there is no file.
-    Raises InputError for a folder."""
+def decisions_bytes(path: Path) -> bytes:
+    """Content of the file without lines of an unfinished write; empty where there is no file. Raises InputError for a
+    folder."""
     try:
         with _locked(path):
-            data, confirmed = read_bytes(path, _MOST_MB), _confirmed_bytes(path)
+            return read_bytes(path, _MOST_MB)[: _confirmed_bytes(path)]
     except FileNotFoundError:
         return b""
     except IsADirectoryError:
         raise InputError(f"{path}: is a folder; decisions are a file. Move the folder away.") from None
-    return data[start:confirmed]
 
 
-def parse_decisions(path: Path, data: bytes, first_line: int = 1) -> tuple[Decision, ...]:
-    """Decisions of lines of the file. path: for messages; first_line: number of the first line."""
-    decisions, start, number = list[Decision](), 0, first_line
+def parse_decisions(path: Path, data: bytes) -> tuple[Decision, ...]:
+    """Decisions of the content of the file. path: for messages."""
+    decisions, start, number = list[Decision](), 0, 1
     with _pause_garbage_collection():
         while start < len(data):
             end = data.find(b"\n", start + _BYTES_AT_A_TIME) + 1 or len(data)
