@@ -265,7 +265,7 @@ def tell_alone(folder: Path, scene: Scene) -> None:
     plan, height = (float(np.sqrt((part**2).mean())) for part in (off[:, :2], off[:, 2]))
     print(f"COLMAP alone, {len(poses)} images laid on the true stations: rms {plan:.3f} m in plan, {height:.3f} m in "
           f"height, {1e6 * np.sqrt(np.mean(np.square(angles))):.0f} urad")  # fmt: skip
-    tell_ground("  its ground", np.array([shift + scale * turn @ each.xyz for each in model.points3D.values()]), scene)
+    tell_ground("  its ground", found.apply(np.array([each.xyz for each in model.points3D.values()])), scene)
     pitch_mm = read_pitch(folder)
     focal_px = np.mean([camera.mean_focal_length() for camera in model.cameras.values()])
     print(f"  its c is {focal_px * pitch_mm:.3f} mm of {scene.camera.principal_distance_mm:.3f} mm", flush=True)
