@@ -18,7 +18,7 @@ from operator import attrgetter
 
 import numpy as np
 
-from adjust.array_types import Array
+from adjust.array_types import Array, Indices
 from adjust.initial_values.pose import Pose
 from adjust.initial_values.resection import resect
 from adjust.target_identification.naming_hypotheses import (
@@ -66,6 +66,7 @@ def name_marks(
     frame_mm: tuple[Array, Array],
     principal_distance_mm: float | None,
     sigma_mm: float,
+    codes: Mapping[int, int] | None = None,
 ) -> Names | str:
     """Identify the marks of an image of known points; returns a sentence on the reason where this fails.
 
@@ -79,12 +80,30 @@ def name_marks(
     frame_mm : lower and upper corner (2,) of the searched area.
     principal_distance_mm : correct to some percent, or None.
     sigma_mm : standard deviation of the marks.
+    codes : point (index) by mark (index), where codes were read; they need not all be correct. The pose that agrees
+        with most of them identifies the other marks. A mark whose code contradicts its identification is left out.
     """
     n, m = len(xyz), len(xy_mm)
-    if min(n, m) < LEAST_POINTS:
+    if codes is None and min(n, m) < LEAST_POINTS:
         return f"{m} marks and {n} points are too few: {LEAST_POINTS} that agree are needed"
-    search, found = _first(_searches(xyz, normals, xy_mm, frame_mm, principal_distance_mm, sigma_mm))
+    if codes is not None and len(codes) < LEAST_CODES:
+        return f"{len(codes)} coded targets were recognised, and {LEAST_CODES} are needed"
+    origin, size = xyz.mean(axis=0), float(np.linalg.norm(np.ptp(xyz, axis=0)))
+    diagonal = float(np.linalg.norm(frame_mm[1] - frame_mm[0]))
+    tried = [(share * diagonal, UNKNOWN_SIGMA) for share in UNKNOWN]
+    if principal_distance_mm is not None:
+        tried = [(principal_distance_mm, KNOWN_SIGMA)]
+    searches = []
+    for c, c_sigma in tried:
+        marks = Marks(xy_mm / c, frame_mm[0] / c, frame_mm[1] / c, sigma_mm / c, c, c_sigma)
+        searches.append(_Search(origin, size, (xyz - origin) / size, normals, marks))
+    return _named_by_pattern(searches) if codes is None else _named_by_codes(searches, codes)
+
+
+def _named_by_pattern(searches: Sequence["_Search"]) -> Names | str:
+    search, found = _first(searches)
     if found is None:
+        n, m = len(search.xyz), len(search.marks.places)
         return f"the {m} marks found do not make the pattern that the {n} points would from any side"
     found, alike = search.likeliest(found)
     if alike is not None:
@@ -95,23 +114,26 @@ def name_marks(
     return search.names(found)
 
 
-def name_coded(
-    xyz: Array,
-    normals: Array,
-    xy_mm: Array,
-    frame_mm: tuple[Array, Array],
-    principal_distance_mm: float | None,
-    sigma_mm: float,
-    codes: Mapping[int, int],
-) -> Names | str:
-    """Identify marks with the help of codes, which need not all be correct.
+def _first(searches: Sequence["_Search"]) -> tuple["_Search", Grown | None]:
+    """Return the first accepted identification, the most significant one of several principal distances."""
+    # The clusters that need the fewest trials come first.
+    most = MOST_LOG10_CHANCE - np.log10(len(searches))
+    tried = 0
+    for cluster in searches[0].clusters:
+        believed = []
+        for search in searches:
+            poses = search.poses(cluster.triple[None], mark_triples(cluster, search.marks))
+            tried += poses.tried
+            if (found := next(iter(search.grown(poses)), None)) is not None and found.log10_chance < most:
+                believed.append((search, found))
+        if believed:
+            return min(believed, key=lambda one: one[1].log10_chance)
+        if tried > MOST_POSES * len(searches):
+            break
+    return searches[0], None
 
-    codes: point (index) by mark (index). The pose that agrees with most codes identifies the other marks. A mark whose
-    code contradicts its identification is left out.
-    """
-    if len(codes) < LEAST_CODES:
-        return f"{len(codes)} coded targets were recognised, and {LEAST_CODES} are needed"
-    searches = _searches(xyz, normals, xy_mm, frame_mm, principal_distance_mm, sigma_mm)
+
+def _named_by_codes(searches: Sequence["_Search"], codes: Mapping[int, int]) -> Names | str:
     grown = [(search, one) for search in searches if (one := search.grow_codes(codes)) is not None]
     if not grown:
         return f"the {len(codes)} coded targets recognised lie on one line and do not orient the image"
@@ -171,11 +193,17 @@ class _Search:
         tests = float(comb(len(codes), OF_POSE))
         return replace(grown, log10_chance=log10_of_chance(_right_codes(grown, codes), len(codes), chance, tests))
 
-    def grow_cluster(self, cluster: Cluster) -> tuple[Grown | None, int]:
-        """Return the most significant identification from one cluster, if any, and the number of poses tried."""
-        triples = mark_triples(cluster, self.marks)
-        poses = promising(self.xyz, self.normals, self.marks, cluster.triple[None], triples)
-        return next(iter(self._grown(poses)), None), poses.tried
+    def poses(self, points: Indices, named: Indices) -> Poses:
+        return promising(self.xyz, self.normals, self.marks, points, named)
+
+    def grown(self, poses: Poses) -> list[Grown]:
+        """Identifications of enough marks, the most significant first."""
+        grown = [
+            grow(View(rotation, shift), *named, self.xyz, self.normals, self.marks)
+            for rotation, shift, named in zip(poses.rotations, poses.shifts, poses.named, strict=True)
+        ]
+        enough = [one for one in grown if len(one.mark) >= LEAST_SHARE * one.expected and len(one.mark) >= LEAST_POINTS]
+        return sorted(enough, key=attrgetter("log10_chance"))
 
     def likeliest(self, found: Grown) -> tuple[Grown, Grown | None]:
         """Return the most significant of an identification and its alternatives, and a rival as good, if any."""
@@ -187,41 +215,11 @@ class _Search:
     def _others(self, found: Grown) -> list[Grown]:
         """Alternative identifications of the image: identified clusters matched to other points."""
         named = [cluster for cluster in self.clusters if all(int(point) in found.mark for point in cluster.triple)]
-        others = []
+        others: list[Grown] = []
         for cluster in named[:OTHER_CLUSTERS]:
-            named_marks = np.array([[found.mark[int(point)] for point in cluster.triple]])
-            poses = promising(self.xyz, self.normals, self.marks, point_triples(cluster, self.xyz), named_marks)
-            for grown in self._grown(poses):
-                same = sum(found.mark.get(point) == mark for point, mark in grown.mark.items())
-                if same < 0.5 * len(grown.mark):
-                    others.append(grown)
-        return others
-
-    def _grown(self, poses: Poses) -> list[Grown]:
-        grown = [
-            grow(View(rotation, shift), *named, self.xyz, self.normals, self.marks)
-            for rotation, shift, named in zip(poses.rotations, poses.shifts, poses.named, strict=True)
-        ]
-        enough = [one for one in grown if len(one.mark) >= LEAST_SHARE * one.expected and len(one.mark) >= LEAST_POINTS]
-        return sorted(enough, key=attrgetter("log10_chance"))
-
-
-def _searches(
-    xyz: Array,
-    normals: Array,
-    xy_mm: Array,
-    frame_mm: tuple[Array, Array],
-    principal_distance_mm: float | None,
-    sigma_mm: float,
-) -> list[_Search]:
-    """Make a search with the given principal distance, or with each assumed one."""
-    origin, size = xyz.mean(axis=0), float(np.linalg.norm(np.ptp(xyz, axis=0)))
-    diagonal = float(np.linalg.norm(frame_mm[1] - frame_mm[0]))
-    tried = [(share * diagonal, UNKNOWN_SIGMA) for share in UNKNOWN]
-    if principal_distance_mm is not None:
-        tried = [(principal_distance_mm, KNOWN_SIGMA)]
-    assumed = (Marks.from_mm(xy_mm, *frame_mm, sigma_mm, c, c_sigma) for c, c_sigma in tried)
-    return [_Search(origin, size, (xyz - origin) / size, normals, marks) for marks in assumed]
+            marks = np.array([[found.mark[int(point)] for point in cluster.triple]])
+            others += self.grown(self.poses(point_triples(cluster, self.xyz), marks))
+        return [one for one in others if len(found.mark.items() & one.mark.items()) < 0.5 * len(one.mark)]
 
 
 def _is_alike(other: Grown, best: Grown) -> bool:
@@ -230,22 +228,3 @@ def _is_alike(other: Grown, best: Grown) -> bool:
     # many as those missed by chance.
     closer = 2 * len(other.mark) * np.log10(other.gate / best.gate)  # likelihood of two coordinates each
     return len(other.mark) >= ALIKE_SHARE * len(best.mark) and bool(closer < TOLD_LOG10)
-
-
-def _first(searches: Sequence[_Search]) -> tuple[_Search, Grown | None]:
-    """Return the first accepted identification, the most significant one of several principal distances."""
-    # The clusters that need the fewest trials come first.
-    most = MOST_LOG10_CHANCE - np.log10(len(searches))
-    tried = 0
-    for cluster in searches[0].clusters:
-        believed = []
-        for search in searches:
-            found, count = search.grow_cluster(cluster)
-            tried += count
-            if found is not None and found.log10_chance < most:
-                believed.append((search, found))
-        if believed:
-            return min(believed, key=lambda one: one[1].log10_chance)
-        if tried > MOST_POSES * len(searches):
-            break
-    return searches[0], None

@@ -3,7 +3,6 @@
 The surrounding points test the resulting poses.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,21 +12,21 @@ from adjust.array_types import Array, Indices, Mask
 from adjust.initial_values.pose import refined_poses, triple_poses
 from adjust.target_identification.unnamed_marks import Marks
 
-_DIRECTIONS = 24  # viewing directions for the ranks of neighbours in the image
 _NEARBY = 6  # nearest points in space, two of which form a cluster with a point
 _RANK_SHARE = 0.8  # quantile of the ranks over the directions
 _SLENDER = 0.25  # width over length of a triangle below which its pose is poor
 _ABOUT = 16  # points around a cluster that test it ...
 _FARTHER = 40  # ... and that test it again after a fit to them
 _DETECTED = 0.75  # assumed detection rate of points in the frame
-_REACH, _LATER_REACH = (
-    0.07,
-    0.02,
-)  # gate as a fraction of the distance from the cluster, for a pose of three marks and a fitted one
+_REACH, _LATER_REACH = 0.07, 0.02  # gate over the distance from the cluster, for a pose of three marks and a fitted one
 _NOISE = 3.0  # gate in standard deviations of a mark
 _SELF_REACH = 1.3  # factor on the distances in a cluster for points confused with it
 _KEPT, _RETURNED = 96, 6
 _CHUNK = 20_000  # hypotheses tested at a time, to limit memory
+# Viewing directions for the ranks of neighbours in the image: unit vectors distributed over the sphere (Fibonacci)
+_HEIGHTS, _AZIMUTHS = 1.0 - (np.arange(24) + 0.5) / 12.0, np.pi * (1.0 + np.sqrt(5.0)) * (np.arange(24) + 0.5)
+_WIDTHS = np.sqrt(1.0 - _HEIGHTS**2)
+_DIRECTIONS = np.column_stack([_WIDTHS * np.cos(_AZIMUTHS), _WIDTHS * np.sin(_AZIMUTHS), _HEIGHTS])
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,34 +58,23 @@ def clusters(xyz: Array, normals: Array, marks_per_point: float) -> list[Cluster
     near = _next(xyz, min(_NEARBY, len(xyz) - 1))
     ranks = _ranks(xyz, normals, near) * max(marks_per_point, 1.0) + 2.0
     first, second = np.triu_indices(near.shape[1], 1)
-    triples = np.stack(
-        [np.broadcast_to(np.arange(len(xyz))[:, None], (len(xyz), len(first))), near[:, first], near[:, second]], axis=2
-    )
     cost = ranks[:, first] * ranks[:, second]
-    corners = xyz[triples]
-    along, across = corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0]
+    along, across = xyz[near[:, first]] - xyz[:, None], xyz[near[:, second]] - xyz[:, None]
     longest = np.maximum(np.maximum((along**2).sum(2), (across**2).sum(2)), ((along - across) ** 2).sum(2))
-    slender = np.linalg.norm(np.cross(along, across), axis=2) < _SLENDER * longest
-    best = np.argmin(np.where(slender, np.inf, cost), axis=1)
-    rows = np.arange(len(xyz))
-    usable = ~slender[rows, best]
-    order = rows[usable][np.argsort(cost[rows, best][usable], kind="stable")]
-    chosen = [
-        Cluster(triples[i, best[i]], (int(ranks[i, first[best[i]]]), int(ranks[i, second[best[i]]]))) for i in order
-    ]
-    return _apart(chosen)
-
-
-def _apart(ordered: Sequence[Cluster]) -> list[Cluster]:
-    """Put clusters without common points first: what occludes one cluster does not affect the next."""
-    used: set[int] = set()
-    first: list[Cluster] = []
+    cost[np.linalg.norm(np.cross(along, across), axis=2) < _SLENDER * longest] = np.inf
+    best = np.argmin(cost, axis=1)
+    least = cost[np.arange(len(xyz)), best]
+    # Clusters without common points come first: what occludes one cluster does not affect the next.
+    apart: list[Cluster] = []
     later: list[Cluster] = []
-    for cluster in ordered:
+    used: set[int] = set()
+    for i in np.argsort(least, kind="stable")[: np.isfinite(least).sum()]:
+        pair = [first[best[i]], second[best[i]]]
+        cluster = Cluster(np.array([i, *near[i, pair]]), (int(ranks[i, pair[0]]), int(ranks[i, pair[1]])))
         own = set(cluster.triple.tolist())
-        (later if own & used else first).append(cluster)
+        (later if own & used else apart).append(cluster)
         used |= own
-    return first + later
+    return apart + later
 
 
 def _next(xyz: Array, count: int) -> Indices:
@@ -101,7 +89,7 @@ def _ranks(xyz: Array, normals: Array, near: Indices) -> Array:
     """(n, k) rank of each near point among a point's neighbours in the image, for most viewing directions."""
     n = len(xyz)
     ranks = []
-    for direction in _directions():
+    for direction in _DIRECTIONS:
         towards = normals @ direction
         if np.isfinite(towards).all() and (towards > 0.3).mean() < 0.5:
             continue
@@ -110,14 +98,6 @@ def _ranks(xyz: Array, normals: Array, near: Indices) -> Array:
         tree = cKDTree(flat)
         ranks.append(np.stack([tree.query_ball_point(flat, reach, return_length=True) for reach in own.T], axis=1))
     return np.quantile(ranks, _RANK_SHARE, axis=0) if ranks else np.full(near.shape, float(n - 1))
-
-
-def _directions() -> Array:
-    """(k, 3) unit vectors distributed over the sphere (Fibonacci lattice)."""
-    i = np.arange(_DIRECTIONS) + 0.5
-    z, angle = 1.0 - 2.0 * i / _DIRECTIONS, np.pi * (1.0 + np.sqrt(5.0)) * i
-    r = np.sqrt(1.0 - z**2)
-    return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
 
 
 def mark_triples(cluster: Cluster, marks: Marks) -> Indices:
@@ -157,7 +137,9 @@ def promising(xyz: Array, normals: Array, marks: Marks, points: Indices, named: 
         own, own_marks = _rows(points, rows), _rows(named, rows)
         rotations, shifts, of = triple_poses(xyz[own], marks.places[own_marks])
         tried += len(of)
-        facing = _facing(rotations, shifts, xyz, normals, own[of])
+        stations = -np.einsum("kji,kj->ki", rotations, shifts)
+        towards = np.einsum("kpi,kpi->kp", normals[own[of]], stations[:, None] - xyz[own[of]])
+        facing = ~(towards <= 0.0).any(axis=1)  # all three points; unknown directions count as facing
         rotations, shifts, of = rotations[facing], shifts[facing], of[facing]
         anchors = marks.places[own_marks[of]].mean(axis=1)
         evidence, _, _ = _tested(rotations, shifts, xyz[_rows(about, rows)[of]], anchors, marks, _REACH)
@@ -195,28 +177,15 @@ def _nearest_points(xyz: Array, points: Indices, count: int) -> Indices:
     return np.asarray(np.take_along_axis(near, order, axis=1), dtype=np.intp)
 
 
-def _facing(rotations: Array, shifts: Array, xyz: Array, normals: Array, points: Indices) -> Mask:
-    """Mask of poses for which all three points face the camera; unknown directions count as facing."""
-    stations = -np.einsum("kji,kj->ki", rotations, shifts)
-    towards = np.einsum("kpi,kpi->kp", normals[points], stations[:, None] - xyz[points])
-    return np.asarray(~(towards <= 0.0).any(axis=1))
-
-
 def _tested(
     rotations: Array, shifts: Array, points: Array, anchors: Array, marks: Marks, reach: float
 ) -> tuple[Array, Indices, Mask]:
     """Log-likelihood ratios (k,) of poses; for each of the points (k, p, 3) the nearest mark and whether it agrees."""
-    places = _projected(rotations, shifts, points)
+    camera = points @ np.swapaxes(rotations, 1, 2) + shifts[:, None]
+    places = camera[..., :2] / np.where(camera[..., 2:] < 0.0, -camera[..., 2:], np.nan)
     nearest = marks.nearest(places)
     gate = _NOISE * marks.sigma + reach * np.linalg.norm(places - anchors[:, None], axis=2)
     hit = np.linalg.norm(places - marks.places[nearest], axis=2) <= gate
     chance = np.clip(marks.chance(places, gate), 1e-9, _DETECTED)
     gain = np.where(hit, np.log(_DETECTED / chance), np.log((1.0 - _DETECTED) / (1.0 - chance)))
     return np.where(marks.inside(places), gain, 0.0).sum(axis=1), nearest, hit & marks.inside(places)
-
-
-def _projected(rotations: Array, shifts: Array, points: Array) -> Array:
-    """(k, p, 2) images of points (k, p, 3), in principal distances; nan behind the camera."""
-    camera = points @ np.swapaxes(rotations, 1, 2) + shifts[:, None]
-    depth = np.where(camera[..., 2:] < 0.0, -camera[..., 2:], np.nan)
-    return np.asarray(camera[..., :2] / depth)

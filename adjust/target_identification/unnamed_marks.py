@@ -1,6 +1,7 @@
 """Unidentified marks of an image, and the growth of a pose from a few identified ones over the whole image."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -16,7 +17,7 @@ _CROWD = 6  # nearest marks from which the local density is estimated
 
 @dataclass(frozen=True, eq=False)
 class Marks:
-    """Marks of an image; all lengths in principal distances."""
+    """Marks of an image, at least one; all lengths in principal distances."""
 
     places: Array  # (m, 2) ideal image coordinates relative to the principal point, y up
     # least, greatest: (2,) corners of the searched area
@@ -25,24 +26,27 @@ class Marks:
     sigma: float  # standard deviation of one coordinate
     c: float  # principal distance, mm
     c_sigma: float  # its relative standard deviation
-    tree: cKDTree  # of the places
-    # nearest_of_cell, density_of_cell: look-up tables of the nearest mark and of the density of marks
-    nearest_of_cell: Indices
-    density_of_cell: Array
 
-    @classmethod
-    def from_mm(
-        cls, xy_mm: Array, least_mm: Array, greatest_mm: Array, sigma_mm: float, c: float, c_sigma: float
-    ) -> "Marks":
-        """Make marks from coordinates (m, 2) in mm, m > 0, in an area between two corners."""
-        places, least, greatest = xy_mm / c, np.asarray(least_mm) / c, np.asarray(greatest_mm) / c
-        tree = cKDTree(places)
-        nearest = np.asarray(tree.query(_centres(least, greatest, _CELLS))[1], dtype=np.intp)
-        density = mark_density(tree, _centres(least, greatest, _COARSE_CELLS))
-        mean = len(places) / float(np.prod(greatest - least))
-        return cls(
-            places, least, greatest, sigma_mm / c, c, c_sigma, tree, nearest, np.maximum(density, mean)
-        )  # fmt: skip
+    @cached_property
+    def tree(self) -> cKDTree:
+        return cKDTree(self.places)
+
+    @cached_property
+    def _nearest_of_cell(self) -> Indices:
+        """Look-up table of the nearest mark."""
+        return np.asarray(self.tree.query(self._centres(_CELLS))[1], dtype=np.intp)
+
+    @cached_property
+    def _density_of_cell(self) -> Array:
+        """Look-up table of the density of marks."""
+        mean = len(self.places) / float(np.prod(self.greatest - self.least))
+        return np.maximum(mark_density(self.tree, self._centres(_COARSE_CELLS)), mean)
+
+    def _centres(self, cells: int) -> Array:
+        """(cells², 2) centres of the cells, row by row."""
+        share = (np.arange(cells) + 0.5) / cells
+        x, y = (self.least + share[:, None] * (self.greatest - self.least)).T
+        return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
     def inside(self, places: Array) -> Mask:
         """Mask of places (..., 2) inside the searched area."""
@@ -50,11 +54,11 @@ class Marks:
 
     def nearest(self, places: Array) -> Indices:
         """Nearest mark of each place (..., 2), to the resolution of the look-up table."""
-        return self.nearest_of_cell[self._cell(places, _CELLS)]
+        return self._nearest_of_cell[self._cell(places, _CELLS)]
 
     def chance(self, places: Array, reach: Array) -> Array:
         """Probability of a mark within reach (...) of places (..., 2), for random marks of the local density."""
-        return chance_of_a_mark(self.density_of_cell[self._cell(places, _COARSE_CELLS)], reach)
+        return chance_of_a_mark(self._density_of_cell[self._cell(places, _COARSE_CELLS)], reach)
 
     def _cell(self, places: Array, cells: int) -> Indices:
         share = (places - self.least) / (self.greatest - self.least)
@@ -79,13 +83,6 @@ def log10_of_agreement(agreeing: int, of: int, chance: float) -> float:
     """log10 of the binomial probability that at least `agreeing` of `of` points agree by chance."""
     with np.errstate(divide="ignore"):  # underflow gives -inf
         return float(np.log10(bdtrc(agreeing - 1, of, chance)))
-
-
-def _centres(least: Array, greatest: Array, cells: int) -> Array:
-    """(cells², 2) centres of the cells, row by row."""
-    share = (np.arange(cells) + 0.5) / cells
-    x, y = (low + share * (high - low) for low, high in zip(least, greatest, strict=True))
-    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
 _ROUNDS = 25

@@ -14,7 +14,7 @@ from adjust.functional_model.lens import Lens
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.transformation import Film
 from adjust.initial_values.resection import MAX_TRIPLES
-from adjust.target_identification.naming import Names, name_coded, name_marks
+from adjust.target_identification.naming import Names, name_marks
 from adjust.target_identification.unnamed_marks import chance_of_a_mark, log10_of_agreement, mark_density
 from measure.targets.block_search import Candidate
 from measure.targets.identification import TargetPrediction
@@ -242,11 +242,8 @@ def name_field(
     normals = np.array([field.normals.get(id, np.full(3, np.nan)) for id in field.ids]).reshape(-1, 3)
     c, pitch_mm = camera.principal_distance_mm, min(measured.pitch_um) / 1000.0
     known = field.xyz, normals, ideal[strongest], (frame[0], frame[1]), c, _SIGMA_PX * pitch_mm
-    if codes:
-        row = {int(candidate): mark for mark, candidate in enumerate(strongest)}
-        names = name_coded(*known, {row[one]: point for one, point in codes.items() if one in row})
-    else:
-        names = name_marks(*known)
+    row = {int(candidate): mark for mark, candidate in enumerate(strongest)}
+    names = name_marks(*known, {row[one]: point for one, point in codes.items() if one in row} if codes else None)
     if isinstance(names, str):
         return names
     return _named(names, field, model, [candidates[i] for i in strongest], pitch_mm)
