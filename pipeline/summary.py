@@ -24,13 +24,14 @@ from pipeline.report.fiducials import Distance, correction_sentence, figure
 from pipeline.report.many_frames import frame_counts
 from pipeline.report.numbers import value_and_sigma
 from pipeline.report.parameters import CameraValue, camera_values
-from pipeline.report.verdict import Level, ReportVerdict, judge
+from pipeline.report.verdict import Level, ReportVerdict, judge, sigma0_bounds
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.check_file import Check
 from pipeline.results.image_unit import FILM_UNIT, ImageUnit
 from pipeline.results.measured_record import pose_record
 from pipeline.text.wording import counted
 
+WORDS = {"good": "Good", "look": "Needs a look", "failed": "No result"}
 STYLES = {"good": "bold green", "look": "bold yellow", "failed": "bold red"}
 FRAME_ROWS = 8  # rows of the table of frames in the terminal; the report has all
 WHOLE_PROBLEMS = 6  # problems printed in full; if there are more, only the first sentence of each
@@ -133,14 +134,16 @@ def _corrections(data: ReportData) -> dict[str, tuple[str, Sequence[Distance]]]:
 def print_summary(summary: Summary, console: Console) -> None:
     """Print the summary in the report's order; file paths are not wrapped."""
     console.print(Text(summary.verdict.sentence, style=STYLES[summary.verdict.level]))
+    if summary.values and (figures := _verdict_figures(summary)):
+        console.print(Text(f"{WORDS[summary.verdict.level]}: {figures}.", style=STYLES[summary.verdict.level]))
     if summary.adjustment and summary.values and summary.adjustment.converged:
         console.print(_camera_table(summary.adjustment, summary.values))
     is_brief = len(summary.verdict.problems) > WHOLE_PROBLEMS
-    for next_step, problems in groupby(summary.verdict.problems, attrgetter("next_step")):
+    for remedy, problems in groupby(summary.verdict.problems, attrgetter("remedy")):
         for problem in problems:
-            console.print(Text(f"- {problem.cause if is_brief else problem.what}"))
-        if next_step:
-            console.print(Text(f"  {next_step}", style="dim"))
+            console.print(Text(" ".join(("-", problem.cause, "" if is_brief else problem.detail)).rstrip()))
+        if remedy:
+            console.print(Text(f"  {remedy}", style="dim"))
     if is_brief:
         console.print(Text("The report has more of each, with pictures.", style="dim"))
     if any(summary.verdicts.values()) and (counts := f"{scan_counts(summary.verdicts)}.") != summary.verdict.sentence:
@@ -163,6 +166,16 @@ def print_summary(summary: Summary, console: Console) -> None:
         if word == "report":  # mentioned as the next step
             continue
         console.print(f"{word}: {path}", soft_wrap=True, markup=False, highlight=False)
+
+
+def _verdict_figures(summary: Summary) -> str:
+    """What the verdict rests on: sigma0 with its bounds, and OpenCV's calibration; empty without a solution."""
+    adjustment, check = summary.adjustment, summary.check
+    if adjustment is None or not adjustment.converged or not adjustment.has_sigma0:
+        return ""
+    low, high = sigma0_bounds(adjustment.variance_factor.redundancy)
+    opencv = f"; OpenCV's calibration {check.verdict}" if check and check.verdict in ("agrees", "differs") else ""
+    return f"sigma0 {adjustment.sigma0:.2f} (usual {low:.2f} to {high:.2f}){opencv}"
 
 
 def _main_numbers(adjustment: AdjustmentRecord) -> dict[str, object]:

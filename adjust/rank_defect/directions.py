@@ -367,8 +367,8 @@ UNNAMED: Mapping[str, tuple[str, str]] = {
     "exterior": (
         "The exterior orientation of image {owner} can change ({quantity} most){followers}: too few known points, or "
         "rays from other stations, hold it.",
-        "Measure known points in this image, take images from other stations that share its points, or give its "
-        "orientation with standard deviations in images.csv.",
+        "Measure known points in it, add images from other stations, or give its orientation with standard deviations "
+        "in images.csv.",
     ),
     "point": (
         "The object point {id} can move ({quantity} most){followers}.",
@@ -412,8 +412,8 @@ def many_sentence(count: int, followers: str) -> tuple[str, str]:
     return (
         f"The network can drift and bend in {count} ways{followers}: what is known of the object is too little for it, "
         "or too far apart.",
-        "Measure known points all over the network, those of a long strip every few images, or give stations with "
-        "standard deviations in images.csv. The standard deviations tell how far it may have drifted.",
+        "Measure known points all over it (of a long strip every few images), or give stations with standard "
+        "deviations in images.csv.",
     )
 
 

@@ -126,8 +126,7 @@ def _marks_outside(result: Adjustment, rows: Sequence[int], trials: Trials) -> I
     yield (
         f"{words}. With y pointing up instead of down all lie inside (σ₀ = {turned.sigma0:.2f}; as it stands "
         f"{result.sigma0:.2f}){'' if fits else ', but the observations agree less then'}: the y axis of the comparator "
-        "coordinates points down, or they count from the lower left corner. Give them with y up, from the first pixel; "
-        "principal point, decentering and stations are wrong until then."
+        "coordinates points down, or they count from the lower left corner. Give them with y up, from the first pixel."
     )
 
 

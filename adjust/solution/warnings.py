@@ -72,7 +72,7 @@ def _weak_parameters(run: Run, cofactor: Cofactor) -> Iterator[str]:
     problem, state = run.numbering.problem, run.end.state
     without_priors = factorise(run.numbering, run.end, camera_priors=False)
     for each in weak_directions(run.numbering, state, without_priors, run.singular):
-        yield f"Practically singular without priors: {description(each.parameters)}. {each.cause} {each.remedy}"
+        yield f"Practically singular without priors ({description(each.parameters)}): {each.cause} {each.remedy}"
     if run.converged:
         yield from filter(None, [undetermined(problem, state, cofactor.variances)])
         yield from loose_principal_distances(problem, state, cofactor.variances)

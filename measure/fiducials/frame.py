@@ -319,7 +319,7 @@ class Frame:
         if fit.damaged_fraction > CLEAR_DAMAGE + min(self._usual_damage, _MOST_UNLIKE):
             reasons.append(Reason(f"{fit.damaged_fraction:.0%} of it is damaged", Code.COVERED))
         elif fit.lost_fraction > _MOST_LOST:
-            lost = f"{fit.lost_fraction:.0%} of what tells its place in one direction is damaged"
+            lost = f"{fit.lost_fraction:.0%} of its edges across one direction is damaged"
             reasons.append(Reason(lost, Code.COVERED))
         sigma_px = largest_sigma_px(fit.covariance_px2)
         is_plain = fit.covariance_is_white and sigma_px <= _PLAIN_SIGMA_PX

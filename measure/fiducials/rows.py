@@ -131,7 +131,7 @@ def _problems(frame: Frame, pitch_um: tuple[float, float] | None) -> list[Reason
     used = int(frame.inliers.sum())
     if used <= 3:
         kind = "an affine transformation" if used == 3 else "a similarity"
-        problem = f"{kind} on {used} fiducials has no redundancy: no check."
+        problem = f"{kind} on {used} fiducials has no redundancy: no check. More marks give one: `reseau review`."
         problems.append(Reason(problem, Code.NO_CHECK))
     return problems
 
@@ -148,7 +148,7 @@ def _stretch(scan: Scan, wide_um: float, tall_um: float, pitch_um: tuple[float, 
     return (
         f"by the marks a pixel is {wide_um:.1f} µm wide and {tall_um:.1f} µm tall, but {given}: more than "
         f"film deforms. The likely cause is {cause}: set pitch_um = [{wide_um:.2f}, {tall_um:.2f}] in the "
-        "project. If a pixel is as given, look at the scanner and at the coordinates in the camera file."
+        "project, or check scanner and camera file."
     )
 
 
@@ -235,8 +235,8 @@ def pitch_problem(
     return Reason(
         f"{source} gives a pitch of {pitch_um[0]:.2f} x {pitch_um[1]:.2f} µm, but the marks' separations suggest "
         f"{film_um[0]:.2f} x {film_um[1]:.2f} µm ({100 * excess[0]:+.1f} and {100 * excess[1]:+.1f} %, where they and "
-        f"the film allow {100 * limit:.1f} %): set pitch_um = [{film_um[0]:.2f}, {film_um[1]:.2f}] in the project, or "
-        "check whether the camera is the right one.",
+        f"the film allow {100 * limit:.1f} %). If the camera is the right one, set pitch_um = [{film_um[0]:.2f}, "
+        f"{film_um[1]:.2f}] in the project.",
         Code.PITCH,
     )
 

@@ -230,7 +230,7 @@ def _writing_sentence(best: _Hypothesis, rival: _Hypothesis, layout: FiducialLay
     telling = [index for index in np.argsort(-np.array(by_line), kind="stable").tolist() if by_line[index] > 0]
     quoted = ", ".join(f'"{lines[index].text}"' for index in telling[:_QUOTED])
     word = "against" if lead > 0 else "for"
-    return f"of {len(lines)} lines of writing {quoted} are evidence {word} pose {rival.pose}: log-odds {abs(lead):.1f}."
+    return f"the writing, such as {quoted}, is evidence {word} pose {rival.pose} with log-odds {abs(lead):.1f}."
 
 
 def _difference(one: int, other: int, layout: FiducialLayout) -> str:

@@ -226,7 +226,7 @@ def _unmeasured(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[str
         return ()
     return (
         f"Given but measured in no image: {'point' if len(lost) == 1 else f'{len(lost)} points,'} {listed(lost)}. "
-        "They have no part in the adjustment; if an image shows one, look for a wrong point number or coordinate.",
+        "If an image shows one, look for a wrong point number or coordinate.",
     )
 
 

@@ -108,7 +108,7 @@ class NewProject:
             ],
         )
         yield (
-            "have marks that several cameras have: that of most calibration reports is taken, images.csv sets another",
+            "have marks of several cameras: the one with most calibration reports is taken, images.csv sets another",
             [
                 line
                 for camera, folders in self._alike_cameras().items()
@@ -278,7 +278,7 @@ def print_new_project(new: NewProject, console: Console) -> None:
         say(f"{camera}: {counted(scans, 'scan')} in {counted(folders, 'folder')}", "bold")
     for what, cases in new.remarks():
         if cases:
-            say(f"Needs a look: {what}:", "yellow")
+            say(f"Needs a look: scans that {what}:", "yellow")
             for case in cases[:_SHOWN]:
                 say(f"    {case}")
             if len(cases) > _SHOWN:

@@ -110,7 +110,7 @@ class Work:
         now = sum(row in self._now for row in known.values())  # measured for other scans in the steps before
         self._store.set_current({row: self._asked(name) for name, row in known.items()})
         if known or len(missing) > 1:
-            rest = {"in the steps above": now, "to measure": len(missing)}
+            rest = {"in this run": now, "to measure": len(missing)}
             reporter.say(count_sentence("measured in an earlier run", len(known) - now, len(tasks), rest))
         if missing:
             self._complete(missing, len(tasks), reporter)

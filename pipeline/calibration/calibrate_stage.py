@@ -124,6 +124,7 @@ class Calibration(PlottedResult):
         """Print the cameras, then the problems, then the files except the report."""
         for camera in self.cameras:
             camera.print(console)
+        console.print("Needs a look." if self.needs_look else "Good: every test was passed.", highlight=False)
         for line in self._lines():
             console.print(line, markup=False, highlight=False, soft_wrap=True)
 
@@ -133,7 +134,11 @@ class Calibration(PlottedResult):
             *(["Pictures of other sizes or focal lengths are taken for other cameras'."] if several else []),
             *(f"- {name} cannot be read: {why}" for name, why in self.unreadable.items()),
             *(f"- {camera} is not calibrated: {why}" for camera, why in self.not_calibrated.items()),
-            *(" ".join((f"- {each.what}", each.next_step)) for each in self.summary.verdict.problems),
+            *(
+                line
+                for each in self.summary.verdict.problems
+                for line in (f"- {each.cause} {each.detail}".rstrip(), f"  {each.remedy}".rstrip())
+            ),
             *(str(file) for file in self.files if file != self.report),
         ]
 

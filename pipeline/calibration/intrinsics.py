@@ -19,6 +19,7 @@ from pipeline.text.wording import counted, listed
 from pipeline.types import Array
 
 HIGHLY_CORRELATED = 0.9
+_WORST = 3  # images named
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,7 @@ class CameraIntrinsics:
     correlations : pairs above HIGHLY_CORRELATED.
     left_out : by image, the reason.
     used : number of images.
+    worst : images with the largest residuals: name, and rms of a point, px.
     known_share : radius up to which the lens was observed, as a fraction of the distance to the corner.
     lens : selection of the lens model; None where it was given.
     pitch_um : pixel pitch, None if unknown.
@@ -68,6 +70,7 @@ class CameraIntrinsics:
     left_out: Mapping[str, str]
     used: int
     rms_px: float
+    worst: tuple[tuple[str, float], ...]
     sigma0: float
     corner_sigma_px: float
     unmodelled_sigma_px: float
@@ -138,7 +141,8 @@ class CameraIntrinsics:
             console.print(line, markup=False, highlight=False)
 
     def _lines(self) -> Iterator[str]:
-        yield f"{counted(self.used, 'picture')}, rms {self.rms_px:.3f} px a point."
+        worst = listed([f"{name} {rms_px:.3f}" for name, rms_px in self.worst])
+        yield f"{counted(self.used, 'picture')}, rms {self.rms_px:.3f} px a point. The worst: {worst} px."
         yield (
             f"Corners {self.corner_sigma_px:.3f} px, unmodelled {self.unmodelled_sigma_px:.3f} px: what lens model, "
             "board and the picture's processing leave."
@@ -230,6 +234,7 @@ def camera_intrinsics(
         left_out=left_out,
         used=len(adjustment.network.images),
         rms_px=float(np.sqrt((v_px**2).sum(axis=1).mean())),
+        worst=_worst_images(adjustment.network.observations.image, v_px),
         sigma0=adjustment.sigma0,
         corner_sigma_px=float(np.sqrt(np.median(np.maximum(given_mm2, 0.0)))) / pixel_mm,
         unmodelled_sigma_px=unmodelled_mm / pixel_mm,
@@ -238,6 +243,13 @@ def camera_intrinsics(
         pitch_um=pitch_um,
         check=check,
     )
+
+
+def _worst_images(images: Sequence[str], v_px: Array) -> tuple[tuple[str, float], ...]:
+    """Images with the largest rms residual vectors (px)."""
+    names, rows = np.unique(np.array(images), return_inverse=True)
+    rms_px = np.sqrt(np.bincount(rows, (v_px**2).sum(axis=1)) / np.bincount(rows))
+    return tuple((str(names[row]), float(rms_px[row])) for row in np.argsort(-rms_px)[:_WORST])
 
 
 def _high_correlations(names: Sequence[str], matrix: Array) -> Iterator[tuple[str, str, float]]:

@@ -66,7 +66,7 @@ def print_library(console: Console) -> None:
         c = entry["principal_distance_mm"]
         table.add_row(
             entry["name"],
-            " x ".join(f"{side:g}" for side in entry["frame_mm"]),
+            " x ".join(f"{side:g}" for side in dict.fromkeys(entry["frame_mm"])),
             f"{c['value']:.2f} ± {c['sigma']:.2f}",
             str(entry["fiducials"]),
             _shape(entry),

@@ -17,6 +17,7 @@ from measure.marks.rendering import known_picture
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Polygon
 from pipeline.files.camera_file import CameraFile
 from pipeline.results.measured_record import MeasuredScan
+from pipeline.text.wording import counted
 
 _OTHER_CONE = 0.02  # fraction of the principal distance: cameras with the same lens cone differ by less
 _MAKERS = ("Wild", "Zeiss", "Jena", "Fairchild")
@@ -98,8 +99,8 @@ def _add_plate(
     if "principal_distance_mm" in plate and not against and camera.principal_distance_mm:
         number = f" (Nr {plate['camera_number']})" if "camera_number" in plate else ""
         notes.append(
-            f"The camera's plate{number} says a principal distance of {plate['principal_distance_mm']} mm, its file "
-            f"{camera.principal_distance_mm:g} mm: worth taking as an approximation, and nothing is changed by it."
+            f"The camera's plate{number} says a principal distance of {plate['principal_distance_mm']} mm, the "
+            f"camera file {camera.principal_distance_mm:g} mm. Nothing is changed by it."
         )
     return scan.changed(None, [Reason(each, Code.PLATE) for each in problems], notes)
 
@@ -294,15 +295,17 @@ class Identification:
 
 
 def print_identification(identification: Identification, console: Console) -> None:
-    for trial in identification.trials:
+    """Print the trials that found marks, the number of the others, and the conclusion."""
+    tried = [trial for trial in identification.trials if trial.found]
+    for trial in tried:
         console.print(", ".join(trial.cameras), style="bold", highlight=False)
         console.print(Padding(_figures(trial), (0, 0, 0, 4)), highlight=False)
+    if rest := identification.trials[len(tried) :]:
+        console.print(f"{counted(len(rest), 'other layout')} of marks: not found (--json has the reasons).")
     console.print(identification.sentence(), highlight=False, soft_wrap=True)
 
 
 def _figures(trial: Trial) -> str:
-    if not trial.found:
-        return f"{trial.score:.2f}: {trial.reason}"
     words = [f"{trial.score:.2f}: {trial.found} of {trial.drawn} marks, likeness {trial.likeness:.2f}"]
     words.append(f"signal-to-noise {trial.snr:.1f}")
     if trial.residual_mm is not None:

@@ -95,7 +95,7 @@ def add_known_lines(
     rolls = {camera: _first(own) for camera, own in of_camera.items() if len(own) > _READ_FIRST}
     first = [task for own in rolls.values() for task in own]
     measured = dict[str, MeasuredScan]()
-    with reporter.stage("read") as count:
+    with reporter.stage("read the writing of") as count:
         for done, scan in enumerate(measure(first) if first else (), 1):
             measured[scan.frame.image] = scan
             count(scan.frame.image, done, len(first))

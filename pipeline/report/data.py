@@ -29,7 +29,7 @@ _SENTENCE = re.compile(r"(?<=[.:]) (?=[A-Z])")
 
 @dataclass(frozen=True)
 class Problem:
-    """Problem that needs a look. what: description; next_step: remedy.
+    """Problem that needs a look. what: description; next_step: remedy, else the description after its first sentence.
 
     images, marks: those concerned, the report shows the first mark; section: of the report, with details.
     """
@@ -47,7 +47,16 @@ class Problem:
 
     @property
     def detail(self) -> str:
-        """Rest of the description."""
+        """Rest of the description, empty where it is the remedy."""
+        return self._rest if self.next_step else ""
+
+    @property
+    def remedy(self) -> str:
+        """What to do."""
+        return self.next_step or self._rest
+
+    @property
+    def _rest(self) -> str:
         return "".join(_SENTENCE.split(self.what, maxsplit=1)[1:])
 
 

@@ -182,7 +182,7 @@ def figure_plot(change: Figure) -> Markup:
     ends = places + px_per_um * change.change_um * (1.0, -1.0)
     corners = page(np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]]))
     um = svg.round_step(70.0 / px_per_um)
-    size = f"{um:g} µm, drawn {1e3 * px_per_um / px_per_mm:,.0f} times too large"
+    size = f"{um:g} µm, enlarged {1e3 * px_per_um / px_per_mm:,.0f} times"
     content = [
         svg.line(corners[:, 0], corners[:, 1], "frame", closed=True),
         *svg.ellipses(ends, px_per_um * radius, angles),

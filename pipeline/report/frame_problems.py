@@ -25,11 +25,26 @@ SAME_PLACE_PX = 0.5  # px; randomly placed marks rarely share a column or row th
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
 _ONE_ANSWER = (
-    "One answer holds for all of them: say in the camera file at which side of the frame it writes, and how, as "
+    "One line in the camera file settles all: at which side of the frame the camera writes, as "
     'writing = ["left: reads upward"].'
 )
 
-Gathered = dict[tuple[str, str], tuple[Problem, list[str]]]  # by masked text: the first problem and the images of all
+
+@dataclass
+class AlikeProblems:
+    """Problems that differ only in numbers: the first, the images of all, and whether the numbers differ."""
+
+    first: Problem
+    images: list[str]
+    differ: bool = False
+
+    def together(self) -> Problem:
+        """The first problem, with the names of all images."""
+        numbers = f" (numbers of {self.images[0]})" if self.differ else ""
+        return replace(self.first, what=f"{listed(self.images)}{numbers}: {self.first.what}", images=tuple(self.images))
+
+
+Gathered = dict[tuple[str, str], AlikeProblems]  # by masked text and remedy
 
 
 @dataclass(frozen=True)
@@ -156,21 +171,16 @@ def frame_problems(shots: list[Frame]) -> Iterator[Problem]:
         gathered: Gathered = {}
         for frame in shots:
             gather(gathered, frame.image, evidence(frame))
-        yield from (named_problem(*each) for each in gathered.values())
+        yield from (each.together() for each in gathered.values())
 
 
 def gather(gathered: Gathered, image: str, problems: Iterable[Problem]) -> None:
     """Add the problems of an image, grouped with those that differ only in numbers."""
     for problem in problems:
         alike = masked_text(problem.what), problem.next_step
-        gathered.setdefault(alike, (problem, []))[1].append(image)
-
-
-def named_problem(problem: Problem, images: list[str]) -> Problem:
-    """Problem of the first image, with the names of all."""
-    has_numbers = len(images) > 1 and masked_text(problem.what) != problem.what
-    of_first = " The numbers are those of the first." if has_numbers else ""
-    return replace(problem, what=f"{listed(images)}: {problem.what}{of_first}", images=tuple(images))
+        known = gathered.setdefault(alike, AlikeProblems(problem, []))
+        known.images.append(image)
+        known.differ |= problem.what != known.first.what
 
 
 def images_by_sentence(shots: list[Frame], evidence: Callable[[Frame], Iterable[str]]) -> dict[str, list[str]]:
@@ -190,7 +200,7 @@ def _assumed_pose(frame: Frame) -> Iterator[Problem]:
         yield Problem(f"pose assumed: {pose.roll}.", _ONE_ANSWER)
     else:
         yield Problem(
-            f"pose assumed ({pose.name}). {capitalised(' '.join(pose.evidence))}",
+            f"pose assumed ({pose.name}). {' '.join(map(capitalised, pose.evidence))}",
             'If the scan was laid on the scanner otherwise, set pose = "90", "180", "270" or with "m" under [measure].',
         )
 

@@ -17,7 +17,6 @@ from pipeline.report.frame_problems import (
     Gathered,
     centers_px,
     gather,
-    named_problem,
     places_apart,
     single_frame_problems,
 )
@@ -156,9 +155,9 @@ def _verdict(frame: Frame) -> Verdict:
 
 def _listed(problems: Gathered) -> Iterator[Problem]:
     """Yield problems, those of most frames first."""
-    ordered = sorted(problems.values(), key=lambda each: -len(each[1]))
-    yield from (named_problem(*each) for each in ordered[:_MOST_PROBLEMS])
-    rest = sum(len(images) for _, images in ordered[_MOST_PROBLEMS:])
+    ordered = sorted(problems.values(), key=lambda each: -len(each.images))
+    yield from (each.together() for each in ordered[:_MOST_PROBLEMS])
+    rest = sum(len(each.images) for each in ordered[_MOST_PROBLEMS:])
     if rest:
         yield Problem(f"{counted(rest, 'more problem')} of frames, all different.", "`reseau status --csv` has them.")
 

@@ -166,8 +166,6 @@ class ProblemView:
 
 
 def _problem_view(problem: Problem, views: Sequence[FrameView]) -> ProblemView:
-    """View of a problem. Without a next step, its further sentences are the remedy."""
-    detail, remedy = (problem.detail, problem.next_step) if problem.next_step else ("", problem.detail)
     known = {view.frame.image: view for view in views}
     images = dict.fromkeys((*problem.images, *(image for image, *_ in problem.marks)))
     links = [(image, f"#{known[image].id}") for image in images if image in known][:LINKS]
@@ -181,7 +179,7 @@ def _problem_view(problem: Problem, views: Sequence[FrameView]) -> ProblemView:
         if (card.mark.kind, card.mark.point) == (kind, point)
     )
     picture = next((card.picture for card in marks if card.picture), None)
-    return ProblemView(problem.cause, detail, remedy, links, picture)
+    return ProblemView(problem.cause, problem.detail, problem.remedy, links, picture)
 
 
 def _points_word(shots: list[Frame]) -> str:

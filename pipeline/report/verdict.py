@@ -118,8 +118,8 @@ def _no_solution(adjustment: AdjustmentRecord) -> Iterator[Problem]:
             "The images hardly determine what is named below as practically singular: add what is advised there, or "
             "fix it."
             if is_practically
-            else "Look for wrong point numbers among the largest residuals, at the approximate orientations, and at "
-            "the units: [object] unit of points and stations, mm in the camera's file.",
+            else "Check point numbers of the largest residuals, approximate orientations, and units ([object] unit; mm "
+            "in the camera file).",
             section="frames",
         )
 
@@ -133,40 +133,38 @@ def _unchecked(adjustment: AdjustmentRecord) -> Iterator[Problem]:
 
 
 def _suspects(adjustment: AdjustmentRecord) -> Iterator[Problem]:
-    rows = adjustment.suspects
-    kept, removed = ([_suspect(row) for row in rows if row.removed is removed] for removed in (False, True))
-    if kept:
-        on_cameras = [row.group in GIVEN for row in rows if not row.removed]
+    kept = [row for row in adjustment.suspects if not row.removed]
+    given, marks = ([row for row in kept if (row.group in GIVEN) is is_given] for is_given in (True, False))
+    remedy = (
+        "Look at the picture: reject a disturbed mark, or correct its number or coordinates. snooping = true under "
+        "[adjust] leaves all out."
+    )
+    owners = Counter(row.owner for row in marks if row.group in ON_FRAMES).most_common(1)
+    if owners and owners[0][1] >= max(LEAST_ALIKE, NEARLY_ALL * len(kept)):
         remedy = (
-            "Look at the picture: reject a disturbed mark or a wrong number in comparator.csv, or correct the given "
-            "coordinate. snooping = true under [adjust] leaves them out."
+            f"Nearly all are marks of {owners[0][0]}: look for wrong point numbers of the whole image, or exclude it."
         )
-        owners = Counter(row.owner for row in rows if not row.removed and row.group in ON_FRAMES).most_common(1)
-        if owners and owners[0][1] >= max(LEAST_ALIKE, NEARLY_ALL * len(kept)):
-            remedy = (
-                f"Nearly all are marks of {owners[0][0]}: look for wrong point numbers of the whole image, or take it "
-                f"out. {remedy}"
+    of_camera = "Correct the given value in the camera's file, or give it the standard deviation that it has."
+    for rows, what_to_do in ((marks, remedy), (given, of_camera)):
+        if rows:
+            yield Problem(
+                f"{counted(len(rows), 'gross error')} suspected: {listed(list(map(_suspect, rows)))}.",
+                what_to_do,
+                marks=_suspect_marks(rows),
+                section="reliability",
             )
-        of_camera = "Correct the given value in the camera's file, or give it the standard deviation that it has."
+    if removed := [row for row in adjustment.suspects if row.removed]:
         yield Problem(
-            f"{counted(len(kept), 'gross error')} suspected: {listed(kept)}.",
-            f"{'' if all(on_cameras) else remedy} {of_camera if any(on_cameras) else ''}".strip(),
-            marks=_suspect_marks(rows, False),
-            section="reliability",
-        )
-    if removed:
-        yield Problem(
-            f"Left out as gross errors: {listed(removed)}.",
+            f"Left out as gross errors: {listed(list(map(_suspect, removed)))}.",
             "Look at the picture or the records, and reject or correct them there.",
-            marks=_suspect_marks(rows, True),
+            marks=_suspect_marks(removed),
             section="reliability",
         )
 
 
-def _suspect_marks(rows: Sequence[SuspectRecord], removed: bool) -> tuple[MarkKey, ...]:
+def _suspect_marks(rows: Sequence[SuspectRecord]) -> tuple[MarkKey, ...]:
     """Keys of the suspects that are marks of a frame."""
-    marks = (row for row in rows if row.removed is removed and row.group in ON_FRAMES)
-    return tuple((row.owner, row.group, row.point) for row in marks)
+    return tuple((row.owner, row.group, row.point) for row in rows if row.group in ON_FRAMES)
 
 
 def _suspect(row: SuspectRecord) -> str:
@@ -225,8 +223,8 @@ def _too_large(adjustment: AdjustmentRecord) -> Iterator[Problem]:
         return
     yield Problem(
         f"{size} ({_group_sigmas(adjustment)}).",
-        "Reject gross errors first. What remains the model lacks: add distortion parameters, or state it by "
-        "film_sigma_um. All standard deviations are already multiplied by σ₀.",
+        "Reject gross errors first; then add distortion parameters, or state film_sigma_um. All σ are already "
+        "multiplied by σ₀.",
         section="reliability",
     )
 

@@ -374,7 +374,7 @@ def test_what_chance_finds_as_well_does_not_stand_out() -> None:
     found = Identification(Path("a.tif"), (trial(("a",), 0.5, 0.3), trial(("b",), 0.0, None)))
     assert found.best == ()
     assert "no camera of the library stands out" in found.sentence()
-    assert found.as_json()["best"] == []
+    assert found.best_names() == ()
 
 
 def test_a_pitch_that_the_marks_contradict_is_reported() -> None:
@@ -402,7 +402,7 @@ def test_solid_marks_alone_name_no_camera_against_the_pitch_of_the_file(
 
 def test_cameras_that_come_close_are_all_named() -> None:
     found = Identification(Path("a.tif"), (trial(("a", "b"), 0.9), trial(("c",), 0.85), trial(("d",), 0.4)))
-    assert found.as_json()["best"] == ["a", "b", "c"]
+    assert found.best_names() == ("a", "b", "c")
     assert "c comes close with 0.85" in found.sentence()
     without_report = replace(found, unreported={"c": "made from one frame", "d": "nobody knows"})
     assert without_report.sentence().endswith("c rests on no calibration report: made from one frame.")

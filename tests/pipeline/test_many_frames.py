@@ -105,7 +105,7 @@ def test_the_worst_frames_are_shown_and_alike_problems_stated_once(many: ReportD
     finding = [problem.what for problem in judge(many).problems]
     assert len(finding) == 2
     assert f"and {len(BAD) - 8} more: 1 fiducial mark not measured, 7 measured" in finding[0]
-    assert f"and {len(FAILED) - 8} more: scan 5 is damaged" in finding[1]
+    assert f"and {len(FAILED) - 8} more (numbers of {image(min(FAILED))}): scan 5 is damaged" in finding[1]
 
 
 def test_what_users_named_is_escaped(page: str) -> None:

@@ -421,7 +421,7 @@ def test_one_displaced_mark_is_the_one_that_changed_most() -> None:
     estimated[3] += (0.05, 0.0)
     form = changed(estimated, 4e-6 * np.eye(10))
     assert int(np.hypot(*form.change_um.T).argmax()) == 3
-    assert "drawn" in figure_plot(form)
+    assert "enlarged" in figure_plot(form)
 
 
 def test_two_marks_have_no_form() -> None:
