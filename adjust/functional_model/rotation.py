@@ -19,7 +19,7 @@ def rotation_from_angles(angles_rad: Array) -> Array:
         (-cp * sk, co * ck - so * sp * sk, so * ck + co * sp * sk),
         (sp, -so * cp, co * cp),
     )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
 def angles_from_rotation(rotation: Array) -> Array:

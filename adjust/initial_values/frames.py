@@ -56,7 +56,7 @@ class Frames:
         freed_mm[at] = np.where(found[:, None], ideal, self.xy_mm[at]) - lens.interior[1:]
         return {
             self.network.images[i].name: Sight(
-                tuple(names[row] for row in self.rows[self.part(i)]),
+                tuple([names[row] for row in self.rows[self.part(i)].tolist()]),
                 freed_mm[self.part(i)],
                 float(lens.interior[0]),
                 float(self.sigma_mm[i]),

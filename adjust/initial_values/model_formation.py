@@ -309,7 +309,8 @@ def intersected(block: Block, weakest: float) -> dict[str, Array]:
 
     Returns coordinates (3,) by point, of those with a determination above `weakest`.
     """
-    names = [name for name in sorted(block.firm) if np.isnan(block.firm[name]).any()]
+    is_sought = np.isnan(np.array(list(block.firm.values())).reshape(-1, 3)).any(axis=1)
+    names = sorted(name for name, is_unknown in zip(block.firm, is_sought, strict=True) if is_unknown)
     position = {name: i for i, name in enumerate(names)}
     rows = [
         (image, k, position[name])

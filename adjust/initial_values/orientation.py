@@ -55,11 +55,9 @@ def orient(
 
 def _coordinates(network: Network, firm: bool) -> dict[str, Array]:
     """Known coordinates (3,) of every point, nan where unknown. firm: without mere approximations (infinite sigma)."""
-    priors = {point.id: (point.X, point.Y, point.Z) for point in network.points}
-    return {
-        name: np.array([np.nan if p is None or (firm and np.isinf(p.sigma)) else p.value for p in three])
-        for name, three in priors.items()
-    }
+    priors = [prior for point in network.points for prior in (point.X, point.Y, point.Z)]
+    values = [np.nan if p is None or (firm and p.sigma == np.inf) else p.value for p in priors]
+    return dict(zip((point.id for point in network.points), np.array(values).reshape(-1, 3), strict=True))
 
 
 def _given_or_resected(exterior: Exterior, block: Block, image: str) -> Pose:
@@ -92,7 +90,8 @@ def _scale_by_distances(block: Block, distances: Sequence[Distance]) -> None:
 def _all_points(block: Block) -> dict[str, Array]:
     """Coordinates of every point: known, else intersected, else the given approximation."""
     points = {**block.rough, **intersected(block, 0.0)}
-    unknown = {name for name, xyz in points.items() if np.isnan(xyz).any()}
+    nowhere = np.isnan(np.array(list(points.values())).reshape(-1, 3)).any(axis=1)
+    unknown = {name for name, is_nowhere in zip(points, nowhere, strict=True) if is_nowhere}
     for name in sorted(unknown):
         showing = [image for image in sorted(block.sights) if name in block.sights[image].points]
         if showing:

@@ -237,12 +237,17 @@ def _grunert_quartic(a: Array, c: Array, cos_a: Array, cos_b: Array, cos_g: Arra
 
 def _quartic_roots(coefficients: Array) -> Array:
     """Real parts (m, 4) of the roots: noise turns the double root of a camera above its points into a complex pair."""
-    monic = coefficients[:, 1:] / coefficients[:, :1]
-    sound = np.logical_and.reduce(np.isfinite(monic), axis=1)
-    companion = np.zeros((len(monic), 4, 4))
-    companion[:, 0] = -np.where(sound[:, np.newaxis], monic, 0.0)
-    companion[:, [1, 2, 3], [0, 1, 2]] = 1.0
-    return np.where(sound[:, np.newaxis], np.real(np.linalg.eigvals(companion)), np.nan)
+    # Ferrari: a root m of the resolvent cubic, the largest of three, splits the quartic into two quadratic equations.
+    b, c, d, e = (coefficients[:, 1:] / coefficients[:, :1]).astype(np.complex128).T
+    p, q, r = c - 3 * b**2 / 8, d - b * c / 2 + b**3 / 8, e - b * d / 4 + b**2 * c / 16 - 3 * b**4 / 256
+    linear, constant = -(p**2) / 12 - r, -(p**3) / 108 + p * r / 3 - q**2 / 8
+    root = np.sqrt(constant**2 / 4 + linear**3 / 27)
+    cube = -constant / 2 + np.where((constant.conj() * root).real > 0, -root, root)
+    each = cube ** (1 / 3) * np.exp(2j * np.pi / 3 * np.arange(3))[:, None]
+    m = each - linear / (3 * each) - p / 3
+    s = np.sqrt(2 * m[np.abs(m).argmax(axis=0), np.arange(len(p))])
+    first, second = (np.sqrt(-2 * p - s**2 - 2 * sign * q / s) for sign in (1, -1))
+    return np.asarray(np.stack([s + first, s - first, second - s, -second - s], axis=1).real / 2 - b.real[:, None] / 4)
 
 
 def _triad(points: Array) -> Array:

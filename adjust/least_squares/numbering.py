@@ -123,6 +123,8 @@ class Numbering:
         group = self._group[shared]
         sizes = np.bincount(group[group >= 0], minlength=len(self._grouped))
         present = np.flatnonzero(sizes)
+        if not len(present):
+            return _Shared(shared, Fronts.single(len(shared)))
         met = self._group_meetings[:, present]
         meeting = csr_array(met.T @ met)
         order = band_order(meeting)

@@ -140,12 +140,15 @@ class Problem:
             values[positions] = state.values[positions] + (centred_jacobian @ step[positions][..., None])[..., 0]
         rotations = rotation_from_vector(step[self.exterior[:, 3:]]) @ state.rotations
         kept, free = self.exterior[self.keeps_angles, 3:], self.exterior[~self.keeps_angles, 3:]
-        rotations[self.keeps_angles] = rotation_from_angles(values[kept])
+        if len(kept):
+            rotations[self.keeps_angles] = rotation_from_angles(values[kept])
         values[free] = angles_near(rotations[~self.keeps_angles], state.values[free])
         return State(values, rotations)
 
     def attitude_by_unknowns(self, state: State) -> Array:
         """(images, 3, 3) derivatives of the rotation vector with respect to the attitude unknowns: vector or angles."""
+        if not self.keeps_angles.any():
+            return np.broadcast_to(np.eye(3), state.rotations.shape)
         by_angles = vector_by_angles(state.values[self.exterior[:, 3:]])
         return np.where(self.keeps_angles[:, None, None], by_angles, np.eye(3))
 

@@ -28,10 +28,10 @@ class Reduction:
         Heights are not reduced where the line of sight depends on them.
         """
         xyz = _given_places(network)
-        count = (~np.isnan(xyz)).sum(axis=0)
-        middle = np.array([np.nanmedian(axis) if some else 0.0 for axis, some in zip(xyz.T, count, strict=True)])
-        off = np.abs(xyz - middle)
-        extent = max((float(np.nanmedian(axis)) for axis, some in zip(off.T, count, strict=True) if some), default=0.0)
+        given = [axis[~np.isnan(axis)] for axis in xyz.T]
+        middle = np.array([np.median(axis) if len(axis) else 0.0 for axis in given])
+        off = [np.abs(axis - center) for axis, center in zip(given, middle, strict=True) if len(axis)]
+        extent = max((float(np.median(axis)) for axis in off), default=0.0)
         step = 2.0 ** np.ceil(np.log2(4.0 * extent)) if extent > 0.0 else 1.0
         origin = step * np.round(middle / step)
         if not network.line_of_sight.is_straight:

@@ -185,6 +185,8 @@ def free_motion(problem: Problem, state: State) -> Array:
 def held_as_known(network: Network, coordinates: Sequence[str]) -> Network:
     """Network for initial values: coordinates that are to be held, and have a value, count as known."""
     held = {object_coordinate(text) for text in coordinates}
+    if not held:
+        return network
     points = []
     for point in network.points:
         priors = zip("XYZ", (point.X, point.Y, point.Z), strict=True)

@@ -37,10 +37,11 @@ def blind_blocks(factor: Factor) -> list[BlindBlock]:
     """Find the blocks with a singular triangle, sorted by their unknowns."""
     found = []
     for blocks in factor.blocks:
-        left, singular, right = np.linalg.svd(blocks.triangle)
+        singular = np.linalg.svd(blocks.triangle, compute_uv=False)
         null = singular <= SINGULAR * singular.max(axis=1, initial=0.0, keepdims=True)
         for i in np.flatnonzero(null.any(axis=1)):
-            of_null = left[i][:, null[i]], right[i][null[i]].T
+            left, _, right = np.linalg.svd(blocks.triangle[i])
+            of_null = left[:, null[i]], right[null[i]].T
             found.append(BlindBlock(blocks.own[i], blocks.shared[i], blocks.triangle[i], blocks.border[i], *of_null))
     return sorted(found, key=lambda block: int(block.own[0]))
 

@@ -16,7 +16,6 @@ from scipy.special import chdtri
 from adjust.array_types import Array, Indices, Mask
 from adjust.problem.camera import Camera
 from adjust.problem.condition_equations import observed_in_camera
-from adjust.problem.estimates import adjusted_image
 from adjust.problem.parameter import Parameter, shortened
 from adjust.solution.blunder_hypotheses import Trials, mirrored_images, reversed_y
 from adjust.solution.result import Adjustment
@@ -165,9 +164,9 @@ def _sides(result: Adjustment) -> dict[str, float]:
     _, extents, axes = np.linalg.svd(xyz - xyz.mean(axis=0), full_matrices=False)
     if extents[1] < FLAT * extents[0] or extents[2] > FLAT * extents[0]:
         return {}
-    images = [image for image in network.images if image.name not in network.objectless_images]
-    stations = {image.name: adjusted_image(result, image.name).station for image in images}
-    return {name: float(np.sign((station - xyz.mean(axis=0)) @ axes[2])) for name, station in stations.items()}
+    sides = np.sign((result.values[result.run.problem.exterior[:, :3]] - xyz.mean(axis=0)) @ axes[2]).tolist()
+    shown = {image.name: side for image, side in zip(network.images, sides, strict=True)}
+    return {name: side for name, side in shown.items() if name not in network.objectless_images}
 
 
 def _principal_point(view: _View, result: Adjustment, family: float) -> Iterator[str]:
@@ -175,7 +174,7 @@ def _principal_point(view: _View, result: Adjustment, family: float) -> Iterator
     parameters = [Parameter.interior(name, axis) for axis in ("x0", "y0")]
     found = result.values_of(parameters)
     words = f"The principal point of camera {name} is found at ({found[0]:.4g}, {found[1]:.4g}) mm"
-    if far := _far_from_given(view.camera, found, result.cofactor_of(parameters), result.sigma0, family):
+    if far := _far_from_given(view.camera, found, result, family):
         yield f"{words}, {far}"
         return
     if picture is None:
@@ -194,18 +193,19 @@ def _principal_point(view: _View, result: Adjustment, family: float) -> Iterator
         )
 
 
-def _far_from_given(camera: Camera, found: Array, cofactor: Array, sigma0: float, family: float) -> str:
+def _far_from_given(camera: Camera, found: Array, result: Adjustment, family: float) -> str:
     """Describe a significant contradiction between estimated and given principal point; empty where there is none."""
     priors = [prior for prior in (camera.x0_mm, camera.y0_mm) if prior is not None and 0.0 < prior.sigma < np.inf]
     if len(priors) < len(found):
         return ""
     given, sigma = np.array([(prior.value, prior.sigma) for prior in priors]).T
+    cofactor = result.cofactor_of([Parameter.interior(camera.name, axis) for axis in ("x0", "y0")])
     size, axes = np.linalg.eigh((np.diag(sigma**2) - cofactor) / np.outer(sigma, sigma))
     along = axes.T @ ((found - given) / sigma)
     checked = size > 1e-6
     if not checked.any():
         return ""
-    statistic = float((along[checked] ** 2 / size[checked]).sum()) / max(1.0, sigma0) ** 2
+    statistic = float((along[checked] ** 2 / size[checked]).sum()) / max(1.0, result.sigma0) ** 2
     if statistic <= chdtri(int(checked.sum()), family):
         return ""
     off = found - given
