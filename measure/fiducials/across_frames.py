@@ -116,7 +116,8 @@ def _misfit(
     measured = (places if film.lens is None else film.lens.ideal_px(places)) @ mm
     covariances = np.array([mm @ np.asarray(mark.covariance_px2) @ mm.T for mark in marks])
     pose = frame.pose.name if frame.pose else "0"
-    return FrameMisfit(FrameMarks.from_places(given, measured, covariances, film.model), sites, pose)
+    weak = np.array([mark.status is Status.WEAK for mark in marks])
+    return FrameMisfit(FrameMarks.from_places(given, measured, covariances, film.model), sites, pose, weak=weak)
 
 
 def _explain_together(frames: Frames, layout: FiducialLayout, film_mm: float) -> tuple[Explanation, Reason]:
@@ -160,7 +161,7 @@ def _in_scan_axes(frame: FrameMisfit, sites: Array, given_mm: Array) -> FrameMis
     """Transform a frame to the scan's axes and nearest sites (m, 2), with the variances of its given places added."""
     marks = frame.marks.widen(given_mm[frame.sites] ** 2).rotate(up_from_camera(frame.pose))
     nearest = np.hypot(*np.moveaxis(marks.given_mm[:, None] - sites[None], -1, 0)).argmin(axis=1)
-    return FrameMisfit(marks, nearest, frame.pose)
+    return replace(frame, marks=marks, sites=nearest)
 
 
 def _add_findings(
@@ -187,11 +188,12 @@ def _add_findings(
         if variance > 0
     }
     known_um = 1000 * float(np.sqrt(max(variances.max(), film_mm**2)))  # including what the adjustment adds later
+    moved = {names[mark]: Doubt(own.weak_mm2 * px_per_mm**2, cause) for mark in np.flatnonzero(own.weak).tolist()}
     problem = _problem(own, shared, names, suspects, known_um)
     is_known = own.hypothesis is Hypothesis.PITCH and any(Code.PITCH in each.codes for each in frame.problems)
     other_problems = [each for each in frame.problems if not {*each.codes} & {*problem.codes} & {Code.PERSPECTIVE}]
     problems = (*other_problems, problem) if problem and not is_known else frame.problems
-    return replace(add_doubts(frame, bent), problems=problems), film_mm
+    return replace(add_doubts(add_doubts(frame, bent), moved), problems=problems), film_mm
 
 
 def _suspicion(off_mm: float) -> Reason:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import chdtri, fdtrc, logsumexp
 
-from measure.array_types import Array
+from measure.array_types import Array, Mask
 from measure.fiducials.options import AFFINITY_SIGMA, MOST_BENT_MM, SCATTER_DEGREES, SCATTER_MM, film_terms, interleaved
 from measure.flags import FALSE_DOUBT
 
@@ -34,7 +34,7 @@ _MOST_OFF_MM = 0.5  # largest standard deviation of a gross error: marks are not
 _FEWEST = 3  # marks needed for a frame
 _LEAST_GATE = 0.1  # fraction of the gate: film may displace a mark by this much, however well most of them agree
 _TURNED = 0.2  # shear per stretch that a wrong pitch causes in a frame rotated by up to 6 degrees
-_MOST_STRETCHED = 0.05  # largest stretch by a wrong pitch
+MOST_STRETCHED = 0.05  # largest stretch by a wrong pitch
 _MOST_PERSPECTIVE = 2e-4  # per mm: film photographed from 0.6 m, tilted by 7 degrees
 _PRIOR = np.log(FALSE_DOUBT)  # log prior probability of each deviation from an ordinary frame
 _QUANTILES = (np.arange(3) + 0.5) / 3  # at which an estimated variance is sampled, to average over it
@@ -150,6 +150,27 @@ class FrameMarks:
             return 0.0
         most = float(np.sqrt((self._beyond_affine.residuals**2).sum()))
         return float(brentq(lambda film_mm: self.chi_square(film_mm) - self.redundancy, 0.0, most)) ** 2
+
+    def added_variance_mm2(self, among: Mask, film_mm: float, affinity: Affinity) -> float:
+        """Variance along an axis of some marks, among (n,), in addition to their covariances.
+
+        Estimated like that of the film, from the chi-square of these marks given the others. Stretch and shear, and a
+        size that is not free, are random as in the affinity.
+        """
+        first = int(affinity.size_is_free)
+        strain = affinity.scatter.sigma * self.affine[:, first:]
+        spread = strain @ strain.T + film_mm**2 * np.eye(len(strain))
+        expected = self.expecting((self.affine @ affinity.mean).reshape(-1, 2), spread)
+        reduced = _Reduced.from_free(expected, self.affine[:, :first])
+        whitened = reduced.basis[np.repeat(among, 2)] / np.sqrt(reduced.variances)
+        shares, axes = np.linalg.eigh(whitened.T @ whitened)  # 0: misfit of the other marks alone
+        residuals = axes.T @ (reduced.residuals / np.sqrt(reduced.variances))
+        affected = shares > _RANK * shares[-1]
+        squares, shares = residuals[affected] ** 2, shares[affected]
+        if squares.sum() <= len(squares):
+            return 0.0
+        most = float((squares / shares).max())
+        return float(brentq(lambda mm2: float(np.sum(squares / (1 + mm2 * shares))) - len(squares), 0.0, most))
 
     def log_density(self, film_mm: float) -> float:
         """Log density of the misfit up to a constant, size, stretch and shear free."""
@@ -407,7 +428,7 @@ class _States:
 def _states(marks: FrameMarks, film: Scatter, affinity: Affinity) -> _States:
     films, stretches, bends = film.variances(), affinity.scatter.variances(), _widths(MOST_BENT_MM)
     bent = (films.mean() + bends**2, stretches, np.zeros(1))
-    pitch = (films, np.geomspace(AFFINITY_SIGMA / 10, _MOST_STRETCHED, _WIDTHS) ** 2, np.zeros(1))
+    pitch = (films, np.geomspace(AFFINITY_SIGMA / 10, MOST_STRETCHED, _WIDTHS) ** 2, np.zeros(1))
     most_mm = max(_MOST_PERSPECTIVE * marks.radius_mm**2, 2 * SCATTER_MM)
     oblique = (films.mean(keepdims=True), stretches.mean(keepdims=True), _widths(most_mm) ** 2)
     # Prior of bent film: the density falls with the inverse square of the standard deviation.
@@ -422,7 +443,7 @@ def _states(marks: FrameMarks, film: Scatter, affinity: Affinity) -> _States:
     effects = np.repeat([stretch, perspective], [3, 2], axis=0).T
     is_pitch = hypothesis == Hypothesis.PITCH
     effects[is_pitch, :3] = stretches.mean() + stretch[is_pitch, None] * (1.0, 1.0, _TURNED**2)
-    effects[:, 0] += (_MOST_STRETCHED * affinity.size_is_free) ** 2
+    effects[:, 0] += (MOST_STRETCHED * affinity.size_is_free) ** 2
     return _States(hypothesis.astype(np.intp), film_mm2, effects, prior)
 
 

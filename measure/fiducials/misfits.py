@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import chdtrc, chdtri
 
-from measure.array_types import Array
+from measure.array_types import Array, Mask
 from measure.fiducials.consistency import (
     LONE_AFFINITY,
+    MOST_STRETCHED,
     Affinity,
     FrameMarks,
     Hypothesis,
@@ -50,6 +51,8 @@ class FrameMisfit:
     hypothesis : accepted hypothesis.
     off_mm : size of the gross errors, by mark.
     suspect_mm2 : (n,) variances of marks that may have a gross error.
+    weak : (n,) marks with the status weak.
+    weak_mm2 : variance along an axis that the weak marks have in addition.
     """
 
     marks: FrameMarks
@@ -60,6 +63,8 @@ class FrameMisfit:
     hypothesis: Hypothesis = Hypothesis.SOUND
     off_mm: Mapping[int, float] = field(default_factory=dict)
     suspect_mm2: Array = field(default_factory=lambda: np.zeros(1))
+    weak: Mask = field(default_factory=lambda: np.zeros(1, dtype=bool))
+    weak_mm2: float = 0.0
 
     @property
     def places(self) -> NDArray[np.intp]:
@@ -214,6 +219,9 @@ def explain(frames: Frames, places_mm: Array, sigma_mm: Array, free_mm: float, b
         least = min(p_values.values(), default=1.0)
         if least * len(frames) >= FALSE_DOUBT:
             films_mm = {place: each.film_mm or film.sigma for place, each in frames.items()}
+            for place, each in frames.items():
+                variance = _weak_mm2(each, expected[place], films_mm[place], affinities.get(place, LONE_AFFINITY))
+                frames[place] = replace(each, weak_mm2=variance)
             return Explanation(frames, Pattern.from_frames(frames, films_mm, *sites), film, is_more)
         limit = min(FALSE_DOUBT / len(frames), max(least, 1e-300) ** _AS_ODD)
         for place, p_value in p_values.items():
@@ -233,6 +241,16 @@ def _explain_alone(frame: FrameMisfit, marks: FrameMarks, film: Scatter, affinit
     film_mm = float(np.sqrt(film.sigma**2 + marks.film_variance_mm2()))
     suspect = np.where(found.suspects, off_mm**2 / 2, 0.0)
     return replace(frame, film_mm=film_mm, hypothesis=hypothesis, suspect_mm2=suspect)
+
+
+def _weak_mm2(frame: FrameMisfit, marks: FrameMarks, film_mm: float, affinity: Affinity) -> float:
+    """Variance that the weak marks of a frame have in addition: whatever made them weak may have moved them."""
+    if not frame.weak.any():
+        return 0.0
+    if frame.hypothesis is Hypothesis.PITCH:
+        affinity = replace(affinity, scatter=Scatter(MOST_STRETCHED))
+    marks = marks.widen(frame.suspect_mm2 * np.ones(len(frame.sites)))
+    return marks.added_variance_mm2(frame.weak, film_mm, affinity)
 
 
 def _own_film_mm(marks: FrameMarks, film: Scatter) -> float:

@@ -3,18 +3,21 @@
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from drawn import FRAME_PX, PITCH_UM, brute_picture, frame_picture, layout_of, measured, pixel_from_camera
 from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
-from measure import FiducialLayout, LayoutMark, MarkShape, cross
+from measure import FiducialLayout, FiducialOptions, LayoutMark, MarkShape, cross
 from measure.fiducials.across_frames import CheckedFrames, check_frames
 from measure.fiducials.consistency import FrameMarks
 from measure.fiducials.options import BelievedFilm
-from measure.flags import Cause, Status
+from measure.flags import Cause, Code, Reason, Status
 from measure.geometry import up_from_camera
+from measure.marks.shapes import polygon, turned_part
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 
 Array = NDArray[np.float64]
@@ -403,3 +406,77 @@ def test_a_perspective_is_named_where_affine_films_are_stated_and_free_where_pro
     for mark in projective.marks:
         assert mark.covariance_px2 is not None
         np.testing.assert_allclose(np.sqrt(np.diag(mark.covariance_px2)), WRONG_MARKS_SIGMA_PX)
+
+
+# Weak marks: what made them weak may have moved them, by what the frame's misfit shows.
+
+
+def weaken(frame: FrameMeasurement, *numbers: int) -> FrameMeasurement:
+    """The frame with some marks of the status weak."""
+    reason = Reason("its contrast is low", Code.CONTRAST)
+    marks = [
+        replace(mark, status=Status.WEAK, reason=reason) if number in numbers else mark
+        for number, mark in enumerate(frame.marks)
+    ]
+    return replace(frame, marks=tuple(marks))
+
+
+def added_px(frame: FrameMeasurement, cause: Cause = Cause.GIVEN_PLACES) -> list[float]:
+    return [mark.covariance.sigmas_px.get(cause, 0.0) for mark in frame.marks if mark.covariance]
+
+
+@pytest.mark.parametrize(("count", "off_px"), [(4, (1.2, 0.9)), (3, (120.0, -90.0))])
+def test_a_weak_mark_is_known_no_better_than_its_frame_shows(count: int, off_px: tuple[float, float]) -> None:
+    """The frame does not stand out: the error is small, or film may stretch three marks as much."""
+    layout = make_layout(FOUR[:count])
+    (frame,) = make_frames(layout, 1, np.random.default_rng(4))
+    (checked,) = checked_together([weaken(shift_mark(frame, 1, off_px), 1)], layout)
+    assert checked.problems == ()
+    added = added_px(checked)
+    assert 0.3 < added.pop(1) / np.hypot(*off_px) < 1.5
+    assert not any(added)
+
+
+def test_weak_marks_of_sound_frames_keep_their_covariances() -> None:
+    """An estimated variance is positive by chance, and then about as large as what is known."""
+    layout, rng = make_layout(FOUR), np.random.default_rng(5)
+    frames = [weaken(frame, 0, 1, 2, 3) for frame in make_frames(layout, 40, rng, camera_mm=0.005)]
+    added = [max(added_px(checked_together([frame], layout)[0])) for frame in frames]
+    assert np.mean(np.array(added) > 0) < 0.4
+    assert max(added) < 4 * np.hypot(SIGMA_PX, 0.005 * PX_PER_MM)
+
+
+def test_other_frames_tell_how_well_a_weak_mark_is_known() -> None:
+    layout = make_layout(EIGHT, sigma_mm=1.0)
+    frames = make_frames(layout, 6, np.random.default_rng(6), camera_mm=0.5)
+    frames[2] = weaken(shift_mark(frames[2], 3, (0.6, 0.0)), 3)
+    added = [added_px(frame, Cause.OTHER_FRAMES) for frame in checked_together(frames, layout)]
+    assert 0.2 < added[2][3] < 0.9
+    assert sum(map(sum, added)) == added[2][3]
+
+
+def test_a_weak_mark_along_whose_edge_a_scratch_runs_is_within_its_claim(tmp_path: Path) -> None:
+    """The scratch is as dark as the background: what is left of the mark matches its drawing, at another place."""
+    (half_wedge,) = polygon(((0.0, 0.0), (1.8, 0.0), (1.8, 1.0)))
+    (streak,) = polygon(((-1.5, -0.05), (2.5, -0.05), (2.5, 0.07), (-1.5, 0.07)))
+    layout = layout_of([MarkShape((turned_part(half_wedge, turn),)) for turn in (-45.0, -135.0, 135.0, 45.0)])
+    matrix, rng = pixel_from_camera("0"), np.random.default_rng(3)
+    grey = frame_picture(layout, matrix, 3) + rng.normal(0.0, 2200.0, (FRAME_PX, FRAME_PX))
+    truth = np.array([matrix @ (*mark.xy_mm, 1.0) for mark in layout.marks])
+    place = np.column_stack([matrix[:, :2], truth[0]])
+    covered = brute_picture(MarkShape((turned_part(streak, -45.0),)), place, FRAME_PX, FRAME_PX, 0.8)
+    grey += covered * (3000.0 + rng.normal(0.0, 2200.0, grey.shape) - grey)
+    frame = measured(grey, layout, tmp_path, FiducialOptions("0"))
+    (checked,) = check_frames([frame], layout, [(PITCH_UM, PITCH_UM)]).frames
+    assert checked.marks[0].status is Status.WEAK
+    sigmas = [mark_sigmas(each.marks[0], truth[0]) for each in (frame, checked)]
+    assert sigmas[0] > 5.0
+    assert sigmas[1] < 3.0
+    for before, after in zip(frame.marks[1:], checked.marks[1:], strict=True):
+        assert before.status is after.status is Status.MEASURED
+        np.testing.assert_array_equal(before.covariance_px2, after.covariance_px2)
+
+
+def mark_sigmas(mark: MarkMeasurement, truth_px: Array) -> float:
+    off = np.asarray(mark.center_px) - truth_px
+    return float(np.sqrt(off @ np.linalg.solve(np.asarray(mark.covariance_px2), off)))
