@@ -9,25 +9,19 @@ from adjust.errors import DatumError
 Kind = Literal["interior", "fiducial", "scanner", "board", "point", "exterior", "film", "join"]
 
 MANY = "*"  # owner or id that stands for several
-CODES: dict[Kind, str] = {
-    "interior": "IO",
-    "fiducial": "FID",
-    "scanner": "SC",
-    "board": "BD",
-    "point": "PT",
-    "exterior": "EO",
-    "film": "T",
-    "join": "JOIN",
+# By kind: code in files, and its owner in messages, one or several.
+_KINDS: dict[Kind, tuple[str, str, str]] = {
+    "interior": ("IO", "camera {owner}", ""),
+    "fiducial": ("FID", "fiducial {id}, camera {owner}", "several fiducials, camera {owner}"),
+    "scanner": ("SC", "scanner {owner}", ""),
+    "board": ("BD", "board {owner}", "several boards"),
+    "point": ("PT", "point {id}", "several points"),
+    "exterior": ("EO", "image {owner}", "several images"),
+    "film": ("T", "the film transformation of image {owner}", "several film transformations"),
+    "join": ("JOIN", "join {id}, frame {owner}", "several joins"),
 }
-_KINDS = {code: kind for kind, code in CODES.items()}
-_PLURALS: dict[Kind, str] = {
-    "fiducial": "several fiducials",
-    "board": "several boards",
-    "point": "several points",
-    "exterior": "several images",
-    "film": "several film transformations",
-    "join": "several joins",
-}
+CODES = {kind: code for kind, (code, _, _) in _KINDS.items()}
+_KIND_OF_CODE = {code: kind for kind, code in CODES.items()}
 
 
 class Parameter(NamedTuple):
@@ -115,38 +109,15 @@ class Parameter(NamedTuple):
     @property
     def any_owner(self) -> "Parameter":
         """Key of the same quantity of several owners: of any image, of any fiducial of the camera."""
-        match self.kind:
-            case "interior" | "scanner":
-                return self
-            case "fiducial":
-                return self._replace(id=MANY)
-            case "point":
-                return self._replace(id=MANY)
-            case _:
-                return self._replace(owner=MANY, id="")
+        if self.kind in ("interior", "scanner"):
+            return self
+        is_part = self.kind in ("fiducial", "point")
+        return self._replace(id=MANY) if is_part else self._replace(owner=MANY, id="")
 
     @property
     def _owner_label(self) -> str:
-        match self.kind:
-            case "fiducial":
-                of = _PLURALS["fiducial"] if self.id == MANY else f"fiducial {self.id}"
-                return f"{of}, camera {self.owner}"
-            case "point":
-                return _PLURALS["point"] if self.id == MANY else f"point {self.id}"
-            case "interior":
-                return f"camera {self.owner}"
-            case "scanner":
-                return f"scanner {self.owner}"
-            case kind if self.owner == MANY:
-                return _PLURALS[kind]
-            case "exterior":
-                return f"image {self.owner}"
-            case "film":
-                return f"the film transformation of image {self.owner}"
-            case "join":
-                return f"join {self.id}, frame {self.owner}"
-            case _:
-                return f"board {self.owner}"
+        _, one, several = _KINDS[self.kind]
+        return (several if several and MANY in (self.owner, self.id) else one).format(owner=self.owner, id=self.id)
 
 
 def description(parameters: Iterable[Parameter]) -> str:
@@ -182,7 +153,7 @@ def parameters_from_texts(texts: Sequence[str]) -> tuple[Parameter, ...]:
 def _parameter(text: str) -> Parameter:
     code, _, rest = text.partition(".")
     owner, dot, quantity = rest.rpartition(".")
-    kind = _KINDS.get(code)
+    kind = _KIND_OF_CODE.get(code)
     if kind is None or not dot or not quantity.isidentifier():
         raise ValueError(f"{text!r} names no quantity of an adjustment")
     if kind == "point":

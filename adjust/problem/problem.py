@@ -194,33 +194,24 @@ class Problem:
         """Column blocks of an observation's derivatives: columns of a free unknown in some observation."""
         free = np.append(self.unknowns.sigma > 0.0, False)  # the last stands for ABSENT
         shown = np.flatnonzero(np.bincount(self.image_numbers[~self.is_fiducial]))
-        positions = (
-            self.exterior[shown],
-            self.places,
-            self.film_positions,
-            self._camera_positions[shown],
-            self._scanner_positions,
-            self.board_positions,
-        )
+        exterior, film, camera, scanner = self._image_positions
+        positions = exterior[shown], self.places, film, camera[shown], scanner, self.board_positions
         used = [np.flatnonzero(free[each].any(axis=0)) for each in positions]
         ends = np.cumsum([len(members) for members in used])
         return Parts(*(Part(members, slice(end - len(members), end)) for members, end in zip(used, ends, strict=True)))
 
     @cached_property
+    def _image_positions(self) -> tuple[Indices, Indices, Indices, Indices]:
+        """(images, k) positions of exterior orientation, film, camera and scanner, padded with ABSENT."""
+        of, images, none = self.unknowns, self.network.images, np.empty(0, dtype=np.intp)
+        cameras = side_by_side([of.camera[image.camera] for image in images])
+        scanners = side_by_side([of.scanner.get(image.scanner, none) for image in images])
+        return self.exterior, self.film_positions, cameras, scanners
+
+    @cached_property
     def film_positions(self) -> Indices:
         """(images, k) positions of the film parameters, padded with ABSENT."""
         return side_by_side([self.unknowns.transformation[image.name] for image in self.network.images])
-
-    @cached_property
-    def _camera_positions(self) -> Indices:
-        """(images, k) positions of interior orientation and distortion, padded with ABSENT."""
-        return side_by_side([self.unknowns.camera[image.camera] for image in self.network.images])
-
-    @cached_property
-    def _scanner_positions(self) -> Indices:
-        """(images, k) positions of the scanner terms, padded with ABSENT."""
-        none = np.empty(0, dtype=np.intp)
-        return side_by_side([self.unknowns.scanner.get(image.scanner, none) for image in self.network.images])
 
     @cached_property
     def further(self) -> tuple[FurtherObservation, ...]:
@@ -292,13 +283,7 @@ class Problem:
         """(n, k) positions of the unknowns in an observation's derivatives, as in `parts`."""
         exterior, place, film, camera, scanner, board = self.parts
         by_image = np.empty((len(self.network.images), self.parts.width), dtype=np.intp)
-        of_images = (
-            (exterior, self.exterior),
-            (film, self.film_positions),
-            (camera, self._camera_positions),
-            (scanner, self._scanner_positions),
-        )
-        for part, positions in of_images:
+        for part, positions in zip((exterior, film, camera, scanner), self._image_positions, strict=True):
             by_image[:, part.columns] = positions[:, part.members]
         columns = by_image[self.image_numbers]
         for part in (exterior, camera):

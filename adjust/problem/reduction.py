@@ -10,7 +10,7 @@ import numpy as np
 
 from adjust.array_types import Array
 from adjust.functional_model.lens import Prior
-from adjust.problem.network import Approximations, Board, Image, Network, ObjectPoint
+from adjust.problem.network import Approximations, Network, ObjectPoint
 from adjust.problem.unknowns import Unknowns
 
 
@@ -51,12 +51,20 @@ class Reduction:
         """Reduce a network."""
         if self.is_none:
             return network
-        return replace(
-            network,
-            images=tuple(self._image(image) for image in network.images),
-            points=tuple(self._point(point) for point in network.points),
-            boards=tuple(self._board(board) for board in network.boards),
+        shift = self._element_shift
+        images, points = [], []
+        for image in network.images:
+            given = image.exterior and replace(image.exterior, values=image.exterior.values - shift)
+            images.append(replace(image, exterior=given))
+        for point in network.points:
+            priors = zip((point.X, point.Y, point.Z), self.origin.tolist(), strict=True)
+            moved = (prior and Prior(prior.value - off, prior.sigma) for prior, off in priors)
+            points.append(ObjectPoint(point.id, *moved))
+        boards = (
+            replace(board, places={id_: xyz - self.origin for id_, xyz in board.places.items()})
+            for board in network.boards
         )
+        return replace(network, images=tuple(images), points=tuple(points), boards=tuple(boards))
 
     def approximations(self, start: Approximations) -> Approximations:
         """Reduce approximations."""
@@ -85,19 +93,6 @@ class Reduction:
     def _element_shift(self) -> Array:
         """(6,) shift of an exterior orientation."""
         return np.append(self.origin, np.zeros(3))
-
-    def _image(self, image: Image) -> Image:
-        if image.exterior is None:
-            return image
-        values = image.exterior.values - self._element_shift
-        return replace(image, exterior=replace(image.exterior, values=values))
-
-    def _point(self, point: ObjectPoint) -> ObjectPoint:
-        priors = zip((point.X, point.Y, point.Z), self.origin.tolist(), strict=True)
-        return ObjectPoint(point.id, *(prior and Prior(prior.value - off, prior.sigma) for prior, off in priors))
-
-    def _board(self, board: Board) -> Board:
-        return replace(board, places={id_: xyz - self.origin for id_, xyz in board.places.items()})
 
 
 def _given_places(network: Network) -> Array:

@@ -1,6 +1,6 @@
 """Units of the tests for gross errors, and the significance levels and critical values of the tests."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -67,7 +67,15 @@ def _sidak(family: float, tests: int) -> float:
     return float(-np.expm1(np.log1p(-family) / max(tests, 1)))
 
 
-PRIOR_GROUPS = ("datum", "control", "interior", "scanner", "board", "exterior")
+_NAMES = {
+    "datum": "given fiducial {point}{alone} (camera {owner})",
+    "control": "control point {point}{alone}",
+    "interior": "given{alone} (camera {owner})",
+    "scanner": "given{alone} (scanner {owner})",
+    "board": "given{alone} (board {owner})",
+    "exterior": "given{alone} of image {owner}",
+}
+PRIOR_GROUPS = tuple(_NAMES)
 
 
 @dataclass(frozen=True)
@@ -85,29 +93,12 @@ class Tested:
     def name(self) -> str:
         """Description: "target 45 in image f1", "given fiducial 7 (camera RC20)", "control point 12 Z"."""
         alone = f" {self.coordinates[0]}" if len(self.coordinates) == 1 else ""
-        match self.group:
-            case "datum":
-                return f"given fiducial {self.point}{alone} (camera {self.owner})"
-            case "control":
-                return f"control point {self.point}{alone}"
-            case "interior":
-                return f"given{alone} (camera {self.owner})"
-            case "scanner":
-                return f"given{alone} (scanner {self.owner})"
-            case "board":
-                return f"given{alone} (board {self.owner})"
-            case "exterior":
-                return f"given{alone} of image {self.owner}"
-            case _:
-                return f"{self.group} {self.point}{alone} in image {self.owner}"
+        words = _NAMES.get(self.group, "{group} {point}{alone} in image {owner}")
+        return words.format(group=self.group, point=self.point, owner=self.owner, alone=alone)
 
     def coordinate_name(self, axis: int) -> str:
         """Description of one coordinate: "target 45 x in image f1"."""
-        return Tested(self.group, self.owner, self.point, (self.coordinates[axis],)).name if self.is_pair else self.name
-
-    @property
-    def is_pair(self) -> bool:
-        return len(self.coordinates) == 2
+        return replace(self, coordinates=(self.coordinates[axis % len(self.coordinates)],)).name
 
 
 @dataclass(frozen=True)
