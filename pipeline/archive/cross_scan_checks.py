@@ -17,7 +17,7 @@ from pipeline.archive.work import Work
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.measuring.camera_identification import add_plates
-from pipeline.measuring.roll import CheckedScan, build_roll, check_scans, note_same_frames
+from pipeline.measuring.roll import check_scans, name_roll, note_same_frames
 from pipeline.measuring.scan_task import ScanTask
 from pipeline.provenance import content_hash, fingerprint, shard_number
 from pipeline.results.measured_record import MeasuredScan
@@ -154,12 +154,10 @@ def _camera_lots(project: Project, tasks: Sequence[ScanTask]) -> list[OfCamera]:
 
 def _check_camera(
     project: Project, camera: CameraFile, tasks: Sequence[ScanTask], work: Work
-) -> tuple[CheckedScan, ...]:
+) -> tuple[MeasuredScan, ...]:
     """Second step of the measurement. Scans whose marks get other names by it are measured again."""
-    scans = [work.read(task.name) for task in tasks]
-    roll = build_roll(tasks, scans, camera.writing)
-    again = list(work.measure(roll.tasks)) if roll.tasks else []
-    return check_scans(camera, scans, roll, again, project.film)
+    scans = name_roll(tasks, [work.read(task.name) for task in tasks], camera.writing, work.measure)
+    return check_scans(camera, scans, project.film)
 
 
 def _writing_remarks(project: Project, tasks: Sequence[ScanTask], work: Work) -> Remarks:

@@ -4,8 +4,10 @@ all images."""
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from measure.flags import NO_REASON, SHEET_POINT_ELSEWHERE, SHEET_POINT_OFF_PLACE, Code, Reason, Status
 from measure.results import MarkMeasurement
@@ -85,58 +87,59 @@ class CodedPoints:
         return cls(tuple(xyz), coordinates, along[:, :2], is_flat(along), settings)
 
 
-def coded_candidates(scan: Scan, coded: CodedPoints) -> list[Candidate]:
-    """Candidates for the dots of such points in the whole scan, the strongest first."""
+@dataclass(frozen=True, eq=False)
+class _CodedDots:
+    """Dots found in a scan.
+
+    Attributes
+    ----------
+    found : candidates, the strongest first.
+    read : point, by index, that the ring around each dot names, right or wrong.
+    named : without points that were read at several places: these do not identify anything, until the others tell which
+        is right.
+    notes : on these points.
+    none_named : reason why no dot is identified by its code, if none is.
+    """
+
+    found: Sequence[Candidate]
+    read: Mapping[int, int]
+    named: dict[int, int]
+    notes: tuple[str, ...]
+    none_named: str
+
+
+def _coded_dots(scan: Scan, coded: CodedPoints, mirrored: bool = False) -> _CodedDots:
+    """Find the dots of coded points in the whole scan, and read their codes. mirrored: the film is seen from its other
+    side."""
     greatest = max(_GREATEST_SHARE * float(np.hypot(scan.width_px, scan.height_px)), _LEAST_DIAMETER_PX)
     search = DiskSearch((_LEAST_DIAMETER_PX, greatest), coded.settings.polarity, _LEAST_CONTRAST)
-    return disk_candidates(scan, search)
-
-
-def read_numbers(scan: Scan, found: Sequence[Candidate], coded: CodedPoints, mirrored: bool = False) -> dict[int, int]:
-    """Read the number around each dot that has one. mirrored: the film is seen from its other side."""
-    code = coded.settings.code
-    read = {index: read_code(scan, dot, code) for index, dot in enumerate(found)} if code else {}
-    return {
-        index: code.mirrored(number) if mirrored else number
-        for index, number in read.items()
-        if number is not None and code is not None
-    }
-
-
-def points_read(numbers: Mapping[int, int], coded: CodedPoints) -> dict[int, int]:
-    """Point (by index) that the ring around each dot names, right or wrong."""
+    found, code = disk_candidates(scan, search), coded.settings.code
+    assert code is not None
+    read = {dot: number for dot, one in enumerate(found) if (number := read_code(scan, one, code)) is not None}
+    numbers = {dot: code.mirrored(number) if mirrored else number for dot, number in read.items()}
     row = {id: i for i, id in enumerate(coded.ids)}
-    points = {dot: coded.settings.numbers.get(number, str(number)) for dot, number in numbers.items()}
-    return {dot: row[point] for dot, point in points.items() if point in row}
-
-
-def named_by_code(points: Mapping[int, int], coded: CodedPoints) -> tuple[dict[int, int], tuple[str, ...]]:
-    """Drop points that were read at several places: these do not identify anything, until the others tell which is
-    right. Also returns notes."""
+    names = {dot: coded.settings.numbers.get(number, str(number)) for dot, number in numbers.items()}
+    points = {dot: row[name] for dot, name in names.items() if name in row}
     count = Counter(points.values())
     twice = sorted(coded.ids[point] for point in count if count[point] > 1)
     notes = (f"The codes of {listed(twice)} were read at more than one place and name nothing.",) if twice else ()
-    return {dot: point for dot, point in points.items() if count[point] == 1}, notes
-
-
-def none_coded(found: Sequence[Candidate], numbers: dict[int, int], coded: CodedPoints) -> str:
-    """Reason why no dot is identified by its code."""
-    bits = coded.settings.code.bits if coded.settings.code else 0
     if not found:
-        return "no dot was found"
-    if not numbers:
-        return f"none of the {len(found)} dots found has a ring of {bits} segments about it that can be read"
-    read = ", ".join(str(number) for number in sorted(set(numbers.values()))[:8])
-    return f"the codes read ({read}) are those of no point of the sheet, or were read at more than one place"
+        why = "no dot was found"
+    elif not numbers:
+        why = f"none of the {len(found)} dots found has a ring of {code.bits} segments about it that can be read"
+    else:
+        shown = ", ".join(str(number) for number in sorted(set(numbers.values()))[:8])
+        why = f"the codes read ({shown}) are those of no point of the sheet, or were read at more than one place"
+    named = {dot: point for dot, point in points.items() if count[point] == 1}
+    return _CodedDots(found, points, named, notes, why)
 
 
 def measure_sheet(scan: Scan, sheet: CodedPoints) -> tuple[tuple[MarkMeasurement, ...], tuple[str, ...]]:
     """Measure every point of a flat sheet. Returns a mark for each, and notes."""
     scan = scan.green_channel()
-    found = coded_candidates(scan, sheet)
-    numbers = read_numbers(scan, found, sheet)
-    coded, notes = named_by_code(points_read(numbers, sheet), sheet)
-    naming: Naming | str = none_coded(found, numbers, sheet)
+    dots = _coded_dots(scan, sheet)
+    found, coded, notes = dots.found, dots.named, dots.notes
+    naming: Naming | str = dots.none_named
     if coded:
         alike = [i for i, dot in enumerate(found) if dot.contrast_dn * _sign(found, coded) > 0.0]
         found, coded = [found[i] for i in alike], {new: coded[i] for new, i in enumerate(alike) if i in coded}
@@ -184,20 +187,18 @@ def measure_coded_field(
 ) -> tuple[tuple[MarkMeasurement, ...], tuple[str, ...]]:
     """Measure every point of a field in space. Returns a mark for each, and notes."""
     scan = scan.green_channel()
-    found = coded_candidates(scan, points)
-    numbers = read_numbers(scan, found, points, _is_mirrored(measured))
-    read = points_read(numbers, points)
-    coded, notes = named_by_code(read, points)
-    model = camera_model(camera, measured)
+    place = measured.frame.pixel_from_camera  # the camera frame's y points up, the scan's rows down
+    dots = _coded_dots(scan, points, place is not None and bool(np.linalg.det(place[:, :2]) > 0.0))
+    found, notes, model = dots.found, dots.notes, camera_model(camera, measured)
     if isinstance(model, str):
         named: NamedField | str = model
-    elif not coded:
-        named = none_coded(found, numbers, points)
+    elif not dots.named:
+        named = dots.none_named
     else:
-        named = name_field(field, model, camera, measured, found, coded)
+        named = name_field(field, model, camera, measured, found, dots.named)
     if isinstance(named, str):
         return absent_targets(points.ids, named), (*notes, f"No target has a name: {named}.")
-    ids = {dot: points.ids[point] for dot, point in read.items()}
+    ids = {dot: points.ids[point] for dot, point in dots.read.items()}
     misread = [(id, found[dot]) for dot, id in ids.items() if named.candidates.get(id) is not found[dot]]
     if misread:
         others = listed(sorted({id for id, _ in misread}))
@@ -224,12 +225,6 @@ def _contradiction(prediction: TargetPrediction, misread: Sequence[tuple[str, Ca
     return NO_REASON
 
 
-def _is_mirrored(measured: MeasuredScan) -> bool:
-    """Whether the scan shows the film from its other side. The camera frame's y points up, the scan's rows down."""
-    place = measured.frame.pixel_from_camera
-    return place is not None and bool(np.linalg.det(place[:, :2]) > 0.0)
-
-
 def _set_dot_size(field: Field, named: NamedField, measured: MeasuredScan) -> Field:
     """Estimate the radius of the dots from the candidates, where the project does not give it."""
     if field.radius > 0.0:
@@ -243,16 +238,62 @@ def _set_dot_size(field: Field, named: NamedField, measured: MeasuredScan) -> Fi
     return replace(unit, radius=unit.radius * float(np.median(ratios)))
 
 
-@dataclass(frozen=True, eq=False)
-class _Sheet:
-    """Points of a sheet: their ids, and coordinates (n, 3) in its plane and perpendicular to it."""
+def check_sheet(project: Project, scans: Sequence[MeasuredScan]) -> tuple[MeasuredScan, ...]:
+    """Doubt or reject sheet points that contradict the other points of their image and the other images of the
+    sheet."""
+    sheet = _sheet(project)
+    if not sheet:
+        return tuple(scans)
+    places, row = plane_coordinates(np.array(list(sheet.values()))), {id: i for i, id in enumerate(sheet)}
+    images: dict[str, ImagePoints] = {}
+    for camera in project.cameras.values():  # the images of one camera share a lens
+        own = [scan for scan in scans if project.image_camera(scan.frame.image) is camera]
+        points = predict_sheet_points([_sheet_image(scan, row) for scan in own], places)
+        images |= {scan.frame.image: one for scan, one in zip(own, points, strict=True) if one is not None}
+    if not images:
+        return tuple(scans)
+    shown = Counter(int(point) for image in images.values() for point in image.index)
+    names, checked = list(sheet), {scan.frame.image: scan for scan in scans}
+    for (name, image), one in zip(images.items(), compare_images(list(images.values()), places), strict=True):
+        most_px = FLAT * float(np.hypot(*np.ptp(image.targets.places_px, axis=0)))
+        far_px, p_values = np.hypot(*one.off_px.T).tolist(), (shown.total() * one.chance).tolist()
+        verdicts = {
+            names[point]: _SheetTest(off_px, p, shown[point] - 1, off_px > most_px)
+            for point, off_px, p in zip(image.index.tolist(), far_px, p_values, strict=True)
+        }
+        scan = checked[name]
+        checked[name] = scan.changed(
+            [
+                _tested_mark(mark, verdicts.get(mark.point)) if mark.kind == "target" else mark
+                for mark in scan.frame.marks
+            ]
+        )
+    return tuple(checked[scan.frame.image] for scan in scans)
 
-    ids: tuple[str, ...]
-    places: Array
+
+def _sheet(project: Project) -> Mapping[str, ArrayLike]:
+    """Points of the project's board, as printed, or of its flat coded sheet; empty without either."""
+    settings = project.targets
+    if settings is not None and settings.board is not None:
+        return settings.board.object_points()
+    if settings is None or settings.code is None:
+        return {}
+    coded = CodedPoints.from_project(project, settings)
+    return dict(zip(coded.ids, coded.xyz, strict=True)) if coded.is_flat else {}
 
 
-@dataclass(frozen=True)
-class _Verdict:
+def _sheet_image(scan: MeasuredScan, row: Mapping[str, int]) -> SheetImage:
+    targets = [mark for mark in scan.frame.marks if mark.kind == "target" and mark.point in row]
+    marks = [mark for mark in targets if mark.status.is_observation]
+    return SheetImage(
+        np.array([row[mark.point] for mark in marks], dtype=np.intp),
+        np.array([mark.center_px for mark in marks]).reshape(-1, 2),
+        np.array([mark.covariance_px2 for mark in marks]).reshape(-1, 2, 2),
+        (scan.width_px, scan.height_px),
+    )
+
+
+class _SheetTest(NamedTuple):
     """Test result of one mark.
 
     Attributes
@@ -269,83 +310,10 @@ class _Verdict:
     is_beyond: bool
 
 
-def check_sheet(project: Project, scans: Sequence[MeasuredScan]) -> tuple[MeasuredScan, ...]:
-    """Doubt or reject sheet points that contradict the other points of their image and the other images of the
-    sheet."""
-    sheet = _sheet(project)
-    if sheet is None:
-        return tuple(scans)
-    images = _images(project, scans, sheet)
-    verdicts = dict(zip(images, _verdicts(list(images.values()), sheet), strict=True))
-    return tuple(_apply_verdicts(scan, verdicts.get(scan.frame.image, {})) for scan in scans)
-
-
-def _sheet(project: Project) -> _Sheet | None:
-    """Points of the project's board, as printed, or of its flat coded sheet; None without either."""
-    settings = project.targets
-    if settings is not None and settings.board is not None:
-        points = settings.board.object_points()
-        return _Sheet(tuple(points), plane_coordinates(np.array(list(points.values()))))
-    if settings is None or settings.code is None:
-        return None
-    coded = CodedPoints.from_project(project, settings)
-    return _Sheet(coded.ids, plane_coordinates(coded.xyz)) if coded.is_flat else None
-
-
-def _images(project: Project, scans: Sequence[MeasuredScan], sheet: _Sheet) -> dict[str, ImagePoints]:
-    """Sheet points in each image, by its name; the images of one camera share a lens."""
-    row = {id: i for i, id in enumerate(sheet.ids)}
-    images: dict[str, ImagePoints] = {}
-    for camera in project.cameras.values():
-        own = [scan for scan in scans if project.image_camera(scan.frame.image) is camera]
-        points = predict_sheet_points([_sheet_image(scan, row) for scan in own], sheet.places)
-        images |= {scan.frame.image: one for scan, one in zip(own, points, strict=True) if one is not None}
-    return images
-
-
-def _sheet_image(scan: MeasuredScan, row: Mapping[str, int]) -> SheetImage:
-    targets = [mark for mark in scan.frame.marks if mark.kind == "target" and mark.point in row]
-    marks = [mark for mark in targets if mark.status.is_observation]
-    return SheetImage(
-        np.array([row[mark.point] for mark in marks], dtype=np.intp),
-        np.array([mark.center_px for mark in marks]).reshape(-1, 2),
-        np.array([mark.covariance_px2 for mark in marks]).reshape(-1, 2, 2),
-        (scan.width_px, scan.height_px),
-    )
-
-
-def _verdicts(images: Sequence[ImagePoints], sheet: _Sheet) -> list[dict[str, _Verdict]]:
-    """Test results by point, for each image."""
-    if not images:
-        return []
-    shown = Counter(int(point) for image in images for point in image.index)
-    tests = sum(shown.values())
-    verdicts: list[dict[str, _Verdict]] = []
-    for image, one in zip(images, compare_images(images, sheet.places), strict=True):
-        most_px = FLAT * float(np.hypot(*np.ptp(image.targets.places_px, axis=0)))
-        far = np.hypot(*one.off_px.T)
-        rows = zip(image.index.tolist(), far.tolist(), one.chance.tolist(), strict=True)
-        verdicts.append(
-            {
-                sheet.ids[point]: _Verdict(off, tests * chance, shown[point] - 1, off > most_px)
-                for point, off, chance in rows
-            }
-        )
-    return verdicts
-
-
-def _apply_verdicts(scan: MeasuredScan, verdicts: Mapping[str, _Verdict]) -> MeasuredScan:
-    marks = [
-        _apply_verdict(mark, verdicts[mark.point]) if mark.kind == "target" and mark.point in verdicts else mark
-        for mark in scan.frame.marks
-    ]
-    return scan.changed(marks)
-
-
-def _apply_verdict(mark: MarkMeasurement, verdict: _Verdict) -> MarkMeasurement:
+def _tested_mark(mark: MarkMeasurement, verdict: _SheetTest | None) -> MarkMeasurement:
     """Set the status of a mark by its test."""
     # Without another image, the mark and the point on the sheet may be at fault; with few others, any of them.
-    if verdict.chance > SHEET_POINT_OFF_PLACE:
+    if verdict is None or verdict.chance > SHEET_POINT_OFF_PLACE:
         return mark
     witnesses = "the sheet's other points" + (" and other pictures" if verdict.others else "")
     how = f"it lies {verdict.off_px:.2f} px from where {witnesses} put it"

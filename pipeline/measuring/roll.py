@@ -2,9 +2,8 @@
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import NewType
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -32,37 +31,14 @@ _READ_FIRST = 4  # frames of a camera on which all text is read
 _WAYS = 2  # scan orientations searched by known lines: more would take as long as reading all text
 _LEAST = 6  # letters and digits that a known line needs
 _TURNS = ("0", "90", "180", "270")  # directions of text in the camera's frame
-CheckedScan = NewType("CheckedScan", MeasuredScan)  # after the cross-scan checks of its camera
 _SAME = ("run", "frames", "date")  # fields that identify a frame together with its number
 
 
-@dataclass(frozen=True, eq=False)
-class Roll:
-    """Scan orientations of one camera's frames from all of them together.
-
-    Attributes
-    ----------
-    poses : by image, the scan orientations that change.
-    tasks : scans whose marks get other names by this and have to be measured again.
-    """
-
-    poses: Mapping[str, Pose]
-    tasks: tuple[ScanTask, ...]
-
-    def named(self, scans: Sequence[MeasuredScan], again: Mapping[str, MeasuredScan]) -> list[MeasuredScan]:
-        """The scans in these orientations, as measured or, by image, measured again."""
-        return [self._named(scan, again.get(scan.frame.image, scan)) for scan in scans]
-
-    def _named(self, scan: MeasuredScan, new: MeasuredScan) -> MeasuredScan:
-        if new.failure:  # the file was readable before: keep the first measurement
-            return scan
-        frame = scan.frame
-        pose = self.poses.get(frame.image, frame.pose)
-        return replace(new, frame=replace(new.frame, pose=pose, writing=frame.writing))
-
-
-def build_roll(tasks: Sequence[ScanTask], scans: Sequence[MeasuredScan], places: Sequence[WrittenPlace]) -> Roll:
-    """Build the roll of one camera's scans.
+def name_roll(
+    tasks: Sequence[ScanTask], scans: Sequence[MeasuredScan], places: Sequence[WrittenPlace], measure: Measure
+) -> list[MeasuredScan]:
+    """Name the marks of one camera's scans by scan orientations from all of its frames together. Scans whose marks get
+    other names by this are measured again.
 
     Parameters
     ----------
@@ -74,7 +50,16 @@ def build_roll(tasks: Sequence[ScanTask], scans: Sequence[MeasuredScan], places:
     poses = poses_of_roll(free, places)
     names = {scan.frame.image: scan.frame.pose.name for scan in free if scan.frame.pose}
     again = [task.posed(poses[task.name].name) for task in tasks if task.name in poses]
-    return Roll(poses, tuple(task for task in again if task.options.fiducials.pose != names.get(task.name)))
+    other = [task for task in again if task.options.fiducials.pose != names.get(task.name)]
+    new = {scan.frame.image: scan for scan in (measure(other) if other else ())}
+    named = []
+    for scan in scans:
+        frame, latest = scan.frame, new.get(scan.frame.image, scan)
+        if not latest.failure:  # the file was readable before: then the first measurement stays
+            pose = poses.get(frame.image, frame.pose)
+            scan = replace(latest, frame=replace(latest.frame, pose=pose, writing=frame.writing))
+        named.append(scan)
+    return named
 
 
 def add_known_lines(
@@ -220,41 +205,20 @@ def _scan_pose(pose: Pose, turn: str) -> str:
 # Cross-scan checks of one camera. The measurements stay as they are; the checks are repeated whenever a scan is added.
 
 
-def check_scans(
-    camera: CameraFile,
-    measured: Sequence[MeasuredScan],
-    roll: Roll,
-    again: Iterable[MeasuredScan],
-    film: BelievedFilm,
-) -> tuple[CheckedScan, ...]:
-    """Check the scans of one camera against one another: scan orientations, the definition of crossings, and fiducials.
+def check_scans(camera: CameraFile, measured: Sequence[MeasuredScan], film: BelievedFilm) -> tuple[MeasuredScan, ...]:
+    """Check the scans of one camera against one another: the definition of crossings, and fiducials.
 
-    Parameters
-    ----------
-    camera : with templates for the marks that were learned.
-    again : the measured scans of `roll.tasks`.
-
-    Returns
-    -------
-    The scans in their order.
+    camera : with templates for the marks that were learned. Returns the scans in their order.
     """
-    scans = roll.named([scan for scan in measured if not scan.failure], {scan.frame.image: scan for scan in again})
+    scans = [scan for scan in measured if not scan.failure]
     marks = one_definition([scan.frame.marks for scan in scans])
-    frames = [replace(scan.frame, marks=own) for scan, own in zip(scans, marks, strict=True)]
-    by_image = {
-        scan.frame.image: replace(scan, frame=frame)
-        for scan, frame in zip(scans, _check_fiducials(camera, frames, scans, film), strict=True)
-    }
-    return tuple(CheckedScan(by_image.get(scan.frame.image, scan)) for scan in measured)
-
-
-def _check_fiducials(
-    camera: CameraFile, frames: Sequence[FrameMeasurement], scans: Sequence[MeasuredScan], film: BelievedFilm
-) -> Sequence[FrameMeasurement]:
-    """Check the fiducials across frames, if the camera has any."""
-    if not camera.layout_marks:
-        return frames
-    return check_frames(frames, camera.layout(), [scan.pitch_um for scan in scans], film).frames
+    frames: Sequence[FrameMeasurement] = [
+        replace(scan.frame, marks=own) for scan, own in zip(scans, marks, strict=True)
+    ]
+    if camera.layout_marks:
+        frames = check_frames(frames, camera.layout(), [scan.pitch_um for scan in scans], film).frames
+    by_image = {scan.frame.image: replace(scan, frame=frame) for scan, frame in zip(scans, frames, strict=True)}
+    return tuple(by_image.get(scan.frame.image, scan) for scan in measured)
 
 
 def note_same_frames(scans: Sequence[MeasuredScan], part_of: Callable[[str], str]) -> list[MeasuredScan]:

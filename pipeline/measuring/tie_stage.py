@@ -4,11 +4,11 @@ import re
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
-from typing import NewType
 
 import numpy as np
 
 from measure.flags import Code, Reason, Status
+from measure.geometry import Affine
 from measure.results import MarkMeasurement
 from measure.scans.remote import scan_path
 from measure.tie_points.features import TieFrame
@@ -32,7 +32,6 @@ _TIE_NAME = re.compile(r"tie\d+")
 _NO_FRAME = Reason(
     "No natural points are sought here: without fiducials there is no interior orientation.", Code.NO_FRAME
 )
-TiedScan = NewType("TiedScan", MeasuredScan)  # after the checks against all others of its project
 
 
 def add_joins(
@@ -77,13 +76,18 @@ def _add_marks(
 
 
 def _part_frame(project: Project, scan: MeasuredScan) -> TieFrame:
-    taken = [
-        (*mark.center_px, max(mark.quality.get("size_px", 0.0), _LEAST_MARK_PX))
-        for mark in scan.frame.marks
-        if mark.center_px is not None and mark.kind == "fiducial"
-    ]
-    marks = np.array(taken).reshape(-1, 3)
+    marks = _taken([mark for mark in scan.frame.marks if mark.kind == "fiducial"])
     return TieFrame(scan.frame.image, scan_path(scan.scan), np.eye(2, 3), None, marks, project.max_pixels)
+
+
+def _taken(marks: Sequence[MarkMeasurement]) -> Array:
+    """(n, 3) column, row and size of the places where no natural point is sought."""
+    places = [
+        (*mark.center_px, max(mark.quality.get("size_px", 0.0), _LEAST_MARK_PX))
+        for mark in marks
+        if mark.center_px is not None
+    ]
+    return np.array(places).reshape(-1, 3)
 
 
 def _agreed(scans: Sequence[MeasuredScan]) -> list[MeasuredScan]:
@@ -96,8 +100,10 @@ def _agreed(scans: Sequence[MeasuredScan]) -> list[MeasuredScan]:
             off_mm = None if second_from_first is None else _discrepancy_mm(first, second, second_from_first)
             if off_mm is None:
                 continue
-            span_mm = _span_mm(first, second)
-            if off_mm <= _GATE_MM + _GATE_SHARE * span_mm:
+            both = [
+                (np.hypot(scan.width_px, scan.height_px), scan.frame.px_per_mm or np.inf) for scan in (first, second)
+            ]
+            if off_mm <= _GATE_MM + _GATE_SHARE * float(sum(px / px_per_mm for px, px_per_mm in both)):
                 checked |= {first.frame.image, second.frame.image}
                 continue
             for scan, other in ((first, second), (second, first)):
@@ -147,16 +153,9 @@ def _discrepancy_mm(first: MeasuredScan, second: MeasuredScan, second_from_first
     if frame is None or second_frame is None or not _fiducials(second):
         return None
     there = np.array(list(_fiducials(second).values()))
-    camera = (there - second_frame[:, 2]) @ np.linalg.inv(second_frame[:, :2]).T
-    here = camera @ frame[:, :2].T + frame[:, 2]
-    predicted = here @ second_from_first[:, :2].T + second_from_first[:, 2]
-    off_px = np.hypot(*(predicted - there).T)
+    here = Affine(frame).apply(Affine(second_frame).inverse.apply(there))
+    off_px = np.hypot(*(Affine(second_from_first).apply(here) - there).T)
     return float(np.sqrt(np.mean(off_px**2))) / (second.frame.px_per_mm or 1.0)
-
-
-def _span_mm(first: MeasuredScan, second: MeasuredScan) -> float:
-    sides = [np.hypot(scan.width_px, scan.height_px) / (scan.frame.px_per_mm or np.inf) for scan in (first, second)]
-    return float(sum(sides))
 
 
 def _contradicted(scan: MeasuredScan, other: MeasuredScan, off_mm: float) -> MeasuredScan:
@@ -219,11 +218,6 @@ def add_ties(
 def _tie_frame(project: Project, scan: MeasuredScan) -> TieFrame | None:
     """Frame for the tie points; None where the camera has fiducials and too few of them were measured."""
     camera = project.image_camera(scan.frame.image)
-    taken = [
-        (*mark.center_px, max(mark.quality.get("size_px", 0.0), _LEAST_MARK_PX))
-        for mark in scan.frame.marks
-        if mark.center_px is not None
-    ]
     pixel_from_camera, frame_mm = scan.frame.pixel_from_camera, camera.frame_mm
     if pixel_from_camera is None:
         if camera.fiducials:
@@ -231,20 +225,15 @@ def _tie_frame(project: Project, scan: MeasuredScan) -> TieFrame | None:
         middle = np.array([scan.width_px - 1, scan.height_px - 1]) / 2
         pixel_from_camera = np.column_stack([np.diag([1000.0, -1000.0] / np.array(scan.pitch_um)), middle])
         frame_mm = None
-    path, marks = scan_path(scan.scan), np.array(taken).reshape(-1, 3)
-    frame = project.scanned_frame(scan.frame.image)
+    path, marks, frame = scan_path(scan.scan), _taken(scan.frame.marks), project.scanned_frame(scan.frame.image)
     return TieFrame(scan.frame.image, path, pixel_from_camera, frame_mm, marks, project.max_pixels, frame)
 
 
 def tie_scans(
     project: Project, scans: Sequence[MeasuredScan], reporter: Reporter, executor: Executor | None = None
-) -> tuple[TiedScan, ...]:
-    """Check and complete the scans across the whole project: sheet points, joins of partial scans, natural tie points.
-
-    Returns
-    -------
-    The scans in their order.
-    """
+) -> tuple[MeasuredScan, ...]:
+    """Check and complete the scans across the whole project, in their order: sheet points, joins of partial scans,
+    natural tie points."""
     together = check_sheet(project, [scan for scan in scans if not scan.failure])
     if project.has_parts:
         with reporter.stage("parts joined of") as count:
@@ -253,4 +242,4 @@ def tie_scans(
         with reporter.stage("natural points sought in") as count:
             together = add_ties(project, project.ties, together, count, executor)
     by_image = {scan.frame.image: scan for scan in together}
-    return tuple(TiedScan(by_image.get(scan.frame.image, scan)) for scan in scans)
+    return tuple(by_image.get(scan.frame.image, scan) for scan in scans)

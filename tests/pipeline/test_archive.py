@@ -29,7 +29,7 @@ from pipeline.archive.status import archive_status
 from pipeline.archive.verdicts import NEXT_STEP, Verdict
 from pipeline.cli import run
 from pipeline.files.camera_file import CameraFile
-from pipeline.measuring.roll import CheckedScan, check_scans
+from pipeline.measuring.roll import check_scans
 from pipeline.measuring.scan_measurement import MeasuredFile, measure_file
 from pipeline.measuring.scan_task import Measure, ScanTask
 from pipeline.results.comparator_file import read_measurement_hash
@@ -395,7 +395,7 @@ def test_of_many_scans_only_the_lot_of_a_new_one_is_tested_again(
     monkeypatch.setattr("pipeline.archive.cross_scan_checks._TOGETHER", 1)
     neighbour = list[list[str]]()
 
-    def counted(camera: CameraFile, scans: Sequence[MeasuredScan], *more: Any) -> tuple[CheckedScan, ...]:
+    def counted(camera: CameraFile, scans: Sequence[MeasuredScan], *more: Any) -> tuple[MeasuredScan, ...]:
         neighbour.append([scan.frame.image for scan in scans])
         return check_scans(camera, scans, *more)
 
