@@ -23,9 +23,7 @@ from rich.console import Console
 from measure.boards.measure import measure_board
 from measure.boards.specs import ChessboardSpec, CircleGridSpec
 from measure.scans.opening import open_scan
-from pipeline.calibration.board_options import board_options
-from pipeline.calibration.calibrate_stage import calibrate_pictures
-from pipeline.calibration.project_files import CalibrationOptions
+from pipeline.calibration.calibrate_stage import calibrate
 from pipeline.progress import Reporter, TimedCount
 
 Array = NDArray[np.float64]
@@ -79,9 +77,9 @@ def case(board: str, width: int, pictures: int, opencv: str, seed: int) -> dict[
                 measure_board(scan, spec)
         measuring_s = time.process_time() - begun
         begun = sum(os.times()[:4])  # child processes included
-        calibrate_pictures(
-            [Path(folder)], Path(folder) / "out", CalibrationOptions(board_options(*options)), reporter, 1
-        )
+        kind, size, square, marker, _, legacy = options
+        out = f"{folder}/out"
+        calibrate(folder, size, square, kind=kind, marker=marker, legacy=legacy, out=out, workers=1, reporter=reporter)
         command_s = sum(os.times()[:4]) - begun
     spent_s = measuring_s + reporter.cpu_s["calibrating"]
     return found | {

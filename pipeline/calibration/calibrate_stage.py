@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from html import escape
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, get_args
 
@@ -143,24 +144,10 @@ class Calibration(PlottedResult):
         ]
 
 
-def calibrate_pictures(
-    given: Sequence[Path], out: Path, options: CalibrationOptions, reporter: Reporter, workers: int | None = None
+def _calibrated(
+    given: Sequence[Path], out: Path, options: CalibrationOptions, reporter: Reporter, workers: int | None
 ) -> Calibration:
-    """Calibrate the cameras that took some images of a board.
-
-    Each camera is adjusted separately, so that a failure does not affect the others.
-
-    Parameters
-    ----------
-    given : image files, and folders that are searched at any depth
-    out : folder of the project and the results
-    workers : number of measuring processes; None: one per core
-
-    Raises
-    ------
-    InputError
-        Where there is no image, or no camera can be calibrated; the message gives the reason.
-    """
+    """Calibrate each camera separately, so that a failure does not affect the others."""
     pictures = find_pictures(given, out)
     first: LensModel = "opencv4" if options.lens == "auto" else options.lens
     lenses = dict.fromkeys((camera.name for camera in pictures.cameras), first)
@@ -178,7 +165,8 @@ def calibrate_pictures(
             try:
                 if any(turned is None for turned in camera.turned_deg.values()):
                     camera = find_turns(project, own, camera)
-                    pictures = pictures.replace_camera(camera)
+                    cameras = (*pictures.cameras[:done], camera, *pictures.cameras[done + 1 :])
+                    pictures = replace(pictures, cameras=cameras)
                     project = write_project(out, pictures, options, lenses)
                 choices[camera.name] = choice = _chosen_lens(project, own, camera, options, left_out)
                 lenses[camera.name] = choice.model if choice else first
@@ -191,27 +179,23 @@ def calibrate_pictures(
     project = write_project(out, replace(pictures, cameras=calibrated), options, lenses)
     summary = run_all(project, reporter, work)
     checks = read_check(project.check_path).cameras if project.check_path.exists() else {}
-    cameras = tuple(
+    found = tuple(
         camera_intrinsics(
-            adjustments[camera.name],
-            camera,
+            adjustments[each.name],
+            each,
             options.pixel_mm,
-            left_out={
-                name: why
-                for name, why in (left_out | dict(adjustments[camera.name].left_out)).items()
-                if name in camera.images
-            },
-            lens=choices[camera.name],
-            pitch_um=options.pitch_um,
-            check=checks.get(camera.name),
+            {name: why for name, why in {**left_out, **adjustments[each.name].left_out}.items() if name in each.images},
+            choices[each.name],
+            options.pitch_um,
+            checks.get(each.name),
         )
-        for camera in calibrated
+        for each in calibrated
     )
-    files = dict(camera_files(cameras, out, options.ros))
+    files = dict(camera_files(found, out, options.ros))
     for path, text in files.items():
         write_atomically(path, text)
     written = (*files, project.report_path, project.path)
-    return Calibration(cameras, pictures.unreadable, not_calibrated, written, summary, adjustments, options.pixel_mm)
+    return Calibration(found, pictures.unreadable, not_calibrated, written, summary, adjustments, options.pixel_mm)
 
 
 def _left_out(pictures: BoardPictureFiles, marks: Sequence[ComparatorPoint]) -> dict[str, str]:
@@ -222,10 +206,10 @@ def _left_out(pictures: BoardPictureFiles, marks: Sequence[ComparatorPoint]) -> 
         corners[mark.image] += mark.status.is_observation
         if not mark.status.is_observation and mark.reason:
             reasons[mark.image] = str(mark.reason)
-    few = {name: count for name, count in corners.items() if count < FEWEST_CORNERS}
     return {
         name: f"only {counted(count, 'corner')} of the board found" if count else reasons[name]
-        for name, count in few.items()
+        for name, count in corners.items()
+        if count < FEWEST_CORNERS
     }
 
 
@@ -291,7 +275,7 @@ def _nothing(pictures: BoardPictureFiles, left_out: Mapping[str, str], not_calib
 
 def _most_common(reasons: Iterable[str]) -> str:
     """The most frequent reason; "" without any."""
-    return next((reason for reason, _ in Counter(reasons).most_common(1)), "")
+    return max(Counter(reasons).items(), key=itemgetter(1), default=("",))[0]
 
 
 def calibrate(
@@ -352,4 +336,4 @@ def calibrate(
     given = board_options(kind, board, square, marker, dictionary, legacy, first_id)
     options = CalibrationOptions(given, LENSES[lens], square_pixels, pitch_um, ros)
     paths = [pictures] if isinstance(pictures, str | os.PathLike) else pictures
-    return calibrate_pictures([Path(path) for path in paths], Path(out), options, reporter or Reporter(), workers)
+    return _calibrated([Path(path) for path in paths], Path(out), options, reporter or Reporter(), workers)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from adjust.problem.parameter import Parameter
 from adjust.solution.result import Adjustment
@@ -20,6 +20,7 @@ from pipeline.types import Array
 
 HIGHLY_CORRELATED = 0.9
 _WORST = 3  # images named
+_FIGURES = ("rms_px", "sigma0", "corner_sigma_px", "unmodelled_sigma_px", "known_share")
 
 
 @dataclass(frozen=True)
@@ -37,12 +38,7 @@ class Intrinsic:
         return max(self.sigma_model, self.sigma_clusters or 0.0)
 
     def as_json(self) -> dict[str, float | None]:
-        return {
-            "value": self.value,
-            "sigma": self.sigma,
-            "sigma_model": self.sigma_model,
-            "sigma_clusters": self.sigma_clusters,
-        }
+        return {name: getattr(self, name) for name in ("value", "sigma", "sigma_model", "sigma_clusters")}
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -97,7 +93,6 @@ class CameraIntrinsics:
 
     def as_json(self) -> dict[str, Any]:
         values = {name: each.as_json() for name, each in self.values.items()}
-        scores = {} if self.lens is None else {score.model: score.rms_px for score in self.lens.scores}
         return {
             "name": self.pictures.name,
             "image_size_px": [self.pictures.width_px, self.pictures.height_px],
@@ -108,12 +103,8 @@ class CameraIntrinsics:
             **{f"{name}_px": values.pop(name) for name in CENTRE},
             "distortion": {"family": self.family, **values},
             "correlations": [{"of": [a, b], "value": value} for a, b, value in self.correlations],
-            "rms_px": self.rms_px,
-            "sigma0": self.sigma0,
-            "corner_sigma_px": self.corner_sigma_px,
-            "unmodelled_sigma_px": self.unmodelled_sigma_px,
-            "known_share": self.known_share,
-            "lens_rms_px": scores,
+            **{name: getattr(self, name) for name in _FIGURES},
+            "lens_rms_px": {} if self.lens is None else dict(self.lens.rms_px),
             "opencv": self._opencv_json(),
         }
 
@@ -130,9 +121,8 @@ class CameraIntrinsics:
     def print(self, console: Console) -> None:
         """Print the camera as a table, then the data it is based on."""
         title = f"{self.pictures.name}, {self.pictures.width_px} x {self.pictures.height_px} px"
-        table = Table(title=title, title_justify="left")
-        for column in ("parameter", "value", "standard deviation"):
-            table.add_column(column, justify="left" if column == "parameter" else "right")
+        figures = (Column(name, justify="right") for name in ("value", "standard deviation"))
+        table = Table("parameter", *figures, title=title, title_justify="left")
         for name, each in self.values.items():
             unit, digits = (", px", 2) if name in CENTRE else ("", 5)
             table.add_row(f"{name}{unit}", f"{each.value:.{digits}f}", f"{each.sigma:.{digits}f}")
@@ -147,10 +137,9 @@ class CameraIntrinsics:
             f"Corners {self.corner_sigma_px:.3f} px, unmodelled {self.unmodelled_sigma_px:.3f} px: what lens model, "
             "board and the picture's processing leave."
         )
-        if self.lens is not None and self.lens.scores:
+        if self.lens is not None and self.lens.rms_px:
             rms_px = {
-                score.model: "no solution" if score.rms_px is None else f"{score.rms_px:.3f} px"
-                for score in self.lens.scores
+                model: "no solution" if rms is None else f"{rms:.3f} px" for model, rms in self.lens.rms_px.items()
             }
             others = ", ".join(f"{model} {rms}" for model, rms in rms_px.items() if model != self.lens.model)
             yield (
@@ -195,7 +184,6 @@ def camera_intrinsics(
     adjustment: Adjustment,
     pictures: CameraPictures,
     pixel_mm: float,
-    *,
     left_out: Mapping[str, str],
     lens: LensChoice | None,
     pitch_um: float | None,
@@ -230,7 +218,11 @@ def camera_intrinsics(
             for row, (name, value) in enumerate(values.items())
         },
         covariance=correlation * np.outer(usable, usable),
-        correlations=tuple(_high_correlations(list(values), correlation)),
+        correlations=tuple(
+            (one, other, float(correlation[row, column]))
+            for (row, one), (column, other) in combinations(enumerate(values), 2)
+            if abs(correlation[row, column]) > HIGHLY_CORRELATED
+        ),
         left_out=left_out,
         used=len(adjustment.network.images),
         rms_px=float(np.sqrt((v_px**2).sum(axis=1).mean())),
@@ -250,12 +242,6 @@ def _worst_images(images: Sequence[str], v_px: Array) -> tuple[tuple[str, float]
     names, rows = np.unique(np.array(images), return_inverse=True)
     rms_px = np.sqrt(np.bincount(rows, (v_px**2).sum(axis=1)) / np.bincount(rows))
     return tuple((str(names[row]), float(rms_px[row])) for row in np.argsort(-rms_px)[:_WORST])
-
-
-def _high_correlations(names: Sequence[str], matrix: Array) -> Iterator[tuple[str, str, float]]:
-    for (row, one), (column, other) in combinations(enumerate(names), 2):
-        if abs(matrix[row, column]) > HIGHLY_CORRELATED:
-            yield one, other, float(matrix[row, column])
 
 
 def _pixels(calibration: PixelCalibration) -> dict[str, float]:

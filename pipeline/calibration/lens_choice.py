@@ -1,7 +1,7 @@
 """Selection of a digital camera's lens model by cross-validation: the simplest that predicts images left out as well as
 any."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -30,18 +30,12 @@ WIDE = 1.0  # half the image's diagonal over the principal distance, above which
 
 
 @dataclass(frozen=True)
-class LensScore:
-    """Result of one lens model. rms_px: prediction error of a point in images left out; None where the model has no
+class LensChoice:
+    """Selected lens model. rms_px: by model, prediction error of a point in images left out; None without a
     solution."""
 
     model: LensModel
-    rms_px: float | None
-
-
-@dataclass(frozen=True)
-class LensChoice:
-    model: LensModel
-    scores: tuple[LensScore, ...]
+    rms_px: Mapping[LensModel, float | None]
 
 
 def free_lens(model: LensModel, square_pixels: bool) -> Distortion:
@@ -67,24 +61,26 @@ def choose_lens(network: Network, square_pixels: bool, pixel_mm: float, adjusted
     adjusted : adjusts a network
     """
     if len(network.images) < FEWEST_PICTURES:
-        return LensChoice("opencv4", ())
+        return LensChoice("opencv4", {})
     squares: dict[LensModel, Array | None] = {}
     best: LensModel = "opencv4"
-    is_wide = False
+    (camera,), is_wide = network.cameras, False
     for model in PARAMETERS:
         if model == "fisheye" and not is_wide:
             continue
-        fitted = _try_adjustment(_replace_lens(network, free_lens(model, square_pixels)), adjusted)
+        free = replace(camera, distortion=free_lens(model, square_pixels))
+        fitted = _try_adjustment(replace(network, cameras=(free,)), adjusted)
         squares[model] = None if fitted is None else fitted.prediction_errors(FOLDS)
         if model == "opencv4":
-            is_wide = fitted is None or _is_wide(fitted)
+            c_mm = 0.0 if fitted is None else fitted.value(Parameter.interior(camera.name, "c"))
+            is_wide = float(np.hypot(*camera.frame_mm)) / 2.0 > WIDE * c_mm
         elif _is_better(squares[model], squares[best]):
             best = model
     sigma_px = np.sqrt(network.observations.covariance_mm2[0, 0, 0]) / pixel_mm
     rms_px = {
         model: None if each is None else float(np.sqrt(each.mean()) * sigma_px) for model, each in squares.items()
     }
-    return LensChoice(best, tuple(LensScore(model, rms) for model, rms in rms_px.items()))
+    return LensChoice(best, rms_px)
 
 
 def _is_better(squares: Array | None, than: Array | None) -> bool:
@@ -101,15 +97,3 @@ def _try_adjustment(network: Network, adjusted: Adjust) -> Adjustment | None:
     except AdjustmentError:
         return None
     return result if result.converged else None
-
-
-def _is_wide(fitted: Adjustment) -> bool:
-    """Whether the field of view is so wide that a fisheye is likely."""
-    (camera,) = fitted.network.cameras
-    c_mm = fitted.value(Parameter.interior(camera.name, "c"))
-    return float(np.hypot(*camera.frame_mm)) / 2.0 > WIDE * c_mm
-
-
-def _replace_lens(network: Network, lens: Distortion) -> Network:
-    (camera,) = network.cameras
-    return replace(network, cameras=(replace(camera, distortion=lens),))

@@ -1,7 +1,8 @@
 """Quarter turns of board images: the turn that fits the lens of the other images."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 
 from adjust.errors import AdjustmentError
@@ -20,14 +21,6 @@ from pipeline.results.comparator_file import ComparatorPoint
 
 PLAIN = 20.0  # twice the log-likelihood ratio; odds of e to the 10
 FEWEST_PICTURES = 3  # images with known turns needed to determine the lens
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """Weighted sum of squared residuals, and its redundancy."""
-
-    vpv: float
-    redundancy: int
 
 
 def find_turns(project: Project, marks: Sequence[ComparatorPoint], camera: CameraPictures) -> CameraPictures:
@@ -63,17 +56,14 @@ def find_turns(project: Project, marks: Sequence[ComparatorPoint], camera: Camer
         groups = [sought]  # all with the same turn
     turns, unsure = dict[str, int](), list[str]()
     for group in groups:
-        fits = dict[int, _Fit]()
+        fits = dict[int, Adjustment]()
         for turn in QUARTERS_DEG:
             images = group if lens else [*fixed, *group]
             network = turned_network(images, known | dict.fromkeys(group, turn))
             if lens is not None:
                 network = replace(network, cameras=(_held_camera(network.cameras[0], lens),))
-            try:
-                found = adjusted(network)
-            except AdjustmentError:
-                continue
-            fits[turn] = _Fit(found.vpv, found.redundancy)
+            with suppress(AdjustmentError):
+                fits[turn] = adjusted(network)
         best = min(fits, key=lambda turn: fits[turn].vpv, default=QUARTERS_DEG[0])
         turns |= dict.fromkeys(group, best)
         if not _is_plain(fits, best):
@@ -84,7 +74,7 @@ def find_turns(project: Project, marks: Sequence[ComparatorPoint], camera: Camer
     return replace(camera, turned_deg=known | turns, unsure_turns=tuple(unsure))
 
 
-def _is_plain(fits: Mapping[int, _Fit], best: int) -> bool:
+def _is_plain(fits: Mapping[int, Adjustment], best: int) -> bool:
     """Whether one turn fits significantly better than the other."""
     if len(fits) < len(QUARTERS_DEG):
         return bool(fits)

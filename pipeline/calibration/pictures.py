@@ -3,7 +3,7 @@
 import os
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -48,10 +48,6 @@ class BoardPictureFiles:
     files: Mapping[str, Path]
     cameras: tuple[CameraPictures, ...]
     unreadable: Mapping[str, str]
-
-    def replace_camera(self, camera: CameraPictures) -> "BoardPictureFiles":
-        """Replace the camera of this name."""
-        return replace(self, cameras=tuple(camera if each.name == camera.name else each for each in self.cameras))
 
 
 def find_pictures(given: Sequence[Path], out: Path) -> BoardPictureFiles:

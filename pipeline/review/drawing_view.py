@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -115,18 +115,7 @@ def drawing_json(drawing: CameraDrawing, placement: FramePlacement) -> Json:
     frame_mm = frame_size_mm(drawing, placement)
     return {
         "mark": drawing.mark,
-        "marks": [
-            {
-                "id": one.id,
-                "px": list(one.px),
-                "xy_mm": list(one.xy_mm),
-                "found_mm": list(placement.camera_mm(one.px)),
-                "turn_deg": one.turn_deg,
-                "blur_px": one.blur_px,
-                "unfitted": one.unfitted,
-            }
-            for one in drawing.marks
-        ],
+        "marks": [{**asdict(one), "found_mm": placement.camera_mm(one.px)} for one in drawing.marks],
         "pitch_um": list(placement.pitch_um),
         "pitch_source": placement.pitch_source,
         "frame_mm": None if frame_mm is None else list(frame_mm),
@@ -138,14 +127,11 @@ def drawing_json(drawing: CameraDrawing, placement: FramePlacement) -> Json:
 
 def _form(mark: MarkJson) -> list[Json]:
     """Form of the scalar keys of a mark, as in its table in a camera file."""
-    kind = mark["kind"]
-    rows = list(key_rows(MARK_TABLES["learned" if kind == "template" else kind]))
-    form = []
-    for row in rows:
+    kind, form = mark["kind"], []
+    for row in key_rows(MARK_TABLES["learned" if kind == "template" else kind]):
         choices = _CHOICES.get(row.name, ())
         if choices or row.type.startswith("number"):
-            absent = choices[0] if choices else 0.0
-            value = mark.get(row.name, absent)
+            value = mark.get(row.name, choices[0] if choices else 0.0)
             form.append({"key": row.name, "unit": row.unit, "meaning": row.meaning, "choices": choices, "value": value})
     return form
 
@@ -216,9 +202,9 @@ def take_step(drawing: CameraDrawing, placement: FramePlacement, step: Mapping[s
                 return _move_drawing(drawing, (float(col), float(row)))
             place = _handle_affine(drawing, shown).inverse.apply(np.array([col, row], float))
             return replace(drawing, mark=dict(add_vertex(mark, place)))
-        case {"drag": "place", "px": [float() | int() as col, float() | int() as row]}:
-            return _move_drawing(drawing, (float(col), float(row)))
         case {"drag": str(key), "px": [float() | int() as col, float() | int() as row]}:
+            if key == "place":
+                return _move_drawing(drawing, (float(col), float(row)))
             handle = next((one for one in handles(mark, shown.toward) if one.key == key), None)
             if handle is None:
                 raise InputError(f"the drawing has no {key!r} to drag.")
@@ -284,17 +270,17 @@ class DrawingAnswers:
     def draw(self, query: Query, body: Any) -> Any:
         """Apply a step to the drawing; returns the drawing as shown."""
         given = parse_values(DrawnCamera, body)
-        drawing, placement = self._placed(given.drawing)
+        drawing = parse_drawing(given.drawing)
+        placement = self._placement(drawing)
         if step := given.step:
             scan = self._session.scan_location(drawing.image)
             drawing = self._pictures.compute(scan, lambda file: take_step(drawing, placement, step, file))
-            placement = self._placement(drawing)
-        return drawing_json(drawing, placement)
+        return drawing_json(drawing, self._placement(drawing))
 
     def picture(self, query: Query) -> bytes:
         """Rendered drawing or residual image around the mark shown."""
-        drawing, placement = self._placed(query.table("drawing"))
-        half, shown = query.whole("half", 8, _WIDEST_PX), drawn_mark(drawing, placement)
+        drawing = parse_drawing(query.table("drawing"))
+        half, shown = query.whole("half", 8, _WIDEST_PX), drawn_mark(drawing, self._placement(drawing))
         if shown is None or not isinstance(shown.mark, MarkShape):
             raise MeasurementError("nothing is drawn there")
         matrix, blur_px = shown.pixel_from_mark, shown.clicked.blur_px
@@ -305,7 +291,8 @@ class DrawingAnswers:
     def save(self, query: Query, body: Any) -> Any:
         """Write the camera file; returns a message with the next step."""
         given = parse_values(DrawnCamera, body)
-        drawing, placement = self._placed(given.drawing)
+        drawing = parse_drawing(given.drawing)
+        placement = self._placement(drawing)
         project, path = self._session.project, camera_path(self._session.folder, given.file)
         if drawing.mark.get("kind") == "learned" and drawing.marks:
             camera = drawn_camera(drawing, placement, path)
@@ -332,10 +319,6 @@ class DrawingAnswers:
         names = {project.missing_camera, *(one.path.name for one in project.cameras.values())}
         first = "" if file in names else f'name it in the project, camera = "{file}", then '
         return {"text": f"Saved {camera.path} with {len(camera.fiducials)} marks. Next: {first}reseau measure."}
-
-    def _placed(self, given: Any) -> tuple[CameraDrawing, FramePlacement]:
-        drawing = parse_drawing(given)
-        return drawing, self._placement(drawing)
 
     def _placement(self, drawing: CameraDrawing) -> FramePlacement:
         project = self._session.project

@@ -93,10 +93,8 @@ class LookedAt:
 
     def place_px(self, point: str, kind: str) -> Array:
         """Centre of the window: measured place, else predicted place, else centre of the scan."""
-        mark, predicted = self.mark(point, kind), self.predicted_px(point, kind)
-        if mark.center_px is not None:
-            return mark.center_px
-        return predicted if predicted is not None else np.array([self.scan.width_px / 2, self.scan.height_px / 2])
+        place = self._known_place(self.mark(point, kind))
+        return place if place is not None else np.array([self.scan.width_px / 2, self.scan.height_px / 2])
 
     def pixel_from_mark(self, point: str, kind: str) -> Array | None:
         """(2, 3) affine matrix of a fiducial: rotation and scale of the frame, at its place; None for other marks."""
@@ -115,11 +113,8 @@ class LookedAt:
         mark = self.mark(point, kind)
         drawn, linear = self.layout_marks.get(point), self.pixel_from_mark(point, kind)
         return {
+            **self._head_json(),
             **mark_json(mark),
-            "image": self.scan.frame.image,
-            "camera": self.camera.name,
-            "verdict": self.verdict,
-            "fingerprint": self.fingerprint,
             "place": _pair(self.place_px(point, kind)),
             "predicted": _pair(self.predicted_px(point, kind)),
             "second": _second(mark),
@@ -130,6 +125,14 @@ class LookedAt:
             "outlines": [] if drawn is None or linear is None else outlines_px(drawn.mark, linear),
             "has_residual": linear is not None and mark.quality.get("blur_px", 0.0) > 0,
             "can_accept": mark.covariance is not None and mark.center_px is not None,
+        }
+
+    def _head_json(self) -> Json:
+        return {
+            "image": self.scan.frame.image,
+            "camera": self.camera.name,
+            "verdict": self.verdict,
+            "fingerprint": self.fingerprint,
             "size": [self.scan.width_px, self.scan.height_px],
         }
 
@@ -140,11 +143,7 @@ class LookedAt:
             {**mark_json(mark), "place": _pair(self._known_place(mark))} for mark in frame.marks if mark.kind != "tie"
         ]
         return {
-            "image": frame.image,
-            "camera": self.camera.name,
-            "verdict": self.verdict,
-            "fingerprint": self.fingerprint,
-            "size": [self.scan.width_px, self.scan.height_px],
+            **self._head_json(),
             "pitch_um": [value for value in self.scan.pitch_um if np.isfinite(value)],
             "problems": [str(problem) for problem in frame.problems],
             "notes": list(self.scan.notes),

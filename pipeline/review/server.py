@@ -15,7 +15,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields
 from importlib import resources
 from typing import Any
-from urllib.parse import parse_qs
 
 import anyio.to_thread
 import uvicorn
@@ -89,20 +88,14 @@ class Guard:
         needs_origin = request.method not in ("GET", "HEAD")
         if origin != f"http://{host}" and (origin is not None or needs_origin):
             return _refused("Only the page itself may ask this.\n")
-        if request.url.path == "/" and (given := _token(request)):
-            return self._welcome() if hmac.compare_digest(given.encode(), self._token.encode()) else _refused(_SPENT)
+        if request.url.path == "/" and (given := request.query_params.get("token", "")):
+            if not hmac.compare_digest(given.encode(), self._token.encode()):
+                return _refused(_SPENT)
+            answer = RedirectResponse("/", status_code=303)  # a cookie in place of the token, which others could read
+            answer.set_cookie(self._cookie, self._secret, httponly=True, samesite="strict")
+            return answer
         own = request.cookies.get(self._cookie, "")
         return None if hmac.compare_digest(own.encode(), self._secret.encode()) else _refused(_SPENT)
-
-    def _welcome(self) -> Response:
-        """Redirect that replaces the token in the address, where others could read it, by a cookie."""
-        answer = RedirectResponse("/", status_code=303)
-        answer.set_cookie(self._cookie, self._secret, httponly=True, samesite="strict")
-        return answer
-
-
-def _token(request: Request) -> str:
-    return (parse_qs(request.url.query).get("token") or [""])[0]
 
 
 def _refused(text: str) -> Response:
@@ -172,38 +165,44 @@ def _bound(port: int) -> socket.socket:
 
 def _application(session: Session, pictures: Pictures) -> Starlette:
     answers, drawing = _Answers(session, pictures), DrawingAnswers(session, pictures)
+    questions: dict[str, Callable[[Query], Any]] = {
+        "start": answers.start,
+        "queue": answers.queue,
+        "mark": answers.mark,
+        "frame": answers.frame,
+        "camera": answers.camera,
+        "scan": answers.scan,
+        "window.png": answers.window,
+        "residual.png": answers.residual,
+        "frame.png": answers.whole,
+        "pose.png": answers.posed,
+        "drawing.png": drawing.picture,
+    }
+    orders: dict[str, Callable[[Query, Any], Any]] = {
+        "decide": answers.decide,
+        "measure": answers.measure,
+        "learn": answers.learn,
+        "draw": drawing.draw,
+        "save-camera": drawing.save,
+        "save-learned": drawing.save_learned,
+    }
     routes = [
         Route("/", _static("index.html")),
         *(Route(f"/static/{name}", _static(name)) for name in _FILES if name != "index.html"),
         Route("/favicon.ico", lambda request: Response(status_code=204)),
-        Route("/api/start", _json(answers.start)),
-        Route("/api/queue", _json(answers.queue)),
-        Route("/api/mark", _json(answers.mark)),
-        Route("/api/frame", _json(answers.frame)),
-        Route("/api/camera", _json(answers.camera)),
-        Route("/api/scan", _json(answers.scan)),
-        Route("/api/window.png", _png(answers.window)),
-        Route("/api/residual.png", _png(answers.residual)),
-        Route("/api/frame.png", _png(answers.whole)),
-        Route("/api/pose.png", _png(answers.posed)),
-        Route("/api/decide", _json(answers.decide), methods=["POST"]),
-        Route("/api/measure", _json(answers.measure), methods=["POST"]),
-        Route("/api/learn", _json(answers.learn), methods=["POST"]),
-        Route("/api/draw", _json(drawing.draw), methods=["POST"]),
-        Route("/api/drawing.png", _png(drawing.picture)),
-        Route("/api/save-camera", _json(drawing.save), methods=["POST"]),
-        Route("/api/save-learned", _json(drawing.save_learned), methods=["POST"]),
+        *(Route(f"/api/{name}", _answering(answer)) for name, answer in questions.items()),
+        *(Route(f"/api/{name}", _answering(answer), methods=["POST"]) for name, answer in orders.items()),
     ]
     return Starlette(routes=routes)
 
 
 class _Answers:
-    """Answers to requests, JSON or images, from query and body."""
+    """Answers to requests, JSON or PNG, from query and body."""
 
     def __init__(self, session: Session, pictures: Pictures) -> None:
         self._session, self._pictures = session, pictures
 
-    def start(self, query: Query, body: Any) -> Any:
+    def start(self, query: Query) -> Any:
         session = self._session
         return {
             "project": session.project.title,
@@ -218,11 +217,11 @@ class _Answers:
             "meaning": {str(choice): choice.meaning for choice in Choice},
         }
 
-    def queue(self, query: Query, body: Any) -> Any:
+    def queue(self, query: Query) -> Any:
         filters = Filters(**{one.name: query.text(one.name) for one in fields(Filters)})
         return self._session.page(filters, query.whole("start", 0, 10**9))
 
-    def mark(self, query: Query, body: Any) -> Any:
+    def mark(self, query: Query) -> Any:
         image, point, kind = query.text("image"), query.text("point"), query.text("kind")
         view, session = self._session.looking.view(image), self._session
         others = [session.looking.view(name) for name in session.looking.others(image, point, kind)]
@@ -239,11 +238,11 @@ class _Answers:
             ],
         }
 
-    def frame(self, query: Query, body: Any) -> Any:
+    def frame(self, query: Query) -> Any:
         image = query.text("image")
         return {**self._session.looking.view(image).frame_json(), "decided": self._session.image_decisions(image)}
 
-    def camera(self, query: Query, body: Any) -> Any:
+    def camera(self, query: Query) -> Any:
         """Camera with marks to be learned: their names, and scans in which to click them."""
         entry = self._session.entry(query.text("key"))
         camera = self._session.project.image_camera(entry.images[0])
@@ -254,7 +253,7 @@ class _Answers:
             "tried": sample_names(entry.images, _TRIED),
         }
 
-    def scan(self, query: Query, body: Any) -> Any:
+    def scan(self, query: Query) -> Any:
         """Size of a scan, measured or not."""
         image = query.text("image")
         learned = self._session.project.image_camera(image).learned if self._session.project.cameras else ()
@@ -289,7 +288,7 @@ class _Answers:
     def decide(self, query: Query, body: Any) -> Any:
         given = parse_values(Decide, body)
         self._session.decide(list(map(_decision, given.decisions)), given.key)
-        return self.queue(query, None)
+        return self.queue(query)
 
     def measure(self, query: Query, body: Any) -> Any:
         given = parse_values(MeasureFrame, body)
@@ -333,25 +332,16 @@ def _static(name: str) -> Callable[[Request], Response]:
     return lambda request: Response(content, media_type=f"{_FILES[name]}; charset=utf-8")
 
 
-def _json(answer: Callable[[Query, Any], Any]) -> Callable[[Request], Any]:
+def _answering(answer: Callable[..., Any]) -> Callable[[Request], Any]:
+    """Handler of requests. answer: returns JSON or PNG from the query and, of a POST request, the body."""
+
     async def answering(request: Request) -> Response:
         try:
-            body = await _body(request) if request.method == "POST" else None
-            return JSONResponse(await anyio.to_thread.run_sync(answer, Query(request.query_params), body))
+            given = [Query(request.query_params), *([await _body(request)] if request.method == "POST" else [])]
+            found = await anyio.to_thread.run_sync(answer, *given)
         except Exception as error:
             return _refusal(error)
-
-    return answering
-
-
-def _png(picture: Callable[[Query], bytes]) -> Callable[[Request], Any]:
-    async def answering(request: Request) -> Response:
-        try:
-            return Response(
-                await anyio.to_thread.run_sync(picture, Query(request.query_params)), media_type="image/png"
-            )
-        except Exception as error:
-            return _refusal(error)
+        return Response(found, media_type="image/png") if isinstance(found, bytes) else JSONResponse(found)
 
     return answering
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from enum import StrEnum
 from itertools import islice
-from typing import Any
+from typing import Any, NamedTuple
 
 from measure.flags import Code, Status
 from measure.scans.remote import fetch_location
@@ -45,6 +45,9 @@ _COMMON = (
     "its marks were learned from what its scans have in common. Click them in one scan to learn them again from it."
 )
 _WORST = (Status.REJECTED, Status.WEAK, Status.PREDICTED, Status.ABSENT)
+_SHOWN = (
+    "key", "question", "point", "kind", "status", "code", "reason", "camera", "verdict", "marks", "is_left",
+)  # fmt: skip
 
 
 class Question(StrEnum):
@@ -119,24 +122,24 @@ def build_queue(project: Project, db: sqlite3.Connection | None, judging: int) -
     return (*_cameras(project, with_marks), *_poses(list(frames.values())), *bare, *marks)
 
 
-@dataclass(frozen=True, slots=True)
-class _Frame:
+class _Frame(NamedTuple):
     image: str
     result: int
     key: str
     camera: str
     verdict: str
+    problem: str
     marks: int
     pose: str
     is_certain: bool
     evidence: str
     roll: str
-    problem: str
 
 
 _FRAMES = """
-select name, result, fingerprint, coalesce(camera, ''), verdict, coalesce(changed -> '$.pose', measured -> '$.pose'),
-    coalesce(changed ->> '$.problems[0]', measured ->> '$.problems[0]', '')
+select name, result, fingerprint, coalesce(camera, ''), verdict,
+    coalesce(changed ->> '$.problems[0]', measured ->> '$.problems[0]', ''),
+    coalesce(changed -> '$.pose', measured -> '$.pose')
 from checked_frame where judging = ? and verdict <> 'failed' and duplicate_of is null
 """
 
@@ -153,24 +156,17 @@ select result, count(*) from checked_mark where judging = ? and status in ('meas
 
 def _frames(db: sqlite3.Connection, judging: int) -> Iterator[_Frame]:
     found: dict[int, int] = dict(db.execute(_FOUND, (judging,)).fetchall())
-    for image, result, key, camera, verdict, pose_json, problem in db.execute(_FRAMES, (judging,)):
-        pose = json.loads(pose_json) if pose_json else None
-        name, is_certain = ("", True) if pose is None else (pose["name"], bool(pose["decided"]))
-        evidence = "" if pose is None else " ".join(pose["evidence"])
-        roll = "" if pose is None else pose["roll"]
-        count = found.get(result, 0)
-        yield _Frame(image, result, key, camera, verdict, count, name, is_certain, evidence, roll, problem)
+    for *frame, pose_json in db.execute(_FRAMES, (judging,)):
+        pose = json.loads(pose_json or '{"name": "", "decided": true, "evidence": [], "roll": ""}')
+        orientation = pose["name"], bool(pose["decided"]), " ".join(pose["evidence"]), pose["roll"]
+        yield _Frame._make((*frame, found.get(frame[1], 0), *orientation))
 
 
 def _cameras(project: Project, with_marks: Collection[str]) -> Iterator[Entry]:
     """Yield a question for each camera whose marks are learned from its scans. with_marks: images with marks found."""
     for camera in project.cameras.values():
-        images = (
-            tuple(image for image in project.scans if project.image_camera(image) is camera)
-            if camera.needs_clicks
-            else ()
-        )
-        if images:
+        images = tuple(image for image in project.scans if project.image_camera(image) is camera)
+        if camera.needs_clicks and images:
             found = sum(image in with_marks for image in images)
             yield Entry(Question.CAMERA, images, (), camera.path.name, "", found, _COMMON if found else _UNKNOWN)
 
@@ -301,13 +297,14 @@ class Session:
 
     def choices(self) -> Json:
         """Possible values of the filters."""
+        entries = self._by_key.values()
         return {
-            "questions": [str(question) for question in Question],
-            "verdicts": sorted({entry.verdict for entry in self._by_key.values() if entry.verdict}),
-            "statuses": sorted({entry.status for entry in self._by_key.values() if entry.status}),
-            "codes": sorted({code for entry in self._by_key.values() for code in entry.code.split()}),
-            "cameras": sorted({entry.camera for entry in self._by_key.values()}),
-            "folders": sorted({entry.folder for entry in self._by_key.values() if entry.folder}),
+            "questions": list(Question),
+            "verdicts": sorted({entry.verdict for entry in entries} - {""}),
+            "statuses": sorted({entry.status for entry in entries} - {""}),
+            "codes": sorted({code for entry in entries for code in entry.code.split()}),
+            "cameras": sorted({entry.camera for entry in entries}),
+            "folders": sorted({entry.folder for entry in entries} - {""}),
         }
 
     @property
@@ -322,20 +319,10 @@ class Session:
     def entry_json(self, entry: Entry) -> Json:
         answer = self._answers.get(entry.key)
         return {
-            "key": entry.key,
-            "question": str(entry.question),
+            **{name: getattr(entry, name) for name in _SHOWN},
             "image": entry.images[0],
             "count": len(entry.images),
             "fingerprint": entry.fingerprints[0] if entry.fingerprints else "",
-            "point": entry.point,
-            "kind": entry.kind,
-            "status": entry.status,
-            "code": entry.code,
-            "reason": entry.reason,
-            "camera": entry.camera,
-            "verdict": entry.verdict,
-            "marks": entry.marks,
-            "is_left": entry.is_left,
             "answer": None if answer is None else _answer_json(answer),
             "old": self._old_json(entry),
         }
@@ -402,7 +389,12 @@ class Session:
     def _check(self, one: Decision) -> None:
         """Check that image and mark exist and the decision is possible. Raises InputError otherwise."""
         if one.subject[2] == LEARNED:
-            self._check_learned(one)
+            if one.image not in self.project.scans:
+                raise InputError(f"there is no image or mark {one.image!r}.")
+            wanted = {mark.id for mark in self.project.image_camera(one.image).learned}
+            if one.decision is Choice.LEARN and set(one.px) != wanted:
+                marks = ", ".join(sorted(wanted))
+                raise InputError(f"{one.image}: click {marks}: all marks of its camera, and no others.")
             return
         try:
             view = self.looking.view(one.image)
@@ -414,13 +406,6 @@ class Session:
                 f"{one.image}, {one.point}: nothing was measured that could be {one.decision}ed. Place it with a click."
             )
 
-    def _check_learned(self, one: Decision) -> None:
-        if one.image not in self.project.scans:
-            raise InputError(f"there is no image or mark {one.image!r}.")
-        wanted = {mark.id for mark in self.project.image_camera(one.image).learned}
-        if one.decision is Choice.LEARN and set(one.px) != wanted:
-            raise InputError(f"{one.image}: click {', '.join(sorted(wanted))}: all marks of its camera, and no others.")
-
 
 def _names_result(one: Decision, fingerprint: str) -> bool:
     """Whether a decision refers to the current result."""
@@ -428,6 +413,5 @@ def _names_result(one: Decision, fingerprint: str) -> bool:
 
 
 def _answer_json(one: Decision) -> Json:
-    head = {"decision": str(one.decision), "point": one.point, "kind": one.subject[2], "who": one.who, "when": one.when}
-    place = {"pose": one.pose, "note": one.note, "col_px": one.col_px, "row_px": one.row_px}
-    return {**head, **place, "image": one.image, "px": one.px}
+    names = ("decision", "image", "point", "pose", "note", "col_px", "row_px", "px", "who", "when")
+    return {**{name: getattr(one, name) for name in names}, "kind": one.subject[2]}

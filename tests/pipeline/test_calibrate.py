@@ -40,7 +40,7 @@ from pipeline.adjusting.turned_pictures import turned_back
 from pipeline.calibration import calibrate_stage, lens_choice
 from pipeline.calibration.board_options import board_options
 from pipeline.calibration.calibrate_stage import Calibration
-from pipeline.calibration.lens_choice import LensChoice, LensModel, LensScore, choose_lens
+from pipeline.calibration.lens_choice import LensChoice, LensModel, choose_lens
 from pipeline.calibration.pictures import find_pictures
 from pipeline.cli import run
 from pipeline.files.target_table import read_targets
@@ -305,7 +305,7 @@ def test_the_lens_that_was_chosen_is_printed_with_what_it_was_chosen_from(
     result: dict[str, Any], calibrations: list[Calibration]
 ) -> None:
     (camera,) = calibrations[0].cameras
-    scores = (LensScore("opencv4", 0.1624), LensScore("opencv5", 0.158), LensScore("fisheye", None))
+    scores: dict[LensModel, float | None] = {"opencv4": 0.1624, "opencv5": 0.158, "fisheye": None}
     text = io.StringIO()
     replace(camera, lens=LensChoice("opencv5", scores)).print(Console(file=text, width=200))
     line = next(line for line in text.getvalue().splitlines() if line.startswith("Lens opencv5"))
@@ -468,7 +468,7 @@ def test_a_richer_lens_is_taken_where_it_predicts_other_pictures_better(
     k3: float, wanted: LensModel, choices: dict[float, LensChoice]
 ) -> None:
     assert choices[k3].model == wanted
-    rms_px = {score.model: score.rms_px for score in choices[k3].scores}
+    rms_px = choices[k3].rms_px
     assert set(rms_px) == {"opencv4", "opencv5"}
     assert rms_px[wanted] == pytest.approx(np.sqrt(2.0) * ERROR_PX, rel=0.15)
 
@@ -481,7 +481,7 @@ def test_a_fisheye_is_tried_where_the_field_is_wide(monkeypatch: pytest.MonkeyPa
     for limit, tried in ((1.0, {"opencv4"}), (0.7, {"opencv4", "fisheye"})):
         monkeypatch.setattr(lens_choice, "WIDE", limit)
         choice = choose_lens(network, True, PIXEL_MM, adjust)
-        assert {score.model for score in choice.scores} == tried
+        assert set(choice.rms_px) == tried
 
 
 @pytest.mark.parametrize("model", ["opencv4", "opencv5", "opencv8", "fisheye"])
