@@ -36,7 +36,8 @@ from pipeline.archive.measurement import (
 )
 from pipeline.archive.results_database import Merged, Store, merge
 from pipeline.archive.results_integrity import DamagedError
-from pipeline.archive.thumbnails import ThumbnailStore
+from pipeline.archive.status import archive_status
+from pipeline.archive.thumbnails import Thumbnails, ThumbnailStore
 from pipeline.errors import InputError, WriteError
 from pipeline.files.images_file import WRITTEN, fill_images
 from pipeline.files.project_file import Project
@@ -62,7 +63,6 @@ from pipeline.summary import Summary, archive_summary, shard_summary, summarise
 from pipeline.workers import NotMeasured, WorkOptions
 
 if TYPE_CHECKING:
-    from pipeline.archive.thumbnails import Thumbnails
     from pipeline.opencv_check.opencv_corners import BoardPictures
 
 _ONE_BY_ONE = 2000  # scans; for more, the summary is read from the store: totals and what needs a look
@@ -112,7 +112,7 @@ def run_measure(project: Project, reporter: Reporter, work: WorkOptions | None =
     if project.images_path is not None:
         run.fill_images(measured_scans(project.measurement_path, digest))
     files = {"comparator coordinates": project.comparator, "measurement": project.measurement_path}
-    return summarise(data, files) if data is not None else archive_summary(project, files)
+    return summarise(data, files) if data is not None else archive_summary(archive_status(project), files)
 
 
 def run_merge(project: Project, stores: Sequence[Path], reporter: Reporter) -> tuple[list[Merged], Summary]:
@@ -124,7 +124,7 @@ def run_merge(project: Project, stores: Sequence[Path], reporter: Reporter) -> t
     try:
         return taken, run_measure(project, reporter, WorkOptions(only_kept=True))
     except NotMeasured:
-        return taken, archive_summary(project, {"measurement": project.measurement_path})
+        return taken, archive_summary(archive_status(project), {"measurement": project.measurement_path})
 
 
 def run_adjust(project: Project, reporter: Reporter) -> Summary:
@@ -353,10 +353,8 @@ class _Run:
             data, {"comparator coordinates": project.comparator, **adjustment, "report": project.report_path}
         )
 
-    def thumbnails(self, data: ReportData) -> "Thumbnails":
+    def thumbnails(self, data: ReportData) -> Thumbnails:
         """Thumbnails of the marks in the data."""
-        from pipeline.archive.thumbnails import Thumbnails
-
         scans, path = data.measurement or {}, self.project.measurement_path
         keys = read_fingerprints(path, data.made_from.get(path.name, ""), scans)
         return Thumbnails(scans.values(), self.project.max_pixels, path, keys)

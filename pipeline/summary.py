@@ -1,6 +1,6 @@
 """Summary of a command: verdict, problems, main numbers, and where the files are."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
@@ -36,6 +36,7 @@ STYLES = {"good": "bold green", "look": "bold yellow", "failed": "bold red"}
 FRAME_ROWS = 8  # rows of the table of frames in the terminal; the report has all
 WHOLE_PROBLEMS = 6  # problems printed in full; if there are more, only the first sentence of each
 NOTES = 3  # that are printed; the report has all
+_MAIN = ("converged", "termination", "iterations", "observations", "unknowns", "redundancy", "sigma0")
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,9 @@ class Summary:
             "notes": list(self.verdict.notes),
             "frames": {name: dict(counts) for name, counts in self.frames.items()},
             "poses": {name: pose_record(pose) for name, pose in self.poses.items()},
-            "adjustment": self.adjustment and _main_numbers(self.adjustment),
+            "adjustment": self.adjustment
+            and {name: getattr(self.adjustment, name) for name in _MAIN}
+            | {"sigma0_from": self.adjustment.variance_factor, "cameras": self.adjustment.cameras},
             "check": self.check and {"verdict": self.check.verdict, "reason": self.check.reason},
             "files": {word: str(path) for word, path in self.files.items()},
         }
@@ -92,29 +95,22 @@ class Summary:
 
 def summarise(data: ReportData, files: Mapping[str, Path]) -> Summary:
     """Summarise the data with the verdict of the report."""
-    frames: dict[str, dict[str, int]] = {}
-    for mark in data.comparator if not data.totals else ():
-        counts = frames.setdefault(mark.image, {str(status): 0 for status in Status})
-        counts[mark.status] += 1
-    if data.totals:
-        frames = {name: {str(s): counts.get(s, 0) for s in Status} for name, counts in data.totals.marks.items()}
-    scans = current_scans(data)
-    poses = {name: scan.frame.pose for name, scan in scans.items() if scan.frame.pose}
-    verdicts = frame_counts(data, report_frames(data)) if data.measurement is not None else {}
+    marks = defaultdict[str, Counter[str]](Counter)
+    for mark in data.comparator:
+        marks[mark.image][mark.status] += 1
+    of_frames = data.totals.marks if data.totals else marks
     cameras = data.adjustment.cameras if data.adjustment else {}
-    values = {name: camera_values(data, name) for name, camera in cameras.items() if camera.is_calibrated}
-    unit = next(iter(data.image_units.values()), FILM_UNIT)
     return Summary(
         judge(data),
-        frames,
-        poses,
+        {name: {str(s): counts.get(s, 0) for s in Status} for name, counts in of_frames.items()},
+        {name: scan.frame.pose for name, scan in current_scans(data).items() if scan.frame.pose},
         data.adjustment,
         data.check,
         files,
         corrections=_corrections(data),
-        values=values,
-        unit=unit,
-        verdicts=verdicts,
+        values={name: camera_values(data, name) for name, camera in cameras.items() if camera.is_calibrated},
+        unit=next(iter(data.image_units.values()), FILM_UNIT),
+        verdicts=frame_counts(data, report_frames(data)) if data.measurement is not None else {},
     )
 
 
@@ -122,12 +118,10 @@ def _corrections(data: ReportData) -> dict[str, tuple[str, Sequence[Distance]]]:
     stored, covariance = data.adjustment, data.covariance
     if stored is None or covariance is None or not stored.converged:
         return {}
-    uncalibrated = [name for name, camera in stored.cameras.items() if not camera.is_calibrated]
-    found = {name: figure(name, stored, covariance) for name in uncalibrated}
     return {
-        name: (correction_sentence(form, stored.cameras[name].fiducials, data.coordinates_source(name)), form.distances)
-        for name, form in found.items()
-        if form is not None
+        name: (correction_sentence(form, camera.fiducials, data.coordinates_source(name)), form.distances)
+        for name, camera in stored.cameras.items()
+        if not camera.is_calibrated and (form := figure(name, stored, covariance)) is not None
     }
 
 
@@ -176,12 +170,6 @@ def _verdict_figures(summary: Summary) -> str:
     low, high = sigma0_bounds(adjustment.variance_factor.redundancy)
     opencv = f"; OpenCV's calibration {check.verdict}" if check and check.verdict in ("agrees", "differs") else ""
     return f"sigma0 {adjustment.sigma0:.2f} (usual {low:.2f} to {high:.2f}){opencv}"
-
-
-def _main_numbers(adjustment: AdjustmentRecord) -> dict[str, object]:
-    how = ("converged", "termination", "iterations", "observations", "unknowns", "redundancy", "sigma0")
-    numbers = {key: getattr(adjustment, key) for key in how}
-    return {**numbers, "sigma0_from": adjustment.variance_factor, "cameras": adjustment.cameras}
 
 
 def _frame_table(summary: Summary) -> Table:
@@ -234,27 +222,21 @@ def _quality(adjustment: AdjustmentRecord) -> str:
     return f"sigma0 {adjustment.sigma0:.3f}, redundancy {adjustment.variance_factor.redundancy:.0f}"
 
 
-def archive_summary(project: Project, files: Mapping[str, Path]) -> Summary:
-    """Summary of a measurement of many scans."""
-    return _scan_summary(archive_status(project), files)
-
-
 def shard_summary(project: Project, path: Path, shard: tuple[int, int]) -> Summary:
     """Summary of a measured shard."""
     status = archive_status(project, path)
     own = tuple(scan for scan in status.scans if scan.verdict not in (Verdict.WAITING, Verdict.OLD))
-    summary = _scan_summary(ArchiveStatus(own), {f"part {shard[0]} of {shard[1]}": path})
+    summary = archive_summary(ArchiveStatus(own), {f"part {shard[0]} of {shard[1]}": path})
     return replace(summary, parts=shard[1])
 
 
-def _scan_summary(status: ArchiveStatus, files: Mapping[str, Path]) -> Summary:
-    sentence = f"{status.sentence}."
+def archive_summary(status: ArchiveStatus, files: Mapping[str, Path]) -> Summary:
+    """Summary of a measurement of many scans."""
     named, more = worst_named(status.scans, NAMED, False)
     problems = [Problem(f"{scan.image}: {scan.verdict}: {scan.why}", NEXT_STEP[scan.verdict]) for scan in named]
     problems += [Problem(f"decisions.jsonl, {line}", "It does not count.") for line in status.idle_decisions]
     if more:
         problems.append(Problem(f"{more} more need a look.", "Run `reseau status` with --verdict or --csv."))
     level: Level = "good" if status.all_good else "look"
-    return Summary(
-        ReportVerdict(level, sentence, tuple(problems), ()), {}, {}, None, None, files, verdicts=status.counts
-    )
+    verdict = ReportVerdict(level, f"{status.sentence}.", tuple(problems), ())
+    return Summary(verdict, {}, {}, None, None, files, verdicts=status.counts)

@@ -17,7 +17,6 @@ from measure.results import ON_FILM
 from pipeline.adjusting.network import build_network
 from pipeline.errors import InputError
 from pipeline.files.project_file import ASSUMED_PITCH_UM, Project
-from pipeline.files.project_tables import AdjustSettings
 from pipeline.measuring.target_field import across, disk_normals, eccentricity_mm, plane_normal
 from pipeline.results.comparator_file import ComparatorPoint, has_pixels_alone
 from pipeline.text.wording import listed
@@ -53,9 +52,10 @@ def add_scanner_bends(
         return network, ()
     films = {image.transformation for image in network.images if image.scanner}
     if not films:
+        given = f'"{settings.scanner}"' if isinstance(settings.scanner, str) else list(settings.scanner)
         raise InputError(
-            f"{project.path}: [adjust] scanner is {_spelt(settings)}, but no image has a film transformation, and a "
-            'digital camera no scanner. Write scanner = "none".'
+            f"{project.path}: [adjust] scanner is {given}, but no image has a film transformation, and a digital "
+            'camera no scanner. Write scanner = "none".'
         )
     sigma_mm = settings.scanner_sigma_um / UM_PER_MM
     if settings.scanner == "auto":
@@ -82,10 +82,6 @@ def name_scanners(project: Project, network: Network) -> Network:
     return replace(network, images=images)
 
 
-def _spelt(settings: AdjustSettings) -> str:
-    return f'"{settings.scanner}"' if isinstance(settings.scanner, str) else str(list(settings.scanner))
-
-
 def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustment:
     """Adjust measured marks. Warnings and notes are part of the result.
 
@@ -96,20 +92,14 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
     adjusted = partial(adjust, options=options)
     network, untold = add_scanner_bends(project, network, adjusted)
     first = adjust_unmodelled(network, adjusted) if project.adjust.unmodelled == "estimate" else adjusted(network)
-    adjustment = first
-    network = adjustment.network  # without images that were left out
+    adjustment, network = first, first.network  # without images that were left out
     uncorrected = np.zeros_like(network.observations.xy_mm)
     if project.disk_radius > 0.0:
         adjustment, uncorrected = _correct_eccentricity(project, network, adjustment, options)
-    warnings = (
-        *left_out,
-        *untold,
-        *_misnamed(project, marks),
-        *_not_corrected(network, uncorrected),
-    )
-    adjustment = replace(adjustment, unmodelled_mm=first.unmodelled_mm)
+    warnings = (*left_out, *untold, *_misnamed(project, marks), *_not_corrected(network, uncorrected))
     notes = (*_assumed_pitch(project), *_unmeasured(project, marks))
-    return replace(adjustment, remarks=(*adjustment.remarks, *warnings), unused=notes)
+    remarks = (*adjustment.remarks, *warnings)
+    return replace(adjustment, unmodelled_mm=first.unmodelled_mm, remarks=remarks, unused=notes)
 
 
 def adjustment_options(project: Project) -> Options:
@@ -127,11 +117,7 @@ def adjustment_options(project: Project) -> Options:
 def _correct_eccentricity(
     project: Project, network: Network, adjustment: Adjustment, options: Options
 ) -> tuple[Adjustment, Array]:
-    """Iterate adjustment and eccentricity correction of disks.
-
-    Returns the adjustment and the largest possible eccentricities (n, 2), mm, of observations that could not be
-    corrected.
-    """
+    """Iterate adjustment and correction of disks; also return the largest uncorrected eccentricities (n, 2), mm."""
     applied = uncorrected = np.zeros_like(network.observations.xy_mm)
     for _ in range(_ROUNDS):
         if not adjustment.converged:
@@ -140,14 +126,15 @@ def _correct_eccentricity(
         if _largest_sigmas(network, wanted - applied) < _SETTLED_SIGMAS:
             break
         applied = wanted
-        corrected = adjust(_shifted(network, -applied), options=options)
+        xy_mm = network.observations.xy_mm - applied
+        shifted = replace(network, observations=replace(network.observations, xy_mm=xy_mm))
+        corrected = adjust(shifted, options=options)
         adjustment = replace(corrected, left_out={**adjustment.left_out, **corrected.left_out})
     return adjustment, uncorrected
 
 
 def _eccentricities(project: Project, adjustment: Adjustment) -> tuple[Array, Array]:
-    """(n, 2) eccentricities to be subtracted from the observations, mm; and (n, 2) largest possible ones of disks with
-    unknown normals."""
+    """(n, 2) mm, eccentricities to be subtracted, and largest possible ones of disks with unknown normals."""
     network = adjustment.network
     observations = network.observations
     ids = [point.id for point in network.points]
@@ -166,25 +153,13 @@ def _eccentricities(project: Project, adjustment: Adjustment) -> tuple[Array, Ar
         if not rows:
             continue
         at = [row_of[observations.point[i]] for i in rows]
-        model = adjusted_image(adjustment, image.name)
-        normals, known = disk_normals([ids[k] for k in at], coordinates[at], given, plane, model.station)
-        off = eccentricity_mm(model, coordinates[at], normals, radius)
-        known_part[rows] = np.where(known[:, None], off, 0.0)
-        slanted = eccentricity_mm(model, coordinates[at], _slanted(normals, coordinates[at], model.station), radius)
-        unknown_part[rows] = np.where(known[:, None], 0.0, slanted)
+        model, places = adjusted_image(adjustment, image.name), coordinates[at]
+        normals, known = disk_normals([ids[k] for k in at], places, given, plane, model.station)
+        known_part[rows] = np.where(known[:, None], eccentricity_mm(model, places, normals, radius), 0.0)
+        sight = (model.station - places) / np.linalg.norm(model.station - places, axis=1, keepdims=True)
+        slanted = (sight + across(sight)[0]) / np.sqrt(2.0)  # at 45° to it, where the eccentricity is largest
+        unknown_part[rows] = np.where(known[:, None], 0.0, eccentricity_mm(model, places, slanted, radius))
     return known_part, unknown_part
-
-
-def _slanted(normals: Array, coordinates: Array, station: Array) -> Array:
-    """Normals at 45° to the line of sight, where the eccentricity is largest."""
-    sight = (station - coordinates) / np.linalg.norm(station - coordinates, axis=1, keepdims=True)
-    slanted: Array = (sight + across(sight)[0]) / np.sqrt(2.0)
-    return slanted
-
-
-def _shifted(network: Network, shift_mm: Array) -> Network:
-    observations = network.observations
-    return replace(network, observations=replace(observations, xy_mm=observations.xy_mm + shift_mm))
 
 
 def _largest_sigmas(network: Network, change_mm: Array) -> float:
@@ -218,8 +193,7 @@ def _misnamed(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[str, 
 
 
 def _unmeasured(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[str, ...]:
-    """Note on given points that no image shows: common for large patterns, but also the effect of a wrong point
-    number."""
+    """Note on given points that no image shows: an effect of large patterns, but also of a wrong point number."""
     observed = {mark.point for mark in marks if mark.status.is_observation and mark.kind not in ON_FILM}
     lost = [id for id in project.object_points if id not in observed]
     if project.given_points is None or not lost:

@@ -29,7 +29,8 @@ def run_choose(project: Project, reporter: Reporter) -> tuple[Choice, ChoiceReco
     with unpublished(project) as new:
         with reporter.stage("comparing") as count:
             marks = read_comparator(project.comparator, project.list_pitch_um)
-            half_mm = {camera.name: _half(camera.frame_mm) for camera in project.cameras.values() if camera.frame_mm}
+            sizes = {camera.name: camera.frame_mm for camera in project.cameras.values() if camera.frame_mm}
+            half_mm = {name: (width / 2.0, height / 2.0) for name, (width, height) in sizes.items()}
             own = adjust_marks(project, marks)
             choice = choose(
                 replace(own, network=name_scanners(project, own.network)),
@@ -71,7 +72,3 @@ def _numbers(candidate: Candidate) -> tuple[str, ...]:
         "none" if predicted is None else f"{predicted.rms_um:.2f}",
         str(len(candidate.correlated)),
     )
-
-
-def _half(frame_mm: tuple[float, float]) -> tuple[float, float]:
-    return (frame_mm[0] / 2.0, frame_mm[1] / 2.0)

@@ -55,8 +55,10 @@ def run_compare(
     chosen = [calibrated_lens(path, content, camera) for path, content in zip(paths, contents, strict=True)]
     names, lenses = zip(*chosen, strict=True)
     calibrations = [_calibration(*each) for each in zip(paths, contents, names, lenses, labels, strict=True)]
-    halves = [_half_mm(*each) for each in zip(paths, contents, names, strict=True)]
-    comparison = compare(calibrations, (min(x for x, _ in halves), min(y for _, y in halves)), times, use)
+    # Half width and height of the area calibrated in all: extent of the observations from the origin.
+    halves = [np.abs(observed_mm(*each)).max(axis=0) for each in zip(paths, contents, names, strict=True)]
+    half_x_mm, half_y_mm = np.min(halves, axis=0).tolist()
+    comparison = compare(calibrations, (half_x_mm, half_y_mm), times, use)
     record = comparison_record(comparison, _remarks(paths, contents, names), level)
     if out is not None:
         check_writable(out)
@@ -66,8 +68,7 @@ def run_compare(
 
 
 def _labels(paths: Sequence[Path]) -> list[str]:
-    """Shortest distinct names of the files: as many last parts of their paths as distinguish them, after removal of a
-    common ending."""
+    """Shortest distinct names of the files: the last parts of their paths, after removal of a common ending."""
     parts = [path.resolve().with_suffix("").parts for path in paths]
     twice = next((path for k, path in enumerate(paths) if parts[k] in parts[:k]), None)
     if twice is not None:
@@ -104,12 +105,6 @@ def _calibration(path: Path, content: AdjustmentRecord, name: str, lens: Lens, l
     unknowns += [Parameter.fiducial(name, id, axis) for id in marks for axis in "xy"]
     covariance, redundancy = read_own_covariance(path).select(unknowns), content.variance_factor.redundancy
     return CameraCalibration(label, lens, marks, covariance, redundancy)
-
-
-def _half_mm(path: Path, content: AdjustmentRecord, name: str) -> tuple[float, float]:
-    """Half width and height of the calibrated area, mm: extent of the observations from the origin."""
-    x, y = np.abs(observed_mm(path, content, name)).max(axis=0)
-    return float(x), float(y)
 
 
 def _remarks(paths: Sequence[Path], contents: Sequence[AdjustmentRecord], names: Sequence[str]) -> tuple[str, ...]:

@@ -1,12 +1,11 @@
 """Build the network of a project from the user's files and the comparator coordinates, with checks of both."""
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.transformation import fewest_marks, marks_needed
@@ -33,45 +32,34 @@ FEWEST_TARGETS = 3  # in an image without observed exterior orientation
 
 def check_fiducials(project: Project, marks: Sequence[ComparatorPoint]) -> None:
     """Raise InputError for fiducials that the camera lacks, and for coordinates that are not in mm."""
-    shown: dict[str, list[ComparatorPoint]] = {}
+    shown = defaultdict[str, list[ComparatorPoint]](list)
     for mark in marks:
         if mark.kind == "fiducial":
-            shown.setdefault(mark.image, []).append(mark)
+            shown[mark.image].append(mark)
     for image, own in shown.items():
-        _check_fiducial_names(project, image, own)
+        camera = project.image_camera(image)
+        ids = [fiducial.id for fiducial in camera.fiducials]
+        for mark in own:
+            if mark.point not in ids:
+                raise InputError(
+                    f"{project.comparator}, line {mark.line}: image {image!r}: {camera.path} has no fiducial "
+                    f"{mark.point!r}. It has {', '.join(ids) or 'none'}."
+                )
         if not project.scans:
-            _check_fiducial_unit(project, image, own)
+            _check_fiducial_unit(project, camera, own)
 
 
-def _check_fiducial_names(project: Project, image: str, marks: Sequence[ComparatorPoint]) -> None:
-    camera = project.image_camera(image)
-    ids = [fiducial.id for fiducial in camera.fiducials]
-    for mark in marks:
-        if mark.point not in ids:
-            raise InputError(
-                f"{project.comparator}, line {mark.line}: image {image!r}: {camera.path} has no fiducial "
-                f"{mark.point!r}. It has {', '.join(ids) or 'none'}."
-            )
-
-
-def _check_fiducial_unit(project: Project, image: str, marks: Sequence[ComparatorPoint]) -> None:
-    """Check the unit: in µm, inches or pixels, the extent of the fiducials differs from the camera's by more than film
-    deformation."""
-    camera = project.image_camera(image)
+def _check_fiducial_unit(project: Project, camera: CameraFile, marks: Sequence[ComparatorPoint]) -> None:
+    """Compare extents: in µm, inches or pixels they differ from the camera's by more than film deformation."""
     given = {one.id: one.xy_mm for one in camera.fiducials if max(one.sigma_mm) < math.inf}
     known = [(mark.xy_mm, given[mark.point]) for mark in marks if mark.xy_mm is not None and mark.point in given]
-    measured_mm, given_mm = (_extent(np.array(places)) for places in zip(*known, strict=True)) if known else (0.0, 0.0)
-    if measured_mm and given_mm and not 1 / OTHER_UNIT < measured_mm / given_mm < OTHER_UNIT:
+    diagonals = np.hypot(*np.ptp(np.array(known), axis=0).T).tolist() if known else [0.0, 0.0]  # measured, given
+    if all(diagonals) and not 1 / OTHER_UNIT < diagonals[0] / diagonals[1] < OTHER_UNIT:
         raise InputError(
-            f"{project.comparator}, line {marks[0].line}: the fiducials of image {image!r} stand "
-            f"{measured_mm / given_mm:.3g} times as far apart as those of {camera.path}. Give both in mm: not in µm, "
-            "inches or pixels."
+            f"{project.comparator}, line {marks[0].line}: the fiducials of image {marks[0].image!r} stand "
+            f"{diagonals[0] / diagonals[1]:.3g} times as far apart as those of {camera.path}. Give both in mm: not in "
+            "µm, inches or pixels."
         )
-
-
-def _extent(xy: NDArray[np.float64]) -> float:
-    """Diagonal of the bounding rectangle of points (n, 2)."""
-    return float(np.hypot(*np.ptp(xy, axis=0)))
 
 
 def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[Network, tuple[str, ...]]:
@@ -105,13 +93,15 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
     images = tuple(_image(project, name) for name in names_by_frame)
     distances, without_end = _distances(project, used)
     cameras, calibrations = _cameras(project, images, used)
+    scanners = dict.fromkeys(image.scanner for image in images if image.scanner)
     network = Network(
         cameras=cameras,
         images=images,
         points=_points(project, used),
         observations=_observations(project.adjust, used),
         distances=distances,
-        scanners=_taking_cameras(project, images),
+        # Digital cameras that photographed the film, with their lens; none for film that was scanned.
+        scanners=tuple(Scanner(name, lens=project.lens.lens) for name in scanners) if project.lens else (),
         boards=_boards(project),
         transparent=project.transparent or (project.targets is not None and project.targets.transparent),
         calibrations=calibrations,
@@ -120,14 +110,6 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
         ),
     )
     return network, (*unjoined, *lonely, *left_out, *without_end)
-
-
-def _taking_cameras(project: Project, images: Sequence[Image]) -> tuple[Scanner, ...]:
-    """Digital cameras that photographed the film, with their lens; empty for film that was scanned."""
-    if project.lens is None:
-        return ()
-    names = dict.fromkeys(image.scanner for image in images if image.scanner)
-    return tuple(Scanner(name, lens=project.lens.lens) for name in names)
 
 
 def anything_to_adjust(project: Project, marks: Sequence[ComparatorPoint]) -> bool:
@@ -181,11 +163,9 @@ def _locatable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list
 
 
 def _orientable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[ComparatorPoint], tuple[str, ...]]:
-    """Drop marks of images that cannot be oriented, with a sentence on each.
-
-    Of an image with too few targets the fiducials remain if they suffice for its film deformation model.
-    """
-    # Marks in several parts of a frame count once.
+    """Drop marks of images that cannot be oriented, with a sentence on each."""
+    # Of an image with too few targets the fiducials remain if they suffice for its film deformation model. Marks in
+    # several parts of a frame count once.
     shown = {(_frame(project, mark.image), mark.kind, mark.point) for mark in marks}
     targets = Counter(frame for frame, kind, _ in shown if kind not in ON_FILM)
     fiducials = Counter(frame for frame, kind, _ in shown if kind == "fiducial")
@@ -214,19 +194,15 @@ def _orientable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[lis
 
 
 def _joinable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[ComparatorPoint], tuple[str, ...]]:
-    """Drop marks of scans that are not connected with the other parts of their frames, with a sentence on each.
-
-    Of a frame with several connected components, the one with the most fiducials remains.
-    """
+    """Drop marks of scans that are not connected with the other parts of their frames, with a sentence on each."""
     shown_points: dict[str, dict[str, set[tuple[str, str]]]] = {}
     for mark in marks:
         if frame := project.scanned_frame(mark.image):
             shown_points.setdefault(frame, {}).setdefault(mark.image, set()).add((mark.kind, mark.point))
     lost = dict[str, str]()
     for frame, parts in shown_points.items():
-        kept = max(
-            _pieces(parts), key=lambda piece: sum(kind == "fiducial" for part in piece for kind, _ in parts[part])
-        )
+        fiducials = {part: sum(kind == "fiducial" for kind, _ in points) for part, points in parts.items()}
+        kept = max(_pieces(parts), key=lambda piece: sum(map(fiducials.__getitem__, piece)))
         lost |= {part: frame for part in parts if part not in kept}
     sentences = tuple(
         f"Image {image!r} has no part in the adjustment: it has fewer than {FEWEST_COMMON} points in common with the "
@@ -312,8 +288,7 @@ def _transformation(project: Project, camera: CameraFile) -> Transformation:
 
 
 def _check_points(project: Project, marks: Sequence[ComparatorPoint]) -> None:
-    """Raise InputError for a target that is not among the given points, if there are any. Tie points need not be
-    given."""
+    """Raise InputError for a target, not a tie point, that is not among the given points, if there are any."""
     given = project.object_points
     for mark in marks:
         if mark.kind == "target" and given and mark.point not in given:
@@ -344,18 +319,21 @@ def _cameras(
 
 def _points(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[ObjectPoint, ...]:
     """Object points that are observed: as given, of the board, or unknown."""
-    given = project.object_points
-    points = {}
+    given, points = project.object_points, dict[str, ObjectPoint]()
     for mark in marks:
         if mark.kind in ON_FILM or mark.point in points:
             continue
-        points[mark.point] = given.get(mark.point) or _unnamed(project, mark)
+        if mark.point in given:
+            points[mark.point] = given[mark.point]
+        elif mark.kind == "tie" and project.ties is not None:  # the height of a natural point may be known
+            points[mark.point] = project.ties.point(mark.point)
+        else:
+            points[mark.point] = ObjectPoint(mark.point, None, None, None)
     return tuple(points.values())
 
 
 def _boards(project: Project) -> tuple[Board, ...]:
-    """All given points as one board, where its bend is to be estimated. Raises InputError where they do not form
-    one."""
+    """All given points as one board, where its bend is to be estimated. Raises InputError if they form none."""
     sigma = project.board_bend_sigma
     if sigma == 0.0:
         return ()
@@ -372,35 +350,26 @@ def _boards(project: Project) -> tuple[Board, ...]:
         ) from None
 
 
-def _unnamed(project: Project, mark: ComparatorPoint) -> ObjectPoint:
-    """Unknown object point; the height of a natural point may be known."""
-    if mark.kind == "tie" and project.ties is not None:
-        return project.ties.point(mark.point)
-    return ObjectPoint(mark.point, None, None, None)
-
-
 def _distances(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[tuple[Distance, ...], tuple[str, ...]]:
     """Distances whose ends are both observed, and a sentence on the others."""
     taking_part = {mark.point for mark in marks if mark.kind not in ON_FILM} | {mark.image for mark in marks}
     known = taking_part | set(project.object_points) | set(project.given_images.camera if project.given_images else ())
     known |= set(project.scans)
-    lost = []
+    kept, lost = [], dict[str, None]()
     for given in project.given_distances:
-        for column, end in (("from", given.distance.start), ("to", given.distance.end)):
+        ends = {"from": given.distance.start, "to": given.distance.end}
+        for column, end in ends.items():
             if end not in known:
                 raise given.row.error(column, f"{end!r} is no object point and no image.{did_you_mean(end, known)}")
-            if end not in taking_part:
-                lost.append(f"{given.distance.start} to {given.distance.end}")
-    kept = tuple(
-        given.distance
-        for given in project.given_distances
-        if given.distance.start in taking_part and given.distance.end in taking_part
-    )
+        if taking_part.issuperset(ends.values()):
+            kept.append(given.distance)
+        else:
+            lost[" to ".join(ends.values())] = None
     sentence = (
-        f"Left out, for an end was measured in no image: the distances {listed(list(dict.fromkeys(lost)))}. See the "
-        "status and reason of its marks."
+        f"Left out, for an end was measured in no image: the distances {listed(list(lost))}. See the status and reason "
+        "of its marks."
     )
-    return kept, (sentence,) if lost else ()
+    return tuple(kept), (sentence,) if lost else ()
 
 
 def _observations(settings: AdjustSettings, marks: Sequence[ComparatorPoint]) -> Observations:

@@ -62,11 +62,10 @@ def measure_again(
     if settings is None or settings.board is not None or not adjustment.converged:
         return None
     field = _adjusted_field(target_field(project), adjustment)
-    sought = {scan.frame.image: _missed(field, scan, adjustment, settings) for scan in scans}
     visits = [
         Visit(scan.frame.image, fetch_location(scan.scan), missed, settings, project.max_pixels)
         for scan in scans
-        if (missed := sought[scan.frame.image])
+        if (missed := _missed(field, scan, adjustment, settings))
     ]
     if not visits:
         return None
@@ -108,19 +107,17 @@ def _missed(
         return ()
     targets = {mark.point: mark for mark in scan.frame.marks if mark.kind not in ON_FILM}
     return tuple(
-        prediction
-        for prediction in field.predictions(adjusted_image(adjustment, image), scan, _SEARCH_PX)
-        if _is_inside(scan, prediction.center_px) and _is_missed(targets.get(prediction.point), settings)
+        one
+        for one in field.predictions(adjusted_image(adjustment, image), scan, _SEARCH_PX)
+        if 0 <= one.center_px[0] < scan.width_px and 0 <= one.center_px[1] < scan.height_px
+        if _is_missed(targets.get(one.point), settings)
     )
 
 
 def _visited(
     scan: MeasuredScan, seen: Sequence[MarkMeasurement] | str, field: Field, adjustment: Adjustment
 ) -> MeasuredScan:
-    """Scan with the targets found in the second pass; the same object if there are none.
-
-    If the second pass failed, the first one's marks stay and the frame gets a problem.
-    """
+    """Scan with the targets found in the second pass; the same object if there are none."""
     if isinstance(seen, str):
         problem = Reason(f"The second pass failed: {seen}", Code.UNREACHABLE)
         return scan.changed(problems=[problem])
@@ -136,17 +133,13 @@ def _visited(
 
 
 def _is_missed(mark: MarkMeasurement | None, settings: TargetSettings) -> bool:
-    """Whether a target is to be sought again. A rejected coded target is not, since another one's ring is at its place;
-    nor is one that a person decided about."""
+    """Whether a target is to be sought again; not one that a person decided about."""
     if mark is None:
         return True
     if Code.DECIDED in mark.reason.codes:
         return False
+    # At the place of a rejected coded target is another one's ring.
     return not mark.status.is_observation and not (settings.code is not None and mark.status is Status.REJECTED)
-
-
-def _is_inside(scan: MeasuredScan, center_px: np.ndarray) -> bool:
-    return bool(0 <= center_px[0] < scan.width_px and 0 <= center_px[1] < scan.height_px)
 
 
 def _is_free(mark: MarkMeasurement, taken_px: np.ndarray) -> bool:

@@ -33,33 +33,23 @@ def check_measurable(project: Project) -> tuple[str, ...]:
     """Return the names of the images to be measured. Raises InputError for errors in the user's files."""
     if not project.scans:
         raise InputError(f'{project.path}: scans is missing: which pictures to measure, such as ["scans/*.tif"].')
-    _check_anything_to_measure(project)
-    check_tie_names(project)
-    _check_marks(project)
-    listed = project.given_images.exterior if project.given_images else {}
-    names = (*project.scans, *(name for name in listed if name not in project.scans and name not in project.left_out))
-    scan_tasks(project, names)  # raises for undefined targets and for fiducials that have no drawing
-    return names
-
-
-def _check_anything_to_measure(project: Project) -> None:
-    """Raise InputError where neither fiducials nor targets nor natural points are sought."""
     sought = [one for camera in project.cameras.values() for one in camera.fiducials if not one.passed_over]
     if not sought and project.targets is None and project.ties is None:
         raise InputError(
             f"{project.path}: there is nothing to measure: {project.default_camera.path} has no fiducial that is not "
             "passed over, and the project neither [targets] nor [ties]. Add what the scans show."
         )
-
-
-def _check_marks(project: Project) -> None:
-    """Raise InputError for a camera with a single mark, which determines neither rotation nor scale of a frame."""
+    check_tie_names(project)
     for camera in project.cameras.values():
         if len(camera.layout_marks) + len(camera.learned) == 1:
             raise InputError(
                 f"{camera.path} has one fiducial mark, and a frame is found by two or more. Add the others, or pass it "
                 'over with mark = "none".'
             )
+    listed = project.given_images.exterior if project.given_images else {}
+    names = (*project.scans, *(name for name in listed if name not in project.scans and name not in project.left_out))
+    scan_tasks(project, names)  # raises for undefined targets and for fiducials that have no drawing
+    return names
 
 
 def find_moved(store: Store, project: Project, reporter: Reporter) -> dict[str, str]:
@@ -155,7 +145,8 @@ def measure_archive(
         work.complete(tasks, reporter)
         if options.moved:
             hash_contents(store, tasks, work, reporter)
-        _check_any(store)
+        if (failures := store.failures()) is not None:
+            raise MeasurementError("\n".join(gathered(failures)))
         copies = find_copies(store, tasks, work)
         made = measured_from(project)
         input_hash = hash_inputs(tasks, work, copies, made)
@@ -177,10 +168,3 @@ def open_executor(project: Project, options: WorkOptions) -> AbstractContextMana
             options.cluster, [fetch_location(path) for path in project.scans.values()], options.workers
         )
     return worker_pool(len(project.scans), options.workers)
-
-
-def _check_any(store: Store) -> None:
-    """Raise MeasurementError with the reasons of all failures where no scan could be measured."""
-    failures = store.failures()
-    if failures is not None:
-        raise MeasurementError("\n".join(gathered(failures)))

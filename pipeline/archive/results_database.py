@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from measure.results import MEASURE_REVISION
 from pipeline.archive.results_integrity import (
@@ -330,11 +330,10 @@ class Store(Database):
     def _program(self) -> int:
         libraries = ", ".join(f"{name} {version(name)}" for name in _LIBRARIES)
         versions = (version("reseau"), MEASURE_REVISION, platform.python_version(), libraries)
-        self.connection.execute(
-            "insert or ignore into program (version, measure_revision, python, libraries) values (?, ?, ?, ?)", versions
-        )
-        where = "version = ? and measure_revision = ? and python = ? and libraries = ?"
-        return int(self.connection.execute(f"select id from program where {where}", versions).fetchone()[0])
+        columns = "version, measure_revision, python, libraries"
+        self.connection.execute(f"insert or ignore into program ({columns}) values (?, ?, ?, ?)", versions)
+        query = f"select id from program where ({columns}) = (?, ?, ?, ?)"
+        return int(self.connection.execute(query, versions).fetchone()[0])
 
 
 def known_identities(path: Path) -> dict[str, Identity]:
@@ -349,15 +348,14 @@ def places(count: int) -> str:
     return ", ".join("?" * count)
 
 
-@dataclass(frozen=True)
-class Merged:
+class Merged(NamedTuple):
     """Outcome of merging one store: number of its results, of those new here, and of damaged ones, which were not
     taken."""
 
     path: Path
     results: int
     new: int
-    damaged: int = 0
+    damaged: int
 
 
 def merge(store: Store, others: Sequence[Path]) -> list[Merged]:

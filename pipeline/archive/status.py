@@ -5,7 +5,6 @@ import io
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -86,11 +85,10 @@ def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
             rows = {row[0]: row for row in _status_rows(store)}
             judging = latest(store)
             idle = inapplicable(store, judging.digest) if judging is not None else ()
-    files, cameras = FileStates(project.path.resolve().parent), project.cameras.values()
-    camera_names = {id(camera): camera.path.name for camera in cameras}
-    scans, request_hash, decisions = [], request_hasher(project), group_decisions(project.decisions)
+    files, scans = FileStates(project.path.resolve().parent), []
+    request_hash, decisions = request_hasher(project), group_decisions(project.decisions)
     for name, file in as_named(project.scans).items():
-        state, camera = files.get(file), camera_names[id(project.image_camera(name))]
+        state, camera = files.get(file), project.image_camera(name).path.name
         found = rows.get(state.uri)
         if found is None or found[5] is None:
             scans.append(ScanStatus(name, state.uri, camera, Verdict.WAITING))
@@ -98,12 +96,12 @@ def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
         _, bytes_, mtime_ns, etag, is_current, verdict, why, failure, seconds, finished, request, taken_in = found
         is_same = is_current and (bytes_, mtime_ns, etag) == (state.bytes, state.mtime_ns, state.etag)
         is_now = is_same and request in (None, request_hash(name))
-        now = _VERDICTS[verdict] if is_now else Verdict.OLD
+        now = Verdict(verdict) if is_now else Verdict.OLD
         if is_now and taken_in is not None and taken_in != decisions_hash(decisions.get(name, ())):
             now, why = Verdict.OLD, "what is decided about it now is not taken in yet"
         scans.append(ScanStatus(name, state.uri, camera, now, why or "", failure or "", seconds, finished))
     unknown = shortened([f"line {number}: {why}" for number, why in sorted(unknown_images(project))])
-    return ArchiveStatus(tuple(sorted(scans, key=itemgetter(0))), tuple(dict.fromkeys((*unknown, *idle))))
+    return ArchiveStatus(tuple(sorted(scans)), tuple(dict.fromkeys((*unknown, *idle))))
 
 
 def _status_rows(store: Store) -> Iterator[Sequence[Any]]:
@@ -125,7 +123,6 @@ def _status_rows(store: Store) -> Iterator[Sequence[Any]]:
             yield (*row[:5], str(Verdict.FAILED), why, str(FailureCode.DAMAGED), None, "", row[10], None)
 
 
-_VERDICTS = {str(verdict): verdict for verdict in Verdict}
 # Most scans are good, and need no reason.
 _QUERY = """
 with frame as (
@@ -168,13 +165,8 @@ def status_json(status: ArchiveStatus) -> dict[str, object]:
             for verdict, count in status.counts.items()
         },
         "images": {
-            scan.image: {
-                "verdict": str(scan.verdict),
-                "why": scan.why,
-                "failure": scan.failure or None,
-                "scan": scan.scan,
-                "camera": scan.camera,
-            }
+            scan.image: {name: getattr(scan, name) for name in ("verdict", "why", "scan", "camera")}
+            | {"failure": scan.failure or None}
             for scan in status.scans
             if scan.verdict.needs_look
         },
@@ -187,11 +179,9 @@ def status_csv(status: ArchiveStatus) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(("image", "verdict", "why", "failure", "scan", "camera", "seconds", "finished"))
-    for scan in status.scans:
-        seconds = "" if scan.seconds is None else f"{scan.seconds:.2f}"
-        writer.writerow(
-            (scan.image, scan.verdict, scan.why, scan.failure, scan.scan, scan.camera, seconds, scan.finished)
-        )
+    for image, scan, camera, verdict, why, failure, seconds, finished in status.scans:
+        seconds_text = "" if seconds is None else f"{seconds:.2f}"
+        writer.writerow((image, verdict, why, failure, scan, camera, seconds_text, finished))
     return text.getvalue()
 
 

@@ -220,4 +220,5 @@ class Work:
 
 def _options_json(task: ScanTask) -> str:
     """JSON of all that a result depends on in addition to the scan, including whether writing can be read."""
-    return task.options_json() if not reads_writing(task.options) else task.options_json()[:-1] + ',"reads":true}'
+    json = task.options.json
+    return f'{json[:-1]},"reads":true}}' if reads_writing(task.options) else json

@@ -1,13 +1,14 @@
 """Improvements of a design: one more photograph, another kappa, more points, better control or measurements."""
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
-from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles
+from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles, rotation_from_vector
 from pipeline.adjusting.network import FEWEST_TARGETS
 from pipeline.design.expected import Expected, expect
 from pipeline.design.setup import PlannedPoint, Setup
@@ -42,37 +43,27 @@ Progress = Callable[[str, int, int], None]
 def alternatives(basis: Expected, progress: Progress | None = None) -> tuple[Alternative, ...]:
     """Try all kinds of changes, each once. Of the photographs that could be added or rolled, the most useful of each
     kind is kept."""
-    setup = basis.setup
-    kinds = [list(kind) for kind in (*_photos(setup), _turned(setup), *([one] for one in _better(setup)))]
-    total = sum(len(kind) for kind in kinds)
-    done = 0
-    chosen = []
-    for kind in kinds:
-        tried = []
-        for change, changed in kind:
-            tried.append(_compared(basis, change, changed))
-            done += 1
-            if progress is not None:
-                progress(change, done, total)
-        if tried:
-            chosen.append(max(tried, key=lambda alternative: alternative.usefulness))
-    return tuple(chosen)
+    setup, tried = basis.setup, defaultdict[int, list[Alternative]](list)
+    kinds = [*_photos(setup), _turned(setup), *([one] for one in _better(setup))]
+    changes = [(kind, *each) for kind, some in enumerate(kinds) for each in some]
+    for done, (kind, change, changed) in enumerate(changes, 1):
+        expected = expect(changed)
+        tried[kind].append(Alternative(change, expected, gains(basis.camera_sigmas, expected.camera_sigmas)))
+        if progress is not None:
+            progress(change, done, len(changes))
+    return tuple(max(some, key=lambda alternative: alternative.usefulness) for some in tried.values())
 
 
 def gains(before: Mapping[str, float], after: Mapping[str, float]) -> dict[str, float]:
     """Reduction of standard deviations in percent."""
-    return {name: _gain(sigma, after.get(name, 0.0)) for name, sigma in before.items()}
 
+    def gain(name: str) -> float:
+        old, new = before[name], after.get(name, 0.0)
+        if math.isinf(old):
+            return math.nan if math.isinf(new) else FOUND
+        return -math.inf if math.isinf(new) else 100.0 * (1.0 - new / old)
 
-def _gain(before: float, after: float) -> float:
-    if math.isinf(before):
-        return math.nan if math.isinf(after) else FOUND
-    return -math.inf if math.isinf(after) else 100.0 * (1.0 - after / before)
-
-
-def _compared(basis: Expected, change: str, changed: Setup) -> Alternative:
-    expected = expect(changed)
-    return Alternative(change, expected, gains(basis.camera_sigmas, expected.camera_sigmas))
+    return {name: gain(name) for name in before}
 
 
 Change = tuple[str, Setup]
@@ -88,7 +79,7 @@ def _photos(setup: Setup) -> Iterator[Iterable[Change]]:
     center, axis = _field_axis(setup.points)
     yield _more(setup, "turned by 90 degrees", _rolled)
     for turn, words in ((QUARTER, "a quarter"), (2 * QUARTER, "half")):
-        rotation = _rotation(axis, turn)
+        rotation = rotation_from_vector(turn * axis)
         yield _more(setup, f"carried {words} round the field", partial(_carried, center=center, rotation=rotation))
 
 
@@ -110,7 +101,9 @@ def _turned(setup: Setup) -> Iterator[Change]:
 
 def _better(setup: Setup) -> Iterator[Change]:
     """More or better measurements, of the kinds that the setup has."""
-    yield "twice as many points, spread alike", replace(setup, points=(*setup.points, *map(_double, setup.points)))
+    # A second point at the same place represents one more of the same distribution.
+    again = (replace(point, id=f"{point.id} again") for point in setup.points)
+    yield "twice as many points, spread alike", replace(setup, points=(*setup.points, *again))
     if any(0.0 < point.sigma_height < math.inf for point in setup.points):
         points = (replace(point, sigma_height=point.sigma_height / 2) for point in setup.points)
         yield "given heights twice as good", replace(setup, points=tuple(points))
@@ -128,11 +121,6 @@ def _better(setup: Setup) -> Iterator[Change]:
     yield "targets measured twice as well", replace(setup, settings=finer)
 
 
-def _double(point: PlannedPoint) -> PlannedPoint:
-    """A second point at the same place, which represents one more of the same distribution."""
-    return replace(point, id=f"{point.id} again")
-
-
 def _add_image(setup: Setup, image: SceneImage) -> Setup:
     return replace(setup, images=(*setup.images, image))
 
@@ -148,13 +136,6 @@ def _field_axis(points: Iterable[PlannedPoint]) -> tuple[Array, Array]:
     axis = np.mean([point.normal for point in listed], axis=0)
     length = float(np.linalg.norm(axis))
     return center, axis / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
-
-
-def _rotation(axis: Array, turn_rad: float) -> Array:
-    """Rotation matrix by Rodrigues' formula."""
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + math.sin(turn_rad) * cross + (1 - math.cos(turn_rad)) * cross @ cross)
 
 
 def _carried(exterior: Exterior, center: Array, rotation: Array) -> Exterior:

@@ -83,7 +83,13 @@ class Design:
                 if each.group == "distance"
             ],
             "reliability": _reliability(expected),
-            "layouts": {"count": self.layouts.count, "sigmas": _means_and_spreads(self.layouts)},
+            "layouts": {
+                "count": self.layouts.count,
+                "sigmas": {
+                    name: {"mean": mean, "spread": self.layouts.spread[name]}
+                    for name, mean in self.layouts.mean.items()
+                },
+            },
             "what_would_help": [
                 {"change": one.change, "gain_percent": one.gain_percent, "sigmas": one.expected.camera_sigmas}
                 for one in self.helpful
@@ -140,8 +146,7 @@ def _points(expected: Expected) -> Iterator[tuple[str, Content]]:
 
 
 def _axis_summary(sigmas: np.ndarray) -> Content:
-    """Summary of a coordinate's standard deviations over the points where it is estimated, and the number where it is
-    not determined."""
+    """Summary of a coordinate's standard deviations where it is estimated, and how often it is not determined."""
     estimated = sigmas[(sigmas > 0.0) & np.isfinite(sigmas)]
     return {
         "rms": rms(estimated),
@@ -152,8 +157,7 @@ def _axis_summary(sigmas: np.ndarray) -> Content:
 
 
 def _reliability(expected: Expected) -> Content:
-    """Reliability by groups and of the camera; null for a smallest error: nothing checks any observation of the
-    group."""
+    """Reliability by groups and of the camera; null for a smallest error: nothing checks the group."""
     groups = {
         one.group: {
             "coordinates": one.coordinates,
@@ -172,10 +176,6 @@ def _reliability(expected: Expected) -> Content:
 
 def _quantity(expected: Expected, parameter: Parameter, scale: float = 1.0) -> Content:
     return {"value": scale * expected.plan.adjustment.value(parameter), "sigma": scale * expected.plan.sigma(parameter)}
-
-
-def _means_and_spreads(layouts: Layouts) -> Content:
-    return {name: {"mean": layouts.mean[name], "spread": layouts.spread[name]} for name in layouts.mean}
 
 
 def _sweep(swept: Swept, picture: str) -> Content:

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from adjust.functional_model.families import parameter_names
-from adjust.functional_model.lens import Lens, Prior
+from adjust.functional_model.lens import Prior
 from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.estimates import adjusted_lens
 from adjust.problem.network import Network
@@ -183,8 +183,7 @@ class Expected:
         return [Parameter.interior(self.camera, name) for name in names]
 
     def _functions(self, radius_mm: float) -> Array:
-        """Rows (4 DIRECTIONS, k) in µm: derivatives of the radial and the tangential distortion at a radius, and of the
-        image of a ray."""
+        """(4 DIRECTIONS, k) µm, derivatives of radial and tangential distortion at a radius, and of a ray's image."""
         angles = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
         outward = np.stack([np.cos(angles), np.sin(angles)], axis=1)
         across = np.stack([-outward[:, 1], outward[:, 0]], axis=1)
@@ -193,18 +192,12 @@ class Expected:
         by_c_and_parameters[np.abs(by_c_and_parameters) < ROUNDING_UM] = 0.0  # most families do not depend on c
         distortion = [np.einsum("di,dik->dk", along, by_c_and_parameters) for along in (outward, across)]
         by_interior = np.insert(np.concatenate(distortion), [1, 1], 0.0, axis=1)
-        ray = UM_PER_MM * _ray_by_unknowns(lens, radius_mm * outward)
+        # The image of a ray by c, x0', y0' and the parameters: from F = 0 with a fixed ray.
+        xy_mm = lens.interior[1:] + radius_mm * outward
+        at = lens.equations(xy_mm, lens.ray_from_observed(xy_mm)[0])
+        by_unknowns = np.concatenate([at.interior_jacobian, at.parameter_jacobian], axis=2)
+        ray = -UM_PER_MM * np.linalg.solve(at.xy_jacobian, by_unknowns)
         return np.concatenate([by_interior, ray.reshape(-1, ray.shape[2])])
-
-
-def _ray_by_unknowns(lens: Lens, from_principal_point_mm: Array) -> Array:
-    """Derivatives (n, 2, 3 + k) of the image of a ray with respect to c, x0', y0' and the parameters: from F = 0 with a
-    fixed ray."""
-    xy_mm = lens.interior[1:] + from_principal_point_mm
-    ray, _ = lens.ray_from_observed(xy_mm)
-    at = lens.equations(xy_mm, ray)
-    by_unknowns = np.concatenate([at.interior_jacobian, at.parameter_jacobian], axis=2)
-    return -np.asarray(np.linalg.solve(at.xy_jacobian, by_unknowns))
 
 
 def expect(setup: Setup) -> Expected:

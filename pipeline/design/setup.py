@@ -147,7 +147,8 @@ def planned_network(setup: Setup) -> tuple[Network, Approximations]:
                 "the field, or leave it out."
             )
     rays = Counter(i for rows in visible.values() for i in rows)
-    used = [i for i in sorted(rays) if rays[i] >= 2 or math.isfinite(min(_sigmas(setup.points[i])))]
+    given = [min(point.sigma_planimetry, point.sigma_height) < math.inf for point in setup.points]
+    used = [i for i in sorted(rays) if rays[i] >= 2 or given[i]]
     camera = _camera(setup)
     observations = _observations(setup, visible, set(used))
     points = [setup.points[i] for i in used]
@@ -192,10 +193,6 @@ def _scanners(setup: Setup) -> tuple[network.Scanner, ...]:
     return (network.Scanner(DEFAULT_SCANNER, dict.fromkeys(names, prior), half_mm=(half_mm, half_mm)),)
 
 
-def _sigmas(point: PlannedPoint) -> tuple[float, float]:
-    return point.sigma_planimetry, point.sigma_height
-
-
 def _camera(setup: Setup) -> Camera:
     """The camera with its priors; fiducials only where the film transformation is estimated from them."""
     point = setup.camera.principal_point_mm or (0.0, 0.0)
@@ -204,9 +201,8 @@ def _camera(setup: Setup) -> Camera:
 
 
 def _object_point(point: PlannedPoint) -> network.ObjectPoint:
-    plane, height = _sigmas(point)
-    x, y, z = (float(value) for value in point.xyz)
-    return network.ObjectPoint(point.id, Prior(x, plane), Prior(y, plane), Prior(z, height))
+    sigmas = (point.sigma_planimetry, point.sigma_planimetry, point.sigma_height)
+    return network.ObjectPoint(point.id, *map(Prior, map(float, point.xyz), sigmas))
 
 
 def _observations(setup: Setup, visible: dict[str, list[int]], used: set[int]) -> Observations:

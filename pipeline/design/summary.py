@@ -130,8 +130,7 @@ def _table(title: str, *columns: str) -> Table:
 
 
 def _camera_table(design: Design) -> Table:
-    """Expected precision of the camera; with fiducials also from the photographs alone, in the frame of the
-    fiducials."""
+    """Expected precision of the camera; with fiducials also from the photographs alone, in their frame."""
     expected, layouts = design.expected, design.layouts
     several = layouts.count > 1
     columns = ["quantity", "value", "sigma", *(["photographs alone"] if expected.fiducials else [])]

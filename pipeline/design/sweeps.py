@@ -74,7 +74,11 @@ class Variations:
         if parts[0] == "camera" and isinstance(values.get("camera"), str):
             values["camera"] = _camera_values(self.path.parent / values["camera"])
         if parts[0] == "exterior":
-            element = _known_word(parts[-1], EXTERIOR, "an exterior orientation has no element")
+            if (element := parts[-1]) not in EXTERIOR:
+                hint = did_you_mean(element, EXTERIOR)
+                raise InputError(
+                    f"an exterior orientation has no element {element!r}.{hint} It has {', '.join(EXTERIOR)}."
+                )
             image = _member(values.get("image", []), ".".join(parts[1:-1]), "image")
             key, index = EXTERIOR[element]
             image[key] = [*image[key][:index], value, *image[key][index + 1 :]]
@@ -151,12 +155,6 @@ def _member(entries: list[Any], name: str, what: str) -> Any:
         return entries[int(name) - 1]
     known = [one for one in names if one] or [str(i + 1) for i in range(len(entries))]
     raise InputError(f"there is no {what} {name!r}.{did_you_mean(name, known)} There are {', '.join(known) or 'none'}.")
-
-
-def _known_word(word: str, known: Mapping[str, object], sentence: str) -> str:
-    if word not in known:
-        raise InputError(f"{sentence} {word!r}.{did_you_mean(word, known)} It has {', '.join(known)}.")
-    return word
 
 
 @dataclass(frozen=True)

@@ -290,7 +290,7 @@ class Identification:
 
     def as_json(self) -> Mapping[str, object]:
         trials = [{**asdict(trial), "stands_out": trial.stands_out} for trial in self.trials]
-        head = {"scan": str(self.scan), "best": self.best_names(), "sentence": self.sentence(), "trials": trials}
+        head = {"scan": str(self.scan), "best": list(self.best_names()), "sentence": self.sentence(), "trials": trials}
         return {**head, "plate": dict(self.plate), "contradicted": sorted(self.contradicted)}
 
 

@@ -17,6 +17,7 @@ from measure.fiducials.frame import Frame
 from measure.fiducials.options import FiducialOptions
 from measure.fiducials.search import Hypotheses, PitchHypothesis, longer, pitch_hypotheses
 from measure.flags import CAMERA_BY_CHANCE
+from measure.geometry import linear_scale
 from measure.marks.shapes import FiducialLayout, LayoutMark, finest_detail_mm, limit_to_frame, thinnest_mm
 from measure.scans.opening import open_scan, thumbnail
 from measure.scans.scan import Scan
@@ -122,9 +123,9 @@ class LayoutSearch:
         """Repeat the search in a larger image, at the pitch of the best placement."""
         if not coarse.answer.placements:
             return coarse
-        linear = coarse.answer.placements[0].pixel_from_camera[:, :2]
         picture = self._solid if coarse.picture is self._coarse_solid else self._fine
-        pitch_mm = coarse.picture.width_px / picture.width_px / float(np.sqrt(abs(np.linalg.det(linear))))
+        px_per_mm = linear_scale(coarse.answer.placements[0].pixel_from_camera)
+        pitch_mm = coarse.picture.width_px / picture.width_px / px_per_mm
         hypothesis = PitchHypothesis((pitch_mm, pitch_mm), _PITCH_TOLERANCE, (pitch_mm, pitch_mm))
         return self._tried(coarse.layout, coarse.bold, picture, [hypothesis], len(coarse.hypotheses))
 
@@ -216,9 +217,13 @@ def identify(
 
 def _layouts_like(layouts: Mapping[Names, FiducialLayout], likely: Collection[str]) -> dict[Names, FiducialLayout]:
     """Layouts whose boldest marks form the same figure, up to scale, as a layout with a likely name."""
+
+    def is_same(figure: Array, other: Array) -> bool:
+        return len(figure) == len(other) and bool(cdist(figure, other).min(axis=1).max() < _SAME_FIGURE)
+
     figures = {names: _figure(layout) for names, layout in layouts.items()}
     known = [figure for names, figure in figures.items() if not {*likely}.isdisjoint(names)]
-    return {names: layout for names, layout in layouts.items() if any(_is_same(figures[names], each) for each in known)}
+    return {names: layout for names, layout in layouts.items() if any(is_same(figures[names], each) for each in known)}
 
 
 def _figure(layout: FiducialLayout) -> Array:
@@ -226,10 +231,6 @@ def _figure(layout: FiducialLayout) -> Array:
     places = np.array([mark.xy_mm for mark in _boldest(layout).marks])
     places = places - places.mean(axis=0)
     return np.asarray(places / np.sqrt((places**2).sum(axis=1).mean()))
-
-
-def _is_same(figure: Array, other: Array) -> bool:
-    return len(figure) == len(other) and bool(cdist(figure, other).min(axis=1).max() < _SAME_FIGURE)
 
 
 def _picture(path: Path, max_pixels: int | None) -> tuple[Scan, float, tuple[float, float] | None]:
@@ -290,7 +291,10 @@ def _first_that_stand_out(
         if any(trial.stands_out for trial in trials):
             return trials, given
         longer = _each(layouts, partial(search.longer_one_way, pitch_um=pitch_um), count)
-        likelier = {names: min(each, longer[names], key=_expected) for names, each in given.items()}
+        likelier = {
+            names: longer[names] if longer[names].answer.expected < each.answer.expected else each
+            for names, each in given.items()
+        }
         trials = _trials(search, likelier, count)
         if any(trial.stands_out for trial in trials):
             return trials, likelier
@@ -306,10 +310,6 @@ def _try_pitch(
     given = _each(layouts, partial(search.try_pitch, pitch_um=pitch_um), count)
     is_beyond_chance = any(each.answer.expected <= CAMERA_BY_CHANCE for each in given.values())
     return _trials(search, given, count) if is_beyond_chance else [], given
-
-
-def _expected(each: Tried) -> float:
-    return each.answer.expected
 
 
 def _each(
@@ -385,7 +385,8 @@ def _trial(search: LayoutSearch, names: Names, each: Tried, close: float) -> Tri
     """Measure the marks of one layout. close: score below which the stretched layout need not be compared."""
     start, expected = time.perf_counter(), each.answer.expected
     frame, reason = search.recognise(each), "fewer than three of its marks at the best constellation"
-    if frame and (width_px := _finest_px(frame, each.layout)) < _LEAST_DETAIL_PX:
+    finest_mm = min(finest_detail_mm(mark.mark) for mark in each.layout.marks)
+    if frame and (width_px := linear_scale(frame.pixel_from_camera) * finest_mm) < _LEAST_DETAIL_PX:
         frame, reason = None, f"too coarse: the finest detail of its marks would be {width_px:.2f} px wide there"
     fits = [fit for fit in frame.fits if fit] if frame else []
     residual = _residual(frame, each.layout) if frame else None
@@ -403,7 +404,7 @@ def _trial(search: LayoutSearch, names: Names, each: Tried, close: float) -> Tri
         reason="" if frame else reason,
         seconds=time.perf_counter() - start,
         expected=expected,
-        pixel_um=1000 / _px_per_mm(frame) if frame else None,
+        pixel_um=1000 / linear_scale(frame.pixel_from_camera) if frame else None,
     )
 
 
@@ -416,35 +417,22 @@ def _score_by_chance(search: LayoutSearch, each: Tried) -> float:
     return likeness(frame) if frame else 0.0
 
 
-def _finest_px(frame: Frame, layout: FiducialLayout) -> float:
-    """Width of the finest detail of a layout's marks in the picture."""
-    return _px_per_mm(frame) * min(finest_detail_mm(mark.mark) for mark in layout.marks)
-
-
-def _px_per_mm(frame: Frame) -> float:
-    return float(np.sqrt(abs(np.linalg.det(frame.pixel_from_camera[:, :2]))))
-
-
 def _residual(frame: Frame, layout: FiducialLayout) -> tuple[float, float] | None:
     """Residuals per axis of an affine transformation, in standard deviations and mm; None without redundancy."""
     pairs = [(fit, given) for fit, given in zip(frame.fits, layout.marks, strict=True) if fit]
     redundancy = 2 * len(pairs) - _AFFINE
     if redundancy <= 0:
         return None
-    px_per_mm = _px_per_mm(frame)
+    px_per_mm = linear_scale(frame.pixel_from_camera)
     given_mm = np.array([given.xy_mm for _, given in pairs])
     comparator_mm = np.array([fit.center_px for fit, _ in pairs]) * (1.0, -1.0) / px_per_mm
     parameters, mirrored = fit_transformation("affine", comparator_mm, given_mm)
     residuals_mm = film_kind("affine", mirrored).apply(parameters, comparator_mm) - given_mm
-    sigma_mm = np.array([_sigma_mm(fit.covariance_px2, given, px_per_mm) for fit, given in pairs])
+    # The marks' covariances are small and nearly isotropic, so their rotation is neglected.
+    own_mm2 = np.array([[np.trace(fit.covariance_px2) / 2 / px_per_mm**2] for fit, _ in pairs])
+    given_sigma_mm = np.array([given.sigma_mm for _, given in pairs])
+    variance_mm2 = given_sigma_mm**2 + own_mm2 + FiducialOptions().film_sigma_mm ** 2
     return (
-        float(np.sqrt(((residuals_mm / sigma_mm) ** 2).sum() / redundancy)),
+        float(np.sqrt((residuals_mm**2 / variance_mm2).sum() / redundancy)),
         float(np.sqrt((residuals_mm**2).sum() / redundancy)),
     )
-
-
-def _sigma_mm(covariance_px2: Array, given: LayoutMark, px_per_mm: float) -> Array:
-    """Standard deviations in x' and y' of mark, given place and film."""
-    # The mark's covariance is small and nearly isotropic, so its rotation is neglected.
-    own, film = float(np.trace(covariance_px2)) / 2 / px_per_mm**2, FiducialOptions().film_sigma_mm
-    return np.asarray(np.sqrt(np.square(given.sigma_mm) + own + film**2))

@@ -5,7 +5,8 @@ The places come from clicks, or from what recurs in all scans near the given coo
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from measure.errors import MeasurementError
 from measure.fiducials.clicked_frame import LEAST_CLICKS, are_collinear
 from measure.fiducials.interior_orientation import fit_frame
 from measure.fiducials.measurement import measure_fiducials
-from measure.geometry import POSES, up_from_camera
+from measure.geometry import POSES, Affine, linear_scale, up_from_camera
 from measure.marks import shapes
 from measure.marks.templates import cut, learn_template
 from measure.scans.parallel import map_items
@@ -89,8 +90,7 @@ def _check_orientation(camera: CameraFile, task: ScanTask, scan: Scan, px: Place
     # A viewer that obeys the file's orientation tag counts other columns and rows than the file.
     if len(px) < LEAST_CLICKS or camera.clicks is None or are_collinear(np.array(list(px.values()))):
         return
-    given = _up_from_camera(_through_clicks(task.options, scan, px))
-    clicked = min(POSES, key=lambda name: float(np.abs(up_from_camera(name) - given).sum()))
+    clicked = _pose(_through_clicks(task.options, scan, px))
     setting = task.options.fiducials.pose
     if setting == clicked or (setting == "auto" and (scan.orientation == 1 or camera.clicks.who)):
         return
@@ -123,10 +123,8 @@ def _learn_recurring_marks(camera: CameraFile, tasks: Sequence[ScanTask], worker
         raise MeasurementError(
             f"{camera.path}: {_NOT_COMMON} the drawn marks were found in {len(usable)} of its scans."
         )
-    jobs = [
-        (usable[0][1].windows[one.id], [view.windows[one.id] for _, view in usable[1:]], one.learned_mm)
-        for one in camera.learned
-    ]
+    (task, (matrix, windows)), *others = usable
+    jobs = [(windows[one.id], [other[one.id] for _, (_, other) in others], one.learned_mm) for one in camera.learned]
     found = list(map_items(workers, _recurrence, jobs))
     lost = [one.id for one, each in zip(camera.learned, found, strict=True) if each.excess < _LEAST_EXCESS]
     if lost:
@@ -134,10 +132,8 @@ def _learn_recurring_marks(camera: CameraFile, tasks: Sequence[ScanTask], worker
             f"{camera.path}: {_NOT_COMMON} nothing near the coordinates of fiducial {', '.join(lost)} recurs in all of "
             f"{len(usable)} scans in one place."
         )
-    task, view = usable[0]
-    matrix = view.placement
     px = {
-        one.id: matrix[:, :2] @ (np.array(one.xy_mm) + each.offset_mm) + matrix[:, 2]
+        one.id: Affine(matrix).apply(np.array(one.xy_mm) + each.offset_mm)
         for one, each in zip(camera.learned, found, strict=True)
     }
     with task.opened() as scan:
@@ -148,31 +144,21 @@ def _recurrence(job: tuple[Window, list[Window], float]) -> Recurrence:
     return recurrence(*job)
 
 
-@dataclass(frozen=True, eq=False)
-class _View:
-    """Approximate placement of the frame in one scan, and a window around every learned mark."""
-
-    placement: Array
-    windows: Mapping[str, Window]
-
-
-def _view(task: ScanTask) -> _View | None:
-    """None where the drawn marks were not found or the scan cannot be read."""
+def _view(task: ScanTask) -> tuple[Array, Mapping[str, Window]] | None:
+    """Approximate placement of the frame in one scan, and a window around every learned mark; None where the drawn
+    marks were not found or the scan cannot be read."""
     camera = task.options.camera
-    try:
-        with task.opened() as scan:
-            placement = _drawn_placement(task.options, scan)
-            if placement is None and len(camera.layout_marks) >= 2:
-                return None
-            if placement is None:
-                placement = _central_frame(task.options, scan)
-            windows = {
-                one.id: resample_square(scan, placement, np.array(one.xy_mm), one.learned_mm, _REACH * one.learned_mm)
-                for one in camera.learned
-            }
-    except MeasurementError:
-        return None
-    return _View(placement, windows)
+    with suppress(MeasurementError), task.opened() as scan:
+        placement = _drawn_placement(task.options, scan)
+        if placement is None and len(camera.layout_marks) >= 2:
+            return None
+        if placement is None:
+            placement = _central_frame(task.options, scan)
+        return placement, {
+            one.id: resample_square(scan, placement, np.array(one.xy_mm), one.learned_mm, _REACH * one.learned_mm)
+            for one in camera.learned
+        }
+    return None
 
 
 def _drawn_placement(options: ScanOptions, scan: Scan) -> Array | None:
@@ -220,23 +206,20 @@ def _start(
     camera: CameraFile, task: ScanTask, scan: Scan, placement: Array, px: Places, alike: tuple[str, ...]
 ) -> CameraFile:
     """Cut templates from one scan; the layout takes their places. alike: scans with the same scan orientation."""
-    inverse = np.linalg.inv(placement[:, :2])
     fiducials = []
     for one in camera.fiducials:
         if isinstance(one.mark, shapes.LearnedMark):
             chip = cut(scan, np.column_stack([placement[:, :2], px[one.id]]), one.mark.size_mm)
-            x, y = inverse @ (px[one.id] - placement[:, 2])
-            one = replace(one, seen_mm=(float(x), float(y)), mark=learn_template([chip], one.mark.size_mm))
+            x, y = Affine(placement).inverse.apply(px[one.id]).tolist()
+            one = replace(one, seen_mm=(x, y), mark=learn_template([chip], one.mark.size_mm))
         fiducials.append(one)
-    given = _up_from_camera(placement)
-    pose = min(POSES, key=lambda name: float(np.abs(up_from_camera(name) - given).sum()))
-    learned_from = LearnedFrom(
-        scan=task.name, sha256=content_hash(scan.path), pose=pose, clicked=camera.clicks is not None, alike=alike
-    )
+    is_clicked = camera.clicks is not None
+    sha256, pose = content_hash(scan.path), _pose(placement)
+    learned_from = LearnedFrom(scan=task.name, sha256=sha256, pose=pose, clicked=is_clicked, alike=alike)
     return replace(camera, fiducials=tuple(fiducials), learned_from=learned_from)
 
 
-def _up_from_camera(placement: Array) -> Array:
-    """(2, 2) rotation, or rotation with reflection, from the camera's axes to the scan's (right, up)."""
-    linear = placement[:, :2] / np.sqrt(abs(np.linalg.det(placement[:, :2])))
-    return np.asarray(np.diag([1.0, -1.0]) @ linear)
+def _pose(placement: Array) -> str:
+    """Scan orientation nearest to a placement."""
+    up = np.diag([1.0, -1.0]) @ placement[:, :2] / linear_scale(placement)  # from the camera's axes to (right, up)
+    return min(POSES, key=lambda name: float(np.abs(up_from_camera(name) - up).sum()))

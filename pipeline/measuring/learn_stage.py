@@ -3,18 +3,18 @@
 First templates from one scan find the marks in every other; the mean over all scans is the final template.
 """
 
+from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
-from hashlib import sha256
 from importlib.metadata import version
 from itertools import chain, count
 from pathlib import Path
 
 import numpy as np
 
-from measure.marks.shapes import FrameCorner, LearnedMark, Mark, MarkShape, MarkTemplate, Polygon
+from measure.marks.shapes import FrameCorner, MarkShape, MarkTemplate, Polygon
 from measure.marks.templates import Chip, cut, learn_template, share_origins
 from measure.results import MEASURE_REVISION, FrameMeasurement
 from measure.scans.opening import declared_tone
@@ -26,7 +26,7 @@ from pipeline.files.project_file import Project
 from pipeline.measuring.first_pictures import first_pictures
 from pipeline.measuring.scan_task import Measure, Memory, ScanTask, sample_names, scan_tasks
 from pipeline.progress import Reporter
-from pipeline.provenance import content_hash, fingerprint, hash_file
+from pipeline.provenance import content_hash, fingerprint, hash_content, hash_file
 from pipeline.results.measured_record import read_tone_information, tone_information_record
 from pipeline.text.atomic import write_atomically
 
@@ -114,15 +114,13 @@ def _check_learned_scan(project: Project, camera: CameraFile) -> CameraFile:
         learned.scan in project.scans and content_hash(project.scans[learned.scan]) == learned.sha256
     ):
         return camera
-    fiducials = tuple(replace(one, mark=_drop_shares(one.mark)) for one in camera.fiducials)
+    fiducials = tuple(
+        replace(one, mark=replace(one.mark, shares={f"{scan}\n": share for scan, share in one.mark.shares.items()}))
+        if isinstance(one.mark, MarkTemplate)  # shares that match no image: a name never contains a line break
+        else one
+        for one in camera.fiducials
+    )
     return replace(camera, fiducials=fiducials, learned_from=None)
-
-
-def _drop_shares(mark: Mark | LearnedMark | None) -> Mark | LearnedMark | None:
-    """Rename the shares of a learned mark so that they match no image: a name never contains a line break."""
-    if not isinstance(mark, MarkTemplate):
-        return mark
-    return replace(mark, shares={f"{scan}\n": share for scan, share in mark.shares.items()})
 
 
 def _learned(
@@ -160,10 +158,10 @@ def _chips(
     """Image patches of every learned mark, by fiducial; and the scan orientations that some frame leaves open."""
     frames = {scan.frame.image: scan.frame for scan in measure(tasks)}
     named = [(task, frames[task.name]) for task in tasks if _is_named(frames[task.name], start)]
-    chips = dict[str, list[Chip]]()
-    for scan_fingerprint in map_items(workers, partial(_learned_chips, learned), named):
-        for id, chip in scan_fingerprint.items():
-            chips.setdefault(id, []).append(chip)
+    chips = defaultdict[str, list[Chip]](list)
+    for of_scan in map_items(workers, partial(_learned_chips, learned), named):
+        for id, chip in of_scan.items():
+            chips[id].append(chip)
     return chips, {rival for frame in frames.values() if frame.pose for rival in frame.pose.rivals}
 
 
@@ -229,16 +227,13 @@ def _stored(camera: CameraFile, place: Path, folder: Path) -> CameraFile:
     return stored
 
 
-def tone_before(setting: float | str, said: Sequence[ToneInformation], scan: Path) -> Tone:
-    """Prior tone curve of a scan, from the project, the file and other scans. The scan's own estimate is not yet
-    included.
-
-    Parameters
-    ----------
-    setting : from the project.
-    said : information from other scans.
-    """
-    return _prior(setting, scan).include_information(said)
+def prior_tone(setting: float | str, scan: Path) -> Tone:
+    """Prior tone curve of a scan, from the setting of the project and the file."""
+    if setting == "auto":
+        return declared_tone(scan) or Tone.unknown()
+    if setting == "srgb":
+        return Tone(srgb(), source=_SET)
+    return Tone(power(1.0 if isinstance(setting, str) else setting), source=_SET)
 
 
 def collect_tones(
@@ -255,9 +250,9 @@ def collect_tones(
     names = [name for name in project.scans if _leans_on_tone(project.image_camera(name))]
     if project.tone != "auto" or len(names) < 2:
         return {}
-    kinds: dict[str, list[str]] = {}
+    kinds = defaultdict[str, list[str]](list)
     for name in names:
-        kinds.setdefault(_kind(project, name), []).append(name)
+        kinds[_kind(project, name)].append(name)
     keys = {kind: _tone_key(project, kind, of_kind) for kind, of_kind in kinds.items() if len(of_kind) > 1}
     before = {kind: memory.recall(key) for kind, key in keys.items()}
     samples = {kind: sample_names(kinds[kind], _SAMPLES) for kind, by_image in before.items() if by_image is None}
@@ -283,31 +278,19 @@ def _tone_key(project: Project, kind: str, names: Sequence[str]) -> str:
     """Key of a scanner's estimates: the marks and settings that they depend on."""
     firsts = {project.image_camera(name).path: name for name in reversed(names)}
     tasks = scan_tasks(project, sorted(firsts.values()))
-    options = sorted(task.fiducials_alone(project.tone).options_json() for task in tasks)
+    options = sorted(task.fiducials_alone(project.tone).options.json for task in tasks)
     return f"tone {fingerprint([kind, options, MEASURE_REVISION])}"
-
-
-def _prior(setting: float | str, scan: Path) -> Tone:
-    if setting == "auto":
-        return declared_tone(scan) or Tone.unknown()
-    if setting == "srgb":
-        return Tone(srgb(), source=_SET)
-    return Tone(power(1.0 if isinstance(setting, str) else setting), source=_SET)
 
 
 def _kind(project: Project, image: str) -> str:
     """Group of scans with one tone curve: same scanner, file type and declared curve."""
     scan = project.scans[image]
-    curve_hash = sha256(np.ascontiguousarray(_prior(project.tone, scan).base).tobytes()).hexdigest()[:8]
+    curve_hash = hash_content(np.ascontiguousarray(prior_tone(project.tone, scan).base).tobytes())[:8]
     return f"{project.image_scanner(image)} {scan.suffix.lower()} {curve_hash}"
 
 
 def _leans_on_tone(camera: CameraFile) -> bool:
     """Whether a camera has marks that an error of the curve displaces: those with edges on one side only."""
-    return any(_has_tip(one.mark) for one in camera.layout_marks)
-
-
-def _has_tip(mark: Mark | object) -> bool:
-    if isinstance(mark, FrameCorner):
-        return True
-    return isinstance(mark, MarkShape) and any(isinstance(part, Polygon) for part in mark.parts)
+    parts = [part for one in camera.layout_marks if isinstance(one.mark, MarkShape) for part in one.mark.parts]
+    corners = [one for one in camera.layout_marks if isinstance(one.mark, FrameCorner)]
+    return bool(corners) or any(isinstance(part, Polygon) for part in parts)

@@ -90,7 +90,7 @@ def add_known_lines(
     for task in tasks:
         lines = known.get(id(task.options.camera), ())
         if lines and task.name not in measured and task.options.fiducials.writing == "pose":
-            options.setdefault(id(task.options), task.options.knowing(lines))
+            options.setdefault(id(task.options), task.changed(known_lines=lines).options)
             task = replace(task, options=options[id(task.options)])
         knowing.append(task)
     return tuple(knowing), measured

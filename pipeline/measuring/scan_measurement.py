@@ -3,7 +3,7 @@
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,7 +23,7 @@ from measure.scans.remote import TRAFFIC, ScanPart, Window, public_text, scan_pa
 from measure.scans.scan import Scan
 from pipeline.errors import InputError, what_to_do
 from pipeline.files.opencv_file import CalibratedLens
-from pipeline.measuring.learn_stage import tone_before
+from pipeline.measuring.learn_stage import prior_tone
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
 from pipeline.measuring.target_identification import misplaced_principal_point
 from pipeline.measuring.target_stage import measure_targets
@@ -138,14 +138,14 @@ def _measure(task: ScanTask, scan: Scan, options: ScanOptions) -> MeasuredScan:
     """Measure a scan, whole or cropped to a window."""
     # Fiducials are measured in grey values corrected by the tone curve. Targets have edges on all sides and are
     # measured in the grey values as they are.
-    tone = tone_before(options.tone, options.said, scan.path)
+    tone = prior_tone(options.tone, scan.path).include_information(options.said)
     frame = replace(_fiducials(options, scan.replace_tone(tone)), image=task.name)
     pitch, problems, notes = _pitch(options, scan, frame)
     of_file = (Reason(f"{capitalised(problem)}.", Code.SECOND_PICTURE) for problem in scan.problems)
     frame = replace(frame, problems=(*of_file, *frame.problems, *problems))
     curve = (frame.tone.note,) if frame.tone else ()
     file_notes = (f"{capitalised(note)}." for note in scan.notes)
-    notes = (*file_notes, *notes, *curve, *_missed_reading(options, frame), *_unknown_lens(options))
+    notes = (*file_notes, *notes, *curve, *_missing_input(options, frame))
     measured = MeasuredScan(task.shown_scan, scan.width_px, scan.height_px, pitch, frame, notes)
     if misplaced := misplaced_principal_point(options.camera, measured):
         measured = measured.changed(problems=[Reason(misplaced, Code.OFF_GIVEN)])
@@ -180,23 +180,17 @@ def reads_writing(options: ScanOptions) -> bool:
     return options.fiducials.writing != "none" and networks() is not None
 
 
-def _missed_reading(options: ScanOptions, frame: FrameMeasurement) -> tuple[str, ...]:
-    """A note if text should be read and the networks for it are not installed."""
-    writing = options.fiducials.writing
-    undecided = writing == "pose" and frame.pose is not None and not frame.pose.decided
-    is_requested = writing == "all" or undecided
-    return (f"{capitalised(MISSING)}.",) if is_requested and networks() is None else ()
-
-
-def _unknown_lens(options: ScanOptions) -> tuple[str, ...]:
-    """A note if the calibration of the taking lens has no covariance."""
-    lens = options.fiducials.lens
-    if not isinstance(lens, CalibratedLens) or lens.is_covariance_known:
-        return ()
-    return (
-        "The calibration of the taking lens gives no covariance: the lens is taken as exact. `reseau calibrate` "
-        "writes one into camera.yaml.",
-    )
+def _missing_input(options: ScanOptions, frame: FrameMeasurement) -> Iterator[str]:
+    """Yield notes where text should be read without the networks for it, or the taking lens has no covariance."""
+    writing, lens = options.fiducials.writing, options.fiducials.lens
+    is_open = writing == "pose" and frame.pose is not None and not frame.pose.decided
+    if (writing == "all" or is_open) and networks() is None:
+        yield f"{capitalised(MISSING)}."
+    if isinstance(lens, CalibratedLens) and not lens.is_covariance_known:
+        yield (
+            "The calibration of the taking lens gives no covariance: the lens is taken as exact. `reseau calibrate` "
+            "writes one into camera.yaml."
+        )
 
 
 def _add_sizes(

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from adjust.functional_model.lens import Distortion, Prior
 from adjust.problem.network import Exterior
-from measure.annotations.fields import KnownLine
 from measure.errors import MissingError
 from measure.fiducials.options import FiducialOptions
 from measure.results import Pose
@@ -62,13 +61,10 @@ class ScanOptions:
     targets: "SoughtTargets | None" = None
     exterior: Exterior | None = None
 
-    def knowing(self, lines: tuple[KnownLine, ...]) -> "ScanOptions":
-        """Copy with text lines that show that a frame lies like others of its camera."""
-        return replace(self, fiducials=replace(self.fiducials, known_lines=lines))
-
     @cached_property
     def json(self) -> str:
-        """All options as canonical JSON."""
+        """Canonical JSON of all that a result depends on in addition to the scan. Equal options give equal text; any
+        option that may change the result changes the text."""
         return canonical_json(self)
 
 
@@ -87,11 +83,6 @@ class ScanTask:
     scan: str
     options: ScanOptions
     max_pixels: int | None = None
-
-    def options_json(self) -> str:
-        """Canonical JSON of all that the result depends on in addition to the scan. Equal options give equal text; any
-        option that may change the result changes the text."""
-        return self.options.json
 
     @property
     def shown_scan(self) -> str:

@@ -53,8 +53,7 @@ class _Plane(ABC):
 
 @table_model
 class _Grid(_Plane):
-    """Targets on a grid around a centre, row by row from the bottom, with random shifts within the cells and out of the
-    plane."""
+    """Targets on a grid around a centre, row by row from the bottom, with random shifts in the plane and out of it."""
 
     columns: _Count
     rows: _Count

@@ -131,9 +131,11 @@ def _given_camera(scene_file: SceneFile, generator: np.random.Generator) -> Came
     true = scene_file.scene.camera
     distance = true.principal_distance_mm + generator.normal(0.0, given.principal_distance_mm)
     point = np.asarray(true.principal_point_mm) + generator.normal(0.0, given.principal_point_mm, 2)
-    parameters = {
-        name: _given_parameter(prior, generator) for name, prior in sorted(camera.distortion.parameters.items())
-    }
+    parameters = dict(sorted(camera.distortion.parameters.items()))
+    for name, prior in parameters.items():
+        if prior.sigma > 0.0:
+            value = 0.0 if math.isinf(prior.sigma) else float(generator.normal(prior.value, prior.sigma))
+            parameters[name] = Prior(value, prior.sigma)
     return replace(
         camera,
         principal_distance_mm=round(float(distance), 4),
@@ -142,12 +144,6 @@ def _given_camera(scene_file: SceneFile, generator: np.random.Generator) -> Came
         distortion=replace(camera.distortion, parameters=parameters),
         fiducials=tuple(_given_fiducial(one, scene_file, generator) for one in camera.fiducials),
     )
-
-
-def _given_parameter(prior: Prior, generator: np.random.Generator) -> Prior:
-    if prior.sigma == 0.0:
-        return prior
-    return Prior(0.0 if math.isinf(prior.sigma) else float(generator.normal(prior.value, prior.sigma)), prior.sigma)
 
 
 def _given_fiducial(fiducial: GivenFiducial, scene_file: SceneFile, generator: np.random.Generator) -> GivenFiducial:
@@ -213,41 +209,28 @@ def _csv(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def _project_text(scene_file: SceneFile) -> str:
-    names = ", ".join(f'"scans/{image.name}.tif"' for image in scene_file.scene.images)
-    return f"""# Rendered from the scene "{scene_file.scene.name}"; the truth is in truth.json.
+    scene, targets = scene_file.scene, field_targets(scene_file.scene.field)
+    names = ", ".join(f'"scans/{image.name}.tif"' for image in scene.images)
+    # The file of a photograph has no pitch.
+    pitch = f'pitch_um = {scene.scanner.pitch_um[0]!r}\n\n[scanner]\nlens = "{TAKING_CAMERA}"\n'
+    # Natural points give no planimetric control.
+    datum = "" if targets else 'datum = "minimal"\n'
+    bend = 'scanner = "auto"\n' if scene.scanner.bend_um and scene_file.camera.fiducials else ""
+    points = 'points = "points.csv"\n' if targets else ""
+    return f"""# Rendered from the scene "{scene.name}"; the truth is in truth.json.
 camera = "camera.toml"
 scans = [{names}]
 comparator = "comparator.csv"
 output = "out"
-{_taking_camera_text(scene_file.scene)}
+{pitch if scene.scanner.lens else ""}
 {_targets_text(scene_file)}
 [object]
-{_points_text(scene_file)}images = "images.csv"
+{points}images = "images.csv"
 unit = "{scene_file.unit}"
 
 [adjust]
 transformation = "{film_transformation(scene_file)}"
-{_datum_text(scene_file)}{_scanner_text(scene_file)}"""
-
-
-def _taking_camera_text(scene: Scene) -> str:
-    """Pitch and lens for a photographed film, since the file of a photograph has no pitch."""
-    if scene.scanner.lens is None:
-        return ""
-    return f'pitch_um = {scene.scanner.pitch_um[0]!r}\n\n[scanner]\nlens = "{TAKING_CAMERA}"\n'
-
-
-def _scanner_text(scene_file: SceneFile) -> str:
-    return 'scanner = "auto"\n' if scene_file.scene.scanner.bend_um and scene_file.camera.fiducials else ""
-
-
-def _datum_text(scene_file: SceneFile) -> str:
-    """Minimum constraints for natural points, which give no planimetric control."""
-    return "" if field_targets(scene_file.scene.field) else 'datum = "minimal"\n'
-
-
-def _points_text(scene_file: SceneFile) -> str:
-    return 'points = "points.csv"\n' if field_targets(scene_file.scene.field) else ""
+{datum}{bend}"""
 
 
 def _targets_text(scene_file: SceneFile) -> str:

@@ -104,11 +104,14 @@ def _view(data: ReportData, stored: AdjustmentRecord, name: str, camera: CameraR
     # Without a solution all sigmas are NaN: they do not mean that the camera was left out of the calibration.
     is_calibrated = camera.is_calibrated or not stored.converged
     covariance = known if is_calibrated else None
-    radius_mm, on = _observed_radius_mm(camera, rows), _plane(data, name, camera, rows, unit)
+    field, radius_mm = vectors.VectorField.from_residuals(rows), _observed_radius_mm(camera, rows)
+    on = _plane(data, name, camera, field, unit) if rows else None
+    some = vectors.VectorField.from_residuals(rows[:: -(-len(rows) // MOST_VECTORS) or 1])  # evenly from all images
     figure = fiducials.figure(name, stored, known) if known else None
     radius = fixed(radius_mm * unit.per_mm, 0)
     places = np.array([(row.camera_x_mm, row.camera_y_mm) for row in rows if row.kind not in ("fiducial", "join")])
-    parameters = list(parameter_rows(name, camera, _prior_scale(name, stored), radius_mm, unit))
+    has_scale = stored.sigma0 > 0.0 and ("interior", name) not in stored.variance_factor.left_out
+    parameters = list(parameter_rows(name, camera, stored.sigma0 if has_scale else 1.0, radius_mm, unit))
     return CameraView(
         name=name,
         record=camera,
@@ -122,7 +125,9 @@ def _view(data: ReportData, stored: AdjustmentRecord, name: str, camera: CameraR
         correlations=high_correlations(name, camera, covariance) if covariance else [],
         correlation_causes=_correlation_causes(name, stored),
         lens=_lens_view(name, camera, covariance, on, radius_mm, unit) if covariance else None,
-        vectors=_vectors(rows, on) if on is not None and is_calibrated else None,
+        vectors=vectors.all_images_plot(some, on, field.scale(LONGEST_VECTOR_PX))
+        if on is not None and is_calibrated
+        else None,
         coverage=coverage_plot(on, places) if on is not None and is_calibrated and len(places) else None,
         observed=len(places),
         maps=list(_uncertainty_maps(camera, on, data.unit)) if on is not None else [],
@@ -143,20 +148,12 @@ def _observed_radius_mm(camera: CameraRecord, rows: list[ResidualRecord]) -> flo
 
 
 def _plane(
-    data: ReportData, name: str, camera: CameraRecord, rows: list[ResidualRecord], unit: ImageUnit
-) -> vectors.Plane | None:
-    """Plane of the camera's frame, or of its observations if the frame size is unknown; None without observations."""
-    if not rows:
-        return None
+    data: ReportData, name: str, camera: CameraRecord, field: vectors.VectorField, unit: ImageUnit
+) -> vectors.Plane:
+    """Plane of the camera's frame, or of its observations if the frame size is unknown."""
     if camera.lens_known is not None and camera.lens_known.frame_mm is not None:
         return vectors.padded_plane(np.array(camera.lens_known.frame_mm), PLOT_PX, unit=unit)
-    return vectors.plane(vectors.VectorField.from_residuals(rows).places_mm, data.frame_mm.get(name), PLOT_PX, unit)
-
-
-def _prior_scale(name: str, stored: AdjustmentRecord) -> float:
-    """Factor by which sigma0 scales the given standard deviations of an interior orientation."""
-    is_left_out = ("interior", name) in stored.variance_factor.left_out
-    return stored.sigma0 if stored.sigma0 > 0.0 and not is_left_out else 1.0
+    return vectors.plane(field.places_mm, data.frame_mm.get(name), PLOT_PX, unit)
 
 
 def _correlation_causes(name: str, stored: AdjustmentRecord) -> list[str]:
@@ -172,8 +169,7 @@ def _correlation_causes(name: str, stored: AdjustmentRecord) -> list[str]:
 def _lens_view(
     name: str, camera: CameraRecord, covariance: Covariance, on: vectors.Plane | None, radius_mm: float, unit: ImageUnit
 ) -> LensView | None:
-    """Distortion out to the corner of the frame if its size is known, otherwise of the observed area. A family defined
-    over the frame is shown on circles within it only."""
+    """Distortion out to the corner of the frame or, if its size is unknown, of the observed area."""
     reach = camera.lens_known
     corner_mm = reach.corner_mm if reach is not None and reach.corner_mm > 0.0 else 0.0
     if corner_mm == 0.0 and on is not None:
@@ -182,7 +178,7 @@ def _lens_view(
     if not parameter_names(camera.distortion.family) or largest == 0.0:
         return None
     known = lens.lens(name, camera, covariance)
-    if is_defined_over_frame(known):
+    if is_defined_over_frame(known):  # on circles within it only
         largest = min(largest, *known.distortion.half_mm)
     curves = distortion_curves(known, largest)
     reach_mm = min(radius_mm or np.inf, float(curves.radius_mm[-1]))
@@ -193,12 +189,6 @@ def _lens_view(
         None if unit.is_pixel else lens.certificate(known, reach_mm),
         lens.lens_map(known, on, radius_mm) if on is not None else None,
     )
-
-
-def _vectors(rows: list[ResidualRecord], on: vectors.Plane) -> Markup:
-    scale = vectors.VectorField.from_residuals(rows).scale(LONGEST_VECTOR_PX)
-    residuals = vectors.VectorField.from_residuals(rows[:: -(-len(rows) // MOST_VECTORS)])  # evenly from all images
-    return vectors.all_images_plot(residuals, on, scale)
 
 
 def _uncertainty_maps(camera: CameraRecord, on: vectors.Plane, unit: str) -> Iterator[tuple[str, Markup]]:

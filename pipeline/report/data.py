@@ -3,7 +3,7 @@
 import math
 import re
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -217,13 +217,14 @@ class Frame:
 def frames(data: ReportData) -> list[Frame]:
     """Frames of all images named in any of the files, sorted by name."""
     scans = current_scans(data)
-    marks: dict[str, dict[tuple[bool, str], Mark]] = defaultdict(dict)
+    marks: dict[str, list[Mark]] = defaultdict(list)
     for mark in _marks(data, scans):
-        marks[mark.image][mark.is_fiducial, mark.point] = mark
+        marks[mark.image].append(mark)
     names = {*scans, *marks, *(data.adjustment.images if data.adjustment and not data.totals else {})}
     return [
-        Frame(name, tuple(sorted(marks[name].values(), key=_order)), scans.get(name))
+        Frame(name, tuple(sorted(marks[name], key=lambda mark: (not mark.is_fiducial, natural(mark.point)))), scan)
         for name in sorted(names, key=natural)
+        for scan in [scans.get(name)]
     ]
 
 
@@ -238,7 +239,8 @@ def natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
-def _marks(data: ReportData, scans: Mapping[str, MeasuredScan]) -> list[Mark]:
+def _marks(data: ReportData, scans: Mapping[str, MeasuredScan]) -> Iterator[Mark]:
+    """Join the sources of each mark. The comparator file takes precedence, since the user may have edited it."""
     measured = {
         (image, mark.kind == "fiducial", mark.point): mark for image, scan in scans.items() for mark in scan.frame.marks
     }
@@ -247,39 +249,22 @@ def _marks(data: ReportData, scans: Mapping[str, MeasuredScan]) -> list[Mark]:
         for row in (data.adjustment.residuals if data.adjustment else ())
     }
     given = {(row.image, row.kind == "fiducial", row.point): row for row in data.comparator}
-    return [_mark(key, measured.get(key), given.get(key), residuals.get(key)) for key in {**measured, **given}]
-
-
-def _mark(
-    key: tuple[str, bool, str],
-    pixel: MarkMeasurement | None,
-    row: ComparatorPoint | None,
-    residual: ResidualRecord | None,
-) -> Mark:
-    """Join the sources of a mark. The comparator file takes precedence, since the user may have edited it."""
-    image, _, point = key
-    known = row or pixel
-    assert known is not None  # the keys come from these two sources
-    return Mark(
-        image=image,
-        point=point,
-        kind=known.kind,
-        status=known.status,
-        reason=pixel.reason if pixel and pixel.reason == known.reason else Reason.read(known.reason, ""),
-        center_px=pixel.center_px if pixel else None,
-        covariance=pixel.covariance if pixel else None,
-        sigma_um=_sigma_um(residual, row),
-        residual=residual,
-        quality=pixel.quality if pixel else {},
-    )
-
-
-def _sigma_um(residual: ResidualRecord | None, row: ComparatorPoint | None) -> Array | None:
-    """Standard deviation used in the adjustment, film included; without an adjustment as measured."""
-    if residual:
-        return np.array([residual.sx_um, residual.sy_um])
-    return 1e3 * row.sigma_mm if row and row.sigma_mm is not None else None
-
-
-def _order(mark: Mark) -> tuple[bool, list[tuple[int, str]]]:
-    return (not mark.is_fiducial, natural(mark.point))
+    joined: dict[tuple[str, bool, str], MarkMeasurement | ComparatorPoint] = {**measured, **given}
+    for key, known in joined.items():
+        pixel, row, residual = measured.get(key), given.get(key), residuals.get(key)
+        # Standard deviation used in the adjustment, film included; without an adjustment as measured.
+        sigma_um = np.array([residual.sx_um, residual.sy_um]) if residual else None
+        if residual is None and row and row.sigma_mm is not None:
+            sigma_um = 1e3 * row.sigma_mm
+        yield Mark(
+            image=key[0],
+            point=known.point,
+            kind=known.kind,
+            status=known.status,
+            reason=pixel.reason if pixel and pixel.reason == known.reason else Reason.read(known.reason, ""),
+            center_px=pixel.center_px if pixel else None,
+            covariance=pixel.covariance if pixel else None,
+            sigma_um=sigma_um,
+            residual=residual,
+            quality=pixel.quality if pixel else {},
+        )

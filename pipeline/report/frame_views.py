@@ -68,9 +68,9 @@ def _badness(mark: Mark) -> tuple[bool, bool, float]:
     )
 
 
-def arrow_scale(marks: list[Mark]) -> float:
-    """Scale of residual arrows, page pixels per µm: a round number at which the longest arrow fits."""
-    lengths = [float(np.hypot(*mark.residual.v_um)) for mark in marks if mark.residual]
+def arrow_scale(shots: list[Frame]) -> float:
+    """Scale of residual arrows on thumbnails, page pixels per µm: a round number at which the longest arrow fits."""
+    lengths = [float(np.hypot(*mark.residual.v_um)) for frame in shots for mark in frame.marks if mark.residual]
     return svg.round_step(ARROW_PX / max(*lengths, LEAST_UM)) if lengths else 1.0
 
 
@@ -85,7 +85,8 @@ def mark_picture(mark: Mark, thumbnail: Thumbnail, px_per_um: float, most_px: fl
         # The centre of the top-left thumbnail pixel lies half a thumbnail pixel inside the picture's edge.
         x, y = (mark.center_px - thumbnail.origin_px + 0.5 * thumbnail.step_px) * zoom
         overlay = _crosshair(x, y, mark) + (_arrow(x, y, mark.residual, px_per_um) if mark.residual else Markup(""))
-    return svg.picture(SIZE_PX, SIZE_PX, _description(mark), image, overlay, class_="thumb")
+    title = f"{mark.kind} {mark.point} in {mark.image}, {mark.status}: the scan about its measured centre"
+    return svg.picture(SIZE_PX, SIZE_PX, title, image, overlay, class_="thumb")
 
 
 def _png_uri(pixels: NDArray[np.generic], most_px: float) -> str:
@@ -103,11 +104,9 @@ def _png_uri(pixels: NDArray[np.generic], most_px: float) -> str:
 def _crosshair(x: float, y: float, mark: Mark) -> Markup:
     """Draw four ticks that leave the centre visible; dashed if the mark is not an observation."""
     ends = np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])
-    at = np.array([x, y])
+    starts, stops = (np.array([x, y]) + px * ends for px in (5.0, 17.0))
     class_ = "hair" if mark.status.is_observation else "hair guess"
-    return svg.strokes(at + 5.0 * ends, at + 17.0 * ends, "halo") + svg.strokes(
-        at + 5.0 * ends, at + 17.0 * ends, class_
-    )
+    return svg.strokes(starts, stops, "halo") + svg.strokes(starts, stops, class_)
 
 
 def _arrow(x: float, y: float, residual: ResidualRecord, px_per_um: float) -> Markup:
@@ -122,10 +121,6 @@ def _arrow(x: float, y: float, residual: ResidualRecord, px_per_um: float) -> Ma
     back, side = -v / length, np.array([v[1], -v[0]]) / length
     x_head, y_head = np.stack([end + 6.0 * back + 3.0 * side, end, end + 6.0 * back - 3.0 * side], axis=1)
     return svg.strokes(start[None], end[None], "halo") + shaft + svg.line(x_head, y_head, "arrow")
-
-
-def _description(mark: Mark) -> str:
-    return f"{mark.kind} {mark.point} in {mark.image}, {mark.status}: the scan about its measured centre"
 
 
 def writing_picture(scan: MeasuredScan | None) -> Markup | None:
@@ -219,7 +214,7 @@ def frame_views(data: ReportData, shots: list[Frame], every_mark: bool = False) 
     """Views of all frames, the worst first, drawn to common scales. every_mark: show all marks, whatever their
     number."""
     shown = {frame.image: list(frame.marks) for frame in shots} if every_mark else shown_marks(shots)
-    px_per_um, most_px = thumbnail_scale(shots), stored_px(shown)
+    px_per_um, most_px = arrow_scale(shots), stored_px(shown)
     by_image = residuals_by_image(data)
     suspects = suspect_rows(data.adjustment) if data.adjustment else frozenset[ResidualRecord]()
     plots = _plots(data, by_image, suspects, [frame.image for frame in shots if frame.image in by_image])
@@ -252,11 +247,6 @@ def cards_to_show(views: Iterable[FrameView]) -> tuple[list[Card], int]:
     """Cards of marks that need a look, those of the worst frame first, and the number of further ones."""
     cards = [card for view in views for card in view.cards if card.needs_look]
     return cards[:MOST_CARDS], len(cards[MOST_CARDS:])
-
-
-def thumbnail_scale(shots: list[Frame]) -> float:
-    """Scale of the residual arrows on the thumbnails, page pixels per µm."""
-    return arrow_scale([mark for frame in shots for mark in frame.marks])
 
 
 def residuals_by_image(data: ReportData) -> dict[str, list[ResidualRecord]]:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 from pipeline.archive.made_from import (
@@ -78,7 +77,7 @@ def measured_data(
     if made is None:
         what = f"{path.name} is of other marks than {project.comparator.name}: it is not shown."
         return _add_problems(data, Problem(what, "Run `reseau measure`."))
-    many = rows is not None or (most_frames is not None and frame_count(data) > most_frames)
+    many = rows is not None or (most_frames is not None and _frame_count(data) > most_frames)
     scans = {} if many else {scan.frame.image: scan for scan in measured_scans(path, digest)}
     data = replace(data, measurement=scans, made_from={**data.made_from, path.name: digest})
     unlike: list[Problem] = []
@@ -106,8 +105,7 @@ def _coordinates_source(camera: CameraFile) -> str:
     return "the camera file" if camera.source.frames else "the library's typical coordinates"
 
 
-def frame_count(data: ReportData) -> int:
-    """Number of images with marks."""
+def _frame_count(data: ReportData) -> int:
     return len({row.image for row in data.comparator})
 
 
@@ -119,15 +117,16 @@ def unread_scans(data: ReportData, project: Project, images: Collection[str] | N
 
 def report_data(project: Project, at: At, most_frames: int = MOST_FRAMES) -> ReportData:
     """Load all data of a report. With more than most_frames frames: totals, and the frames that need a look."""
-    camera_of = partial(_camera_name, project)
+
+    def camera_of(image: str) -> str:
+        return project.image_camera(image).name
+
     stored = _stored(project, at)
     if stored is not None and len(stored.names) > most_frames:
         needed = stored.names - {frame.image for frame in stored.plain}
         return reduced(measured_data(project, at, rows=stored.rows(needed)), stored.scans(needed), camera_of, stored)
     data = adjusted_data(project, at, most_frames)
-    if frame_count(data) <= most_frames:
-        return data
-    return reduced(data, unread_scans(data, project), camera_of)
+    return data if _frame_count(data) <= most_frames else reduced(data, unread_scans(data, project), camera_of)
 
 
 def frame_data(project: Project, at: At, images: Collection[str]) -> ReportData:
@@ -143,15 +142,10 @@ def frame_data(project: Project, at: At, images: Collection[str]) -> ReportData:
 
 
 def _stored(project: Project, at: At) -> StoredMarks | None:
-    """Open the stored marks if comparator.csv is unchanged and nothing is adjusted, so that not all need be read; else
-    None."""
+    """Stored marks, not all of which need be read, if comparator.csv is unchanged and nothing is adjusted."""
     if not project.scans or at(project.adjustment_path).exists():
         return None
     return StoredMarks.open(project.measurement_path, at(project.comparator))
-
-
-def _camera_name(project: Project, image: str) -> str:
-    return project.image_camera(image).name
 
 
 def adjusted_data(project: Project, at: At, most_frames: int | None = None) -> ReportData:

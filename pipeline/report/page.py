@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -23,7 +22,7 @@ from pipeline.report.frame_problems import (
     fraction_test,
     places_px,
 )
-from pipeline.report.frame_views import FrameView, cards_to_show, frame_views, thumbnail_scale
+from pipeline.report.frame_views import FrameView, arrow_scale, cards_to_show, frame_views
 from pipeline.report.many_frames import totals_view
 from pipeline.report.numbers import fixed, fixed_list, significant, value_and_sigma
 from pipeline.report.parameters import axes_sentence, group_sentences, spoken_name
@@ -154,18 +153,8 @@ def _frame_context(data: ReportData, shots: list[Frame], every_mark: bool = Fals
     }
 
 
-@dataclass(frozen=True)
-class ProblemView:
-    """Problem as printed: cause, details, remedy, and links (text, target)."""
-
-    cause: str
-    detail: str
-    remedy: str
-    links: list[tuple[str, str]]
-    picture: Markup | None
-
-
-def _problem_view(problem: Problem, views: Sequence[FrameView]) -> ProblemView:
+def _problem_view(problem: Problem, views: Sequence[FrameView]) -> dict[str, object]:
+    """Problem as printed: cause, details, remedy, links (text, target) and picture of its first mark."""
     known = {view.frame.image: view for view in views}
     images = dict.fromkeys((*problem.images, *(image for image, *_ in problem.marks)))
     links = [(image, f"#{known[image].id}") for image in images if image in known][:LINKS]
@@ -179,7 +168,8 @@ def _problem_view(problem: Problem, views: Sequence[FrameView]) -> ProblemView:
         if (card.mark.kind, card.mark.point) == (kind, point)
     )
     picture = next((card.picture for card in marks if card.picture), None)
-    return ProblemView(problem.cause, problem.detail, problem.remedy, links, picture)
+    told = {"cause": problem.cause, "detail": problem.detail, "remedy": problem.remedy}
+    return {**told, "links": links, "picture": picture}
 
 
 def _points_word(shots: list[Frame]) -> str:
@@ -200,7 +190,7 @@ def _fractions(places: Mapping[str, Array]) -> Iterator[tuple[str, FractionTest,
 
 def _arrow_bar(data: ReportData, shots: list[Frame]) -> tuple[float, float]:
     """Round length for the legend of the residual arrows, and its page pixels."""
-    px_per_unit = thumbnail_scale(shots) / next(iter(data.image_units.values()), FILM_UNIT).per_um
+    px_per_unit = arrow_scale(shots) / next(iter(data.image_units.values()), FILM_UNIT).per_um
     length = svg.round_step(40.0 / px_per_unit)
     return length, length * px_per_unit
 

@@ -74,7 +74,9 @@ def camera_values(data: ReportData, name: str) -> list[CameraValue]:
     sigma = _sigmas(by_mm, model) if np.isfinite(sigmas).all() else np.abs(by_mm) @ sigmas
     if data.covariance is not None and data.covariance.clusters is not None:
         sigma = np.maximum(sigma, _sigmas(by_mm, data.covariance.clusters.select(keys)))
-    return list(map(CameraValue, values, values.values(), sigma.tolist(), _units(camera, values, unit)))
+    family = family_of(camera.distortion.family)
+    units = [unit.long_name if name in INTERIOR_MEANING else family.unit(name) for name in values]
+    return list(map(CameraValue, values, values.values(), sigma.tolist(), units))
 
 
 def _stated(camera: CameraRecord, known: Mapping[str, Quantity], unit: ImageUnit) -> tuple[dict[str, float], Array]:
@@ -84,12 +86,6 @@ def _stated(camera: CameraRecord, known: Mapping[str, Quantity], unit: ImageUnit
         return pixel_intrinsics(mm, 1.0 / unit.per_mm)
     scale = np.array([unit.per_mm if key in ("c", "x0", "y0") else 1.0 for key in mm])
     return dict(zip(mm, (scale * list(mm.values())).tolist(), strict=True)), np.diag(scale)
-
-
-def _units(camera: CameraRecord, values: Mapping[str, float], unit: ImageUnit) -> Iterator[str]:
-    family = family_of(camera.distortion.family)
-    for name in values:
-        yield unit.long_name if name in INTERIOR_MEANING else family.unit(name)
 
 
 def _sigmas(by_mm: Array, covariance: Array) -> Array:

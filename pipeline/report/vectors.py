@@ -1,5 +1,6 @@
 """Plots over the camera frame: vectors (residuals, partial scans, distortion, scanner), coverage, and contours."""
 
+import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -53,13 +54,11 @@ class Plane:
         bars = [(self.px_per_mm / self.unit.per_mm, f"{self.unit.long_name} (frame)")]
         if px_per_um is not None:
             bars.insert(0, (px_per_um / self.unit.per_um, f"{self.unit.short_name} (vectors)"))
-        drawn = [self._scale_bar(4.0 + 15.0 * row, *bar) for row, bar in enumerate(bars)]
-        height = self.height_px + FOOT_PX
-        return svg.picture(self.width_px, height, title, outline, *content, *drawn)
-
-    def _scale_bar(self, below: float, px_per_unit: float, words: str) -> Markup:
-        length = svg.round_step(60.0 / px_per_unit)
-        return svg.scale_bar(MARGIN_PX, self.height_px + below, length * px_per_unit, f"{length:g} {words}")
+        drawn = []
+        for row, (px_per_unit, words) in enumerate(bars):
+            length, y = svg.round_step(60.0 / px_per_unit), self.height_px + 4.0 + 15.0 * row
+            drawn.append(svg.scale_bar(MARGIN_PX, y, length * px_per_unit, f"{length:g} {words}"))
+        return svg.picture(self.width_px, self.height_px + FOOT_PX, title, outline, *content, *drawn)
 
 
 @dataclass(frozen=True)
@@ -214,11 +213,10 @@ def contour_plot(on: Plane, x_mm: Array, y_mm: Array, sigma_um: Array, title: st
     drawn, labels = [], list[tuple[float, float, str]]()
     for level in _levels(float(np.nanmin(sigma)), high):
         for line in find_contours(sigma, level):
-            row, column = line.T
-            mm = np.stack([_interpolated(column, x_mm), _interpolated(row, y_mm)], axis=1)
-            page = on.page(mm)
+            nodes = zip(line.T[::-1], (x_mm, y_mm), strict=True)
+            page = on.page(np.stack([np.interp(at, np.arange(len(axis)), axis) for at, axis in nodes], axis=1))
             drawn.append(svg.line(page[:, 0], page[:, 1], "contour"))
-            free = [at for at in page.tolist() if _is_apart(at, labels)]
+            free = [at for at in page.tolist() if all(math.dist(at, label[:2]) > LABEL_ROOM_PX for label in labels)]
             if len(line) > 3 and free:
                 labels.append((*free[len(free) // 2], f"{level:g}"))
     names = [svg.words(px, py + 4.0, text, "contour-label", "middle") for px, py, text in labels]
@@ -231,11 +229,3 @@ def _levels(low: float, high: float) -> list[float]:
         powers = 10.0 ** np.arange(np.floor(np.log10(max(low, 1e-3 * high))), np.ceil(np.log10(high)) + 1.0)
         return [float(f"{m * power:.3g}") for power in powers for m in (1.0, 2.0, 5.0) if low < m * power < high]
     return [float(f"{each:.6g}") for each in svg.ticks(low, high, LEVELS)]
-
-
-def _interpolated(position: Array, axis_mm: Array) -> Array:
-    return np.interp(position, np.arange(len(axis_mm)), axis_mm)
-
-
-def _is_apart(at: list[float], labels: list[tuple[float, float, str]]) -> bool:
-    return all(np.hypot(at[0] - x, at[1] - y) > LABEL_ROOM_PX for x, y, _ in labels)

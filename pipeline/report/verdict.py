@@ -306,18 +306,11 @@ def _solution_check(found: Callable[[AdjustmentRecord], Iterator[Problem]], chec
     return problems
 
 
-def _frame_check(data: ReportData, shots: list[Frame]) -> Iterator[Problem]:
-    if data.totals:
-        yield from data.totals.problems
-        return
-    yield from frame_problems(shots)
-
-
 # Checks that lead to exit code 1, by their names in docs/how-to/read-the-report.md.
 NEEDS_A_LOOK: dict[str, Evidence] = {
     "solution": lambda data, _: _no_solution(data.adjustment) if data.adjustment else (),
     "made from": lambda data, _: data.problems,
-    "frames": _frame_check,
+    "frames": lambda data, shots: data.totals.problems if data.totals else frame_problems(shots),
     "pixel locking": lambda data, shots: pixel_locking(data.totals.places_px if data.totals else places_px(shots)),
     "warnings": lambda data, _: map(Problem, data.adjustment.warnings if data.adjustment else ()),
     "σ₀": _solution_check(_too_large, checked=True),

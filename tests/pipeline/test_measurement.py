@@ -72,9 +72,9 @@ def make_tasks(folder: Path, project: str = PROJECT, camera: str = CAMERA) -> tu
 def test_scans_that_have_all_in_common_have_equal_options(tmp_path: Path) -> None:
     a, b = make_tasks(tmp_path / "here")
     there, _ = make_tasks(tmp_path / "there")
-    assert a.options_json() == b.options_json() == there.options_json()
-    assert pickle.loads(pickle.dumps(a)).options_json() == a.options_json()
-    assert json.loads(a.options_json())
+    assert a.options.json == b.options.json == there.options.json
+    assert pickle.loads(pickle.dumps(a)).options.json == a.options.json
+    assert json.loads(a.options.json)
     assert (a.name, Path(a.scan).name) == ("a", "a.tif")
 
 
@@ -96,7 +96,7 @@ def test_scans_that_have_all_in_common_have_equal_options(tmp_path: Path) -> Non
 )
 def test_what_may_change_the_result_changes_the_options(changed: Changed, tmp_path: Path) -> None:
     before, after = make_tasks(tmp_path), make_tasks(tmp_path, *changed(PROJECT, CAMERA))
-    assert before[0].options_json() != after[0].options_json()
+    assert before[0].options.json != after[0].options.json
 
 
 @pytest.mark.parametrize(
@@ -111,14 +111,14 @@ def test_what_may_change_the_result_changes_the_options(changed: Changed, tmp_pa
 )
 def test_what_changes_no_scan_leaves_its_options(changed: Changed, tmp_path: Path) -> None:
     before, after = make_tasks(tmp_path), make_tasks(tmp_path, *changed(PROJECT, CAMERA))
-    assert before[0].options_json() == after[0].options_json()
+    assert before[0].options.json == after[0].options.json
 
 
 def test_where_targets_are_sought_the_lens_and_the_orientation_of_the_scan_count(tmp_path: Path) -> None:
     a, b = make_tasks(tmp_path, PROJECT + TARGETS)
     longer, _ = make_tasks(tmp_path, PROJECT + TARGETS, CAMERA.replace("distance_mm = 30.0", "distance_mm = 31.0"))
     larger, _ = make_tasks(tmp_path, PROJECT + TARGETS.replace("30.0", "31.0"))
-    assert len({task.options_json() for task in (a, b, longer, larger)}) == 4
+    assert len({task.options.json for task in (a, b, longer, larger)}) == 4
     assert b"points.csv" not in pickle.dumps(a)  # the project does not travel with it
 
 
@@ -133,8 +133,8 @@ def test_the_marks_of_another_camera_do_not_count(tmp_path: Path) -> None:
         return make_tasks(tmp_path, given)
 
     before, after = both("0.1"), both("0.12")
-    assert before[0].options_json() == after[0].options_json()
-    assert before[1].options_json() != after[1].options_json()
+    assert before[0].options.json == after[0].options.json
+    assert before[1].options.json != after[1].options.json
 
 
 def test_few_of_many_scans_are_the_same_when_another_one_comes() -> None:
@@ -302,7 +302,7 @@ def test_a_scan_refused_for_its_size_says_how_to_allow_it(tmp_path: Path, capsys
     failed: MeasuredScan = measured_scan(task)
     assert failed.failure is not None
     assert failed.failure.code is FailureCode.TOO_LARGE
-    assert task.options_json() == scan_tasks(read_project(project), ["a"])[0].options_json()
+    assert task.options.json == scan_tasks(read_project(project), ["a"])[0].options.json
     assert os.path.samefile(failed.scan, tmp_path / "a.tif")
 
 

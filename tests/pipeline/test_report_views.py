@@ -20,7 +20,7 @@ from pipeline import build_network, read_comparator, read_project
 from pipeline.cli import run
 from pipeline.drawing.svg import Axes, round_step, ticks
 from pipeline.report import Thumbnail
-from pipeline.report.data import Mark, natural
+from pipeline.report.data import Frame, Mark, natural
 from pipeline.report.fiducials import Figure, figure_of_films, figure_plot
 from pipeline.report.frame_views import SIZE_PX, arrow_scale, mark_picture
 from pipeline.report.lens import curves_plot, largest_effects_um, lens, lens_map
@@ -161,9 +161,9 @@ def test_the_residual_points_up_where_y_grows() -> None:
 
 def test_the_longest_arrow_fits() -> None:
     rows = [replace(RESIDUAL, vx_um=v) for v in (1.0, -13.0)]
-    scale = arrow_scale([mark((0.0, 0.0), row) for row in rows])
+    scale = arrow_scale([Frame("a", tuple(mark((0.0, 0.0), row) for row in rows))])
     assert 13.0 <= 13.0 * scale <= 34.0
-    assert arrow_scale([replace(mark((0.0, 0.0)))]) == 1.0
+    assert arrow_scale([Frame("a", (mark((0.0, 0.0)),))]) == 1.0
 
 
 def test_vectors_over_the_camera_are_to_scale() -> None:
