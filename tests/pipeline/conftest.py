@@ -8,6 +8,7 @@ from importlib import resources
 from pathlib import Path
 
 import cv2
+import made_up_calibration
 import pytest
 from browser import started_browser
 from demonstration import FEWER_TARGETS, FRAMES
@@ -16,6 +17,7 @@ from playwright.sync_api import Browser
 
 from pipeline.cli import run
 from pipeline.rendered.scene_file import render_project
+from pipeline.report import ReportData
 from pipeline.workers import worker_pool
 
 
@@ -73,6 +75,16 @@ def project(finished: tuple[Path, int], tmp_path: Path) -> Path:
     folder = tmp_path / "project"
     shutil.copytree(finished[0], folder)
     return folder
+
+
+@pytest.fixture
+def measured_data() -> ReportData:
+    return made_up_calibration.measured_report()
+
+
+@pytest.fixture
+def adjusted_data() -> ReportData:
+    return made_up_calibration.adjusted_report()
 
 
 @pytest.fixture(scope="module")

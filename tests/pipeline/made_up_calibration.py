@@ -1,7 +1,7 @@
 """A made-up calibration of five aerial frames, and its files: result file and report are tested on its numbers."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -180,6 +180,26 @@ def _network(points: tuple[str, ...], targets_mm: Array, rng: np.random.Generato
         tuple(ObjectPoint(point, Prior(0.0), Prior(0.0), Prior(0.0)) for point in points),
         observations,
     )
+
+
+def set_adjustment(data: ReportData, **values: Any) -> ReportData:
+    """With other values in the adjustment's record."""
+    assert data.adjustment is not None
+    return replace(data, adjustment=replace(data.adjustment, **values))
+
+
+def set_frames(data: ReportData, change: Callable[[FrameMeasurement], FrameMeasurement]) -> ReportData:
+    """With every scan's frame changed."""
+    assert data.measurement is not None
+    scans = {name: replace(scan, frame=change(scan.frame)) for name, scan in data.measurement.items()}
+    return replace(data, measurement=scans)
+
+
+def set_mark(data: ReportData, row: int, status: Status, reason: str) -> ReportData:
+    """With another status of one mark of comparator.csv."""
+    rows = list(data.comparator)
+    rows[row] = replace(rows[row], status=status, reason=reason)
+    return replace(data, comparator=rows)
 
 
 @cache

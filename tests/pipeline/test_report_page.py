@@ -9,6 +9,7 @@ from typing import Any
 
 import made_up_calibration
 import pytest
+from made_up_calibration import set_adjustment, set_frames, set_mark
 from studies import parametrize_with_studies
 
 from measure import Code, FrameMeasurement, Reason, Status
@@ -16,23 +17,6 @@ from pipeline.report import Problem, ReportData, render_report, write_report
 from pipeline.results.adjustment_record import Sigma0Record
 from pipeline.results.assessment_record import CorrelationRecord
 from pipeline.results.check_file import Check
-from pipeline.results.comparator_file import ComparatorPoint
-
-
-@pytest.fixture
-def measured_data() -> ReportData:
-    return made_up_calibration.measured_report()
-
-
-@pytest.fixture
-def adjusted_data() -> ReportData:
-    return made_up_calibration.adjusted_report()
-
-
-@pytest.fixture
-def singular() -> ReportData:
-    return made_up_calibration.singular()
-
 
 VOID = {"meta", "br", "img", "hr", "input", "link"}
 
@@ -95,7 +79,8 @@ def test_a_good_calibration_says_so_first() -> None:
 
 def test_no_section_and_no_column_is_empty(adjusted_data: ReportData) -> None:
     without = replace(adjusted_data, measurement=None, thumbnail=None, check=None, covariance=None)
-    for html in (good_page(), render_report(without), digital_page(), render_report(film_alone())):
+    film_alone = made_up_calibration.film_alone()
+    for html in (good_page(), render_report(without), digital_page(), render_report(film_alone)):
         for section in re.findall(r"<section.*?</section>", html, re.DOTALL):
             assert len(Document(section).text.split()) > 5, section
         for table in re.findall(r"<table.*?</table>", html, re.DOTALL):
@@ -133,28 +118,23 @@ def test_a_digital_camera_is_reported_in_pixels_without_film() -> None:
     assert f"{rms / 20.0:.3f}" in document.text
 
 
-def test_standard_deviations_by_leaving_out_pictures_are_shown_where_they_are_larger() -> None:
+@pytest.mark.parametrize(("factor", "sigma"), [(9.0, "0.62"), (1 / 9.0, "0.21")])  # 3 times 0.205, or as they are
+def test_standard_deviations_by_leaving_out_pictures_are_shown_where_they_are_larger(factor: float, sigma: str) -> None:
     data = made_up_calibration.digital()
     assert data.covariance is not None
-    clusters = replace(data.covariance, matrix=9.0 * data.covariance.matrix)
+    clusters = replace(data.covariance, matrix=factor * data.covariance.matrix)
     text = rendered(replace(data, covariance=replace(data.covariance, clusters=clusters))).text
-    assert "c = 7683.20 ± 0.62 px" in text  # 3 times 0.205
-    smaller = replace(data.covariance, matrix=data.covariance.matrix / 9.0)
-    assert "± 0.21 px" in rendered(replace(data, covariance=replace(data.covariance, clusters=smaller))).text
-
-
-def film_alone() -> ReportData:
-    """The fiducials of the good calibration, without anything else."""
-    return made_up_calibration.film_alone()
+    assert f"c = 7683.20 ± {sigma} px" in text
 
 
 def test_an_archive_has_totals_first_and_corrections_in_words() -> None:
-    document = rendered(film_alone())
+    film_alone = made_up_calibration.film_alone()
+    document = rendered(film_alone)
     assert [id for id in document.ids if not id.startswith("frame-")] == [
         "verdict", "totals", "problems", "frames", "marks", "fiducials", "reliability", "notes",
     ]  # fmt: skip
     assert "5 of 5 scans measured (5 good)." in document.text
-    library = rendered(replace(film_alone(), given_by={"RC 20": "the library's typical coordinates"})).text
+    library = rendered(replace(film_alone, given_by={"RC 20": "the library's typical coordinates"})).text
     assert "Corrections to the library's typical coordinates, after" in library
     assert "certificate" not in library
     assert re.search(r"Corrections to the given coordinates, after a common [\w, ]+: \d+\.\d µm rms", document.text)
@@ -164,8 +144,7 @@ def test_an_archive_has_totals_first_and_corrections_in_words() -> None:
 def test_marks_that_fit_badly_are_shown_and_all_others_closed(adjusted_data: ReportData) -> None:
     assert adjusted_data.adjustment is not None
     first, *others = adjusted_data.adjustment.residuals
-    rows = (replace(first, w=-3.4), *others)
-    html = render_report(replace(adjusted_data, adjustment=replace(adjusted_data.adjustment, residuals=rows)))
+    html = render_report(set_adjustment(adjusted_data, residuals=(replace(first, w=-3.4), *others)))
     shown, closed = html[html.index("<h2>Frames") :].split('<details id="marks">')
     assert shown.count('<div class="card"') == 1
     assert "w</dt><dd>−3.4" in shown
@@ -174,10 +153,7 @@ def test_marks_that_fit_badly_are_shown_and_all_others_closed(adjusted_data: Rep
 
 
 def test_a_problem_has_cause_remedy_link_and_thumbnail(adjusted_data: ReportData) -> None:
-    lost = replace(adjusted_data.comparator[2], status=Status.REJECTED, reason="4.2 px off")
-    html = render_report(
-        replace(adjusted_data, comparator=[*adjusted_data.comparator[:2], lost, *adjusted_data.comparator[3:]])
-    )
+    html = render_report(set_mark(adjusted_data, 2, Status.REJECTED, "4.2 px off"))
     (problem,) = re.findall(r"<li>.*?</li>", html[: html.index("<h2>Frames")], re.DOTALL)
     assert "<b>f1: 1 fiducial mark not measured" in problem
     assert 'class="step">Settle them with' in problem
@@ -185,29 +161,23 @@ def test_a_problem_has_cause_remedy_link_and_thumbnail(adjusted_data: ReportData
     assert problem.count("data:image/png") == 1
 
 
-def test_nothing_is_loaded_from_anywhere() -> None:
+def test_nothing_is_loaded_from_anywhere_and_every_link_finds_its_place() -> None:
     html = good_page()
-    for address in Document(html).addresses:
-        assert address.startswith(("#", "data:image/png;base64,")), address
-    assert "http" not in html
-    assert "url(" not in html
-    assert "@import" not in html
-
-
-def test_every_link_inside_finds_its_place_and_no_id_stands_twice() -> None:
-    document = Document(good_page())
+    document = Document(html)
+    inside, pictures = (
+        [each for each in document.addresses if each.startswith(start)] for start in ("#", "data:image/png")
+    )
+    assert len(inside) + len(pictures) == len(document.addresses)
+    assert len(pictures) == 160  # of every mark
+    assert {address[1:] for address in inside} <= set(document.ids)
     assert len(document.ids) == len(set(document.ids))
-    assert {address[1:] for address in document.addresses if address.startswith("#")} <= set(document.ids)
+    assert not re.search(r"http|url\(|@import", html)
 
 
 def test_every_drawing_has_words_for_those_who_cannot_see_it() -> None:
     html = good_page()
     for opening in re.findall(r"<svg[^>]*>", html):
         assert re.search(r'aria-label="[^"]{10,}', opening), opening
-
-
-def test_every_mark_has_its_picture() -> None:
-    assert sum(address.startswith("data:") for address in Document(good_page()).addresses) == 160
 
 
 def test_the_statuses_are_those_of_the_table() -> None:
@@ -224,30 +194,25 @@ def test_no_check_stands_where_the_redundancy_is_zero() -> None:
     )
 
 
-def test_a_priori_standard_deviations_are_named(adjusted_data: ReportData) -> None:
-    """One frame whose given coordinates only place the datum has redundancy, but none that tells sigma0."""
-    assert adjusted_data.adjustment is not None
-    content = replace(adjusted_data.adjustment, sigma0=1.0, sigma0_from=Sigma0Record(0.0, True, ()))
-    text = rendered(replace(adjusted_data, adjustment=content)).text
-    assert text.count("Standard deviations are a priori ones") == 2  # as a note, and with the groups
-
-
-def test_the_redundancy_next_to_sigma0_is_the_one_that_it_comes_from(adjusted_data: ReportData) -> None:
-    assert adjusted_data.adjustment is not None
-    content = replace(adjusted_data.adjustment, redundancy=100, sigma0=1.0, sigma0_from=Sigma0Record(37.0, False, ()))
-    verdict = rendered(replace(adjusted_data, adjustment=content)).text.split("Camera metric")[0]
-    assert "redundancy 37" in verdict
-    assert "redundancy 100" not in verdict
-
-
-def test_an_adjustment_without_any_redundancy_is_not_called_good(adjusted_data: ReportData) -> None:
-    assert adjusted_data.adjustment is not None
-    nothing = Sigma0Record(0.0, True, ())
-    content = replace(adjusted_data.adjustment, redundancy=0, sigma0=1.0, sigma0_from=nothing)
-    text = rendered(replace(adjusted_data, adjustment=content)).text
-    assert "Nothing checks the result" in text
-    assert "The redundancy is 0: no check." in text
-    assert "! Needs a look" in text
+@pytest.mark.parametrize(
+    ("redundancy", "of_sigma0", "words", "count"),
+    [
+        (257, 0.0, "Standard deviations are a priori ones", 2),  # as a note, and with the groups
+        (100, 37.0, "redundancy 37", 2),
+        (100, 37.0, "redundancy 100", 0),
+        (0, 0.0, "Nothing checks the result", 1),
+        (0, 0.0, "The redundancy is 0: no check.", 1),
+        (0, 0.0, "! Needs a look", 1),
+    ],
+)
+def test_the_redundancy_is_that_which_sigma0_comes_from(
+    adjusted_data: ReportData, redundancy: int, of_sigma0: float, words: str, count: int
+) -> None:
+    """Given coordinates that only place the datum have redundancy, but none that tells sigma0."""
+    source = Sigma0Record(of_sigma0, of_sigma0 == 0.0, ())
+    text = rendered(set_adjustment(adjusted_data, redundancy=redundancy, sigma0=1.0, sigma0_from=source)).text
+    text = text if "priori" in words else text.split("Camera metric")[0]
+    assert text.count(words) == count
 
 
 def test_only_measured(measured_data: ReportData) -> None:
@@ -260,12 +225,9 @@ def test_only_measured(measured_data: ReportData) -> None:
 def test_a_frame_that_was_not_found_says_so_once(measured_data: ReportData) -> None:
     reason = "no fiducial was measured: the constellation does not fit"
     absent = [replace(point, status=Status.ABSENT, reason=reason) for point in measured_data.comparator]
-    assert measured_data.measurement is not None
-    scans = {
-        image: replace(scan, frame=FrameMeasurement(image, (), problems=(Reason(f"{reason}.", Code.NO_FRAME),)))
-        for image, scan in measured_data.measurement.items()
-    }
-    text = rendered(replace(measured_data, comparator=tuple(absent), measurement=scans)).text
+    problem = (Reason(f"{reason}.", Code.NO_FRAME),)
+    data = set_frames(measured_data, lambda frame: FrameMeasurement(frame.image, (), problems=problem))
+    text = rendered(replace(data, comparator=absent)).text
     assert text.count(f"{reason}.") == 1
     assert "fiducial marks not measured" not in text
     assert "run `reseau adjust`" not in text
@@ -281,23 +243,20 @@ def test_tie_points_are_not_called_targets(measured_data: ReportData) -> None:
     assert "targets" not in text[: text.index("Notes")]
 
 
-def test_given_coordinates_without_scans(adjusted_data: ReportData) -> None:
-    text = rendered(replace(adjusted_data, measurement=None, thumbnail=None)).text
-    assert "There are no pictures: the scans are not at hand." in text
-
-
-def test_exterior_orientations_stand_in_the_users_unit(adjusted_data: ReportData) -> None:
-    assert "Exterior orientation (m, degrees)" in Document(good_page()).text
-    assert "Exterior orientation (mm, degrees)" in rendered(replace(adjusted_data, unit="mm")).text
-
-
-def test_no_check_against_opencv_yet(adjusted_data: ReportData) -> None:
-    assert "It has not been made: run reseau check ." in rendered(replace(adjusted_data, check=None)).text
-
-
-def test_without_the_covariance_the_curves_are_left_out_with_a_word(adjusted_data: ReportData) -> None:
-    text = rendered(replace(adjusted_data, covariance=None)).text
-    assert "The camera has no distortion parameters, or their covariance is missing." in text
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({}, "Exterior orientation (m, degrees)"),
+        ({"unit": "mm"}, "Exterior orientation (mm, degrees)"),
+        ({"measurement": None, "thumbnail": None}, "There are no pictures: the scans are not at hand."),
+        ({"check": None}, "It has not been made: run reseau check ."),
+        ({"covariance": None}, "The camera has no distortion parameters, or their covariance is missing."),
+    ],
+)
+def test_what_is_not_there_has_a_word_in_its_place(
+    adjusted_data: ReportData, change: dict[str, Any], words: str
+) -> None:
+    assert words in rendered(replace(adjusted_data, **change)).text
 
 
 def test_nothing_at_all() -> None:
@@ -307,93 +266,67 @@ def test_nothing_at_all() -> None:
     assert "No frame has been measured yet" in text
 
 
-def test_a_singular_network_names_cause_and_remedy(singular: ReportData) -> None:
-    text = rendered(singular).text
-    assert "✕ No result" in text
-    assert "There is no calibration: the network is singular." in text
-    assert "c and the flying height move together over flat ground." in text
-    assert "Fix c." in text
-    assert "all values and residuals of this report are those of the last iteration" in text
+def test_a_singular_network_names_cause_and_remedy() -> None:
+    text = rendered(made_up_calibration.singular()).text
+    for words in (
+        "✕ No result",
+        "There is no calibration: the network is singular.",
+        "c and the flying height move together over flat ground.",
+        "Fix c.",
+        "all values and residuals of this report are those of the last iteration",
+        "There is no solution to draw the distortion from.",
+    ):
+        assert words in text
     assert not re.search(r"\bnan\b|\bNone\b", text)
-    assert "There is no solution to draw the distortion from." in text
 
 
 def test_why_parameters_are_highly_correlated_stands_with_the_camera(adjusted_data: ReportData) -> None:
-    stored = adjusted_data.adjustment
-    assert stored is not None
-    (camera,) = stored.cameras
-    pair = CorrelationRecord((f"IO.{camera}.c", "EO.*.Z0"), 0.98, "c and Z0 trade off.", "Tilt.")
-    text = rendered(replace(adjusted_data, adjustment=replace(stored, correlations=(pair,)))).text
-    assert "c and Z0 trade off. Tilt." in text
+    pair = CorrelationRecord(("IO.RC 20.c", "EO.*.Z0"), 0.98, "c and Z0 trade off.", "Tilt.")
+    assert "c and Z0 trade off. Tilt." in rendered(set_adjustment(adjusted_data, correlations=(pair,))).text
 
 
 def test_what_the_user_named_is_escaped(adjusted_data: ReportData) -> None:
     name = '<script>alert("x")</script> & Co'
-    first = replace(adjusted_data.comparator[0], status=Status.WEAK, reason=name)
-    html = render_report(
-        replace(
-            adjusted_data,
-            project=name,
-            comparator=[first, *adjusted_data.comparator[1:]],
-            problems=(Problem(name, name),),
-        )
-    )
+    data = set_mark(adjusted_data, 0, Status.WEAK, name)
+    html = render_report(replace(data, project=name, problems=(Problem(name, name),)))
     Document(html)
     assert "<script>alert" not in html
     assert "&lt;script&gt;alert" in html
 
 
-def _key(mark: ComparatorPoint) -> tuple[str, str, str]:
-    return mark.image, mark.kind, mark.point
-
-
 def test_a_rejected_fiducial_is_a_problem_with_its_reason(adjusted_data: ReportData) -> None:
     reason = "4.2 px off the other marks' places."
-    rejected = replace(adjusted_data.comparator[2], status=Status.REJECTED, reason=reason)
-    rows = [*adjusted_data.comparator[:2], rejected, *adjusted_data.comparator[3:]]
+    lost = adjusted_data.comparator[2]
     assert adjusted_data.adjustment is not None
-    kept = tuple(
-        row for row in adjusted_data.adjustment.residuals if (row.image, row.kind, row.point) != _key(rejected)
-    )
-    text = rendered(
-        replace(adjusted_data, comparator=rows, adjustment=replace(adjusted_data.adjustment, residuals=kept))
-    ).text
+    rows = adjusted_data.adjustment.residuals
+    kept = tuple(row for row in rows if (row.image, row.kind, row.point) != (lost.image, lost.kind, lost.point))
+    text = rendered(set_adjustment(set_mark(adjusted_data, 2, Status.REJECTED, reason), residuals=kept)).text
     assert "! Needs a look" in text
     assert "1 thing needs a look" in text
-    assert (
-        "f1: 1 fiducial mark not measured, 7 measured. Reasons: 3 rejected: 4.2 px off the other marks' places." in text
-    )
+    assert f"f1: 1 fiducial mark not measured, 7 measured. Reasons: 3 rejected: {reason}" in text
     assert "7 of 8 (1 rejected)" in text
 
 
 def test_reasons_that_differ_by_their_numbers_are_reported_once(measured_data: ReportData) -> None:
-    rows = list(measured_data.comparator)
-    for index, off in ((2, 4.2), (4, 3.1)):
-        rows[index] = replace(rows[index], status=Status.REJECTED, reason=f"{off} px off the other marks' places")
-    names = f"{rows[2].point}, {rows[4].point}"
-    text = rendered(replace(measured_data, comparator=rows)).text
-    reasons = f"{names} rejected, such as {rows[2].point}: 4.2 px off the other marks' places."
-    assert f"6 measured. Reasons: {reasons}" in text
+    data = set_mark(measured_data, 2, Status.REJECTED, "4.2 px off the other marks' places")
+    data = set_mark(data, 4, Status.REJECTED, "3.1 px off the other marks' places")
+    first, second = (data.comparator[row].point for row in (2, 4))
+    reasons = f"{first}, {second} rejected, such as {first}: 4.2 px off the other marks' places."
+    assert f"6 measured. Reasons: {reasons}" in rendered(data).text
 
 
 def test_of_many_targets_the_worst_are_shown_and_all_fiducials(adjusted_data: ReportData) -> None:
     """60 frames of 8 fiducials and 24 targets: 600 // 60 = 10 targets a frame."""
-    assert adjusted_data.adjustment is not None
+    picture = adjusted_data.thumbnail
+    assert picture is not None
     names = [f"{image}-{copy}" for copy in range(12) for image in ("f1", "f2", "f3", "f4", "f5")]
     rows = [replace(row, image=name) for name in names for row in adjusted_data.comparator if row.image == name[:2]]
     data = replace(adjusted_data, comparator=rows, measurement=None, adjustment=None, check=None)
-    first = _copy_pictures(data)
-    html = render_report(first)
+    html = render_report(replace(data, thumbnail=lambda image, point, kind: picture(image[:2], point, kind)))
     assert html.count("data:image/png") == 60 * (8 + 10)
     assert "14 more targets of this frame are not pictured" in html
     assert html.count('<details class="frame"') == 60
     assert " open>" not in html
-
-
-def _copy_pictures(data: ReportData) -> ReportData:
-    picture = data.thumbnail
-    assert picture is not None
-    return replace(data, thumbnail=lambda image, point, kind: picture(image[:2], point, kind))
 
 
 def test_the_file_is_written_whole_and_the_same_each_time(adjusted_data: ReportData, tmp_path: Path) -> None:
