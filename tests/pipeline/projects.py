@@ -200,8 +200,8 @@ def make_table_project(folder: Path) -> Path:
     project = write_network_project(network, folder)
     assert run(["adjust", str(project)]) in (0, 1)
     (folder / "out").rename(folder / "earlier")
-    _replace(folder / "camera.toml", "[sigma]\n", '[sigma]\ncalibration = "earlier/adjustment.json"\n')
-    _replace(project, "[object]\n", '[object]\nimages = "images.csv"\ndistances = "distances.csv"\n')
+    replace_text(folder / "camera.toml", "[sigma]\n", '[sigma]\ncalibration = "earlier/adjustment.json"\n')
+    replace_text(project, "[object]\n", '[object]\nimages = "images.csv"\ndistances = "distances.csv"\n')
     rows = ["image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg"]
     for i, (station, angles) in enumerate(zip(truth.stations, truth.attitudes, strict=True)):
         rows.append(",".join([f"f{i}", *(f"{value:.1f}" for value in (*station, *np.degrees(angles)))]))
@@ -211,10 +211,20 @@ def make_table_project(folder: Path) -> Path:
     return project
 
 
-def _replace(path: Path, old: str, new: str) -> None:
+def replace_text(path: Path, old: str, new: str) -> None:
+    """The first place of a file's text that reads so, otherwise."""
     text = path.read_text(encoding="utf-8")
     assert old in text
     path.write_text(text.replace(old, new, 1), encoding="utf-8")
+
+
+def change_project(old: str, new: str) -> Callable[[Path], None]:
+    """A change of the project file in a folder."""
+    return lambda folder: replace_text(folder / "project.toml", old, new)
+
+
+def change_camera(old: str, new: str) -> Callable[[Path], None]:
+    return lambda folder: replace_text(folder / "camera.toml", old, new)
 
 
 def _place(network: Network, id: str) -> list[float]:

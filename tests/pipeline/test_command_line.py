@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from projects import scan_content
+from projects import change_camera, change_project, replace_text, scan_content
 from rich.console import Console
 from studies import parametrize_with_studies
 
@@ -37,12 +37,6 @@ from pipeline.workers import worker_pool
 SAID = pytest.CaptureFixture[str]
 
 
-def replaced(path: Path, old: str, new: str) -> None:
-    text = path.read_text(encoding="utf-8")
-    assert old in text
-    path.write_text(text.replace(old, new, 1), encoding="utf-8")
-
-
 def rewritten_scans(folder: Path, pattern: str) -> None:
     path = folder / "project.toml"
     text = re.sub(r"^scans = .*$", f'scans = ["{pattern}"]', path.read_text(encoding="utf-8"), flags=re.MULTILINE)
@@ -55,49 +49,26 @@ def results(folder: Path) -> dict[str, bytes]:
     return {file.name: scan_content(file) for file in files if not file.name.endswith(("-wal", "-shm"))}
 
 
-def no_project(folder: Path) -> None:
-    (folder / "project.toml").unlink()
+def remove(*names: str) -> Callable[[Path], None]:
+    def spoil(folder: Path) -> None:
+        for file in (file for name in names for file in folder.glob(name)):
+            file.unlink()
+
+    return spoil
 
 
-def no_camera(folder: Path) -> None:
-    (folder / "camera.toml").unlink()
-
-
-def no_scans(folder: Path) -> None:
-    for file in (folder / "scans").iterdir():
-        file.unlink()
-
-
-def toml_typo(folder: Path) -> None:
-    replaced(folder / "project.toml", 'camera = "camera.toml"', 'camera = "camera.toml')
-
-
-def misspelt_key(folder: Path) -> None:
-    replaced(folder / "project.toml", "diameter_mm", "diametre_mm")
+def write(name: str, text: str) -> Callable[[Path], None]:
+    return lambda folder: (folder / name).write_text(text, encoding="utf-8") and None
 
 
 def misspelt_key_and_no_file(folder: Path) -> None:
-    replaced(folder / "project.toml", "comparator =", "comparater =")
+    replace_text(folder / "project.toml", "comparator =", "comparater =")
     (folder / "points.csv").unlink()
 
 
-def two_files_missing(folder: Path) -> None:
-    for name in ("camera.toml", "points.csv"):
-        (folder / name).unlink()
-
-
 def duplicated_point(folder: Path) -> None:
-    path = folder / "points.csv"
-    lines = path.read_text(encoding="utf-8").splitlines()
-    path.write_text("\n".join([*lines, lines[3]]) + "\n", encoding="utf-8")
-
-
-def no_folder_for_results(folder: Path) -> None:
-    replaced(folder / "project.toml", 'output = "out"', 'output = "points.csv/out"')
-
-
-def no_pattern(folder: Path) -> None:
-    rewritten_scans(folder, "scans")
+    lines = (folder / "points.csv").read_text(encoding="utf-8").splitlines()
+    write("points.csv", "\n".join([*lines, lines[3]]) + "\n")(folder)
 
 
 def name_in_another_encoding(folder: Path) -> None:
@@ -106,85 +77,77 @@ def name_in_another_encoding(folder: Path) -> None:
     rewritten_scans(folder, "scans/*.tif")
 
 
-def pitch_in_mm(folder: Path) -> None:
-    replaced(folder / "project.toml", "output =", "pitch_um = 0.045\noutput =")
-
-
-def pitch_in_nm(folder: Path) -> None:
-    replaced(folder / "project.toml", "output =", "pitch_um = 20000\noutput =")
-
-
-def blank_id(folder: Path) -> None:
-    replaced(folder / "camera.toml", 'id = "1"', 'id = "1 "')
-
-
 def nothing_to_measure(folder: Path) -> None:
     camera = (folder / "camera.toml").read_text(encoding="utf-8")
-    passed_over = re.sub(r"^mark = .*$", 'mark = "none"', camera, flags=re.MULTILINE)
-    (folder / "camera.toml").write_text(passed_over, encoding="utf-8")
-    (folder / "project.toml").write_text('camera = "camera.toml"\nscans = ["scans/*.tif"]\n', encoding="utf-8")
-
-
-def marks_over_points(folder: Path) -> None:
-    replaced(folder / "project.toml", 'comparator = "comparator.csv"', 'comparator = "points.csv"')
-
-
-def marks_over_a_scan(folder: Path) -> None:
-    replaced(folder / "project.toml", 'comparator = "comparator.csv"', 'comparator = "scans/../scans/frame2.tif"')
-
-
-def marks_over_a_folder(folder: Path) -> None:
-    replaced(folder / "project.toml", 'comparator = "comparator.csv"', 'comparator = "out"')
-
-
-def calibration_that_is_written_anew(folder: Path) -> None:
-    replaced(folder / "camera.toml", "[sigma]", '[sigma]\ncalibration = "out/adjustment.json"')
-
-
-def no_fiducials(folder: Path) -> None:
-    (folder / "camera.toml").write_text('name = "bare"\n', encoding="utf-8")
+    write("camera.toml", re.sub(r"^mark = .*$", 'mark = "none"', camera, flags=re.MULTILINE))(folder)
+    write("project.toml", 'camera = "camera.toml"\nscans = ["scans/*.tif"]\n')(folder)
 
 
 def one_fiducial(folder: Path) -> None:
     camera = (folder / "camera.toml").read_text(encoding="utf-8")
     head, first, *_ = camera.split("[[fiducial]]")
-    marks = camera[camera.index("[mark.") :]
-    (folder / "camera.toml").write_text(f"{head}[[fiducial]]{first}{marks}", encoding="utf-8")
+    write("camera.toml", f"{head}[[fiducial]]{first}{camera[camera.index('[mark.') :]}")(folder)
 
 
-def no_points(folder: Path) -> None:
-    replaced(folder / "project.toml", 'points = "points.csv"', "")
-
-
-def points_without_coordinates(folder: Path) -> None:
-    (folder / "points.csv").write_text("point,X,Y,Z,sX,sY,sZ\n101,1.0,2.0,0.5,,,\n102,,,,,,\n", encoding="utf-8")
+MARKS_FILE = 'comparator = "comparator.csv"'
+NO_COORDINATES = "point,X,Y,Z,sX,sY,sZ\n101,1.0,2.0,0.5,,,\n102,,,,,,\n"
 
 
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (no_project, ["project.toml", "no such file"]),
-        (no_camera, ["camera.toml", "no such file"]),
-        (no_scans, ["scans/frame1.tif", "finds no file", "It holds no files"]),
-        (toml_typo, ["project.toml", "not valid TOML", "line 2"]),
-        (misspelt_key, ["project.toml", "diametre_mm", "diameter_mm"]),
+        (remove("project.toml"), ["project.toml", "no such file"]),
+        (remove("camera.toml"), ["camera.toml", "no such file"]),
+        (remove("scans/*"), ["scans/frame1.tif", "finds no file", "It holds no files"]),
+        (change_project('"camera.toml"', '"camera.toml'), ["project.toml", "not valid TOML", "line 2"]),
+        (change_project("diameter_mm", "diametre_mm"), ["project.toml", "diametre_mm", "diameter_mm"]),
         (misspelt_key_and_no_file, ["project.toml, line 4", "comparater", "Did you mean 'comparator'?"]),
-        (two_files_missing, ["line 2: camera: there is no such file", "line 12: [object] points: there is no such"]),
+        (
+            remove("camera.toml", "points.csv"),
+            ["line 2: camera: there is no such file", "line 12: [object] points: there is no such"],
+        ),
         (duplicated_point, ["points.csv", "'103'", "line 4"]),
-        (no_folder_for_results, ["cannot be written"]),
-        (no_pattern, ["line 3: scans: 'scans' is a folder", "'scans/*.tif'"]),
+        (change_project('output = "out"', 'output = "points.csv/out"'), ["cannot be written"]),
+        (
+            lambda folder: rewritten_scans(folder, "scans"),
+            ["line 3: scans: 'scans' is a folder", "'scans/*.tif'"],
+        ),
         (name_in_another_encoding, ["line 3: scans:", "is not text in UTF-8", "Rename it"]),
-        (pitch_in_mm, ["line 5: pitch_um: 0.045 µm is finer than any scanner"]),
-        (pitch_in_nm, ["line 5: pitch_um: 20000 µm is coarser than any scan"]),
-        (blank_id, ["camera.toml, line", "text on one line without blanks at its ends, not '1 '"]),
+        (
+            change_project("output =", "pitch_um = 0.045\noutput ="),
+            ["line 5: pitch_um: 0.045 µm is finer than any scanner"],
+        ),
+        (
+            change_project("output =", "pitch_um = 20000\noutput ="),
+            ["line 5: pitch_um: 20000 µm is coarser than any scan"],
+        ),
+        (
+            change_camera('id = "1"', 'id = "1 "'),
+            ["camera.toml, line", "text on one line without blanks at its ends, not '1 '"],
+        ),
         (nothing_to_measure, ["there is nothing to measure", "Add what the scans show"]),
-        (marks_over_points, ["line 4: comparator:", "written over [object] points"]),
-        (marks_over_a_scan, ["line 4: comparator:", "written over the scan frame2"]),
-        (marks_over_a_folder, ["line 4: comparator:", "is a folder"]),
-        (calibration_that_is_written_anew, ["line 5: output:", "over the earlier calibration", "another folder"]),
-        (no_fiducials, ["transformation is 'affine'", "has no fiducials for it"]),
-        (no_points, ["kind 'disk' is named by the targets' coordinates", "there is no [object] points"]),
-        (points_without_coordinates, ["[object] points: 1 points with X, Y and Z name no targets; give 4"]),
+        (
+            change_project(MARKS_FILE, 'comparator = "points.csv"'),
+            ["line 4: comparator:", "written over [object] points"],
+        ),
+        (
+            change_project(MARKS_FILE, 'comparator = "scans/../scans/frame2.tif"'),
+            ["line 4: comparator:", "written over the scan frame2"],
+        ),
+        (change_project(MARKS_FILE, 'comparator = "out"'), ["line 4: comparator:", "is a folder"]),
+        (
+            change_camera("[sigma]", '[sigma]\ncalibration = "out/adjustment.json"'),
+            ["line 5: output:", "over the earlier calibration", "another folder"],
+        ),
+        (write("camera.toml", 'name = "bare"\n'), ["transformation is 'affine'", "has no fiducials for it"]),
+        (
+            change_project('points = "points.csv"', ""),
+            ["kind 'disk' is named by the targets' coordinates", "there is no [object] points"],
+        ),
+        (
+            write("points.csv", NO_COORDINATES),
+            ["[object] points: 1 points with X, Y and Z name no targets; give 4"],
+        ),
         (one_fiducial, ["camera.toml has one fiducial mark", "two or more"]),
     ],
 )
@@ -227,7 +190,7 @@ def test_full_disk_gets_a_message_and_leaves_earlier_results(project: Path, caps
 
 def adjust_network(project: Path, capsys: SAID, marks: str | None = None) -> tuple[int, dict[str, Any], str]:
     """`reseau adjust --json` on coordinates alone: exit code, summary, what was said on stderr."""
-    replaced(project / "project.toml", "scans = [", "# scans = [")
+    replace_text(project / "project.toml", "scans = [", "# scans = [")
     if marks is not None:
         (project / "comparator.csv").write_text(marks, encoding="utf-8")
     capsys.readouterr()
@@ -309,8 +272,8 @@ def test_image_with_two_targets_is_left_out_and_named(project: Path, capsys: SAI
 
 
 def test_singular_network_is_named_in_words(project: Path, capsys: SAID) -> None:
-    replaced(project / "camera.toml", "principal_distance_mm = 1.0", 'principal_distance_mm = "free"')
-    replaced(project / "camera.toml", "principal_point_mm = [1.0, 1.0]", 'principal_point_mm = "free"')
+    replace_text(project / "camera.toml", "principal_distance_mm = 1.0", 'principal_distance_mm = "free"')
+    replace_text(project / "camera.toml", "principal_point_mm = [1.0, 1.0]", 'principal_point_mm = "free"')
     text = (
         (project / "camera.toml").read_text(encoding="utf-8").replace("sigma_mm = [0.005, 0.005]", 'sigma_mm = "free"')
     )

@@ -9,21 +9,15 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 import pytest
-from drawn import brute_picture, placed
 from projects import adjusted_project, write_project
 
 from adjust import AdjustmentError
-from measure import MarkShape, MeasurementError, Scan, ScanWindow, match, ring_cross
-from measure.boards.measure import measure_board
-from measure.boards.specs import ChessboardSpec
-from measure.scans.cache import WholePicture
-from measure.scans.metadata import NO_TAGS
+from measure import MeasurementError
 from measure.scans.remote import Address
 from pipeline import InputError, read_comparator, read_project
 from pipeline.archive.checked_statuses import latest
@@ -41,7 +35,6 @@ from pipeline.text.names import names_below
 
 REFUSED = (InputError, MeasurementError, AdjustmentError)
 SECRETS = ("hunter2", "s3cr3t-signature", "AKIAEXAMPLE")
-Damage = Callable[[random.Random, Path], None]
 GOOD, WRONG, TRACEBACK, OUTSIDE = "right or refused", "wrong as right", "traceback", "outside"
 
 
@@ -84,7 +77,7 @@ def readings(folder: Path) -> dict[str, Any]:
 
     def scans() -> Any:
         scans = measured_scans(path)
-        kept = [scan for scan in scans if scan.failure is None or _is_own(scan.failure.code)]
+        kept = [scan for scan in scans if scan.failure is None or scan.failure.code is not FailureCode.DAMAGED]
         return {
             s.frame.image: [scan_detail(s, os.path.relpath(s.scan, folder)), *map(mark_row, s.frame.marks)]
             for s in kept
@@ -106,10 +99,6 @@ def readings(folder: Path) -> dict[str, Any]:
         except REFUSED:
             result[name] = None
     return result
-
-
-def _is_own(code: FailureCode) -> bool:
-    return code is not FailureCode.DAMAGED
 
 
 def is_right(found: Any, right: Any) -> bool:
@@ -151,25 +140,8 @@ TABLES = ("scan", "result", "mark", "judging", "judged_frame", "judged", "kept",
 
 
 def change_values(rng: random.Random, path: Path) -> None:
-    values = [
-        None,
-        0,
-        1,
-        -1,
-        2.5,
-        1e300,
-        "",
-        "x",
-        "../../x",
-        "[]",
-        "{}",
-        "null",
-        b"\xff\x00",
-        "a",
-        "good",
-        "measured",
-        2**62,
-    ]
+    words = ["", "x", "../../x", "[]", "{}", "null", b"\xff\x00", "a", "good", "measured"]
+    values = [None, 0, 1, -1, 2.5, 1e300, *words, 2**62]
     with sqlite3.connect(path, isolation_level=None) as db:
         db.execute("pragma foreign_keys = off")
         table = rng.choice(TABLES)
@@ -196,7 +168,7 @@ def change_values(rng: random.Random, path: Path) -> None:
 # --- decisions
 
 
-def decisions_trial(rng: random.Random, measured_folder: Path, folder: Path) -> str:
+def decisions_trial(rng: random.Random, folder: Path) -> str:
     """A file of good lines, one of them spoiled: all good ones are read, or the bad one is named; and appending writes
     all of a batch or nothing."""
     folder.mkdir(parents=True)
@@ -330,19 +302,15 @@ def study(kind: str, count: int, seed: int, measured_folder: Path, adjusted_fold
     counts = Counter[str]()
     for number in range(count):
         rng, place = random.Random(f"{kind} {seed} {number}"), folder / f"{kind}{number}"
-        match kind:
-            case "bytes":
-                own_outcome = database_trial(rng, measured_folder, place, change_bytes)
-            case "values":
-                own_outcome = database_trial(rng, measured_folder, place, change_values)
-            case "decisions":
-                own_outcome = decisions_trial(rng, measured_folder, place)
-            case "imports":
-                own_outcome = imports_trial(rng, place / "p")
-            case "names":
-                own_outcome = names_trial(rng, adjusted_folder, place / "p")
-            case _:
-                own_outcome = addresses_trial(rng)
+        trials: dict[str, Callable[[], str]] = {
+            "bytes": partial(database_trial, rng, measured_folder, place, change_bytes),
+            "values": partial(database_trial, rng, measured_folder, place, change_values),
+            "decisions": partial(decisions_trial, rng, place),
+            "imports": partial(imports_trial, rng, place / "p"),
+            "names": partial(names_trial, rng, adjusted_folder, place / "p"),
+            "addresses": partial(addresses_trial, rng),
+        }
+        own_outcome = trials[kind]()
         if own_outcome != GOOD:
             print(kind, seed, number, own_outcome)
         counts[own_outcome] += 1
@@ -380,26 +348,6 @@ def test_thousands_of_hostile_inputs(kind: str, measured_folder: Path, adjusted_
     assert study(kind, 600, 36, measured_folder, adjusted_folder, tmp_path) == {GOOD: 600}
 
 
-RING_CROSS = MarkShape(ring_cross(0.8, 0.12, 0.6, 0.08))
-
-
-def errors_over_a_pixel() -> np.ndarray:
-    """Matched less true columns of one mark at 25 phases, clean but for the rounding to 16 bits."""
-    errors = []
-    for phase in np.arange(25) / 25.0:
-        true = placed(12.0, (24.0 + phase, 24.3))
-        grey = np.rint(8000.0 + 30000.0 * brute_picture(RING_CROSS, true, 49, 49, 0.8))
-        start = placed(12.0, (24.5, 24.5))
-        errors.append(match(ScanWindow(grey), RING_CROSS, start).center_px[0] - (24.0 + phase))
-    return np.array(errors)
-
-
-def test_trap_half_pixel_lost_and_a_grid_of_a_tenth_of_a_pixel_left() -> None:
-    errors = errors_over_a_pixel()
-    assert abs(errors.mean()) < 0.003
-    assert np.ptp(errors) < 0.01
-
-
 def test_trap_a_failed_scan_is_dropped_from_the_table(finished: tuple[Path, int]) -> None:
     """Every mark of every scan has its row, found or not, with a reason unless it was measured."""
     folder, _ = finished
@@ -408,27 +356,6 @@ def test_trap_a_failed_scan_is_dropped_from_the_table(finished: tuple[Path, int]
     for image in {point.image for point in points}:
         assert sum(point.image == image and point.kind == "fiducial" for point in points) == 8
     assert all(point.reason for point in points if point.status != "measured")
-
-
-def test_trap_a_frame_is_cut_to_the_bounding_box_of_its_marks(finished: tuple[Path, int]) -> None:
-    """Pixels are counted from the file's own corner: the picture is never cut before it is measured."""
-    folder, _ = finished
-    first = next(p for p in read_comparator(folder / "comparator.csv") if p.kind == "fiducial")
-    assert first.xy_mm is not None
-    assert np.abs(first.xy_mm).min() > 3.0  # the scan has a margin of 3 mm about the frame
-
-
-def test_trap_opencv_5_drops_dimensions_and_takes_single_precision_only() -> None:
-    spec = ChessboardSpec(4, 3, 10.0)
-    squares = (np.indices((4, 5)).sum(axis=0) % 2).astype(np.float64)
-    board = np.pad(np.kron(squares, np.ones((60, 60))), 40, constant_values=1.0)
-    grey = cv2.GaussianBlur(board * 40000.0 + 5000.0, (0, 0), 1.0).astype(np.uint16)
-    marks = measure_board(Scan(Path("board.tif"), WholePicture(grey[:, :, None]), NO_TAGS), spec).marks
-    assert all(mark.center_px is not None and mark.center_px.shape == (2,) for mark in marks)
-    found = np.array([mark.center_px for mark in marks])
-    inner = np.array([(40 + 60 * c - 0.5, 40 + 60 * r - 0.5) for r in (1, 2, 3) for c in (1, 2, 3, 4)])
-    nearest = np.abs(found[:, None] - inner).max(axis=2).min(axis=1)
-    assert nearest.max() < 0.002  # single precision would round 1e-5 here, a lost half pixel 0.5
 
 
 def test_trap_two_blas_threads_a_worker() -> None:

@@ -113,12 +113,6 @@ def wrong_ends(sound: Path, trials: int, seed: int, capsys: SAID) -> Counter[str
 
 
 @pytest.mark.study
-def test_a_share_of_changed_results(sound: Path, capsys: SAID) -> None:
-    found = wrong_ends(sound, 8, 1, capsys)
-    assert set(found) <= {"message", "result"}, "\n".join(found)
-
-
-@pytest.mark.study
 def test_all_changed_results(sound: Path, capsys: SAID) -> None:
     found = wrong_ends(sound, 3000, 2, capsys)
     with capsys.disabled():

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 import pytest
-from projects import make_table_project, scan_content
+from projects import replace_text, scan_content
 
 from pipeline.cli import run
 
@@ -159,23 +159,7 @@ def counted(old: Path, folder: Path, command: str, trials: int, whoms: tuple[Who
 
 def changed(project: Path) -> None:
     """Other input than the results were made from."""
-    camera = project.parent / "camera.toml"
-    text = camera.read_text(encoding="utf-8")
-    assert "principal_distance_mm = 1.0" in text
-    camera.write_text(text.replace("principal_distance_mm = 1.0", "principal_distance_mm = 0.5"), encoding="utf-8")
-
-
-@pytest.mark.study
-def test_a_share_of_the_kills(tmp_path: Path) -> None:
-    old = tmp_path / "old"
-    old.mkdir()
-    project = make_table_project(old)
-    text = (old / "camera.toml").read_text(encoding="utf-8")
-    (old / "camera.toml").write_text(text.replace('calibration = "earlier/adjustment.json"\n', ""), encoding="utf-8")
-    assert run(["adjust", str(project)]) in (0, 1)
-    changed(project)
-    found = counted(old, tmp_path, "adjust", 2, ("parent",), 1)
-    assert not [what for what in found if "WRONG" in what], found
+    replace_text(project.with_name("camera.toml"), "principal_distance_mm = 1.0", "principal_distance_mm = 0.5")
 
 
 @pytest.mark.study
@@ -183,8 +167,7 @@ def test_two_hundred_kills(rendered_demo: Path, tmp_path: Path, capsys: pytest.C
     old = tmp_path / "old"
     shutil.copytree(rendered_demo, old)
     project = old / "project.toml"
-    text = project.read_text(encoding="utf-8")
-    project.write_text(text.replace(', "scans/frame3.tif"', ""), encoding="utf-8")
+    replace_text(project, ', "scans/frame3.tif"', "")
     assert run(["run", str(project)]) in (0, 1)
     changed(project)
     project.write_text(f"pitch_um = 45.001\n{project.read_text(encoding='utf-8')}", encoding="utf-8")  # other places

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 from in_process import Loses
-from projects import keep_scans
-from test_command_line import replaced, results, rewritten_scans
+from projects import change_camera, change_project, keep_scans, replace_text
+from test_command_line import results, rewritten_scans
 
 from adjust import AdjustmentError, Prior
 from measure import MeasurementError, Status
@@ -105,32 +105,21 @@ def scan_gone(folder: Path) -> None:
     rewritten_scans(folder, "scans/frame*.tif")
 
 
-def another_mark(folder: Path) -> None:
-    replaced(folder / "camera.toml", "[[fiducial]]", '[[fiducial]]\nid = "99"\nxy_mm = [1.0, 2.0]\n\n[[fiducial]]')
+another_mark = change_camera("[[fiducial]]", '[[fiducial]]\nid = "99"\nxy_mm = [1.0, 2.0]\n\n[[fiducial]]')
+surer_camera = change_camera("principal_distance_mm = 1.0", "principal_distance_mm = 1.1")
+robust = change_project("[adjust]", "[adjust]\nrobust = true")
 
 
-def surer_camera(folder: Path) -> None:
-    replaced(folder / "camera.toml", "principal_distance_mm = 1.0", "principal_distance_mm = 1.1")
+def old(name: str) -> Callable[[Path], None]:
+    """A result of before the last adjustment."""
 
+    def change(folder: Path) -> None:
+        data = (folder / "out" / name).read_bytes()
+        surer_camera(folder)
+        assert run(["adjust", str(folder / "project.toml")]) in (0, 1)
+        (folder / "out" / name).write_bytes(data)
 
-def robust(folder: Path) -> None:
-    replaced(folder / "project.toml", "[adjust]", "[adjust]\nrobust = true")
-
-
-def old_check(folder: Path) -> None:
-    check = folder / "out" / "check.json"
-    text = check.read_text(encoding="utf-8")
-    surer_camera(folder)
-    assert run(["adjust", str(folder / "project.toml")]) in (0, 1)
-    check.write_text(text, encoding="utf-8")
-
-
-def old_covariance(folder: Path) -> None:
-    covariance = folder / "out" / "adjustment.npz"
-    data = covariance.read_bytes()
-    surer_camera(folder)
-    assert run(["adjust", str(folder / "project.toml")]) in (0, 1)
-    covariance.write_bytes(data)
+    return change
 
 
 def old_measurement(folder: Path) -> None:
@@ -146,20 +135,20 @@ def drop_provenance(folder: Path) -> None:
     path.write_text(json.dumps(content), encoding="utf-8")
 
 
-def moved_mark(folder: Path) -> None:
-    path = folder / "comparator.csv"
-    lines = path.read_text(encoding="utf-8").splitlines()
-    row = next(i for i, line in enumerate(lines) if ",target," in line and ",measured," in line)
-    cells = lines[row].split(",")
-    cells[3] = f"{float(cells[3]) + 0.001:.7f}"
-    path.write_text("\n".join([*lines[:row], ",".join(cells), *lines[row + 1 :]]) + "\n", encoding="utf-8")
+def moved(name: str, is_moved: Callable[[str], bool], column: int) -> Callable[[Path], None]:
+    """A table of which one number, in the first of such rows, is another one."""
+
+    def change(folder: Path) -> None:
+        line = next(filter(is_moved, (folder / name).read_text(encoding="utf-8").splitlines()))
+        cells = line.split(",")
+        cells[column] = f"{float(cells[column]) + 0.01:.7f}"
+        replace_text(folder / name, line, ",".join(cells))
+
+    return change
 
 
-def moved_point(folder: Path) -> None:
-    path = folder / "points.csv"
-    head, first, *rest = path.read_text(encoding="utf-8").splitlines()
-    id, x, *others = first.split(",")
-    path.write_text("\n".join([head, ",".join([id, f"{float(x) + 0.01}", *others]), *rest]), encoding="utf-8")
+moved_mark = moved("comparator.csv", lambda line: ",target," in line and ",measured," in line, 3)
+moved_point = moved("points.csv", lambda line: not line.startswith("point"), 1)
 
 
 @pytest.mark.parametrize(
@@ -172,8 +161,8 @@ def moved_point(folder: Path) -> None:
         (moved_point, "adjustment.json is of other points than there are now", set()),
         (robust, "adjustment.json is of other settings than there are now", set()),
         (surer_camera, "adjustment.json is of other cameras than there are now", set()),
-        (old_check, "check.json is of another adjustment: it is not shown.", {"adjustment"}),
-        (old_covariance, "adjustment.npz goes with another adjustment.json: both are not shown.", set()),
+        (old("check.json"), "check.json is of another adjustment: it is not shown.", {"adjustment"}),
+        (old("adjustment.npz"), "adjustment.npz goes with another adjustment.json: both are not shown.", set()),
         (drop_provenance, "adjustment.json is of what it does not say: it is not shown.", set()),
         (old_measurement, "measurement.db is of other marks than comparator.csv", {"adjustment", "check"}),
     ],
@@ -320,74 +309,48 @@ def test_a_place_that_cannot_be_taken_is_named_with_those_that_were(
     assert ".unfinished" not in message
 
 
-def marks_over_notes(folder: Path) -> Path:
-    (folder / "notes.csv").write_text("# my comparator notes\na,b\n", encoding="utf-8")
-    replaced(folder / "project.toml", 'comparator = "comparator.csv"', 'comparator = "notes.csv"')
-    return folder / "notes.csv"
-
-
-def marks_over_a_device(folder: Path) -> Path:
-    (folder / "null.csv").symlink_to("/dev/null")
-    replaced(folder / "project.toml", 'comparator = "comparator.csv"', 'comparator = "null.csv"')
-    return folder / "null.csv"
-
-
-def report_over_a_letter(folder: Path) -> Path:
-    (folder / "out" / "report.html").write_text("<!DOCTYPE html><title>A letter</title>", encoding="utf-8")
-    return folder / "out" / "report.html"
-
-
-def adjustment_over_data(folder: Path) -> Path:
-    (folder / "out" / "adjustment.json").write_text('{"name": "reseau"}', encoding="utf-8")
-    return folder / "out" / "adjustment.json"
-
-
 @pytest.mark.parametrize(
-    ("spoil", "words"),
+    ("name", "content", "words"),
     [
-        (marks_over_notes, "was not written by reseau"),
-        (marks_over_a_device, "is no regular file"),
-        (report_over_a_letter, "was not written by reseau"),
-        (adjustment_over_data, "was not written by reseau"),
+        ("notes.csv", "# my comparator notes\na,b\n", "was not written by reseau"),
+        ("null.csv", "", "is no regular file"),
+        ("out/report.html", "<!DOCTYPE html><title>A letter</title>", "was not written by reseau"),
+        ("out/adjustment.json", '{"name": "reseau"}', "was not written by reseau"),
     ],
 )
 def test_nothing_is_written_over_what_is_no_result(
-    project: Path, capsys: SAID, spoil: Callable[[Path], Path], words: str
+    project: Path, capsys: SAID, name: str, content: str, words: str
 ) -> None:
-    path = spoil(project)
-    before = path.read_bytes()
+    if name.endswith(".csv"):
+        replace_text(project / "project.toml", 'comparator = "comparator.csv"', f'comparator = "{name}"')
+    if content:
+        (project / name).write_text(content, encoding="utf-8")
+    else:
+        (project / name).symlink_to("/dev/null")
     assert run(["run", str(project / "project.toml")]) == 2
     assert words in capsys.readouterr().err
-    assert path.read_bytes() == before
-
-
-def calibration(folder: Path) -> None:
-    shutil.copytree(folder / "out", folder / "earlier")
-    replaced(folder / "camera.toml", "[sigma]", '[sigma]\ncalibration = "earlier/adjustment.json"')
+    assert (project / name).read_text(encoding="utf-8") == content
 
 
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        (
-            'output = "out"',
-            'output = "earlier"',
-            "line 5: output: adjustment.json would be written over the earlier",
-        ),
+        ('output = "out"', 'output = "earlier"', "line 5: output: adjustment.json would be written over the earlier"),
         ('comparator = "comparator.csv"', 'comparator = "earlier/adjustment.npz"', "over the covariance of"),
         ('comparator = "comparator.csv"', 'comparator = "out/adjustment.json"', "over another result"),
         ('comparator = "comparator.csv"', 'comparator = "camera.toml"', "over the camera of"),
     ],
 )
 def test_the_projects_own_inputs_are_never_outputs(project: Path, capsys: SAID, old: str, new: str, words: str) -> None:
-    calibration(project)
-    replaced(project / "project.toml", old, new)
+    shutil.copytree(project / "out", project / "earlier")
+    change_camera("[sigma]", '[sigma]\ncalibration = "earlier/adjustment.json"')(project)
+    replace_text(project / "project.toml", old, new)
     assert run(["run", str(project / "project.toml")]) == 2
     assert words in capsys.readouterr().err
 
 
 def test_a_folder_outside_the_projects_is_named(project: Path, tmp_path: Path, capsys: SAID) -> None:
-    replaced(project / "project.toml", 'output = "out"', 'output = "../elsewhere"')
+    change_project('output = "out"', 'output = "../elsewhere"')(project)
     _, own_summary = summary(project, capsys, "adjust")
     assert any(
         f"outside the project's folder: to {tmp_path.resolve() / 'elsewhere'}" in note for note in own_summary["notes"]
