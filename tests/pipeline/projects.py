@@ -55,7 +55,7 @@ def write_project(folder: Path, names: Sequence[str], project: str = PROJECT, la
     return folder / "project.toml"
 
 
-def write_network_project(network: Network, folder: Path) -> Path:
+def write_network_project(network: Network, folder: Path, frame_mm: str = "frame_mm = [228.0, 228.0]") -> Path:
     """camera.toml, points.csv, comparator.csv and project.toml; the path of the last."""
     camera, points, observed = network.cameras[0], network.points, network.observations
     c, x0, y0 = camera.principal_distance_mm, camera.x0_mm, camera.y0_mm
@@ -65,7 +65,7 @@ def write_network_project(network: Network, folder: Path) -> Path:
     given = camera.distortion.parameters
     lines = [
         f'name = "{camera.name}"',
-        "frame_mm = [228.0, 228.0]",
+        frame_mm,
         f"principal_distance_mm = {c.value!r}",
         f"principal_point_mm = [{x0.value!r}, {y0.value!r}]",
         "[sigma]",
@@ -76,6 +76,7 @@ def write_network_project(network: Network, folder: Path) -> Path:
         f"r0_dm = {camera.distortion.r0_mm / 100.0!r}"
         if camera.distortion.family == "juhl"
         else f"r0_mm = {camera.distortion.r0_mm!r}",
+        'decentering = "paper"' if camera.distortion.decentering == "paper" else "",
         "[distortion.value]",
         *(f"{name} = {prior.value!r}" for name, prior in given.items()),
         "[distortion.sigma]",

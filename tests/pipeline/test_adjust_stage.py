@@ -3,12 +3,14 @@
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from reference_cases import CASES, CAUSES, DROPPED
+from projects import write_network_project
+from reference_cases import CASES, CAUSES, DROPPED, case_network
 from studies import parametrize_with_studies
 
 from adjust import Adjustment, AdjustmentError
@@ -118,44 +120,9 @@ def quantity(result: dict[str, Any], parameter: str) -> tuple[float, float]:
 
 def write_project(case: dict[str, Any], folder: Path) -> None:
     """The case as a user would write it."""
-    given = case["input"]
-    interior = dict(zip(case["io_names"], zip(given["io_obs"], given["io_sigma"], strict=True), strict=True))
-    distortion = {name: pair for name, pair in interior.items() if name not in ("x0", "y0", "c")}
-    lines = [
-        'name = "C"',
-        f"principal_distance_mm = {interior['c'][0]!r}",
-        f"principal_point_mm = [{interior['x0'][0]!r}, {interior['y0'][0]!r}]",
-        "[sigma]",
-        f"principal_distance_mm = {sigma(interior['c'][1])}",
-        f"principal_point_mm = [{sigma(interior['x0'][1])}, {sigma(interior['y0'][1])}]",
-        "[distortion]",
-        f'family = "{case["distortion"]}"',
-        f"r0_dm = {case['r0']!r}" if case["distortion"] == "juhl" else f"r0_mm = {case['r0']!r}",
-        'decentering = "paper"' if case["decentering_mode"] == "paper" else "",
-        "[distortion.value]",
-        *(f"{name} = {value!r}" for name, (value, _) in distortion.items()),
-        "[distortion.sigma]",
-        *(f"{name} = {sigma(s)}" for name, (_, s) in distortion.items()),
-    ]
-    for i, ((x, y), (sx, sy)) in enumerate(zip(given["fid_obs"], given["fid_sigma"], strict=True), 1):
-        lines += ["[[fiducial]]", f'id = "{i}"', f"xy_mm = [{x!r}, {y!r}]", f"sigma_mm = [{sigma(sx)}, {sigma(sy)}]"]
-    (folder / "camera.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    rows = ["point,X,Y,Z,sX,sY,sZ"]
-    for i, (xyz, sigmas) in enumerate(zip(given["pts_obs"], given["pts_sigma"], strict=True), 1):
-        rows.append(",".join([str(i), *map(repr, xyz), *("" if s is None else repr(s) for s in sigmas)]))
-    (folder / "points.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
-    rows = ["image,point,kind,x_mm,y_mm,sx_mm,sy_mm"]
-    for kind, key in (("target", "obs"), ("fiducial", "fobs")):
-        rows += [",".join([str(i), str(p), kind, *map(repr, rest)]) for i, p, *rest in given[key]]
-    (folder / "comparator.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
-    (folder / "project.toml").write_text(
-        f'camera = "camera.toml"\n[object]\npoints = "points.csv"\n[adjust]\ntransformation = "{case["transform"]}"\n',
-        encoding="utf-8",
-    )
-
-
-def sigma(value: float | None) -> str:
-    return '"free"' if value is None else repr(value)
+    network = case_network(case)
+    camera = replace(network.cameras[0], name="C")
+    write_network_project(replace(network, cameras=(camera,)), folder, frame_mm="")
 
 
 CASE = "iii_selfcal_all_unknown_datum_A"

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import tifffile
 from drawn import PITCH_UM, layout_of
-from projects import CAMERA, write_project
+from projects import CAMERA, change_camera, change_project, replace_text, write_project
 from studies import parametrize_with_studies
 
 from measure import MarkShape, Pose, polygon
@@ -94,13 +94,6 @@ def verdicts(folder: Path) -> dict[str, str]:
     return {scan.image: str(scan.verdict) for scan in archive_status(read_project(folder / "project.toml")).scans}
 
 
-def rewritten(folder: Path, name: str, old: str, new: str) -> None:
-    path = folder / name
-    text = path.read_text(encoding="utf-8")
-    assert old in text
-    path.write_text(text.replace(old, new), encoding="utf-8")
-
-
 def one_pixel(folder: Path) -> None:
     pixels = tifffile.imread(folder / "b.tif")
     pixels[5, 5] ^= 1
@@ -119,12 +112,11 @@ CHANGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "renamed": (lambda p: (p / "b.tif").rename(p / "e.tif"), "e"),
     "one more": (one_more, "d"),
     "one less": (lambda p: (p / "b.tif").unlink(), ""),
-    "excluded": (lambda p: rewritten(p, "project.toml", "[measure]", 'exclude = ["b.tif"]\n[measure]'), ""),
-    "an option": (lambda p: rewritten(p, "project.toml", 'pose = "0"', 'pose = "0"\ntone = "linear"'), "abc"),
-    "a mark drawn otherwise": (lambda p: rewritten(p, "camera.toml", "line_mm = 0.1\n", "line_mm = 0.11\n"), "abc"),
-    "an option of the adjustment": (
-        lambda p: rewritten(p, "project.toml", "[measure]", "[adjust]\nrobust = true\n[measure]"), ""),
-    "the camera's name": (lambda p: rewritten(p, "camera.toml", 'name = "K"', 'name = "L"'), ""),
+    "excluded": (change_project("[measure]", 'exclude = ["b.tif"]\n[measure]'), ""),
+    "an option": (change_project('pose = "0"', 'pose = "0"\ntone = "linear"'), "abc"),
+    "a mark drawn otherwise": (change_camera("line_mm = 0.1\n", "line_mm = 0.11\n"), "abc"),
+    "an option of the adjustment": (change_project("[measure]", "[adjust]\nrobust = true\n[measure]"), ""),
+    "the camera's name": (change_camera('name = "K"', 'name = "L"'), ""),
     "a pose decided": (
         lambda p: (p / "decisions.jsonl").write_text('{"image": "b", "decision": "pose", "pose": "90"}\n'), "b"),
     "the marks' file deleted": (lambda p: (p / "comparator.csv").unlink(), ""),
@@ -149,10 +141,10 @@ def test_exactly_what_changed_is_measured_again(folder: Path, change: str) -> No
 
 def test_what_was_measured_with_other_options_comes_back_without_measuring(folder: Path) -> None:
     before = marks(folder)
-    rewritten(folder, "project.toml", 'pose = "0"', 'pose = "0"\ntone = "linear"')
+    replace_text(folder / "project.toml", 'pose = "0"', 'pose = "0"\ntone = "linear"')
     measure(folder)
     assert len(measured) == 3
-    rewritten(folder, "project.toml", 'pose = "0"\ntone = "linear"', 'pose = "0"')
+    replace_text(folder / "project.toml", 'pose = "0"\ntone = "linear"', 'pose = "0"')
     measure(folder)
     assert len(measured) == 3
     assert marks(folder) == before
@@ -367,14 +359,13 @@ def test_status_says_why_a_scan_needs_attention(folder: Path) -> None:
     assert whys == {"a": "pose 0 is assumed", "b": "pose 90 is assumed", "c": ""}
 
 
-def test_the_page_of_results_has_the_table_of_verdicts() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "reference" / "results.md").read_text(encoding="utf-8")
-    assert all(f"| `{verdict}` | {verdict.meaning} | {NEXT_STEP[verdict]} |" in text for verdict in Verdict)
-
-
-def test_the_page_of_scans_has_the_table_of_failures() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "reference" / "scans.md").read_text(encoding="utf-8")
-    assert all(f"| `{code}` | {code.meaning} |" in text for code in FailureCode)
+def test_the_pages_of_results_and_scans_have_the_tables_of_verdicts_and_failures() -> None:
+    results, scans = (
+        (Path(__file__).parents[2] / "docs" / "reference" / name).read_text(encoding="utf-8")
+        for name in ("results.md", "scans.md")
+    )
+    assert all(f"| `{verdict}` | {verdict.meaning} | {NEXT_STEP[verdict]} |" in results for verdict in Verdict)
+    assert all(f"| `{code}` | {code.meaning} |" in scans for code in FailureCode)
 
 
 BOARD = '[targets]\nkind = "chessboard"\nrows = 5\ncolumns = 7\nsquare_mm = 20.0\n'
@@ -390,7 +381,7 @@ def test_of_many_scans_only_the_lot_of_a_new_one_is_tested_again(
     folder: Path, three: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("pipeline.archive.work.measure_file", drop_targets)
-    rewritten(folder, "project.toml", "[measure]", f"{BOARD}[measure]")
+    replace_text(folder / "project.toml", "[measure]", f"{BOARD}[measure]")
     measure(folder)
     monkeypatch.setattr("pipeline.archive.cross_scan_checks._TOGETHER", 1)
     neighbour = list[list[str]]()
@@ -458,9 +449,7 @@ def test_the_tone_of_a_scanner_stays_when_scans_come_and_go(tmp_path: Path, caps
     mark = f'[mark.m]\nkind = "polygon"\nvertices_mm = {[*map(list, TIP_MM)]}\n'
     (folder / "camera.toml").write_text(CAMERA.split("[mark.m]")[0] + mark, encoding="utf-8")
     measure(folder)
-    assert (
-        "0 of 2 scans measured in an earlier run" in capsys.readouterr().err
-    )  # this call asked them for the curve itself
+    assert "0 of 2 scans measured in an earlier run" in capsys.readouterr().err  # this call measured them for the curve
     measured.clear()
     measure(folder)
     assert not measured

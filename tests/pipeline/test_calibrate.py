@@ -252,19 +252,8 @@ def result(calibrated_folder: Path, calibrations: list[Calibration]) -> dict[str
 
     with redirect_stdout(printed), pytest.MonkeyPatch.context() as patch:
         patch.setattr(calibrate_stage, "calibrate", keep)
-        code = run(
-            [
-                "calibrate",
-                str(calibrated_folder),
-                *CALIBRATED_BOARD,
-                "--lens",
-                "opencv4",
-                "--out",
-                str(out),
-                "--ros",
-                "--json",
-            ]
-        )
+        options = ("--lens", "opencv4", "--out", str(out), "--ros", "--json")
+        code = run(["calibrate", str(calibrated_folder), *CALIBRATED_BOARD, *options])
     assert code == 1  # two pictures are left out
     return dict(json.loads(printed.getvalue()))
 
@@ -317,10 +306,8 @@ def test_square_pixels_join_fx_and_fy_and_the_project_goes_on(
     calibrated_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pictures = [str(calibrated_folder / f"p{number}.png") for number in range(len(TURNS))]
-    assert run(["calibrate", *pictures, *CALIBRATED_BOARD, "--square-pixels", "--out", str(tmp_path), "--json"]) in (
-        0,
-        1,
-    )
+    options = ("--square-pixels", "--out", str(tmp_path), "--json")
+    assert run(["calibrate", *pictures, *CALIBRATED_BOARD, *options]) in (0, 1)
     (camera,) = json.loads(capsys.readouterr().out)["cameras"]
     assert camera["fx_px"] == camera["fy_px"]
     assert run(["run", str(tmp_path / "project.toml")]) in (0, 1)

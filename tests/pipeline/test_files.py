@@ -3,7 +3,7 @@
 import errno
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -67,10 +67,21 @@ def written(folder: Path, name: str, text: str) -> Path:
     return path
 
 
-def refused(read: Callable[[Path], object], path: Path) -> str:
+def refused(read: Callable[[Path], object], path: Path, words: Sequence[str] = ()) -> str:
+    """The message, which says all these words."""
     with pytest.raises(InputError) as error:
         read(path)
-    return str(error.value)
+    message = str(error.value)
+    for word in words:
+        assert word in message
+    return message
+
+
+def bare_project(folder: Path, text: str) -> Project:
+    """Of a camera without fiducials and marks that are given."""
+    written(folder, "camera.toml", 'name = "c"\nframe_mm = [24.0, 36.0]\nprincipal_distance_mm = 50.0\n')
+    written(folder, "comparator.csv", "image,point,kind,x_mm,y_mm\n")
+    return read_project(written(folder, "project.toml", f'camera = "camera.toml"\n{text}\n'))
 
 
 @pytest.mark.parametrize(("folder", "title"), [("roll_7", "roll_7"), ("roll_7/out", "roll_7/out")])
@@ -103,11 +114,8 @@ def test_an_astrograph_of_10_m_with_small_plates_is_a_camera(tmp_path: Path) -> 
 def test_camera_file_gives_priors_and_marks(tmp_path: Path) -> None:
     file = read_camera(written(tmp_path, "camera.toml", CAMERA))
     camera = file.camera()
-    assert camera.principal_distance_mm is not None
-    assert camera.principal_distance_mm.sigma == math.inf
-    assert camera.x0_mm is not None
-    assert camera.y0_mm is not None
-    assert (camera.x0_mm.sigma, camera.y0_mm.sigma) == (0.0, 2.0)
+    priors = (camera.principal_distance_mm, camera.x0_mm, camera.y0_mm)
+    assert [prior and prior.sigma for prior in priors] == [math.inf, 0.0, 2.0]
     assert camera.distortion.parameters["k3"].sigma == math.inf
     assert "k5" not in camera.distortion.parameters
     assert camera.fiducials["1"].y_mm.sigma == math.inf
@@ -200,9 +208,7 @@ def test_camera_file_with_a_mistake_gets_a_message_that_helps(
 ) -> None:
     assert old in CAMERA
     path = written(tmp_path, "camera.toml", CAMERA.replace(old, new, 1))
-    message = refused(read_camera, path)
-    for word in [str(path), *words]:
-        assert word in message
+    refused(read_camera, path, [str(path), *words])
 
 
 def test_a_self_calibration_set_without_a_frame_is_reported_what_it_needs(tmp_path: Path) -> None:
@@ -238,14 +244,8 @@ def test_missing_file_is_named_with_the_place_inspected_for(tmp_path: Path) -> N
 def test_points_file_fixed_free_and_unknown(tmp_path: Path) -> None:
     text = "point,X,Y,Z,sX,sY,sZ\n# a comment\n1,1,2,3,0,0.5,\n2,,,7,,,0.02\n"
     points = {point.id: point for point in read_points(written(tmp_path, "points.csv", text)).points}
-    first, second = points["1"], points["2"]
-    assert first.X is not None
-    assert first.Y is not None
-    assert first.Z is not None
-    assert (first.X.sigma, first.Y.sigma, first.Z.sigma) == (0.0, 0.5, math.inf)
-    assert second.X is None
-    assert second.Z is not None
-    assert second.Z.sigma == 0.02
+    sigmas = {id: [axis and axis.sigma for axis in (point.X, point.Y, point.Z)] for id, point in points.items()}
+    assert sigmas == {"1": [0.0, 0.5, math.inf], "2": [None, None, 0.02]}
 
 
 @pytest.mark.parametrize(
@@ -265,9 +265,7 @@ def test_points_file_fixed_free_and_unknown(tmp_path: Path) -> None:
     ],
 )
 def test_points_file_with_a_mistake(tmp_path: Path, text: str, words: list[str]) -> None:
-    message = refused(read_points, written(tmp_path, "points.csv", text))
-    for word in words:
-        assert word in message
+    refused(read_points, written(tmp_path, "points.csv", text), words)
 
 
 def test_images_file_in_degrees_with_or_without_ending(tmp_path: Path) -> None:
@@ -320,18 +318,8 @@ def test_a_measurement_is_read_back_with_its_reasons_and_the_causes_of_its_covar
 
 
 def test_the_projects_film_is_what_measuring_believes_of_it(tmp_path: Path) -> None:
-    written(tmp_path, "camera.toml", 'name = "c"\nframe_mm = [24.0, 36.0]\nprincipal_distance_mm = 50.0\n')
-    written(tmp_path, "comparator.csv", "image,point,kind,x_mm,y_mm\n")
-    project = 'camera = "camera.toml"\n[adjust]\nfilm_sigma_um = '
-    assert read_project(written(tmp_path, "project.toml", project + "12.0")).film == BelievedFilm(0.012, is_stated=True)
-    assert read_project(written(tmp_path, "project.toml", project + "0.0")).film == BelievedFilm(SCATTER_MM)
-
-
-def test_half_pixel_pixel_centres_are_whole_numbers() -> None:
-    pitch = (20.0, 20.0)
-    np.testing.assert_array_equal(comparator_from_pixel(np.zeros(2), pitch), np.zeros(2))
-    pixel = np.array([[3.25, 7.5], [0.0, 11.0]])
-    np.testing.assert_allclose(pixel_from_comparator(comparator_from_pixel(pixel, pitch), pitch), pixel, rtol=1e-14)
+    film = [bare_project(tmp_path, f"[adjust]\nfilm_sigma_um = {sigma_um}").film for sigma_um in (12.0, 0.0)]
+    assert film == [BelievedFilm(0.012, is_stated=True), BelievedFilm(SCATTER_MM)]
 
 
 @pytest.mark.parametrize(
@@ -343,10 +331,7 @@ def test_half_pixel_pixel_centres_are_whole_numbers() -> None:
     ],
 )
 def test_comparator_file_with_a_mistake(tmp_path: Path, row: str, words: list[str]) -> None:
-    path = written(tmp_path, "comparator.csv", f"image,point,kind,x_mm,y_mm\n{row}\n")
-    message = refused(read_comparator, path)
-    for word in words:
-        assert word in message
+    refused(read_comparator, written(tmp_path, "comparator.csv", f"image,point,kind,x_mm,y_mm\n{row}\n"), words)
 
 
 def test_a_list_of_pixels_is_read_with_y_up_by_the_pitch(tmp_path: Path) -> None:
@@ -469,9 +454,7 @@ def test_two_files_of_one_name_in_a_folder_are_refused_and_so_is_leaving_all_out
     ("said", "tone"), [("", "auto"), ('tone = "linear"', "linear"), ("tone = 2.2", 2.2), ('tone = "srgb"', "srgb")]
 )
 def test_the_tone_curve_of_a_project(tmp_path: Path, said: str, tone: float | str) -> None:
-    written(tmp_path, "camera.toml", 'name = "c"\nframe_mm = [24.0, 36.0]\nprincipal_distance_mm = 50.0\n')
-    written(tmp_path, "comparator.csv", "image,point,kind,x_mm,y_mm\n")
-    assert read_project(written(tmp_path, "project.toml", f'camera = "camera.toml"\n[measure]\n{said}\n')).tone == tone
+    assert bare_project(tmp_path, f"[measure]\n{said}").tone == tone
 
 
 @pytest.mark.parametrize(
@@ -479,15 +462,13 @@ def test_the_tone_curve_of_a_project(tmp_path: Path, said: str, tone: float | st
     [('"2.2"', ["tone", "linear", "A number above 0, without quotes"]), ("-1.0", ["tone", "greater than 0"])],
 )
 def test_a_tone_curve_that_is_none(tmp_path: Path, said: str, words: list[str]) -> None:
-    path = written(tmp_path, "project.toml", f'camera = "camera.toml"\n[measure]\ntone = {said}\n')
-    message = refused(read_project, path)
-    for word in words:
-        assert word in message
+    refused(read_project, written(tmp_path, "p.toml", f'camera = "camera.toml"\n[measure]\ntone = {said}\n'), words)
 
 
 def test_rows_go_down_and_y_goes_up() -> None:
     np.testing.assert_allclose(comparator_from_pixel(np.array([[3.0, 5.0]]), (20.0, 10.0)), [[0.06, -0.05]])
     np.testing.assert_allclose(pixel_from_comparator(np.array([0.06, -0.05]), (20.0, 10.0)), [3.0, 5.0])
+    np.testing.assert_array_equal(comparator_from_pixel(np.zeros(2), (20.0, 20.0)), np.zeros(2))  # a pixel's middle
 
 
 @pytest.mark.parametrize(

@@ -239,11 +239,6 @@ def test_a_failed_scan_has_a_row_for_each_target(tmp_path: Path) -> None:
     assert (kinds.count("fiducial"), kinds.count("target")) == (4, 20)
 
 
-def read_rows(project: Path, images: str) -> list[str]:
-    lines = (project.parent / "comparator.csv").read_text(encoding="utf-8").splitlines()
-    return [line for line in lines if line[1:2] == "," and line[0] in images]
-
-
 @pytest.mark.study
 def test_damaged_and_missing_scans_cost_the_others_nothing(tmp_path: Path, capsys: SAID) -> None:
     """Of six scans one is damaged, one a text and one a link that leads nowhere; images.csv names another."""
@@ -279,18 +274,6 @@ def test_damaged_and_missing_scans_cost_the_others_nothing(tmp_path: Path, capsy
     assert {name: scan.failure and str(scan.failure.code) for name, scan in scans.items()} == {
         "a": None, "b": None, "c": None, "d": "unreadable", "e": "missing", "f": "unreadable", "g": "missing",
     }  # fmt: skip
-
-
-def test_where_no_scan_can_be_measured_the_message_names_each(tmp_path: Path, capsys: SAID) -> None:
-    project = write_project(tmp_path, ["a", "b"])
-    for name in ("a.tif", "b.tif"):
-        (tmp_path / name).write_bytes(b"no picture")
-    assert run(["measure", str(project)]) == 2
-    message = capsys.readouterr().err
-    assert "a.tif" in message
-    assert "b.tif" in message
-    assert "Traceback" not in message
-    assert not (tmp_path / "comparator.csv").exists()
 
 
 def test_a_scan_refused_for_its_size_says_how_to_allow_it(tmp_path: Path, capsys: SAID) -> None:

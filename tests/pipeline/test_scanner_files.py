@@ -33,6 +33,8 @@ from synthetic_images.render import render_scene
 from synthetic_images.scene import Film, Scene, SceneCamera, SceneFiducial, SceneImage, TakingLens, Tones
 from synthetic_images.scene import Scanner as SceneScanner
 
+TEMPLATE = (files("pipeline") / "templates" / "scene.toml").read_text(encoding="utf-8")
+BENT_TEMPLATE = TEMPLATE.replace("# bend_um = {a20 = 20.0, b11 = -15.0}", "bend_um = {a20 = 20.0, b11 = -15.0}")
 TRUTH = {"a20": 0.02, "b11": -0.015, "b02": 0.01}
 QUARTERS = [0.0, 90.0, 180.0, 270.0] * 2
 
@@ -138,11 +140,9 @@ def test_a_rendered_scanner_is_the_one_that_is_adjusted() -> None:
     pixels = np.concatenate([geometry.pixel_from_camera(np.array(list(marks_mm.values()))) for geometry in geometries])
     bend = scanner_bend(made)
     scanner = Scanner("S", dict.fromkeys(bend_um, Prior(0.0, np.inf)), bend.center_mm, (bend.size_mm / 2,) * 2)
-    network = replace(
-        bent_films([0.0] * len(poses), {}, {}, marks_mm=marks_mm, sigma_given_mm=0.0),
-        scanners=(scanner,),
-    )
-    network = replace(network, observations=replace(network.observations, xy_mm=pixels * [0.04, -0.04]))
+    network = bent_films([0.0] * len(poses), {}, {}, marks_mm=marks_mm, sigma_given_mm=0.0)
+    observations = replace(network.observations, xy_mm=pixels * [0.04, -0.04])
+    network = replace(network, scanners=(scanner,), observations=observations)
     result = adjust(network, approximate(network))
     assert result.converged
     for name, value in bend_um.items():
@@ -150,10 +150,8 @@ def test_a_rendered_scanner_is_the_one_that_is_adjusted() -> None:
 
 
 def test_a_rendered_project_of_a_bent_scanner_appears_for_it(tmp_path: Path) -> None:
-    text = (files("pipeline") / "templates" / "scene.toml").read_text(encoding="utf-8")
-    bent = text.replace("# bend_um = {a20 = 20.0, b11 = -15.0}", "bend_um = {a20 = 20.0, b11 = -15.0}")
-    assert bent != text
-    (tmp_path / "scene.toml").write_text(bent, encoding="utf-8")
+    assert BENT_TEMPLATE != TEMPLATE
+    (tmp_path / "scene.toml").write_text(BENT_TEMPLATE, encoding="utf-8")
     scene_file = read_scene(tmp_path / "scene.toml")
     assert scene_file.scene.scanner.bend_um == {"a20": 20.0, "b11": -15.0}
     write_rendered(scene_file, tmp_path)
@@ -162,10 +160,8 @@ def test_a_rendered_project_of_a_bent_scanner_appears_for_it(tmp_path: Path) -> 
 
 def test_a_design_says_what_cannot_be_known_of_the_scanner(tmp_path: Path) -> None:
     """The template's second frame turned by 180 degrees against the first, and laid like it, which tells less."""
-    text = (files("pipeline") / "templates" / "scene.toml").read_text(encoding="utf-8")
-    text = text.replace('scanner = "none"  ', 'scanner = ["a20"]  ').replace(
-        "alternatives = true", "alternatives = false"
-    )
+    text = TEMPLATE.replace('scanner = "none"  ', 'scanner = ["a20"]  ')
+    text = text.replace("alternatives = true", "alternatives = false")
     turned, alike = (text.replace('pose = "90m"', f'pose = "{pose}"') for pose in ("180", "0"))
     sigmas = {}
     for name, content in (("two", turned), ("alike", alike)):
@@ -177,8 +173,7 @@ def test_a_design_says_what_cannot_be_known_of_the_scanner(tmp_path: Path) -> No
 
 
 def test_a_design_tries_scans_turned_by_180_degrees(tmp_path: Path) -> None:
-    text = (files("pipeline") / "templates" / "scene.toml").read_text(encoding="utf-8")
-    text = text.replace('scanner = "none"  ', 'scanner = ["a20", "b11"]  ').replace('pose = "90m"', 'pose = "0"')
+    text = TEMPLATE.replace('scanner = "none"  ', 'scanner = ["a20", "b11"]  ').replace('pose = "90m"', 'pose = "0"')
     (tmp_path / "scene.toml").write_text(text, encoding="utf-8")
     run(["design", str(tmp_path / "scene.toml"), str(tmp_path / "out")])
     found = json.loads((tmp_path / "out" / "design.json").read_text(encoding="utf-8"))
@@ -190,9 +185,7 @@ def test_a_design_tries_scans_turned_by_180_degrees(tmp_path: Path) -> None:
 
 def test_two_photographs_of_a_rendered_scene_give_its_scanner_back(tmp_path: Path) -> None:
     """Marks where the renderer puts them, to 1.5 um: most of the terms that are tried are not told by two frames."""
-    text = (files("pipeline") / "templates" / "scene.toml").read_text(encoding="utf-8")
-    text = text.replace("# bend_um = {a20 = 20.0, b11 = -15.0}", "bend_um = {a20 = 20.0, b11 = -15.0}")
-    (tmp_path / "scene.toml").write_text(text, encoding="utf-8")
+    (tmp_path / "scene.toml").write_text(BENT_TEMPLATE, encoding="utf-8")
     scene_file = read_scene(tmp_path / "scene.toml")
     write_rendered(scene_file, tmp_path)
     project_text = (tmp_path / "project.toml").read_text(encoding="utf-8")

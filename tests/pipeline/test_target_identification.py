@@ -35,6 +35,8 @@ from pipeline.text.tables import read_toml
 from synthetic_images.frame import frame_truth
 from synthetic_images.truth import Truth, truth_json
 
+Array = NDArray[np.float64]
+
 
 def test_pattern_is_named_right_with_targets_missing_and_marks_that_are_none() -> None:
     rng = np.random.default_rng(1)
@@ -85,12 +87,8 @@ def test_eccentricity_and_place_of_a_disk_are_those_of_the_rendered_one(rendered
     radius = 0.013  # m
     largest = 0.0
     for frame in truth["images"].values():
-        model = true_model(camera, frame)
-        shown = {id: place for id, place in frame["targets"].items() if place["visible"]}
-        points = [truth["points"][id] for id in shown]
-        centers = np.array([[point[axis]["value"] for axis in "XYZ"] for point in points])
-        normals = np.array([point["normal"] for point in points])
-        pitch = tuple(frame["pitch_um"])
+        model, pitch = true_model(camera, frame), tuple(frame["pitch_um"])
+        centers, normals, true_px, ellipse_px = shown_disks(truth, frame)
         place_px, maps, perspective, visible = disk_images(model, pitch, centers, normals, radius)
         assert visible.all()
         # A point of the plane ten radii off, moved by perspective by up to 0.8 px: film and lens hardly bend here.
@@ -99,8 +97,6 @@ def test_eccentricity_and_place_of_a_disk_are_those_of_the_rendered_one(rendered
         far, _ = model.comparator_from_object(centers + radius * (6.0 * first + 8.0 * second))
         projected_px = place_px + off_px / (1.0 + np.sum(perspective * off_px, axis=1))[:, None]
         np.testing.assert_allclose(pixel_from_comparator(far, pitch), projected_px, atol=0.03)
-        true_px = np.array([(place["col_px"], place["row_px"]) for place in shown.values()])
-        ellipse_px = np.array([(place["ellipse_col_px"], place["ellipse_row_px"]) for place in shown.values()])
         np.testing.assert_allclose(place_px, true_px, atol=1e-6)
         off_px = pixel_from_comparator(eccentricity_mm(model, centers, normals, radius), pitch)
         np.testing.assert_allclose(off_px, ellipse_px - true_px, atol=2e-5)
@@ -139,35 +135,35 @@ def test_large_disks_at_close_range_under_strong_distortion(tmp_path: Path) -> N
     """125 px wide and up to 1.2 px off, 0.1 px of which comes from the lens, of 2 % in the corner."""
     (tmp_path / "scene.toml").write_text(CLOSE, encoding="utf-8")
     scene = read_scene(tmp_path / "scene.toml").scene
-    truth = Truth(scene, (frame_truth(scene, 0),))
-    document = json.loads(truth_json(truth))
+    document = json.loads(truth_json(Truth(scene, (frame_truth(scene, 0),))))
     (camera,), (frame,) = document["cameras"].values(), document["images"].values()
-    shown = {id: place for id, place in frame["targets"].items() if place["visible"]}
-    points = [document["points"][id] for id in shown]
-    centers = np.array([[point[axis]["value"] for axis in "XYZ"] for point in points])
-    normals = np.array([point["normal"] for point in points])
+    centers, normals, true_px, ellipse_px = shown_disks(document, frame)
     off_mm = eccentricity_mm(true_model(camera, frame), centers, normals, 0.06)
     off_px = pixel_from_comparator(off_mm, tuple(frame["pitch_um"]))
-    true_px = np.array(
-        [(t["ellipse_col_px"] - t["col_px"], t["ellipse_row_px"] - t["row_px"]) for t in shown.values()]
-    )  # fmt: skip
-    assert np.abs(true_px).max() > 0.9
-    np.testing.assert_allclose(off_px, true_px, atol=2e-3)
+    assert np.abs(ellipse_px - true_px).max() > 0.9
+    np.testing.assert_allclose(off_px, ellipse_px - true_px, atol=2e-3)
+
+
+def shown_disks(truth: dict[str, Any], frame: dict[str, Any]) -> tuple[Array, Array, Array, Array]:
+    """Centres, normals, places and middles of the ellipses of a frame's visible disks."""
+    shown = {id: place for id, place in frame["targets"].items() if place["visible"]}
+    points = [truth["points"][id] for id in shown]
+    return (
+        np.array([[point[axis]["value"] for axis in "XYZ"] for point in points]),
+        np.array([point["normal"] for point in points]),
+        np.array([(place["col_px"], place["row_px"]) for place in shown.values()]),
+        np.array([(place["ellipse_col_px"], place["ellipse_row_px"]) for place in shown.values()]),
+    )
 
 
 def true_model(camera: dict[str, Any], frame: dict[str, Any]) -> ImageModel:
     distortion, exterior, film = camera["distortion"], frame["exterior"], frame["transformation"]
+    point = camera["principal_point_mm"]
     angles = np.deg2rad([exterior[name]["value"] for name in ("omega_deg", "phi_deg", "kappa_deg")])
     return ImageModel(
         Lens(
             Distortion(distortion["family"], {}, distortion["decentering"], distortion["r0_mm"]),
-            np.array(
-                [
-                    camera["principal_distance_mm"]["value"],
-                    camera["principal_point_mm"]["x"]["value"],
-                    camera["principal_point_mm"]["y"]["value"],
-                ]
-            ),
+            np.array([camera["principal_distance_mm"]["value"], *(point[axis]["value"] for axis in "xy")]),
             np.array([distortion[name]["value"] for name in parameter_names(distortion["family"])]),
         ),
         rotation_from_angles(angles),
@@ -200,13 +196,19 @@ def test_vectors_across_are_at_right_angles() -> None:
     np.testing.assert_allclose(np.linalg.norm(second, axis=1), 1.0)
 
 
+PINHOLE = ImageModel(
+    Lens(Distortion("none", {}), np.array([100.0, 0.0, 0.0]), np.empty(0)),
+    np.eye(3),
+    np.zeros(3),
+    Film("none", np.empty(0), np.zeros(2), False),
+)
+
+
 def test_the_ellipse_of_a_near_disk_is_that_of_its_outline() -> None:
     """Through a pinhole, of a disk a third as far off as it is wide: the centre of gravity of 4000 points' polygon."""
-    radius, c = 0.9, 100.0
+    radius, c = 0.9, PINHOLE.lens.interior[0]
     centers, normals = np.array([[0.8, -0.5, -3.0], [-1.0, 0.6, -2.7]]), np.array([[0.6, 0.0, 0.8], [0.36, -0.48, 0.8]])
-    film = Film("none", np.empty(0), np.zeros(2), False)
-    model = ImageModel(Lens(Distortion("none", {}), np.array([c, 0.0, 0.0]), np.empty(0)), np.eye(3), np.zeros(3), film)
-    found = eccentricity_mm(model, centers, normals, radius)
+    found = eccentricity_mm(PINHOLE, centers, normals, radius)
     angles = np.linspace(0.0, 2.0 * np.pi, 4000, endpoint=False)
     for center, normal, off in zip(centers, normals, found, strict=True):
         first = np.cross(normal, [0.0, 1.0, 0.0])
@@ -223,20 +225,12 @@ def test_the_ellipse_of_a_near_disk_is_that_of_its_outline() -> None:
 
 def test_the_eccentricity_of_disks_at_seven_digits_is_that_at_the_origin() -> None:
     """To a picometre and less: what coordinates of seven digits lose by rounding would be 10 pm here."""
-    centers, normals = (
-        np.array([[0.75, -0.5, -3.0], [-1.0, 0.625, -2.75]]),
-        np.array([[0.6, 0.0, 0.8], [0.0, -0.6, 0.8]]),
-    )
-    film = Film("none", np.empty(0), np.zeros(2), False)
-    model = ImageModel(
-        Lens(Distortion("none", {}), np.array([100.0, 0.0, 0.0]), np.empty(0)), np.eye(3), np.zeros(3), film
-    )
+    centers = np.array([[0.75, -0.5, -3.0], [-1.0, 0.625, -2.75]])
+    normals = np.array([[0.6, 0.0, 0.8], [0.0, -0.6, 0.8]])
     far = np.array([500_000.0, 5_400_000.0, 300.0])
-    there = eccentricity_mm(replace(model, station=far), centers + far, normals, 0.013)
-    np.testing.assert_allclose(there, eccentricity_mm(model, centers, normals, 0.013), rtol=0.0, atol=1e-12)
+    there = eccentricity_mm(replace(PINHOLE, station=far), centers + far, normals, 0.013)
+    np.testing.assert_allclose(there, eccentricity_mm(PINHOLE, centers, normals, 0.013), rtol=0.0, atol=1e-12)
 
-
-Array = NDArray[np.float64]
 
 SCENE = """seed = 3
 [camera]
