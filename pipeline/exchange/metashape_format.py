@@ -12,6 +12,7 @@ from pipeline.exchange.micmac_format import film_box
 from pipeline.exchange.pinhole import BROWN, FittedLens, checked_misfits, sheared_lens
 from pipeline.exchange.xml_tree import child_numbers, read_xml, xml_text
 from pipeline.files.camera_file import CameraFile
+from pipeline.opencv_check.opencv_calibration import INTERIOR
 from pipeline.resampling.canvas import Canvas
 from pipeline.text.names import file_word
 
@@ -101,7 +102,7 @@ def _image(frame: OutFrame) -> dict[str, object]:
 def _calibration(lens: FittedLens, box: Canvas) -> str:
     """Calibration of the exposed frame, with its width and height; cx and cy from its centre. Metashape's p1 is
     OpenCV's p2."""
-    fx, fy, x0, y0 = lens.values[:4]
+    fx, fy, x0, y0 = lens.named(INTERIOR)
     k1, k2, p1, p2, k3 = lens.named(BROWN)
     middle = box.x_mm + box.width_px * box.pitch_mm / 2.0, box.y_mm - box.height_px * box.pitch_mm / 2.0
     values = {

@@ -20,6 +20,7 @@ from pipeline.exchange.pinhole import (
     sheared_lens,
 )
 from pipeline.exchange.xml_tree import Content, Element, child_numbers, child_text, read_xml, xml_text
+from pipeline.opencv_check.opencv_calibration import INTERIOR
 from pipeline.resampling.canvas import Canvas
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.text.names import file_word, image_name
@@ -141,7 +142,7 @@ def _sigmas_px(marks: Sequence[ComparatorPoint], pitch_mm: float) -> dict[str, f
 
 def _calibration(lens: FittedLens, box: Canvas) -> str:
     """Central perspective with ModPhgrStd, in px of the resampled frame. MicMac's P1 is OpenCV's p2."""
-    fx, fy, x0, y0 = lens.values[:4]
+    fx, fy, x0, y0 = lens.named(INTERIOR)
     k1, k2, p1, p2, k3 = lens.named(BROWN)
     focal = float(fy / box.pitch_mm)
     point = box.pixel_from_camera(np.array([x0, y0])) + CONVENTION.first_pixel_px

@@ -32,7 +32,8 @@ def write(block: Block, options: ExportOptions) -> Written:
 def _yaml(frame: PinholeFrame, lens_reach: str | None) -> str:
     """YAML text of one image. lens_reach: comment on the radius up to which the lens is known."""
     fx, fy, cx, cy = frame.interior_px(CONVENTION)
-    used = np.flatnonzero(frame.lens.values[4:])
+    distortion = frame.lens.named(NAMES[4:])
+    used = np.flatnonzero(distortion)
     count = next(size for size in (5, 8, 12, 14) if size > (used.max() if used.size else 0))
     storage = cv2.FileStorage("", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML)
     storage.write("image", frame.picture)
@@ -46,7 +47,7 @@ def _yaml(frame: PinholeFrame, lens_reach: str | None) -> str:
         storage.write("distortion_model", FISHEYE)
         storage.write("distortion_coefficients", np.array([frame.lens.fisheye]))
     else:
-        storage.write("distortion_coefficients", frame.lens.values[4 : 4 + count].reshape(1, -1))
+        storage.write("distortion_coefficients", distortion[:count].reshape(1, -1))
     storage.write("R", frame.rotation)
     storage.write("t", frame.translation.reshape(3, 1))
     return str(storage.releaseAndGetString())

@@ -15,7 +15,7 @@ from measure.errors import MeasurementError
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, Frame, WholeFrame
 from pipeline.exchange.formats import Convention, ExportOptions, Written
-from pipeline.opencv_check.opencv_calibration import FISHEYE, INTERIOR, NAMES, fixed, opencv_values
+from pipeline.opencv_check.opencv_calibration import FISHEYE, INTERIOR, fixed, model_names, opencv_values
 from pipeline.resampling.canvas import Canvas, outline_canvas
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.types import Array
@@ -31,23 +31,25 @@ Y_DOWN_Z_FORWARD = np.diag([1.0, -1.0, -1.0])  # from the camera's axes (y up, l
 
 @dataclass(frozen=True)
 class FittedLens:
-    """A lens in OpenCV's model.
+    """A lens of the family of one of OpenCV's models. largest_mm: largest error of a point in the frame."""
 
-    Attributes
-    ----------
-    values : (18,) OpenCV's parameters as in `opencv_model`, in mm with y up.
-    largest_mm : largest error of a point in the frame.
-    fisheye : k1 to k4 of OpenCV's fisheye, instead of the distortion; otherwise empty.
-    shear : b2 as in the family `opencv`, for programs that have it.
-    """
-
-    values: Array
+    lens: Lens
     largest_mm: float
-    fisheye: tuple[float, ...] = ()
-    shear: float = 0.0
 
     def named(self, names: Sequence[str]) -> Array:
-        return np.array([self.values[NAMES.index(name)] for name in names])
+        """OpenCV's parameters by their names, in mm with y up; 0 for those of the other model."""
+        known = dict(zip(model_names(self.lens.distortion.family), opencv_values(self.lens)[0], strict=True))
+        return np.array([known.get(name, 0.0) for name in names])
+
+    @property
+    def fisheye(self) -> list[float]:
+        """k1 to k4 of OpenCV's fisheye; empty for its other model."""
+        return self.lens.parameters[:4].tolist() if self.lens.distortion.family == FISHEYE else []
+
+    @property
+    def shear(self) -> float:
+        """b2 of the family, for programs that have it."""
+        return float(self.lens.parameters[-1])
 
 
 def nearest_lens(block: Block, frame: Frame, models: Sequence[Sequence[str]], options: ExportOptions) -> FittedLens:
@@ -62,7 +64,7 @@ def nearest_lens(block: Block, frame: Frame, models: Sequence[Sequence[str]], op
         return FittedLens(_undistorted(lens), 0.0)
     for names in models:
         if _has_only(lens, (*names, "b1")):
-            return _opencv(lens)
+            return FittedLens(lens, 0.0)
     for names in models:
         fitted = _fit_opencv(block, frame, names)
         if fitted.largest_mm <= options.largest_misfit_px * min(frame.known_pitch_um) / 1000.0:
@@ -77,12 +79,8 @@ def fisheye_lens(block: Block, frame: Frame, options: ExportOptions) -> FittedLe
     assert lens is not None
     if lens.distortion.family != FISHEYE or options.with_lens:
         return None
-    *k, b1, b2 = lens.parameters.tolist()
-    c, x0, y0 = lens.interior
-    values = np.zeros(len(NAMES))
-    values[:4] = c * (1.0 + b1), c, x0, y0
-    farthest_mm = float(np.abs(frame_corners_mm(block, frame)[:, 1] - y0).max())
-    return FittedLens(values, abs(b2) * farthest_mm, tuple(k))
+    farthest_mm = float(np.abs(frame_corners_mm(block, frame)[:, 1] - lens.interior[2]).max())
+    return FittedLens(lens, abs(float(lens.parameters[-1])) * farthest_mm)
 
 
 def sheared_lens(block: Block, frame: Frame, at_ideal: bool) -> FittedLens:
@@ -98,12 +96,12 @@ def sheared_lens(block: Block, frame: Frame, at_ideal: bool) -> FittedLens:
     if family == "none":
         return FittedLens(_undistorted(lens), 0.0)
     if _has_only(lens, BROWN if at_ideal else (*BROWN, *_AFFINE)):
-        return _opencv(lens)
+        return FittedLens(lens, 0.0)
     if family in _ONE_SCALE or not at_ideal:
         return _fit_opencv(block, frame, (*BROWN, *_AFFINE))
     rays, observed_mm = _over_frame(block, frame)
-    fitted, shear = _sheared_step(rays, observed_mm)
-    return FittedLens(fitted, _largest(_sheared(fitted, shear, rays) - observed_mm), shear=shear)
+    fitted = _sheared_fit(rays, observed_mm)
+    return FittedLens(fitted, float(np.linalg.norm(_sheared(fitted, rays) - observed_mm, axis=1).max()))
 
 
 def frame_corners_mm(block: Block, frame: Frame) -> Array:
@@ -122,11 +120,8 @@ def frame_corners_mm(block: Block, frame: Frame) -> Array:
     return np.array([observed.min(axis=0), observed.max(axis=0)])
 
 
-def _undistorted(lens: Lens) -> Array:
-    c, x0, y0 = lens.interior
-    values = np.zeros(len(NAMES))
-    values[:4] = c, c, x0, y0
-    return values
+def _undistorted(lens: Lens) -> Lens:
+    return Lens(Distortion("opencv"), lens.interior, np.zeros(len(parameter_names("opencv"))))
 
 
 def _has_only(lens: Lens, names: Sequence[str]) -> bool:
@@ -134,14 +129,6 @@ def _has_only(lens: Lens, names: Sequence[str]) -> bool:
     family = lens.distortion.family
     known = zip(parameter_names(family), lens.parameters, strict=True)
     return family == "opencv" and not any(value for name, value in known if name not in names)
-
-
-def _opencv(lens: Lens) -> FittedLens:
-    given = dict(zip(parameter_names(lens.distortion.family), lens.parameters.tolist(), strict=True))
-    values = _undistorted(lens)
-    values[0] *= 1.0 + given["b1"]
-    values[4:] = [given[name] for name in NAMES[4:]]
-    return FittedLens(values, 0.0, shear=given["b2"])
 
 
 def _over_frame(block: Block, frame: Frame) -> tuple[Array, Array]:
@@ -166,14 +153,11 @@ def _fit_opencv(block: Block, frame: Frame, names: Sequence[str]) -> FittedLens:
         found = convert_lens(lens, into, corners_mm, estimated)
     except AdjustmentError:  # treat it as a model that does not fit
         return FittedLens(_undistorted(lens), np.inf)
-    return FittedLens(opencv_values(found.lens)[0], found.largest_mm, shear=float(found.lens.parameters[-1]))
+    return FittedLens(found.lens, found.largest_mm)
 
 
-def _sheared_step(rays: Array, observed_mm: Array) -> tuple[Array, float]:
-    """Parameters (18,) and shear, with affinity and shear of the ideal point, by one linear least-squares fit.
-
-    The observations are linear in c, in c times each of the other parameters, and in the principal point.
-    """
+def _sheared_fit(rays: Array, observed_mm: Array) -> Lens:
+    """Lens with affinity and shear of the ideal point: linear in c, c times the other parameters, principal point."""
     a, b = (rays * (1.0, -1.0)).T  # OpenCV's axes
     r2, none, one = a * a + b * b, np.zeros_like(a), np.ones_like(a)
     across = [a, a * r2, a * r2**2, 2 * a * b, r2 + 2 * a * a, a * r2**3, a, b, one, none]
@@ -181,23 +165,19 @@ def _sheared_step(rays: Array, observed_mm: Array) -> tuple[Array, float]:
     design = np.concatenate([np.stack(across, axis=1), np.stack(down, axis=1)])
     scale = np.linalg.norm(design, axis=0)
     observed = np.concatenate([observed_mm[:, 0], -observed_mm[:, 1]])
-    c, k1, k2, p1, p2, k3, b1, b2, x0, y0 = (np.linalg.lstsq(design / scale, observed)[0] / scale).tolist()
-    values = np.zeros(len(NAMES))
-    values[:9] = c + b1, c, x0, y0, k1 / c, k2 / c, p1 / c, p2 / c, k3 / c
-    return values, b2 / c
+    c, *terms, x0, y0 = (np.linalg.lstsq(design / scale, observed)[0] / scale).tolist()
+    fitted = dict(zip((*BROWN, *_AFFINE), terms, strict=True))
+    parameters = np.array([fitted.get(name, 0.0) / c for name in parameter_names("opencv")])
+    return Lens(Distortion("opencv"), np.array([c, x0, y0]), parameters)
 
 
-def _sheared(values: Array, shear: float, rays: Array) -> Array:
+def _sheared(lens: Lens, rays: Array) -> Array:
     """Camera coordinates (n, 2) in mm of rays (n, 2)."""
-    fx, fy = values[:2]
-    unit = Lens(Distortion("opencv"), np.array([1.0, 0.0, 0.0]), np.array([*values[4:], 0.0, 0.0]))
-    bent, _ = unit.camera_from_ray(rays)
-    across = fy * bent[:, 0] + (fx - fy) * rays[:, 0] - fy * shear * rays[:, 1]
-    return np.asarray(np.column_stack([across, fy * bent[:, 1]]) + values[2:4])
-
-
-def _largest(off_mm: Array) -> float:
-    return float(np.linalg.norm(off_mm, axis=1).max())
+    parameters, (b1, b2) = lens.parameters.copy(), lens.parameters[-2:]
+    parameters[-2:] = 0.0
+    bent, _ = replace(lens, interior=np.array([1.0, 0.0, 0.0]), parameters=parameters).camera_from_ray(rays)
+    bent[:, 0] += b1 * rays[:, 0] - b2 * rays[:, 1]
+    return np.asarray(lens.interior[0] * bent + lens.interior[1:])
 
 
 @dataclass(frozen=True)
