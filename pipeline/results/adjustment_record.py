@@ -8,9 +8,10 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+from pydantic import Field
 
 from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.lens import INTERIOR_NAMES, Distortion, Lens
@@ -32,7 +33,7 @@ from pipeline.results.assessment_record import (
     SuspectRecord,
 )
 from pipeline.results.image_unit import FILM_UNIT, ImageUnit
-from pipeline.results.record_json import KEY, REST, Finite
+from pipeline.results.record_json import FOREIGN, Finite, Flag, Number, NumberOrNone, Whole, WithRest
 from pipeline.types import Array
 
 
@@ -40,8 +41,8 @@ from pipeline.types import Array
 class GivenQuantity:
     """Prior value of a quantity; sigma 0: fixed, NaN: free."""
 
-    value: float
-    sigma: float
+    value: Number
+    sigma: Number
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,11 +52,11 @@ class Quantity:
     given: prior; t, p: statistic and p-value of its significance test, None if not tested.
     """
 
-    value: float
-    sigma: float
+    value: Number
+    sigma: Number
     given: GivenQuantity | None = None
-    t: float | None = None
-    p: float | None = None
+    t: NumberOrNone = None
+    p: NumberOrNone = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,20 +65,21 @@ class GroupTestRecord:
 
     group: str
     parameters: tuple[str, ...]
-    F: float
-    p: float
+    F: Number
+    p: Number
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DistortionRecord:
+class DistortionRecord(WithRest):
     """Distortion family with its settings. axes: None if those of the camera; parameters: estimates by name."""
 
+    rest: ClassVar = "parameters"
     family: str
-    r0_mm: float = 0.0
+    r0_mm: Number = 0.0
     decentering: Literal["reduced", "paper"] | None = None
-    half_mm: tuple[float, float] | None = None
+    half_mm: tuple[Number, Number] | None = None
     axes: str | None = None
-    parameters: Mapping[str, Quantity] = field(default_factory=dict, metadata={REST: True})
+    parameters: Mapping[str, Quantity] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Raises ValueError for invalid settings."""
@@ -120,7 +122,7 @@ class FiducialRecord:
 
     x_mm: Quantity
     y_mm: Quantity
-    rho: float
+    rho: Number
 
     @property
     def xy_mm(self) -> tuple[float, float]:
@@ -139,12 +141,12 @@ _UNKNOWN = 0.1  # standard deviation over the radius from which nothing is known
 class LensReachRecord:
     """Extent of the observations of a lens (see `LensReach`). share: radius_mm as a fraction of corner_mm."""
 
-    radius_mm: float
-    corner_mm: float
-    sigma_um: float
-    corner_sigma_um: float
-    frame_mm: tuple[tuple[float, float], tuple[float, float]] | None
-    share: float
+    radius_mm: Number
+    corner_mm: Number
+    sigma_um: Number
+    corner_sigma_um: Number
+    frame_mm: tuple[tuple[Number, Number], tuple[Number, Number]] | None
+    share: Number
 
     def sentence(self, camera: str, unit: ImageUnit = FILM_UNIT) -> str:
         """State the radius up to which the distortion is known, and its precision within and beyond."""
@@ -167,10 +169,10 @@ class ProjectionRecord:
     distance: of the points, object units, NaN at infinity; sigma_um: one row for each y_mm.
     """
 
-    distance: float
-    x_mm: tuple[float, ...]
-    y_mm: tuple[float, ...]
-    sigma_um: tuple[tuple[float, ...], ...]
+    distance: Number
+    x_mm: tuple[Number, ...]
+    y_mm: tuple[Number, ...]
+    sigma_um: tuple[tuple[Number, ...], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,10 +180,10 @@ class ConvertedFrom:
     """Source of a converted lens. source: its distortion before conversion; same: whether the two models agree;
     largest_um, rms_um: their difference over the frame."""
 
-    source: DistortionRecord = field(metadata={KEY: "from"})
-    same: bool
-    largest_um: float
-    rms_um: float
+    source: Annotated[DistortionRecord, Field(alias="from")]
+    same: Flag
+    largest_um: Number
+    rms_um: Number
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -225,8 +227,8 @@ class TakingLensRecord:
     """Lens of a digital camera that photographed the film. interior_mm: c, x0', y0' in comparator coordinates."""
 
     family: str
-    interior_mm: tuple[float, float, float]
-    parameters: Mapping[str, float]
+    interior_mm: tuple[Number, Number, Number]
+    parameters: Mapping[str, Number]
 
     @classmethod
     def from_lens(cls, lens: Lens) -> "TakingLensRecord":
@@ -244,8 +246,8 @@ class ScannerRecord:
     """Geometric error of a scanner, mm: products of Legendre polynomials over an extent given by center_mm and half_mm.
     lens: that of the digital camera used as a scanner, None otherwise."""
 
-    center_mm: tuple[float, float]
-    half_mm: tuple[float, float]
+    center_mm: tuple[Number, Number]
+    half_mm: tuple[Number, Number]
     terms: Mapping[str, Quantity]
     significance: tuple[GroupTestRecord, ...] = ()
     lens: TakingLensRecord | None = None
@@ -264,21 +266,23 @@ class ScannerRecord:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BoardRecord:
+class BoardRecord(WithRest):
     """Bending of a board: deflection of its middle from its plane, object units. points: number of its points."""
 
-    points: int
-    terms: Mapping[str, Quantity] = field(metadata={REST: True})
+    rest: ClassVar = "terms"
+    points: Whole
+    terms: Mapping[str, Quantity]
     significance: tuple[GroupTestRecord, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FilmRecord:
+class FilmRecord(WithRest):
     """Film transformation of an image; parameters by their keys in the file."""
 
+    rest: ClassVar = "parameters"
     kind: str
-    mirrored: bool = False
-    parameters: Mapping[str, Quantity] = field(default_factory=dict, metadata={REST: True})
+    mirrored: Flag = False
+    parameters: Mapping[str, Quantity] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Raises ValueError for an unknown kind or a missing parameter."""
@@ -348,7 +352,7 @@ class PointRecord:
 class PartRecord:
     """Partial scan of a frame. corner_sigma_um: largest standard deviation of its film transformation at a corner."""
 
-    corner_sigma_um: float
+    corner_sigma_um: Number
 
 
 @dataclass(frozen=True, slots=True)
@@ -360,10 +364,10 @@ class JoinRecord:
 
     point: str
     images: tuple[str, ...]
-    x_mm: float
-    y_mm: float
-    dx_um: float
-    dy_um: float
+    x_mm: Number
+    y_mm: Number
+    dx_um: Number
+    dy_um: Number
 
 
 @dataclass(frozen=True, slots=True)
@@ -376,11 +380,11 @@ class PartMarkRecord:
     image: str
     point: str
     kind: str
-    x_mm: float
-    y_mm: float
-    sx_mm: float
-    sy_mm: float
-    rho: float
+    x_mm: Number
+    y_mm: Number
+    sx_mm: Number
+    sy_mm: Number
+    rho: Number
 
 
 @dataclass(frozen=True, slots=True)
@@ -397,8 +401,8 @@ class Sigma0Record:
     """Basis of sigma0 (see `VarianceFactor`)."""
 
     redundancy: Finite
-    a_priori: bool
-    left_out: tuple[GivenGroup, ...]
+    a_priori: Flag
+    left_out: tuple[Annotated[GivenGroup, FOREIGN], ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -419,15 +423,15 @@ class AdjustmentRecord:
 
     reseau: str
     made_from: Mapping[str, str] = field(default_factory=dict)
-    converged: bool
+    converged: Flag
     termination: str
-    iterations: int
-    observations: int
-    conditions: int
-    unknowns: int
-    redundancy: int
-    vpv: float = math.nan
-    sigma0: float
+    iterations: Whole
+    observations: Whole
+    conditions: Whole
+    unknowns: Whole
+    redundancy: Whole
+    vpv: Number = math.nan
+    sigma0: Number
     sigma0_from: Sigma0Record | None = None
     covariance: str = ""
     singular: tuple[NullDirectionRecord, ...]
@@ -435,10 +439,10 @@ class AdjustmentRecord:
     warnings: tuple[str, ...]
     notes: tuple[str, ...] = ()
     left_out: Mapping[str, str] = field(default_factory=dict)
-    unmodelled_mm: Mapping[str, float] = field(default_factory=dict)
-    variance_factors: Mapping[str, float]
-    variance_sigmas: Mapping[str, float]
-    explanations: tuple[Explanation, ...] = ()
+    unmodelled_mm: Mapping[str, Number] = field(default_factory=dict)
+    variance_factors: Mapping[str, Number]
+    variance_sigmas: Mapping[str, Number]
+    explanations: tuple[Annotated[Explanation, FOREIGN], ...] = ()
     suspects: tuple[SuspectRecord, ...]
     reliability: ReliabilityRecord | None
     cameras: Mapping[str, CameraRecord]
@@ -448,15 +452,15 @@ class AdjustmentRecord:
     frames: Mapping[str, JoinedFrameRecord] = field(default_factory=dict)
     points: Mapping[str, PointRecord]
     residuals: tuple[ResidualRecord, ...]
-    refraction: bool = False
-    earth_curvature: bool = False
+    refraction: Flag = False
+    earth_curvature: Flag = False
     distances: tuple[DistanceRecord, ...]
     fiducial_distances: tuple[FiducialDistanceRecord, ...] = ()
     calibrations: tuple[ObservedQuantity, ...]
     calibration_tests: tuple[ContradictionRecord, ...] = ()
     antennas: tuple[ObservedQuantity, ...]
-    groups: Mapping[str, Group]
-    history: tuple[Iteration, ...] = ()
+    groups: Mapping[str, Annotated[Group, FOREIGN]]
+    history: tuple[Annotated[Iteration, FOREIGN], ...] = ()
 
     def __post_init__(self) -> None:
         """Raises ValueError for references to undefined cameras or images."""

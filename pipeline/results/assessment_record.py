@@ -1,12 +1,22 @@
 """Residuals, tests and reliability in `adjustment.json`: one class per table of the file."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated
 
-from adjust.problem.parameter import parameter_from_text
-from pipeline.results.record_json import KEY
+from pydantic import AfterValidator, Field
 
-ParameterText = Annotated[str, parameter_from_text]  # as `Parameter.text`
+from adjust.problem.parameter import parameter_from_text
+from pipeline.results.record_json import Flag, Number, NumberOrNone, Whole
+
+
+def _parameter_text(text: str) -> str:
+    try:
+        return parameter_from_text(text).text
+    except ValueError as error:
+        raise ValueError(f"is not what it should be: {error}") from None
+
+
+ParameterText = Annotated[str, AfterValidator(_parameter_text)]  # as `Parameter.text`
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,28 +39,28 @@ class ResidualRecord:
     image: str
     point: str
     kind: str
-    vx_um: float
-    vy_um: float
-    redundancy_x: float
-    redundancy_y: float
-    w: float
-    w_x: float
-    w_y: float
-    weight: float
-    sx_um: float
-    sy_um: float
-    x_mm: float
-    y_mm: float
-    camera_x_mm: float
-    camera_y_mm: float
-    camera_vx_um: float
-    camera_vy_um: float
-    tau_x: float | None = None
-    tau_y: float | None = None
-    statistic: float | None = None
-    smallest_error_x_um: float | None = None
-    smallest_error_y_um: float | None = None
-    effect_sigmas: float | None = None
+    vx_um: Number
+    vy_um: Number
+    redundancy_x: Number
+    redundancy_y: Number
+    w: Number
+    w_x: Number
+    w_y: Number
+    weight: Number
+    sx_um: Number
+    sy_um: Number
+    x_mm: Number
+    y_mm: Number
+    camera_x_mm: Number
+    camera_y_mm: Number
+    camera_vx_um: Number
+    camera_vy_um: Number
+    tau_x: NumberOrNone = None
+    tau_y: NumberOrNone = None
+    statistic: NumberOrNone = None
+    smallest_error_x_um: NumberOrNone = None
+    smallest_error_y_um: NumberOrNone = None
+    effect_sigmas: NumberOrNone = None
 
     @property
     def v_um(self) -> tuple[float, float]:
@@ -61,14 +71,14 @@ class ResidualRecord:
 class DistanceRecord:
     """Residual of a given distance, object units; see `FurtherResidual`."""
 
-    start: str = field(metadata={KEY: "from"})
-    end: str = field(metadata={KEY: "to"})
-    distance: float
-    sigma: float
-    v: float
-    redundancy: float
-    w: float
-    detectable: float
+    start: Annotated[str, Field(alias="from")]
+    end: Annotated[str, Field(alias="to")]
+    distance: Number
+    sigma: Number
+    v: Number
+    redundancy: Number
+    w: Number
+    detectable: Number
 
     @property
     def name(self) -> str:
@@ -80,14 +90,14 @@ class FiducialDistanceRecord:
     """Residual of a given distance between two fiducials of a camera, mm; residual and detectable error in µm."""
 
     camera: str
-    start: str = field(metadata={KEY: "from"})
-    end: str = field(metadata={KEY: "to"})
-    mm: float
-    sigma_mm: float
-    v_um: float
-    redundancy: float
-    w: float
-    detectable_um: float
+    start: Annotated[str, Field(alias="from")]
+    end: Annotated[str, Field(alias="to")]
+    mm: Number
+    sigma_mm: Number
+    v_um: Number
+    redundancy: Number
+    w: Number
+    detectable_um: Number
 
     @property
     def name(self) -> str:
@@ -103,12 +113,12 @@ class ObservedQuantity:
     """Residual of a quantity of an earlier calibration (mm) or of an antenna coordinate (object units)."""
 
     name: str
-    value: float
-    sigma: float
-    v: float
-    redundancy: float
-    w: float
-    detectable: float
+    value: Number
+    sigma: Number
+    v: Number
+    redundancy: Number
+    w: Number
+    detectable: Number
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,8 +126,8 @@ class ContradictionDirection:
     """Value from the images minus observed value of a quantity, and its standard deviation."""
 
     name: ParameterText
-    difference: float
-    sigma: float
+    difference: Number
+    sigma: Number
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,9 +138,9 @@ class ContradictionRecord:
     first.
     """
 
-    F: float
-    freedom: int
-    p: float
+    F: Number
+    freedom: Whole
+    p: Number
     direction: tuple[ContradictionDirection, ...]
 
 
@@ -148,7 +158,7 @@ class CorrelationRecord:
     """Highly correlated quantities. rho: correlation."""
 
     parameters: tuple[ParameterText, ...]
-    rho: float
+    rho: Number
     cause: str
     remedy: str
 
@@ -162,15 +172,15 @@ class SuspectRecord:
     owner: str
     point: str
     coordinates: tuple[str, ...]
-    statistic: float
-    size: int
-    critical: float
-    w: float
-    tau: float
-    critical_tau: float
-    error: tuple[float, ...]
+    statistic: Number
+    size: Whole
+    critical: Number
+    w: Number
+    tau: Number
+    critical_tau: Number
+    error: tuple[Number, ...]
     alike: tuple[str, ...]
-    removed: bool
+    removed: Flag
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,8 +188,8 @@ class OuterRecord:
     """Outer reliability of a camera parameter: the effect of the worst undetected error, absolute and in sigmas."""
 
     parameter: ParameterText
-    effect: float
-    sigmas: float
+    effect: Number
+    sigmas: Number
     cause: str
 
 
@@ -189,13 +199,13 @@ class TestedGiven:
 
     name: str
     group: str
-    v: float
-    sigma: float
-    redundancy: float
-    w: float
-    tau: float
-    smallest_error: float
-    effect_sigmas: float
+    v: Number
+    sigma: Number
+    redundancy: Number
+    w: Number
+    tau: Number
+    smallest_error: Number
+    effect_sigmas: Number
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,10 +216,10 @@ class ReliabilityRecord:
     parameter; unchecked: coordinates without redundancy; given: tests of given coordinates.
     """
 
-    alpha: float
-    power: float
-    family: float
-    critical_tau: float
+    alpha: Number
+    power: Number
+    family: Number
+    critical_tau: Number
     outer: tuple[OuterRecord, ...]
     unchecked: tuple[str, ...]
     given: tuple[TestedGiven, ...]

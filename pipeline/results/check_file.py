@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from pipeline.results.record_json import Finite, read_record
+from pipeline.results.record_json import Finite, Number, Whole, read_record
 
 Verdict = Literal["agrees", "differs", "not possible"]
 
@@ -14,8 +14,8 @@ Verdict = Literal["agrees", "differs", "not possible"]
 class Estimate:
     """Value with its a-posteriori standard deviation."""
 
-    value: float
-    sigma: float
+    value: Number
+    sigma: Number
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Row:
     unit: str
     reseau: Estimate
     opencv: Estimate
-    difference_sigmas: float
+    difference_sigmas: Number
 
     @classmethod
     def from_numbers(cls, name: str, unit: str, reseau: Estimate, opencv: Estimate) -> "Row":
@@ -53,8 +53,8 @@ class CornersCheck:
     found. detector: OpenCV's functions; not_found: images in which these found no board."""
 
     detector: str
-    images: int
-    points: int
+    images: Whole
+    points: Whole
     not_found: tuple[str, ...]
     reseau: PixelCalibration
     opencv: PixelCalibration
@@ -73,11 +73,11 @@ class CameraCheck:
 
     verdict: Verdict
     reason: str
-    images: int = 0
-    points: int = 0
-    rms_opencv_um: float = float("nan")
-    rms_reseau_um: float = float("nan")
-    refit_residual_um: float = float("nan")
+    images: Whole = 0
+    points: Whole = 0
+    rms_opencv_um: Number = float("nan")
+    rms_reseau_um: Number = float("nan")
+    refit_residual_um: Number = float("nan")
     rows: tuple[Row, ...] = ()
     corners_px: CornersCheck | None = field(default_factory=lambda: None)  # null in the file where there is none
 

@@ -4,11 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
+from typing import Annotated
 
 from adjust.model_selection.candidates import Candidate, Model
 from adjust.model_selection.cross_validation import CrossValidation
 from adjust.model_selection.model_choice import Choice
-from pipeline.results.record_json import read_record, record_from
+from pipeline.results.record_json import FOREIGN, Number, NumberOrNone, Whole, read_record, record_from
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class ParameterCorrelation:
     """Two highly correlated parameters."""
 
     parameters: tuple[str, str]
-    correlation: float
+    correlation: Number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,14 +44,14 @@ class CandidateRecord:
     parameters: tuple[str, ...]
     bends: Mapping[str, tuple[str, ...]]
     problem: str = ""
-    observations: int | None = None
-    unknowns: int | None = None
-    redundancy: int | None = None
-    vpv: float | None = None
-    sigma0: float | None = None
-    aic: float | None = None
-    aicc: float | None = None
-    cross_validation: CrossValidation | None = field(default_factory=lambda: None)
+    observations: Whole | None = None
+    unknowns: Whole | None = None
+    redundancy: Whole | None = None
+    vpv: NumberOrNone = None
+    sigma0: NumberOrNone = None
+    aic: NumberOrNone = None
+    aicc: NumberOrNone = None
+    cross_validation: Annotated[CrossValidation, FOREIGN] | None = field(default_factory=lambda: None)
     correlated: tuple[ParameterCorrelation, ...] | None = None
     warnings: tuple[str, ...] | None = None
 
@@ -69,9 +70,9 @@ class ModelTest:
 
     simpler: str
     richer: str
-    F: float
-    degrees: tuple[int, int]
-    p: float
+    F: Number
+    degrees: tuple[Whole, Whole]
+    p: Number
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,14 +3,15 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
 from adjust.quality.lens_comparison import CameraCalibration, Comparison, Test, sigmas
-from pipeline.results.record_json import read_record
+from pipeline.results.record_json import FOREIGN, Number, read_record
 from pipeline.types import Array
 
-Pair = tuple[float, float]
+Pair = tuple[Number, Number]
 
 DRIFT, NO_DRIFT = "drift", "no drift"
 
@@ -20,7 +21,7 @@ class ComparedCalibration:
     """Calibration in a comparison. time: in the user's unit, or the number of the calibration."""
 
     name: str
-    time: float
+    time: Number
     family: str
 
 
@@ -33,11 +34,11 @@ class ParameterDifference:
     """
 
     name: str
-    first: float
-    other: float
-    difference: float
-    sigma: float
-    sigmas: float
+    first: Number
+    other: Number
+    difference: Number
+    sigma: Number
+    sigmas: Number
 
 
 @dataclass(frozen=True)
@@ -73,11 +74,11 @@ class ComparisonRecord:
     """
 
     verdict: str
-    probability: float
-    level: float
+    probability: Number
+    level: Number
     use: str
-    same: Test
-    trend: Test | None
+    same: Annotated[Test, FOREIGN]
+    trend: Annotated[Test, FOREIGN] | None
     calibrations: tuple[ComparedCalibration, ...]
     places_mm: tuple[Pair, ...]
     differences: tuple[CalibrationDifference, ...]

@@ -1,45 +1,98 @@
 """Serialisation of records, dataclasses and named tuples, as JSON, for all result files.
 
-The fields of a record are the keys of the file, in order. Readers check values against the annotations and ignore
-unknown keys. `float` is a number, or null for NaN; `Finite` is never null. A field with default None is written only
-if it is set. Metadata of a field: KEY, its name in the file if different; REST, for a mapping whose entries are
-written among the other keys.
+The fields of a record are the keys of the file, in order; an alias is the name of a key that is no name of a field.
+Readers check values against the annotations and ignore unknown keys. `Number` is a number, or null for NaN; `Finite` is
+never null. A field with default None is written only if it is set.
 """
 
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, Field, fields, is_dataclass, make_dataclass
 from functools import cache
 from itertools import islice
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from types import NoneType
+from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin, get_type_hints
+
+from pydantic import (
+    AfterValidator,
+    GetCoreSchemaHandler,
+    PlainValidator,
+    Strict,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+)
 
 from pipeline.errors import InputError
 from pipeline.text.atomic import write_atomically
-from pipeline.text.text_file import quote_value, read_json
+from pipeline.text.table_models import name_in_file
+from pipeline.text.text_file import parse_json, quote_value, read_bytes
 
 Record = TypeVar("Record")
-Read = Callable[[Any], Any]
-Field = tuple[str, str, Any]  # name, key, default
 
-FINITE, KEY, REST = "finite", "key", "rest"
-Finite = Annotated[float, FINITE]
 
+def _number(value: Any) -> float:
+    return math.nan if value is None else _finite(value, " or null")
+
+
+def _finite(value: Any, others: str = "") -> float:
+    if type(value) is not float and type(value) is not int:
+        raise ValueError(_wrong(value, f"a number{others}"))
+    try:
+        number = float(value)
+    except OverflowError:  # a whole number of hundreds of digits
+        number = math.inf
+    if not math.isfinite(number):
+        raise ValueError(_wrong(value, "a finite number"))
+    return number
+
+
+def _wrong(value: Any, expected: str) -> str:
+    return f"is {quote_value(value)}; it should be {expected}"
+
+
+Flag = Annotated[bool, Strict()]
+Whole = Annotated[int, Strict()]
+Number = Annotated[float, PlainValidator(_number)]
+NumberOrNone = Annotated[float | None, PlainValidator(_number)]
+Finite = Annotated[float, PlainValidator(_finite)]
+_EXPECTED = {
+    "string_type": "a text", "bool_type": "true or false", "int_type": "a whole number", "float_type": "a number",
+    "dict_type": "a table", "dataclass_type": "a table",
+}  # fmt: skip
 _AT_A_TIME = 10_000  # JSON tokens written at once
-_NAMES: Mapping[type, str] = {str: "a text", bool: "true or false", int: "a whole number", float: "a number"}
 
 
-class WrongForm(Exception):
-    """Invalid value in a record. problem: what is wrong; place: path of the value within the record."""
+class _Foreign:
+    """Note on a record of another package: its numbers are read as those of the records here."""
 
-    def __init__(self, problem: str, place: str = "") -> None:
-        super().__init__(problem)
-        self.problem, self.place = problem, place
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
+        types: Any = {bool: Flag, int: Whole, float: Number, tuple[float, float]: tuple[Number, Number]}
+        hints = {name: types.get(hint, hint) for name, hint in get_type_hints(source).items()}
+        stand_in: Any = make_dataclass(source.__name__, hints.items())
+        return handler.generate_schema(Annotated[stand_in, AfterValidator(lambda value: source(**vars(value)))])
 
-    def nested_in_list(self, place: str) -> "WrongForm":
-        return WrongForm(self.problem, place + self.place)
+
+FOREIGN = _Foreign()
+
+
+class WithRest:
+    """Base of records with a mapping, the field `rest`, whose entries stand among the other keys in the file."""
+
+    __slots__ = ()
+    rest: ClassVar[str]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _gathered(cls, value: Any) -> Any:
+        if not isinstance(value, dict):
+            return value
+        kind: Any = cls
+        known = {key for _, key, _ in _fields(kind)} - {cls.rest}
+        own = {key: each for key, each in value.items() if key in known}
+        return own | {cls.rest: {key: each for key, each in value.items() if key not in known}}
 
 
 def json_text(record: object, ensure_ascii: bool = False) -> Iterator[str]:
@@ -74,30 +127,62 @@ def read_record(kind: type[Record], path: Path, remedy: str) -> Record:
     Raises FileNotFoundError and IsADirectoryError, and InputError if the file is not JSON or has an invalid value; the
     message names the place and the expected value.
     """
-    content = read_json(path)
+    data = read_bytes(path)
     try:
-        return parsed(kind, content)
-    except WrongForm as wrong:
-        place = wrong.place.removeprefix(".") or "the file"
-        raise InputError(f"{path}: {place} {wrong.problem}. {remedy}") from None
+        record: Record = _adapter(kind).validate_json(data)
+        return record
+    except ValidationError as error:
+        parse_json(data, path)  # raises for a file that is no JSON
+        place, problem = _place_and_problem(kind, error.errors(include_url=False)[0])
+        raise InputError(f"{path}: {place or 'the file'} {problem}. {remedy}") from None
 
 
-def parsed(kind: type[Record], content: Any) -> Record:
-    """Convert parsed JSON to a record. Raises WrongForm for invalid content."""
-    key: Any = kind
-    reader: Callable[[Any], Record] = _reader(key)
-    return reader(content)
+_adapter: Callable[[Any], TypeAdapter[Any]] = cache(TypeAdapter)
+
+
+def _place_and_problem(kind: Any, error: Any) -> tuple[str, str]:
+    """Path of a wrong value within a record, and what is wrong."""
+    place, at = "", kind
+    way = error["loc"][:-1] if error["type"] == "missing" else error["loc"]
+    for step in way:
+        at = _required(at)
+        if isinstance(step, int):
+            place, at = f"{place}[{step}]", get_args(at)[0]
+        elif get_origin(at) is not None:
+            place, at = f"{place}[{step!r}]", get_args(at)[1]
+        else:
+            name = next(name for name, key, _ in _fields(at) if step in (key, name))
+            place = place if name == getattr(at, "rest", "") else f"{place}.{step}"
+            at = get_type_hints(at, include_extras=True)[name]
+    wrong, arguments, cause = error["type"], get_args(_required(at)), error.get("ctx", {}).get("error")
+    if cause is not None or (wrong == "missing" and isinstance(error["loc"][-1], str)):
+        return place.removeprefix("."), str(cause or f"has no key {error['loc'][-1]!r}")
+    expected = _EXPECTED.get(wrong, error["msg"])
+    if wrong in ("tuple_type", "missing", "too_long"):
+        expected = "a list" if ... in arguments else f"a list of {len(arguments)}"
+    elif wrong == "literal_error":
+        expected = " or ".join(map(repr, arguments))
+    null = " or null" if NoneType in get_args(at) else ""
+    return place.removeprefix("."), _wrong(error["input"], expected + null)
+
+
+def _required(kind: Any) -> Any:
+    """Type without annotations and without None."""
+    while get_origin(kind) is Annotated or NoneType in get_args(kind):
+        kind = next(each for each in get_args(kind) if each is not NoneType)
+    return kind
 
 
 def _content(record: object) -> dict[str, Any]:
     """Keys and values of a record; nested records are not converted."""
     content: dict[str, Any] = {}
     kind: Any = type(record)
+    rest = getattr(kind, "rest", "")
     for name, key, default in _fields(kind):
         value = getattr(record, name)
         if value is None and default is None:
             continue
-        if key == REST:
+        if name == rest:
             content |= _plain(value)
         else:
             content[key] = _plain(value)
@@ -118,157 +203,13 @@ def _plain(value: Any) -> Any:
 
 
 @cache
-def _fields(kind: type) -> tuple[Field, ...]:
+def _fields(kind: type) -> tuple[tuple[str, str, Any], ...]:
+    """Name, key in the file and default of each field of a record."""
     if not is_dataclass(kind):  # a named tuple
         named: Any = kind
         return tuple((name, name, named._field_defaults.get(name, MISSING)) for name in named._fields)
-    made = []
-    for each in fields(kind):
-        default = each.default if each.default_factory is MISSING else each.default_factory
-        made.append((each.name, REST if REST in each.metadata else each.metadata.get(KEY, each.name), default))
-    return tuple(made)
+    return tuple((each.name, name_in_file(each), _default(each)) for each in fields(kind))
 
 
-@cache
-def _reader(kind: Any) -> Read:
-    """Function that reads a value of a type or raises WrongForm."""
-    origin, arguments = get_origin(kind), get_args(kind)
-    if origin is Annotated:
-        return _annotated(arguments[0], arguments[1])
-    if origin in (Union, UnionType):
-        inner = next(each for each in arguments if each is not NoneType)
-        return _number if inner is float else _optional(_reader(inner))  # for numbers, null is NaN
-    if origin is Literal:
-        return _word(arguments)
-    if origin is tuple:
-        return _list(_reader(arguments[0]), None if arguments[1] is ... else len(arguments))
-    if kind is Any:
-        return lambda value: value
-    if isinstance(origin, type) and issubclass(origin, Mapping):
-        return _mapping(_reader(arguments[1]))
-    return _plain_reader(kind) if kind in _NAMES else _record_reader(kind)
-
-
-def _plain_reader(kind: type, is_finite: bool = False) -> Read:
-    if kind is float:
-        return _finite if is_finite else _number
-
-    def read(value: Any) -> Any:
-        if type(value) is not kind:
-            raise _wrong(value, _NAMES[kind])
-        return value
-
-    return read
-
-
-def _number(value: Any) -> float:
-    return math.nan if value is None else _finite(value, " or null")
-
-
-def _finite(value: Any, others: str = "") -> float:
-    if type(value) is not float and type(value) is not int:
-        raise _wrong(value, f"a number{others}")
-    try:
-        number = float(value)
-    except OverflowError:  # a whole number of hundreds of digits
-        number = math.inf
-    if not math.isfinite(number):
-        raise _wrong(value, "a finite number")
-    return number
-
-
-def _annotated(kind: Any, note: Any) -> Read:
-    """Reader of an annotated type. note: FINITE, or a function that raises ValueError for invalid values."""
-    if note == FINITE:
-        return _plain_reader(kind, is_finite=True)
-    read = _reader(kind)
-
-    def read_checked(value: Any) -> Any:
-        try:
-            note(read(value))
-        except ValueError as error:
-            raise WrongForm(f"is not what it should be: {error}") from None
-        return value
-
-    return read_checked
-
-
-def _optional(read: Read) -> Read:
-    def read_value(value: Any) -> Any:
-        try:
-            return None if value is None else read(value)
-        except WrongForm as wrong:
-            raise wrong if wrong.place else WrongForm(f"{wrong.problem} or null") from None
-
-    return read_value
-
-
-def _word(words: tuple[str, ...]) -> Read:
-    def read(value: Any) -> Any:
-        if value not in words:
-            raise _wrong(value, " or ".join(map(repr, words)))
-        return value
-
-    return read
-
-
-def _list(read: Read, length: int | None) -> Read:
-    def read_value(value: Any) -> tuple[Any, ...]:
-        if not isinstance(value, list) or (length is not None and len(value) != length):
-            raise _wrong(value, "a list" if length is None else f"a list of {length}")
-        made: list[Any] = []
-        try:
-            for item in value:
-                made.append(read(item))  # noqa: PERF401  # its length gives the index of the invalid item
-        except WrongForm as wrong:
-            raise wrong.nested_in_list(f"[{len(made)}]") from None
-        return tuple(made)
-
-    return read_value
-
-
-def _mapping(read: Read) -> Read:
-    def read_value(value: Any) -> dict[str, Any]:
-        if not isinstance(value, dict):
-            raise _wrong(value, "a table")
-        made, key = {}, ""
-        try:
-            for key, item in value.items():
-                made[key] = read(item)
-        except WrongForm as wrong:
-            raise wrong.nested_in_list(f"[{key!r}]") from None
-        return made
-
-    return read_value
-
-
-def _record_reader(kind: type) -> Read:
-    hints, known = get_type_hints(kind, include_extras=True), _fields(kind)
-    readers = [(name, key, _reader(hints[name])) for name, key, _ in known]
-    keys = {key for _, key, _ in known}
-    needed = {key for _, key, default in known if default is MISSING and key != REST}
-
-    def read(value: Any) -> Any:
-        if not isinstance(value, dict):
-            raise _wrong(value, "a table")
-        if not needed <= value.keys():
-            raise WrongForm(f"has no key {next(key for _, key, _ in known if key in needed - value.keys())!r}")
-        made, key = {}, ""
-        try:
-            for name, key, of in readers:
-                if key in value:
-                    made[name] = of(value[key])
-                elif key == REST:
-                    made[name] = of({each: item for each, item in value.items() if each not in keys})
-        except WrongForm as wrong:
-            raise wrong.nested_in_list("" if key == REST else f".{key}") from None
-        try:
-            return kind(**made)
-        except ValueError as error:  # from __post_init__: inconsistent fields
-            raise WrongForm(str(error)) from None
-
-    return read
-
-
-def _wrong(value: Any, expected: str) -> WrongForm:
-    return WrongForm(f"is {quote_value(value)}; it should be {expected}")
+def _default(field: Field[Any]) -> Any:
+    return field.default if field.default_factory is MISSING else field.default_factory

@@ -355,7 +355,7 @@ def _place(table: Table, model: type, loc: tuple[int | str, ...]) -> tuple[Table
 
 def _inner_model(model: type, key: str) -> type | None:
     """Model of a sub-table or of each of several; None for a key that has none."""
-    fields = {_name_in_file(field): field for field in _model_fields(model)}
+    fields = {name_in_file(field): field for field in _model_fields(model)}
     hint: Any = get_type_hints(model).get(fields[key].name) if key in fields else None
     inner = [each for each in (hint, *get_args(hint)) if isinstance(each, type) and dataclasses.is_dataclass(each)]
     return inner[0] if inner else None
@@ -366,10 +366,11 @@ def _model_fields(model: type) -> tuple[dataclasses.Field[Any], ...]:
 
 
 def _keys(model: type) -> list[str]:
-    return [_name_in_file(field) for field in _model_fields(model)]
+    return [name_in_file(field) for field in _model_fields(model)]
 
 
-def _name_in_file(field: dataclasses.Field[Any]) -> str:
+def name_in_file(field: dataclasses.Field[Any]) -> str:
+    """Alias of a field, its name if it has none."""
     notes = get_args(field.type)[1:] if get_origin(field.type) is Annotated else ()
     return next((each.alias for each in notes if isinstance(each, FieldInfo) and each.alias), field.name)
 
@@ -397,7 +398,7 @@ def key_rows(model: type) -> Iterator[KeyRow]:
         unit = _UNITS.get(field.name.rpartition("_")[2], "")
         is_array = "tuple" in str(field.type)
         form = words or ("tables" if is_array else "table")
-        yield KeyRow(_name_in_file(field), form, unit, _default_text(field), meaning)
+        yield KeyRow(name_in_file(field), form, unit, _default_text(field), meaning)
 
 
 def _notes(hint: Any) -> Iterator[Any]:
