@@ -1,6 +1,7 @@
 """Printed tables and plots of reseau design: expected precision, improvements, sweeps."""
 
 import math
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from rich.text import Text
 from adjust.problem.parameter import Parameter, description
 from pipeline.design.alternatives import FOUND
 from pipeline.design.design_file import Design
-from pipeline.design.expected import Expected, error_unit, rms
+from pipeline.design.expected import GroupReliability, error_unit, rms
 from pipeline.design.sweeps import Swept
 from pipeline.drawing import svg
 from pipeline.report.numbers import NONE, fixed, significant, value_and_sigma
@@ -23,6 +24,7 @@ DASHES = ("none", "7 3", "2 3", "7 3 2 3")
 WIDTH_PX, HEIGHT_PX, KEY_PX = 760.0, 460.0, 160.0
 ROW_PX = 17.0  # px, height of a name in the legend
 UNDETERMINED = "not determined"
+SLOPE = "slope"  # last row of the table of a sweep
 UM_PER_MM = 1000.0
 KINDS = {
     "datum": "given fiducial",
@@ -34,6 +36,7 @@ KINDS = {
 UNIT_WORDS = {"um": " µm", "object unit": ""}
 LABELS = {"x0": "x0'", "y0": "y0'"}
 IN_UM = ("c", "x0", "y0", "fiducials", "ray", "scanner")
+PrintedTable = tuple[str, Sequence[str], Iterable[Sequence[str]]]  # title, heads, rows
 
 
 def plot_sweep(swept: Swept, path: Path) -> None:
@@ -116,121 +119,101 @@ def print_design(design: Design, console: Console) -> None:
         console.print(Text(f"  {null.remedy}", style="dim"))
     for warning in adjustment.warnings:
         console.print(Text(f"- {warning}"))
-    tables = [_camera_table(design), _curve_table(expected), _fiducial_table(design), _scanner_table(expected)]
-    tables += [_point_table(expected), _reliability_table(expected), _outer_table(expected), _help_table(design)]
-    for table in (*tables, *map(_sweep_table, design.swept)):
+    for title, heads, rows in (*_tables(design), *map(_sweep_table, design.swept)):
+        table = Table(*heads, title=title, title_justify="left")
+        for row in rows:
+            if row[0] == SLOPE:
+                table.add_section()
+            table.add_row(*(Text(cell) for cell in row))
         if table.row_count:
             console.print(table)
     for word, path in design.files.items():
         console.print(f"{word}: {path}", soft_wrap=True, markup=False, highlight=False)
 
 
-def _table(title: str, *columns: str) -> Table:
-    return Table(*columns, title=title, title_justify="left")
+def _tables(design: Design) -> Iterator[PrintedTable]:
+    """Yield the tables of a design, except those of its sweeps."""
+    expected, alone, layouts = design.expected, design.alone, design.layouts
+    camera, plan = expected.camera, expected.plan
+    yield _camera_table(design)
+    curve = [
+        (f"{at.radius_mm:.1f}", *map(_sigma, (at.radial_um, at.tangential_um, at.ray_um))) for at in expected.curve
+    ]
+    yield "Distortion, sigma in µm", ("radius, mm", "radial", "tangential", "image of a ray"), curve
+    places = {id: [Parameter.fiducial(camera, id, axis) for axis in "xy"] for id in expected.fiducials}
+    fiducials = [
+        (id, *(_sigma(UM_PER_MM * sigma) for sigma in (*map(plan.sigma, place), *(alone[each] for each in place))))
+        for id, place in places.items()
+    ]
+    yield "Fiducial marks, sigma", ("fiducial", "x', µm", "y', µm", "photographs alone: x', µm", "y', µm"), fiducials
+    bend = [(each.quantity, _sigma(UM_PER_MM * sigma)) for each, sigma in expected.scanner_sigmas.items()]
+    yield "Bend of the scanner", ("term", "sigma, µm"), bend
+    free = {axis: sigmas[sigmas > 0.0] for axis, sigmas in zip("XYZ", expected.point_sigmas.T, strict=True)}
+    points = [
+        (axis, *(map(_sigma, (rms(sigmas), float(sigmas.max()))) if len(sigmas) else ("fixed", "fixed")))
+        for axis, sigmas in free.items()
+    ]
+    yield "Object points, sigma", ("coordinate", "rms", "largest"), points
+    heads = ("kind", "coordinates", "redundancy", "median", "largest", "unchecked")
+    yield "Smallest gross errors that are found", heads, map(_reliability_row, expected.reliability.groups)
+    # Outer reliability of the camera; of the fiducials only the worst is shown.
+    marks = [one for one in expected.reliability.camera if one.parameter.kind == "fiducial"]
+    effects = [one for one in expected.reliability.camera if one not in marks]
+    effects += sorted(marks, key=lambda one: -one.in_sigmas)[:1]
+    outer = [(one.parameter.label, f"{one.in_sigmas:.1f}", one.cause) for one in effects]
+    yield "What errors that are not found may do to the camera", ("parameter", "in its sigmas", "error in"), outer
+    names = list(expected.camera_sigmas)
+    gains = [(one.change, *(_gain(one.gain_percent[name]) for name in names)) for one in design.helpful]
+    title = "What would help: by how many percent the sigmas shrink"
+    first = ", of the first layout" if layouts.count > 1 else ""
+    yield title + first, ("change", *(LABELS.get(name, name) for name in names)), gains
 
 
-def _camera_table(design: Design) -> Table:
+def _camera_table(design: Design) -> PrintedTable:
     """Expected precision of the camera; with fiducials also from the photographs alone, in their frame."""
     expected, layouts = design.expected, design.layouts
-    several = layouts.count > 1
-    columns = ["quantity", "value", "sigma", *(["photographs alone"] if expected.fiducials else [])]
-    columns += [f"mean of {layouts.count} layouts", "spread"] if several else []
-    table = _table(f"Expected precision of camera {expected.camera}", *columns)
-    rows = {"c": "principal distance, mm", "x0": "principal point x', mm", "y0": "principal point y', mm"}
-    for name, label in {**rows, **{name: name for name in expected.family_parameters}}.items():
+    several, rows = layouts.count > 1, []
+    heads = ["quantity", "value", "sigma", *(["photographs alone"] if expected.fiducials else [])]
+    heads += [f"mean of {layouts.count} layouts", "spread"] if several else []
+    labels = {"c": "principal distance, mm", "x0": "principal point x', mm", "y0": "principal point y', mm"}
+    for name, label in {**labels, **{name: name for name in expected.family_parameters}}.items():
         parameter = Parameter.interior(expected.camera, name)
         value, sigma = expected.plan.adjustment.value(parameter), expected.plan.sigma(parameter)
-        known = (significant(value, 6), UNDETERMINED) if math.isinf(sigma) else value_and_sigma(value, sigma)
-        cells = [label, *known]
+        cells = [
+            label,
+            *((significant(value, 6), UNDETERMINED) if math.isinf(sigma) else value_and_sigma(value, sigma)),
+        ]
         if expected.fiducials:
             cells.append(_sigma(design.alone[parameter]) if sigma > 0.0 else "")
         if several and name in layouts.mean:
             scale = UM_PER_MM if name in IN_UM else 1.0
             cells += [_sigma(layouts.mean[name] / scale), _sigma(layouts.spread[name] / scale)]
-        table.add_row(*cells)
-    return table
+        rows.append(cells)
+    return f"Expected precision of camera {expected.camera}", heads, rows
 
 
-def _curve_table(expected: Expected) -> Table:
-    table = _table("Distortion, sigma in µm", "radius, mm", "radial", "tangential", "image of a ray")
-    for at in expected.curve:
-        table.add_row(f"{at.radius_mm:.1f}", _sigma(at.radial_um), _sigma(at.tangential_um), _sigma(at.ray_um))
-    return table
+def _reliability_row(one: GroupReliability) -> tuple[str, ...]:
+    unit = error_unit(one.group)
+    sizes = () if unit == "mixed" else (one.median, one.largest)
+    errors = [_sigma(size) + UNIT_WORDS[unit] if math.isfinite(size) else NONE for size in sizes] or [NONE, NONE]
+    return KINDS.get(one.group, one.group), str(one.coordinates), fixed(one.redundancy), *errors, str(one.unchecked)
 
 
-def _fiducial_table(design: Design) -> Table:
-    heads = ("x', µm", "y', µm", "photographs alone: x', µm", "y', µm")
-    table = _table("Fiducial marks, sigma", "fiducial", *heads)
-    for id in design.expected.fiducials:
-        place = [Parameter.fiducial(design.expected.camera, id, axis) for axis in "xy"]
-        sigmas = (*(design.expected.plan.sigma(each) for each in place), *(design.alone[each] for each in place))
-        table.add_row(Text(id), *(_sigma(UM_PER_MM * sigma) for sigma in sigmas))
-    return table
-
-
-def _scanner_table(expected: Expected) -> Table:
-    table = _table("Bend of the scanner", "term", "sigma, µm")
-    for parameter, sigma in expected.scanner_sigmas.items():
-        table.add_row(parameter.quantity, _sigma(UM_PER_MM * sigma))
-    return table
-
-
-def _point_table(expected: Expected) -> Table:
-    table = _table("Object points, sigma", "coordinate", "rms", "largest")
-    for axis, sigmas in zip("XYZ", expected.point_sigmas.T, strict=True):
-        free = [float(sigma) for sigma in sigmas if sigma > 0.0]
-        table.add_row(axis, _sigma(rms(free)) if free else "fixed", _sigma(max(free)) if free else "fixed")
-    return table
-
-
-def _reliability_table(expected: Expected) -> Table:
-    heads = ("kind", "coordinates", "redundancy", "median", "largest", "unchecked")
-    table = _table("Smallest gross errors that are found", *heads)
-    for one in expected.reliability.groups:
-        unit = error_unit(one.group)
-        sizes = () if unit == "mixed" else (one.median, one.largest)
-        errors = [_sigma(size) + UNIT_WORDS[unit] if math.isfinite(size) else NONE for size in sizes] or [NONE, NONE]
-        kind = KINDS.get(one.group, one.group)
-        table.add_row(kind, str(one.coordinates), fixed(one.redundancy), *errors, str(one.unchecked))
-    return table
-
-
-def _outer_table(expected: Expected) -> Table:
-    """Outer reliability of the camera; of the fiducials only the worst is shown."""
-    table = _table("What errors that are not found may do to the camera", "parameter", "in its sigmas", "error in")
-    effects = expected.reliability.camera
-    marks = [one for one in effects if one.parameter.kind == "fiducial"]
-    shown = [one for one in effects if one not in marks] + sorted(marks, key=lambda one: -one.in_sigmas)[:1]
-    for one in shown:
-        table.add_row(Text(one.parameter.label), f"{one.in_sigmas:.1f}", Text(one.cause))
-    return table
-
-
-def _help_table(design: Design) -> Table:
-    names = list(design.expected.camera_sigmas)
-    title = "What would help: by how many percent the sigmas shrink"
-    title += ", of the first layout" if design.layouts.count > 1 else ""
-    table = _table(title, "change", *(LABELS.get(name, name) for name in names))
-    for one in design.helpful:
-        table.add_row(Text(one.change), *(_gain(one.gain_percent[name]) for name in names))
-    return table
-
-
-def _sweep_table(swept: Swept) -> Table:
-    names = swept.names
-    heads = (f"{LABELS.get(name, name)}, µm" if name in IN_UM else name for name in names)
-    layouts = swept.steps[0].sigmas.count
-    title = f"Sigmas over {swept.quantity}" + (f", mean of {layouts} layouts" if layouts > 1 else "")
-    table = _table(title, swept.quantity, "points", *heads)
-    for step in swept.steps:
-        value = step.value if isinstance(step.value, str) else f"{step.value:g}"
-        sigmas = (_sigma(step.sigmas.mean[name]) if name in step.sigmas.mean else "fixed" for name in names)
-        table.add_row(Text(value), str(step.points), *sigmas)
+def _sweep_table(swept: Swept) -> PrintedTable:
+    names, layouts = swept.names, swept.steps[0].sigmas.count
+    heads = (swept.quantity, "points", *(f"{LABELS.get(name, name)}, µm" if name in IN_UM else name for name in names))
+    rows = [
+        (
+            step.value if isinstance(step.value, str) else f"{step.value:g}",
+            str(step.points),
+            *(_sigma(step.sigmas.mean[name]) if name in step.sigmas.mean else "fixed" for name in names),
+        )
+        for step in swept.steps
+    ]
     slopes = [swept.slope(name) for name in names]
     if not all(math.isnan(slope) for slope in slopes):
-        table.add_section()
-        table.add_row("slope", "", *("" if math.isnan(slope) else f"{slope:+.2f}" for slope in slopes))
-    return table
+        rows.append((SLOPE, "", *("" if math.isnan(slope) else f"{slope:+.2f}" for slope in slopes)))
+    return f"Sigmas over {swept.quantity}" + (f", mean of {layouts} layouts" if layouts > 1 else ""), heads, rows
 
 
 def _sigma(sigma: float) -> str:

@@ -137,7 +137,7 @@ def _form(mark: MarkJson) -> list[Json]:
 
 
 def _shown_json(drawing: CameraDrawing, shown: DrawnMark) -> Json:
-    own = handles(drawing.mark, shown.toward)
+    own = list(handles(drawing.mark, shown.toward))
     place = _handle_affine(drawing, shown)
     lines = [] if shown.mark is None else outlines_px(shown.mark, shown.pixel_from_mark)
     if drawing.is_picture:

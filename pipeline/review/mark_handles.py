@@ -7,6 +7,7 @@ the place to which one was dragged.
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -34,9 +35,42 @@ class Handle:
     dragged: Callable[[Array], MarkJson]
 
 
-def handles(mark: MarkJson, toward: Point = (1.0, 1.0)) -> list[Handle]:
-    """Handles of a mark. toward: signs (x, y) of the quadrant in which the frame lies, used for a frame corner."""
-    return list(_HANDLES[mark["kind"]](mark, toward))
+def handles(mark: MarkJson, toward: Point = (1.0, 1.0)) -> Iterator[Handle]:
+    """Yield the handles of a mark or of a part of one, by the values that it has.
+
+    toward: signs (x, y) of the quadrant in which the frame lies, used for a frame corner.
+    """
+    center = np.array(mark.get("center_mm", (0.0, 0.0)))
+    if "center_mm" in mark:
+        yield _place(mark, "center_mm")
+    if "ring_mm" in mark:
+        yield _length(mark, "ring_mm", _RING_DEG)
+        yield _length(mark, "ring_line_mm", _LINE_DEG, 2.0, mark["ring_mm"])
+    if "arm_mm" in mark:
+        yield from _cross(mark)
+    if mark.get("kind") == "frame-corner":
+        yield _length(mark, "reach_mm", 0.0 if toward[0] > 0 else 180.0)
+        yield _length(mark, "radius_mm", 90.0 if toward[1] > 0 else -90.0)
+    elif "radius_mm" in mark:
+        yield _length(mark, "radius_mm", 0.0, side=center)
+    if mark.get("shape") == "ring":
+        yield _length(mark, "line_mm", 90.0, 2.0, mark["radius_mm"], center)
+    if "from_mm" in mark:
+        start, end = np.array(mark["from_mm"]), np.array(mark["to_mm"])
+        angle = math.degrees(math.atan2(*(end - start)[::-1]))
+        yield _place(mark, "from_mm")
+        yield _place(mark, "to_mm")
+        yield _length(mark, "line_mm", angle + 90.0, 2.0, side=(start + end) / 2)
+    if "size_mm" in mark:
+        half, key = mark["size_mm"] / 2, "size_mm"
+        yield Handle(key, (half, half), lambda place: _changed(mark, key, max(2 * np.abs(place).max(), _LEAST_MM)))
+    for at, vertex in enumerate(mark.get("vertices_mm", ())):
+        yield Handle(
+            f"vertices_mm.{at}", _point(vertex), partial(_drag_item, mark, "vertices_mm", at, np.ndarray.tolist)
+        )
+    for at, part in enumerate(mark.get("part", ())):
+        for one in handles(part):
+            yield Handle(f"part.{at}.{one.key}", one.place_mm, partial(_drag_item, mark, "part", at, one.dragged))
 
 
 def first_drawing(kind: str, size_mm: float) -> MarkJson:
@@ -145,20 +179,25 @@ def _length(
 
     def dragged(place: Array) -> MarkJson:
         value = factor * (float(along @ (place - start)) - offset)
-        return _rounded({**mark, key: max(value, 0.0 if key in ("gap_mm", "reach_mm") else _LEAST_MM)})
+        return _changed(mark, key, max(value, 0.0 if key in ("gap_mm", "reach_mm") else _LEAST_MM))
 
     return Handle(key, _point(start + along * (offset + mark.get(key, 0.0) / factor)), dragged)
 
 
 def _place(mark: MarkJson, key: str) -> Handle:
-    return Handle(key, _point(mark[key]), lambda place: _rounded({**mark, key: place.tolist()}))
+    return Handle(key, _point(mark[key]), lambda place: _changed(mark, key, place.tolist()))
 
 
-def _dot(mark: MarkJson, toward: Point) -> Iterator[Handle]:
-    yield _length(mark, "radius_mm", 0.0)
+def _changed(mark: MarkJson, key: str, value: Any) -> MarkJson:
+    return _rounded({**mark, key: value})
 
 
-def _cross(mark: MarkJson, toward: Point) -> Iterator[Handle]:
+def _drag_item(mark: MarkJson, key: str, at: int, dragged: Callable[[Array], Any], place: Array) -> MarkJson:
+    """Mark with an item of a list dragged to a place."""
+    return _changed(mark, key, [*mark[key][:at], dragged(place), *mark[key][at + 1 :]])
+
+
+def _cross(mark: MarkJson) -> Iterator[Handle]:
     angle = mark.get("angle_deg", 0.0)
 
     def turned(place: Array) -> MarkJson:
@@ -169,90 +208,3 @@ def _cross(mark: MarkJson, toward: Point) -> Iterator[Handle]:
     yield _length(mark, "line_mm", angle + 90.0, 2.0, side=_unit(angle) * _LINE_AT * mark["arm_mm"])
     yield _length(mark, "gap_mm", angle + 90.0)
     yield Handle("angle_deg", _point(-_unit(angle) * mark["arm_mm"]), turned)
-
-
-def _ring(mark: MarkJson) -> Iterator[Handle]:
-    yield _length(mark, "ring_mm", _RING_DEG)
-    yield _length(mark, "ring_line_mm", _LINE_DEG, 2.0, mark["ring_mm"])
-
-
-def _ring_dot(mark: MarkJson, toward: Point) -> Iterator[Handle]:
-    yield from (*_ring(mark), *_dot(mark, toward))
-
-
-def _ring_cross(mark: MarkJson, toward: Point) -> Iterator[Handle]:
-    yield from (*_ring(mark), *_cross(mark, toward))
-
-
-def _polygon(mark: MarkJson, toward: Point) -> Iterator[Handle]:
-    for at, vertex in enumerate(mark["vertices_mm"]):
-
-        def dragged(place: Array, at: int = at) -> MarkJson:
-            vertices = [*mark["vertices_mm"]]
-            vertices[at] = place.tolist()
-            return _rounded({**mark, "vertices_mm": vertices})
-
-        yield Handle(f"vertices_mm.{at}", _point(vertex), dragged)
-
-
-def _parts(mark: MarkJson, toward: Point) -> Iterator[Handle]:
-    for at, part in enumerate(mark["part"]):
-        for one in _PARTS[part["shape"]](part):
-
-            def dragged(place: Array, at: int = at, one: Handle = one) -> MarkJson:
-                parts = [*mark["part"]]
-                parts[at] = one.dragged(place)
-                return {**mark, "part": parts}
-
-            yield Handle(f"part.{at}.{one.key}", one.place_mm, dragged)
-
-
-def _disk_part(part: MarkJson) -> Iterator[Handle]:
-    yield _place(part, "center_mm")
-    yield _length(part, "radius_mm", 0.0, side=np.array(part["center_mm"]))
-
-
-def _ring_part(part: MarkJson) -> Iterator[Handle]:
-    yield from _disk_part(part)
-    yield _length(part, "line_mm", 90.0, 2.0, part["radius_mm"], np.array(part["center_mm"]))
-
-
-def _bar_part(part: MarkJson) -> Iterator[Handle]:
-    start, end = np.array(part["from_mm"]), np.array(part["to_mm"])
-    angle = math.degrees(math.atan2(*(end - start)[::-1]))
-    yield _place(part, "from_mm")
-    yield _place(part, "to_mm")
-    yield _length(part, "line_mm", angle + 90.0, 2.0, side=(start + end) / 2)
-
-
-def _square(mark: MarkJson, toward: Point) -> Iterator[Handle]:
-    half = mark["size_mm"] / 2
-
-    def dragged(place: Array) -> MarkJson:
-        return _rounded({**mark, "size_mm": max(2 * float(np.abs(place).max()), _LEAST_MM)})
-
-    yield Handle("size_mm", (half, half), dragged)
-
-
-def _corner(mark: MarkJson, toward: Point) -> Iterator[Handle]:
-    yield _length(mark, "reach_mm", 0.0 if toward[0] > 0 else 180.0)
-    yield _length(mark, "radius_mm", 90.0 if toward[1] > 0 else -90.0)
-
-
-_HANDLES: Mapping[str, Callable[[MarkJson, Point], Iterator[Handle]]] = {
-    "cross": _cross,
-    "dot": _dot,
-    "ring-cross": _ring_cross,
-    "ring-dot": _ring_dot,
-    "polygon": _polygon,
-    "parts": _parts,
-    "template": _square,
-    "learned": _square,
-    "frame-corner": _corner,
-}
-_PARTS: Mapping[str, Callable[[MarkJson], Iterator[Handle]]] = {
-    "disk": _disk_part,
-    "ring": _ring_part,
-    "bar": _bar_part,
-    "polygon": lambda part: _polygon(part, (1.0, 1.0)),
-}
