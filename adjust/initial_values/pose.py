@@ -28,7 +28,7 @@ class Sight:
 
 
 LM_ITERATIONS = 12
-SETTLED = 1e-6  # relative change of a sum of squares at convergence
+SETTLED = 1e-4  # relative change of a sum of squares at convergence
 BEHIND = 1e6  # squared residual, in squared principal distances, of a point behind the camera
 LARGEST_CHANGE = 0.5  # of the logarithm of the principal distance in one step
 USUAL_BEND = 0.3  # prior standard deviation of third-degree radial distortion, at an angle of 45 degrees

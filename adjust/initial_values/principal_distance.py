@@ -13,9 +13,9 @@ from adjust.functional_model.projection import rays
 from adjust.initial_values.pose import KnownField, Pose
 from adjust.initial_values.resection import distance_together, plausible_pose, resections, trial_misfits
 
-GRID = np.geomspace(0.35, 16.0, 10)  # principal distances tried, in radii of the imaged field: 140 to 7 degrees
+GRID = np.geomspace(0.35, 16.0, 9)  # principal distances tried, in radii of the imaged field: 140 to 7 degrees
 FEWEST = 4  # known points of an image
-COARSE_IMAGES, COARSE_POINTS = 4, 30
+COARSE_IMAGES, COARSE_POINTS = 4, 15
 FINE_IMAGES = 50
 LARGEST_RELATIVE_SIGMA = 0.15
 ANGLES_DEG = np.arange(88.0, 8.0, -4.0)  # trial angles between the axis and the outermost point of all images

@@ -180,7 +180,7 @@ class SparseBlocks:
         rest = self.right - self.border.times(solution[:count] / self.scale[:count]).reshape(self.right.shape)
         own = np.zeros_like(rest)
         for i in reversed(range(rest.shape[1])):
-            own[:, i] = (rest[:, i] - (self.triangle[:, i] * own).sum(axis=1)) / diagonal[:, i]
+            own[:, i] = (rest[:, i] - np.einsum("bk,bk->b", self.triangle[:, i], own)) / diagonal[:, i]
         there = self.own >= 0
         solution[self.own[there]] = own[there] * self.scale[self.own[there]]
 
@@ -195,7 +195,7 @@ class SparseBlocks:
         inverse = np.zeros_like(scaled)
         for i in reversed(range(scaled.shape[1])):
             inverse[:, i, i] = 1.0
-            inverse[:, i] -= (scaled[:, i, i + 1 :, None] * inverse[:, i + 1 :]).sum(axis=1)
+            inverse[:, i] -= np.einsum("bk,bkj->bj", scaled[:, i, i + 1 :], inverse[:, i + 1 :])
             inverse[:, i] /= scaled[:, i, i, None]
         return inverse
 

@@ -133,8 +133,8 @@ class SparseRows:
     def column_squares(self, count: int, equations: "SharedEquations") -> Array:
         """(n,) sums of squares of the columns of all unknowns."""
         squares = np.zeros(count + 1)
-        by_own = self.matrix[..., self.pattern.columns[0]]
-        for of_rows, unknowns in zip((by_own**2).sum(axis=1).T, self.pattern.own.T, strict=True):
+        for column, unknowns in zip(self.pattern.columns[0], self.pattern.own.T, strict=True):
+            of_rows = self.matrix[:, 0, column] ** 2 + self.matrix[:, 1, column] ** 2
             squares[unknowns] = np.bincount(self.pattern.block, of_rows, len(unknowns))
         squares[: self.pattern.count] = equations.diagonal
         return squares[:-1]

@@ -178,8 +178,9 @@ def _principal_point(view: _View, result: Adjustment, family: float) -> Iterator
         yield f"{words}, {far}"
         return
     if picture is None:
-        reach = AROUND * np.ptp(view.xy_mm, axis=0).max()
-        picture = np.array([view.xy_mm.min(axis=0) - reach, view.xy_mm.max(axis=0) + reach])
+        low, high = (np.array([limit(values) for values in view.xy_mm.T]) for limit in (np.min, np.max))
+        reach = AROUND * (high - low).max()
+        picture = np.array([low - reach, high + reach])
         if view.digital:
             picture = np.array([np.minimum(picture[0], 0.0), np.maximum(picture[1], 0.0)])
         kind = "outside all that the marks cover"
