@@ -11,7 +11,7 @@ from adjust.array_types import Array, Mask
 from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Lens
 from adjust.problem.camera import Camera
-from adjust.problem.estimates import Estimates, adjusted_image, adjusted_lens
+from adjust.problem.estimates import Estimates, adjusted_lens, observed_places
 from adjust.problem.parameter import Parameter
 from adjust.quality.lens_reach import distortion_curves, is_defined_over_frame
 
@@ -222,23 +222,17 @@ def adjusted_camera_plots(
 ) -> CameraPlots:
     """Collect the data for the plots of a camera; v_mm (n, 2): residuals in the comparator."""
     observations = estimates.network.observations
-    of_image, places, moved, is_fiducial = np.array(observations.image), [], [], []
-    images = [each for each in estimates.network.images if each.camera == camera.name]
-    for image in images:
-        rows, model = np.flatnonzero(of_image == image.name), adjusted_image(estimates, image.name)
-        places.append(model.camera_from_comparator(observations.xy_mm[rows]))
-        moved.append(model.camera_from_comparator(observations.xy_mm[rows] + v_mm[rows]) - places[-1])
-        is_fiducial.append(observations.is_fiducial[rows])
-    observed = np.concatenate(places)
+    rows, observed = observed_places(estimates, camera.name, observations.xy_mm)
+    _, adjusted = observed_places(estimates, camera.name, observations.xy_mm + v_mm)
     lens = adjusted_lens(estimates, camera.name)
     keys = [Parameter.interior(camera.name, each) for each in lens.quantities]
     return CameraPlots(
         name=camera.name,
         lens=replace(lens, covariance=estimates.sigma0**2 * estimates.cofactor_of(keys)),
         places_mm=observed,
-        vectors_mm=np.concatenate(moved),
-        is_fiducial=np.concatenate(is_fiducial),
-        images=len(images),
+        vectors_mm=adjusted - observed,
+        is_fiducial=observations.is_fiducial[rows],
+        images=sum(image.camera == camera.name for image in estimates.network.images),
         corners_mm=np.array(camera.frame_corners(observed) or (observed.min(axis=0), observed.max(axis=0))),
         uncertainty=uncertainty,
         pixel_mm=pixel_mm,

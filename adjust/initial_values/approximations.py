@@ -141,7 +141,7 @@ def _interior(camera: Camera, frames: Frames, resected: dict[str, Pose]) -> Arra
 
 def _has_approximate_points(network: Network) -> bool:
     """Whether coordinates are given that the adjustment does not observe."""
-    given = (prior for point in network.points for prior in (point.X, point.Y, point.Z) if prior is not None)
+    given = (prior for point in network.points for prior in point.priors if prior is not None)
     return any(prior.sigma == np.inf for prior in given)
 
 

@@ -36,7 +36,7 @@ def orient(
     AdjustmentError
         If a point cannot be intersected.
     """
-    firm, rough = (_coordinates(network, firm) for firm in (True, False))
+    firm, rough = (network.coordinates(firm) for firm in (True, False))
     block = Block(sights, firm, rough, dict(resected))
     for image in network.images:
         if image.exterior is not None and image.name in sights:
@@ -51,13 +51,6 @@ def orient(
     if missing:
         raise UnorientedError({name: _why_not_oriented(block, name) for name in missing})
     return block.poses, _all_points(block)
-
-
-def _coordinates(network: Network, firm: bool) -> dict[str, Array]:
-    """Known coordinates (3,) of every point, nan where unknown. firm: without mere approximations (infinite sigma)."""
-    priors = [prior for point in network.points for prior in (point.X, point.Y, point.Z)]
-    values = [np.nan if p is None or (firm and p.sigma == np.inf) else p.value for p in priors]
-    return dict(zip((point.id for point in network.points), np.array(values).reshape(-1, 3), strict=True))
 
 
 def _given_or_resected(exterior: Exterior, block: Block, image: str) -> Pose:

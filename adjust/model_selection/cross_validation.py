@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from adjust.array_types import Array, Indices
+from adjust.array_types import Array, Indices, Mask
 from adjust.errors import AdjustmentError
 from adjust.functional_model.projection import ImageModel
 from adjust.initial_values.intersection import intersect
@@ -42,7 +42,8 @@ def folds(network: Network, options: Options) -> tuple[frozenset[str], ...]:
     """
     held = {name for distance in network.distances for name in (distance.start, distance.end)}
     held |= {object_coordinate(text).id for text in options.datum_coordinates} | set(options.datum_points)
-    known = {point for point in network.observed_points if not np.isnan(_given_coordinates(network, point)).all()}
+    given = network.coordinates(firm=True)
+    known = {point for point in network.observed_points if not np.isnan(given[point]).all()}
     if len(known) < FEWEST_KNOWN:
         held |= known
     free = sorted(network.observed_points - held)
@@ -132,15 +133,15 @@ def _errors(models: Mapping[str, ImageModel], adjustment: Adjustment, points: fr
     network, observations = adjustment.network, adjustment.network.observations
     rows = _rows(network, points)
     names, point = np.unique(np.array(observations.point)[rows], return_inverse=True)
-    known = np.array([_given_coordinates(network, name) for name in names]).reshape(-1, 3)
-    known = known + lifted(adjustment, names.tolist())
+    given = network.coordinates(firm=True)
+    known = np.array([given[name] for name in names]).reshape(-1, 3) + lifted(adjustment, names.tolist())
     second = (np.arange(len(point)) - np.searchsorted(point, point)) % 2 == 1  # second, fourth, ... ray of its point
     images = np.array(observations.image)[rows]
     rays_of = {str(image): np.flatnonzero(images == image) for image in np.unique(images)}
     centers, directions = np.empty((len(rows), 3)), np.empty((len(rows), 3))
     for image, at in rays_of.items():
         centers[at], directions[at] = models[image].station, _directions(models[image], observations.xy_mm[rows[at]])
-    unknown = np.isnan(known).any(axis=1)
+    unknown: Mask = np.asarray(np.isnan(known).any(axis=1))
     errors, predicted_rows = [], []
     for half in (False, True):
         source = unknown[point] & (second == half)
@@ -148,20 +149,13 @@ def _errors(models: Mapping[str, ImageModel], adjustment: Adjustment, points: fr
         if source.any():
             found, _ = intersect(centers[source], directions[source], point[source], known)
             located = np.where(unknown[:, None], found, known)
-        predicted = ~source & (unknown[point] | (not half)) & np.isfinite(located).all(axis=1)[point]
+        predicted = ~source & (unknown[point] | (not half)) & np.isfinite(located[point]).all(axis=1)
         for image, at in rays_of.items():
             chosen = at[predicted[at]]
             xy_mm, visible = models[image].comparator_from_object(located[point[chosen]])
             errors.append((xy_mm - observations.xy_mm[rows[chosen]])[visible])
             predicted_rows.append(rows[chosen][visible])
     return np.concatenate(errors), np.concatenate(predicted_rows)
-
-
-def _given_coordinates(network: Network, point: str) -> Array:
-    """(3,) given coordinates, exact or with a standard deviation; nan where not given."""
-    each = network.point_by_id[point]
-    priors = (each.X, each.Y, each.Z)
-    return np.array([prior.value if prior is not None and np.isfinite(prior.sigma) else np.nan for prior in priors])
 
 
 def _directions(model: ImageModel, xy_mm: Array) -> Array:

@@ -35,7 +35,6 @@ from adjust.rank_defect.datum import held_as_known
 from adjust.solution.adjustment import Options, adjust
 from adjust.solution.result import Adjustment
 
-HIGH_CORRELATION = 0.95
 ROUNDS = 3  # rounds of selecting distortion, scanner terms and transformation in turn
 
 Progress = Callable[[str, int], None]
@@ -209,18 +208,10 @@ class _Fits:
 
 def _correlated(result: Adjustment) -> tuple[tuple[str, str, float], ...]:
     """Pairs of highly correlated interior parameters of a camera, highest first."""
+    several = len(result.network.cameras) > 1
     pairs = []
-    for camera in result.network.cameras:
-        own = [each for each in result.parameters if each.kind == "interior" and each.owner == camera.name]
-        cofactor = result.cofactor_of(own)
-        free = np.flatnonzero(np.diag(cofactor) > 0.0)
-        scale = np.sqrt(np.diag(cofactor)[free])
-        correlation = cofactor[np.ix_(free, free)] / np.outer(scale, scale)
-        several = len(result.network.cameras) > 1
-        shown = [own[i].label if several else own[i].quantity for i in free]
-        pairs += [
-            (shown[i], shown[j], float(correlation[i, j]))
-            for i, j in zip(*np.triu_indices(len(free), 1), strict=True)
-            if abs(correlation[i, j]) > HIGH_CORRELATION
-        ]
-    return tuple(sorted(pairs, key=lambda pair: -abs(pair[2])))
+    for each in result.correlations:
+        if all(parameter.kind == "interior" for parameter in each.parameters):
+            first, second = (one.label if several else one.quantity for one in each.parameters)
+            pairs.append((first, second, each.rho))
+    return tuple(pairs)

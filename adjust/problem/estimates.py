@@ -166,6 +166,18 @@ def adjusted_lens(estimates: Estimates, camera: str) -> Lens:
     return Lens(distortion, interior, parameters)
 
 
+def observed_places(estimates: Estimates, camera: str, xy_mm: Array) -> tuple[Indices, Array]:
+    """Rows of a camera's observations, image by image, and their camera coordinates (m, 2) from comparator ones
+    (n, 2)."""
+    network = estimates.network
+    rows, places = [np.empty(0, dtype=np.intp)], [np.empty((0, 2))]
+    for number, image in enumerate(network.images):
+        if image.camera == camera:
+            rows.append(np.flatnonzero(network.image_numbers == number))
+            places.append(adjusted_image(estimates, image.name).camera_from_comparator(xy_mm[rows[-1]]))
+    return np.concatenate(rows), np.concatenate(places)
+
+
 def adjusted_places(estimates: Estimates, points: Sequence[str]) -> Array:
     """(n, 3) adjusted coordinates of object points, including the bend of their board."""
     places = estimates.values_of(Parameter.point(point, axis) for point in points for axis in "XYZ").reshape(-1, 3)

@@ -144,6 +144,10 @@ class ObjectPoint:
     Y: Prior | None
     Z: Prior | None
 
+    @property
+    def priors(self) -> tuple[Prior | None, Prior | None, Prior | None]:
+        return self.X, self.Y, self.Z
+
 
 @dataclass(frozen=True, eq=False)
 class Board:
@@ -262,12 +266,13 @@ class Network:
     @cached_property
     def known_places(self) -> dict[str, Array]:
         """(3,) coordinates of the points given in X, Y and Z, by id."""
-        given = {point.id: [each for each in (point.X, point.Y, point.Z) if each] for point in self.points}
-        return {
-            id_: np.array([each.value for each in priors])
-            for id_, priors in given.items()
-            if len(priors) == len("XYZ") and all(np.isfinite(each.sigma) for each in priors)
-        }
+        return {id_: xyz for id_, xyz in self.coordinates(firm=True).items() if not np.isnan(xyz).any()}
+
+    def coordinates(self, firm: bool) -> dict[str, Array]:
+        """(3,) known coordinates of every point, nan where unknown; firm: without approximations (infinite sigma)."""
+        priors = [prior for point in self.points for prior in point.priors]
+        values = [np.nan if p is None or (firm and p.sigma == np.inf) else p.value for p in priors]
+        return dict(zip((point.id for point in self.points), np.array(values).reshape(-1, 3), strict=True))
 
     @cached_property
     def observed_points(self) -> frozenset[str]:

@@ -57,7 +57,7 @@ class Reduction:
             given = image.exterior and replace(image.exterior, values=image.exterior.values - shift)
             images.append(replace(image, exterior=given))
         for point in network.points:
-            priors = zip((point.X, point.Y, point.Z), self.origin.tolist(), strict=True)
+            priors = zip(point.priors, self.origin.tolist(), strict=True)
             moved = (prior and Prior(prior.value - off, prior.sigma) for prior, off in priors)
             points.append(ObjectPoint(point.id, *moved))
         boards = (
@@ -84,7 +84,7 @@ class Reduction:
         for at in [*unknowns.point.values(), *{at[0]: at[:3] for at in unknowns.exterior.values()}.values()]:
             whole[at] += self.origin
         for point in (each for each in network.points if each.id in unknowns.point):
-            for at, prior in zip(unknowns.point[point.id], (point.X, point.Y, point.Z), strict=True):
+            for at, prior in zip(unknowns.point[point.id], point.priors, strict=True):
                 if prior is not None and prior.sigma == 0.0 and unknowns.sigma[at] == 0.0:
                     whole[at] = prior.value
         return whole
@@ -97,9 +97,7 @@ class Reduction:
 
 def _given_places(network: Network) -> Array:
     """(n, 3) given coordinates of the points, else of the stations; nan where not given."""
-    priors = [(point.X, point.Y, point.Z) for point in network.points]
-    rows = [[np.nan if prior is None else prior.value for prior in three] for three in priors]
-    places = np.array(rows, dtype=np.float64).reshape(-1, 3)
+    places = np.array(list(network.coordinates(firm=False).values())).reshape(-1, 3)
     if not np.isnan(places).all():
         return places
     return np.array([image.exterior.center for image in network.images if image.exterior is not None]).reshape(-1, 3)

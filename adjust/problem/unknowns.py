@@ -152,7 +152,7 @@ class _Rows:
         """Append three coordinates for each point; return their positions by id."""
         first = len(self.parameters)
         self.parameters.extend(Parameter("point", "", point.id, axis) for point in points for axis in "XYZ")
-        self.priors.extend(chain.from_iterable((point.X, point.Y, point.Z) for point in points))
+        self.priors.extend(chain.from_iterable(point.priors for point in points))
         nowhere = np.full(3, np.nan)
         places = np.array([approximations.points.get(point.id, nowhere) for point in points], dtype=np.float64)
         self.starts.extend(places.ravel().tolist())

@@ -17,7 +17,7 @@ from adjust.functional_model.rotation import rotation_from_angles, vector_by_ang
 from adjust.problem.camera import Camera
 from adjust.problem.estimates import Estimates
 from adjust.problem.network import EXTERIOR_NAMES
-from adjust.problem.parameter import MANY, Parameter
+from adjust.problem.parameter import MANY, Parameter, shortened
 
 HIGH = 0.95
 IMAGES_AT_ONCE = 16
@@ -201,8 +201,7 @@ def _exterior_words(
     owner = MANY if len(images) > 1 else images[0]
     if len(images) == len(frames) > 1:
         return elements, f"{what} of all images", owner
-    more = f" and {len(images) - SHOWN} more" if len(images) > SHOWN else ""
-    return elements, f"{what} of image{'s' * (len(images) > 1)} {', '.join(images[:SHOWN])}{more}", owner
+    return elements, f"{what} of image{'s' * (len(images) > 1)} {shortened(images, SHOWN)}", owner
 
 
 def _cause(first: str, second: str, known: bool) -> tuple[str, str]:

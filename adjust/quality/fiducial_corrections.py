@@ -89,12 +89,8 @@ def corrections_to_given(films: Sequence[Film], places_mm: Array, given_mm: Arra
 
 def _comparator_by_unknowns(film: Film, xy_mm: Array) -> Array:
     """(2n, 2n + k) derivatives of comparator coordinates by camera coordinates and film parameters."""
-    kind, half = film_kind(film.transformation, film.mirrored), np.array(0.5 * np.ptp(xy_mm, axis=0).max())
-    center = xy_mm.mean(axis=0)
-    by_film = kind.design(film.parameters, xy_mm, center, half).reshape(2 * len(xy_mm), -1)
-    by_film = by_film @ np.linalg.inv(kind.centred_jacobian(film.parameters, center, half))
     back = _block_product(np.eye(2 * len(xy_mm)), np.asarray(np.linalg.inv(film.gradient(xy_mm)), dtype=np.float64))
-    return np.hstack([back, -back @ by_film])
+    return np.hstack([back, -back @ film.design(xy_mm).reshape(2 * len(xy_mm), -1)])
 
 
 def _block_product(matrix: Array, by_place: Array) -> Array:

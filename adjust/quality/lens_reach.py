@@ -8,7 +8,7 @@ from adjust.array_types import Array
 from adjust.functional_model.families import family
 from adjust.functional_model.lens import Lens
 from adjust.problem.camera import Camera, Corners
-from adjust.problem.estimates import Estimates, adjusted_image, adjusted_lens
+from adjust.problem.estimates import Estimates, adjusted_lens, observed_places
 from adjust.problem.parameter import Parameter
 
 RADII = 80
@@ -75,8 +75,8 @@ def function_sigmas(lens: Lens, by: Array) -> Array:
     return np.sqrt(np.maximum(variance, 0.0))
 
 
-def directions() -> Array:
-    angles = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
+def directions(count: int = DIRECTIONS) -> Array:
+    angles = np.arange(count) * (2.0 * np.pi / count)
     return np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
@@ -103,16 +103,10 @@ class LensReach:
 
 def lens_reach(estimates: Estimates, camera: Camera, frame_mm: tuple[float, float] | None) -> LensReach | None:
     """Find the extent of the observations of a lens; None without observations. frame_mm: width and height."""
-    network = estimates.network
-    observations = network.observations
-    places = [np.zeros((0, 2))]
+    observations = estimates.network.observations
     principal_point = np.array([estimates.value(Parameter.interior(camera.name, each)) for each in ("x0", "y0")])
-    of_image = np.array(observations.image)
-    for image in network.images:
-        rows = np.flatnonzero((of_image == image.name) & ~observations.is_fiducial)
-        if image.camera == camera.name and len(rows):
-            places.append(adjusted_image(estimates, image.name).camera_from_comparator(observations.xy_mm[rows]))
-    observed = np.concatenate(places)
+    rows, places_mm = observed_places(estimates, camera.name, observations.xy_mm)
+    observed = places_mm[~observations.is_fiducial[rows]]
     if not len(observed):
         return None
     radius_mm = float(np.linalg.norm(observed - principal_point, axis=1).max())
@@ -128,9 +122,7 @@ def _sigma_um(estimates: Estimates, camera: Camera, radius_mm: float) -> float:
     """The largest standard deviation of the distortion at a radius, over all directions and along any."""
     lens = adjusted_lens(estimates, camera.name)
     unknowns = [Parameter.interior(camera.name, each) for each in lens.quantities if each not in ("x0", "y0")]
-    angles = np.arange(REACH_DIRECTIONS) * (2.0 * np.pi / REACH_DIRECTIONS)
-    places = radius_mm * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    moved = lens.displacement(places)
+    moved = lens.displacement(radius_mm * directions(REACH_DIRECTIONS))
     if not moved.imaged.all():
         return np.nan
     by = moved.by_unknowns_um

@@ -22,7 +22,7 @@ from scipy.linalg import block_diag
 from adjust.array_types import Array
 from adjust.errors import AdjustmentError
 from adjust.functional_model.projection import ImageModel, ray_by_orientation, rays, sight_vectors
-from adjust.functional_model.transformation import film_kind, film_parameter_names
+from adjust.functional_model.transformation import Film, film_parameter_names
 from adjust.problem.camera import Camera
 from adjust.problem.estimates import Estimates, adjusted_image, adjusted_lens, adjusted_places
 from adjust.problem.parameter import Parameter
@@ -121,9 +121,16 @@ class ProjectionField:
         self._lens = adjusted_lens(estimates, camera.name)
         self.calibration = [Parameter.interior(camera.name, name) for name in self._lens.quantities]
         self.films = list[Parameter]()
-        self._marks = _MarkFrame.from_camera(estimates, camera)
-        if self._marks is not None:
-            self.calibration += [Parameter.fiducial(camera.name, id, axis) for id in camera.fiducials for axis in "xy"]
+        images = (image for image in estimates.network.images if image.camera == camera.name)
+        filmed = next((image for image in images if image.transformation != "none" and camera.fiducials), None)
+        self._film = None if filmed is None else adjusted_image(estimates, filmed.name).film
+        if self._film is not None:
+            keys = [Parameter.fiducial(camera.name, id, axis) for id in camera.fiducials for axis in "xy"]
+            self.calibration += keys
+            design = _by_film(self._film, estimates.values_of(keys).reshape(-1, 2)).reshape(len(keys), -1)
+            sizes = np.linalg.norm(design, axis=0)
+            # (q, 2 f) effect of changed marks on the interior orientation of a scan, by least squares
+            self._film_by_marks = np.linalg.pinv(design / sizes).astype(np.float64) / sizes[:, None]
         self._align(estimates)
 
     def _align(self, estimates: Estimates) -> None:
@@ -146,7 +153,7 @@ class ProjectionField:
             right = right + weighted @ by.reshape(-1, by.shape[2])
             film_names = film_parameter_names(image.transformation)
             self.films += [Parameter.film(image.name, name) for name in film_names]
-            by_films.append(-weighted @ _by_film(model, places[-1]).reshape(2 * len(rows), len(film_names)))
+            by_films.append(-weighted @ _by_film(model.film, places[-1]).reshape(2 * len(rows), len(film_names)))
         scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), np.finfo(float).tiny))
         self._orientation = np.linalg.pinv(normal * np.outer(scale, scale), rcond=RANK, hermitian=True)
         self._orientation *= np.outer(scale, scale)
@@ -171,8 +178,10 @@ class ProjectionField:
         if len(covariance) > len(self.calibration):
             following = np.concatenate([following[:, :lens], 0.0 * following[:, lens:], self._by_films], axis=1)
         free = np.pad(by, ((0, 0), (0, 0), (0, following.shape[1] - by.shape[2]))) + turn @ following
-        if self._marks is not None:
-            covariance = self._marks.reduced(covariance, lens)
+        if self._film is not None:  # the film parameters take the place of the marks
+            others = len(covariance) - lens - self._film_by_marks.shape[1]
+            reduction = block_diag(np.eye(lens), self._film_by_marks, np.eye(others))
+            covariance = np.asarray(reduction @ covariance @ reduction.T)
         common = self._sigma0**2 * turn @ self._orientation @ turn.swapaxes(1, 2)
         result[found] = free @ covariance @ free.swapaxes(1, 2) + common
         return result
@@ -183,45 +192,10 @@ class ProjectionField:
         at = self._lens.equations(xy_mm, ray)
         calibration = np.concatenate([at.interior_jacobian, at.parameter_jacobian], axis=2)
         by: Array = -np.linalg.solve(at.xy_jacobian, calibration)
-        if self._marks is not None:
-            by = np.concatenate([by, -self._marks.design(xy_mm)], axis=2)
+        if self._film is not None:
+            by = np.concatenate([by, -_by_film(self._film, xy_mm)], axis=2)
         orientation = ray_by_orientation(ray, inverse_depth)
         return by, np.asarray(-np.linalg.solve(at.xy_jacobian, at.ray_jacobian @ orientation), dtype=np.float64)
-
-
-@dataclass(frozen=True)
-class _MarkFrame:
-    """Effect of changed fiducial coordinates on the interior orientation of a scan.
-
-    by_marks (q, 2 f): derivatives of the q film parameters by the coordinates, by least squares.
-    """
-
-    model: ImageModel
-    by_marks: Array
-
-    @classmethod
-    def from_camera(cls, estimates: Estimates, camera: Camera) -> "_MarkFrame | None":
-        """From the first image of a camera on film; None for a digital camera."""
-        images = (image for image in estimates.network.images if image.camera == camera.name)
-        image = next((image for image in images if image.transformation != "none"), None)
-        if image is None or not camera.fiducials:
-            return None
-        model = adjusted_image(estimates, image.name)
-        keys = [Parameter.fiducial(camera.name, id, axis) for id in camera.fiducials for axis in "xy"]
-        marks = estimates.values_of(keys).reshape(-1, 2)
-        design = _by_film(model, marks).reshape(2 * len(marks), -1)
-        sizes = np.linalg.norm(design, axis=0)
-        return cls(model, np.linalg.pinv(design / sizes).astype(np.float64) / sizes[:, None])
-
-    def design(self, xy_mm: Array) -> Array:
-        """(n, 2, q) derivatives of camera points by the film parameters."""
-        return _by_film(self.model, xy_mm)
-
-    def reduced(self, covariance: Array, lens: int) -> Array:
-        """Replace the marks, which follow the lens in the covariance, by the q film parameters."""
-        others = len(covariance) - lens - self.by_marks.shape[1]
-        reduction = block_diag(np.eye(lens), self.by_marks, np.eye(others))
-        return np.asarray(reduction @ covariance @ reduction.T)
 
 
 def frame_grid(corners_mm: Sequence[Sequence[float]] | Array, longer: int) -> Array:
@@ -232,14 +206,9 @@ def frame_grid(corners_mm: Sequence[Sequence[float]] | Array, longer: int) -> Ar
     return np.stack(np.meshgrid(x, y), axis=-1)
 
 
-def _by_film(model: ImageModel, xy_mm: Array) -> Array:
+def _by_film(film: Film, xy_mm: Array) -> Array:
     """(n, 2, q) derivatives of camera points by the parameters of an image's film transformation."""
-    film = model.film
-    kind = film_kind(film.transformation, film.mirrored)
-    comparator_mm, _ = film.comparator_from_camera(xy_mm)
-    half = np.array(max(float(np.ptp(comparator_mm, axis=0).max()), 1.0))
-    centred = kind.design(film.parameters, comparator_mm, film.center_mm, half)
-    return np.asarray(centred @ np.linalg.inv(kind.centred_jacobian(film.parameters, film.center_mm, half)))
+    return film.design(film.comparator_from_camera(xy_mm)[0])
 
 
 def _targets(model: ImageModel, xyz: Array) -> tuple[Array, Array]:

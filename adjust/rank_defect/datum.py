@@ -189,7 +189,7 @@ def held_as_known(network: Network, coordinates: Sequence[str]) -> Network:
         return network
     points = []
     for point in network.points:
-        priors = zip("XYZ", (point.X, point.Y, point.Z), strict=True)
+        priors = zip("XYZ", point.priors, strict=True)
         known = (p and Prior(p.value) if Parameter.point(point.id, axis) in held else p for axis, p in priors)
         points.append(ObjectPoint(point.id, *known))
     return replace(network, points=tuple(points))

@@ -232,7 +232,7 @@ def field_geometry(problem: Problem, state: State, camera: str) -> FieldGeometry
     axes = state.rotations[[image.camera == camera for image in problem.network.images], 2]
     mean = axes.mean(axis=0)
     off = np.linalg.norm(np.cross(axes, mean / (np.linalg.norm(mean) or 1.0)), axis=1)
-    given = [[p is not None and np.isfinite(p.sigma) for p in (q.X, q.Y, q.Z)] for q in problem.network.points]
+    given = [[p is not None and np.isfinite(p.sigma) for p in q.priors] for q in problem.network.points]
     whole, heights = (sum(all(point[first:]) for point in given) for first in (0, 2))
     known = "points" if whole >= FIELD else "heights" if heights >= FIELD else "nothing"
     return FieldGeometry(bool(extents[-1] <= FLAT * extents[0]), bool(off.max() < PARALLEL_RAD), known)

@@ -109,7 +109,7 @@ def _move_points(network: Network, by: Array) -> Network:
     factors = by[range(3), axes].tolist()
     points = []
     for point in network.points:
-        given = point.X, point.Y, point.Z
+        given = point.priors
         moved = (_scaled(given[axis], factor) for axis, factor in zip(axes, factors, strict=True))
         points.append(ObjectPoint(point.id, *moved))
     return replace(network, points=tuple(points))

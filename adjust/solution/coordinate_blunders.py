@@ -151,7 +151,7 @@ def free_points(network: Network, start: Approximations, far: Sequence[FarPoint]
     places = {each.name: each.place for each in far}
 
     def freed(point: ObjectPoint) -> ObjectPoint:
-        return ObjectPoint(point.id, *(Prior(each.value, np.inf) for each in (point.X, point.Y, point.Z) if each))
+        return ObjectPoint(point.id, *(Prior(each.value, np.inf) for each in point.priors if each))
 
     points = tuple(freed(point) if point.id in places else point for point in network.points)
     return replace(network, points=points), replace(start, points={**start.points, **places})
@@ -172,7 +172,7 @@ def coordinate_slips(network: Network, far: Sequence[FarPoint], without: Adjustm
     for each in far:
         coordinates, point = [Parameter.point(each.name, axis) for axis in "XYZ"], network.point_by_id[each.name]
         place, cofactor = without.values_of(coordinates), without.cofactor_of(coordinates)
-        variances = [prior.sigma**2 for prior in (point.X, point.Y, point.Z) if prior]
+        variances = [prior.sigma**2 for prior in point.priors if prior]
         weight: Array = np.asarray(np.linalg.inv(cofactor + np.diag(variances)), dtype=np.float64)
 
         def passes(xyz: Array, place: Array = place, weight: Array = weight) -> bool:

@@ -309,14 +309,14 @@ def test_what_is_wrong_with_a_picture_is_no_unmodelled_error_that_passes() -> No
     """One of eight pictures is mirrored: that is refused, or said, and not taken for a lens that is a little poor."""
     network = board_network(np.random.default_rng(7), 8, 5e-4, given_mm=1e-4)
     xy_mm = network.observations.xy_mm.copy()
-    rows = [row for row, image in enumerate(network.observations.image) if image == "p3"]
+    rows = [row for row, image in enumerate(network.observations.image) if image == "i3"]
     xy_mm[rows, 0] = BOARD_FRAME_MM[0] - xy_mm[rows, 0]
     mirrored = replace(network, observations=replace(network.observations, xy_mm=xy_mm))
     try:
         text = " ".join(adjust_unmodelled(mirrored, adjust).warnings)
     except AdjustmentError as error:
         text = str(error)
-    assert "p3" in text
+    assert "i3" in text
     assert "mirrored" in text
 
 
