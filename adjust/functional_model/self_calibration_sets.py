@@ -1,31 +1,17 @@
 """Self-calibration sets over the frame: products of orthogonal polynomials (Ebner, Grün, Legendre) and Fourier series.
 
-With ξ = xr / bx, η = yr / by, xr and yr reduced to the principal point and bx, by half the frame (`half_mm`), all are
-products φm(ξ) φn(η) up to one degree in x and in y, in dx and in dy. The polynomials φ are orthogonal over the points
--1, 0, 1 (Ebner), over -1, -1/2, 0, 1/2, 1 (Grün) or over -1..1 (Legendre), and so are the products over the grid of
-3 x 3 or 5 x 5 points or the whole frame. Six combinations are left out, since exterior and interior orientation absorb
-them: two shifts, a rotation, a change of scale and, of degree two, the two tilts (x², xy), (xy, y²). Of the terms in
-these, only the combinations orthogonal to them remain: (ξ, -η), (η, ξ), (-t φ2(ξ), ξη) and (ξη, -t φ2(η)), with t = 2,
-10/7 and 5/6. In a frame that is not square, the parts of these four are weighted with the square root of by / bx or its
-inverse, so that they remain orthogonal to the omitted combinations.
+ξ = xr / bx and η = yr / by are coordinates from the principal point over half the frame (`half_mm`). Parameters: mm.
 
-All parameters are in mm. The published coefficient of a product of degree m + n is ours over b^(m + n).
+Polynomials: dx and dy are sums of φm(ξ) φn(η), orthogonal over 3 x 3 points (Ebner), 5 x 5 points (Grün) or the frame
+(Legendre). Shifts, rotation, scale and the tilts (x², xy), (xy, y²) are left out, since the orientations absorb them.
+What is orthogonal to them remains of their terms: (ξ, -η), (η, ξ), (-t φ2(ξ), ξη), (ξη, -t φ2(η)), with t = 2, 10/7,
+5/6; √(by / bx) weights their parts where the frame is not square. A published coefficient is ours over b^(m + n).
 
-Sources: H. Ebner, Self calibrating block adjustment, Bildmessung und Luftbildwesen 44 (1976), 128-139. A. Grün,
-Experiences with self-calibrating bundle adjustment, ACSM-ASP Convention, Washington 1978. R. Tang, D. Fritsch,
-M. Cramer, W. Schneider, A flexible mathematical method for camera calibration in digital aerial photogrammetry,
-Photogrammetric Engineering and Remote Sensing 78 (2012), 1069-1077.
+Fourier: cosine and sine of π(mξ + nη), for m = 0, n = 1..N and m = 1..N, n = -N..N, in dx and in dy. Opposite edges get
+equal corrections unless `half_mm` is larger than half the frame.
 
-With u = π xr / bx, v = π yr / by, xr and yr reduced to the principal point and bx, by half the frame (`half_mm`):
-
-    dx = Σ a_mn cos(m u + n v) + b_mn sin(m u + n v)        dy = Σ c_mn cos(m u + n v) + d_mn sin(m u + n v)
-
-over m = 0, n = 1..N and m = 1..N, n = -N..N: 16 parameters of the first order, 48 of the second, in mm. The constant,
-a shift, is left out; all others are orthogonal over the frame. They are periodic with the frame, so that opposite edges
-get the same correction. A larger `half_mm` avoids this.
-
-Source: R. Tang, D. Fritsch, M. Cramer, New rigorous and flexible Fourier self-calibration models for airborne camera
-calibration, ISPRS Journal of Photogrammetry and Remote Sensing 71 (2012), 76-85.
+Sources: H. Ebner, Bildmessung und Luftbildwesen 44 (1976). A. Grün, ACSM-ASP Convention, Washington 1978. R. Tang et
+al., Photogrammetric Engineering and Remote Sensing 78 (2012) for Legendre, ISPRS Journal 71 (2012) for Fourier.
 """
 
 from collections.abc import Sequence

@@ -1,22 +1,17 @@
-"""Film transformations T: comparator (x, y) to camera (x', y'), each explicit in the comparator coordinates.
+"""Film transformations T: comparator (x, y) to camera (x', y') in mm, m = -1 where the scan is mirrored, else 1.
 
-Parameters (..., k) go with coordinates (..., 2). The columns of a polynomial around a distant origin are nearly
-dependent. The adjustment therefore estimates centred parameters: those of the same formula in (x - center) / half, with
-the centre and half the extent of the observations in an image. `design` holds the derivatives with respect to these,
-`centred_jacobian` converts back.
+    none           x' = x                                      y' = y
+    congruent      x' = a1 + cos(t) x - m sin(t) y             y' = b1 + sin(t) x + m cos(t) y     t: `angle`, rad
+    similarity     x' = a1 + p x - m q y                       y' = b1 + q x + m p y
+    affine         x' = a1 + a2 x + a3 y                       y' = b1 + b2 x + b3 y
+    projective     the affine ones over d = 1 + c1 x + c2 y
+    bilinear       the affine ones + a4 xy                     + b4 xy
+    conformal(n)   x' + i y' = Σ (a[k+1] + i b[k+1]) z^k       k = 0..n, z = x + i m y
+    polynomial(n)  x' = a1 + a2 x + a3 y + a4 x² + a5 xy + ... of total degree n; y' with b
 
-    none           x' = x                     y' = y
-    congruent      x' = a1 + cos(t) x - m sin(t) y,   y' = b1 + sin(t) x + m cos(t) y,   t the `angle` in rad
-    similarity     x' = a1 + p x - m q y      y' = b1 + q x + m p y
-    affine         x' = a1 + a2 x + a3 y      y' = b1 + b2 x + b3 y
-    projective     x' = (a1 + a2 x + a3 y) / d,       y' = (b1 + b2 x + b3 y) / d,       d = 1 + c1 x + c2 y
-    bilinear       x' = a1 + a2 x + a3 y + a4 xy      y' = b1 + b2 x + b3 y + b4 xy
-    conformal(n)   x' + i y' = (a1 + i b1) + (a2 + i b2) z + ... + (a[n+1] + i b[n+1]) z^n,   z = x + i m y
-    polynomial(n)  x' = a1 + a2 x + a3 y + a4 x² + a5 xy + a6 y² + a7 x³ + a8 x²y + ... of total degree n; y' with b
-
-x, y are observed comparator coordinates in mm, neither centred nor scaled. m is -1 where the scan is mirrored, else 1.
-Congruent, similarity and conformal transformations need m as an input; the parameters of the others include mirroring.
-conformal(1) is a similarity, polynomial(1) an affine transformation.
+Parameters are (..., k), coordinates (..., 2). The adjustment estimates the parameters of (x - center) / half, with the
+centre and half the extent of an image's observations: the columns are nearly dependent otherwise. m is given for
+congruent, similarity and conformal; the parameters of the others include mirroring.
 """
 
 import re

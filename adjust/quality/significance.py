@@ -1,18 +1,11 @@
 """Significance tests of camera, scanner and board parameters, and compatibility tests against earlier calibrations.
 
-A parameter, or a group of k, is tested against the value x0 of the null hypothesis: 0 for distortion, the given value
-for c, x0' and y0'. With d = x - x0 and Q the cofactor matrix of d,
+The null hypothesis is 0 for distortion and the given value for c, x0' and y0'. The difference d of k parameters from it
+has the cofactor Q; F = d' Q⁻¹ d / (k sigma0²) is F(k, r) distributed with the redundancy r, its root Student's t for
+k = 1. A given value with a prior sigma differs by -v, of the cofactor sigma² - q (Koch 1999, 4.2 and 4.3).
 
-    t = d / (sigma0 √Q)  ~  Student's t with the redundancy r,       F = d' Q⁻¹ d / (k sigma0²)  ~  F(k, r),
-
-where sigma0 and r are those of the variance factor; without redundancy sigma0 is 1 and t is normal. For a quantity with
-a prior, the difference from the given value, -v of that observation, has the cofactor sigma² - q (Koch, Parameter
-estimation and hypothesis testing in linear models, 1999, chapters 4.2 and 4.3).
-
-Each quantity may pass by itself where all together do not. With C = L L' their covariance, v their residuals and
-S = I - H (see `adjust.quality.run`), the other observations determine them as observed + d, d = L S^+ L^-1 v,
-with the covariance L S^+ L'. The statistic u' S^+ u, u = L^-1 v, is chi-square with the rank of S as its degrees of
-freedom: the test of a block of errors (Baarda 1968; Förstner and Wrobel, Photogrammetric Computer Vision, 4.6.4).
+A whole calibration with covariance C = L L' and residuals v is tested by u' S⁺ u, u = L⁻¹ v, S = I - H: chi-square with
+the rank of S as degrees of freedom (Baarda 1968; Förstner and Wrobel, 4.6.4).
 """
 
 from collections.abc import Iterator, Mapping, Sequence

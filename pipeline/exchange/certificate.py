@@ -1,22 +1,12 @@
 """Calibration certificates: fit of the table of radial distortion, and conversion between its two principal distances.
 
-A lens images a ray at the angle t from its axis at the radius r. The distortion in a table is r - c tan t. It therefore
-depends on the c it was computed with: the equivalent principal distance, which the lens approaches near its axis, or
-the calibrated one, which makes the largest positive and negative distortions equal (Manual of Photogrammetry). In the
-model of this program, the correction k3 r^3 + k5 r^5 + k7 r^7 has no linear term, so that c is the equivalent one:
+A table gives r - C tan t for rays at the angle t, with the equivalent or the calibrated principal distance C (Manual of
+Photogrammetry). In the model of this program c is the equivalent one; c - C, k3, k5, k7 are fitted linearly:
 
-    r - C tan t = (c - C) tan t + k3 r^3 + k5 r^5 + k7 r^7        C: principal distance of the table
+    r - C tan t = (c - C) tan t + k3 r³ + k5 r⁵ + k7 r⁷
 
-This is linear in c - C, k3, k5, k7.
-
-A certificate may give two principal points: that of autocollimation, PPA, where the axis meets the image, and that of
-best symmetry, PPS, the origin of its distortion. The model has one, the PPA. With d = PPS - PPA, the distortion
-k_n r^(n-1) x relative to the PPS becomes, relative to the PPA and to the first order in d,
-
-    k_n r^(n-1) x - k_n r^(n-1) (d + (n - 1) x (x.d) / r^2)
-
-For n = 3 the second part is a decentring distortion with P = -k_3 d. For larger n a decentring distortion is fitted to
-it over the disk of radius R that the table covers: P = -k_n d R^(n-3) 6 (3 n + 1) / (10 (n + 3)).
+The model has one principal point, of autocollimation (PPA). Distortion about a point of symmetry (PPS) d away gets
+a decentering part P = -k_n d R^(n-3) 6 (3 n + 1) / (10 (n + 3)), fitted over the table's radius R; exact for n = 3.
 """
 
 import math
