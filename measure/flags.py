@@ -151,6 +151,12 @@ class Cause(MeaningfulWord):
     CLICK = "click", "A person pointed at it, and nothing could be matched there."
     LENS = "taking lens", "Uncertainty of the lens that photographed the film, from its calibration."
 
+    @property
+    def shown(self) -> str:
+        """Name for readers; files keep the value."""
+        names = {Cause.UNLIKE_DRAWING: "model misfit", Cause.OWN_TURN: "rotation", Cause.LANDSCAPE: "notch background"}
+        return names.get(self, self.value)
+
 
 class Limit(float):
     """Significance level, or limit of an expected number of false alarms. of: the event it refers to; decides: the

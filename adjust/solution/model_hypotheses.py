@@ -373,7 +373,10 @@ def _board_words(run: Run, added: Indices, _: float) -> tuple[str, str]:
         f"first axis and {value[1]:.3g} ± {sigma[1]:.1g} along its second (points' unit; ± for independent errors, "
         "on real boards up to 5 times as much)"
     )
-    return cause, 'Put it on a flat plate, or let its bend be adjusted: board_bend = "free" under [object].'
+    return (
+        cause,
+        'Put it on a flat plate, or let its bend be adjusted: board_bend = "free" under [object] in project.toml.',
+    )
 
 
 def _group_words(camera: str, groups: ImageGroups, run: Run, added: Indices, _: float) -> tuple[str, str]:

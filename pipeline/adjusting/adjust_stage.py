@@ -200,7 +200,7 @@ def _unmeasured(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[str
         return ()
     return (
         f"Given but measured in no image: {'point' if len(lost) == 1 else f'{len(lost)} points,'} {listed(lost)}. "
-        "If an image shows one, look for a wrong point number or coordinate.",
+        f"If an image shows {'it' if len(lost) == 1 else 'one'}, look for a wrong point number or coordinate.",
     )
 
 

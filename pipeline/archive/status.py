@@ -191,8 +191,11 @@ def print_status(status: ArchiveStatus, console: Console, every: bool = False) -
     for verdict, count in status.counts.items():
         if count:
             table.add_row(str(verdict), str(count), Text(verdict.meaning), Text(NEXT_STEP[verdict]))
-    console.print(Text(status.sentence))
-    console.print(table)
+    if status.scans:
+        console.print(Text(status.sentence))
+        console.print(table)
+    else:
+        console.print("No scan has this verdict.")
     named, more = worst_named(status.scans, len(status.scans) if every else NAMED, every)
     for scan in named:
         console.print(Text(f"{scan.verdict}: {scan.image}{f': {scan.why}' if scan.why else ''}"), soft_wrap=True)

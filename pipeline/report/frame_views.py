@@ -278,7 +278,7 @@ def _plots(
 def _causes(covariance: Covariance | None) -> tuple[tuple[str, str, str], ...]:
     sigmas = {} if covariance is None else covariance.sigmas_px
     parts = [(cause, sigma) for cause, sigma in sigmas.items() if sigma >= _LEAST_PART_PX]
-    named = tuple((str(cause), fixed(sigma, 3), cause.meaning) for cause, sigma in parts)
+    named = tuple((cause.shown, fixed(sigma, 3), cause.meaning) for cause, sigma in parts)
     return named if len(named) > 1 else ()
 
 

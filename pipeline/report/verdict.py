@@ -221,10 +221,11 @@ def _too_large(adjustment: AdjustmentRecord) -> Iterator[Problem]:
         yield replace(explained[0], what=f"{size}. {explained[0].what}")
         yield from explained[1:]
         return
+    is_calibrated = any(camera.is_calibrated for camera in adjustment.cameras.values())
+    model = "add distortion parameters" if is_calibrated else "choose a richer film transformation"
     yield Problem(
         f"{size} ({_group_sigmas(adjustment)}).",
-        "Reject gross errors first; then add distortion parameters, or state film_sigma_um. All σ are already "
-        "multiplied by σ₀.",
+        f"Reject gross errors first; then {model}, or state film_sigma_um. All σ are already multiplied by σ₀.",
         section="reliability",
     )
 

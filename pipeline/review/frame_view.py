@@ -234,7 +234,7 @@ def _second(mark: MarkMeasurement) -> list[float] | None:
 def _causes(mark: MarkMeasurement) -> list[Json]:
     """Contributions to the standard deviation, the largest first."""
     parts = mark.covariance.parts.items() if mark.covariance else ()
-    parts_px = [(str(c), c.meaning, float(np.sqrt(max(np.trace(px2) / 2, 0.0)))) for c, px2 in parts]
+    parts_px = [(c.shown, c.meaning, float(np.sqrt(max(np.trace(px2) / 2, 0.0)))) for c, px2 in parts]
     return [{"cause": c, "meaning": m, "sigma_px": s} for c, m, s in sorted(parts_px, key=lambda one: -one[2])]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from measure import FrameMeasurement, MarkMeasurement
-from measure.flags import LIMITS, NO_REASON, Code, Reason, Status
+from measure.flags import LIMITS, NO_REASON, Cause, Code, Reason, Status
 from measure.geometry import Affine
 
 ROOT = Path(__file__).parents[2]
@@ -25,6 +25,7 @@ def test_the_page_has_the_table() -> None:
     page = (ROOT / "docs" / "reference" / "statuses.md").read_text(encoding="utf-8")
     rows = dict(re.findall(r"^\| `([a-z-]+)` \| (.+) \|$", page, flags=re.MULTILINE))
     assert rows == {str(code): code.meaning for code in Code}
+    assert [cause for cause in Cause if f"\n| {cause.shown} " not in page] == []
 
 
 def test_every_reason_of_the_code_has_a_code() -> None:

@@ -342,6 +342,8 @@ def test_status_tells_what_changed_outside(folder: Path, capsys: SAID) -> None:
     assert output["verdicts"]["good"]["scans"] == 1
     assert run(["status", project, "--csv", "--verdict", "waiting"]) == 1
     assert capsys.readouterr().out.splitlines()[1].startswith("d,waiting,")
+    assert run(["status", project, "--verdict", "failed"]) == 1
+    assert "No scan has this verdict." in capsys.readouterr().out
     assert run(["status", project, "--verdict", "dreadful"]) == 2
 
 

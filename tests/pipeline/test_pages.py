@@ -6,6 +6,7 @@ import re
 import shlex
 import shutil
 import subprocess
+import textwrap
 from collections.abc import Callable, Iterator
 from html.parser import HTMLParser
 from pathlib import Path
@@ -343,12 +344,17 @@ def test_the_commands_of_the_page_of_archives_run(desk: Path) -> None:
 def test_the_figures_of_the_demonstration_on_the_pages(tmp_path: Path) -> None:
     """Those of the tutorial, and the table of the page of models."""
     assert run(["demo", str(tmp_path)]) == DONE
-    adjustment = read_adjustment(tmp_path / "out" / "adjustment.json")
+    mine = tmp_path / "mine"
+    shutil.copytree(tmp_path / "scans", mine / "scans")
+    for name in ("camera.toml", "points.csv"):
+        shutil.copy(tmp_path / name, mine)
+    (mine / "project.toml").write_text(block("toml"), encoding="utf-8")
+    assert run(["run", str(mine / "project.toml")]) == DONE
+    adjustment = read_adjustment(mine / "out" / "adjustment.json")
     (camera,) = adjustment.cameras.values()
     c = camera.principal_distance_mm
-    tutorial = (ROOT / "docs" / "start" / "film-scan.md").read_text(encoding="utf-8")
-    assert f"c = {c.value:.3f} mm, with a standard deviation of {c.sigma:.3f}" in tutorial
-    assert f"Here it is {adjustment.sigma0:.2f}" in tutorial
+    assert f"c = {c.value:.3f} mm, with a standard deviation of {c.sigma:.3f}" in PAGE
+    assert f"Here it is {adjustment.sigma0:.2f}" in PAGE
     assert run(["choose", str(tmp_path / "project.toml")]) == DONE
     candidates = {
         each["name"]: each for each in json.loads((tmp_path / "out" / "choose.json").read_text())["candidates"]
@@ -359,6 +365,25 @@ def test_the_figures_of_the_demonstration_on_the_pages(tmp_path: Path) -> None:
         found = candidates[name.strip("*")]
         assert (int(unknowns), int(redundancy)) == (found["unknowns"], found["redundancy"])
         assert float(sigma0) == pytest.approx(found["sigma0"], abs=0.006)
+
+
+@real_data.needs("film_scans", "aerial")
+@pytest.mark.study
+def test_the_example_of_the_page_of_archives(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = (ROOT / "docs" / "start" / "archive.md").read_text(encoding="utf-8")
+    assert run(["template", "camera", "--marks", "ring-cross", "--square", "212", "--c", "153"]) == DONE
+    drawn = capsys.readouterr().out.partition("[mark.corner]")[0]
+    mark = re.search(r"^    \[mark.corner\]\n(?:    .*\n)+", page, flags=re.MULTILINE)
+    assert mark is not None
+    (tmp_path / "camera.toml").write_text(drawn + textwrap.dedent(mark[0]), encoding="utf-8")
+    scan = real_data.DATA / "film_scans" / "aerial" / "0b50b18e.jpeg"
+    project = f'camera = "camera.toml"\nscans = ["{scan}"]\n[measure]\ntone = "linear"\nwriting = "none"\n'
+    (tmp_path / "project.toml").write_text(project, encoding="utf-8")
+    assert run(["measure", str(tmp_path / "project.toml")]) == LOOK
+    rows = (tmp_path / "comparator.csv").read_text(encoding="utf-8").splitlines()
+    shown = re.findall(r"^    (0b50b18e,.*)$", page, flags=re.MULTILINE)
+    assert len(shown) == 2
+    assert set(shown) <= set(rows)
 
 
 @real_data.needs("chessboards", "opencv")
