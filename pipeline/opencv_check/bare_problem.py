@@ -85,7 +85,7 @@ def bare_problem(adjustment: Adjustment, camera_name: str) -> BareProblem:
     }
     return BareProblem(
         network=Network(
-            cameras=(_freed(camera, values, free),),
+            cameras=(_freed(camera, camera.distortion, values, free),),
             images=tuple(Image(name, camera_name, "none") for name in usable),
             points=tuple(_fixed_point(adjustment, point) for point in points),
             observations=_observations({name: shown[name] for name in usable}, sigma_mm),
@@ -114,23 +114,19 @@ def bare_problem(adjustment: Adjustment, camera_name: str) -> BareProblem:
 
 def opencv_problem(problem: BareProblem, parameters: Array) -> BareProblem:
     """The bare problem with OpenCV's own distortion, from parameters (18,) in the order of `opencv_model.NAMES`."""
-    values = dict(zip(NAMES, parameters.tolist(), strict=True))
-    values |= {"b1": values["fx"] / values["fy"] - 1, "b2": 0.0}
-    free = set(problem.freedom.names) - {"fy"} | ({"b1"} if "fy" in problem.freedom.names else set())
-    priors = {name: Prior(value, np.inf if name in free else 0.0) for name, value in values.items()}
-    camera = replace(
-        problem.network.cameras[0],
-        principal_distance_mm=Prior(values["fy"], priors["fx"].sigma),
-        x0_mm=priors["cx"],
-        y0_mm=priors["cy"],
-        distortion=Distortion("opencv", {name: priors[name] for name in parameter_names("opencv")}),
-    )
-    interior = {camera.name: np.array([values["fy"], values["cx"], values["cy"]])}
-    return replace(
-        problem,
-        network=replace(problem.network, cameras=(camera,)),
-        approximations=replace(problem.approximations, interior=interior),
-    )
+    fx, fy, x0, y0, *distortion = parameters.tolist()
+    values = {
+        "c": fy,
+        "x0": x0,
+        "y0": y0,
+        **dict(zip(NAMES[4:], distortion, strict=True)),
+        "b1": fx / fy - 1,
+        "b2": 0.0,
+    }
+    free = {"c", "x0", "y0", *problem.freedom.distortion}.difference(problem.freedom.held_interior)
+    camera = _freed(problem.network.cameras[0], Distortion("opencv"), values, free)
+    approximations = replace(problem.approximations, interior={camera.name: np.array([fy, x0, y0])})
+    return replace(problem, network=replace(problem.network, cameras=(camera,)), approximations=approximations)
 
 
 def free_parameters(camera: Camera) -> set[str]:
@@ -152,16 +148,16 @@ def _freedom(camera: Camera, free: set[str]) -> Freedom:
     return Freedom(tuple(counterpart for name, counterpart in counterparts.items() if name in free))
 
 
-def _freed(camera: Camera, values: Mapping[str, float], free: set[str]) -> Camera:
+def _freed(camera: Camera, distortion: Distortion, values: Mapping[str, float], free: set[str]) -> Camera:
+    """Camera of a distortion model without fiducials and priors. free: parameters that are estimated."""
     priors = {name: Prior(value, np.inf if name in free else 0.0) for name, value in values.items()}
+    parameters = {name: priors[name] for name in parameter_names(distortion.family)}
     return replace(
         camera,
         principal_distance_mm=priors["c"],
         x0_mm=priors["x0"],
         y0_mm=priors["y0"],
-        distortion=replace(
-            camera.distortion, parameters={name: priors[name] for name in parameter_names(camera.distortion.family)}
-        ),
+        distortion=replace(distortion, parameters=parameters),
         fiducials={},
     )
 

@@ -13,6 +13,7 @@ from adjust.functional_model.lens import Lens
 from adjust.functional_model.scanner import NO_BEND, Bend
 from adjust.functional_model.transformation import Film, film_parameter_names
 from measure.errors import MeasurementError
+from measure.geometry import Affine
 from measure.scans.remote import Window
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.comparator_file import comparator_from_pixel, pixel_from_comparator
@@ -84,12 +85,9 @@ def measured_chain(measured: MeasuredScan, taking_lens: Lens | None = None) -> F
     matrix = measured.frame.pixel_from_camera
     if matrix is None:
         return None
-    by_camera = comparator_from_pixel(matrix.T, measured.pitch_um)  # rows: of x', y' and 1
-    inverse = np.linalg.inv(by_camera[:2].T)
-    shift = -inverse @ by_camera[2]
-    a, b = ([shift[axis], *inverse[axis]] for axis in (0, 1))
-    order = {"a1": a[0], "a2": a[1], "a3": a[2], "b1": b[0], "b2": b[1], "b3": b[2]}
-    parameters = np.array([order[name] for name in film_parameter_names("affine")])
+    back = Affine(comparator_from_pixel(matrix.T, measured.pitch_um).T).inverse
+    known = dict(zip(("a2", "a3", "a1", "b2", "b3", "b1"), back.matrix.ravel().tolist(), strict=True))
+    parameters = np.array([known[name] for name in film_parameter_names("affine")])
     return FrameChain(measured.pitch_um, Film("affine", parameters, _middle_mm(measured)), Bend(lens=taking_lens))
 
 
