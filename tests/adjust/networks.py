@@ -417,32 +417,43 @@ def two_cameras(
     """Four images of each; marks: what is made of the first and of the second camera's fiducial ids."""
     rng = np.random.default_rng(17)
     points = field_points(rng, 12)
-    both = [
-        _rename_network(*simulated(rng, truth, points=points, point_sigma=0.0), name, mark, image, point, number)
-        for number, (truth, name, mark) in enumerate(
-            zip((Truth(), Truth(c=120.0, x0=-0.2, y0=0.1)), cameras, marks, strict=True)
-        )
-    ]
-    networks, starts = zip(*both, strict=True)
-    network = Network(
-        tuple(each.cameras[0] for each in networks),
-        tuple(chain.from_iterable(each.images for each in networks)),
-        networks[0].points,
-        join_observations(*(each.observations for each in networks)),
+
+    def numbered(number: int) -> Name:
+        return lambda name: image(f"{number}{name}")
+
+    truths = (Truth(), Truth(c=120.0, x0=-0.2, y0=0.1))
+    first, second = (
+        rename_network(*simulated(rng, truth, points=points), name, mark, numbered(number), point)
+        for number, (truth, name, mark) in enumerate(zip(truths, cameras, marks, strict=True))
     )
-    start = replace(
-        starts[0],
-        interior={name: value for each in starts for name, value in each.interior.items()},
-        exterior={name: value for each in starts for name, value in each.exterior.items()},
-        transformation={name: value for each in starts for name, value in each.transformation.items()},
+    return join_networks(first, second)
+
+
+def join_networks(
+    one: tuple[Network, Approximations], other: tuple[Network, Approximations]
+) -> tuple[Network, Approximations]:
+    """Both together; what has one name is one thing."""
+    (a, start_a), (b, start_b) = one, other
+    network = Network(
+        tuple({each.name: each for each in (*b.cameras, *a.cameras)}.values())[::-1],
+        a.images + b.images,
+        tuple({each.id: each for each in (*a.points, *b.points)}.values()),
+        join_observations(a.observations, b.observations),
+    )
+    start = Approximations(
+        {**start_a.interior, **start_b.interior},
+        {**start_a.exterior, **start_b.exterior},
+        {**start_a.transformation, **start_b.transformation},
+        {**start_a.points, **start_b.points},
+        start_a.mirrored | start_b.mirrored,
     )
     return network, start
 
 
-def _rename_network(
-    network: Network, start: Approximations, camera: str, mark: Name, image: Name, point: Name, number: int
+def rename_network(
+    network: Network, start: Approximations, camera: str, mark: Name, image: Name, point: Name
 ) -> tuple[Network, Approximations]:
-    new = {each.name: image(f"{number}{each.name}") for each in network.images}
+    new = {each.name: image(each.name) for each in network.images}
     rows = network.observations
     view = (mark(name) if kind == "fiducial" else point(name) for name, kind in zip(rows.point, rows.kind, strict=True))
     return (

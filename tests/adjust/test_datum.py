@@ -232,18 +232,6 @@ def test_inner_constraints_have_the_least_trace_and_leave_centre_turn_and_size(c
     assert eigenvalues[6] < 1e-9 * eigenvalues[7]
 
 
-def test_minimal_datum_of_the_reference_case() -> None:
-    """The reference's network with nothing fixed by hand gives the reference's camera."""
-    case = load("iii_selfcal_all_unknown_datum_A")
-    start = case_approximations(case, case["input"]["initial_approximations"])
-    case["input"]["pts_sigma"] = [[None] * 3 for _ in case["input"]["pts_sigma"]]
-    result = adjust(case_network(case), start, Options(datum="minimal"))
-    assert result.vpv == pytest.approx(case["result"]["vpv"], rel=1e-8)
-    reference = case["result"]["parameters"]["IO.c"]
-    assert result.value("IO.K.c") == pytest.approx(reference["value"], abs=1e-6 * reference["std_apriori"])
-    assert result.sigma("IO.K.c") == pytest.approx(reference["std_aposteriori"], rel=1e-7)
-
-
 def set_exteriors(network: Network, sigmas: Array, truth: Truth) -> Network:
     """The network with observed exterior orientations."""
     values = np.hstack([np.array(truth.stations), np.array(truth.attitudes)])

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from networks import field_points, join_observations, simulated
+from networks import field_points, join_networks, rename_network, simulated
 from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
@@ -158,35 +158,20 @@ def test_what_cannot_be_compared_is_refused(count: int, times: tuple[float, ...]
 def two_networks(kind: Transformation, noise: float) -> tuple[tuple[Network, Approximations], ...]:
     """Two data sets of one camera, their names with an A and a B, and both together; errors as small as one likes."""
     networks = []
-    for prefix, seed in (("A", 1), ("B", 2)):
+    for prefix, seed in (("A{}", 1), ("B{}", 2)):
         rng = np.random.default_rng(seed)
         free = {"k3": np.inf, "p1": np.inf}
         network, start = simulated(rng, None, kind, field_points(rng, 14), 0.0, free, False, 0.002 * noise)
         rows = network.observations
         rows = replace(
             rows,
-            image=tuple(prefix + name for name in rows.image),
-            point=tuple(p if k == "fiducial" else prefix + p for p, k in zip(rows.point, rows.kind, strict=True)),
             xy_mm=rows.xy_mm + noise * rng.normal(0.0, 0.004, rows.xy_mm.shape),
             covariance_mm2=noise**2 * rows.covariance_mm2,
         )
-        images = tuple(replace(image, name=prefix + image.name) for image in network.images)
-        points = tuple(replace(point, id=prefix + point.id) for point in network.points)
-        network = replace(network, images=images, points=points, observations=rows)
-        exterior, films, known = (
-            {prefix + k: v for k, v in each.items()} for each in (start.exterior, start.transformation, start.points)
-        )
-        networks.append((network, replace(start, exterior=exterior, transformation=films, points=known)))
-    (a, start_a), (b, start_b) = networks
-    rows = join_observations(a.observations, b.observations)
-    joint = replace(a, images=a.images + b.images, points=a.points + b.points, observations=rows)
-    start_joint = replace(
-        start_a,
-        exterior={**start_a.exterior, **start_b.exterior},
-        transformation={**start_a.transformation, **start_b.transformation},
-        points={**start_a.points, **start_b.points},
-    )
-    return (a, start_a), (b, start_b), (joint, start_joint)
+        network = replace(network, observations=rows)
+        networks.append(rename_network(network, start, "K", str, prefix.format, prefix.format))
+    a, b = networks
+    return a, b, join_networks(a, b)
 
 
 def make_calibration(result: Adjustment, fiducials: bool) -> Calibration:
@@ -203,15 +188,14 @@ def set_calibration(network: Network, calibration: Calibration) -> Network:
         return Prior(value[name], np.inf) if name in value else prior
 
     (camera,) = network.cameras
-    assert camera.principal_distance_mm is not None
-    assert camera.x0_mm is not None
-    assert camera.y0_mm is not None
     parameters = camera.distortion.parameters
+    interior = zip(("c", "x0", "y0"), (camera.principal_distance_mm, camera.x0_mm, camera.y0_mm), strict=True)
+    c, x0, y0 = (prior and freed(f"IO.K.{name}", prior) for name, prior in interior)
     free = replace(
         camera,
-        principal_distance_mm=freed("IO.K.c", camera.principal_distance_mm),
-        x0_mm=freed("IO.K.x0", camera.x0_mm),
-        y0_mm=freed("IO.K.y0", camera.y0_mm),
+        principal_distance_mm=c,
+        x0_mm=x0,
+        y0_mm=y0,
         distortion=replace(camera.distortion, parameters={n: freed(f"IO.K.{n}", p) for n, p in parameters.items()}),
         fiducials={
             id_: Fiducial(freed(f"FID.K.{id_}.x", mark.x_mm), freed(f"FID.K.{id_}.y", mark.y_mm))

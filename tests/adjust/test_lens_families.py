@@ -6,7 +6,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from networks import Truth, camera_point, digital_network, field_points, simulated
+from networks import Truth, camera_point, digital_network, field_points, given_interior, simulated
 from numpy.typing import NDArray
 
 from adjust import AdjustmentError, Approximations, Camera, Network, adjust, approximate
@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 PIXEL_MM = 0.005
 SIZE_PX = np.array([4000.0, 3000.0])
 FX, FY, CX, CY = 4810.0, 4800.0, 2010.0, 1490.0
+MATRIX = np.array([[FX, 0.0, CX], [0.0, FY, CY], [0.0, 0.0, 1.0]])
+INTERIOR = np.array([FY, CX, -CY]) * PIXEL_MM
+NO_FILM = Film("none", np.empty(0), np.zeros(2))
 SKEW = 7.0
 FISHEYE = np.array([0.03, -0.02, 0.004, -0.001])
 LENS = [-0.12, 0.09, 0.0012, -0.0008, -0.03, 0.02, -0.01, 0.004, 0.0011, -0.0007, 0.0005, 0.0009]
@@ -35,8 +38,7 @@ def opencv_pixels(angles: Array, station: Array, xyz: Array) -> Array:
     """Pixels (n, 2) by OpenCV."""
     rotation = FLIP @ rotation_from_angles(angles)
     rvec, _ = cv2.Rodrigues(rotation)
-    matrix = np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]])
-    pixels, _ = cv2.projectPoints(xyz, rvec, -rotation @ station, matrix, DISTORTION)
+    pixels, _ = cv2.projectPoints(xyz, rvec, -rotation @ station, MATRIX, DISTORTION)
     return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
 
@@ -53,8 +55,7 @@ def camera(free: bool) -> Camera:
         name: Prior(value, 0.0 if name in ("k4", "k5", "k6") else sigma)
         for name, value in zip(parameter_names("opencv"), values, strict=True)
     }
-    c, x0, y0 = FY * PIXEL_MM, CX * PIXEL_MM, -CY * PIXEL_MM
-    return Camera("D", Prior(c, sigma), Prior(x0, sigma), Prior(y0, sigma), Distortion("opencv", parameters))
+    return Camera("D", *given_interior(INTERIOR, sigma), Distortion("opencv", parameters))
 
 
 def numbered(xyz: Array) -> dict[str, Array]:
@@ -69,9 +70,8 @@ def board() -> Array:
 def test_projection_is_opencvs() -> None:
     angles, station = np.array([0.2, -0.3, 0.5]), np.array([300.0, -200.0, 1500.0])
     xyz = np.random.default_rng(2).uniform(-400, 400, (50, 3))
-    interior = np.array([FY * PIXEL_MM, CX * PIXEL_MM, -CY * PIXEL_MM])
-    lens = Lens(camera(False).distortion, interior, camera(False).distortion.values)
-    image = ImageModel(lens, rotation_from_angles(angles), station, Film("none", np.empty(0), np.zeros(2)))
+    lens = Lens(camera(False).distortion, INTERIOR, camera(False).distortion.values)
+    image = ImageModel(lens, rotation_from_angles(angles), station, NO_FILM)
     projected, visible = image.comparator_from_object(xyz)
     assert visible.all()
     np.testing.assert_allclose(projected, mm(opencv_pixels(angles, station, xyz)), atol=1e-11)
@@ -87,8 +87,7 @@ def skewed(rays: Array) -> Array:
 def fisheye(rays: Array) -> Array:
     """The same by OpenCV's fisheye, whose skew is alpha fx."""
     directions = np.column_stack([rays * [1.0, -1.0], np.ones(len(rays))])[:, None]
-    matrix = np.array([[FX, 0.0, CX], [0.0, FY, CY], [0.0, 0.0, 1.0]])
-    pixels, _ = cv2.fisheye.projectPoints(directions, np.zeros(3), np.zeros(3), matrix, FISHEYE, alpha=SKEW / FX)
+    pixels, _ = cv2.fisheye.projectPoints(directions, np.zeros(3), np.zeros(3), MATRIX, FISHEYE, alpha=SKEW / FX)
     return np.asarray(np.reshape(pixels, (-1, 2)))
 
 
@@ -101,26 +100,23 @@ def test_skew_and_fisheye_are_opencvs(
 ) -> None:
     """Up to 72 degrees off the axis for the fisheye; the middle too; and back again."""
     rays = np.vstack([np.random.default_rng(3).uniform(-largest, largest, (60, 2)) / np.sqrt(2.0), np.zeros(2)])
-    interior = np.array([FY, CX, -CY]) * PIXEL_MM
-    values = np.array([*lens, FX / FY - 1.0, SKEW / FY])
-    projected, found = Lens(Distortion(family), interior, values).camera_from_ray(rays)
+    model = Lens(Distortion(family), INTERIOR, np.array([*lens, FX / FY - 1.0, SKEW / FY]))
+    projected, found = model.camera_from_ray(rays)
     assert found.all()
     np.testing.assert_allclose(projected, mm(pixels(rays)), atol=1e-11)
-    ideal, found = Lens(Distortion(family), interior, values).ideal_from_observed(projected)
+    ideal, found = model.ideal_from_observed(projected)
     assert found.all()
-    np.testing.assert_allclose((ideal - interior[1:]) / interior[0], rays, atol=1e-12)
+    np.testing.assert_allclose((ideal - INTERIOR[1:]) / INTERIOR[0], rays, atol=1e-12)
 
 
 def test_corrected_points_are_opencvs_undistorted_points() -> None:
     rng = np.random.default_rng(4)
     pixels = rng.uniform([0, 0], SIZE_PX, (40, 2))
     values = np.array([*DISTORTION, FX / FY - 1.0, 0.0])
-    interior = np.array([FY, CX, -CY]) * PIXEL_MM
-    ideal, found = Lens(Distortion("opencv"), interior, values).ideal_from_observed(mm(pixels))
-    matrix = np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]])
+    ideal, found = Lens(Distortion("opencv"), INTERIOR, values).ideal_from_observed(mm(pixels))
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 500, 1e-14)
-    normal = cv2.undistortPoints(pixels[:, None], matrix, DISTORTION, R=np.eye(3), P=np.eye(3), criteria=criteria)
-    expected = np.asarray(normal).reshape(-1, 2) * [1, -1] * interior[0] + interior[1:]
+    normal = cv2.undistortPoints(pixels[:, None], MATRIX, DISTORTION, R=np.eye(3), P=np.eye(3), criteria=criteria)
+    expected = np.asarray(normal).reshape(-1, 2) * [1, -1] * INTERIOR[0] + INTERIOR[1:]
     assert found.all()
     np.testing.assert_allclose(ideal, expected, atol=1e-9)
 
@@ -135,9 +131,8 @@ def test_adjustment_recovers_opencvs_parameters() -> None:
     rows = [
         (f"i{i}", str(j), xy) for i, pose in enumerate(poses) for j, xy in enumerate(mm(opencv_pixels(*pose, relief)))
     ]
-    c, x0, y0 = FY * PIXEL_MM, CX * PIXEL_MM, -CY * PIXEL_MM
     start = Approximations(
-        {"D": np.array([c * 1.01, x0 + 0.1, y0 - 0.1])},
+        {"D": INTERIOR * [1.01, 1.0, 1.0] + [0.0, 0.1, -0.1]},
         {f"i{i}": np.concatenate([s + rng.uniform(-10, 10, 3), a + rng.uniform(-0.02, 0.02, 3)])
          for i, (a, s) in enumerate(poses)},
         {}, {},
@@ -145,7 +140,7 @@ def test_adjustment_recovers_opencvs_parameters() -> None:
     result = adjust(digital_network(camera(True), rows, numbered(relief), 0.0005), start)
     assert result.converged
     assert result.vpv < 1e-12
-    expected = dict(zip(NAMES, DISTORTION, strict=True)) | {"c": c, "x0": x0, "y0": y0, "b1": FX / FY - 1}
+    expected = dict(zip((*NAMES, "c", "x0", "y0", "b1"), (*DISTORTION, *INTERIOR, FX / FY - 1), strict=True))
     for name, value in expected.items():
         i = result.index(f"IO.D.{name}")
         assert result.values[i] == pytest.approx(value, abs=1e-3 * np.sqrt(result.cofactor.variances[i]))
@@ -155,16 +150,9 @@ def test_torlegard_is_inverted() -> None:
     truth = Truth()
     xyz = field_points(np.random.default_rng(1), 30)
     angles, station = np.array(truth.attitudes[1]), np.array(truth.stations[1])
-    model = ImageModel(
-        Lens(
-            Distortion("torlegard"),
-            np.array([truth.c, truth.x0, truth.y0]),
-            np.array([truth.distortion.get(name, 0.0) for name in parameter_names("torlegard")]),
-        ),
-        rotation_from_angles(angles),
-        station,
-        Film("none", np.empty(0), np.zeros(2)),
-    )
+    parameters = np.array([truth.distortion.get(name, 0.0) for name in parameter_names("torlegard")])
+    lens = Lens(Distortion("torlegard"), np.array([truth.c, truth.x0, truth.y0]), parameters)
+    model = ImageModel(lens, rotation_from_angles(angles), station, NO_FILM)
     observed, visible = model.camera_from_object(xyz)
     assert visible.all()
     expected = camera_point(truth, 1, xyz)
@@ -172,9 +160,8 @@ def test_torlegard_is_inverted() -> None:
     ideal, found = model.lens.ideal_from_observed(observed)
     u, v, w = model.rotation @ (xyz - station).T
     assert found.all()
-    np.testing.assert_allclose(
-        ideal, np.stack([truth.x0 - truth.c * u / w, truth.y0 - truth.c * v / w], axis=1), atol=1e-10
-    )
+    expected = np.stack([truth.x0 - truth.c * u / w, truth.y0 - truth.c * v / w], axis=1)
+    np.testing.assert_allclose(ideal, expected, atol=1e-10)
 
 
 def test_what_has_no_image_is_reported() -> None:
@@ -188,12 +175,7 @@ def test_what_has_no_image_is_reported() -> None:
         np.array([[0.9, 0], [1.2, 0]])
     )
     assert list(found) == [True, False]
-    model = ImageModel(
-        Lens(Distortion(), np.array([100.0, 0.0, 0.0]), np.empty(0)),
-        np.eye(3),
-        np.zeros(3),
-        Film("none", np.empty(0), np.zeros(2)),
-    )
+    model = ImageModel(Lens(Distortion(), np.array([100.0, 0.0, 0.0]), np.empty(0)), np.eye(3), np.zeros(3), NO_FILM)
     _, visible = model.comparator_from_object(np.array([[0.0, 0.0, -5.0], [0.0, 0.0, 5.0], [1.0, 0.0, 0.0]]))
     assert list(visible) == [True, False, False]
 
@@ -231,8 +213,8 @@ def wide_network(seed: int, lens: Array = WIDE) -> Network:
         pixels = pixels.reshape(-1, 2)
         shown = np.flatnonzero(((pixels > 0.0) & (pixels < SIZE_PX)).all(axis=1))
         rows += [(f"i{i}", str(j), mm(pixels[j]) + rng.normal(0.0, noise_mm, 2)) for j in shown]
-    c, x0, y0 = (Prior(value * PIXEL_MM, np.inf) for value in (WIDE_FX, CX, -CY))
-    wide = Camera("D", c, x0, y0, Distortion("opencv", {name: Prior(0.0, np.inf) for name in RATIONAL}))
+    interior = given_interior(PIXEL_MM * np.array([WIDE_FX, CX, -CY]), np.inf)
+    wide = Camera("D", *interior, Distortion("opencv", {name: Prior(0.0, np.inf) for name in RATIONAL}))
     found = {row[1] for row in rows}
     return digital_network(wide, rows, {k: v for k, v in numbered(xyz).items() if k in found}, noise_mm)
 

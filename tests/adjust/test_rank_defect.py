@@ -280,24 +280,6 @@ def test_a_datum_for_the_object_leaves_the_camera_directions(datum: Datum) -> No
     assert [CAUSES["IO.c"] in direction.cause for direction in result.singular] == [True]
 
 
-def test_a_flat_field_of_heights_needs_four_datum_values() -> None:
-    """With noisy heights too, which make the equations formally regular with three."""
-    case = dropped(load("v_singular_H2D_vertcross_affine"), set())
-    rng = np.random.default_rng(1)
-    for row, sigma in zip(case["input"]["pts_obs"], case["input"]["pts_sigma"], strict=True):
-        row[2] += rng.normal(0.0, 0.02)
-        sigma[2] = 0.02
-    result = adjust_network(case, Options(datum="minimal"))
-    assert result.converged
-    fixed = [name for name in result.names if name.startswith("PT.") and result.sigma(name) == 0.0]
-    assert sorted(name[-1] for name in fixed) == ["X", "X", "Y", "Y"]
-
-
-def test_a_good_network_has_no_warning() -> None:
-    network, start = simulated(np.random.default_rng(2), free={"k3": np.inf, "p1": np.inf})
-    assert adjust(network, start).warnings == ()
-
-
 @pytest.mark.parametrize("count", [9, 40])
 def test_a_point_in_one_image_only_is_named(count: int) -> None:
     """Whether images or points are eliminated first: four images have 48 unknowns, nine points 27, forty 120."""

@@ -38,11 +38,13 @@ def comparator_mm(seed: int, count: int = 5) -> np.ndarray:
     return np.linalg.solve(AFFINE, (camera - SHIFT).T).T + noise
 
 
-def write_fiducials_project(folder: Path, marks: dict[str, int], camera: str = "", extra: tuple[str, ...] = ()) -> Path:
-    """Frames by name with so many fiducials each, and further lines of comparator.csv."""
+def write_fiducials_project(
+    folder: Path, marks: dict[str, int], camera: str = "", extra: tuple[str, ...] = (), sigma_mm: float = 0.0
+) -> Path:
+    """Frames by name with so many fiducials each, of which the camera knows that much, and further marks' lines."""
     lines = ['name = "K"', camera]
     for id_, (x, y) in GIVEN.items():
-        lines += ["[[fiducial]]", f'id = "{id_}"', f"xy_mm = [{x}, {y}]", "sigma_mm = 0"]
+        lines += ["[[fiducial]]", f'id = "{id_}"', f"xy_mm = [{x}, {y}]", f"sigma_mm = {sigma_mm}"]
     (folder / "camera.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
     rows = ["image,point,kind,x_mm,y_mm,sx_mm,sy_mm", *extra]
     for seed, (image, count) in enumerate(marks.items()):
@@ -95,12 +97,8 @@ def test_film_transformations_without_an_object(tmp_path: Path, capsys: pytest.C
 
 
 def test_a_frame_without_enough_targets_keeps_its_film_transformation(tmp_path: Path) -> None:
-    project = write_fiducials_project(
-        tmp_path,
-        {"a": 5, "b": 2},
-        "principal_distance_mm = 153.0",
-        ("a,t1,target,100.0,90.0,0.004,0.004",),
-    )
+    target = ("a,t1,target,100.0,90.0,0.004,0.004",)
+    project = write_fiducials_project(tmp_path, {"a": 5, "b": 2}, "principal_distance_mm = 153.0", target)
     (tmp_path / "points.csv").write_text("point,X,Y,Z\nt1,0,0,0\n", encoding="utf-8")
     project.write_text('camera = "camera.toml"\n[object]\npoints = "points.csv"\n', encoding="utf-8")
     assert run(["adjust", str(project)]) == 1
@@ -130,9 +128,7 @@ def test_the_form_of_the_fiducials_is_reported_where_they_are_estimated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Marks with a datum of 1 mm: no figure of mm is left in the form, and the dashes are gone."""
-    project = write_fiducials_project(tmp_path, {f"f{i}": 5 for i in range(60)})
-    camera = tmp_path / "camera.toml"
-    camera.write_text(camera.read_text(encoding="utf-8").replace("sigma_mm = 0\n", "sigma_mm = 1\n"), encoding="utf-8")
+    project = write_fiducials_project(tmp_path, {f"f{i}": 5 for i in range(60)}, sigma_mm=1.0)
     assert run(["run", str(project)]) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert re.search(r"K: Corrections to the certificate, after a common affine transformation: \d\.\d µm rms", printed)
@@ -157,10 +153,9 @@ def test_the_form_of_the_fiducials_is_reported_where_they_are_estimated(
 def test_corrections_are_to_what_the_camera_file_rests_on(
     source: str, given_by: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    project = write_fiducials_project(tmp_path, {"a": 5, "b": 5})
-    camera = tmp_path / "camera.toml"
-    text = camera.read_text(encoding="utf-8").replace("sigma_mm = 0\n", "sigma_mm = 0.01\n")
-    camera.write_text(f"{text}{source}", encoding="utf-8")
+    project = write_fiducials_project(tmp_path, {"a": 5, "b": 5}, sigma_mm=0.01)
+    with (tmp_path / "camera.toml").open("a", encoding="utf-8") as camera:
+        camera.write(source)
     run(["run", str(project)])
     assert f"Corrections to {given_by}, after a common" in " ".join(capsys.readouterr().out.split())
 
@@ -169,9 +164,7 @@ def test_a_single_frame_with_a_mere_datum_has_a_priori_sigmas(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """sigma0 was 0.003 here, and multiplied the datum's 1 mm: now the shift is known to 1 mm over the root of 5."""
-    project = write_fiducials_project(tmp_path, {"a": 5})
-    camera = tmp_path / "camera.toml"
-    camera.write_text(camera.read_text(encoding="utf-8").replace("sigma_mm = 0\n", "sigma_mm = 1\n"), encoding="utf-8")
+    project = write_fiducials_project(tmp_path, {"a": 5}, sigma_mm=1.0)
     run(["adjust", str(project)])
     printed = " ".join(capsys.readouterr().out.split())
     assert "standard deviations a priori" in printed
@@ -184,9 +177,7 @@ def test_a_single_frame_with_a_mere_datum_has_a_priori_sigmas(
 
 def test_one_frame_within_its_certificate_needs_no_attention(tmp_path: Path) -> None:
     """Four calibrated fiducials of one frame, given to 10 µm and measured to 4 µm: nothing speaks against any."""
-    project = write_fiducials_project(tmp_path, {"a": 4})
-    camera = tmp_path / "camera.toml"
-    camera.write_text(camera.read_text(encoding="utf-8").replace("sigma_mm = 0", "sigma_mm = 0.01"), encoding="utf-8")
+    project = write_fiducials_project(tmp_path, {"a": 4}, sigma_mm=0.01)
     assert run(["run", str(project)]) == 0
     rows = (tmp_path / "comparator.csv").read_text(encoding="utf-8").splitlines()
     name, id_, kind, x, *rest = rows[1].split(",")

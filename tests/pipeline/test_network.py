@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from networks import BOARD_FRAME_MM, BOARD_TRUTH, Truth, board_network, field_points, film_parameters, simulated
-from projects import write_network_project
+from projects import replace_text, write_network_project
 from studies import parametrize_with_studies
 from test_bent_boards import BENDS_MM, bent_board, make_network
 
 from adjust import Adjustment, Distortion, Parameter, Prior
 from adjust.functional_model.transformation import film_parameter_names
-from adjust.problem.network import Network, Transformation
+from adjust.problem.network import Transformation
 from pipeline import InputError, build_network, read_comparator, read_project
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
@@ -132,7 +132,7 @@ SCANS = Truth(middle_mm=(120.0, -115.0), mirrored=(False, True, False, False))
 def test_films_of_every_kind_are_adjusted_from_files(kind: Transformation, tmp_path: Path) -> None:
     points = field_points(np.random.default_rng(7), 16)
     network, _ = simulated(np.random.default_rng(4), SCANS, kind, points)
-    write_project(network, kind, tmp_path)
+    write_network_project(network, tmp_path)
     assert run(["adjust", str(tmp_path / "project.toml")]) == (1 if kind == "polynomial(2)" else 0)  # too few marks
     result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
     assert result["converged"]
@@ -158,49 +158,12 @@ def test_films_of_every_kind_are_adjusted_from_files(kind: Transformation, tmp_p
 )
 def test_a_wrong_transformation_is_reported_with_its_line(spelling: str, words: list[str], tmp_path: Path) -> None:
     network, _ = simulated(np.random.default_rng(4), noise=False)
-    write_project(network, spelling, tmp_path)
+    project = write_network_project(network, tmp_path)
+    replace_text(project, '"affine"', f'"{spelling}"')
     with pytest.raises(InputError) as caught:
-        read_project(tmp_path / "project.toml")
+        read_project(project)
     for word in ["project.toml, line 5: [adjust] transformation", *words]:
         assert word in str(caught.value)
-
-
-def write_project(network: Network, kind: Transformation, folder: Path) -> None:
-    """The network as a user would write it."""
-    camera = network.cameras[0]
-    marks = [
-        f'[[fiducial]]\nid = "{id_}"\nxy_mm = [{mark.x_mm.value!r}, {mark.y_mm.value!r}]\nsigma_mm = 1.0'
-        for id_, mark in camera.fiducials.items()
-    ]
-    interior = [prior.value for prior in (camera.principal_distance_mm, camera.x0_mm, camera.y0_mm) if prior]
-    values = [f"{name} = {prior.value!r}" for name, prior in camera.distortion.parameters.items()]
-    lines = [
-        'name = "K"\nframe_mm = [228.0, 228.0]',
-        f"principal_distance_mm = {interior[0]!r}\nprincipal_point_mm = {interior[1:]}",
-        "[sigma]\nprincipal_distance_mm = 1.0\nprincipal_point_mm = 1.0",
-        '[distortion]\nfamily = "torlegard"\n[distortion.value]',
-        *values,
-        *marks,
-    ]
-    (folder / "camera.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    rows = ["point,X,Y,Z,sX,sY,sZ"]
-    rows += [
-        ",".join([point.id, *(repr(q.value) for q in (point.X, point.Y, point.Z) if q), "0,0,0"])
-        for point in network.points
-    ]
-    (folder / "points.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
-    rows = ["image,point,kind,x_mm,y_mm,sx_mm,sy_mm"]
-    observed = network.observations
-    sigmas = np.sqrt(np.diagonal(observed.covariance_mm2, axis1=1, axis2=2))
-    for *names, xy, sigma in zip(
-        observed.image, observed.point, observed.kind, observed.xy_mm.tolist(), sigmas.tolist(), strict=True
-    ):
-        rows.append(",".join([*names, *map(repr, xy), *map(repr, sigma)]))
-    (folder / "comparator.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
-    (folder / "project.toml").write_text(
-        f'camera = "camera.toml"\n[object]\npoints = "points.csv"\n[adjust]\ntransformation = "{kind}"\n',
-        encoding="utf-8",
-    )
 
 
 Spoil = Callable[[list[str]], None]

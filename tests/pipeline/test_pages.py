@@ -183,15 +183,8 @@ def test_the_example_measures_adjusts_and_plots(names: dict[str, Any], tmp_path:
         truth.cameras["metric 6 x 6"].principal_distance_mm.value, abs=0.05
     )
     assert (tmp_path / "residuals.png").stat().st_size > 5000
-    for each in (
-        frame,
-        frame.marks[0],
-        result,
-        names["network"],
-        result.network.observations,
-        result.residuals,
-        result.reliability,
-    ):
+    shown = (frame, frame.marks[0], result, names["network"], result.network.observations, result.residuals)
+    for each in (*shown, result.reliability):
         assert "\n" not in repr(each)
         assert len(repr(each)) < 200
     assert result._repr_html_().count("<tr>") == sum(name.startswith("IO.") for name in result.names) + 1
@@ -390,19 +383,8 @@ def test_the_example_of_the_page_of_archives(tmp_path: Path, capsys: pytest.Capt
 @pytest.mark.study
 def test_the_table_of_the_page_of_boards(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pictures = sorted((real_data.DATA / "chessboards" / "opencv").glob("left[0-9]*.jpg"))
-    run(
-        [
-            "calibrate",
-            *map(str, pictures),
-            "--board",
-            "9x6",
-            "--square",
-            "25mm",
-            "--json",
-            "--out",
-            str(tmp_path / "out"),
-        ]
-    )
+    options = ("--board", "9x6", "--square", "25mm", "--json", "--out", str(tmp_path / "out"))
+    run(["calibrate", *map(str, pictures), *options])
     (camera,) = json.loads(capsys.readouterr().out)["cameras"]
     page = ROOT / "docs" / "start" / "board.md"
     rows = table(page, "parameter")

@@ -19,7 +19,7 @@ from measure.tie_points.features import TieFrame
 from measure.tie_points.joins import measure_joins
 from pipeline import InputError, read_comparator, read_images, read_measurement
 from pipeline.cli import run
-from pipeline.files.project_file import Project, read_project
+from pipeline.files.project_file import read_project
 from pipeline.measuring.tie_stage import add_joins
 from pipeline.results.measured_record import MeasuredScan
 
@@ -284,7 +284,7 @@ def test_scans_that_have_nothing_in_common_are_reported(tmp_path: Path) -> None:
 @pytest.mark.study
 def test_fiducials_that_contradict_the_joins_are_rejected(halves: Path) -> None:
     """As if the frame of the right half had been found one mark too far to the right."""
-    project = _project(halves)
+    project = read_project(halves / "project.toml")
     scans = [_bare(scan) for scan in read_measurement(halves / "out" / "measurement.db")]
     shifted = scans[1].frame.pixel_from_camera
     assert shifted is not None
@@ -293,10 +293,6 @@ def test_fiducials_that_contradict_the_joins_are_rejected(halves: Path) -> None:
     result = add_joins(project, [scans[0], wrong], lambda *_: None, None)
     assert all("contradict those of" in " ".join(scan.frame.problems) for scan in result)
     assert not any(mark.kind == "fiducial" and mark.status.is_observation for mark in result[1].frame.marks)
-
-
-def _project(folder: Path) -> Project:
-    return read_project(folder / "project.toml")
 
 
 def _bare(scan: MeasuredScan) -> MeasuredScan:
