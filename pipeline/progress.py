@@ -41,41 +41,30 @@ class Reporter:
     @contextmanager
     def stage(self, title: str) -> Iterator[TimedCount]:
         """Begin a stage; the yielded function reports its progress."""
-        started_s = time.monotonic()
-
-        def line(what: str, done: int, total: int, left_s: float | None) -> str:
-            passed_s = time.monotonic() - started_s
-            if left_s is None and done and passed_s > _EVERY_S:
-                left_s = passed_s / done * (total - done)
-            count = f"{done} of {total}" if total > 1 else ""
-            left = time_left(left_s) if left_s is not None and done < total else ""
-            return ", ".join(part for part in (" ".join(part for part in (title, count, what) if part), left) if part)
-
-        if self._console.is_terminal and not self._console.quiet:
-            columns = TextColumn("{task.description}", markup=False), BarColumn()
-            with Progress(*columns, console=self._console, transient=True) as bar:
-                task = bar.add_task(title)
-
-                def show(what: str, done: int, total: int, /, left_s: float | None = None) -> None:
-                    bar.update(task, description=line(what, done, total, left_s), completed=done, total=total)
-
-                yield show
-        else:
-            yield self._lines(line)
-
-    def say(self, text: str) -> None:
-        """Print a permanent line, above the bar if there is one."""
-        self._console.print(text, markup=False, highlight=False)
-
-    def _lines(self, line: Callable[[str, int, int, float | None], str]) -> TimedCount:
-        """Report the first and the last step, and others at intervals."""
-        shown_s = -_EVERY_S
+        started_s, shown_s, bar = time.monotonic(), -_EVERY_S, None
 
         def show(what: str, done: int, total: int, /, left_s: float | None = None) -> None:
             nonlocal shown_s
             now_s = time.monotonic()
-            if now_s - shown_s >= _EVERY_S or (done == total and total > 1):
+            if left_s is None and done and now_s - started_s > _EVERY_S:
+                left_s = (now_s - started_s) / done * (total - done)
+            count = f"{done} of {total}" if total > 1 else ""
+            left = f", {time_left(left_s)}" if left_s is not None and done < total else ""
+            line = " ".join(filter(None, (title, count, what))) + left
+            if bar is not None:
+                bar.update(bar.task_ids[0], description=line, completed=done, total=total)
+            elif now_s - shown_s >= _EVERY_S or (done == total and total > 1):  # the first, the last, and at intervals
                 shown_s = now_s
-                self.say(line(what, done, total, left_s))
+                self.say(line)
 
-        return show
+        if self._console.is_terminal and not self._console.quiet:
+            columns = TextColumn("{task.description}", markup=False), BarColumn()
+            with Progress(*columns, console=self._console, transient=True) as bar:
+                bar.add_task(title)
+                yield show
+        else:
+            yield show
+
+    def say(self, text: str) -> None:
+        """Print a permanent line, above the bar if there is one."""
+        self._console.print(text, markup=False, highlight=False)

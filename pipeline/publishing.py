@@ -174,12 +174,11 @@ def _clear(project: Project) -> None:
 
 
 def _is_alive(pid: int) -> bool:
-    if os.name != "posix":  # on other systems signal 0 would end the process
-        return True
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True
+    if os.name == "posix":  # on other systems signal 0 would end the process
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return False
+        except OSError:
+            pass
     return True

@@ -75,8 +75,6 @@ _NAME = "reseau-spelled"
 def _spelled(error: UnicodeError) -> tuple[str, int]:
     if not isinstance(error, UnicodeEncodeError):
         raise error
-    return "".join(_letter(letter) for letter in error.object[error.start : error.end]), error.end
-
-
-def _letter(letter: str) -> str:
-    return SPELLED.get(letter) or unicodedata.normalize("NFKD", letter).encode("ascii", "ignore").decode() or "?"
+    letters = error.object[error.start : error.end]
+    bare = {letter: unicodedata.normalize("NFKD", letter).encode("ascii", "ignore").decode() for letter in letters}
+    return "".join(SPELLED.get(letter) or bare[letter] or "?" for letter in letters), error.end

@@ -258,28 +258,27 @@ class SubmittedAgain(Executor):
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         outer: Future[Any] = Future()
-        self._begin(outer, partial(fn, *args, **kwargs), 0)
+        self._begin(outer, partial(fn, *args, **kwargs), KILLS)
         return outer
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         self._executor.shutdown(wait, cancel_futures=cancel_futures)
 
-    def _begin(self, outer: Future[Any], call: Callable[[], Any], losses: int) -> None:
+    def _begin(self, outer: Future[Any], call: Callable[[], Any], left: int) -> None:
         try:
             inner = self._executor.submit(call)
         except Exception as error:  # lost connection to the scheduler
             outer.set_exception(BrokenExecutor(str(error)))
             return
-        inner.add_done_callback(partial(self._done, outer, call, losses))
+        inner.add_done_callback(partial(self._done, outer, call, left - 1))
 
-    def _done(self, outer: Future[Any], call: Callable[[], Any], losses: int, inner: Future[Any]) -> None:
+    def _done(self, outer: Future[Any], call: Callable[[], Any], left: int, inner: Future[Any]) -> None:
         if outer.cancelled():
             return
-        error = None if inner.cancelled() else inner.exception()
-        if error is None and not inner.cancelled():
+        if not inner.cancelled() and inner.exception() is None:
             outer.set_result(inner.result())
-        elif losses + 1 < KILLS:
-            self._begin(outer, call, losses + 1)
+        elif left:
+            self._begin(outer, call, left)
         else:
             outer.set_exception(WorkerKilled())
 

@@ -2,7 +2,7 @@
 frame."""
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import count
 from pathlib import Path
 
@@ -51,15 +51,14 @@ def run_compare(
         A file has no calibration of the camera, or the calibrations are not comparable.
     """
     labels = _labels(paths)
-    contents = [read_adjustment(path) for path in paths]
-    chosen = [calibrated_lens(path, content, camera) for path, content in zip(paths, contents, strict=True)]
-    names, lenses = zip(*chosen, strict=True)
-    calibrations = [_calibration(*each) for each in zip(paths, contents, names, lenses, labels, strict=True)]
+    contents = {path: read_adjustment(path) for path in paths}
+    lenses = {path: calibrated_lens(path, content, camera) for path, content in contents.items()}
+    calibrations = [_calibration(path, contents[path], *lenses[path], label) for path, label in labels.items()]
     # Half width and height of the area calibrated in all: extent of the observations from the origin.
-    halves = [np.abs(observed_mm(*each)).max(axis=0) for each in zip(paths, contents, names, strict=True)]
+    halves = [np.abs(observed_mm(path, contents[path], name)).max(axis=0) for path, (name, _) in lenses.items()]
     half_x_mm, half_y_mm = np.min(halves, axis=0).tolist()
     comparison = compare(calibrations, (half_x_mm, half_y_mm), times, use)
-    record = comparison_record(comparison, _remarks(paths, contents, names), level)
+    record = comparison_record(comparison, _remarks(contents, [name for name, _ in lenses.values()]), level)
     if out is not None:
         check_writable(out)
         write_record(record, out / "compare.json")
@@ -67,7 +66,7 @@ def run_compare(
     return comparison, record
 
 
-def _labels(paths: Sequence[Path]) -> list[str]:
+def _labels(paths: Sequence[Path]) -> dict[Path, str]:
     """Shortest distinct names of the files: the last parts of their paths, after removal of a common ending."""
     parts = [path.resolve().with_suffix("").parts for path in paths]
     twice = next((path for k, path in enumerate(paths) if parts[k] in parts[:k]), None)
@@ -76,7 +75,7 @@ def _labels(paths: Sequence[Path]) -> list[str]:
     while len(parts) > 1 and len({each[-1] for each in parts}) == 1:
         parts = [each[:-1] for each in parts]
     enough = next(n for n in count(1) if len({each[-n:] for each in parts}) == len(parts))
-    return ["/".join(each[-enough:]) for each in parts]
+    return {path: "/".join(each[-enough:]) for path, each in zip(paths, parts, strict=True)}
 
 
 def calibrated_lens(path: Path, content: AdjustmentRecord, name: str | None) -> tuple[str, Lens]:
@@ -107,15 +106,15 @@ def _calibration(path: Path, content: AdjustmentRecord, name: str, lens: Lens, l
     return CameraCalibration(label, lens, marks, covariance, redundancy)
 
 
-def _remarks(paths: Sequence[Path], contents: Sequence[AdjustmentRecord], names: Sequence[str]) -> tuple[str, ...]:
+def _remarks(contents: Mapping[Path, AdjustmentRecord], names: Sequence[str]) -> tuple[str, ...]:
     remarks = [
         f"{path}: was adjusted with an earlier calibration as an observation. If that one is among those compared, "
         "they are not independent, and the test is milder than it says."
-        for path, content in zip(paths, contents, strict=True)
+        for path, content in contents.items()
         if content.calibrations
     ]
     alike = defaultdict(list)
-    for path, content in zip(paths, contents, strict=True):
+    for path, content in contents.items():
         alike[content.made_from.get("marks")].append(str(path))
     remarks += [
         f"{listed(same)} were adjusted from the same measured marks: they are not independent, and that they agree "

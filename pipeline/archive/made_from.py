@@ -5,7 +5,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from pipeline.archive.results_database import known_identities
+from pipeline.archive.results_database import Store
 from pipeline.files.project_file import Project
 from pipeline.provenance import FileStates, Identity, fingerprint, hash_text, parts_hash
 from pipeline.results.comparator_file import ComparatorPoint
@@ -35,7 +35,10 @@ _ORIGIN = {"path", "source"}
 def measured_from(project: Project) -> MadeFrom:
     """Inputs of a measurement: every scan, what is sought in it, and the approximate values used to predict targets.
     The latter do not change a measured mark, but determine which ones are found and how they are named."""
-    known, files = known_identities(project.measurement_path), FileStates(project.path.resolve().parent)
+    known, files = dict[str, Identity](), FileStates(project.path.resolve().parent)
+    if project.measurement_path.exists():
+        with Store(project.measurement_path) as store:
+            known = store.identities()
     coordinates = {id: [prior and prior.value for prior in (p.X, p.Y, p.Z)] for id, p in project.object_points.items()}
     places = [
         coordinates,

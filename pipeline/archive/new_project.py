@@ -131,7 +131,13 @@ class NewProject:
             "are of several cameras of one type, by their plates: give each a camera file with its number",
             [f"{name}: Nr {', '.join(sorted(own))}" for name, own in numbers.items() if len(own) > 1],
         )
-        yield "have a resolution in their files that their marks contradict", [*self._contradicted_pitches()]
+        against = {
+            group: [each for sample in group.samples if (each := sample.against_pitch())] for group in self.named
+        }
+        yield (
+            "have a resolution in their files that their marks contradict",
+            [f"{group.folder}: {sentences[0]}" for group, sentences in against.items() if sentences],
+        )
 
     def notes(self) -> Iterator[str]:
         """Yield information that needs no action."""
@@ -189,12 +195,6 @@ class NewProject:
                 others = [name for name in group.candidates if name != group.camera][: CANDIDATES - 1]
                 alike[group.camera, *others].append(str(group.folder))
         return {cameras: sorted(set(folders)) for cameras, folders in alike.items()}
-
-    def _contradicted_pitches(self) -> Iterator[str]:
-        for group in self.named:
-            contradiction = next((against for sample in group.samples if (against := sample.against_pitch())), "")
-            if contradiction:
-                yield f"{group.folder}: {contradiction}"
 
 
 def init_project(given: Sequence[Path], folder: Path, reporter: Reporter, max_pixels: int | None = None) -> NewProject:
@@ -372,12 +372,13 @@ def _relative_name(folder: Path, path: Path) -> str:
 
 def _totals(new: NewProject) -> dict[str, tuple[int, int]]:
     """{camera: (number of scans, number of folders)}."""
-    scans, folders = defaultdict[str, int](int), defaultdict[str, set[Path]](set)
+    of_camera = defaultdict[str, list[ScanGroup]](list)
     for group in new.found.groups:
-        key = group.camera or ("digital camera" if group.digital else "camera unknown")
-        scans[key] += len(group.paths)
-        folders[key].add(group.folder)
-    return {key: (count, len(folders[key])) for key, count in scans.items()}
+        of_camera[group.camera or ("digital camera" if group.digital else "camera unknown")].append(group)
+    return {
+        camera: (sum(len(group.paths) for group in groups), len({group.folder for group in groups}))
+        for camera, groups in of_camera.items()
+    }
 
 
 def _place(group: ScanGroup) -> str:

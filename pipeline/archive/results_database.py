@@ -336,14 +336,6 @@ class Store(Database):
         return int(self.connection.execute(query, versions).fetchone()[0])
 
 
-def known_identities(path: Path) -> dict[str, Identity]:
-    """`Store.identities` of a store; empty where there is none."""
-    if not path.exists():
-        return {}
-    with Store(path) as store:
-        return store.identities()
-
-
 def places(count: int) -> str:
     return ", ".join("?" * count)
 
@@ -372,19 +364,16 @@ def merge(store: Store, others: Sequence[Path]) -> list[Merged]:
         if path.resolve() == store.path.resolve():
             raise InputError(f"{path}: is the results database that the others are joined into. Name the others only.")
         Store(path).close()
-    return [_merge_store(store, path) for path in others]
-
-
-def _merge_store(store: Store, path: Path) -> Merged:
-    db = store.connection
-    db.execute("attach ? as other", (str(path),))
-    try:
-        results, sound = db.execute(f"select count(*), total({_SOUND}) from other.result r").fetchone()
-        with store.writing():
-            new = _insert(db)
-    finally:
-        db.execute("detach other")
-    return Merged(path, results, new, results - int(sound))
+    db, merged = store.connection, []
+    for path in others:
+        db.execute("attach ? as other", (str(path),))
+        try:
+            results, sound = db.execute(f"select count(*), total({_SOUND}) from other.result r").fetchone()
+            with store.writing():
+                merged.append(Merged(path, results, _insert(db), results - int(sound)))
+        finally:
+            db.execute("detach other")
+    return merged
 
 
 def _insert(db: sqlite3.Connection) -> int:

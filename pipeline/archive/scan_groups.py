@@ -341,19 +341,19 @@ def identify_sample(
     path, likely = sample
     try:
         head = read_head(path, max_pixels)
-        board = _board(path, max_pixels) if head.camera or has_sensor_size(head) else ""
+        board = ""
+        if head.camera or has_sensor_size(head):
+            with open_scan(path, max_pixels) as scan:
+                board = recognise_board(scan)
         if board or head.camera:
             return Identification(path, (), board=board)
         found = identify(path, cameras, pitch_um, Reporter(Console(quiet=True)), max_pixels, likely)
-        is_scan = head.pitch.um is not None
-        return found if found.best or is_scan else replace(found, board=_board(path, max_pixels))
+        if found.best or head.pitch.um is not None:
+            return found
+        with open_scan(path, max_pixels) as scan:
+            return replace(found, board=recognise_board(scan))
     except MeasurementError as error:
         return str(error)
-
-
-def _board(path: Path, max_pixels: int | None) -> str:
-    with open_scan(path, max_pixels) as scan:
-        return recognise_board(scan)
 
 
 def print_groups(grouped: Catalogue, console: Console) -> None:

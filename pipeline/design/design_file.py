@@ -165,11 +165,11 @@ def _reliability(expected: Expected) -> Content:
             "smallest_error": {"median": one.median, "largest": one.largest, "unit": error_unit(one.group)},
             "unchecked": one.unchecked,
         }
-        for one in expected.reliability.groups
+        for one in expected.groups
     }
     camera = [
         {"parameter": one.parameter.text, "effect_in_sigmas": one.in_sigmas, "error_in": one.cause}
-        for one in expected.reliability.camera
+        for one in expected.outer_effects
     ]
     return {"groups": groups, "camera": camera}
 

@@ -1,6 +1,7 @@
 """Expected precision and reliability of a setup: of the camera, the distortion along the radius, and the points."""
 
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -48,27 +49,18 @@ class GroupReliability:
     unchecked: int
 
 
-@dataclass(frozen=True)
-class PlannedReliability:
-    """Inner reliability by groups and outer reliability by camera parameters (Baarda)."""
-
-    groups: tuple[GroupReliability, ...]
-    camera: tuple[OuterEffect, ...]
-
-
-def planned_reliability(plan: Plan) -> PlannedReliability:
-    """Reliability of a plan for its sigma0; empty without redundancy."""
-    found = plan.adjustment.reliability
+def group_reliability(plan: Plan) -> tuple[GroupReliability, ...]:
+    """Inner reliability (Baarda) of a plan for its sigma0 by groups; empty without redundancy."""
+    found, groups = plan.adjustment.reliability, defaultdict[str, list[tuple[float, float]]](list)
     if found is None:
-        return PlannedReliability((), ())
-    groups: dict[str, list[tuple[float, float]]] = {}
+        return ()
     for unit, redundancy, smallest in zip(found.tested, found.redundancy, found.smallest, strict=True):
         scale = plan.sigma0 * (UM_PER_MM if unit.group in IN_MM else 1.0)
-        rows = groups.setdefault(unit.group, [])
-        rows += [(float(redundancy[i]), scale * float(smallest[i])) for i in range(len(unit.coordinates))]
+        pairs = zip(redundancy.tolist(), (scale * smallest).tolist(), strict=True)
+        groups[unit.group] += list(pairs)[: len(unit.coordinates)]
     for each in plan.adjustment.further:
-        groups.setdefault(each.group, []).append((each.redundancy, plan.sigma0 * each.detectable))
-    return PlannedReliability(tuple(_group(name, rows) for name, rows in groups.items()), tuple(found.outer))
+        groups[each.group].append((each.redundancy, plan.sigma0 * each.detectable))
+    return tuple(_group(name, rows) for name, rows in groups.items())
 
 
 def error_unit(group: str) -> str:
@@ -167,8 +159,13 @@ class Expected:
         )
 
     @cached_property
-    def reliability(self) -> PlannedReliability:
-        return planned_reliability(self.plan)
+    def groups(self) -> tuple[GroupReliability, ...]:
+        return group_reliability(self.plan)
+
+    @property
+    def outer_effects(self) -> Sequence[OuterEffect]:
+        """Outer reliability by camera parameters (Baarda)."""
+        return self.plan.adjustment.reliability.outer if self.plan.adjustment.reliability else ()
 
     @cached_property
     def point_sigmas(self) -> Array:

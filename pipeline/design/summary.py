@@ -155,10 +155,10 @@ def _tables(design: Design) -> Iterator[PrintedTable]:
     ]
     yield "Object points, sigma", ("coordinate", "rms", "largest"), points
     heads = ("kind", "coordinates", "redundancy", "median", "largest", "unchecked")
-    yield "Smallest gross errors that are found", heads, map(_reliability_row, expected.reliability.groups)
+    yield "Smallest gross errors that are found", heads, map(_reliability_row, expected.groups)
     # Outer reliability of the camera; of the fiducials only the worst is shown.
-    marks = [one for one in expected.reliability.camera if one.parameter.kind == "fiducial"]
-    effects = [one for one in expected.reliability.camera if one not in marks]
+    marks = [one for one in expected.outer_effects if one.parameter.kind == "fiducial"]
+    effects = [one for one in expected.outer_effects if one not in marks]
     effects += sorted(marks, key=lambda one: -one.in_sigmas)[:1]
     outer = [(one.parameter.label, f"{one.in_sigmas:.1f}", one.cause) for one in effects]
     yield "What errors that are not found may do to the camera", ("parameter", "in its sigmas", "error in"), outer

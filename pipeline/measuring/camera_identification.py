@@ -72,10 +72,10 @@ def add_plates(
     ----------
     cameras : all cameras of the project, by their names in images.csv.
     """
-    plates = {scan.frame.image: parse_plate(scan.frame.writing or ()) for scan in scans}
-    numbers = sorted({plate["camera_number"] for plate in plates.values() if "camera_number" in plate})
+    plates = [parse_plate(scan.frame.writing or ()) for scan in scans]
+    numbers = sorted({plate["camera_number"] for plate in plates if "camera_number" in plate})
     known = {other.number: name for name, other in cameras.items() if other.number}
-    return [_add_plate(camera, scan, plates[scan.frame.image], numbers, known) for scan in scans]
+    return [_add_plate(camera, scan, plate, numbers, known) for scan, plate in zip(scans, plates, strict=True)]
 
 
 def _add_plate(

@@ -209,7 +209,8 @@ def identify(
     reports = {name: source.reports for name, source in sources.items() if source}
     trials = [replace(trial, pixel_um=trial.pixel_um and trial.pixel_um / times) for trial in trials]
     ranked = tuple(sorted(trials, key=lambda trial: (-trial.score, trial.expected)))
-    plate = _plate(picture) if any(trial.stands_out for trial in trials) else {}
+    reader = networks() if any(trial.stands_out for trial in trials) else None
+    plate = {} if reader is None else parse_plate(read_writing(picture, reader, enough=is_whole_plate))
     against_plate = {name: contradictions(camera, plate) for name, camera in cameras.items()}
     contradicted = {name: against for name, against in against_plate.items() if against}
     return Identification(path, ranked, unreported, given, plate, contradicted, alike, reports)
@@ -247,12 +248,6 @@ def _limit_drawings(layout: FiducialLayout) -> FiducialLayout:
     pairs = zip(layout.marks, limit_to_frame(layout).marks, strict=True)
     marks = tuple(limited if (np.abs(given.xy_mm) < half_mm).all() else given for given, limited in pairs)
     return replace(layout, marks=marks)
-
-
-def _plate(picture: Scan) -> dict[str, str]:
-    """Text of the camera's own plate, by field; empty if no text networks are installed."""
-    reader = networks()
-    return {} if reader is None else parse_plate(read_writing(picture, reader, enough=is_whole_plate))
 
 
 def _alike_in_scan(
@@ -336,7 +331,9 @@ def _trials(search: LayoutSearch, tries: Mapping[Names, Tried], count: Count) ->
     """Try the layouts in order of their expected false alarms."""
     # Once a layout stands out, others are measured only if they are significant and may hold more marks.
     trials: list[Trial] = []
-    ranked = sorted(tries, key=lambda names: _likeliest_first(tries[names]))
+    # By two digits of these; among equals (layouts with the same corners) the fewest marks first.
+    keys = {names: (float(f"{each.answer.expected:.2g}"), len(each.layout.marks)) for names, each in tries.items()}
+    ranked = sorted(tries, key=keys.__getitem__)
     for done, names in enumerate(ranked, len(ranked)):
         each, standing = tries[names], [trial for trial in trials if trial.stands_out]
         limits = [_expected_at_most(trial, len(each.layout.marks)) for trial in standing]
@@ -346,11 +343,6 @@ def _trials(search: LayoutSearch, tries: Mapping[Names, Tried], count: Count) ->
             count(", ".join(names), done, 2 * len(ranked))
             trials.append(_trial(search, names, each, CLOSE * max((trial.score for trial in standing), default=0.0)))
     return trials
-
-
-def _likeliest_first(each: Tried) -> tuple[float, int]:
-    """Sort key: expected false alarms, two digits; among equals (layouts with the same corners) fewest marks first."""
-    return float(f"{each.answer.expected:.2g}"), len(each.layout.marks)
 
 
 def _expected_at_most(seen: Trial, marks: int) -> float:

@@ -228,36 +228,20 @@ def note_same_frames(scans: Sequence[MeasuredScan], part_of: Callable[[str], str
     ----------
     part_of : the frame of which an image is one of several partial scans; these share a frame on purpose.
     """
-    named: dict[tuple[tuple[str, str], ...], list[str]] = {}
-    names = {scan.frame.image: _name(scan.frame) for scan in scans}
-    for image, name in names.items():
-        if name:
-            named.setdefault(name, []).append(image)
-    return [_note_same_frame(scan, names[scan.frame.image], named, part_of) for scan in scans]
-
-
-def _name(frame: FrameMeasurement) -> tuple[tuple[str, str], ...]:
-    """Fields that identify the frame: its number and the run, its frames or the date, as far as they are known."""
-    values = unique_fields(frame.writing or (), ("frame", *_SAME))
-    return tuple(values.items()) if "frame" in values and len(values) > 1 else ()
-
-
-def _note_same_frame(
-    scan: MeasuredScan,
-    name: tuple[tuple[str, str], ...],
-    named: Mapping[tuple[tuple[str, str], ...], list[str]],
-    part_of: Callable[[str], str],
-) -> MeasuredScan:
-    own = scan.frame.image
-    others = [
-        image for image in named.get(name, ()) if image != own and not (part_of(own) and part_of(image) == part_of(own))
-    ]
-    if not name or not others:
-        return scan
-    text = ", ".join(f"{field} {value}" for field, value in name)
-    problem = Reason(
-        f"its writing says {text}, and so does that of {' and '.join(others)}: these are scans of one frame, or a line "
-        "is misread. Leave one of them out, or look at frames.csv.",
-        Code.AMBIGUOUS,
-    )
-    return scan.changed(problems=[problem])
+    # The number identifies a frame together with the run, its frames or the date.
+    fields = {scan.frame.image: unique_fields(scan.frame.writing or (), ("frame", *_SAME)) for scan in scans}
+    named = defaultdict[str, list[str]](list)
+    for image, values in fields.items():
+        if "frame" in values and len(values) > 1:
+            named[", ".join(f"{field} {value}" for field, value in values.items())].append(image)
+    problems = dict[str, Reason]()
+    for text, images in named.items():
+        for own in images:
+            alike = [image for image in images if not (part_of(own) and part_of(image) == part_of(own))]
+            if others := [image for image in alike if image != own]:
+                problems[own] = Reason(
+                    f"its writing says {text}, and so does that of {' and '.join(others)}: these are scans of one "
+                    "frame, or a line is misread. Leave one of them out, or look at frames.csv.",
+                    Code.AMBIGUOUS,
+                )
+    return [scan.changed(problems=[problems[name]] if (name := scan.frame.image) in problems else []) for scan in scans]

@@ -198,19 +198,12 @@ class NamedField:
         tree = cKDTree([one.center_px for one in named])
         near = np.arange(1, min(_NEIGHBOURS, len(named)) + 1)
         return tuple(
-            self._as_found(one)
-            if one.point in self.candidates
-            else replace(one, center_px=one.center_px + np.median(off[tree.query(one.center_px, k=near)[1]], axis=0))
+            replace(one, center_px=one.center_px + np.median(off[tree.query(one.center_px, k=near)[1]], axis=0))
+            if (found := self.candidates.get(one.point)) is None
+            else replace(
+                one, center_px=found.center_px, pixel_from_disk=found.pixel_from_disk, search_px=_FOUND_WITHIN_PX
+            )
             for one in predicted
-        )
-
-    def _as_found(self, predicted: TargetPrediction) -> TargetPrediction:
-        found = self.candidates[predicted.point]
-        return replace(
-            predicted,
-            center_px=found.center_px,
-            pixel_from_disk=found.pixel_from_disk,
-            search_px=_FOUND_WITHIN_PX,
         )
 
 

@@ -236,13 +236,12 @@ def _reasons(lost: list[Mark]) -> str:
     alike: dict[str, list[Mark]] = {}
     for mark in lost:
         alike.setdefault(f"{mark.status}: {masked_text(mark.reason)}", []).append(mark)
-    return "; ".join(_lost_marks(marks) for marks in list(alike.values())[:LISTED])
-
-
-def _lost_marks(marks: list[Mark]) -> str:
-    first, names = marks[0], listed([mark.point for mark in marks])
-    like = f", such as {first.point}" if len({mark.reason for mark in marks}) > 1 else ""
-    return f"{names} {first.status}{like}: {first.reason.rstrip('.')}"
+    sentences = []
+    for first, *others in list(alike.values())[:LISTED]:
+        like = f", such as {first.point}" if any(mark.reason != first.reason for mark in others) else ""
+        names = listed([mark.point for mark in (first, *others)])
+        sentences.append(f"{names} {first.status}{like}: {first.reason.rstrip('.')}")
+    return "; ".join(sentences)
 
 
 def pixel_locking(places_px: Mapping[str, Array]) -> Iterator[Problem]:

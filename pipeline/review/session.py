@@ -210,12 +210,10 @@ class Filters:
     search: str = ""
 
     def lets_through(self, entry: Entry) -> bool:
+        whole = ("question", "verdict", "status", "camera")
         return (
-            self.question in ("", entry.question)
-            and self.verdict in ("", entry.verdict)
-            and self.status in ("", entry.status)
+            all(getattr(self, name) in ("", getattr(entry, name)) for name in whole)
             and (not self.code or self.code in entry.code.split())
-            and self.camera in ("", entry.camera)
             and (not self.folder or f"{entry.folder}/".startswith(f"{self.folder}/"))
             and (not self.search or any(self.search.lower() in image.lower() for image in entry.images))
         )

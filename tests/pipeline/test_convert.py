@@ -205,7 +205,7 @@ def test_a_file_named_twice_is_refused(project: Path, capsys: pytest.CaptureFixt
     ],
 )
 def test_calibrations_are_named_by_what_differs_in_their_paths(files: tuple[str, ...], labels: list[str]) -> None:
-    assert _labels([Path(file) for file in files]) == labels
+    assert list(_labels([Path(file) for file in files]).values()) == labels
 
 
 C, K3, K5 = 153.02, 2.0e-8, -1.5e-12

@@ -348,7 +348,7 @@ def test_a_distance_has_the_part_that_its_variance_gives_it(tmp_path: Path) -> N
         assert after.plan.sigma(name) == pytest.approx(np.sqrt(expected[i, i]), rel=1e-6)
     (finding,) = after.plan.adjustment.further
     assert finding.redundancy == pytest.approx(sigma**2 / (sigma**2 + row @ gain), rel=1e-6)
-    assert {group.group for group in after.reliability.groups} >= {"distance"}
+    assert {group.group for group in after.groups} >= {"distance"}
 
 
 def test_observed_orientations_hold_what_they_are_of(tmp_path: Path) -> None:

@@ -252,7 +252,7 @@ RC10 = parse_camera(
 def test_a_plate_is_held_against_the_cameras_file() -> None:
     own = add_plates(RC10, [scan("a", [line("WILD 15/4 UAG"), line("Nr 13043 152.75")]), scan("b", None)], {})
     assert own[0].frame.problems == ()
-    assert "(Nr 13043) says a principal distance of 152.75 mm, its file 153 mm" in own[0].notes[0]
+    assert "(Nr 13043) says a principal distance of 152.75 mm, the camera file 153 mm" in own[0].notes[0]
     assert own[1].notes == ()
     assert contradictions(RC10, parse_plate([line("RMK A 30/23"), line("Nr 1234 305.12")])) == [
         "it is of a camera by Zeiss",
