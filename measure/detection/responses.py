@@ -77,7 +77,8 @@ class ByteCache(Generic[Cached]):
         return self._entries[key][0]
 
     def put(self, key: Hashable, value: Cached, size_bytes: int) -> None:
-        """Add a value that is not cached yet."""
+        """Add a value, in place of an earlier one of the same key."""
+        self._bytes -= self._entries.pop(key, (value, 0))[1]
         self.make_room(size_bytes)
         self._entries[key] = value, size_bytes
         self._bytes += size_bytes
@@ -167,11 +168,12 @@ class ScanMaps(Mapping[Key, Map]):
         height, width = self._scan.height_px // self._reduction, self._scan.width_px // self._reduction
         kind_bytes = 4 * height * width * len(self._set.signs)
         most = max(self._cache.limit_bytes // kind_bytes, 1)
-        details, sign = self._set.details_px, next(iter(self._set.signs))
+        details = self._set.details_px
         missing = [
             kind
             for kind in range(first, len(details))
-            if details[kind] == details[first] and self._cache.get((self._own, (kind, sign))) is None
+            if details[kind] == details[first]
+            and any(self._cache.get((self._own, (kind, sign))) is None for sign in self._set.signs)
         ][:most]
         self._cache.make_room(len(missing) * kind_bytes)
         maps = self._set.maps(missing, self._pictures())

@@ -355,6 +355,14 @@ def test_what_is_not_cached_any_more_is_made_again() -> None:
     assert few[0, 1] is not first
 
 
+def test_a_map_of_which_only_the_other_polarity_is_cached_is_made_again() -> None:
+    every, cache = maps(ByteCache(100 * MAP_BYTES)), ByteCache[Map](3 * MAP_BYTES)
+    few = maps(cache)
+    for key in ((0, -1), (0, 1), (1, 1), (0, -1), (1, 1), (1, -1), (0, -1)):
+        np.testing.assert_array_equal(few[key], every[key])
+        assert cache._bytes == sum(size for _, size in cache._entries.values()) <= cache.limit_bytes
+
+
 def test_a_faint_mark_next_to_the_frames_edge_is_what_answers_most() -> None:
     """The edge is nine times as strong as the mark on overexposed film."""
     rng = np.random.default_rng(1)
