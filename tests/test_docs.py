@@ -6,9 +6,9 @@ import os
 import re
 import subprocess
 from pathlib import Path
-from types import ModuleType
 
 import pytest
+from loaded_script import script
 
 DOCS = Path(__file__).parents[1] / "docs"
 MKDOCS = DOCS.parent / ".venv-docs" / "bin" / "mkdocs"
@@ -48,7 +48,7 @@ def test_every_link_of_the_pages_leads_somewhere() -> None:
 @pytest.mark.study
 def test_the_gallery_quotes_the_program() -> None:
     page = (DOCS / "failure-gallery.md").read_text(encoding="utf-8")
-    assert leveled(page) == leveled(script("make_gallery").text()), "run python docs/make_gallery.py"
+    assert leveled(page) == leveled(script(DOCS / "make_gallery.py").text()), "run python docs/make_gallery.py"
 
 
 def leveled(text: str) -> str:
@@ -61,7 +61,7 @@ def leveled(text: str) -> str:
 )
 def test_the_matrices_of_the_figures(name: str, shape: tuple[int, int], filled: int) -> None:
     """Ten points, eight fiducials, five images: 2 x 2 blocks in A; in B 19 elements a target's row, 4 a fiducial's."""
-    module = script("make_structure")
+    module = script(DOCS / "make_structure.py")
     matrix = module.structure().matrices[name]
     assert matrix.shape == shape
     if name == "B":
@@ -71,24 +71,14 @@ def test_the_matrices_of_the_figures(name: str, shape: tuple[int, int], filled: 
     assert (DOCS / f"figure-{'ABN'.index(name) + 1}-{name}.png").stat().st_size < 150_000
 
 
-def script(name: str) -> ModuleType:
-    """A script of docs/ as a module."""
-    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_every_module_stands_on_the_map_of_the_code_with_its_own_words() -> None:
     page = (DOCS / "code.md").read_text(encoding="utf-8")
-    assert page == script("make_code_map").mapped(page), "run python docs/make_code_map.py"
+    assert page == script(DOCS / "make_code_map.py").mapped(page), "run python docs/make_code_map.py"
 
 
 def test_the_page_of_keys_is_current() -> None:
     page = (DOCS / "keys.md").read_text(encoding="utf-8")
-    assert page == script("make_keys").text(), "run python docs/make_keys.py"
+    assert page == script(DOCS / "make_keys.py").text(), "run python docs/make_keys.py"
     assert "| `film_sigma_um` | number, 0 or more | µm | 0 |" in page
 
 

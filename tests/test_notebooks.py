@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_docs import script
+from loaded_script import script
 
 import reseau
 
@@ -42,6 +42,6 @@ def test_it_is_stored_with_its_plots_and_names_what_there_is(path: Path) -> None
 
 @pytest.mark.study
 def test_it_runs_to_its_end(path: Path, tmp_path: Path) -> None:
-    made = script("run_notebooks").executed(path, tmp_path)
+    made = script(path.parents[1] / "run_notebooks.py").executed(path, tmp_path)
     assert figures(made) == figures(json.loads(path.read_text(encoding="utf-8")))
     assert [each for cell in code_cells(made) for each in cell["outputs"] if each["output_type"] == "execute_result"]

@@ -21,22 +21,10 @@ ALLOWED = {
     "pipeline": PACKAGES - {"reseau"},
     "reseau": set[str](),  # by names alone
 }
-ADJUST_FROM_THE_GROUND_UP = (
-    "errors",
-    "array_types",
-    "linear_algebra",
-    "functional_model",
-    "problem",
-    "least_squares",
-    "rank_defect",
-    "validation",
-    "initial_values",
-    "quality",
-    "display",
-    "solution",
-    "target_identification",
-    "model_selection",
-)  # folders, and the files at the root
+ADJUST_FROM_THE_GROUND_UP = (  # folders, and the files at the root
+    "errors", "array_types", "linear_algebra", "functional_model", "problem", "least_squares", "rank_defect",
+    "validation", "initial_values", "quality", "display", "solution", "target_identification", "model_selection",
+)  # fmt: skip
 TYPES_ALONE = {"_typeshed"}  # known to type checkers, and not to Python
 USED_WHERE_INSTALLED = {"pandas"}  # tables are given in it; nothing needs it
 LOADED_BY_OTHERS = {"s3fs"}  # by fsspec, for addresses of its scheme

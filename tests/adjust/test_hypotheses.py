@@ -36,18 +36,12 @@ QUICK = ("lens: no radial term", "mm for m, stations in m", "noise too small")
 SOUND = MISFITS[NOTHING]
 
 
+@pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.study)], ids=["board", "deep field"])
 @pytest.mark.parametrize(
     "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.study) for name in MISFITS]
 )
-def test_what_the_model_lacks_is_named(name: str) -> None:
-    sentences, _ = misfit_sentences(draw_network(name, 4))
-    assert misfit_outcome(name, sentences) == "named", sentences
-
-
-@pytest.mark.study
-@pytest.mark.parametrize("name", list(MISFITS))
-def test_what_the_model_of_a_deep_field_lacks_is_named(name: str) -> None:
-    sentences, _ = misfit_sentences(draw_network(name, 5))
+def test_what_the_model_lacks_is_named(name: str, seed: int) -> None:
+    sentences, _ = misfit_sentences(draw_network(name, seed))
     assert misfit_outcome(name, sentences) == "named", sentences
 
 

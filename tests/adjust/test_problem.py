@@ -144,20 +144,6 @@ def test_an_image_with_two_targets_and_a_known_orientation_is_adjusted() -> None
     assert result.converged
 
 
-@pytest.mark.study
-def test_wrong_point_numbers_diverge_or_show() -> None:
-    """Two images whose points are numbered the other way round never end as if all were well."""
-    network, start = simulated(np.random.default_rng(1))
-    observations = network.observations
-    swapped = tuple(
-        str(11 - int(point)) if kind == "target" and image in ("f1", "f2") else point
-        for image, point, kind in zip(observations.image, observations.point, observations.kind, strict=True)
-    )
-    result = adjust(replace(network, observations=replace(observations, point=swapped)), start)
-    assert result.termination in ("diverged", "iteration limit", "converged")
-    assert not result.converged or result.sigma0 > 100.0
-
-
 def test_bad_options_are_refused() -> None:
     with pytest.raises(ValueError, match=r"datum must be one of control, minimal, free"):
         Options(datum=cast(Datum, "fixed"))

@@ -268,6 +268,12 @@ def measured(
     return result
 
 
+def pose_of(frame: FrameMeasurement) -> tuple[str, bool]:
+    """The name of a frame's scan orientation, and whether it is decided."""
+    assert frame.pose is not None
+    return frame.pose.name, frame.pose.decided
+
+
 def assert_right(result: FrameMeasurement, layout: FiducialLayout, matrix: Array) -> None:
     """All marks measured, with the right names, within their standard deviations."""
     for mark, given in zip(result.marks, layout.marks, strict=True):

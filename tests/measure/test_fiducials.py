@@ -19,6 +19,7 @@ from drawn import (
     measured,
     paint,
     pixel_from_camera,
+    pose_of,
     written_scan,
 )
 from scipy.ndimage import gaussian_filter
@@ -45,8 +46,7 @@ from measure.marks.templates import cut, learn_template
 def test_identification_dots_decide_each_of_eight_poses(pose: str, tmp_path: Path) -> None:
     matrix = pixel_from_camera(pose)
     result = measured(frame_picture(NUMBERED, matrix), NUMBERED, tmp_path)
-    assert result.pose is not None
-    assert (result.pose.name, result.pose.decided) == (pose, True), result.pose.evidence
+    assert pose_of(result) == (pose, True), result.pose
     assert_right(result, NUMBERED, matrix)
     assert result.pixel_from_camera is not None
     np.testing.assert_allclose(result.pixel_from_camera, matrix, atol=0.02)
@@ -151,8 +151,7 @@ def test_the_users_pose_is_taken(tmp_path: Path) -> None:
 def test_a_pose_of_the_user_that_the_picture_contradicts_is_reported(tmp_path: Path) -> None:
     matrix = pixel_from_camera("90m")
     result = measured(frame_picture(NUMBERED, matrix), NUMBERED, tmp_path, FiducialOptions(pose="0"))
-    assert result.pose is not None
-    assert (result.pose.name, result.pose.decided) == ("0", True)
+    assert pose_of(result) == ("0", True)
     assert any(
         "pose 0 is set in the project, but the marks of this frame show 90m" in problem
         and "identification dots" in problem
@@ -164,8 +163,7 @@ def test_marks_places_decide_where_they_are_not_symmetric(tmp_path: Path) -> Non
     uneven = layout_of([MarkShape(RING_CROSS)] * 4, ((7.0, -7.0), (-7.0, -7.0), (-7.0, 6.0), (6.5, 7.0)))
     matrix = pixel_from_camera("90")
     result = measured(frame_picture(uneven, matrix), uneven, tmp_path)
-    assert result.pose is not None
-    assert (result.pose.name, result.pose.decided) == ("90", True), result.pose.evidence
+    assert pose_of(result) == ("90", True), result.pose
     assert_right(result, uneven, matrix)
 
 
@@ -243,8 +241,7 @@ def test_of_two_whole_frames_in_a_scan_none_is_taken_in_silence(tmp_path: Path) 
     grey = np.hstack([frame_picture(NUMBERED, matrix, seed) for seed in (1, 2)])
     grey[:, FRAME_PX:] = gaussian_filter(grey[:, FRAME_PX:], 1.0)  # this one answers less
     result = measured(grey, NUMBERED, tmp_path)
-    assert result.pose is not None
-    assert (result.pose.name, result.pose.decided) == ("0", False)
+    assert pose_of(result) == ("0", False)
     assert any("the scan shows another frame (20.0, " in text for text in result.problems)
 
 

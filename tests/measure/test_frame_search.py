@@ -335,20 +335,23 @@ def frame(across_um: float, down_um: float) -> FrameMeasurement:
     return FrameMeasurement("a", tuple(marks), None, matrix)
 
 
-def test_a_pitch_that_film_and_separations_allow_is_no_problem() -> None:
-    assert pitch_problem(frame(20.1, 19.9), layout(0.01), (20.0, 20.0), "the project") is None
-
-
-def test_a_wrong_pitch_is_named() -> None:
-    problem = pitch_problem(frame(21.17, 20.0), layout(0.01), (20.0, 20.0), "the project")
-    assert problem is not None
-    assert "the project gives a pitch of 20.00 x 20.00 µm" in problem
-    assert "set pitch_um = [21.17, 20.00]" in problem
-
-
-def test_separations_known_to_a_few_millimetres_say_little() -> None:
-    assert pitch_problem(frame(20.6, 20.6), layout(3.0), (20.0, 20.0), "the project") is None
-    assert pitch_problem(frame(20.6, 20.6), layout(0.1), (20.0, 20.0), "the project") is not None
+@pytest.mark.parametrize(
+    ("pitch_um", "sigma_mm", "is_wrong"),
+    [
+        ((20.1, 19.9), 0.01, False),  # film may do that
+        ((21.17, 20.0), 0.01, True),
+        ((20.6, 20.6), 3.0, False),  # separations known to a few millimetres say little
+        ((20.6, 20.6), 0.1, True),
+    ],
+)
+def test_a_pitch_that_film_and_separations_do_not_allow_is_named(
+    pitch_um: tuple[float, float], sigma_mm: float, is_wrong: bool
+) -> None:
+    problem = pitch_problem(frame(*pitch_um), layout(sigma_mm), (20.0, 20.0), "the project")
+    assert (problem is not None) == is_wrong
+    if problem is not None:
+        assert "the project gives a pitch of 20.00 x 20.00 µm" in problem
+        assert f"set pitch_um = [{pitch_um[0]:.2f}, {pitch_um[1]:.2f}]" in problem
 
 
 def test_right_pitches_are_called_wrong_as_rarely_as_is_stated() -> None:

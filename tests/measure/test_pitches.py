@@ -22,6 +22,7 @@ from drawn import (
     measured,
     paint,
     pixel_from_camera,
+    pose_of,
     written_scan,
 )
 from scipy.ndimage import gaussian_filter
@@ -166,8 +167,7 @@ def test_three_clicks_find_a_frame_in_any_pose_that_no_search_finds(pose: str, t
     matrix = pixel_from_camera(pose, FAR_TURN_RAD)
     grey = frame_picture(ALIKE, matrix)
     result = measured(grey, ALIKE, tmp_path, FiducialOptions(clicks=make_clicks(matrix, "124")))
-    assert result.pose is not None
-    assert (result.pose.name, result.pose.decided) == (pose, True)
+    assert pose_of(result) == (pose, True)
     assert_right(result, ALIKE, matrix)
 
 
@@ -267,8 +267,7 @@ def red_on_grey() -> Array:
 def test_red_marks_as_light_as_their_grey_ground_are_found_and_right(tmp_path: Path) -> None:
     """The search answers to the green here, in which they are dark."""
     result = measured(red_on_grey(), NUMBERED, tmp_path)
-    assert result.pose is not None
-    assert (result.pose.name, result.pose.decided) == ("90", True)
+    assert pose_of(result) == ("90", True)
     assert_right(result, NUMBERED, MATRIX)
     assert result.weights is not None
     np.testing.assert_allclose(result.weights, RED, atol=0.06)

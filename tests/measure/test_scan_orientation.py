@@ -18,6 +18,7 @@ from drawn import (
     measured,
     paint,
     pixel_from_camera,
+    pose_of,
     scan_of,
     written_scan,
 )
@@ -195,8 +196,7 @@ def test_where_no_place_is_known_frames_are_named_so_that_their_writing_is_uprig
 def test_nothing_is_read_where_nobody_asks_and_a_mirror_is_not_assumed(tmp_path: Path) -> None:
     silent = measure_picture("90m", tmp_path, WILD, "none")
     assert silent.writing is None
-    assert silent.pose is not None
-    assert (silent.pose.name, silent.pose.decided) == ("0", False)
+    assert pose_of(silent) == ("0", False)
 
 
 TITLE = KnownLine("RUN 31  CANBERRA  17.6.69", "90", "left", ((-13.9, -9.0), (-13.9, 2.0), (-13.1, 2.0), (-13.1, -9.0)))
@@ -207,8 +207,7 @@ def test_a_frame_that_lies_as_others_of_its_roll_is_read_only_where_their_line_s
 ) -> None:
     alike = measure_picture("0", tmp_path, WILD, known_lines=(TITLE,))
     assert [(each.side, each.pose) for each in alike.writing or ()] == [("left", "90")]
-    assert alike.pose is not None
-    assert (alike.pose.name, alike.pose.decided) == ("0", True)
+    assert pose_of(alike) == ("0", True)
 
 
 @pytest.mark.study
@@ -217,8 +216,7 @@ def test_a_frame_that_lies_otherwise_is_read_as_a_whole(pose: str, tmp_path: Pat
     """The plate lies where the title is looked for, or the title itself in a mirror."""
     other = measure_picture(pose, tmp_path, WILD, known_lines=(TITLE,))
     assert {each.side for each in other.writing or ()} == {"left", "right"}
-    assert other.pose is not None
-    assert (other.pose.name, other.pose.decided) == (pose, True)
+    assert pose_of(other) == (pose, True)
 
 
 def test_a_known_line_is_one_that_says_the_same_and_lies_so_plainly() -> None:

@@ -1,6 +1,5 @@
 """Scans are measured one by one, each by its own task, and their records are written and read back."""
 
-import importlib.util
 import json
 import os
 import pickle
@@ -15,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from loaded_script import script
 from projects import CAMERA, PROJECT, measure_scan, write_project
 
 from measure.annotations.fields import Line, Reading
@@ -290,13 +290,7 @@ def test_a_scan_refused_for_its_size_says_how_to_allow_it(tmp_path: Path, capsys
 
 
 def test_no_module_is_entered_again_from_one_that_it_has_called() -> None:
-    file = Path(__file__).parents[2] / "benchmarks" / "trip.py"
-    spec = importlib.util.spec_from_file_location("trip", file)
-    assert spec is not None
-    assert spec.loader is not None
-    trip = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(trip)
-    calls = trip.followed()
+    calls = script(Path(__file__).parents[2] / "benchmarks" / "trip.py").followed()
     assert {"measure.fiducials.measurement", "pipeline.measuring.roll", "pipeline.results.comparator_file"} <= set(
         calls.order
     )

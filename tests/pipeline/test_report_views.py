@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from projects import write_network_project
 
 from adjust import Parameter, adjust, approximate
+from adjust.functional_model.lens import Lens
 from adjust.quality.lens_reach import distortion_curves
 from measure.flags import NO_REASON, Status
 from pipeline import build_network, read_comparator, read_project
@@ -226,11 +227,7 @@ def test_contours_of_a_field_that_grows_to_the_right_are_upright_lines_at_their_
     labels = sorted(float(text) for text in re.findall(r'class="contour-label"[^>]*>([\d.]+)<', plot))
     assert labels[-3:] == [1.0, 2.0, 5.0]
     assert [26.0 + 5.0 * 12.0 * value for value in labels] == pytest.approx(places, abs=0.2)
-
-
-def test_a_field_without_uncertainty_has_no_contours() -> None:
-    grid = np.linspace(-30.0, 30.0, 5)
-    assert contour_plot(FRAME, grid, grid, np.zeros((5, 5)), "field") is None
+    assert contour_plot(FRAME, x_mm, y_mm, np.zeros((13, 25)), "field") is None
 
 
 Array = NDArray[np.float64]
@@ -313,10 +310,16 @@ def test_the_effect_of_a_parameter_is_the_displacement_it_makes() -> None:
     assert effects["p2"] == pytest.approx(3e3 * RADIUS_MM**2)
 
 
+WIDE_FRAME = Plane(np.array([[-75.0, -75.0], [75.0, 75.0]]), 500.0)
+
+
+def of_k3() -> Lens:
+    return lens("A", camera("torlegard", k3=1e-7), covariance("A", ("k3",), np.array([[1e-18]])))
+
+
 def test_the_map_shows_the_longest_vector_with_its_sigma() -> None:
     """k3 r³ with r to the outermost of 15 x 15 squares over a frame of 150 mm: 70 mm in x and y, less x0', y0'."""
-    of = lens("A", camera("torlegard", k3=1e-7), covariance("A", ("k3",), np.array([[1e-18]])))
-    drawn = lens_map(of, Plane(np.array([[-75.0, -75.0], [75.0, 75.0]]), 500.0))
+    drawn = lens_map(of_k3(), WIDE_FRAME)
     r = np.hypot(70.3, 70.2)
     assert drawn.largest_um == pytest.approx((1e3 * 1e-7 * r**3, 1e3 * 1e-9 * r**3))
     assert drawn.plot.count("M") == 2 * 15**2 + drawn.plot.count('class="bar"')
@@ -324,14 +327,15 @@ def test_the_map_shows_the_longest_vector_with_its_sigma() -> None:
 
 def test_the_map_shows_what_lies_beyond_the_outermost_target() -> None:
     """Of 15 x 15 squares of 10 mm about (0.3, -0.2) the middles of 37 lie within 35 mm."""
-    of = lens("A", camera("torlegard", k3=1e-7), covariance("A", ("k3",), np.array([[1e-18]])))
-    plane = Plane(np.array([[-75.0, -75.0], [75.0, 75.0]]), 500.0)
-    drawn = lens_map(of, plane, 35.0)
+    drawn = lens_map(of_k3(), WIDE_FRAME, 35.0)
     dots = {kind: re.search(f'd="([^"]*)" class="dot {kind}"', drawn.plot) for kind in ("target", "extrapolated")}
     counts = {kind: found[1].count("M") for kind, found in dots.items() if found}
     assert counts == {"target": 37, "extrapolated": 15**2 - 37}
     assert drawn.extrapolated
-    assert not lens_map(of, plane, 110.0).extrapolated
+    assert not lens_map(of_k3(), WIDE_FRAME, 110.0).extrapolated
+    curves = distortion_curves(of_k3(), RADIUS_MM)
+    assert "no targets here" in curves_plot(curves, 100.0)
+    assert "no targets here" not in curves_plot(curves, RADIUS_MM)
 
 
 def test_of_a_set_over_the_frame_the_effect_is_the_largest_within_it() -> None:
@@ -339,14 +343,6 @@ def test_of_a_set_over_the_frame_the_effect_is_the_largest_within_it() -> None:
     entry = camera("ebner", b3=0.01)
     entry = replace(entry, distortion=replace(entry.distortion, half_mm=(114.0, 90.0)))
     assert largest_effects_um(lens("A", entry), RADIUS_MM)["b3"] > 1e3 * 4 / 3 * np.sqrt(90 / 114)
-
-
-def test_the_curve_shows_where_no_target_was() -> None:
-    drawn = distortion_curves(
-        lens("A", camera("torlegard", k3=1e-7), covariance("A", ("k3",), np.array([[1e-18]]))), RADIUS_MM
-    )
-    assert "no targets here" in curves_plot(drawn, 100.0)
-    assert "no targets here" not in curves_plot(drawn, RADIUS_MM)
 
 
 def test_parameters_say_what_is_significant_and_what_the_prior_carried() -> None:
@@ -422,11 +418,8 @@ def test_one_displaced_mark_is_the_one_that_changed_most() -> None:
     form = changed(estimated, 4e-6 * np.eye(10))
     assert int(np.hypot(*form.change_um.T).argmax()) == 3
     assert "enlarged" in figure_plot(form)
-
-
-def test_two_marks_have_no_form() -> None:
-    few = dict(list(fiducials(GIVEN).items())[:2])
-    assert figure_of_films("A", few, Covariance((), np.empty(0), np.empty((0, 0))), {}) is None
+    two = dict(list(fiducials(GIVEN).items())[:2])
+    assert figure_of_films("A", two, Covariance((), np.empty(0), np.empty((0, 0))), {}) is None
 
 
 NAMES = ("residuals", "coverage", "distortion", "uncertainty-infinity", "uncertainty-near")
