@@ -4,11 +4,12 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence, Set
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -22,6 +23,8 @@ from pipeline.text.text_file import read_bytes
 
 _PLAIN = {str, int, bool, type(None)}  # types of most values, tested first
 NO_FINGERPRINT = {"fingerprint": False}  # metadata of a field that is not part of a value's fingerprint
+Item = TypeVar("Item")
+
 _PIECES, _PIECE = 8, 32768  # number and bytes of pieces of a file, spread evenly from its first byte to its last
 _HEAD_BYTES = 1 << 16
 _MIDDLE_PX = 256
@@ -203,6 +206,19 @@ def content_hash(path: Path) -> str:
     except (OSError, MissingError, UnreachableError):
         return ""
     return digest.hexdigest()
+
+
+def alike_groups(items: Iterable[Item], *values: Callable[[Item], object]) -> list[list[Item]]:
+    """Groups of two or more items for which all values agree. A value is computed only where those before it agree; an
+    item with a false one (an empty or unreadable file) is in no group."""
+    groups = [list(items)]
+    for value in values:
+        parts = defaultdict[tuple[int, object], list[Item]](list)
+        for number, group in enumerate(groups):
+            for item in group:
+                parts[number, value(item)].append(item)
+        groups = [group for (_, known), group in parts.items() if known and len(group) > 1]
+    return groups
 
 
 def _tables(path: Path) -> bytes:

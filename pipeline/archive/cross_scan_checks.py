@@ -19,7 +19,7 @@ from pipeline.files.project_file import Project
 from pipeline.measuring.camera_identification import add_plates
 from pipeline.measuring.roll import check_scans, name_roll, note_same_frames
 from pipeline.measuring.scan_task import ScanTask
-from pipeline.provenance import content_hash, fingerprint, shard_number
+from pipeline.provenance import alike_groups, content_hash, fingerprint, shard_number
 from pipeline.results.measured_record import MeasuredScan
 
 _TOGETHER = 2000  # most frames of a camera that are checked together, to limit memory
@@ -87,21 +87,20 @@ def find_copies(store: Store, tasks: Sequence[ScanTask], work: Work) -> dict[str
 
     Whole files are read only where size and the hash of parts agree.
     """
-    groups = defaultdict[tuple[int, str], list[ScanTask]](list)
-    identities = store.identities()
-    for task in tasks:
+    identities, hashes = store.identities(), store.content_hashes()
+
+    def parts(task: ScanTask) -> object:
         known = identities.get(work.state(task).uri)
-        if known is not None and known.state.bytes > 0 and known.parts_hash:
-            groups[known.state.bytes, known.parts_hash].append(task)
-    hashes = store.content_hashes()
-    originals, copies = dict[str, str](), dict[str, str]()
-    for group in groups.values():
-        originals.clear()
-        for task in sorted(group, key=lambda task: task.name) if len(group) > 1 else ():
-            content = hashes.get(work.state(task).uri) or content_hash(scan_path(task.scan))
-            hashes[work.state(task).uri] = content
-            if content and originals.setdefault(content, task.name) != task.name:
-                copies[task.name] = originals[content]
+        return known and known.state.bytes > 0 and known.parts_hash and (known.state.bytes, known.parts_hash)
+
+    def content(task: ScanTask) -> str:
+        uri = work.state(task).uri
+        hashes[uri] = hashes.get(uri) or content_hash(scan_path(task.scan))
+        return hashes[uri]
+
+    copies = dict[str, str]()
+    for original, *others in alike_groups(sorted(tasks, key=lambda task: task.name), parts, content):
+        copies |= {task.name: original.name for task in others}
     store.set_content_hashes(hashes)
     store.set_copies({work.state(task).uri: copies[task.name] for task in tasks if task.name in copies})
     return copies

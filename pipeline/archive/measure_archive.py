@@ -1,6 +1,5 @@
 """Measure a project's scans into its results database: only what is missing or changed."""
 
-from collections import defaultdict
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
@@ -58,25 +57,20 @@ def find_moved(store: Store, project: Project, reporter: Reporter) -> dict[str, 
     Only results whose content was hashed by an earlier call with `--moved` are found.
     """
     known, files = store.identities(), FileStates(project.path.resolve().parent)
-    by_size = defaultdict[int, dict[str, str]](dict)
-    for uri, content in store.content_hashes().items():
-        by_size[known[uri].state.bytes][content] = uri
     states = {name: files.get(file) for name, file in as_named(project.scans).items()}
     unknown = {name: state for name, state in states.items() if state != getattr(known.get(state.uri), "state", None)}
     taken = {state.uri for name, state in states.items() if name not in unknown}
+    free = {content: uri for uri, content in store.content_hashes().items() if uri not in taken}
+    sizes = {known[uri].state.bytes for uri in free.values()}
     found, keys = 0, dict[str, str]()
     with reporter.stage("searched in the results database") as count:
         for done, (name, state) in enumerate(unknown.items(), 1):
             count(name, done, len(unknown))
-            if not by_size.get(state.bytes):
-                continue
             path = project.scans[name]
-            content = content_hash(path)
-            uri = by_size[state.bytes].get(content, "")
-            if content and uri and uri not in taken:
+            uri = free.pop(content_hash(path), "") if state.bytes in sizes else ""
+            if uri and uri not in taken:  # nor has another file come to its place
                 keys |= store.move(uri, Identity(state, parts_hash(path, project.max_pixels)))
                 taken.add(state.uri)
-                del by_size[state.bytes][content]
                 found += 1
     if unknown:
         reporter.say(

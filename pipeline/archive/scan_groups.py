@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,7 @@ from pipeline.files.scan_files import folders_below
 from pipeline.measuring.camera_identification import Identification, is_solid
 from pipeline.measuring.camera_trials import identify
 from pipeline.progress import Count, Reporter
-from pipeline.provenance import content_hash, parts_hash
+from pipeline.provenance import alike_groups, content_hash, parts_hash
 from pipeline.text.names import SCAN_ENDINGS
 from pipeline.text.wording import counted
 
@@ -403,14 +404,7 @@ def _files_below(folder: Path) -> Iterator[Path]:
 def _copies(files: Sequence[Path], max_pixels: int | None) -> Iterator[tuple[Path, Path]]:
     """Yield (copy, original) for files with identical bytes; size and a hash of parts are compared first."""
     # The original has the shortest name, since copies are called `Copy of 0001` or `0001 (1)`.
-    alike = [list(files)]
-    values = (lambda path: path.stat().st_size), (lambda path: parts_hash(path, max_pixels)), content_hash
-    for value in values:
-        parts = defaultdict[tuple[int, object], list[Path]](list)
-        for number, group in enumerate(alike):
-            for path in group:
-                parts[number, value(path)].append(path)
-        alike = [group for group in parts.values() if len(group) > 1]
-    for group in alike:
-        original, *others = sorted(group, key=lambda path: len(path.name))
+    by_name = sorted(files, key=lambda path: len(path.name))
+    parts = partial(parts_hash, max_pixels=max_pixels)
+    for original, *others in alike_groups(by_name, lambda path: path.stat().st_size, parts, content_hash):
         yield from ((path, original) for path in others)

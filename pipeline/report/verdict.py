@@ -24,7 +24,7 @@ from pipeline.results.assessment_record import (
     ResidualRecord,
     SuspectRecord,
 )
-from pipeline.results.check_file import Check, PixelCalibration
+from pipeline.results.check_file import Check
 from pipeline.text.wording import counted, listed
 
 Observed = DistanceRecord | FiducialDistanceRecord | ObservedQuantity
@@ -251,9 +251,9 @@ def _sigma0_and(side: str, bound: float, sigma0: float) -> str:
     return f"σ₀ = {sigma0:.{digits}f} is {side} {bound:.{digits}f}"
 
 
-def _lens_problems(data: ReportData, shots: list[Frame]) -> Iterator[Problem]:
-    """Yield problems of lenses observed out to less than half the corner radius. From there to the corner the term of
-    k3 grows by 2^7 = 128, so that a hundredth of a pixel inside becomes more than a pixel."""
+def _lens_problems(data: ReportData) -> Iterator[Problem]:
+    """Yield problems of lenses observed out to less than half the corner radius."""
+    # From there to the corner the term of k3 grows by 2^7 = 128: a hundredth of a pixel becomes more than a pixel.
     remedy = "Observe targets out to the corners of the picture, or use the lens within that radius only."
     for _, sentence, share in lens_sentences(data):
         if share < LEAST_SHARE:
@@ -262,8 +262,8 @@ def _lens_problems(data: ReportData, shots: list[Frame]) -> Iterator[Problem]:
 
 def lens_sentences(data: ReportData) -> Iterator[tuple[str, str, float]]:
     """Yield camera, extent of its lens in words, and the extent as a fraction of the corner radius."""
-    if data.adjustment is not None and _is_solved(data):
-        for name, known in data.adjustment.estimated_lenses():
+    if solved := _solved(data):
+        for name, known in solved.estimated_lenses():
             yield name, known.sentence(name, data.unit_of_camera(name)), known.share
 
 
@@ -279,32 +279,21 @@ def _check_problems(check: Check) -> Iterator[Problem]:
 def _corners_notes(check: Check) -> Iterator[str]:
     """Yield notes comparing OpenCV's calibrations from its own board corners and from those measured here."""
     for name, camera in check.cameras.items():
-        corners = camera.corners_px
-        if corners:
+        if corners := camera.corners_px:
+            here, own = (
+                f"fx {px.fx:.2f}, fy {px.fy:.2f}, cx {px.cx:.2f}, cy {px.cy:.2f} px, rms {px.rms:.3f} px a point"
+                for px in (corners.reseau, corners.opencv)
+            )
             lost = f" OpenCV found no board in {listed(corners.not_found)}." if corners.not_found else ""
             yield (
                 f"OpenCV's calibration of {name} from {corners.points} points of {corners.images} pictures: with the "
-                f"points measured here {_pixel_figures(corners.reseau)}; with OpenCV's own ({corners.detector}) "
-                f"{_pixel_figures(corners.opencv)}.{lost}"
+                f"points measured here {here}; with OpenCV's own ({corners.detector}) {own}.{lost}"
             )
 
 
-def _pixel_figures(px: PixelCalibration) -> str:
-    return f"fx {px.fx:.2f}, fy {px.fy:.2f}, cx {px.cx:.2f}, cy {px.cy:.2f} px, rms {px.rms:.3f} px a point"
-
-
-def _is_solved(data: ReportData) -> bool:
-    return data.adjustment is not None and not any(_no_solution(data.adjustment))
-
-
-def _solution_check(found: Callable[[AdjustmentRecord], Iterator[Problem]], checked: bool = False) -> Evidence:
-    """Restrict a check to adjustments with a solution; checked: also with an estimated sigma0."""
-
-    def problems(data: ReportData, _: list[Frame]) -> Iterator[Problem]:
-        if data.adjustment is not None and _is_solved(data) and (not checked or data.adjustment.has_sigma0):
-            yield from found(data.adjustment)
-
-    return problems
+def _solved(data: ReportData) -> AdjustmentRecord | None:
+    """The adjustment, if it has a solution."""
+    return data.adjustment if data.adjustment and not any(_no_solution(data.adjustment)) else None
 
 
 # Checks that lead to exit code 1, by their names in docs/how-to/read-the-report.md.
@@ -314,11 +303,11 @@ NEEDS_A_LOOK: dict[str, Evidence] = {
     "frames": lambda data, shots: data.totals.problems if data.totals else frame_problems(shots),
     "pixel locking": lambda data, shots: pixel_locking(data.totals.places_px if data.totals else places_px(shots)),
     "warnings": lambda data, _: map(Problem, data.adjustment.warnings if data.adjustment else ()),
-    "σ₀": _solution_check(_too_large, checked=True),
-    "redundancy": _solution_check(_unchecked),
-    "reach of the lens": _lens_problems,
-    "distances, calibrations, antennas": _solution_check(_further_problems),
-    "gross errors": _solution_check(_suspects),
+    "σ₀": lambda data, _: _too_large(solved) if (solved := _solved(data)) and solved.has_sigma0 else (),
+    "redundancy": lambda data, _: _unchecked(solved) if (solved := _solved(data)) else (),
+    "reach of the lens": lambda data, _: _lens_problems(data),
+    "distances, calibrations, antennas": lambda data, _: _further_problems(solved) if (solved := _solved(data)) else (),
+    "gross errors": lambda data, _: _suspects(solved) if (solved := _solved(data)) else (),
     "OpenCV": lambda data, _: _check_problems(data.check) if data.check else (),
 }
 
@@ -343,10 +332,8 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
         yield from data.adjustment.notes
         yield from _unmodelled_notes(data, data.adjustment)
         yield from _weight_notes(data.adjustment)
-        if _is_solved(data) and data.adjustment.has_sigma0:
-            yield from _too_small(data.adjustment)
-        elif _is_solved(data):
-            yield A_PRIORI
+        if solved := _solved(data):
+            yield from _too_small(solved) if solved.has_sigma0 else (A_PRIORI,)
     if data.is_film_alone:
         yield (
             "Fiducial marks are the same in every frame: if two scans bear each other's names, nothing here shows it."
