@@ -103,7 +103,7 @@ def _camera_axes(lens: DistortedRay, b1: float, b2: float, first: int) -> Distor
             return vectors(lens.value[:, k - first], np.zeros_like(lens.value[:, 0]))
         return camera_axes(lens.parameter_derivative(k).T).T
 
-    ray_jacobian = np.moveaxis(camera_axes(np.moveaxis(lens.ray_jacobian, 0, -1)), -1, 0)
+    ray_jacobian = camera_axes(lens.ray_jacobian.transpose(1, 2, 0)).transpose(2, 0, 1)
     return DistortedRay(camera_axes(lens.value.T).T, ray_jacobian * DOWN, parameter_derivative)
 
 

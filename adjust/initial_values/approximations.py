@@ -1,6 +1,6 @@
 """Initial values of an adjustment, computed from the network: the user need not supply approximations."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 
@@ -70,7 +70,7 @@ def _initial_values(network: Network) -> Approximations:
     poses, points = orient(network, sights, resected)
     return Approximations(
         interior=interior,
-        exterior={image.name: _exterior(image, poses[image.name]) for image in network.images if image.name in poses},
+        exterior=_exteriors([image for image in network.images if image.name in poses], poses),
         transformation=transformation,
         points=points,
         mirrored=mirrored,
@@ -193,7 +193,7 @@ def _sights(camera: Camera, frames: Frames, interior: Array) -> dict[str, Sight]
     images = frames.camera_images(camera.name)
     folds = lens.folded_over(frames.xy_mm[frames.places(images)])
     first = np.cumsum([0, *np.diff(frames.starts)[images]])
-    for i, start, stop in zip(images, first[:-1], first[1:], strict=True):
+    for i, start, stop in zip(images, first[:-1], first[1:], strict=True) if folds.any() else ():
         folded = folds[start:stop]
         if folded.mean() > MOST_FOLDED:
             radius_mm = float(np.linalg.norm(frames.xy_mm[frames.part(i)][folded] - interior[1:], axis=1).min())
@@ -208,8 +208,14 @@ def _sights(camera: Camera, frames: Frames, interior: Array) -> dict[str, Sight]
     return frames.sights(camera.name, lens)
 
 
-def _exterior(image: Image, pose: Pose) -> Array:
-    """X0, Y0, Z0, omega, phi, kappa (6,); of equivalent angles those nearest to the given ones."""
-    if image.exterior is None:
-        return np.concatenate([pose.center, angles_from_rotation(pose.rotation)])
-    return np.concatenate([pose.center, angles_near(pose.rotation, image.exterior.values[3:])])
+def _exteriors(images: Sequence[Image], poses: Mapping[str, Pose]) -> dict[str, Array]:
+    """X0, Y0, Z0, omega, phi, kappa (6,) by image; of equivalent angles those nearest to the given ones."""
+    rotations = np.array([poses[image.name].rotation for image in images]).reshape(-1, 3, 3)
+    nearby = angles_from_rotation(rotations)
+    for angles, image in zip(nearby, images, strict=True):
+        if image.exterior is not None:
+            angles[:] = image.exterior.values[3:]
+    angles = angles_near(rotations, nearby)
+    return {
+        image.name: np.concatenate([poses[image.name].center, own]) for image, own in zip(images, angles, strict=True)
+    }

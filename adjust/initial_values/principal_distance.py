@@ -92,7 +92,8 @@ def _largest_fields(fields: Sequence[KnownField], fewest: int, most: int) -> lis
 
 
 def _radius_mm(fields: Sequence[KnownField]) -> float:
-    return max(float(np.linalg.norm(each.xy_mm, axis=1).max()) for each in fields)
+    x, y = np.concatenate([each.xy_mm for each in fields]).T
+    return float(np.hypot(x, y).max())
 
 
 def _misfit_mm2(fields: Sequence[KnownField], lens: Lens) -> float:

@@ -7,7 +7,7 @@ evaluated at the observed camera point instead: then F = T(S(x, y)) - image of t
 on the observations through T and S alone.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -175,18 +175,19 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
         else:
             by_camera_xy[rows] = at.xy_jacobian
         own = [k for k in parts.camera.members if k < len(lens.quantities)]  # other cameras may have other families
-        by_camera = [at.quantity_derivative(k) for k in own]
+        by_camera = np.empty((len(own), 2, len(images)))
+        for column, k in zip(by_camera, own, strict=True):
+            column[:] = at.quantity_derivative(k).T
         if compiled.kernels is not None and straight and not len(parts.board.members):
             numbers = np.arange(rows.start, rows.stop) if isinstance(rows, slice) else rows
             compiled.kernels.target_derivatives(
                 numbers, images, state.rotations, attitude, shown.ray, shown.in_camera, at.ray_jacobian,
-                parts.exterior.members, parts.place.members,
-                np.reshape([each.T for each in by_camera], (-1, 2, len(images))),
+                parts.exterior.members, parts.place.members, by_camera,
                 np.array([parts.camera.columns.start]), by_unknowns,
             )  # fmt: skip
         else:
             _fill_targets(by_unknowns, problem, state, shown, at.ray_jacobian)
-            _fill(by_unknowns, rows, parts.camera, by_camera)
+            _fill(by_unknowns, rows, parts.camera, by_camera.swapaxes(1, 2))
     for part, of_film, of_distorted in (
         (parts.film, film.parameter_jacobian, at_distorted.parameter_jacobian),
         (parts.scanner, film.by_scanner, at_distorted.by_scanner),
@@ -227,7 +228,7 @@ def _fill_targets(by_unknowns: Array, problem: Problem, state: State, shown: Tar
     _fill(by_unknowns, rows, parts.board, by_boards)
 
 
-def _fill(by_unknowns: Array, rows: Rows, part: Part, derivatives: Sequence[Array]) -> None:
+def _fill(by_unknowns: Array, rows: Rows, part: Part, derivatives: Iterable[Array]) -> None:
     """Write the derivatives (n, 2) with respect to the members of a part into its columns."""
     for column, derivative in enumerate(derivatives, part.columns.start):
         by_unknowns[..., column][rows] = derivative
