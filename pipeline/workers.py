@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import platform
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -23,6 +24,8 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
 from itertools import islice
+from multiprocessing.context import SpawnContext, SpawnProcess
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import cv2
@@ -75,6 +78,26 @@ def worker_pool(scans: int, workers: int | None = None) -> Iterator[Executor]:
         pool.shutdown(cancel_futures=True)
 
 
+class ScriptlessProcess(SpawnProcess):
+    """Spawned process that does not run the main module again: a user's script would start another measurement."""
+
+    starting = threading.Lock()
+
+    @staticmethod
+    def _Popen(process_obj: Any) -> Any:
+        main = sys.modules["__main__"]
+        with ScriptlessProcess.starting:
+            sys.modules["__main__"] = ModuleType("__main__")
+            try:
+                return SpawnProcess._Popen(process_obj)
+            finally:
+                sys.modules["__main__"] = main
+
+
+class ScriptlessContext(SpawnContext):
+    Process = ScriptlessProcess
+
+
 class LocalPool(ThreadPoolExecutor):
     """Threads with a process each, which get one task at a time.
 
@@ -123,7 +146,7 @@ class LocalPool(ThreadPoolExecutor):
         raise WorkerKilled
 
     def _start(self) -> ProcessPoolExecutor:
-        process = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=prepare)
+        process = ProcessPoolExecutor(1, ScriptlessContext(), initializer=prepare)
         self._own.process = process
         self._all.append(process)
         return process

@@ -114,6 +114,18 @@ def test_a_killed_process_is_replaced_and_its_task_begun_again(tmp_path: Path) -
         assert list(pool.map(square, range(4))) == [0, 1, 4, 9]
 
 
+def test_a_script_without_a_guard_starts_the_workers_once(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import operator\nfrom pipeline.workers import worker_pool\n"
+        "with worker_pool(1, workers=1) as pool:\n    print(pool.submit(operator.add, 2, 3).result(60))\n",
+        encoding="utf-8",
+    )
+    variables = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, str(script)], env=variables, capture_output=True, text=True)
+    assert (done.stdout, done.returncode) == ("5\n", 0), done.stderr
+
+
 @pytest.mark.study
 def test_a_task_that_kills_its_process_twice_is_given_up_and_none_else(tmp_path: Path) -> None:
     with worker_pool(2, workers=2) as pool:
