@@ -18,12 +18,11 @@ import numpy as np
 from adjust.array_types import Array, Mask
 from adjust.functional_model.correction import Correction, Imaged, no_correction
 from adjust.functional_model.families import family, parameter_names
-from adjust.linear_algebra.small_matrices import columns, determinant, solved, zeros
+from adjust.linear_algebra.small_matrices import columns, determinant, newton, zeros
 
 Decentering = Literal["reduced", "paper"]
 
 INTERIOR_NAMES = ("c", "x0", "y0")
-NEWTON_STEPS = 30
 NEWTON_TOLERANCE = 1e-14  # fraction of the principal distance
 
 
@@ -193,36 +192,34 @@ class Lens:
         """Do the same as `camera_from_ray` for rays that are imaged already."""
         c, principal_point = self.interior[0], self.interior[1:]
         correct = family(self.distortion.family).correct
-        found = np.zeros(len(imaged.value), dtype=bool)
         with np.errstate(over="ignore", invalid="ignore"):
-            xy_mm = ideal_mm = principal_point + imaged.value
+            ideal_mm = principal_point + imaged.value
             unfolded = _unfolded(determinant(imaged.ray_jacobian))
             if correct is no_correction:
                 return ideal_mm, unfolded & np.isfinite(ideal_mm).all(axis=1)
             tolerance_mm = 4 * NEWTON_TOLERANCE * (abs(c) + np.abs(ideal_mm).max(axis=1))
-            for _ in range(NEWTON_STEPS):
-                correction = correct(self.distortion, xy_mm, principal_point, self.parameters)
-                step, regular = _newton_step(np.eye(2) - correction.xy_jacobian, xy_mm - ideal_mm - correction.value)
-                xy_mm = xy_mm - step
-                found = regular & unfolded & (np.abs(step).max(axis=1) <= tolerance_mm)
-                if found.all():
-                    break
+
+        def misclosure(xy_mm: Array) -> tuple[Array, Array]:
+            correction = correct(self.distortion, xy_mm, principal_point, self.parameters)
+            return xy_mm - ideal_mm - correction.value, np.eye(2) - correction.xy_jacobian
+
+        xy_mm, found = newton(ideal_mm, misclosure, lambda _: np.where(unfolded, tolerance_mm, -np.inf))
         return xy_mm, found
 
     def ideal_from_observed(self, xy_mm: Array) -> tuple[Array, Mask]:
         """Remove the distortion from observed camera coordinates (n, 2) in mm; also return the mask of those found."""
         if self.is_pinhole:
             return xy_mm, np.asarray(np.isfinite(xy_mm).all(axis=1))
-        ray = (xy_mm - self.interior[1:]) / self.interior[0]
-        found = np.zeros(len(ray), dtype=bool)
-        with np.errstate(over="ignore", invalid="ignore"):
-            for _ in range(NEWTON_STEPS):
-                at = self.equations(xy_mm, ray)
-                step, regular = _newton_step(-at.ray_jacobian, -at.value)
-                ray = ray - step
-                found = regular & (np.abs(step).max(axis=1) <= 4 * NEWTON_TOLERANCE * (1.0 + np.abs(ray).max(axis=1)))
-                if found.all():
-                    break
+
+        def misclosure(ray: Array) -> tuple[Array, Array]:
+            at = self.equations(xy_mm, ray)
+            return -at.value, -at.ray_jacobian
+
+        ray, found = newton(
+            (xy_mm - self.interior[1:]) / self.interior[0],
+            misclosure,
+            lambda ray: 4 * NEWTON_TOLERANCE * (1.0 + np.abs(ray).max(axis=1)),
+        )
         return self.interior[1:] + self.interior[0] * ray, found
 
     def ray_from_observed(self, xy_mm: Array) -> tuple[Array, Mask]:
@@ -258,13 +255,6 @@ class Lens:
         derivatives[:, :, 0] -= ray
         derivatives[~imaged] = 0.0
         return Displacement(np.where(imaged[:, None], 1e3 * (xy_mm - ideal_mm), np.nan), 1e3 * derivatives, imaged)
-
-
-def _newton_step(by_unknown: Array, value: Array) -> tuple[Array, Mask]:
-    """Newton steps (n, 2), and the mask (n,) of points where the orientation of the image is kept."""
-    side = determinant(by_unknown)
-    regular = _unfolded(side)
-    return solved(by_unknown, value, regular, side), regular
 
 
 def _unfolded(side: Array) -> Mask:

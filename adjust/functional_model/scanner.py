@@ -34,12 +34,11 @@ from adjust.functional_model.self_calibration_sets import (
     summed,
 )
 from adjust.functional_model.transformation import polynomial_order
-from adjust.linear_algebra.small_matrices import determinant, product, solved
+from adjust.linear_algebra.small_matrices import newton, product
 
 SMOOTH = (2, 3)  # total degrees of the smooth terms
 ALONG = (4, 5, 6)  # degrees of the carriage terms, along one axis alone, for tests
 COMBINED = {"stretch": STRETCH, "shear": SHEAR, "tilt_x": TILT_X, "tilt_y": TILT_Y}
-STEPS = 30
 TOLERANCE_MM = 1e-11
 
 
@@ -138,22 +137,14 @@ class Bend:
 
     def inverse(self, parameters: Array, xy_mm: Array) -> tuple[Array, Mask]:
         """Compute scan coordinates (n, 2) from corrected ones (n, 2); mask of those found (none where S folds over)."""
-        found = np.ones(len(xy_mm), dtype=bool)
         if self.is_identity:
-            return xy_mm, found
-        scan_mm = xy_mm
-        with np.errstate(over="ignore", invalid="ignore"):
-            for _ in range(STEPS):
-                at = self.displacement(parameters, scan_mm)
-                gradient = np.eye(2) - at.xy_jacobian
-                side = determinant(gradient)
-                regular = np.isfinite(side) & (side > 0.0)
-                step = solved(gradient, scan_mm - at.value - xy_mm, regular, side)
-                scan_mm = scan_mm - step
-                found = regular & (np.abs(step).max(axis=1) <= TOLERANCE_MM)
-                if found.all():
-                    break
-        return scan_mm, found
+            return xy_mm, np.ones(len(xy_mm), dtype=bool)
+
+        def misclosure(scan_mm: Array) -> tuple[Array, Array]:
+            at = self.displacement(parameters, scan_mm)
+            return scan_mm - at.value - xy_mm, np.eye(2) - at.xy_jacobian
+
+        return newton(xy_mm, misclosure, lambda _: TOLERANCE_MM)
 
     @cached_property
     def _polynomial_set(self) -> PolynomialSet:

@@ -23,9 +23,8 @@ from math import comb
 import numpy as np
 
 from adjust.array_types import Array, Mask
-from adjust.linear_algebra.small_matrices import applied, determinant, solved
+from adjust.linear_algebra.small_matrices import NEWTON_STEPS, applied, determinant, solved
 
-NEWTON_STEPS = 30
 NEWTON_TOLERANCE = 1e-9  # fraction of a coordinate: the remaining error is the square of the last step
 
 

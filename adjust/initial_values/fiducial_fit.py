@@ -23,7 +23,6 @@ MOST_SUBSETS = 100
 GROSS = 13.8  # squared distance, in variances of a coordinate, above which a mark is an outlier (0.1 % point)
 PLAINLY = 0.01  # ratio of the squared residuals, mirrored over upright, below which a scan is mirrored
 LEAST_VARIANCE_MM2 = 1e-4  # of a coordinate: film deformation and scanner errors reach this
-LEAST_ASPECT = 0.1  # width over length of the marks: on a narrower strip, errors may be mistaken for mirroring
 LATTICE = np.stack(np.meshgrid(*2 * [np.linspace(-1.0, 1.0, 8)]), axis=-1).reshape(-1, 2)
 
 
@@ -64,33 +63,8 @@ def _is_mirrored(comparator_mm: Array, camera_mm: Array) -> bool:
     kinds = [film_kind("similarity", mirrored) for mirrored in (False, True)]
     if _agree(_squared(kinds[0], _fit(kinds[0], comparator_mm, camera_mm), comparator_mm, camera_mm)):
         return False
-    determinant = _determinant_where_marks_agree(comparator_mm, camera_mm)
-    if determinant is not None:
-        return determinant < 0
     upright, mirrored = (_robust_fit(kind, comparator_mm, camera_mm)[1] for kind in kinds)
     return mirrored < PLAINLY * upright
-
-
-def _determinant_where_marks_agree(comparator_mm: Array, camera_mm: Array) -> float | None:
-    """Determinant of the affine transformation on which all marks agree, negative for a mirrored scan."""
-    # None if the marks do not agree, are too few for a check, or are nearly collinear.
-    affine = film_kind("affine", False)
-    if (
-        len(comparator_mm) <= least_marks(affine)
-        or _are_nearly_collinear(comparator_mm)
-        or _are_nearly_collinear(camera_mm)
-    ):
-        return None
-    parameters = _fit(affine, comparator_mm, camera_mm)
-    if not _agree(_squared(affine, parameters, comparator_mm, camera_mm)):
-        return None
-    origin, *along = affine.apply(parameters, np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
-    return float(np.linalg.det(np.array(along) - origin))
-
-
-def _are_nearly_collinear(xy_mm: Array) -> bool:
-    most, least = np.linalg.svd(xy_mm - xy_mm.mean(axis=0), compute_uv=False)
-    return bool(least < LEAST_ASPECT * most)
 
 
 def _robust_fit(kind: FilmKind, comparator_mm: Array, camera_mm: Array) -> tuple[Array, float]:

@@ -5,12 +5,14 @@ operation on an element is one pass over contiguous numbers. A loop over matrice
 than for its arithmetic. All functions accept complex arrays, and arrays in any memory layout, only more slowly.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import DTypeLike
 
 from adjust.array_types import Array, Indices, Mask
+
+NEWTON_STEPS = 30
 
 
 def zeros(count: int, *shape: int, dtype: DTypeLike = np.float64) -> Array:
@@ -85,6 +87,28 @@ def solved(matrix: Array, right: Array, regular: Mask, of: Array) -> Array:
     first = (matrix[..., 1, 1] * x - matrix[..., 0, 1] * y) / divisor
     second = (matrix[..., 0, 0] * y - matrix[..., 1, 0] * x) / divisor
     return vectors(first, second)
+
+
+def newton(
+    start: Array, misclosure: Callable[[Array], tuple[Array, Array]], tolerance: Callable[[Array], Array | float]
+) -> tuple[Array, Mask]:
+    """Solve n pairs of equations by Newton's method; returns the unknowns (n, 2) and the mask of those found.
+
+    misclosure: values (n, 2) and derivatives (n, 2, 2) at unknowns (n, 2). A solution is found where the last step is
+    within the tolerance and the determinant of the derivatives is positive, so that the image is not folded over.
+    """
+    xy, found = start, np.zeros(len(start), dtype=bool)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(NEWTON_STEPS):
+            value, gradient = misclosure(xy)
+            side = determinant(gradient)
+            regular = np.isfinite(side) & (side > 0.0)
+            step = solved(gradient, value, regular, side)
+            xy = xy - step
+            found = regular & (np.abs(step).max(axis=1) <= tolerance(xy))
+            if found.all():
+                break
+    return xy, found
 
 
 def inverse(matrix: Array) -> Array:

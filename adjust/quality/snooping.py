@@ -22,8 +22,6 @@ from adjust.quality.weighting import robust_scale
 
 TOLD_APART = 7.0  # difference of two statistics that decides between explanations: odds of 30 to 1
 ALIKE_SHOWN = 3
-PAIRED = 300  # worst units searched for pairs that mask each other
-MOST_PAIRED = 2000  # largest number of tested units for which such pairs are searched
 AT_ONCE = 20  # columns of V computed in one pass
 MOST_SUSPECT = 0.25  # largest fraction of gross errors; beyond it, right and wrong cannot be distinguished
 MOST_AT_ONCE = 60  # gross errors in one adjustment; the next one continues
@@ -172,37 +170,12 @@ class Snooping:
         for _ in range(2 * most):
             statistic = self._reduced_statistics(chosen)
             worst = int(np.argmax(statistic / limits))
-            found = [worst] if statistic[worst] > limits[worst] else self._hidden_pair(chosen, limits)
-            if not found or len(chosen) + len(found) > most:
+            if statistic[worst] <= limits[worst] or len(chosen) == most:
                 break
-            chosen += found
+            chosen.append(worst)
             confirmed = self._joint_errors(chosen)[1] > limits[chosen]
-            chosen = [unit for unit, still in zip(chosen, confirmed, strict=True) if still or unit in found]
+            chosen = [unit for unit, still in zip(chosen, confirmed, strict=True) if still or unit == worst]
         return chosen
-
-    def _hidden_pair(self, chosen: Sequence[int], limits: Array) -> list[int]:
-        """Two units that mask each other: each is significant without the other, and both are together."""
-        # Searched only if the test of v'Pv still fails, among the PAIRED worst units. In large networks no unit has
-        # such an influence on another's residual, and the search is left out.
-        if len(limits) > MOST_PAIRED:
-            return []
-        finite = np.isfinite(limits)
-        raised = float((limits[finite] / self.critical[finite]).max(initial=1.0))
-        rest, redundancy = self.rest(chosen)
-        if special.chdtrc(redundancy, rest / raised) > self.probabilities.family:
-            return []
-        alone = self._reduced_statistics(chosen)
-        candidates = np.argsort(-alone / self.critical, kind="stable")[:PAIRED]
-        self._prepare([int(unit) for unit in candidates])
-        pairs = len(candidates) * (len(candidates) - 1) // 2
-        critical = raised * self.probabilities.critical(np.array([4]), pairs)[0]
-        given = np.array([self._reduced_statistics([*chosen, int(unit)])[candidates] for unit in candidates])
-        of_pair = alone[candidates][:, None] + given
-        hidden = (of_pair > critical) & (given > limits[candidates]) & (limits[candidates][:, None] < given.T)
-        if not hidden.any():
-            return []
-        first, second = np.unravel_index(np.argmax(np.where(hidden, of_pair, 0.0)), hidden.shape)
-        return [int(candidates[first]), int(candidates[second])]
 
     def _contradiction(self, chosen: Sequence[int], unit: int, limits: Array) -> GrossError:
         errors, joint = self._joint_errors(chosen)
