@@ -1,6 +1,5 @@
 """Commands that write files: rectified scans, exchange formats, converted lenses, synthetic scans, templates."""
 
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -77,10 +76,16 @@ def export(
     done = run_export(read(project, max_pixels), format, out_dir, ExportOptions(pitch_um, lens, misfit_px))
     show(
         as_json,
-        lambda: {"folder": str(out_dir), **asdict(replace(done.written, files={})), "files": done.files},
+        lambda: {
+            "folder": str(out_dir),
+            "files": tuple(done.files),
+            "lost": done.lost,
+            "notes": done.notes,
+            "left_out": done.left_out,
+        },
         lambda _: say(done.readme_text, f"{out_dir}: {counted(len(done.files), 'file')}"),
     )
-    return LOOK if done.written.left_out else DONE
+    return LOOK if done.left_out else DONE
 
 
 def import_(

@@ -6,7 +6,7 @@ import re
 import shutil
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -37,16 +37,7 @@ README = "README.txt"
 _HEAD = "Written by reseau"
 
 
-@dataclass(frozen=True)
-class Exchanged:
-    """Names of the written files and the text of their README. written: what was written, and what was lost."""
-
-    files: tuple[str, ...]
-    readme_text: str
-    written: Written
-
-
-def run_export(project: Project, format: str, folder: Path, options: ExportOptions) -> Exchanged:
+def run_export(project: Project, format: str, folder: Path, options: ExportOptions) -> Written:
     """Write a format's files into a folder, replacing an earlier export.
 
     Raises InputError for an unknown format, a folder that holds anything else, and whatever the format cannot
@@ -62,7 +53,7 @@ def run_export(project: Project, format: str, folder: Path, options: ExportOptio
     parts = {"Lost": written.lost, "Notes": written.notes, "Left out": written.left_out}
     readme_text = readme(format, _convention_lines(convention), parts)
     publish(folder, written.files, readme_text)
-    return Exchanged(tuple(written.files), readme_text, written)
+    return replace(written, readme_text=readme_text)
 
 
 def _convention_lines(convention: Convention) -> list[str]:
@@ -129,7 +120,7 @@ def _check_names(block: Block) -> None:
             )
 
 
-def run_import(format: str, paths: Sequence[Path], folder: Path, options: ImportOptions) -> Exchanged:
+def run_import(format: str, paths: Sequence[Path], folder: Path, options: ImportOptions) -> Written:
     """Convert another program's files and write the result into a folder, replacing an earlier import.
 
     Raises InputError for an unknown format and for files that do not have it.
@@ -149,7 +140,7 @@ def run_import(format: str, paths: Sequence[Path], folder: Path, options: Import
     parts = {"Files": tuple(files), "Notes": notes}
     readme_text = readme(f"import of {format}", ["From:", *(f"- {path.name}" for path in paths)], parts)
     publish(folder, files, readme_text)
-    return Exchanged(tuple(files), readme_text, Written(files, notes=notes))
+    return Written(files, notes=notes, readme_text=readme_text)
 
 
 def _unknown_notes(cameras: Sequence[CameraFile]) -> Iterator[str]:

@@ -73,12 +73,14 @@ class Written:
     lost : data that the format cannot hold.
     notes : remarks for the user.
     left_out : images, or parts of them, that were not exported, with the reasons.
+    readme_text : of the folder; "" before it is written.
     """
 
     files: Mapping[str, str | bytes]
     lost: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
+    readme_text: str = ""
 
 
 def format_writer(name: str) -> tuple[Callable[..., Written], Convention]:

@@ -57,10 +57,6 @@ class StoredThumbnail:
     step_px: float
     jpeg: bytes
 
-    @classmethod
-    def from_thumbnail(cls, thumbnail: Thumbnail, point: str, kind: str) -> "StoredThumbnail":
-        return cls(point, kind, thumbnail.origin_px, thumbnail.step_px, thumbnail.jpeg)
-
     @property
     def thumbnail(self) -> Thumbnail:
         pixels = cv2.imdecode(np.frombuffer(self.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
@@ -71,21 +67,14 @@ class StoredThumbnail:
         return (self.point, self.kind) == _WHOLE
 
 
-def stored_thumbnails(scan: Scan, measured: MeasuredScan) -> tuple[StoredThumbnail, ...]:
-    """Thumbnails of a scan just measured: of its marks, and of the whole scan if a reduced image was decoded."""
-    marks = [(mark, cut(scan, mark)) for mark in measured.frame.marks]
-    whole = [StoredThumbnail.from_thumbnail(picture, *_WHOLE) for picture in _whole(scan)]
-    return (
-        *whole,
-        *(StoredThumbnail.from_thumbnail(picture, m.point, m.kind) for m, picture in marks if picture is not None),
-    )
-
-
 class TakenThumbnails(list[StoredThumbnail]):
     """Collector of the thumbnails of scans while they are open."""
 
     def take(self, scan: Scan, measured: MeasuredScan) -> None:
-        self.extend(stored_thumbnails(scan, measured))
+        """Take those of the marks, and of the whole scan if a reduced image was decoded."""
+        taken: list[tuple[tuple[str, str], Thumbnail | None]] = [(_WHOLE, whole) for whole in _whole(scan)]
+        taken += [((mark.point, mark.kind), cut(scan, mark)) for mark in measured.frame.marks]
+        self += (StoredThumbnail(*name, each.origin_px, each.step_px, each.jpeg) for name, each in taken if each)
 
 
 def cut(scan: Scan, mark: MarkMeasurement) -> Thumbnail | None:
