@@ -6,7 +6,7 @@ combines them with film deformations, fiducials, lens and control.
 """
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,8 +15,8 @@ import numpy as np
 
 from adjust.functional_model.rotation import angles_from_rotation
 from adjust.problem.network import Exterior
-from pipeline.blocks.mapping import Mapped, given_interior, mapped, quiet_colmap
-from pipeline.blocks.pictures import BlockPicture, write_pictures
+from pipeline.blocks.mapping import given_interior, mapped, quiet_colmap
+from pipeline.blocks.pictures import write_pictures
 from pipeline.blocks.ties import oriented_by_control, tie_marks
 from pipeline.errors import InputError
 from pipeline.files.images_file import ELEMENTS, GivenImages
@@ -39,16 +39,14 @@ class OrientedBlock:
     Attributes
     ----------
     project : project with the block's own comparator.csv, images.csv and output.
-    mapped : result of COLMAP.
-    pictures : images that COLMAP used.
+    oriented : number of images that COLMAP oriented.
     seconds : duration of each step.
     left_out : images that COLMAP did not orient.
     ties, tracks : number of tie marks and of tie points.
     """
 
     project: Project
-    mapped: Mapped
-    pictures: tuple[BlockPicture, ...]
+    oriented: int
     seconds: dict[str, float]
     left_out: tuple[str, ...]
     ties: int
@@ -85,7 +83,7 @@ def run_block(project: Project, folder: Path, pitch_um: float | None, reporter: 
         poses = oriented_by_control(found, pictures, marks, project.object_points, interior)
         own = written_block(project, folder, (*marks, *ties), poses)
     left_out = tuple(sorted({project.scanned_frame(mark.image) or mark.image for mark in marks} - set(poses)))
-    return OrientedBlock(own, found, pictures, clock.seconds, left_out, len(ties), len({tie.point for tie in ties}))
+    return OrientedBlock(own, len(found.poses), clock.seconds, left_out, len(ties), len({tie.point for tie in ties}))
 
 
 def coarse_pitch_um(project: Project) -> float | None:
@@ -101,7 +99,7 @@ def coarse_pitch_um(project: Project) -> float | None:
 def block_lines(block: OrientedBlock) -> list[str]:
     """Lines for the user about a block."""
     lines = [
-        f"COLMAP oriented {counted(len(block.mapped.poses), 'image')}; {counted(block.ties, 'tie mark')} of "
+        f"COLMAP oriented {counted(block.oriented, 'image')}; {counted(block.ties, 'tie mark')} of "
         f"{counted(block.tracks, 'point')} are observations now."
     ]
     lines += [f"not oriented: {', '.join(block.left_out)}"] if block.left_out else []
@@ -133,7 +131,8 @@ def written_block(
             values = np.concatenate([station, angles_from_rotation(rotation)])
             exterior[image] = Exterior(values)
             elements = [repr(float(value)) for value in [*values[:3], *np.degrees(values[3:])]]
-        lines.append(csv_line([image, *elements, *(column.get(image, "") for column in _columns(given))]))
+        columns = (given.camera, given.scanner, given.part_of)
+        lines.append(csv_line([image, *elements, *(column.get(image, "") for column in columns)]))
     write_atomically(folder / "images.csv", "\n".join(lines) + "\n")
     return replace(
         project,
@@ -143,10 +142,6 @@ def written_block(
         given_images=replace(given, exterior=exterior),
         images_path=folder / "images.csv",
     )
-
-
-def _columns(given: GivenImages) -> tuple[Mapping[str, str], ...]:
-    return given.camera, given.scanner, given.part_of
 
 
 def _problems(results: Sequence[Resampled]) -> str:

@@ -46,12 +46,10 @@ class Mapped:
     Attributes
     ----------
     poses : by image, rotation (3, 3) and translation (3,) to axes x right, y down, z forward.
-    points : by point, coordinates (3,).
     tracks : by point, its observations.
     """
 
     poses: dict[str, tuple[Array, Array]]
-    points: dict[int, Array]
     tracks: dict[int, list[Sight]]
 
 
@@ -103,7 +101,7 @@ def read_model(model: Any, database: Any, pictures: Sequence[BlockPicture]) -> M
         pose = image.cam_from_world()
         poses[names[image.name]] = (np.array(pose.rotation.matrix()), np.array(pose.translation))
     sizes_px = {number: _sizes_px(np.array(database.read_keypoints(number))) for number in images}
-    tracks, points = {}, {}
+    tracks = {}
     for number, point in model.points3D.items():
         sights = []
         for element in point.track.elements:
@@ -113,8 +111,8 @@ def read_model(model: Any, database: Any, pictures: Sequence[BlockPicture]) -> M
             place = place_px - CONVENTION.first_pixel_px
             size_px = float(sizes_px[element.image_id][row])
             sights.append(Sight(names[image.name], float(place[0]), float(place[1]), size_px, off_px))
-        tracks[int(number)], points[int(number)] = sights, np.array(point.xyz)
-    return Mapped(poses, points, tracks)
+        tracks[int(number)] = sights
+    return Mapped(poses, tracks)
 
 
 def _sizes_px(keypoints: Array) -> Array:

@@ -62,10 +62,6 @@ class StoredThumbnail:
         pixels = cv2.imdecode(np.frombuffer(self.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
         return Thumbnail(np.asarray(pixels), self.origin_px, self.step_px)
 
-    @property
-    def is_whole(self) -> bool:
-        return (self.point, self.kind) == _WHOLE
-
 
 class TakenThumbnails(list[StoredThumbnail]):
     """Collector of the thumbnails of scans while they are open."""

@@ -326,7 +326,7 @@ def test_the_whole_scan_is_kept_where_measuring_saw_it(folder: Path) -> None:
     with ThumbnailStore(folder / "out" / "measurement.db") as store:
         stored = store.get(keys(folder)["a"])
     assert stored is not None
-    assert stored.is_whole
+    assert (stored.point, stored.kind) == ("", "frame")
     pixels = tifffile.imread(folder / "a.tif").astype(float)
     step = round(stored.step_px)
     height, width = stored.thumbnail.pixels.shape

@@ -208,7 +208,6 @@ def lattice_px(places_mm: Array) -> Array:
 def mapped(noise_px: float = 0.0) -> Mapped:
     """What COLMAP would say of a perfect block, in a frame that is turned, shifted and of another scale."""
     rng = np.random.default_rng(5)
-    theirs = SCALE * POINTS @ TURN.T + SHIFT
     poses = {}
     for i in IMAGES:
         turn = np.diag([1.0, -1.0, -1.0]) @ rotation(*TRUTH.attitudes[i]) @ TURN.T
@@ -219,7 +218,7 @@ def mapped(noise_px: float = 0.0) -> Mapped:
     tracks = {
         j: [Sight(f"f{i}", float(view[i][j, 0]), float(view[i][j, 1]), 4.0, off) for i in IMAGES] for j in range(100)
     }
-    return Mapped(poses, dict(enumerate(theirs)), tracks)
+    return Mapped(poses, tracks)
 
 
 def disagree(block: Mapped, off_px: float) -> Mapped:
