@@ -49,14 +49,9 @@ def read_bytes(path: Path, most_mb: int = MOST_MB) -> bytes:
     return data
 
 
-def read_json(path: Path) -> Any:
-    """Read a JSON file. Raises as `read_bytes`, and InputError, with the remedy, for invalid JSON, which includes NaN,
-    infinite and overlong numbers, and excessive nesting."""
-    return parse_json(read_bytes(path), path)
-
-
 def parse_json(data: bytes, path: Path) -> Any:
-    """Parse the content of a JSON file, as `read_json` does. path: for messages."""
+    """Parse the content of a JSON file. path: for messages. Raises InputError, with the remedy, for invalid JSON, which
+    includes NaN, infinite and overlong numbers, and excessive nesting."""
     try:
         return json.loads(data.decode("utf-8"), parse_constant=refuse_constant)
     except (ValueError, RecursionError) as error:
