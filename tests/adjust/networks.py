@@ -497,13 +497,11 @@ def halves(
     overlap_mm: float = 40.0,
     targets: int = 12,
     turned: bool = False,
-    known_fiducials: bool = True,
     join_sigma: float = JOIN_SIGMA,
 ) -> Halves:
     """Four frames of known points, each in a left and a right half with an affine film of its own.
 
-    turned: the right halves lay turned by half a turn. known_fiducials: given to 1 um, else to 1 mm.
-    join_sigma: of the joins' errors, mm.
+    turned: the right halves lay turned by half a turn. join_sigma: of the joins' errors, mm.
     """
     truth = Truth()
     points = field_points(rng, targets)
@@ -530,12 +528,11 @@ def halves(
             observed = comparator_point("affine", film, False, np.array([mark[2] for mark in own]))
             for (kind, id_, _, sigma), xy in zip(own, observed, strict=True):
                 rows.append((name, id_, kind, xy + rng.normal(0.0, sigma, 2), max(sigma, 1e-4)))
-    sigma = 0.001 if known_fiducials else 1.0
     camera = Camera(
         "K",
         *given_interior(np.array([truth.c, truth.x0, truth.y0]) + rng.normal(size=3)),
         Distortion(truth.family, {name: Prior(value) for name, value in truth.distortion.items()}),
-        given_marks({id_: xy + rng.normal(0.0, sigma, 2) for id_, xy in FIDUCIALS.items()}, sigma),
+        given_marks({id_: xy + rng.normal(0.0, 0.001, 2) for id_, xy in FIDUCIALS.items()}, 0.001),
     )
     images = tuple(Image(name, "K", "affine", part_of=name.split(".")[0]) for name in films)
     targets_xyz = known_points({str(j): xyz for j, xyz in enumerate(points)})
@@ -776,10 +773,9 @@ def project_field(
     outliers: float = 0.0,
     distortion: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
     aspect: float = 1.0,
-    seed: int = 1,
 ) -> Projected:
     """A network of known points as OpenCV projects them, scanned with any turn; all points within 115 mm are seen."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(1)
     rows: list[ObservedRow] = []
     rotations, centers = {}, {}
     for number, station in enumerate(stations):
@@ -834,8 +830,8 @@ def scan_from_camera(kind: Transformation, mirrored: bool, rng: np.random.Genera
     return turn @ stretch @ np.diag([-1.0 if mirrored else 1.0, 1.0]), rng.uniform(50.0, 150.0, 2)
 
 
-def relief_field(relief_m: float, seed: int = 5, n: int = 40) -> Array:
-    return np.random.default_rng(seed).uniform(-1.0, 1.0, (n, 3)) * [900.0, 900.0, relief_m]
+def relief_field(relief_m: float, n: int = 40) -> Array:
+    return np.random.default_rng(5).uniform(-1.0, 1.0, (n, 3)) * [900.0, 900.0, relief_m]
 
 
 CONVERGENT_STATIONS = [

@@ -30,11 +30,6 @@ def whole(result: Adjustment) -> Array:
     return result.cofactor_of(result.names)
 
 
-def free_network() -> tuple[Network, Adjustment, Adjustment]:
-    network, start = simulated(np.random.default_rng(5), point_sigma=np.inf, free={"k3": np.inf})
-    return network, adjust(network, start, Options(datum="minimal")), adjust(network, start, Options(datum="free"))
-
-
 CHOICES = (
     Options(datum="minimal"),
     Options(datum="minimal", datum_coordinates=("0.X", "0.Y", "0.Z", "1.X", "1.Y", "1.Z", "2.Z")),
@@ -284,7 +279,8 @@ def test_no_attitude_is_singular() -> None:
 
 def test_cofactors_of_each_are_parts_of_the_whole_matrix() -> None:
     """Of points and of images, in a free network and in one with fixed coordinates."""
-    for result in free_network()[1:]:
+    network, start = simulated(np.random.default_rng(5), point_sigma=np.inf, free={"k3": np.inf})
+    for result in (adjust(network, start, Options(datum="minimal")), adjust(network, start, Options(datum="free"))):
         for prefix, count in (("PT.", 3), ("EO.", 6)):
             groups = np.flatnonzero(np.char.startswith(result.names, prefix)).reshape(-1, count)
             expected = [result.cofactor.part(at) for at in groups]

@@ -270,18 +270,15 @@ def test_the_origin_of_the_comparator_does_not_matter(kind: Transformation) -> N
         np.random.default_rng(4), Truth(), "polynomial(3)", field_points(np.random.default_rng(5), 40), noise=False
     )
     network = replace(network, images=tuple(replace(image, transformation=kind) for image in network.images))
-    results = [adjust(each, approximate(each)) for each in (network, moved_origin(network, 1500.0))]
+    observations = network.observations
+    moved = replace(network, observations=replace(observations, xy_mm=observations.xy_mm + 1500.0))
+    results = [adjust(each, approximate(each)) for each in (network, moved)]
     for result in results:
         assert result.converged
         assert np.abs(result.residuals.v_mm).max() < 1e-10
     for name in ("IO.K.c", "IO.K.x0", "FID.K.3.y", "EO.f2.omega"):
         near, far = (result.sigma(name) / result.sigma0 for result in results)
         assert far == pytest.approx(near, rel=1e-9)
-
-
-def moved_origin(network: Network, off_mm: float) -> Network:
-    observations = network.observations
-    return replace(network, observations=replace(observations, xy_mm=observations.xy_mm + off_mm))
 
 
 @pytest.mark.parametrize(("kind", "marks"), [("projective", 3), ("bilinear", 3), ("conformal(3)", 2)])

@@ -91,7 +91,8 @@ def test_covariance_is_that_of_the_same_data_adjusted_in_the_other_family() -> N
     rng = np.random.default_rng(2)
     first = adjust_network(lens_network("aicon", rng), ("a1", "a2", "b1", "b2"))
     network = first.network
-    second = adjust_network(set_family(network, "opencv"), ("k1", "k2", "p1", "p2"))
+    other = replace(network, cameras=(replace(network.cameras[0], distortion=Distortion("opencv")),))
+    second = adjust_network(other, ("k1", "k2", "p1", "p2"))
     source, names = quantities("aicon"), quantities("opencv")
     values = np.array([first.value(name) for name in source])
     lens = Lens(network.cameras[0].distortion, values[:3], values[3:], first.cofactor_of(source))
@@ -109,10 +110,6 @@ def test_covariance_is_that_of_the_same_data_adjusted_in_the_other_family() -> N
 
 def quantities(family: str) -> list[str]:
     return [f"IO.L.{name}" for name in ("c", "x0", "y0", *parameter_names(family))]
-
-
-def set_family(network: Network, family: str) -> Network:
-    return replace(network, cameras=(replace(network.cameras[0], distortion=Distortion(family)),))
 
 
 def adjust_network(network: Network, free: tuple[str, ...]) -> Adjustment:

@@ -62,11 +62,6 @@ def numbered(xyz: Array) -> dict[str, Array]:
     return {str(j): each for j, each in enumerate(xyz)}
 
 
-def board() -> Array:
-    x, y = np.meshgrid(np.arange(-6.0, 7.0), np.arange(-5.0, 6.0))
-    return np.stack([x.ravel() * 100, y.ravel() * 100, np.zeros(x.size)], axis=1)
-
-
 def test_projection_is_opencvs() -> None:
     angles, station = np.array([0.2, -0.3, 0.5]), np.array([300.0, -200.0, 1500.0])
     xyz = np.random.default_rng(2).uniform(-400, 400, (50, 3))
@@ -124,8 +119,8 @@ def test_corrected_points_are_opencvs_undistorted_points() -> None:
 def test_adjustment_recovers_opencvs_parameters() -> None:
     """Exact images by OpenCV, its parameters and fx/fy free: estimated as they went in."""
     rng = np.random.default_rng(6)
-    relief = board()
-    relief[:, 2] = 150 * np.sin(relief[:, 0] / 70)
+    x, y = (100.0 * each.ravel() for each in np.meshgrid(np.arange(-6.0, 7.0), np.arange(-5.0, 6.0)))
+    relief = np.stack([x, y, 150 * np.sin(x / 70)], axis=1)
     tilts = [(0.0, 0.0, 0.0), (0.4, 0.1, 1.5), (-0.4, 0.2, 3.0), (0.1, 0.45, -1.5), (-0.1, -0.4, 0.7)]
     poses = [(np.array(tilt), np.array([1200 * tilt[1], -1200 * tilt[0], 1150.0])) for tilt in tilts]
     rows = [

@@ -21,12 +21,6 @@ _MOST_LOST = 60  # bytes
 _HEADERS = 800  # bytes at either end of a file: where tags and tables stand
 
 
-@cache
-def read_pixels() -> NDArray[np.uint16]:
-    """(400, 400), of 16 bits."""
-    return np.clip(frame_picture(NUMBERED, pixel_from_camera("0")), 0, 65535).astype(np.uint16)
-
-
 def _tiff(grey: NDArray[Any], **options: Any) -> bytes:
     memory = BytesIO()
     tifffile.imwrite(memory, grey, **options)
@@ -48,7 +42,7 @@ def _png(grey: NDArray[Any]) -> bytes:
 @cache
 def stored() -> Mapping[str, bytes]:
     """The frame as files, by how they store it."""
-    fine = read_pixels()
+    fine = np.clip(frame_picture(NUMBERED, pixel_from_camera("0")), 0, 65535).astype(np.uint16)
     grey = (fine >> 7).clip(0, 255).astype(np.uint8)
     colour = np.dstack([grey, grey, grey])
     in_jpeg: dict[str, Any] = {"compression": "jpeg", "compressionargs": {"level": 90}}

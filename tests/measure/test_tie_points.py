@@ -240,11 +240,8 @@ def picture_joins(blur: float) -> Array:
     """Band-limited noise, whose values between pixels are known: periodic, by its spectrum."""
     rng = np.random.default_rng(2)
     spectrum = np.fft.rfft2(rng.normal(size=(SIDE, SIDE)))
-    return np.asarray(np.fft.irfft2(spectrum * np.exp(-2.0 * (np.pi * blur * _frequencies()) ** 2), s=(SIDE, SIDE)))
-
-
-def _frequencies() -> Array:
-    return np.asarray(np.hypot(np.fft.fftfreq(SIDE)[:, None], np.fft.rfftfreq(SIDE)[None]))
+    frequencies = np.hypot(np.fft.fftfreq(SIDE)[:, None], np.fft.rfftfreq(SIDE)[None])
+    return np.asarray(np.fft.irfft2(spectrum * np.exp(-2.0 * (np.pi * blur * frequencies) ** 2), s=(SIDE, SIDE)))
 
 
 def shifted(grey: Array, col: float, row: float) -> Array:

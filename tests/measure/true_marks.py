@@ -26,7 +26,6 @@ GREYS = 4  # gain, offset, two slopes
 MARGIN_PX = 8  # of ground about a mark's bounds
 MARGIN_BLURS = 4.0  # standard deviations of the blur, about its outline
 _OUTLINE_BLUR_PX, _SHOWN = 0.3, 0.02  # what counts as the mark itself
-_FINE = 4  # likewise, of what is drawn together with its ground
 _FOLD = 8  # pixels of a quarter leave bars that cross almost along the pixels 0.001 px off
 WHITE = 0.1  # of the variance of grain: the scanner's own noise
 

@@ -140,7 +140,6 @@ def seen_px(camera: CameraFile, format: str) -> Array:
 
 
 FISHEYE_PITCH_MM = 0.1
-FISHEYE_POINTS = np.random.default_rng(2).uniform(-1.0, 1.0, (60, 3)) * [2.0, 2.0, 0.3]
 
 
 def fisheye_project(folder: Path) -> Path:

@@ -21,7 +21,6 @@ from pipeline import InputError, read_comparator, read_images, read_measurement
 from pipeline.cli import run
 from pipeline.files.project_file import read_project
 from pipeline.measuring.tie_stage import add_joins
-from pipeline.results.measured_record import MeasuredScan
 
 MARKS = """
 [camera]
@@ -285,23 +284,14 @@ def test_scans_that_have_nothing_in_common_are_reported(tmp_path: Path) -> None:
 def test_fiducials_that_contradict_the_joins_are_rejected(halves: Path) -> None:
     """As if the frame of the right half had been found one mark too far to the right."""
     project = read_project(halves / "project.toml")
-    scans = [_bare(scan) for scan in read_measurement(halves / "out" / "measurement.db")]
-    shifted = scans[1].frame.pixel_from_camera
-    assert shifted is not None
-    shifted = shifted + np.array([[0.0, 0.0, 50.0], [0.0, 0.0, 0.0]])
-    wrong = _set_frame(scans[1], shifted)
-    result = add_joins(project, [scans[0], wrong], lambda *_: None, None)
+    scans = []
+    for scan, shift_px in zip(read_measurement(halves / "out" / "measurement.db"), (0.0, 50.0), strict=True):
+        marks = tuple(mark for mark in scan.frame.marks if mark.kind != "join")
+        place = np.array(scan.frame.pixel_from_camera) + np.array([[0.0, 0.0, shift_px], [0.0, 0.0, 0.0]])
+        scans.append(replace(scan, frame=replace(scan.frame, marks=marks, problems=(), pixel_from_camera=place)))
+    result = add_joins(project, scans, lambda *_: None, None)
     assert all("contradict those of" in " ".join(scan.frame.problems) for scan in result)
     assert not any(mark.kind == "fiducial" and mark.status.is_observation for mark in result[1].frame.marks)
-
-
-def _bare(scan: MeasuredScan) -> MeasuredScan:
-    marks = tuple(mark for mark in scan.frame.marks if mark.kind != "join")
-    return replace(scan, frame=replace(scan.frame, marks=marks, problems=()))
-
-
-def _set_frame(scan: MeasuredScan, pixel_from_camera: np.ndarray) -> MeasuredScan:
-    return replace(scan, frame=replace(scan.frame, pixel_from_camera=pixel_from_camera))
 
 
 @pytest.mark.study

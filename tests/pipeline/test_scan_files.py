@@ -26,7 +26,6 @@ from pipeline.files.scan_files import find_scans, found_names
 from pipeline.measuring.scan_measurement import measured_scan
 from pipeline.measuring.scan_task import scan_tasks
 from pipeline.provenance import file_state, parts_hash
-from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.tables import Table
 from synthetic_images import areas, scene
 from synthetic_images.render import render_scene
@@ -130,13 +129,8 @@ def truth(folder: Path, image: str) -> Array:
     return np.array([[places[id]["col_px"], places[id]["row_px"]] for id in CORNERS])
 
 
-def measure_picture(folder: Path, image: str) -> MeasuredScan:
-    (task,) = scan_tasks(read_project(folder / "project.toml"), [image])
-    return measured_scan(task)
-
-
 def test_what_a_scan_shows_next_to_the_frame_that_was_measured_needs_attention(roll: Path) -> None:
-    scan = measure_picture(roll, "roll")
+    scan = measured_scan(scan_tasks(read_project(roll / "project.toml"), ["roll"])[0])
     finding = " ".join(scan.frame.problems)
     assert "2 pictures of full size (pages 1, 2), and page 1 was measured" in finding
     assert "shows a second frame" in finding or "shows another frame" in finding

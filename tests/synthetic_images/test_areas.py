@@ -5,16 +5,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from synthetic_images.areas import Area, bar, bounds, centroid, coverage, disk, polygon, ring, stroke
+from synthetic_images.areas import bar, bounds, centroid, coverage, disk, polygon, ring, stroke
 from synthetic_images.optics import seen_coverage
 
 Array = NDArray[np.float64]
 
 WINDOW = (-3, 5, 24, 20)  # col0, row0, width, height
-
-
-def shift_area(area: Area, by: tuple[float, float]) -> Area:
-    return tuple(outline + by for outline in area)
 
 
 def moments(cover: NDArray[np.float32], col0: int, row0: int) -> tuple[float, Array]:
@@ -108,7 +104,7 @@ def test_an_outline_may_run_either_way_round() -> None:
 
 
 def test_a_window_cuts_and_changes_nothing() -> None:
-    area = shift_area(disk((0.0, 0.0), 9.0), (7.6, 14.2))
+    area = tuple(outline + np.array((7.6, 14.2)) for outline in disk((0.0, 0.0), 9.0))
     col0, row0, width, height = -10, -5, 40, 40
     whole = coverage((area,), col0, row0, width, height)
     part = coverage((area,), 4, 9, 7, 6)
