@@ -47,9 +47,6 @@ def test_values_stand_with_their_a_posteriori_sigma_and_what_was_given(adjustmen
     assert camera["distortion"]["k3"]["given"] == {"value": 0.0, "sigma": None}, "free: no sigma is given"
     assert camera["distortion"]["k7"] == {"value": 0.0, "sigma": 0.0, "given": {"value": 0.0, "sigma": 0.0}}
     assert set(camera["fiducials"]) == set("12345678")
-
-
-def test_a_fixed_quantity_has_sigma_zero(path: Path) -> None:
     assert file_content(path)["points"]["3"]["Z"]["sigma"] == 0.0
 
 
@@ -165,14 +162,12 @@ def test_the_file_has_the_keys_of_its_contract(path: Path) -> None:
     assert list(content["groups"]["target"]) == ["sigma0", "rms_x_um", "rms_y_um", "redundancy"]
 
 
-def test_a_missing_file_says_what_to_run(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"adjustment\.json: there is no such file\. Run `reseau adjust`"):
-        read_adjustment(tmp_path / "adjustment.json")
-
-
-def test_text_that_is_no_json_is_named_with_its_line(path: Path) -> None:
+def test_a_file_that_is_missing_or_no_json_is_named_with_what_to_do(path: Path) -> None:
     path.write_text('{"reseau": "0.1",\n oh', encoding="utf-8")
     with pytest.raises(InputError, match=r"is not valid JSON .*line 2"):
+        read_adjustment(path)
+    path.unlink()
+    with pytest.raises(InputError, match=r"adjustment\.json: there is no such file\. Run `reseau adjust`"):
         read_adjustment(path)
 
 
@@ -206,11 +201,19 @@ def test_a_broken_file_names_the_place(path: Path, keys: tuple[str, ...], value:
 
 def test_a_missing_or_broken_covariance_is_named(path: Path) -> None:
     file = covariance_path(path)
+    with np.load(file) as arrays:
+        content = dict(arrays)
+    content["names"][0] = "c"
+    wrong_size = {"names": np.array(["a", "b"]), "values": np.zeros(2), "matrix": np.zeros((3, 3))}
+    for arrays, words in (
+        (content, "'c' names no quantity of an adjustment"),
+        (wrong_size, "2 names do not fit a matrix"),
+    ):
+        np.savez_compressed(file, **arrays)
+        with pytest.raises(InputError, match=words):
+            read_covariance(path)
     file.write_bytes(b"no archive")
     with pytest.raises(InputError, match=r"adjustment\.npz: is not a covariance file"):
-        read_covariance(path)
-    np.savez(file, names=np.array(["a", "b"]), values=np.zeros(2), matrix=np.zeros((3, 3)))
-    with pytest.raises(InputError, match="2 names do not fit a matrix"):
         read_covariance(path)
     file.unlink()
     with pytest.raises(InputError, match="there is no such file"):
@@ -261,16 +264,6 @@ def test_names_that_would_run_together_have_results_of_their_own(tmp_path: Path)
             assert covariance.select([alike])[0, 0] == pytest.approx(plain.sigma(own) ** 2, rel=1e-12)
 
 
-def test_a_covariance_whose_names_say_nothing_is_refused(path: Path) -> None:
-    file = covariance_path(path)
-    with np.load(file) as arrays:
-        content = dict(arrays)
-    content["names"][0] = "c"
-    np.savez_compressed(file, **content)
-    with pytest.raises(InputError, match="'c' names no quantity of an adjustment"):
-        read_covariance(path)
-
-
 def iterate_places(value: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
     """Every place of a JSON value, of lists those of the first entry."""
     yield place
@@ -282,17 +275,8 @@ def iterate_places(value: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[An
 def test_a_check_with_a_value_of_a_wrong_type_is_refused_with_its_place(tmp_path: Path) -> None:
     pixels = PixelCalibration(1.0, 2.0, 3.0, 4.0, 0.5)
     corners = CornersCheck("findChessboardCorners", 3, 12, ("a",), pixels, pixels)
-    camera = CameraCheck(
-        "agrees",
-        "All agree.",
-        3,
-        12,
-        1.0,
-        1.1,
-        0.1,
-        (Row.from_numbers("k1", "", Estimate(1.0, 0.1), Estimate(1.0, 0.1)),),
-        corners,
-    )
+    row = Row.from_numbers("k1", "", Estimate(1.0, 0.1), Estimate(1.0, 0.1))
+    camera = CameraCheck("agrees", "All agree.", 3, 12, 1.0, 1.1, 0.1, (row,), corners)
     content = plain_json(Check.from_cameras({"K": camera}))
     path = tmp_path / "check.json"
     path.write_text(json.dumps(content), encoding="utf-8")

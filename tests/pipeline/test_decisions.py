@@ -53,8 +53,12 @@ def place(point: str, col_px: float, **rest: Any) -> Decision:
     return mark_decision(Choice.PLACE, point, col_px=col_px, row_px=2.0, **rest)
 
 
-def test_what_is_appended_is_read_again(tmp_path: Path) -> None:
-    path = tmp_path / "decisions.jsonl"
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "decisions.jsonl"
+
+
+def test_what_is_appended_is_read_again(path: Path) -> None:
     result = [
         Decision("box/a", Choice.ACCEPT, "1", "fiducial", note="é <b>", who="ann", when="2026-01-01T10:00:00+00:00"),
         place("2", 1.5, fingerprint="f", window=(1.0, 2.0, 81.0, 81.0)),
@@ -66,8 +70,7 @@ def test_what_is_appended_is_read_again(tmp_path: Path) -> None:
     assert read_decisions(path) == tuple(result)
 
 
-def test_a_line_cut_short_does_not_count_and_the_next_one_stands_by_itself(tmp_path: Path) -> None:
-    path = tmp_path / "decisions.jsonl"
+def test_a_line_cut_short_does_not_count_and_the_next_one_stands_by_itself(path: Path) -> None:
     append_decisions(path, [mark_decision(Choice.ACCEPT)])
     whole = path.read_bytes()
     path.write_bytes(whole + b'{"image": "a", "deci')
@@ -79,9 +82,10 @@ def test_a_line_cut_short_does_not_count_and_the_next_one_stands_by_itself(tmp_p
     assert [one.decision for one in read_decisions(path)] == [Choice.ACCEPT, Choice.REJECT]
 
 
-def test_lines_that_a_full_disk_stops_are_all_taken_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lines_that_a_full_disk_stops_are_all_taken_back(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Of a roll, decided at once: none of its lines counts, and the message says so."""
-    path = tmp_path / "decisions.jsonl"
     append_decisions(path, [mark_decision(Choice.ACCEPT)])
     before = path.read_bytes()
 
@@ -97,9 +101,8 @@ def test_lines_that_a_full_disk_stops_are_all_taken_back(tmp_path: Path, monkeyp
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_lines_that_a_process_was_ended_over_do_not_count(tmp_path: Path) -> None:
+def test_lines_that_a_process_was_ended_over_do_not_count(path: Path, tmp_path: Path) -> None:
     """What stands beside the file then tells where the lines that count end."""
-    path = tmp_path / "decisions.jsonl"
     append_decisions(path, [mark_decision(Choice.ACCEPT)])
     size = path.stat().st_size
     append_decisions(path, [Decision(f"f{k}", Choice.POSE, pose="90") for k in range(120)])
@@ -123,8 +126,7 @@ def test_lines_that_a_process_was_ended_over_do_not_count(tmp_path: Path) -> Non
         Decision("a", Choice.ACCEPT),
     ],
 )
-def test_what_would_not_be_read_is_not_written(decision: Decision, tmp_path: Path) -> None:
-    path = tmp_path / "decisions.jsonl"
+def test_what_would_not_be_read_is_not_written(decision: Decision, path: Path) -> None:
     with pytest.raises(InputError, match=r"the decision about a.*Nothing was written"):
         append_decisions(path, [mark_decision(Choice.ACCEPT), decision])
     assert not path.exists()
@@ -133,8 +135,7 @@ def test_what_would_not_be_read_is_not_written(decision: Decision, tmp_path: Pat
 @pytest.mark.parametrize(
     "line", ['{"image": "a" "point": "1"}', "nothing", "{'image': 'a'}", '{"image": "a", "decision": NaN}']
 )
-def test_a_typing_error_in_the_last_line_is_named(line: str, tmp_path: Path) -> None:
-    path = tmp_path / "decisions.jsonl"
+def test_a_typing_error_in_the_last_line_is_named(line: str, path: Path) -> None:
     append_decisions(path, [mark_decision(Choice.ACCEPT)])
     with path.open("a") as file:
         file.write(line)
@@ -189,10 +190,9 @@ def test_status_is_stale_until_a_decision_is_taken_in(tmp_path: Path, capsys: py
 
 
 @pytest.mark.study
-def test_a_million_lines_are_read_in_little_more_than_their_json_takes(tmp_path: Path) -> None:
+def test_a_million_lines_are_read_in_little_more_than_their_json_takes(path: Path) -> None:
     """1.1 to 1.8 times as long; 4.2 to 4.5 s of CPU."""
     line = '{{"image": "box/{0:05d}", "point": "{1}", "kind": "fiducial", "decision": "reject", "who": "ann"}}'
-    path = tmp_path / "decisions.jsonl"
     path.write_text("\n".join(line.format(k % 50_000, k % 8) for k in range(1_000_000)) + "\n")
     began = time.process_time()
     assert len(read_decisions(path)) == 1_000_000
@@ -204,7 +204,7 @@ def test_a_million_lines_are_read_in_little_more_than_their_json_takes(tmp_path:
 
 
 def test_lines_of_all_forms_are_read_in_their_order_and_a_wrong_one_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Lines are checked many at a time, those of one form together."""
     monkeypatch.setattr(decisions_file, "_BYTES_AT_A_TIME", 500)
@@ -217,7 +217,6 @@ def test_lines_of_all_forms_are_read_in_their_order_and_a_wrong_one_is_named(
     ]
     chosen = np.random.default_rng(3).integers(len(forms), size=200).tolist()
     lines = [json.dumps(forms[form]).replace("{}", str(k)) for k, form in enumerate(chosen)]
-    path = tmp_path / "decisions.jsonl"
     path.write_text("\n \n".join(lines) + "\n")
     read = read_decisions(path)
     expected = [
@@ -256,8 +255,7 @@ def test_lines_of_all_forms_are_read_in_their_order_and_a_wrong_one_is_named(
         ("{", "line 2: is no JSON"),
     ],
 )
-def test_a_wrong_line_is_named(line: str, words: str, tmp_path: Path) -> None:
-    path = tmp_path / "decisions.jsonl"
+def test_a_wrong_line_is_named(line: str, words: str, path: Path) -> None:
     path.write_text(f'{{"image": "a", "decision": "accept", "point": "1"}}\n{line}\n')
     with pytest.raises(InputError, match=words):
         read_decisions(path)
