@@ -34,11 +34,15 @@ def test_the_critical_w_grows_with_the_number_of_tests() -> None:
     assert critical_w(100) == pytest.approx(3.891, abs=1e-3)
 
 
+ONE_LINE = 150  # letters in the width of the report at 1300 px
+
+
 def describe(data: ReportData) -> str:
     """All problems in one text, for a calibration that is not good."""
     verdict = judge(data)
     assert verdict.level == "look"
     assert verdict.exit_code == 1
+    assert [problem.remedy for problem in verdict.problems if len(problem.remedy) > ONE_LINE] == []
     return " ".join(f"{problem.what} {problem.next_step}" for problem in verdict.problems)
 
 
