@@ -185,10 +185,16 @@ def test_a_file_that_is_missing_or_no_json_is_named_with_what_to_do(path: Path) 
         (("images", "f1", "camera"), "other", r"images\['f1'\].camera is 'other', which cameras do not hold"),
         (("images", "f1", "transformation"), {"kind": "affine"}, "transformation has no key 'a1'"),
         (("sigma0_from", "redundancy"), None, "sigma0_from.redundancy is None; it should be a number"),
+        (("sigma0_from",), {}, r"sigma0_from has no key 'redundancy'\."),
         (("vpv",), 10**400, "vpv is .*; it should be a finite number"),
+        (("groups", "target", "sigma0"), "x", r"groups\['target'\].sigma0 is 'x'; it should be a number or null"),
+        (("history", 0, "attempts"), 1.5, r"history\[0\].attempts is 1\.5; it should be a whole number"),
+        (("cameras", "RC 20", "distortion", "decentering"), "x", "is 'x'; it should be 'reduced' or 'paper' or null"),
+        (("scanners",), {"s": {"center_mm": [1.0]}}, r"scanners\['s'\].center_mm is \[1.0\]; .* a list of 2"),
+        (("suspects",), {}, "suspects is {}; it should be a list"),
     ],
 )  # fmt: skip
-def test_a_broken_file_names_the_place(path: Path, keys: tuple[str, ...], value: object, message: str) -> None:
+def test_a_broken_file_names_the_place(path: Path, keys: tuple[Any, ...], value: object, message: str) -> None:
     content = file_content(path)
     inner = content
     for key in keys[:-1]:
@@ -197,6 +203,15 @@ def test_a_broken_file_names_the_place(path: Path, keys: tuple[str, ...], value:
     path.write_text(json.dumps(content), encoding="utf-8")
     with pytest.raises(InputError, match=message):
         read_adjustment(path)
+
+
+def test_null_is_a_number_that_is_not_known(path: Path) -> None:
+    content = file_content(path)
+    content["groups"]["target"]["rms_x_um"] = content["residuals"][0]["w"] = None
+    path.write_text(json.dumps(content), encoding="utf-8")
+    adjustment = read_adjustment(path)
+    assert np.isnan([adjustment.groups["target"].rms_x_um, adjustment.residuals[0].w]).all()
+    assert plain_json(adjustment) == content
 
 
 def test_a_missing_or_broken_covariance_is_named(path: Path) -> None:
