@@ -46,7 +46,7 @@ def test_the_formulas(kind: Transformation, mirrored: bool) -> None:
 def test_derivatives_by_complex_steps(kind: Transformation, mirrored: bool) -> None:
     formula, parameters = film_kind(kind, mirrored), make_parameters(kind, mirrored)
     gradient = formula.gradient(parameters, PLACES_MM)
-    design = formula.design(parameters, PLACES_MM, np.zeros(2), ONE)
+    design = Film(kind, parameters, MIDDLE_MM, mirrored).design(PLACES_MM)
     for axis in (0, 1):
         stepped = formula.apply(parameters, PLACES_MM + 1j * STEP * np.eye(2)[axis]).imag / STEP
         np.testing.assert_allclose(gradient[..., axis], stepped, rtol=0, atol=1e-13)
