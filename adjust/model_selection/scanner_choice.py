@@ -127,8 +127,9 @@ class _Equations:
         if not open_.any():
             return None
         best = int(np.argmax(np.where(open_, explained, -np.inf)))
-        redundancy = self.redundancy - len(taken) - 1
-        left = self.vpv - self._explained_square_sum(taken) - float(explained[best])
+        redundancy, at = self.redundancy - len(taken) - 1, [self.terms.index(each) for each in taken]
+        by_taken = self.right[at] @ np.linalg.solve(self.normal[np.ix_(at, at)], self.right[at])
+        left = self.vpv - float(by_taken) - float(explained[best])
         if redundancy > 0 and left > 0.0:
             return self.terms[best], float(fdtrc(1, redundancy, explained[best] / left * redundancy))
         return self.terms[best], float(chdtrc(1, explained[best]))
@@ -141,10 +142,6 @@ class _Equations:
         right = self.right - self.normal[:, at] @ solved[:, -1]
         determined = normal > self.known / HARDLY**2
         return determined, np.where(determined, right**2 / np.where(determined, normal, 1.0), 0.0)
-
-    def _explained_square_sum(self, taken: Sequence[str]) -> float:
-        at = [self.terms.index(each) for each in taken]
-        return float(self.right[at] @ np.linalg.solve(self.normal[np.ix_(at, at)], self.right[at]))
 
 
 def _free_distortion(trial: Adjustment) -> list[Parameter]:

@@ -163,7 +163,9 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
     at_distorted = _film_derivatives(problem, state, distorted) if problem.by_elements else film
     by_camera_xy = laid_out(np.broadcast_to(np.eye(2), (len(xy_mm), 2, 2)))
     has_films = any(films.kind.names for films in problem.films) or bool(problem.scans)
-    by_unknowns = _no_derivatives(len(xy_mm), parts.width)
+    count, width = len(xy_mm), parts.width  # stored by rows for the compiled loops, by columns for numpy
+    by_rows = compiled.kernels is not None
+    by_unknowns = np.zeros((count, 2, width)) if by_rows else np.zeros((width, count, 2)).transpose(1, 2, 0)
     by_unknowns[problem.is_fiducial, :, parts.place.columns] = -np.eye(2, 3)[:, parts.place.members]  # F3, F4
     straight, attitude = problem.network.line_of_sight.is_straight, problem.attitude_by_unknowns(state)
     for shown in computed.targets:
@@ -200,18 +202,12 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
     return Derivatives(product(by_camera_xy, film.xy_jacobian) if has_films else by_camera_xy, by_unknowns)
 
 
-def _no_derivatives(count: int, width: int) -> Array:
-    """(n, 2, k) zeros, stored by rows for the compiled loops or by columns for numpy."""
-    return (
-        np.zeros((count, 2, width)) if compiled.kernels is not None else np.zeros((width, count, 2)).transpose(1, 2, 0)
-    )
-
-
 def _fill_targets(by_unknowns: Array, problem: Problem, state: State, shown: TargetImages, by_ray: Array) -> None:
     """Fill the columns of exterior orientation, points and boards from the derivatives (n, 2, 2) w.r.t. the ray."""
     parts, rows, straight = problem.parts, shown.rows, problem.network.line_of_sight.is_straight
     images = problem.image_numbers[rows]
-    by_in_camera = _camera_axes_derivative(by_ray, shown)
+    by_in_plane = by_ray / -shown.in_camera[:, 2, None, None]  # the ray is -U/W, -V/W
+    by_in_camera = columns([by_in_plane[..., 0], by_in_plane[..., 1], applied(by_in_plane, shown.ray)])
     by_vector = product(by_in_camera, take_members(state.rotations, images))
     by_attitude = cross(shown.in_camera[:, None, :], by_in_camera)
     if problem.keeps_angles.any():
@@ -232,12 +228,6 @@ def _fill(by_unknowns: Array, rows: Rows, part: Part, derivatives: Iterable[Arra
     """Write the derivatives (n, 2) with respect to the members of a part into its columns."""
     for column, derivative in enumerate(derivatives, part.columns.start):
         by_unknowns[..., column][rows] = derivative
-
-
-def _camera_axes_derivative(ray_jacobian: Array, shown: TargetImages) -> Array:
-    """Derivatives (n, 2, 3) with respect to U, V, W from those (n, 2, 2) with respect to the ray -U/W, -V/W."""
-    by_in_plane = ray_jacobian / -shown.in_camera[:, 2, None, None]
-    return columns([by_in_plane[..., 0], by_in_plane[..., 1], applied(by_in_plane, shown.ray)])
 
 
 @dataclass(frozen=True)

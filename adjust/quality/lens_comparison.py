@@ -12,7 +12,7 @@ from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
-from scipy.linalg import qr
+from scipy.linalg import block_diag, qr
 from scipy.special import fdtrc
 
 from adjust.array_types import Array
@@ -120,12 +120,14 @@ def compare(
     if len(when) != len(calibrations) or not (np.diff(when) > 0).all():
         raise AdjustmentError(f"{len(calibrations)} calibrations need as many times, in rising order, not {when}.")
     shared = tuple(id for id in calibrations[0].fiducials if all(id in each.fiducials for each in calibrations))
-    places = _grid(half_mm)
+    across, along = (np.linspace(-half, half, _GRID) for half in half_mm)
+    places = np.stack(np.meshgrid(across, along), axis=-1).reshape(-1, 2)
     views = [_View(each, calibrations[0], places, shared) for each in calibrations]
     system = _System(views, when, use)
-    field, covariance = (np.array(each) for each in zip(*map(system.difference, range(1, len(views))), strict=True))
+    one = np.eye(len(views))
+    field, covariance = map(np.array, zip(*(system.freed(each - one[0]) for each in one[1:]), strict=True))
     count = len(places)
-    trend, trend_covariance = system.trend_field()
+    trend, trend_covariance = system.freed(system.trend_factors)
     return Comparison(
         calibrations=tuple(calibrations),
         times=when,
@@ -146,12 +148,6 @@ def compare(
 def sigmas(covariance: Array) -> Array:
     """Standard deviations (..., 2) of covariances (..., 2, 2)."""
     return np.asarray(np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1)))
-
-
-def _grid(half_mm: tuple[float, float]) -> Array:
-    """(m, 2) places over the frame."""
-    x, y = (np.linspace(-half, half, _GRID) for half in half_mm)
-    return np.stack(np.meshgrid(x, y, indexing="xy"), axis=-1).reshape(-1, 2)
 
 
 class _View:
@@ -178,19 +174,12 @@ class _View:
         self.ray = ray @ self.turn
         self.marks_mm = marks
         self.value = np.concatenate([self.c_um * self.ray, 1e3 * (marks - shift) @ np.linalg.inv(turn).T])
-        self.jacobian = self._jacobian(shared)
-
-    def _jacobian(self, shared: tuple[str, ...]) -> Array:
-        """(2 (m + f), n) derivatives of the value by the calibration's quantities, at fixed rotation and scale."""
-        own, fields = self.own, 2 * len(self.ray)
         by = np.concatenate([self.equations.interior_jacobian, self.equations.parameter_jacobian], axis=2)
-        rows = np.zeros((fields + 2 * len(shared), len(own.covariance)))
-        rows[:fields, : by.shape[2]] = self._field_change(by).reshape(fields, -1)
-        names = list(own.fiducials)
-        for k, id in enumerate(shared):
-            column = by.shape[2] + 2 * names.index(id)
-            rows[fields + 2 * k, column] = rows[fields + 2 * k + 1, column + 1] = 1e3
-        return rows
+        names, width = list(own.fiducials), 2 * len(own.fiducials)
+        rows = [2 * names.index(id) + axis for id in shared for axis in (0, 1)]
+        of_marks = 1e3 * np.eye(width)[rows].reshape(len(rows), width)
+        # (2 (m + f), n) derivatives of the value by the calibration's quantities, at fixed rotation and scale
+        self.jacobian = block_diag(self._field_change(by).reshape(-1, by.shape[2]), of_marks)
 
     def _field_change(self, by: Array) -> Array:
         """(m, 2, n) changes of the field, µm, from changes of the equations (m, 2, n)."""
@@ -302,18 +291,15 @@ class _System:
         probability = float(fdtrc(freedom, self.redundancy, chi / freedom)) if freedom and self.redundancy else 1.0
         return Test(chi, freedom, probability)
 
-    def difference(self, k: int) -> tuple[Array, Array]:
-        """Difference of view k and the first one."""
-        return self._freed(np.eye(len(self.changes))[k] - np.eye(len(self.changes))[0])
-
-    def trend_field(self) -> tuple[Array, Array]:
-        """Linear change from the first time to the last, by weighted regression over all views."""
+    @property
+    def trend_factors(self) -> Array:
+        """Factors of the views in the linear change from the first time to the last, by weighted regression."""
         variances = np.array([np.square(self.freeing @ root).sum(axis=1).mean() for root in self.roots])
         weights = 1.0 / (variances + _UNSEEN_UM**2)
         along = self.times - np.average(self.times, weights=weights)
-        return self._freed(weights * along * np.ptp(self.times) / np.sum(weights * along**2))
+        return np.asarray(weights * along * np.ptp(self.times) / np.sum(weights * along**2))
 
-    def _freed(self, factors: Array) -> tuple[Array, Array]:
+    def freed(self, factors: Array) -> tuple[Array, Array]:
         """Linear combination (m + f, 2) of the views without the changes without effect, and its covariance by
         place."""
         change = np.sum([factor * each for factor, each in zip(factors, self.changes, strict=True)], axis=0)

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.special import chdtrc
 
-from adjust.array_types import Array, Indices
+from adjust.array_types import Array
 from adjust.functional_model.families import family
 from adjust.least_squares.iteration import Linearised
 from adjust.problem.condition_equations import observed_in_camera
@@ -44,7 +44,10 @@ def edge_motions(problem: Problem, at: Linearised) -> dict[int, float]:
     found: dict[int, float] = {}
     for name, free in trading_off(problem).items():
         rows, radius_mm = problem.targets_by_camera[name], observed_radius_mm(problem, at.state, name)
-        found |= {i: radius_mm / moved for i in free if (moved := _largest_motion_mm(problem, at, rows, i))}
+        for position in free:
+            change = at.rows.change_mm(at.by_observation, np.arange(len(problem.unknowns)) == position)[rows]
+            if moved := float(np.linalg.norm(change, axis=1).max()):
+                found[position] = radius_mm / moved
     return found
 
 
@@ -94,10 +97,3 @@ def inseparable(problem: Problem, state: State, variances: Array) -> dict[str, t
             )
             found[name] = names, sentence
     return found
-
-
-def _largest_motion_mm(problem: Problem, at: Linearised, rows: Indices, position: int) -> float:
-    """Largest motion of a target for a unit change of one parameter."""
-    step = np.zeros(len(problem.unknowns))
-    step[position] = 1.0
-    return float(np.linalg.norm(at.rows.change_mm(at.by_observation, step)[rows], axis=1).max())

@@ -319,15 +319,12 @@ def settle_datum(problem: Problem, options: Options) -> Problem:
         unknowns = unknowns.fixed_as_given(chosen_coordinates(problem, options.datum_coordinates))
     elif options.datum != "control":
         unknowns = unknowns.fixed(minimal_datum(problem))
-    return _straighten_sight(replace(problem, unknowns=unknowns))
-
-
-def _straighten_sight(problem: Problem) -> Problem:
-    """Use straight lines of sight where there is a datum defect: bent ones would determine the datum, but hardly."""
-    bent = not problem.network.line_of_sight.is_straight
-    if bent and object_datum(problem, problem.start()).free.shape[1] > 0:
-        return replace(problem, network=replace(problem.network, line_of_sight=STRAIGHT))
-    return problem
+    settled = replace(problem, unknowns=unknowns)
+    is_bent = not problem.network.line_of_sight.is_straight
+    if is_bent and object_datum(settled, settled.start()).free.shape[1] > 0:
+        # Bent lines of sight would determine the datum, but hardly.
+        return replace(settled, network=replace(problem.network, line_of_sight=STRAIGHT))
+    return settled
 
 
 def _center_datum(problem: Problem, last: Run, members: Indices, options: Options) -> Run:

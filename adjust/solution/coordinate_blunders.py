@@ -4,6 +4,7 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -120,30 +121,27 @@ def _sights(problem: Problem) -> dict[str, Sight]:
     return sights
 
 
-@dataclass(frozen=True)
-class Slip:
-    """Given point that contradicts all other information significantly."""
+class Slip(NamedTuple):
+    """Given point that contradicts all other information significantly, in words."""
 
-    far: FarPoint  # the point
-    place: Array  # (3,) its place in an adjustment without its given coordinates
-    sigma: float  # largest standard deviation of that place
-    off: Array  # (3,) given coordinates minus place
-    explained: str  # sentence on the clerical error that would explain it; may be empty
+    far: FarPoint
+    sentence: str
 
-    @property
-    def sentence(self) -> str:
-        far, distance = self.far, float(np.linalg.norm(self.off))
-        digits = max(0, 1 - int(np.floor(np.log10(self.sigma))))
-        at = ", ".join(f"{axis} = {value:.{digits}f}" for axis, value in zip("XYZ", self.place, strict=True))
-        by = ", ".join(f"{axis} by {value:+.{digits}f}" for axis, value in zip("XYZ", self.off, strict=True))
-        missed = f"{far.miss_mm:.3g} mm from its marks" if np.isfinite(far.miss_mm) else "behind the camera"
-        guess = f" {self.explained}" if self.explained else ""
-        return (
-            f"Control point {far.name} is not where it is given: its rays from {far.images} images meet at {at}, "
-            f"{distance:.{digits}f} away ({by}). What is given lies {missed} in the images, every other given point "
-            f"within {far.others_mm:.2g} mm.{guess} Correct its coordinates, or its number among the marks; with "
-            f"snooping = true the adjustment does without them."
-        )
+
+def _slip(far: FarPoint, place: Array, sigma: float, off: Array, explained: str) -> Slip:
+    """Word a slip by the point's place (3,) without its given coordinates, and their difference (3,) from it."""
+    distance, digits = float(np.linalg.norm(off)), max(0, 1 - int(np.floor(np.log10(sigma))))
+    at = ", ".join(f"{axis} = {value:.{digits}f}" for axis, value in zip("XYZ", place, strict=True))
+    by = ", ".join(f"{axis} by {value:+.{digits}f}" for axis, value in zip("XYZ", off, strict=True))
+    missed = f"{far.miss_mm:.3g} mm from its marks" if np.isfinite(far.miss_mm) else "behind the camera"
+    guess = f" {explained}" if explained else ""
+    return Slip(
+        far,
+        f"Control point {far.name} is not where it is given: its rays from {far.images} images meet at {at}, "
+        f"{distance:.{digits}f} away ({by}). What is given lies {missed} in the images, every other given point "
+        f"within {far.others_mm:.2g} mm.{guess} Correct its coordinates, or its number among the marks; with "
+        f"snooping = true the adjustment does without them.",
+    )
 
 
 def free_points(network: Network, start: Approximations, far: Sequence[FarPoint]) -> tuple[Network, Approximations]:
@@ -180,7 +178,7 @@ def coordinate_slips(network: Network, far: Sequence[FarPoint], without: Adjustm
 
         if not passes(given[each.name]):
             sigma = scale * float(np.sqrt(np.diag(cofactor).max()))
-            found.append(Slip(each, place, sigma, given[each.name] - place, _explanation(each.name, given, passes)))
+            found.append(_slip(each, place, sigma, given[each.name] - place, _explanation(each.name, given, passes)))
     return found
 
 

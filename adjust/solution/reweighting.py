@@ -119,7 +119,9 @@ def _run(problem: Problem, weighting: Weighting, state: State, limit: int) -> Ru
     last = _iterate(problem, weighting, state, limit)
     is_lost = not last.converged and bool(last.solution.history)
     alike = [at for positions in _alike_at_zero(problem, state, is_lost).values() for at in positions]
-    for held in (alike,) if is_lost else (alike, _free_of_cameras(problem)):
+    of_cameras = np.concatenate([*problem.unknowns.camera.values()])
+    free = of_cameras[np.isinf(problem.unknowns.sigma[of_cameras])].tolist()
+    for held in (alike,) if is_lost else (alike, free):
         if held and (is_lost or (last.singular and not last.solution.history)):
             begun = _run(replace(problem, unknowns=problem.unknowns.fixed(held)), weighting, state, limit)
             if begun.converged:
@@ -175,12 +177,6 @@ def _apart(problem: Problem, state: State) -> State:
         apart = family(problem.network.camera_by_name[camera].distortion.family).apart(values[at])
         values[at] = np.where(np.isinf(unknowns.sigma[at]), apart, values[at])
     return State(values, state.rotations)
-
-
-def _free_of_cameras(problem: Problem) -> list[int]:
-    """All free parameters of cameras."""
-    unknowns = problem.unknowns
-    return [int(at) for positions in unknowns.camera.values() for at in positions if np.isinf(unknowns.sigma[at])]
 
 
 def _iterate(problem: Problem, weighting: Weighting, state: State, limit: int) -> Run:
