@@ -153,10 +153,7 @@ def _function(network: Network, x: Values, row: int, xy: Array | Complex, mirror
     return np.asarray(place - np.array([io["x0"], io["y0"]]) + io["c"] * np.array([u / w, v / w]) - d)
 
 
-_LENS = {
-    "torlegard": ("k3", "k5", "k7", "p1", "p2", "p3", "p4"),
-    "brown": ("k1", "k2", "k3", "p1", "p2", "b1", "b2"),
-}
+_LENS = {"torlegard": ("k3", "k5", "k7", "p1", "p2", "p3", "p4"), "brown": ("k1", "k2", "k3", "p1", "p2", "b1", "b2")}
 
 
 def _distortion(network: Network, camera: str, x: Values, r: Complex, place: Complex) -> Complex:

@@ -365,9 +365,7 @@ MISHAPS: dict[str, Mishap] = {
         "An image with three targets", _three_targets, ("Nothing checks the orientation of image f3", "c of camera K")
     ),
     "swapped": Mishap(
-        "Two point numbers swapped in one image",
-        _swapped,
-        ("The points 3 and 7 of image f1", "c of camera K"),
+        "Two point numbers swapped in one image", _swapped, ("The points 3 and 7 of image f1", "c of camera K")
     ),
 }
 

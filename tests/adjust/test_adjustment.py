@@ -367,8 +367,7 @@ def round_network(network: Network) -> Network:
 def shifted_point(point: ObjectPoint, shift: Array) -> ObjectPoint:
     priors = zip((point.X, point.Y, point.Z), shift, strict=True)
     return ObjectPoint(
-        point.id,
-        *(each and Prior(GRID * round(each.value / GRID) + float(off), each.sigma) for each, off in priors),
+        point.id, *(each and Prior(GRID * round(each.value / GRID) + float(off), each.sigma) for each, off in priors)
     )
 
 

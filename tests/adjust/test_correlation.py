@@ -114,11 +114,7 @@ LENS = np.array([-0.25, 0.08, 4e-4, -3e-4, 0.01])
 
 
 def board_network(
-    seed: int,
-    free: tuple[str, ...],
-    noise: bool = True,
-    images: int = 8,
-    tilts_deg: tuple[float, float] = (20.0, 40.0),
+    seed: int, free: tuple[str, ...], noise: bool = True, images: int = 8, tilts_deg: tuple[float, float] = (20.0, 40.0)
 ) -> Network:
     """A board of 54 corners in the middle of pictures of 1280 x 960 pixels of 0.01 mm, noise of a tenth of one."""
     rng = np.random.default_rng(seed)

@@ -338,8 +338,7 @@ def test_joins_have_a_variance_component_of_their_own() -> None:
     observations = simulated.network.observations
     loose = np.array([16.0 if kind == "join" else 1.0 for kind in observations.kind])[:, None, None]
     network = replace(
-        simulated.network,
-        observations=replace(observations, covariance_mm2=observations.covariance_mm2 * loose),
+        simulated.network, observations=replace(observations, covariance_mm2=observations.covariance_mm2 * loose)
     )
     factors = adjust(network, options=Options(variance_components=True)).variance_factors
     assert factors["join"] == pytest.approx(1.0 / 16.0, rel=0.3)

@@ -68,11 +68,7 @@ def spoil_station(network: Network, error: float) -> Network:
 X, Y = np.array([1.0, 0.0]), np.array([0.0, 1.0])
 CASES: dict[str, tuple[str, int, Callable[[Network, float], Network]]] = {
     "target": ("target 4 in image f1", 1, lambda n, e: with_errors(n, {row_of(n, "target", "f1", "4"): e * Y})),
-    "fiducial": (
-        "fiducial 2 in image f3",
-        0,
-        lambda n, e: with_errors(n, {row_of(n, "fiducial", "f3", "2"): e * X}),
-    ),
+    "fiducial": ("fiducial 2 in image f3", 0, lambda n, e: with_errors(n, {row_of(n, "fiducial", "f3", "2"): e * X})),
     "control": ("control point 5 Z", 0, spoil_control),
     "datum": ("given fiducial 3 (camera K)", 1, spoil_fiducial),
     "exterior": ("given X0 of image f2", 0, spoil_station),

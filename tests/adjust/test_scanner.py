@@ -377,11 +377,7 @@ def test_a_bend_of_given_terms_over_the_extent_of_the_scans() -> None:
 MM = 0.05
 F, CX, CY = 3000.0, 1010.0, 760.0
 COEFFICIENTS = (-0.12, 0.05, 1e-3, -5e-4, 0.0)
-LENS = Lens(
-    Distortion("opencv"),
-    np.array([F * MM, CX * MM, -CY * MM]),
-    np.array([*COEFFICIENTS, *np.zeros(11)]),
-)
+LENS = Lens(Distortion("opencv"), np.array([F * MM, CX * MM, -CY * MM]), np.array([*COEFFICIENTS, *np.zeros(11)]))
 PX = np.random.default_rng(3).uniform((0.0, 0.0), (2000.0, 1500.0), (40, 2))
 MATRIX = np.array([[F, 0.0, CX], [0.0, F, CY], [0.0, 0.0, 1.0]])
 

@@ -257,8 +257,7 @@ def add_edges(frame: FrameMeasurement, sigmas: Sequence[float], off_px: float = 
     """The frame with second places of its marks, so many standard deviations and off_px from the matched ones."""
     marks = [
         replace(
-            mark,
-            quality={"second_method_sigmas": own, "second_method_col_px": off_px, "second_method_row_px": 0.0},
+            mark, quality={"second_method_sigmas": own, "second_method_col_px": off_px, "second_method_row_px": 0.0}
         )
         for mark, own in zip(frame.marks, sigmas, strict=True)
     ]

@@ -141,13 +141,7 @@ def large_board() -> tuple[Array, dict[str, Array]]:
 
 @parametrize_with_studies(
     ("shown", "count"),
-    [
-        (np.s_[:, 60:], 51),
-        (np.s_[:, :250], 48),
-        (np.s_[:190, :], 45),
-        (np.s_[80:, 70:], 40),
-        (np.s_[:180, :240], 39),
-    ],
+    [(np.s_[:, 60:], 51), (np.s_[:, :250], 48), (np.s_[:190, :], 45), (np.s_[80:, 70:], 40), (np.s_[:180, :240], 39)],
     quick=(3,),
 )
 def test_a_part_of_a_chessboard_has_the_names_of_the_whole(

@@ -44,8 +44,7 @@ SRGB = b"para" + bytes(4) + struct.pack(">HH", 3, 0) + struct.pack(
 
 
 @pytest.mark.parametrize(
-    ("curve", "expected"),
-    [(GAMMA, HALF**1.8), (TABLE, HALF**2), (SRGB, 0.21404), (b"curv" + bytes(8), HALF)],
+    ("curve", "expected"), [(GAMMA, HALF**1.8), (TABLE, HALF**2), (SRGB, 0.21404), (b"curv" + bytes(8), HALF)]
 )
 def test_profiles_of_every_kind_of_curve(curve: bytes, expected: float, tmp_path: Path) -> None:
     path = tmp_path / "a.tif"

@@ -147,10 +147,7 @@ FRAME_CORNER_HALF_MM = 10.0
 CORNERS = {"1": (10.0, -10.0), "2": (-10.0, -10.0), "3": (-10.0, 10.0), "4": (10.0, 10.0)}
 TURN, CENTER = 0.007, (262.3, 257.6)
 MATRIX = np.column_stack(
-    [
-        PX_PER_MM * np.array([[np.cos(TURN), -np.sin(TURN)], [-np.sin(TURN), -np.cos(TURN)]]),
-        CENTER,
-    ]
+    [PX_PER_MM * np.array([[np.cos(TURN), -np.sin(TURN)], [-np.sin(TURN), -np.cos(TURN)]]), CENTER]
 )
 
 

@@ -32,11 +32,7 @@ def written(path: Path, picture: np.ndarray, **tags: Any) -> Path:
         ("grey.tif", GREY, {"resolution": (500, 500), "resolutionunit": "CENTIMETER"}),
         ("tiled.tif", WIDE, {"tile": (32, 32), "compression": "deflate"}),
         ("colour.tif", COLOUR, {"photometric": "rgb"}),
-        (
-            "palette.tif",
-            GREY,
-            {"photometric": "palette", "colormap": GREYS},
-        ),
+        ("palette.tif", GREY, {"photometric": "palette", "colormap": GREYS}),
         ("grey.jpg", GREY, {}),
         ("colour.jpg", COLOUR, {}),
         ("grey.png", GREY, {}),
@@ -46,10 +42,7 @@ def written(path: Path, picture: np.ndarray, **tags: Any) -> Path:
     ],
 )
 def test_the_head_says_what_the_opened_scan_does(
-    name: str,
-    picture: np.ndarray,
-    tags: dict[str, object],
-    tmp_path: Path,
+    name: str, picture: np.ndarray, tags: dict[str, object], tmp_path: Path
 ) -> None:
     path = written(tmp_path / name, picture, **tags)
     head = read_head(path)

@@ -23,13 +23,7 @@ from studies import parametrize_with_studies
 from measure import Status
 from measure.boards.markers import ReadMarkers, charuco_board, find_aruco, find_charuco, off_corners
 from measure.boards.measure import BoardMeasurement, measure_board
-from measure.boards.specs import (
-    AprilGridSpec,
-    ArucoSpec,
-    CharucoSpec,
-    FoundCorner,
-    aruco_dictionary,
-)
+from measure.boards.specs import AprilGridSpec, ArucoSpec, CharucoSpec, FoundCorner, aruco_dictionary
 
 Array = NDArray[np.float64]
 OLDER = CharucoSpec("4X4_50", 6, 6, 32.0, 24.0, legacy=True)

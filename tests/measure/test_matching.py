@@ -61,12 +61,7 @@ def errors_and_sigmas(name: str, blur_px: float, snr: float, count: int) -> tupl
 
 @parametrize_with_studies(
     ("name", "blur_px", "count"),
-    [
-        ("cross", 0.7, 54),
-        ("ring-cross", 1.0, 60),
-        ("ring-dot", 1.0, 54),
-        ("dot", 0.8, 54),
-    ],
+    [("cross", 0.7, 54), ("ring-cross", 1.0, 60), ("ring-dot", 1.0, 54), ("dot", 0.8, 54)],
     quick=(3,),
 )
 def test_sigmas_are_those_of_the_errors(name: str, blur_px: float, count: int) -> None:

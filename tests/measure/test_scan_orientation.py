@@ -202,9 +202,7 @@ def test_nothing_is_read_where_nobody_asks_and_a_mirror_is_not_assumed(tmp_path:
 TITLE = KnownLine("RUN 31  CANBERRA  17.6.69", "90", "left", ((-13.9, -9.0), (-13.9, 2.0), (-13.1, 2.0), (-13.1, -9.0)))
 
 
-def test_a_frame_that_lies_as_others_of_its_roll_is_read_only_where_their_line_stands(
-    tmp_path: Path,
-) -> None:
+def test_a_frame_that_lies_as_others_of_its_roll_is_read_only_where_their_line_stands(tmp_path: Path) -> None:
     alike = measure_picture("0", tmp_path, WILD, known_lines=(TITLE,))
     assert [(each.side, each.pose) for each in alike.writing or ()] == [("left", "90")]
     assert pose_of(alike) == ("0", True)

@@ -58,10 +58,7 @@ def brown(x: Array, y: Array, k1: float, k2: float, k3: float, p1: float, p2: fl
     """OpenCV's distortion of an ideal point."""
     r2 = x * x + y * y
     radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-    return (
-        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-    )
+    return (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)
 
 
 def micmac_px(folder: Path, image: str, points: Array, before: str = "OIS-Reech_") -> Array:

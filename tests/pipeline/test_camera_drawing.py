@@ -198,10 +198,7 @@ def test_what_is_not_complete_is_stated_and_not_refused() -> None:
 
 @pytest.mark.parametrize(
     ("mark", "statuses"),
-    [
-        ({"kind": "ring-cross", **SIZES}, {"measured"}),
-        ({"kind": "template", "size_mm": 2.4}, {"measured", "weak"}),
-    ],
+    [({"kind": "ring-cross", **SIZES}, {"measured"}), ({"kind": "template", "size_mm": 2.4}, {"measured", "weak"})],
 )
 def test_a_saved_camera_measures_the_scan(
     mark: dict[str, float | str], statuses: set[str], scan: Path, tmp_path: Path

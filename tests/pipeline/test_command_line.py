@@ -111,10 +111,7 @@ NO_COORDINATES = "point,X,Y,Z,sX,sY,sZ\n101,1.0,2.0,0.5,,,\n102,,,,,,\n"
         ),
         (duplicated_point, ["points.csv", "'103'", "line 4"]),
         (change_project('output = "out"', 'output = "points.csv/out"'), ["cannot be written"]),
-        (
-            lambda folder: rewritten_scans(folder, "scans"),
-            ["line 3: scans: 'scans' is a folder", "'scans/*.tif'"],
-        ),
+        (lambda folder: rewritten_scans(folder, "scans"), ["line 3: scans: 'scans' is a folder", "'scans/*.tif'"]),
         (name_in_another_encoding, ["line 3: scans:", "is not text in UTF-8", "Rename it"]),
         (
             change_project("output =", "pitch_um = 0.045\noutput ="),
@@ -147,10 +144,7 @@ NO_COORDINATES = "point,X,Y,Z,sX,sY,sZ\n101,1.0,2.0,0.5,,,\n102,,,,,,\n"
             change_project('points = "points.csv"', ""),
             ["kind 'disk' is named by the targets' coordinates", "there is no [object] points"],
         ),
-        (
-            write("points.csv", NO_COORDINATES),
-            ["[object] points: 1 points with X, Y and Z name no targets; give 4"],
-        ),
+        (write("points.csv", NO_COORDINATES), ["[object] points: 1 points with X, Y and Z name no targets; give 4"]),
         (one_fiducial, ["camera.toml has one fiducial mark", "two or more"]),
     ],
 )

@@ -160,10 +160,7 @@ def damaged_covariance(how: str, data: bytes) -> bytes:
         ("text", "text and real numbers, not <U"),
         ("infinite", "the covariance of c of camera K and x0 of camera K is no finite number"),
         ("asymmetric", "the covariance of c of camera K and x0 of camera K is not that of the exchanged pair"),
-        (
-            "impossible",
-            "the covariance of c of camera K and x0 of camera K is larger than",
-        ),
+        ("impossible", "the covariance of c of camera K and x0 of camera K is larger than"),
         ("misnamed", "adjustment.json holds c of camera K, and adjustment.npz does not"),
         ("another value", "gives c of camera K the value 153.7"),
         ("another sigma", "gives c of camera K the standard deviation 0.4"),

@@ -19,14 +19,7 @@ from measure.boards.find import recognise_board
 from measure.scans.opening import open_scan, read_head
 from pipeline import read_project, stages
 from pipeline.archive import new_project
-from pipeline.archive.scan_groups import (
-    Catalogue,
-    Sample,
-    ScanGroup,
-    catalogue,
-    identify_sample,
-    name_cameras,
-)
+from pipeline.archive.scan_groups import Catalogue, Sample, ScanGroup, catalogue, identify_sample, name_cameras
 from pipeline.cli import run
 from pipeline.files import library
 from pipeline.files.library import read_library
@@ -116,10 +109,7 @@ def test_a_camera_is_known_by_most_samples_and_by_what_its_plate_does_not_contra
         ((identify_camera(path), identify_camera(path)), "no camera stands out in 2 of them"),
         ((alike, identify_camera(path, "zeiss-rmk-a-153")), "not all show the same camera"),
         ((alike, identify_camera(path), identify_camera(path)), "not all show the same camera"),
-        (
-            (identify_camera(path, "wild-rc5-153", against=["wild-rc5-153"]),),
-            "the camera's plate in the picture names",
-        ),
+        ((identify_camera(path, "wild-rc5-153", against=["wild-rc5-153"]),), "the camera's plate in the picture names"),
     ]:
         fake_identification = kind(group, *samples)
         assert fake_identification.cameras == ()

@@ -339,10 +339,7 @@ def test_clicks_that_contradict_the_set_orientation_are_questioned(pose: str, re
     ],
 )
 def test_clicks_in_a_picture_turned_by_any_orientation_tag_are_questioned(
-    tag: int,
-    shown: Callable[[float, float, float, float], tuple[float, float]],
-    rendered: Path,
-    tmp_path: Path,
+    tag: int, shown: Callable[[float, float, float, float], tuple[float, float]], rendered: Path, tmp_path: Path
 ) -> None:
     """The tag's own definition (TIFF 6.0, page 36) says where a viewer shows a pixel."""
     picture = tifffile.imread(rendered / "scans" / "f1.tif")

@@ -66,8 +66,7 @@ def test_interior_orientation_of_eight_fiducials(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "rms_um"),
-    [("affine", ((5.7, 5.1), (5.7, 4.3))), ("similarity", ((6.8, 6.2), (6.5, 5.3)))],
+    ("kind", "rms_um"), [("affine", ((5.7, 5.1), (5.7, 4.3))), ("similarity", ((6.8, 6.2), (6.5, 5.3)))]
 )
 def test_fiducials_of_a_film_pair(kind: str, rms_um: Sequence[tuple[float, float]], tmp_path: Path) -> None:
     """A Wild RC30 pair, the calibrated fiducials held fixed."""

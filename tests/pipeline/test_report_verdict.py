@@ -89,10 +89,7 @@ def suspect(**values: Any) -> tuple[SuspectRecord]:
             {"name": "given fiducial 7 (camera RC 20)", "group": "datum", "removed": True},
             ["Left out as gross errors: given fiducial 7 (camera RC 20) (w = −9.3)."],
         ),
-        (
-            {"name": "given c (camera RC 20)", "group": "interior"},
-            ["Correct the given value in the camera's file"],
-        ),
+        ({"name": "given c (camera RC 20)", "group": "interior"}, ["Correct the given value in the camera's file"]),
     ],
 )
 def test_a_gross_error_is_named_with_what_to_do(

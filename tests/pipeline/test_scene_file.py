@@ -134,9 +134,7 @@ def test_the_template_becomes_a_project_that_can_be_read(
     assert [done for _, done, _ in calls] == list(range(1, 13))
 
 
-def test_truth_has_the_names_of_the_adjustment(
-    rendered_template: tuple[Path, list[tuple[str, int, int]]],
-) -> None:
+def test_truth_has_the_names_of_the_adjustment(rendered_template: tuple[Path, list[tuple[str, int, int]]]) -> None:
     truth = json.loads((rendered_template[0] / "truth.json").read_text(encoding="utf-8"))
     camera = truth["cameras"]["small metric camera"]
     assert camera["principal_distance_mm"] == {"value": 60.0}
