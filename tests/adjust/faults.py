@@ -21,13 +21,14 @@ from networks import (
     digital_network,
     field_points,
     give_values,
+    map_priors,
     quarters,
     simulated,
     vertical,
 )
 from numpy.typing import NDArray
 
-from adjust import Adjustment, AdjustmentError, Camera, Distortion, Fiducial, Options, Prior, adjust
+from adjust import Adjustment, AdjustmentError, Camera, Distortion, Options, Prior, adjust
 from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles
 from adjust.problem.network import Approximations, Exterior, Network, ObjectPoint
 from adjust.problem.tested import Probabilities
@@ -412,16 +413,15 @@ def change_points(given: Network, changed: Callable[[Array], Array], sigma: floa
 
 
 def y_down(given: Network) -> Network:
-    camera = given.cameras[0]
-    marks = {id: Fiducial(mark.x_mm, Prior(-mark.y_mm.value, mark.y_mm.sigma)) for id, mark in camera.fiducials.items()}
-    return replace(given, cameras=(replace(camera, fiducials=marks),))
+    return map_priors(given, lambda name, prior: replace(prior, value=-prior.value) if name.endswith(".y") else prior)
 
 
 def other_c(given: Network, off_mm: float = 10.0) -> Network:
-    camera = given.cameras[0]
-    assert camera.principal_distance_mm is not None
-    c = Prior(camera.principal_distance_mm.value + off_mm, camera.principal_distance_mm.sigma)
-    return replace(given, cameras=(replace(camera, principal_distance_mm=c),))
+    return shift_given(given, "IO.K.c", off_mm)
+
+
+def shift_given(given: Network, name: str, off: float) -> Network:
+    return map_priors(given, lambda each, prior: replace(prior, value=prior.value + off) if each == name else prior)
 
 
 def exchanged(given: Network, with_fiducials: bool = False) -> Network:
@@ -434,9 +434,7 @@ def exchanged(given: Network, with_fiducials: bool = False) -> Network:
 
 
 def one_point(given: Network) -> Network:
-    first, *others = given.points
-    assert first.X is not None
-    return replace(given, points=(replace(first, X=Prior(first.X.value + 200.0, first.X.sigma)), *others))
+    return shift_given(given, f"PT.{given.points[0].id}.X", 200.0)
 
 
 @dataclass(frozen=True)

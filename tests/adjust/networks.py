@@ -376,27 +376,43 @@ def set_prior(network: Network, sigma: float) -> Network:
 
 def give_values(network: Network, sigmas: Mapping[str, float], marks: int | None = None) -> Network:
     """Standard deviations for c, x0, y0 and for x and y of the first (None: all) fiducials, the others as they are."""
-    camera = network.cameras[0]
-    fiducials = {
-        id_: Fiducial(
-            replace(mark.x_mm, sigma=sigmas.get("x", mark.x_mm.sigma)),
-            replace(mark.y_mm, sigma=sigmas.get("y", mark.y_mm.sigma)),
+    first = list(network.cameras[0].fiducials)[:marks]
+
+    def given(name: str, prior: Prior) -> Prior:
+        *owner, quantity = name.split(".")
+        is_given = quantity in sigmas and (owner[0] == "IO" or owner[-1] in first)
+        return replace(prior, sigma=sigmas[quantity]) if is_given else prior
+
+    return map_priors(network, given)
+
+
+def map_priors(network: Network, change: Callable[[str, Prior], Prior]) -> Network:
+    """With every given value of cameras and points changed, by the name of its unknown."""
+
+    def mapped(name: str, prior: Prior | None) -> Prior | None:
+        return prior and change(name, prior)
+
+    cameras = []
+    for camera in network.cameras:
+        own, mark_name = f"IO.{camera.name}.", f"FID.{camera.name}.{{}}.{{}}".format
+        lens = {name: change(own + name, prior) for name, prior in camera.distortion.parameters.items()}
+        changed = replace(
+            camera,
+            principal_distance_mm=mapped(f"{own}c", camera.principal_distance_mm),
+            x0_mm=mapped(f"{own}x0", camera.x0_mm),
+            y0_mm=mapped(f"{own}y0", camera.y0_mm),
+            distortion=replace(camera.distortion, parameters=lens),
+            fiducials={
+                id_: Fiducial(change(mark_name(id_, "x"), mark.x_mm), change(mark_name(id_, "y"), mark.y_mm))
+                for id_, mark in camera.fiducials.items()
+            },
         )
-        for id_, mark in list(camera.fiducials.items())[:marks]
-    }
-    changed = Camera(
-        camera.name,
-        _draw_given(camera.principal_distance_mm, sigmas.get("c")),
-        _draw_given(camera.x0_mm, sigmas.get("x0")),
-        _draw_given(camera.y0_mm, sigmas.get("y0")),
-        camera.distortion,
-        {**camera.fiducials, **fiducials},
+        cameras.append(changed)
+    points = (
+        ObjectPoint(each.id, *(mapped(f"PT.{each.id}.{axis}", getattr(each, axis)) for axis in "XYZ"))
+        for each in network.points
     )
-    return replace(network, cameras=(changed,))
-
-
-def _draw_given(prior: Prior | None, sigma: float | None) -> Prior | None:
-    return prior if prior is None or sigma is None else replace(prior, sigma=sigma)
+    return replace(network, cameras=tuple(cameras), points=tuple(points))
 
 
 def vertical(*kappas: float) -> tuple[Triple, ...]:

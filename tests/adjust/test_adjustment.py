@@ -8,14 +8,14 @@ from functools import partial
 import numpy as np
 import pytest
 from dense_adjustment import solve_densely
-from networks import Truth, field_points, join_observations, simulated
+from networks import Truth, field_points, join_networks, rename_network, simulated, with_covariance
 from numpy.typing import NDArray
 from reference_cases import CAMERA, Case, case_approximations, case_network, load, own_name
 from studies import parametrize_with_studies
 
 from adjust import Adjustment, Camera, Distortion, Prior
 from adjust.functional_model.rotation import rotation_from_angles
-from adjust.problem.network import Approximations, Exterior, Image, LineOfSight, Network, ObjectPoint, Transformation
+from adjust.problem.network import Approximations, Exterior, LineOfSight, Network, ObjectPoint, Transformation
 from adjust.problem.reduction import Reduction
 from adjust.solution.adjustment import Datum, Options, adjust
 
@@ -258,31 +258,16 @@ def heights_and_mixtures() -> Variant:
 def two_cameras() -> Variant:
     """A film camera and a digital one with Brown's lens, that share the points; correlated observations."""
     film, start = simulated(np.random.default_rng(7), free={"k3": np.inf, "p1": np.inf})
-    truth = Truth(
-        c=80.0,
-        x0=0.1,
-        y0=0.2,
-        distortion={"k3": 3e-7},
-        stations=Truth().stations[::-1],
-        attitudes=Truth().attitudes[::-1],
-    )
+    truth = Truth(c=80.0, x0=0.1, y0=0.2, distortion={"k3": 3e-7})
+    truth = replace(truth, stations=truth.stations[::-1], attitudes=truth.attitudes[::-1])
     xyz = np.array([start.points[point.id] for point in film.points])
     other, begin = simulated(np.random.default_rng(70), truth, "none", points=xyz)
     lens = Distortion("brown", {"k1": Prior(3e-7, np.inf), "b1": Prior(0.0, 1e-3), "b2": Prior(0.0, np.inf)})
     camera = Camera("D", Prior(80.5, np.inf), Prior(0.0, 1.0), Prior(0.0, 1.0), lens)
-    names = {image.name: f"d{image.name}" for image in other.images}
-    rows, turned = other.observations, np.array([[1.0, 0.6], [0.6, 1.5]]) * 0.004**2
-    renamed = tuple(names[name] for name in rows.image)
-    rows = replace(rows, image=renamed, covariance_mm2=np.tile(turned, (len(rows), 1, 1)))
-    observations = join_observations(film.observations, rows)
-    images = (*film.images, *(Image(name, "D", "none") for name in names.values()))
-    both = Network((*film.cameras, camera), images, film.points, observations)
-    return both, Approximations(
-        interior={**start.interior, "D": np.array([80.5, 0.0, 0.0])},
-        exterior={**start.exterior, **{names[name]: values for name, values in begin.exterior.items()}},
-        transformation={**start.transformation, **{name: np.empty(0) for name in names.values()}},
-        points=start.points,
-    )
+    correlated = np.tile(np.array([[1.0, 0.6], [0.6, 1.5]]) * 0.004**2, (len(other.observations), 1, 1))
+    other, begin = rename_network(with_covariance(other, correlated), begin, "D", str, "d{}".format, str)
+    begin = replace(begin, interior={"D": np.array([80.5, 0.0, 0.0])})
+    return join_networks((film, start), (replace(other, cameras=(camera,)), begin))
 
 
 def fiducials_fixed_free_and_given() -> Variant:

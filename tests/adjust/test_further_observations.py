@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from networks import ATTITUDES, STATIONS, Truth, camera_point, field_points, rotation, simulated
+from networks import ATTITUDES, STATIONS, Truth, camera_point, field_points, give_values, rotation, simulated
 from numpy.typing import NDArray
 from reference_cases import CAMERA, case_approximations, case_network, load, own_name
 from scipy.optimize import least_squares
@@ -17,6 +17,7 @@ from adjust.solution.planning import plan
 
 Array = NDArray[np.float64]
 
+NO_INTERIOR = dict.fromkeys(("c", "x0", "y0"), np.inf)
 TRUTH = Truth(distortion={"k3": 1.5e-7})
 ANTENNA = (0.4, -1.1, 2.3)
 EO_SIGMAS = np.array([0.3, 0.3, 0.4, 2e-4, 2e-4, 3e-4])
@@ -246,7 +247,7 @@ def test_what_was_measured_does_not_matter() -> None:
 @pytest.mark.study
 def test_simulated_measurements_scatter_as_planned() -> None:
     network, values = simulated(np.random.default_rng(0), noise=False, free={"k3": np.inf})
-    network = set_interior(network, np.inf)
+    network = give_values(network, NO_INTERIOR)
     names = ["IO.K.c", "IO.K.x0", "IO.K.k3", "FID.K.1.x", "FID.K.4.y", "EO.f1.Z0", "EO.f2.kappa"]
     expected = plan(network, values)
     rng = np.random.default_rng(11)
@@ -261,7 +262,7 @@ def test_simulated_measurements_scatter_as_planned() -> None:
 def test_twice_as_large_errors_give_twice_as_large_sigmas() -> None:
     """Of what observations alone determine: no prior has a say."""
     network, values = simulated(np.random.default_rng(5), noise=False, fiducial_sigma=0.0)
-    network = set_interior(network, np.inf)
+    network = give_values(network, NO_INTERIOR)
     rows = network.observations
     coarse = replace(network, observations=replace(rows, covariance_mm2=4.0 * rows.covariance_mm2))
     fine, doubled, factor = plan(network, values), plan(coarse, values), plan(network, values, sigma0=2.0)
@@ -275,7 +276,7 @@ def test_a_singular_network_still_determines_the_rest() -> None:
     """Juhl's field of known heights: not c, x0', y0', but all nine deformations as if these were known."""
     case = load("ii_juhl_3photos")
     network, values = case_network(case), case_approximations(case, case["truth"])
-    regular, singular = plan(network, values), plan(set_interior(network, np.inf), values)
+    regular, singular = plan(network, values), plan(give_values(network, NO_INTERIOR), values)
     assert regular.singular == ()
     assert len(singular.singular) == 3
     for name in (f"IO.{CAMERA}.c", f"IO.{CAMERA}.x0", f"IO.{CAMERA}.y0", "EO.1.Z0"):
@@ -339,15 +340,6 @@ def test_a_point_behind_the_camera_is_reported() -> None:
     away = {**values.exterior, "f2": values.exterior["f2"] + np.array([0.0, 0.0, 0.0, np.pi, 0.0, 0.0])}
     with pytest.raises(AdjustmentError, match=r"cannot be planned: point \d+ lies behind the camera in image f2"):
         plan(network, replace(values, exterior=away))
-
-
-def set_interior(network: Network, sigma: float) -> Network:
-    """The same with one standard deviation for c, x0' and y0'."""
-    camera = network.cameras[0]
-    c, x0, y0 = (
-        replace(prior, sigma=sigma) for prior in (camera.principal_distance_mm, camera.x0_mm, camera.y0_mm) if prior
-    )
-    return replace(network, cameras=(replace(camera, principal_distance_mm=c, x0_mm=x0, y0_mm=y0),))
 
 
 def measure_picture(network: Network, rng: np.random.Generator) -> Network:

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from networks import field_points, join_networks, rename_network, simulated
+from networks import field_points, join_networks, map_priors, rename_network, simulated
 from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
-from adjust import Adjustment, AdjustmentError, Calibration, Fiducial, Parameter, adjust
+from adjust import Adjustment, AdjustmentError, Calibration, Parameter, adjust
 from adjust.functional_model.lens import Distortion, Lens, Prior
 from adjust.problem.network import Approximations, Network, Transformation
 from adjust.quality.lens_comparison import CameraCalibration, compare, sigmas
@@ -183,26 +183,8 @@ def make_calibration(result: Adjustment, fiducials: bool) -> Calibration:
 def set_calibration(network: Network, calibration: Calibration) -> Network:
     """The network with that calibration in the place of the camera's priors."""
     value = dict(zip((each.text for each in calibration.parameters), calibration.values.tolist(), strict=True))
-
-    def freed(name: str, prior: Prior) -> Prior:
-        return Prior(value[name], np.inf) if name in value else prior
-
-    (camera,) = network.cameras
-    parameters = camera.distortion.parameters
-    interior = zip(("c", "x0", "y0"), (camera.principal_distance_mm, camera.x0_mm, camera.y0_mm), strict=True)
-    c, x0, y0 = (prior and freed(f"IO.K.{name}", prior) for name, prior in interior)
-    free = replace(
-        camera,
-        principal_distance_mm=c,
-        x0_mm=x0,
-        y0_mm=y0,
-        distortion=replace(camera.distortion, parameters={n: freed(f"IO.K.{n}", p) for n, p in parameters.items()}),
-        fiducials={
-            id_: Fiducial(freed(f"FID.K.{id_}.x", mark.x_mm), freed(f"FID.K.{id_}.y", mark.y_mm))
-            for id_, mark in camera.fiducials.items()
-        },
-    )
-    return replace(network, cameras=(free,), calibrations=(calibration,))
+    free = map_priors(network, lambda name, prior: Prior(value[name], np.inf) if name in value else prior)
+    return replace(free, calibrations=(calibration,))
 
 
 @pytest.mark.parametrize("kind", [pytest.param("none", marks=pytest.mark.study), "affine"])
