@@ -102,8 +102,8 @@ def _calibration(path: Path, content: AdjustmentRecord, name: str, lens: Lens, l
     marks = {id: np.array(mark.xy_mm) for id, mark in content.cameras[name].fiducials.items()}
     unknowns = [Parameter.interior(name, each) for each in lens.quantities]
     unknowns += [Parameter.fiducial(name, id, axis) for id in marks for axis in "xy"]
-    covariance, redundancy = read_own_covariance(path).select(unknowns), content.variance_factor.redundancy
-    return CameraCalibration(label, lens, marks, covariance, redundancy)
+    covariance = read_own_covariance(path).select_larger(unknowns)
+    return CameraCalibration(label, lens, marks, covariance, content.variance_factor.redundancy)
 
 
 def _remarks(contents: Mapping[Path, AdjustmentRecord], names: Sequence[str]) -> tuple[str, ...]:

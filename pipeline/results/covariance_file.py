@@ -3,7 +3,7 @@
 import io
 import zipfile
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -50,6 +50,15 @@ class Covariance:
         block[at < 0, :] = 0.0
         block[:, at < 0] = 0.0
         return block
+
+    def select_larger(self, parameters: Sequence[Parameter]) -> Array:
+        """Covariance as by `select`, enlarged where `clusters` has larger standard deviations."""
+        block = self.select(parameters)
+        if self.clusters is None:
+            return block
+        variance, scatter = np.diagonal(block), np.diagonal(self.clusters.select(parameters))
+        factor = np.sqrt(np.maximum(scatter / np.where(variance > 0.0, variance, np.inf), 1.0))
+        return np.asarray(block * np.outer(factor, factor))
 
     @cached_property
     def _positions(self) -> dict[Parameter, int]:

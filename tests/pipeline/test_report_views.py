@@ -247,6 +247,17 @@ def covariance(name: str, parameters: tuple[str, ...], matrix: Array) -> Covaria
     return Covariance(tuple(Parameter.interior(name, each) for each in parameters), np.zeros(len(parameters)), matrix)
 
 
+def test_a_covariance_is_enlarged_where_leaving_out_images_scatters_more() -> None:
+    keys = tuple(Parameter.interior("K", each) for each in ("c", "x0"))
+    model = np.array([[4.0, 1.0], [1.0, 1.0]])
+    clusters = Covariance(keys, np.zeros(2), np.diag([36.0, 0.25]))
+    larger = Covariance(keys, np.zeros(2), model, clusters=clusters).select_larger(
+        (*keys, Parameter.interior("K", "k1"))
+    )
+    assert larger.tolist() == [[36.0, 3.0, 0.0], [3.0, 1.0, 0.0], [0.0, 0.0, 0.0]]
+    assert Covariance(keys, np.zeros(2), model).select_larger(keys).tolist() == model.tolist()
+
+
 def test_the_radial_curve_of_torlegard_is_its_polynomial_and_its_sigma_follows() -> None:
     """dr = k3 r³ + k5 r⁵; with the correlation of k3 and k5 its variance is a quadratic form in (r³, r⁵)."""
     k3, k5, s3, s5, rho = 1.7e-7, -5.4e-12, 3e-9, 2e-13, -0.97
