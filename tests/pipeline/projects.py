@@ -76,7 +76,7 @@ def write_network_project(network: Network, folder: Path, frame_mm: str = "frame
         f"r0_dm = {camera.distortion.r0_mm / 100.0!r}"
         if camera.distortion.family == "juhl"
         else f"r0_mm = {camera.distortion.r0_mm!r}",
-        'decentering = "paper"' if camera.distortion.decentering == "paper" else "",
+        *(['decentering = "paper"'] if camera.distortion.decentering == "paper" else []),
         "[distortion.value]",
         *(f"{name} = {prior.value!r}" for name, prior in given.items()),
         "[distortion.sigma]",
