@@ -20,6 +20,7 @@ from adjust.problem.parameter import (
     object_coordinate,
     parameter_from_text,
     parameters_from_texts,
+    shortened,
 )
 from adjust.solution.adjustment import Datum, Options, adjust
 
@@ -314,6 +315,24 @@ def test_no_other_module_takes_names_apart_or_builds_them() -> None:
         "pipeline/rendered/design_table.py: split",  # a key of a scene's table
         "pipeline/review/mark_handles.py: split",  # a key of a drawing's table
     }
+
+
+def test_long_lists_tell_how_many_names_are_left_out() -> None:
+    assert shortened(["a", "b"], 2) == "a, b"
+    assert shortened(["a", "b", "c", "d", "e"], 2) == "a, b and 3 more"
+
+
+def test_approximations_are_no_known_coordinates() -> None:
+    points = (
+        ObjectPoint("1", Prior(1.0), Prior(2.0, 0.1), Prior(3.0, np.inf)),
+        ObjectPoint("2", None, Prior(5.0), None),
+        ObjectPoint("3", Prior(6.0), Prior(7.0), Prior(8.0, 0.5)),
+    )
+    network = replace(simulated(np.random.default_rng(0))[0], points=points)
+    np.testing.assert_array_equal(network.coordinates(firm=True)["1"], [1.0, 2.0, np.nan])
+    np.testing.assert_array_equal(network.coordinates(firm=False)["1"], [1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(network.coordinates(firm=False)["2"], [np.nan, 5.0, np.nan])
+    assert list(network.known_places) == ["3"]
 
 
 def dotted_names(file: Path) -> list[str]:
