@@ -11,7 +11,7 @@ import numpy as np
 from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.projection import rays
 from adjust.initial_values.pose import KnownField, Pose
-from adjust.initial_values.resection import distance_together, plausible_pose, resections, trial_misfits
+from adjust.initial_values.resection import IMPLAUSIBLE, distance_together, resections, trial_misfits
 
 GRID = np.geomspace(0.35, 16.0, 9)  # principal distances tried, in radii of the imaged field: 140 to 7 degrees
 FEWEST = 4  # known points of an image
@@ -52,9 +52,9 @@ def find_principal_distance(fields: Sequence[KnownField]) -> tuple[float | None,
         found = resections(fields, [c] * len(fields), refined)
         if all(each is other for each, other in zip(found, refined, strict=True)):
             break  # all images agree
-    poses = {field: plausible_pose(each, c) for field, each in zip(fields, found, strict=True)}
-    determined = c if sigma < LARGEST_RELATIVE_SIGMA else None
-    return determined, {field: pose for field, pose in poses.items() if pose is not None}
+    resected = [(field, each) for field, each in zip(fields, found, strict=True) if each is not None]
+    poses = {field: each.pose for field, each in resected if each.sigma_mm <= IMPLAUSIBLE * c}
+    return c if sigma < LARGEST_RELATIVE_SIGMA else None, poses
 
 
 def find_wide_distance(fields: Sequence[KnownField], distortion: Distortion) -> float | None:

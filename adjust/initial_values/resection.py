@@ -77,15 +77,8 @@ def resect_images(fields: Sequence[KnownField], principal_distances_mm: Sequence
             candidates = three_point_poses(field.xyz, field.xy_mm, c)
             poses.append(candidates[0] if len(candidates) == 1 else None)
         else:
-            poses.append(plausible_pose(resection, c))
+            poses.append(None if resection is None or resection.sigma_mm > IMPLAUSIBLE * c else resection.pose)
     return poses
-
-
-def plausible_pose(resection: Resection | None, principal_distance_mm: float) -> Pose | None:
-    """The pose of a resection; None where the residuals are so large that points must have been misidentified."""
-    if resection is None or resection.sigma_mm > IMPLAUSIBLE * principal_distance_mm:
-        return None
-    return resection.pose
 
 
 def resect(xyz: Array, xy_mm: Array, principal_distance_mm: float, floor_mm: float = 1e-4) -> Resection | None:
