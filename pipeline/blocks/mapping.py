@@ -100,7 +100,9 @@ def read_model(model: Any, database: Any, pictures: Sequence[BlockPicture]) -> M
     for image in images.values():
         pose = image.cam_from_world()
         poses[names[image.name]] = (np.array(pose.rotation.matrix()), np.array(pose.translation))
-    sizes_px = {number: _sizes_px(np.array(database.read_keypoints(number))) for number in images}
+    keypoints = {number: np.array(database.read_keypoints(number)) for number in images}
+    shapes = {number: each[:, 2:6].reshape(-1, 2, 2) for number, each in keypoints.items()}  # behind x and y
+    sizes_px = {number: np.sqrt(np.abs(np.linalg.det(each))) for number, each in shapes.items()}
     tracks = {}
     for number, point in model.points3D.items():
         sights = []
@@ -113,11 +115,6 @@ def read_model(model: Any, database: Any, pictures: Sequence[BlockPicture]) -> M
             sights.append(Sight(names[image.name], float(place[0]), float(place[1]), size_px, off_px))
         tracks[int(number)] = sights
     return Mapped(poses, tracks)
-
-
-def _sizes_px(keypoints: Array) -> Array:
-    """(n,) sizes of COLMAP's features (n, 6): x, y and the (2, 2) shape matrix of each."""
-    return np.asarray(np.sqrt(np.abs(np.linalg.det(keypoints[:, 2:6].reshape(-1, 2, 2)))))
 
 
 def _extract(pycolmap: Any, database: Path, folder: Path, pictures: Sequence[BlockPicture], camera: CameraFile) -> None:

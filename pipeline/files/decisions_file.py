@@ -303,7 +303,8 @@ def append_decisions(path: Path, decisions: Iterable[Decision]) -> None:
             file.flush()
             os.fsync(file.fileno())
         except BaseException:
-            _truncate(path, size)
+            with suppress(OSError):  # buffered data is not written: that would fail again
+                os.truncate(path, size)
             raise
         finally:
             journal.unlink(missing_ok=True)
@@ -356,12 +357,6 @@ def _locked(path: Path, exclusive: bool = False) -> Iterator[None]:
             with suppress(OSError):
                 fcntl.flock(file, fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH)
         yield
-
-
-def _truncate(path: Path, size: int) -> None:
-    """Restore the earlier size, ignoring errors. Buffered data is not written: that would fail again."""
-    with suppress(OSError):
-        os.truncate(path, size)
 
 
 def _end_last_line(file: BinaryIO, path: Path) -> None:

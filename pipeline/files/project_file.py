@@ -274,7 +274,7 @@ def _read_tables(table: Table, needs_camera: bool = True) -> Project:
     antenna = given.object.antenna_offset
     if any(antenna) and "images" not in named:
         raise objects.error("antenna_offset", 'goes with images = "...", the file of the observed stations. Give both.')
-    lacks_camera = not needs_camera and _lacks_camera(given.camera, folder)
+    lacks_camera = not (needs_camera or given.camera.startswith(PREFIX) or (folder / given.camera).exists())
     _check_named(table, objects, "" if lacks_camera else given.camera, named)
     images = read_images(named["images"], antenna) if "images" in named else None
     found = FoundScans({}, frozenset())
@@ -363,10 +363,6 @@ def _clicks(project: Project, camera: CameraFile, shown: Decision | None) -> Cli
         )
     px = {one.id: shown.px[one.id] for one in camera.learned}
     return Clicks(shown.image, px, shown.fingerprint, shown.who or "somebody")
-
-
-def _lacks_camera(camera: str, folder: Path) -> bool:
-    return not camera.startswith(PREFIX) and not (folder / camera).exists()
 
 
 def _check_named(table: Table, objects: Table, camera: str, named: Mapping[str, Path]) -> None:

@@ -53,7 +53,7 @@ def folders_below(root: Path) -> Iterator[str]:
             below, target = os.path.join(place, name), os.path.join(real, name)
             if not is_link:
                 waiting.append((below, target))
-            elif not _contains(target := os.path.realpath(target), real):
+            elif os.path.commonpath([target := os.path.realpath(target), real]) != target:
                 links.append((below, target))
 
 
@@ -85,10 +85,6 @@ def _list_folders(folder: str) -> list[tuple[str, bool]]:
     with suppress(OSError), os.scandir(folder) as entries:
         return sorted((one.name, one.is_symlink()) for one in entries if one.is_dir() and not one.name.startswith("."))
     return []
-
-
-def _contains(folder: str, path: str) -> bool:
-    return os.path.commonpath([folder, path]) == folder
 
 
 # Scans that a project names: files, addresses and patterns at any depth; names of their images.

@@ -78,7 +78,9 @@ def bare_problem(adjustment: Adjustment, camera_name: str) -> BareProblem:
     sigmas = np.concatenate([shown[name][1] for name in usable]) if usable else np.ones(1)
     sigma_mm = float(np.sqrt((sigmas**2).mean()))
     points = sorted({point for name in usable for point in shown[name][2]})
+    places = adjusted_places(adjustment, points)
     free = free_parameters(camera)
+    counterparts = {"c": "fx", "x0": "cx", "y0": "cy", **COUNTERPARTS[camera.distortion.family]}
     values = {
         name: adjustment.value(Parameter.interior(camera_name, name))
         for name in ("c", "x0", "y0", *parameter_names(camera.distortion.family))
@@ -87,7 +89,10 @@ def bare_problem(adjustment: Adjustment, camera_name: str) -> BareProblem:
         network=Network(
             cameras=(_freed(camera, camera.distortion, values, free),),
             images=tuple(Image(name, camera_name, "none") for name in usable),
-            points=tuple(_fixed_point(adjustment, point) for point in points),
+            points=tuple(
+                ObjectPoint(point, *(Prior(value, 0.0) for value in xyz))
+                for point, xyz in zip(points, places.tolist(), strict=True)
+            ),
             observations=_observations({name: shown[name] for name in usable}, sigma_mm),
         ),
         approximations=Approximations(
@@ -98,10 +103,10 @@ def bare_problem(adjustment: Adjustment, camera_name: str) -> BareProblem:
                 for frame in [adjustment.network.image_by_name[name].frame]
             },
             transformation={name: np.zeros(0) for name in usable},
-            points=dict(zip(points, adjusted_places(adjustment, points), strict=True)),
+            points=dict(zip(points, places, strict=True)),
         ),
         images=tuple(shown[name][0] for name in usable),
-        freedom=_freedom(camera, free),
+        freedom=Freedom(tuple(counterpart for name, counterpart in counterparts.items() if name in free)),
         sigma_mm=sigma_mm,
         sigma_spread=float(sigmas.max() / sigmas.min()),
         gross=sum(
@@ -143,11 +148,6 @@ def free_parameters(camera: Camera) -> set[str]:
     return free | ({"b1"} if camera.distortion.family == FISHEYE and "c" in free else set())
 
 
-def _freedom(camera: Camera, free: set[str]) -> Freedom:
-    counterparts = {"c": "fx", "x0": "cx", "y0": "cy", **COUNTERPARTS[camera.distortion.family]}
-    return Freedom(tuple(counterpart for name, counterpart in counterparts.items() if name in free))
-
-
 def _freed(camera: Camera, distortion: Distortion, values: Mapping[str, float], free: set[str]) -> Camera:
     """Camera of a distortion model without fiducials and priors. free: parameters that are estimated."""
     priors = {name: Prior(value, np.inf if name in free else 0.0) for name, value in values.items()}
@@ -179,10 +179,6 @@ def _image_points(adjustment: Adjustment, image: str) -> tuple[ImagePoints, Arra
     covariance = gradient @ observations.covariance_mm2[rows] @ gradient.swapaxes(1, 2)
     sigmas = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2)
     return ImagePoints(image, xyz, model.camera_from_comparator(observations.xy_mm[rows])), sigmas, points
-
-
-def _fixed_point(adjustment: Adjustment, point: str) -> ObjectPoint:
-    return ObjectPoint(point, *(Prior(float(value), 0.0) for value in adjusted_places(adjustment, [point])[0]))
 
 
 def _is_fixed(point: ObjectPoint) -> bool:
