@@ -25,21 +25,16 @@ CONVENTION = Convention(
 _SIDE_POINTS = 8  # points per side, since a side of the frame is not a straight line on a map
 
 
-def check_crs(crs: str) -> None:
-    """Raise InputError for an unknown coordinate reference system."""
-    if crs.upper() not in _DEGREES and _zone(crs) is None:
+def lon_lat(xy: Array, crs: str) -> Array:
+    """Longitude and latitude (n, 2) in degrees from easting and northing (n, 2) in m, or from longitude and latitude.
+    Raises InputError for an unknown coordinate reference system."""
+    zone = _zone(crs)
+    if crs.upper() not in _DEGREES and zone is None:
         raise InputError(
             f"crs {crs!r} is not known here. Known are UTM zones (EPSG:32601 to 32660, 32701 to 32760 of WGS 84, 25828 "
             f"to 25838 of ETRS89) and degrees of longitude and latitude ({', '.join(_DEGREES)}). Transform the points "
             "to one of them."
         )
-
-
-def lon_lat(xy: Array, crs: str) -> Array:
-    """Longitude and latitude (n, 2) in degrees from easting and northing (n, 2) in m, or from longitude and
-    latitude."""
-    check_crs(crs)
-    zone = _zone(crs)
     return _from_utm(xy, *zone) if zone else xy
 
 

@@ -77,15 +77,8 @@ class Row:
 def csv_line(cells: Sequence[str]) -> str:
     """Format cells as a line of CSV without line end, which `read_csv` reads back unchanged. Cells are quoted if
     necessary, also if the line would otherwise be a comment."""
-    return ",".join(_quoted(_as_text(cell)) for cell in cells)
-
-
-def _as_text(cell: str) -> str:
-    return f"'{cell}" if _FORMULA.match(cell) and not _NO_FORMULA.fullmatch(cell) else cell
-
-
-def _as_it_was(cell: str) -> str:
-    return cell[1:] if _TAKEN_FOR_TEXT.match(cell) else cell
+    texts = (f"'{cell}" if _FORMULA.match(cell) and not _NO_FORMULA.fullmatch(cell) else cell for cell in cells)
+    return ",".join(map(_quoted, texts))
 
 
 def _quoted(cell: str) -> str:
@@ -124,7 +117,8 @@ def read_csv(path: Path, required: Sequence[str], optional: Sequence[str] = ()) 
 
 def _cells(path: Path, line: int, text: str) -> list[str]:
     try:
-        return [_as_it_was(cell.strip()) for cell in next(csv.reader([text]))]
+        cells = map(str.strip, next(csv.reader([text])))
+        return [cell[1:] if _TAKEN_FOR_TEXT.match(cell) else cell for cell in cells]
     except csv.Error as error:
         raise InputError(f"{path}, line {line}: is no line of CSV ({error}). Mend it.") from None
 
