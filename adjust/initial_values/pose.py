@@ -108,7 +108,8 @@ def refined_distance(
 
     Returns
     -------
-    Principal distance in mm, and the standard deviation of its logarithm: infinite if the points do not determine it;
+    Principal distance in mm, and the standard deviation of its logarithm: infinite if the points do not determine it,
+    or the iteration does not converge;
     rotations, shifts, and image coordinates over c without distortion (k, n, 2).
 
     Raises
@@ -135,13 +136,14 @@ def refined_distance(
         change = np.clip(change, -LARGEST_CHANGE, LARGEST_CHANGE)
         rotations, shifts = _stepped(rotations, shifts, through[..., 2] - through[..., :2] @ change)
         c, bend = c * float(np.exp(change[0])), bend + float(change[1])
-        if abs(change[0]) < np.sqrt(SETTLED):
+        if is_settled := bool(abs(change[0]) < np.sqrt(SETTLED)):
             break
     tangents = (xy_mm - bend * by_bend_mm) / c
     squares = float((weights * squared_residuals(rotations, shifts, points, tangents)).sum())
     variance = max(squares / max(2.0 * float(weights.sum()) - 6 * len(points) - 2, 1.0), noise**2)
     cofactor = float(np.linalg.inv(reduced)[0, 0])
-    return c, float(np.sqrt(variance * cofactor)) if cofactor > 0 else np.inf, rotations, shifts, tangents
+    spread = float(np.sqrt(variance * cofactor)) if cofactor > 0 and is_settled else np.inf
+    return c, spread, rotations, shifts, tangents
 
 
 def squared_residuals(rotations: Array, shifts: Array, points: Array, tangents: Array) -> Array:

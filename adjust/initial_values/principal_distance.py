@@ -17,7 +17,7 @@ GRID = np.geomspace(0.35, 16.0, 9)  # principal distances tried, in radii of the
 FEWEST = 4  # known points of an image
 COARSE_IMAGES, COARSE_POINTS = 4, 15
 FINE_IMAGES = 50
-LARGEST_RELATIVE_SIGMA = 0.15
+LARGEST_RELATIVE_SIGMA, CLEAR_SIGMA = 0.15, 0.05
 ANGLES_DEG = np.arange(88.0, 8.0, -4.0)  # trial angles between the axis and the outermost point of all images
 WIDE_IMAGES = 5
 FEWEST_WIDE = 6  # known points of an image
@@ -50,7 +50,7 @@ def find_principal_distance(fields: Sequence[KnownField]) -> tuple[float | None,
             return None, {}
         c, sigma, refined = together
         found = resections(fields, [c] * len(fields), refined)
-        if all(each is other for each, other in zip(found, refined, strict=True)):
+        if sigma < CLEAR_SIGMA and all(each is other for each, other in zip(found, refined, strict=True)):
             break  # all images agree
     resected = [(field, each) for field, each in zip(fields, found, strict=True) if each is not None]
     poses = {field: each.pose for field, each in resected if each.sigma_mm <= IMPLAUSIBLE * c}

@@ -139,14 +139,17 @@ def resections(
 def trial_misfits(fields: Sequence[KnownField], principal_distances_mm: Array) -> Array:
     """Misfits (m,) in mm² of images, at least four points each, with trial principal distances (m,).
 
-    Each is the sum over the images of the robust variance of a coordinate, for the best pose from a few triples.
+    Each is the geometric mean over the images of the robust variance of a coordinate, for the best pose from a few
+    triples: the likelihood where each image has its own variance, so that misidentified points of one image do not
+    decide.
     """
     c = np.repeat(principal_distances_mm, len(fields))
     variances = c**2  # of images without a pose
     for some, batch, rotations, shifts, image in _best_poses(len(principal_distances_mm) * list(fields), c, TRIAL):
         sigma = _robust_sigmas(batch.squared(rotations, shifts, image), batch.counts[image])
         variances[some[image]] = (sigma * batch.c[image]) ** 2
-    return np.asarray(variances.reshape(len(principal_distances_mm), -1).sum(axis=1))
+    floor = np.array([field.sigma_mm for field in fields]) ** 2
+    return np.asarray(np.exp(np.log(variances.reshape(-1, len(fields)) + floor).mean(axis=1)))
 
 
 def three_point_poses(xyz: Array, xy_mm: Array, principal_distance_mm: float) -> list[Pose]:
@@ -168,12 +171,13 @@ def distance_together(
 ) -> tuple[float, float, list[Resection | None]] | None:
     """Estimate a principal distance by least squares over all images resected with an approximate one.
 
-    The inliers are chosen again by their residuals, free of the distortion that is estimated with it. Returns the
-    principal distance in mm, the standard deviation of its logarithm, and the resections; None if no image was resected
-    or the estimate fails.
+    The inliers are chosen again by their residuals, free of the distortion that is estimated with it. Images without a
+    plausible pose count only if there are no others. Returns the principal distance in mm, the standard deviation of
+    its logarithm, and the resections; None if no image was resected or the estimate fails.
     """
-    resected = [i for i, each in enumerate(found) if each is not None]
-    known = [each for each in found if each is not None]
+    resected = [i for i, each in enumerate(found) if plausible_pose(each, principal_distance_mm)]
+    resected = resected or [i for i, each in enumerate(found) if each is not None]
+    known = [each for i in resected if (each := found[i]) is not None]
     if not known:
         return None
     batch = _Fields.from_fields([fields[i] for i in resected], np.full(len(known), principal_distance_mm))

@@ -26,7 +26,7 @@ from adjust.rank_defect.datum import (
 )
 from adjust.solution.blunder_hypotheses import Trials, blunder_sentence, stations_elsewhere
 from adjust.solution.coordinate_blunders import Slip, coordinate_slips, far_points, few_points, free_points
-from adjust.solution.left_out_images import adopt_lens, fitting, leave_out
+from adjust.solution.left_out_images import adopt_lens, contradicting_image, fitting, leave_out
 from adjust.solution.options import Datum, Method, Options
 from adjust.solution.plausibility import check_plausibility
 from adjust.solution.result import Adjustment, is_fixed, run_result
@@ -62,7 +62,8 @@ def adjust(
     -------
     Adjustment
         The result. Images without an orientation are left out, and so are those in which some point has no image at the
-        start; both are tried again once the lens is known (`Adjustment.left_out`). Given points with coordinate
+        start, or which keep the iteration from converging; all are tried again once the lens is known
+        (`Adjustment.left_out`). Given points with coordinate
         blunders are named where the observations do not agree because of them; robust estimation and data snooping
         start without these points.
 
@@ -127,19 +128,27 @@ class _Solver:
     def leave_out_blind(
         self, part: Network, start: Approximations | None, left_out: dict[str, str]
     ) -> tuple[Adjustment, dict[str, str]]:
-        """Adjust a network without the images in which some point has no image at the start; also return the reasons.
+        """Adjust a network without the images that keep it from a solution; also return the reasons.
 
-        Raises NoImageError where too little would remain.
+        These are the images in which some point has no image at the start, and where the iteration does not converge
+        the one that contradicts the others most, if it converges without it. Raises NoImageError where too little would
+        remain.
         """
         try:
-            return self.check_whole(part, None, start), left_out
+            result = self.check_whole(part, None, start)
         except NoImageError as error:
             rest = leave_out(part, error.reasons) if error.reasons else None
             begun = None if rest is None else self.own_start(rest)
             if rest is None or begun is None:
                 raise
-            reasons = error.reasons
-        return self.leave_out_blind(rest, begun, left_out | reasons)
+            return self.leave_out_blind(rest, begun, left_out | error.reasons)
+        reasons = contradicting_image(result) if result.termination not in ("converged", "singular") else {}
+        rest = leave_out(part, reasons) if reasons else None
+        begun = None if rest is None else self.own_start(rest)
+        if rest is None or begun is None:
+            return result, left_out
+        without, more = self.leave_out_blind(rest, begun, left_out | reasons)
+        return (without, more) if without.converged else (result, left_out)
 
     def try_again(self, network: Network, rest: Adjustment, left_out: dict[str, str]) -> Adjustment:
         """Adjust with those left-out images that fit once the lens is known."""

@@ -57,7 +57,7 @@ class Explanation:
 
     Attributes
     ----------
-    kind : "radial", "decentering", "pixels", "groups", "board" or "noise".
+    kind : "radial", "decentering", "pixels", "groups", "board", "point" or "noise".
     cause : cause in words with figures.
     remedy : what to do.
     p : p-value.
@@ -224,7 +224,7 @@ def _first_order_fall(run: Run, problem: Problem) -> float:
 
 def _following(model: _Model) -> _Model | None:
     """Return the adjustment for the next round: groups of images get separate lenses; None without a solution."""
-    if model.hypothesis is None or not model.hypothesis.contrasts:
+    if model.hypothesis is None or model.hypothesis.kind != "groups":
         return model
     problem = separate_lenses(model.run)
     run = None if problem is None else model.adjusted(problem)

@@ -14,6 +14,7 @@ from adjust.problem.parameter import Parameter
 from adjust.solution.result import Adjustment
 
 FITTING = 3.0  # in sigma0 of the others: largest rms standardised residual of an image that agrees with them
+CONTRADICTING = 0.5  # share of v'Pv above which one image explains why the iteration does not converge
 FEWEST_RAYS = 2  # rays needed for a point without priors
 
 
@@ -57,6 +58,27 @@ def fitting(result: Adjustment, frames: Collection[str], sigma0: float) -> set[s
     of_mark = np.array([image.frame for image in result.network.images])[result.network.image_numbers]
     excess = (np.nan_to_num(result.residuals.w) ** 2).sum(axis=1) - 2.0 * (FITTING * sigma0) ** 2
     return {frame for frame in frames if (result.weights * excess)[of_mark == frame].sum() <= 0.0}
+
+
+def contradicting_image(result: Adjustment) -> dict[str, str]:
+    """The frame that causes most of v'Pv in an adjustment without a solution, with the reason; empty if none does."""
+    image_numbers = result.network.image_numbers
+    frames = np.array([image.frame for image in result.network.images])[image_numbers]
+    # Without a solution there are no standardised residuals.
+    variances = np.diagonal(result.network.observations.covariance_mm2, axis1=1, axis2=2)
+    share = (result.residuals.v_mm**2 / variances).sum(axis=1)
+    names, of_frame = np.unique(frames, return_inverse=True)
+    sums = np.bincount(of_frame, share)
+    worst = int(np.argmax(sums))
+    if len(names) < 2 or sums[worst] <= CONTRADICTING * sums.sum():
+        return {}
+    point = result.network.observations.point[int(np.argmax(np.where(of_frame == worst, share, -1.0)))]
+    return {
+        str(
+            names[worst]
+        ): f"with image {names[worst]} the iteration does not converge, without it it does. Its largest "
+        f"residual is that of {point}. Check the point numbers of this image."
+    }
 
 
 def _adopt_camera(camera: Camera, result: Adjustment) -> Camera:

@@ -1,6 +1,7 @@
 """Hypotheses on errors of a network's model, each as the same problem with additional unknowns.
 
-Lens terms, non-square pixels, different interior orientations of images, a bent board. Each problem starts where the
+Lens terms, non-square pixels, different interior orientations of images, a bent board, wrong coordinates of a given
+point. Each problem starts where the
 adjustment without its unknowns ended, so that one linearised step estimates the fall of v'Pv.
 
 Two groups of images: with orientation and film of one image eliminated from its rows, the shift (c, x0', y0') of that
@@ -163,6 +164,7 @@ def _solved(normal: Array, right: Array) -> Array:
 FREE = Prior(0.0, np.inf)
 TERMS_TOGETHER = 2  # radial terms tested jointly
 OTHERS = " (other images)"  # suffix of a camera's name for the images with a different interior orientation
+FEWEST_GIVEN, FEWEST_IMAGES = 5, 2  # given points, and images of one, that tell a wrong one
 NAMED = 5  # images named in a message
 ALIKE = 7.0  # difference of chi-square plus twice the unknowns below which two readings are not distinguished
 
@@ -174,7 +176,7 @@ Words = Callable[[Run, Indices, float], tuple[str, str]]
 class ModelHypothesis:
     """Model with additional unknowns."""
 
-    kind: str  # "radial", "decentering", "pixels", "groups" or "board"
+    kind: str  # "radial", "decentering", "pixels", "groups", "board" or "point"
     words: Words  # returns cause (with figures) and remedy
     problem: Problem  # problem that starts where the simpler model ended
     added: Indices  # (k,) positions of the additional unknowns
@@ -194,6 +196,7 @@ def model_hypotheses(run: Run) -> Iterator[ModelHypothesis]:
             yield from hypotheses(run, camera)
     yield from _scanner_pixels(run)
     yield from _bent_board(run)
+    yield from _wrong_point(run)
 
 
 def _lens_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
@@ -257,6 +260,30 @@ def _bent_board(run: Run) -> Iterator[ModelHypothesis]:
         return
     problem = _continued(run, replace(network, boards=(board,)))
     yield ModelHypothesis("board", _board_words, problem, problem.unknowns.board[board.name])
+
+
+def _wrong_point(run: Run) -> Iterator[ModelHypothesis]:
+    """Wrong coordinates of the fixed point whose residuals are largest, where at least two images show it.
+
+    Coordinates that are given with a standard deviation are observations, tested by data snooping.
+    """
+    network, unknowns = run.problem.network, run.problem.unknowns
+    names, of_row = network.observations.numbered_points
+    rows = np.flatnonzero(~run.problem.is_fiducial)
+    variances = np.diagonal(network.observations.covariance_mm2[rows], axis1=1, axis2=2)
+    squares = np.bincount(of_row[rows], (run.end.v_mm[rows] ** 2 / variances).sum(axis=1), len(names))
+    images = np.bincount(of_row[rows], minlength=len(names))
+    fixed = {name for name, at in unknowns.point.items() if not unknowns.sigma[at].any()}
+    given = [k for k, name in enumerate(names) if name in fixed and images[k] >= FEWEST_IMAGES]
+    if network.boards or len(given) < FEWEST_GIVEN:
+        return
+    name = names[max(given, key=lambda k: squares[k])]
+    problem = _continued(run, network)
+    sigma, added = problem.unknowns.sigma.copy(), problem.unknowns.point[name]
+    sigma[added] = np.inf
+    freed = replace(problem, unknowns=replace(problem.unknowns, sigma=sigma))
+    choices, contrasts = float(np.log(len(given))), len(added) * (len(given) - 1)
+    yield ModelHypothesis("point", partial(_point_words, name), freed, added, choices, contrasts)
 
 
 def _free_terms(camera: Camera) -> set[str]:
@@ -376,6 +403,17 @@ def _board_words(run: Run, added: Indices, _: float) -> tuple[str, str]:
     return (
         cause,
         'Put it on a flat plate, or let its bend be adjusted: board_bend = "free" under [object] in project.toml.',
+    )
+
+
+def _point_words(name: str, run: Run, added: Indices, _: float) -> tuple[str, str]:
+    value, covariance = _estimate(run, added)
+    off, sigma = run.problem.unknowns.given[added] - value, np.sqrt(np.diag(covariance))
+    digits = [max(0, -int(np.floor(np.log10(s)))) for s in sigma]
+    by = ", ".join(f"{axis} by {d:+.{n}f} ± {s:.1g}" for axis, d, s, n in zip("XYZ", off, sigma, digits, strict=True))
+    return (
+        f"Point {name} is not where it is given: its coordinates are off, {by} (points' unit)",
+        "Correct the coordinates of this point, or its number among the marks.",
     )
 
 

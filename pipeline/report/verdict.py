@@ -403,6 +403,9 @@ def _sentence(data: ReportData, shots: list[Frame], level: Level, problems: int)
     ]
     if not constants:
         return f"Film transformations from {found}; no frame is oriented, and no camera calibrated{ending}"
+    if not data.totals:
+        used = {row.image for row in data.adjustment.residuals}
+        found = f"{counted(len(data.adjustment.residuals), 'mark')} in {counted(len(used), 'frame')}"
     return f"Calibrated from {found}: {'; '.join(constants)}{ending}"
 
 

@@ -536,6 +536,7 @@ class Effects:
     crop: float = 0.0
     scale: float = 0.0
     bend: float = 0.0
+    point: float = 0.0
     noise: float = 1.0
     pitch: float = 1.0
     object_unit: float = 1.0
@@ -625,6 +626,7 @@ def _projected(made: Scene, effects: Effects, kind: Misfit, image: int, rotation
     low, high = points.min(axis=0), points.max(axis=0)
     relative = (2.0 * points - low - high)[:, :2] / (high - low)[:2]
     points[:, 2] += effects.bend * (1.0 - relative[:, 0] ** 2)
+    points[WRONG_POINT, :2] -= effects.point
     u, v, w = rotation @ (points - station).T
     x, y = -u / w, v / w
     lens = dict.fromkeys(("k1", "k2", "p1", "p2", "k3"), 0.0) | kind.lens
@@ -643,6 +645,7 @@ def _projected(made: Scene, effects: Effects, kind: Misfit, image: int, rotation
     return np.asarray(at * (1.0 + own * effects.scale))
 
 
+WRONG_POINT = 17
 MISFITS = {
     NOTHING: Misfit(lambda e: Effects(), ()),
     "pixels not square": Misfit(lambda e: Effects(b1=1e-3 * e), ("pixels of camera cam are not square",)),
@@ -663,6 +666,9 @@ MISFITS = {
         lens={"k1": -0.2, "k2": 0.1}, size=2
     ),
     "board bent": Misfit(lambda e: Effects(bend=0.5 * e), ("is not flat",), size=2, fields=False),
+    "a point is elsewhere": Misfit(
+        lambda e: Effects(point=0.1 * e), (f"Point p{WRONG_POINT} is not where it is given",), size=3
+    ),
     "pitch ten times too large": Misfit(
         lambda e: Effects(pitch=10.0), ("principal distance of camera cam is not the 10 mm",), sized=False, c_given=True
     ),

@@ -321,6 +321,38 @@ def test_an_image_with_wrong_names_is_left_out(robust: bool) -> None:
     assert result.redundancy == alone.redundancy
 
 
+def test_an_image_with_wrong_names_does_not_decide_on_an_unknown_principal_distance() -> None:
+    rng = np.random.default_rng(1)
+    images = good_images(8, rng)
+    network = make_network({"a shuffled one": rng.permutation(images["good0"]), **images}, rng)
+    network = replace(network, cameras=(replace(network.cameras[0], principal_distance_mm=None),))
+    result = adjust(network)
+    assert list(result.left_out) == ["a shuffled one"]
+    assert abs(result.value("IO.cam.c") - C) < 4.0 * result.sigma("IO.cam.c")
+
+
+def test_images_with_which_the_iteration_does_not_converge_are_left_out() -> None:
+    """Their points have the names of their neighbours to the right, those at the end of a row wrong ones."""
+    rng = np.random.default_rng(8)
+    images = good_images(8, rng)
+    wrong = {name: np.roll(images[name].reshape(6, 9, 2), 1, axis=1).reshape(-1, 2) for name in ("good2", "good5")}
+    result = adjust(make_network({**images, **wrong}, rng))
+    assert result.converged
+    assert sorted(result.left_out) == ["good2", "good5"]
+    assert {reason.split(" the ")[0] for reason in result.left_out.values()} == {
+        "with image good2",
+        "with image good5",
+    }
+    assert abs(result.value("IO.cam.c") - C) < 4.0 * result.sigma("IO.cam.c")
+    assert result.redundancy == adjust(make_network(images, rng)).redundancy - 2 * (2 * 54 - 6)
+
+
+def test_images_are_not_left_out_where_none_explains_the_divergence() -> None:
+    rng = np.random.default_rng(4)
+    images = {name: np.roll(xy.reshape(6, 9, 2), 1, axis=1).reshape(-1, 2) for name, xy in good_images(6, rng).items()}
+    assert not adjust(make_network(images, rng)).left_out
+
+
 def test_an_image_whose_points_lie_on_a_line_is_left_out() -> None:
     rng = np.random.default_rng(2)
     images = good_images(6, rng)

@@ -53,6 +53,13 @@ def test_good(adjusted_data: ReportData) -> None:
     assert (alone.level, alone.sentence[:40]) == ("good", "Calibrated from 160 marks in 5 frames: R")
 
 
+def test_marks_and_frames_left_out_of_the_adjustment_do_not_count(adjusted_data: ReportData) -> None:
+    assert adjusted_data.adjustment is not None
+    rows = adjusted_data.adjustment.residuals
+    some = changed(adjusted_data, residuals=tuple(row for row in rows if row.image != rows[0].image))
+    assert judge(some).sentence.startswith("Calibrated from 128 marks in 4 frames: ")
+
+
 def test_sigma0_above_and_below_its_bounds(adjusted_data: ReportData) -> None:
     assert "σ₀ = 1.60 is above 1.11" in describe(changed(adjusted_data, sigma0=1.6))
     assert "film_sigma_um" in describe(changed(adjusted_data, sigma0=1.6))
