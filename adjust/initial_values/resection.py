@@ -175,7 +175,8 @@ def distance_together(
     plausible pose count only if there are no others. Returns the principal distance in mm, the standard deviation of
     its logarithm, and the resections; None if no image was resected or the estimate fails.
     """
-    resected = [i for i, each in enumerate(found) if plausible_pose(each, principal_distance_mm)]
+    most_mm = IMPLAUSIBLE * principal_distance_mm
+    resected = [i for i, each in enumerate(found) if each is not None and each.sigma_mm <= most_mm]
     resected = resected or [i for i, each in enumerate(found) if each is not None]
     known = [each for i in resected if (each := found[i]) is not None]
     if not known:
