@@ -102,8 +102,10 @@ def _calibration(path: Path, content: AdjustmentRecord, name: str, lens: Lens, l
     marks = {id: np.array(mark.xy_mm) for id, mark in content.cameras[name].fiducials.items()}
     unknowns = [Parameter.interior(name, each) for each in lens.quantities]
     unknowns += [Parameter.fiducial(name, id, axis) for id in marks for axis in "xy"]
-    covariance = read_own_covariance(path).select_larger(unknowns)
-    return CameraCalibration(label, lens, marks, covariance, content.variance_factor.redundancy)
+    stored, redundancy = read_own_covariance(path), content.variance_factor.redundancy
+    if stored.clusters is not None:  # a jackknife has as many degrees of freedom as images less one
+        redundancy = min(redundancy, len(content.camera_images(name)) - 1.0)
+    return CameraCalibration(label, lens, marks, stored.select_larger(unknowns), redundancy)
 
 
 def _remarks(contents: Mapping[Path, AdjustmentRecord], names: Sequence[str]) -> tuple[str, ...]:

@@ -52,13 +52,17 @@ class Covariance:
         return block
 
     def select_larger(self, parameters: Sequence[Parameter]) -> Array:
-        """Covariance as by `select`, enlarged where `clusters` has larger standard deviations."""
+        """Covariance as by `select`, enlarged in each direction in which that of `clusters` is larger."""
         block = self.select(parameters)
-        if self.clusters is None:
+        free = np.flatnonzero(np.diagonal(block) > 0.0)
+        if self.clusters is None or not len(free):
             return block
-        variance, scatter = np.diagonal(block), np.diagonal(self.clusters.select(parameters))
-        factor = np.sqrt(np.maximum(scatter / np.where(variance > 0.0, variance, np.inf), 1.0))
-        return np.asarray(block * np.outer(factor, factor))
+        root = np.linalg.cholesky(block[np.ix_(free, free)])
+        scatter = self.clusters.select(parameters)[np.ix_(free, free)]
+        ratios, directions = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, scatter).T))
+        spread = root @ directions * np.sqrt(np.maximum(ratios, 1.0))
+        block[np.ix_(free, free)] = spread @ spread.T
+        return block
 
     @cached_property
     def _positions(self) -> dict[Parameter, int]:

@@ -247,14 +247,15 @@ def covariance(name: str, parameters: tuple[str, ...], matrix: Array) -> Covaria
     return Covariance(tuple(Parameter.interior(name, each) for each in parameters), np.zeros(len(parameters)), matrix)
 
 
-def test_a_covariance_is_enlarged_where_leaving_out_images_scatters_more() -> None:
+def test_a_covariance_is_enlarged_in_the_directions_in_which_leaving_out_images_scatters_more() -> None:
     keys = tuple(Parameter.interior("K", each) for each in ("c", "x0"))
-    model = np.array([[4.0, 1.0], [1.0, 1.0]])
-    clusters = Covariance(keys, np.zeros(2), np.diag([36.0, 0.25]))
-    larger = Covariance(keys, np.zeros(2), model, clusters=clusters).select_larger(
-        (*keys, Parameter.interior("K", "k1"))
-    )
-    assert larger.tolist() == [[36.0, 3.0, 0.0], [3.0, 1.0, 0.0], [0.0, 0.0, 0.0]]
+    model, along = np.array([[4.0, 1.0], [1.0, 1.0]]), np.array([[1.0, -1.0]])
+    clusters = Covariance(keys, np.zeros(2), 25.0 * along.T @ along)
+    known = Covariance(keys, np.zeros(2), model, clusters=clusters)
+    larger = known.select_larger((*keys, Parameter.interior("K", "k1")))
+    assert np.linalg.eigvalsh(larger[:2, :2] - model).min() > -1e-9
+    assert np.linalg.eigvalsh(larger[:2, :2] - clusters.matrix).min() > -1e-9
+    assert not larger[2].any()
     assert Covariance(keys, np.zeros(2), model).select_larger(keys).tolist() == model.tolist()
 
 
