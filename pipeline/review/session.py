@@ -157,7 +157,7 @@ select result, count(*) from checked_mark where judging = ? and status in ('meas
 def _frames(db: sqlite3.Connection, judging: int) -> Iterator[_Frame]:
     found: dict[int, int] = dict(db.execute(_FOUND, (judging,)).fetchall())
     for *frame, pose_json in db.execute(_FRAMES, (judging,)):
-        pose = json.loads(pose_json or '{"name": "", "decided": true, "evidence": [], "roll": ""}')
+        pose = json.loads(pose_json or "null") or {"name": "", "decided": True, "evidence": [], "roll": ""}
         orientation = pose["name"], bool(pose["decided"]), " ".join(pose["evidence"]), pose["roll"]
         yield _Frame._make((*frame, found.get(frame[1], 0), *orientation))
 
