@@ -293,6 +293,8 @@ class MarkFit:
     size_sigma : standard deviation of the mark's relative size; infinite if not estimated.
     edges : second place by the mark's edges.
     sloping : second place of an ellipse with a contrast gradient.
+    line_width : logarithm of the width of the lines of a cross over the drawn width, and its standard deviation, where
+        they are narrower than the least blur explains.
     own_shape : rotation and scale by the image alone, where the frame determined them.
     tone : information on an unknown tone curve.
     sharpening : score of the scan's sharpening.
@@ -322,6 +324,7 @@ class MarkFit:
     size_sigma: float = np.inf
     edges: SecondPlace | None = None
     sloping: SecondPlace | None = None
+    line_width: tuple[float, float] | None = None
     own_shape: OwnShape | None = None
     tone: MarkTone | None = None
     sharpening: SharpeningScore | None = None

@@ -40,6 +40,8 @@ _TOUCHED_PX = 0.3  # rms displacement of the edges of wedges and notches that th
 _AS_MUCH = 2.0
 _FEWEST_FRAMES = 3  # needed: of two, either may be the outlier
 _NEAR = 3.0  # standard deviations from the median, within which frames agree
+_WIDTH_SIGMA = 0.15  # standard deviation of the logarithm of the width of a frame's lines over the drawn one
+_LEAST_WIDTH, _LONGEST_WIDTH = 0.03, 0.2  # of the same: a smaller change is ignored, a larger one is not linear
 _SHORTEST = 0.1  # lower bound of ratios: an arm shorter than this counts as missing
 _ARM, _SHAPE, _BLUR = "arm", "shape", "blur"
 Key = tuple[str, str]  # a mark and its figure: size, turn, blur, arm1, arm2, ...
@@ -98,6 +100,23 @@ class SharedShape:
         touched = share * _density(self.off, np.hypot(self.sigma, spread))
         untouched = (1 - share) * _density(self.off, self.sigma)
         return max(touched / max(touched + untouched, 1e-300) - share, 0.0)
+
+
+def shared_line_width(widths: Sequence[tuple[float, float] | None]) -> float:
+    """Ratio of the width of the lines of crosses of one drawing to the drawn width; 1 if not significant.
+
+    widths: logarithm of each cross's own ratio and its standard deviation; None where the blur explains its lines.
+    """
+    found = [width for width in widths if width is not None]
+    if len(found) < max(_FEWEST_BLURS, len(widths) / 2):
+        return 1.0
+    values, sigmas = np.array(found).T
+    off = np.abs(values - np.median(values))
+    near = off <= _NEAR * np.hypot(sigmas, np.median(off))
+    mean, sigma, _ = mean_of_unlike(values[near], sigmas[near], size_spread)
+    known = float(mean / (1 + (sigma / _WIDTH_SIGMA) ** 2))
+    is_clear = abs(known) > max(_NEAR * sigma, _LEAST_WIDTH)
+    return float(np.exp(np.clip(known, -_LONGEST_WIDTH, _LONGEST_WIDTH))) if is_clear else 1.0
 
 
 def unlike_others(size_ratio: float, turn_rad: float | None) -> Reason:

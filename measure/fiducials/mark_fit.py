@@ -49,7 +49,11 @@ class Detection:
 
 
 def detect_mark(
-    scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sigma: float | None = None
+    scan: Scan,
+    expected: MarkPrediction,
+    options: MatchOptions,
+    frame_sigma: float | None = None,
+    before: MarkFit | None = None,
 ) -> Detection:
     """Localise a mark within the search radius of its predicted place and fit it there.
 
@@ -58,12 +62,13 @@ def detect_mark(
     expected : the predicted place; without a search radius the mark is fitted at that place.
     frame_sigma : standard deviation of the predicted rotation (rad), scale, stretch and shear; None unless they come
         from a frame fitted to all marks.
+    before : an earlier fit at that place, from which the new one starts.
     """
     predicted = expected.center_px.copy()
     inside = bool(np.all(predicted >= -0.5) and np.all(predicted < np.array([scan.width_px, scan.height_px]) - 0.5))
     if not inside:
         return Detection(predicted, False, None, Reason("its place is outside of the scan", Code.OUTSIDE))
-    fit, false_alarms = _localise_and_fit(scan, expected, options, frame_sigma)
+    fit, false_alarms = _localise_and_fit(scan, expected, options, frame_sigma, before)
     if lost := _lost(scan, expected if fit is None or not fit.converged else expected.shift_to(fit.center_px)):
         return Detection(predicted, False, None, lost)
     if fit is None:
@@ -114,7 +119,7 @@ def _unlike(fit: MarkFit, expected: MarkPrediction, full_scale_dn: float) -> Rea
 
 
 def _localise_and_fit(
-    scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sigma: float | None
+    scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sigma: float | None, before: MarkFit | None
 ) -> tuple[MarkFit | None, float]:
     """Match the mark at the highest correlation peak. Returns the fit, None without a peak, and its false alarms."""
     mark = expected.mark
@@ -126,11 +131,11 @@ def _localise_and_fit(
     if peak is None:
         return None, 1.0
     center_px, false_alarms = peak
-    return _fit_from(scan, expected, center_px, options, frame_sigma), false_alarms
+    return _fit_from(scan, expected, center_px, options_for(expected.mark, options, frame_sigma), before), false_alarms
 
 
 def _fit_from(
-    scan: Scan, expected: MarkPrediction, center_px: Array, options: MatchOptions, frame_sigma: float | None
+    scan: Scan, expected: MarkPrediction, center_px: Array, options: MatchOptions, before: MarkFit | None
 ) -> MarkFit:
     """Match the mark from an initial place."""
     mark, start = expected.mark, expected.shift_to(center_px).pixel_from_mark
@@ -139,7 +144,7 @@ def _fit_from(
     if expected.surroundings.robust and isinstance(mark, MarkShape):
         inner = np.column_stack([start[:, :2], start[:, 2] - window.origin_px])
         window = window.exclude(pixels_beyond_edge(window.grey, mark, inner))
-    return match(window, mark, start, options_for(mark, options, frame_sigma))
+    return match(window, mark, start, options, before)
 
 
 def options_for(mark: Mark, options: MatchOptions, frame_sigma: float | None) -> MatchOptions:

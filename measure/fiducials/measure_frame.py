@@ -17,7 +17,7 @@ from measure.fiducials.faint_marks import detect_faint_marks, faint_reach_px
 from measure.fiducials.frame import CLEAR_LIKENESS, MANY, Frame, orient_frame
 from measure.fiducials.mark_fit import Detection, detect_mark, not_found
 from measure.fiducials.options import FiducialOptions
-from measure.fiducials.refit import refit_frame, sharpen_frame
+from measure.fiducials.refit import fit_line_widths, refit_frame, sharpen_frame
 from measure.flags import FAINT_MARK_BY_NOISE, TEXTURE_LIKE_A_FAINT_MARK
 from measure.marks.rendering import picture
 from measure.marks.shapes import FiducialLayout, Mark
@@ -41,12 +41,12 @@ def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, opti
     frame = sharpen_frame(detect_frame(scan, layout, placement, options))
     if frame.scan.tone.sharpening and not scan.tone.sharpening:
         frame = sharpen_frame(detect_missing_marks(frame))
-    return refit_frame(frame)
+    return refit_frame(fit_line_widths(frame))
 
 
 def detect_frame(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
     """Detect the marks of a frame, clear and faint ones, without the refit."""
-    return detect_missing_marks(detect_clear_marks(scan, layout, placement, options))
+    return detect_missing_marks(fit_line_widths(detect_clear_marks(scan, layout, placement, options)))
 
 
 def detect_clear_marks(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:

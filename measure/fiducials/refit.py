@@ -13,6 +13,7 @@ from measure.fiducials.mark_comparison import (
     SharedBlur,
     SharedShape,
     shared_blurs,
+    shared_line_width,
     shared_shapes,
     touch_of_edges,
     touch_of_round,
@@ -24,7 +25,7 @@ from measure.fiducials.options import film_terms, interleaved
 from measure.flags import LARGE_ERROR, Cause
 from measure.geometry import linear_scale
 from measure.marks.rendering import reach_px
-from measure.marks.shapes import Disk, Mark, MarkShape, Ring
+from measure.marks.shapes import Disk, Mark, MarkShape, Ring, widen_lines
 from measure.matching.match import is_cross, mark_window, measure_arms
 from measure.matching.models import PIXEL_VARIANCE_PX2, MatchOptions, is_round
 from measure.matching.window import read_window
@@ -39,6 +40,7 @@ _TONE_ROUNDS = 5  # largest number of refits with an improved tone curve
 _OTHER_STARTS, _AGREED = (2.2, 1.0), 0.1  # gammas of further initial curves; disagreement up to which none is tried
 _TELLING = 8  # most significant marks used to estimate the sharpening after the first round: more cost time
 _SHARPENING_ROUNDS = 6  # largest number of refits with an improved sharpening
+_WIDTH_ROUNDS = 3  # largest number of refits with another width of lines
 _MOVED = 0.3  # fraction of a mark's standard deviation: smaller shifts by a better curve are ignored
 _UNCHECKED = 3  # marks, which an affine transformation fits without residuals
 _REFIT_PX = 1.5  # search range around a mark that was fitted already
@@ -56,6 +58,31 @@ def refit_frame(frame: Frame) -> Frame:
     return _compare_shapes(_add_lens_covariance(_add_tone_covariance(frame)))
 
 
+def fit_line_widths(frame: Frame) -> Frame:
+    """Draw the crosses with lines as wide as they show in this scan, and refit them.
+
+    Exposure widens or narrows the lines of all marks of a frame alike. Where a line is drawn too wide, the size of a
+    cross takes that up, and the ends of its arms are taken for damage.
+    """
+    for _ in range(_WIDTH_ROUNDS):
+        groups: dict[Mark, dict[int, tuple[float, float] | None]] = defaultdict(dict)
+        for index, fit in frame.clear_fits.items():
+            groups[frame.layout.marks[index].mark][index] = fit.line_width
+        ratios = {mark: shared_line_width(list(widths.values())) for mark, widths in groups.items()}
+        changed: dict[Mark, Mark] = {
+            mark: widen_lines(mark, ratio)
+            for mark, ratio in ratios.items()
+            if isinstance(mark, MarkShape) and ratio != 1
+        }
+        if not changed:
+            break
+        marks = tuple(replace(each, mark=changed.get(each.mark, each.mark)) for each in frame.layout.marks)
+        frame = replace(frame, layout=replace(frame.layout, marks=marks))
+        options = replace(frame.options.match, tells_sharpening=True)
+        frame = _refit(frame, {index: options for mark in changed for index in groups[mark]})
+    return frame
+
+
 def sharpen_frame(frame: Frame) -> Frame:
     """Estimate the sharpening of the scan from the clear marks, and refit them in the scan without it.
 
@@ -65,13 +92,16 @@ def sharpen_frame(frame: Frame) -> Frame:
         return frame
     plainest, begun = sorted(frame.clear_fits.items(), key=lambda item: -item[1].significance), frame
     telling = [index for index, fit in plainest if fit.sharpening is not None]
+    last = before = frame.scan.tone.sharpening
     for _ in range(_SHARPENING_ROUNDS):
-        before = frame.scan.tone.sharpening
+        if before:
+            telling = telling[:_TELLING]
         scores = [fit.sharpening for index in telling if (fit := frame.detections[index].fit) and fit.sharpening]
         found = estimate_sharpening(before, scores, len(frame.scan.tone.mean))
         if found is None or found.is_as(before):
             break
-        frame = replace(frame, scan=frame.scan.replace_tone(frame.scan.tone.sharpened(found)))
+        last, before = before, found.damped(before, last) if last else found
+        frame = replace(frame, scan=frame.scan.replace_tone(frame.scan.tone.sharpened(before)))
         telling = telling[:_TELLING]
         frame = _refit(frame, dict.fromkeys(telling, frame.options.match), orient=False)
     if found is not None:
@@ -84,7 +114,8 @@ def _refit_with_tone(frame: Frame) -> Frame:
     """Refit the marks with the tone curve estimated from them; if they disagree, from further initial curves."""
     prior = frame.scan.tone.prior
     best = _refit_from_curve(frame, prior, frame.scan.tone)
-    for power in _OTHER_STARTS if best.tone.disagreement > _AGREED and _depends_on_tone(best) else ():
+    is_open = best.tone.disagreement > _AGREED and not best.tone.is_doubted and _depends_on_tone(best)
+    for power in _OTHER_STARTS if is_open else ():
         other = _refit_from_curve(best, prior, prior.shift_to_power(power))
         best = other if other.tone.disagreement < best.tone.disagreement else best
     return best
@@ -105,6 +136,8 @@ def _refit_from_curve(frame: Frame, prior: Tone, start: Tone) -> Frame:
             break
         frame = _refit(frame, dict.fromkeys(pending | moved, frame.options.match))
         pending = set()
+        if estimate.is_doubted:  # by the prior curve again, the marks would only lead to the same estimate
+            return replace(frame, tone=estimate)
     return replace(frame, tone=FrameTone.from_marks(prior, _mark_tones(frame), frame.scan.tone))
 
 
@@ -289,4 +322,6 @@ def _fit_again(frame: Frame, index: int, options: MatchOptions) -> MarkFit | Non
     if before is None:
         return None
     expected = frame.prediction(index, _REFIT_PX).shift_to(before.center_px)
-    return detect_mark(frame.scan, expected, options, _linear_sigma(frame)).fit
+    # Marks whose size, place and blur are less separate begin anew: they have further minima.
+    begun = before if isinstance(expected.mark, MarkShape) and is_cross(expected.mark) else None
+    return detect_mark(frame.scan, expected, options, _linear_sigma(frame), begun).fit

@@ -279,6 +279,12 @@ def _turned_point(point: Point, angle_deg: float) -> Point:
     return (c * point[0] - s * point[1], s * point[0] + c * point[1])
 
 
+def widen_lines(mark: MarkShape, ratio: float) -> MarkShape:
+    """Multiply the widths of a mark's bars by a ratio."""
+    widened = (replace(part, line_mm=ratio * part.line_mm) if isinstance(part, Bar) else part for part in mark.parts)
+    return replace(mark, parts=tuple(widened))
+
+
 def thinnest_mm(mark: Mark) -> float:
     """Width (mm) of the mark's thinnest line, estimated from its parts."""
     if isinstance(mark, MarkTemplate):

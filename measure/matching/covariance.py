@@ -14,7 +14,16 @@ from measure.marks.shapes import MarkTemplate
 from measure.marks.shared_picture import SMOOTHED_PX2
 from measure.marks.templates import GRAIN_PX
 from measure.matching.models import GREY
-from measure.noise.noise_model import SCALE_VARIANCE, NoiseModel, autocovariance, combined, correlated, faded, products
+from measure.noise.noise_model import (
+    SCALE_VARIANCE,
+    NoiseModel,
+    autocovariance,
+    combined,
+    correlated,
+    factors,
+    faded,
+    products,
+)
 from measure.noise.robust_estimation import robust_scale
 from measure.results import Covariance, MarkFit, OwnShape, SecondPlace
 
@@ -261,6 +270,26 @@ def sloping_place(fit: LinearFit) -> SecondPlace | None:
     sloping = fit.design[-GREY] * fit.design[-2:] * fit.used
     left = (sloping - combined(products(sloping, fit.design), fit.by_grey)) * fit.used  # not absorbed by the match
     return _second_place(fit, -products(fit.by_grey[:2], sloping), products(left, sloping), left, left)
+
+
+def line_width(fit: LinearFit, change: Array, held: int) -> tuple[float, float]:
+    """Estimate the width of a mark's lines as a further unknown of the fit.
+
+    Parameters
+    ----------
+    change : (height, width) derivative of the model by the logarithm of the width.
+    held : index of an unknown held fixed, the blur at its limit.
+
+    Returns
+    -------
+    Logarithm of the width over the drawn one, and its standard deviation; infinite where it is not determined.
+    """
+    others, change = np.delete(fit.design, held, axis=0) * fit.used, change * fit.used
+    left = (change - combined(factors(others, change), others))[None]
+    normal, variance = float(products(left, change[None])[0, 0]), float(fit.covariance(left)[0, 0])
+    if not (normal > 0 and variance > 0):
+        return 0.0, np.inf
+    return float(products(left, fit.residuals[None])[0, 0]) / normal, float(np.sqrt(variance)) / normal
 
 
 def _second_place(fit: LinearFit, by_unknown: Array, normal: Array, weights: Array, left: Array) -> SecondPlace | None:

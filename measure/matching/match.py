@@ -14,18 +14,19 @@ import numpy as np
 from measure.array_types import Array, Mask
 from measure.flags import Cause
 from measure.marks.rendering import extent_px, frame_pixel_mask, known_mask, picture
-from measure.marks.shapes import Bar, Mark, MarkShape, MarkTemplate
+from measure.marks.shapes import Bar, Mark, MarkShape, MarkTemplate, widen_lines
 from measure.matching.covariance import (
     Landscape,
     LinearFit,
     covariance_of_changed_tone,
     edge_place,
+    line_width,
     own_shape,
     second_order,
     sloping_place,
 )
 from measure.matching.gauss_newton import EDGE_BLURS, PictureFit
-from measure.matching.models import GREY, MatchOptions, PictureModel, background_planes, background_px, is_round
+from measure.matching.models import GREY, MatchOptions, PictureModel, State, background_planes, background_px, is_round
 from measure.matching.tone_information import (
     mark_tone_information,
     sharpening_score,
@@ -41,10 +42,17 @@ from measure.tone.sharpening import SharpeningScore
 __all__ = ["MarkFit", "MatchOptions", "mark_window", "match"]
 
 
+_WIDER = 1.05  # relative width of lines, step of the difference
 _SPARE_PX = 2.0  # px beyond the margin, so that the mark can move
 
 
-def match(window: ScanWindow, mark: Mark, pixel_from_mark: Array, options: MatchOptions | None = None) -> MarkFit:
+def match(
+    window: ScanWindow,
+    mark: Mark,
+    pixel_from_mark: Array,
+    options: MatchOptions | None = None,
+    before: MarkFit | None = None,
+) -> MarkFit:
     """Fit a mark to a window of the scan. Never raises because of the image content.
 
     Parameters
@@ -55,6 +63,7 @@ def match(window: ScanWindow, mark: Mark, pixel_from_mark: Array, options: Match
     pixel_from_mark : (2, 3) affine matrix from (x_mm, y_mm, 1) to the scan's (col, row). Its last column is the
         approximate centre, correct to a pixel or two.
     options : MatchOptions, optional
+    before : fit of the mark under another tone curve, blur or drawing, from which this one starts.
 
     Returns
     -------
@@ -64,7 +73,10 @@ def match(window: ScanWindow, mark: Mark, pixel_from_mark: Array, options: Match
     options, start = options or MatchOptions(), np.array(pixel_from_mark, dtype=float)
     grey = np.where(window.usable, np.asarray(window.grey, float), 0.0)
     window = replace(window, grey=grey, valid=window.usable)
-    fit = _fit_part(window, mark, start, options)
+    begun = None if before is None or before.covariance is None else before
+    fit = _fit_part(window, mark, start, options, begun=begun)
+    if begun is not None and fit.reason:
+        fit = _fit_part(window, mark, start, options)
     if not _is_right(fit):
         detail = _fit_part(window, mark, start, options, background_px(mark, start))
         if not detail.reason:
@@ -83,12 +95,22 @@ def mark_window(mark: Mark, pixel_from_mark: Array, margin_px: float) -> tuple[i
 
 
 def _fit_part(
-    window: ScanWindow, mark: Mark, start: Array, options: MatchOptions, coarse_px: float | None = None
+    window: ScanWindow,
+    mark: Mark,
+    start: Array,
+    options: MatchOptions,
+    coarse_px: float | None = None,
+    begun: MarkFit | None = None,
 ) -> PictureFit:
     """Fit the mark in the part of the window around it. coarse_px: blur (px) whose result is subtracted as background;
-    None: the background is modelled."""
+    None: the background is modelled. begun: nearly the result."""
     fit = _start_fit(window, mark, start, options, coarse_px)
-    fit.approach()
+    if begun is None:
+        fit.approach()
+    else:
+        variance_px2 = begun.blur_px**2 + fit.model.smoothed_px2
+        fit.state = State(begun.pixel_from_mark, variance_px2, np.zeros(GREY)).shifted(-np.array(fit.window.origin_px))
+        fit.choose_area()
     reach_px = options.margin_blurs * fit.model.blur_px
     if not fit.reason and reach_px > options.margin_px:  # the blur spreads the mark beyond the margin
         wide = _start_fit(window, mark, start, replace(options, margin_px=reach_px), coarse_px)
@@ -217,6 +239,7 @@ def _add_precision(result: MarkFit, fit: PictureFit, noise: NoiseModel, about: t
     freedom, has_blur = model.options.freedom, model.blur is not None and not model.blur_is_at_limit
     tells_shape = freedom in ("similarity", "affine") and not is_round(model.mark)
     shape, strain = slice(2, 4), slice(4, model.linear.stop)
+    by_width = _by_line_width(fit)
     sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return replace(
         result,
@@ -231,13 +254,31 @@ def _add_precision(result: MarkFit, fit: PictureFit, noise: NoiseModel, about: t
         size_sigma=float(sigmas[2]) if len(model.generators) else np.inf,
         edges=edge_place(linear, model.blur_px),
         sloping=sloping_place(linear) if freedom == "ellipse" and model.background_px is None else None,
+        line_width=None
+        if by_width is None or model.blur is None or not model.blur_is_at_limit
+        else line_width(linear, by_width, model.blur),
         own_shape=own_shape(linear, shape, strain, model.departures) if tells_shape else None,
-        tone=_mark_tone(fit, linear, priors_dn2, landscape),
-        sharpening=_sharpening_score(fit, linear, priors_dn2),
+        tone=_mark_tone(fit, linear, priors_dn2, landscape, by_width),
+        sharpening=_sharpening_score(fit, linear, priors_dn2, by_width),
     )
 
 
-def _mark_tone(fit: PictureFit, linear: LinearFit, priors_dn2: Array, landscape: Landscape) -> MarkTone | None:
+def _by_line_width(fit: PictureFit) -> Array | None:
+    """(height, width) derivative by the logarithm of the width of a cross's lines. None for other marks."""
+    model, place = fit.model, fit.state.pixel_from_mark
+    if not (isinstance(model.mark, MarkShape) and is_cross(model.mark)):
+        return None
+    height, width = model.grey.shape
+    wider, drawn = (
+        picture(mark, place, width, height, model.blur_px) for mark in (widen_lines(model.mark, _WIDER), model.mark)
+    )
+    change = model.detail(model.contrast_dn / np.log(_WIDER) * (wider - drawn))
+    return np.asarray(change * model.steadiness * model.slopes)
+
+
+def _mark_tone(
+    fit: PictureFit, linear: LinearFit, priors_dn2: Array, landscape: Landscape, by_width: Array | None
+) -> MarkTone | None:
     """Information of the mark on the tone curve. None if the curve is known, or for a chip, which comes from scans with
     the same curve."""
     model, coding = fit.model, fit.window.coding
@@ -247,10 +288,14 @@ def _mark_tone(fit: PictureFit, linear: LinearFit, priors_dn2: Array, landscape:
         return tone_without_information(linear, model.light, model.detail, coding)
     drawn, linear = model.drawn_light, replace(linear, noise=linear.noise.floored(fit.floor_dn**2))
     clear = clear_of_ends(drawn, model.grey, model.clipped, model.noise_dn)
-    return mark_tone_information(linear, drawn, model.grey, clear, priors_dn2, model.departures, coding, landscape)
+    return mark_tone_information(
+        linear, drawn, model.grey, clear, priors_dn2, model.departures, coding, landscape, by_width
+    )
 
 
-def _sharpening_score(fit: PictureFit, linear: LinearFit, priors_dn2: Array) -> SharpeningScore | None:
+def _sharpening_score(
+    fit: PictureFit, linear: LinearFit, priors_dn2: Array, by_width: Array | None
+) -> SharpeningScore | None:
     """Score of the scan's sharpening. None where the background is not modelled. Pixels masked as damage are included,
     since halos are taken for damage until they are modelled."""
     model = fit.model
@@ -259,7 +304,8 @@ def _sharpening_score(fit: PictureFit, linear: LinearFit, priors_dn2: Array) -> 
         return None
     drawn = model.drawn_light
     shown = fit.area & model.tells & clear_of_ends(drawn, model.grey, model.clipped, model.noise_dn)
-    return sharpening_score(replace(linear, used=shown), drawn, priors_dn2, model.departures, fit.window.coding)
+    shown_fit = replace(linear, used=shown)
+    return sharpening_score(shown_fit, drawn, priors_dn2, model.departures, fit.window.coding, by_width)
 
 
 def _likeness(fit: PictureFit) -> float:

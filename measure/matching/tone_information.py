@@ -28,6 +28,7 @@ def mark_tone_information(
     departures: Array,
     coding: Coding,
     landscape: Landscape,
+    by_width: Array | None = None,
 ) -> MarkTone:
     """Compute the information of a linearised fit on the tone curve, with the fit's unknowns eliminated.
 
@@ -43,13 +44,15 @@ def mark_tone_information(
         changes an edge as a curve does.
     priors_dn2, departures : (unknowns,) see `tone_score`.
     landscape : background texture within the mark.
+    by_width : (height, width) derivative by the width of lines, a further unknown. Otherwise the curve would explain
+        lines that are narrower or wider than drawn.
     """
     tone, full_scale_dn = coding.tone, coding.full_scale_dn
     on_place = _moved_px(fit, tone.derivatives(grey, full_scale_dn))
     information = ToneInformation.empty()
     if _has_contrast(drawn):
         within = replace(fit, used=fit.used & clear)
-        uneven = _uneven(fit.design[-GREY], fit.steadiness)
+        uneven = np.concatenate([_uneven(fit.design[-GREY], fit.steadiness), _images(by_width, drawn.shape)])
         changes = tone.derivatives(drawn, full_scale_dn) * within.used * fit.steadiness
         score, left, covariance = _score(within, changes, priors_dn2, departures, uneven)
         covariance += landscape.covariance(left) + _least_variances(fit, changes).sum() * np.eye(len(left))
@@ -68,10 +71,11 @@ def tone_without_information(
 
 
 def sharpening_score(
-    fit: LinearFit, drawn: Array, priors_dn2: Array, departures: Array, coding: Coding
+    fit: LinearFit, drawn: Array, priors_dn2: Array, departures: Array, coding: Coding, by_width: Array | None = None
 ) -> SharpeningScore | None:
     """Score the scan's sharpening together with the tone curve, as in `mark_tone_information`. The fit's mask includes
-    halos. None where the model has no contrast."""
+    halos. by_width (height, width): derivative by the width of lines, a further unknown. None where the model has no
+    contrast."""
     if not _has_contrast(drawn):
         return None
     tone, full_scale_dn = coding.tone, coding.full_scale_dn
@@ -79,9 +83,14 @@ def sharpening_score(
     # Sign: light by a wrong curve lacks the departure, whereas sharpening adds halos to it.
     halos = -tone.slope(drawn, full_scale_dn) * halos
     changes = np.concatenate([tone.derivatives(drawn, full_scale_dn), halos]) * (fit.used * fit.steadiness)
-    score, _, covariance = _score(fit, changes, priors_dn2, departures)
+    score, _, covariance = _score(fit, changes, priors_dn2, departures, _images(by_width, drawn.shape))
     covariance += np.diag(_least_variances(fit, changes))
     return SharpeningScore(score.value, score.normal, covariance, _moved_px(fit, halos))
+
+
+def _images(image: Array | None, shape: tuple[int, ...]) -> Array:
+    """(n, height, width) the image, if there is one."""
+    return np.zeros((0, *shape)) if image is None else image[None]
 
 
 def _has_contrast(drawn: Array) -> bool:

@@ -73,6 +73,11 @@ class FrameTone:
         return cls(tone, information, least, greatest, estimate.scatter, float(step @ step))
 
     @property
+    def is_doubted(self) -> bool:
+        """Whether the marks' own curve is one that no scanner has, and was not taken."""
+        return self.information is None and self.apart > 0 and not self.tone.is_known
+
+    @property
     def disagreement(self) -> float:
         """Variance of departures: disagreement of the marks with one another and with the curve used for matching."""
         return self.scatter + self.apart

@@ -92,6 +92,14 @@ class Sharpening:
         radius_px = float(np.clip(self.radius_px * np.exp(step[1]), *_RADIUS_RANGE_PX))
         return replace(self, amount=amount, radius_px=radius_px, covariance=covariance)
 
+    def damped(self, before: "Sharpening", last: "Sharpening") -> "Sharpening":
+        """Halve the step from an earlier estimate, if it goes back towards the last one before: amount and radius are
+        correlated, and full steps alternate."""
+        if (self.values - before.values) @ ((before.values - last.values) / _LONGEST**2) >= 0:
+            return self
+        amount, log_radius = (self.values + before.values) / 2
+        return replace(self, amount=float(amount), radius_px=float(np.exp(log_radius)))
+
     def is_as(self, other: "Sharpening") -> bool:
         """Whether it differs from another one by little compared with its standard deviations."""
         step = np.array([self.amount - other.amount, np.log(self.radius_px / other.radius_px)])

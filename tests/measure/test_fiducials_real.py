@@ -86,7 +86,7 @@ def middle(scan: Scan) -> tuple[Scan, NDArray[np.int64]]:
 @pytest.mark.parametrize(("number", "steps"), [(11, 1), (11, 2), (15, 2), (16, 2), (17, 2)])
 def test_the_crosses_of_a_reseau_on_a_landscape(number: int, steps: int) -> None:
     """As many crosses as line profiles found, and on the same crosses no larger residuals: on all of them, those too
-    that the profiles' affinity left out, and on those that it used."""
+    that the profiles' affinity left out, but for the standard deviations of weak ones, and on those that it used."""
     layout = lattice(steps)
     with open_scan(SCANS / "reseau" / f"apollo-{number}.jpg") as scan:
         shown, first = (scan, np.zeros(2)) if steps == 2 else middle(scan)
@@ -102,7 +102,10 @@ def test_the_crosses_of_a_reseau_on_a_landscape(number: int, steps: int) -> None
     assert len(observed) >= len(places)
     assert len(set(nearest.tolist())) == len(places)
     assert np.median(distance.min(axis=1)) < 0.5
-    assert affine_rms_px(given, observed) <= affine_rms_px(indices, places) + 1e-3
+    claims = [mark.covariance_px2 for mark in result.marks if mark.status is Status.WEAK]
+    claimed_px2 = sum(float(np.trace(covariance)) for covariance in claims if covariance is not None)
+    allowed_px2 = affine_rms_px(indices, places) ** 2 + claimed_px2 / len(observed)
+    assert affine_rms_px(given, observed) ** 2 <= allowed_px2
     assert affine_rms_px(given[nearest[used]], observed[nearest[used]]) <= affine_rms_px(indices[used], places[used])
 
 

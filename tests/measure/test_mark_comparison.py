@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from drawn import layout_of, paint, pixel_from_camera, written_scan
 from true_marks import KIND, TrueMark, some_mark
 
 from measure import FiducialLayout, FiducialOptions, LayoutMark, Scan
@@ -17,6 +18,7 @@ from measure.fiducials.mark_comparison import (
     SharedShape,
     Touch,
     shared_blurs,
+    shared_line_width,
     shared_shapes,
     touch_of_round,
 )
@@ -24,10 +26,12 @@ from measure.fiducials.mark_fit import not_found
 from measure.fiducials.measure_frame import measure_frame
 from measure.fiducials.rows import absent_frame
 from measure.flags import Cause, Status
+from measure.marks.shapes import MarkShape, cross, thinnest_mm
 from measure.matching.gauss_newton import UNSETTLED
 from measure.results import Covariance
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
+from measure.tone.curve import LINEAR
 
 PIXEL = 1 / 12
 
@@ -44,6 +48,31 @@ def test_a_faint_mark_gets_the_blur_of_the_others_and_those_need_none() -> None:
     assert shared[4] is not None
     assert np.hypot(shared[4].blur_px, np.sqrt(PIXEL)) == pytest.approx(1.2, rel=0.01)
     assert not shared[4].differs
+
+
+def test_a_width_of_lines_that_most_crosses_show_is_taken_and_that_of_few_is_not() -> None:
+    widths = [(-0.15, 0.02), (-0.13, 0.02), (-0.17, 0.03), (0.4, 0.05), None, None]
+    assert shared_line_width(widths) == pytest.approx(np.exp(-0.15), rel=0.03)
+    assert shared_line_width([*widths, None, None, None]) == 1.0
+    assert shared_line_width([(-0.02, 0.001)] * 4) == 1.0
+
+
+def test_crosses_whose_lines_are_narrower_than_drawn_are_drawn_so_and_measured(tmp_path: Path) -> None:
+    shown, given = (layout_of([MarkShape(cross(2.4, mm), "dark")] * 4) for mm in (0.1, 0.12))
+    matrix, size = pixel_from_camera("0"), 400
+    grey = 30000 + np.random.default_rng(3).normal(0, 400.0, (size, size))
+    for mark in shown.marks:
+        paint(grey, mark.mark, mark.xy_mm, matrix, -20000.0, 55, 0.1)
+    with written_scan(grey, tmp_path) as scan:
+        frame = measure_frame(
+            scan.replace_tone(LINEAR), given, Placement("0", matrix, 1.0, 4, 1, 1, (0.05, 0.05)), FiducialOptions("0")
+        )
+    drawn_mm = {round(thinnest_mm(mark.mark), 3) for mark in frame.layout.marks}
+    assert len(drawn_mm) == 1
+    assert min(drawn_mm) < 0.11
+    for fit, mark in zip(frame.fits, given.marks, strict=True):
+        assert fit is not None
+        assert np.hypot(*(fit.center_px - matrix @ (*mark.xy_mm, 1.0))) < 0.05
 
 
 def test_marks_of_one_blur_are_rarely_doubted_and_another_blur_is() -> None:
