@@ -23,7 +23,7 @@ from measure.fiducials.mark_comparison import (
     touch_of_round,
 )
 from measure.fiducials.mark_fit import not_found
-from measure.fiducials.measure_frame import measure_frame
+from measure.fiducials.measure_frame import detect_frame, measure_frame
 from measure.fiducials.rows import absent_frame
 from measure.flags import Cause, Status
 from measure.marks.shapes import MarkShape, cross, thinnest_mm
@@ -57,14 +57,14 @@ def test_a_width_of_lines_that_most_crosses_show_is_taken_and_that_of_few_is_not
     assert shared_line_width([(-0.02, 0.001)] * 4) == 1.0
 
 
-def test_crosses_whose_lines_are_narrower_than_drawn_are_drawn_so_and_measured(tmp_path: Path) -> None:
+def test_crosses_whose_lines_are_narrower_than_drawn_are_drawn_so_and_fitted(tmp_path: Path) -> None:
     shown, given = (layout_of([MarkShape(cross(2.4, mm), "dark")] * 4) for mm in (0.1, 0.12))
     matrix, size = pixel_from_camera("0"), 400
     grey = 30000 + np.random.default_rng(3).normal(0, 400.0, (size, size))
     for mark in shown.marks:
         paint(grey, mark.mark, mark.xy_mm, matrix, -20000.0, 55, 0.1)
     with written_scan(grey, tmp_path) as scan:
-        frame = measure_frame(
+        frame = detect_frame(
             scan.replace_tone(LINEAR), given, Placement("0", matrix, 1.0, 4, 1, 1, (0.05, 0.05)), FiducialOptions("0")
         )
     drawn_mm = {round(thinnest_mm(mark.mark), 3) for mark in frame.layout.marks}
