@@ -200,10 +200,11 @@ def model_hypotheses(run: Run) -> Iterator[ModelHypothesis]:
 
 
 def _lens_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
-    """The next radial terms that a camera lacks, its next decentering terms, and non-square pixels."""
+    """The lowest radial terms that a camera lacks, its next decentering terms, and non-square pixels."""
     free, own = _free_terms(camera), partial(_own_terms, camera)
-    first = min(len(free.intersection((*own("radial"), *RADIAL))), len(RADIAL) - TERMS_TOGETHER)
-    radial = RADIAL[first : first + TERMS_TOGETHER]
+    freed = {degree for names in (own("radial"), RADIAL) for degree, name in enumerate(names) if name in free}
+    lacking = [term for degree, term in enumerate(RADIAL) if degree not in freed]
+    radial = (lacking or RADIAL[-TERMS_TOGETHER:])[:TERMS_TOGETHER]
     pattern = f"a radial pattern, of the degrees {', '.join(name.removeprefix('+r') for name in radial)} in r"
     yield _extended_lens(run, camera, radial, "radial", partial(_lens_words, camera, "radial", pattern))
     lower, higher = DECENTERING

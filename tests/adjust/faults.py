@@ -661,6 +661,10 @@ MISFITS = {
         lambda e: Effects(radial=0.05 * e), ("have a radial pattern",), free=("k1", "p1", "p2"),
         lens={"k1": -0.2, "p1": 4e-4}, size=2
     ),
+    "lens: k2 held": Misfit(
+        lambda e: Effects(radial=0.05 * e), ("have a radial pattern, of the degrees 5",),
+        free=("k1", "p1", "p2", "k3"), lens={"k1": -0.2, "p1": 4e-4}, size=2
+    ),
     "lens: no decentering": Misfit(
         lambda e: Effects(tangential=5e-4 * e), ("have a tangential pattern",), free=("k1", "k2"),
         lens={"k1": -0.2, "k2": 0.1}, size=2
