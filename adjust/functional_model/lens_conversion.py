@@ -18,7 +18,7 @@ from adjust.functional_model.lens import INTERIOR_NAMES, Distortion, Lens
 SAME = 1e-9  # fraction of the principal distance: largest rounding difference of two equivalent descriptions
 _GRID = 25  # points per side of the grid over the frame
 _STEPS = 60
-_STEP = 1e-13  # fraction of the principal distance: a step with less effect in the image means convergence
+_STEP = 1e-13  # fraction of the principal distance: what has less effect in the image, a step or a value, is rounding
 _RELATED = 1e-6  # fraction of a source parameter's effect in the image: a parameter that changes by more depends on it
 
 
@@ -135,6 +135,8 @@ class _Rays:
             if not (np.isfinite(values).all() and values[0] > 0.0):
                 break
             if np.abs(design * step).max() <= _STEP * values[0]:
+                effect_mm = np.abs(design * values[columns]).max(axis=0)
+                values[columns] = np.where(effect_mm > _STEP * values[0], values[columns], 0.0)
                 return self._ended(lens.replaced_values(values), columns, estimated)
         raise AdjustmentError(
             f"the lens cannot be brought to the family {into.family}: the fit finds no end. Name fewer of its "

@@ -39,6 +39,15 @@ def test_another_r0_is_another_principal_distance() -> None:
     assert found.by_source[3, 3] == pytest.approx(1 / s - k3 * r0**2 / s**2, rel=1e-6)
 
 
+@pytest.mark.parametrize("name", ["torlegard", "opencv"])
+def test_parameters_of_a_lens_without_distortion_are_zero(name: str) -> None:
+    source = Lens(Distortion("none"), np.array([INTERIOR[0], 0.0, 0.0]), np.zeros(0))
+    target = Distortion(name, r0_mm=9.0 if family(name).needs == "r0_mm" else 0.0)
+    found = convert_lens(source, target, CORNERS_MM, parameter_names(name))
+    assert found.lens.values[0] == pytest.approx(INTERIOR[0], rel=1e-12)
+    assert not found.lens.values[1:].any()
+
+
 def test_the_ideal_point_in_mm_and_without_units() -> None:
     """aicon with r0 = 0 is OpenCV's: k1 = a1 c², p1 = -b2 c, p2 = b1 c, as cv2 projects."""
     c = INTERIOR[0]
