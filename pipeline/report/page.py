@@ -1,5 +1,6 @@
 """Rendering of report.html: a single file, without network access, readable without scripts and in print."""
 
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
@@ -9,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from measure import flags
 from pipeline.drawing import svg
@@ -81,8 +82,13 @@ def _environment() -> Environment:
     environment.globals["drawing_css"] = Markup(svg.style())
     words = (value_and_sigma, axes_sentence, group_sentences)
     environment.globals |= {function.__name__: function for function in words}
-    environment.filters |= {"fixed": fixed, "fixed_list": fixed_list, "significant": significant}
+    environment.filters |= {"code": _code, "fixed": fixed, "fixed_list": fixed_list, "significant": significant}
     return environment
+
+
+def _code(text: str) -> Markup:
+    """Text in HTML, with what stands between backticks as code."""
+    return Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
 
 def _context(data: ReportData) -> dict[str, object]:

@@ -319,7 +319,7 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
         yield "No measurement was handed to this report."
     if not data.adjustment:
         if _observed(data, shots):
-            yield "These marks are not adjusted yet: run `reseau adjust`."
+            yield "These marks are not adjusted yet: run `reseau run`."
     elif not data.adjustment.converged:
         yield "There is no solution: all values and residuals of this report are those of the last iteration."
     elif not data.check and not data.is_film_alone:

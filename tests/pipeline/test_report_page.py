@@ -216,10 +216,18 @@ def test_the_redundancy_is_that_which_sigma0_comes_from(
 
 
 def test_only_measured(measured_data: ReportData) -> None:
-    text = rendered(measured_data).text
+    page = render_report(measured_data)
+    text = Document(page).text
     assert "✓ Good" in text
     assert "Measured: 160 marks in 5 frames." in text
-    assert "These marks are not adjusted yet: run `reseau adjust`." in text
+    assert "These marks are not adjusted yet: run <code>reseau run</code>." in page
+
+
+def test_commands_in_problems_are_code(measured_data: ReportData) -> None:
+    problem = Problem("It is <stale>. So says `reseau status`.", "Run `reseau measure`.")
+    page = render_report(replace(measured_data, problems=(problem,)))
+    for words in ("It is &lt;stale&gt;.", "So says <code>reseau status</code>.", "Run <code>reseau measure</code>."):
+        assert words in page
 
 
 def test_a_frame_that_was_not_found_says_so_once(measured_data: ReportData) -> None:
@@ -230,7 +238,7 @@ def test_a_frame_that_was_not_found_says_so_once(measured_data: ReportData) -> N
     text = rendered(replace(data, comparator=absent)).text
     assert text.count(f"{reason}.") == 1
     assert "fiducial marks not measured" not in text
-    assert "run `reseau adjust`" not in text
+    assert "not adjusted yet" not in text
 
 
 def test_tie_points_are_not_called_targets(measured_data: ReportData) -> None:
