@@ -21,16 +21,25 @@ _UPRIGHT = 0.9  # |X| of the normal above which the board's first axis is taken 
 class BoardForm:
     """Shape of the bend of a board.
 
-    normal (3,): unit normal, positive in its largest component. shapes (n, 2): offsets of the points for a bend of 1
-    along each axis.
+    normal (3,): unit normal, positive in its largest component. axes (2, 3): unit vectors along the sides. places
+    (n, 2): of the points along them, from their mean. shapes (n, 2): offsets of the points for a bend of 1 along each
+    axis.
     """
 
     normal: Array
+    axes: Array
+    places: Array
     shapes: Array
 
     def offsets(self, bends: Array) -> Array:
         """(n, 3) offsets of the points for bends (2,), in object units."""
         return np.asarray((self.shapes @ bends)[:, None] * self.normal)
+
+    @property
+    def strain_directions(self) -> Array:
+        """(n, 2, 3) displacements of the points by a stretch of 1, first axis over second, and by a shear of 1."""
+        (along, across), (x, y) = self.axes, self.places.T[..., None]
+        return np.stack([x * along - y * across, y * along + x * across], axis=1) / 2.0
 
 
 def board_form(xyz: Array) -> BoardForm:
@@ -47,10 +56,11 @@ def board_form(xyz: Array) -> BoardForm:
     upright = np.eye(3)[int(abs(normal[0]) > _UPRIGHT)]
     along = upright - normal * (upright @ normal)
     along /= np.linalg.norm(along)
-    places = centred @ np.stack([along, np.cross(normal, along)], axis=1)
-    places = places @ _to_sides(places)
+    plane = np.stack([along, np.cross(normal, along)], axis=1)
+    axes = plane @ _to_sides(centred @ plane)
+    places = centred @ axes
     low, high = places.min(axis=0), places.max(axis=0)
-    return BoardForm(normal, 1.0 - ((2.0 * places - low - high) / (high - low)) ** 2)
+    return BoardForm(normal, axes.T, places, 1.0 - ((2.0 * places - low - high) / (high - low)) ** 2)
 
 
 def _to_sides(places: Array) -> Array:

@@ -154,21 +154,23 @@ class Board:
     """Flat board with a bend, which displaces its points from the plane (see `functional_model.board`).
 
     places: flat coordinates (3,) of all its points by id, including those in no image. bends: priors of bend_x and
-    bend_y, in object units.
+    bend_y, in object units. is_strained: the two parameters are stretch and shear of the plane instead of bends.
     """
 
     name: str
     places: Mapping[str, Array]
     bends: tuple[Prior, Prior] = (Prior(0.0, np.inf), Prior(0.0, np.inf))
+    is_strained: bool = False
 
     def __post_init__(self) -> None:
         board_form(np.array(list(self.places.values())))  # raises ValueError for points that are not a board
 
     @cached_property
     def lift_directions(self) -> dict[str, Array]:
-        """(2, 3) displacement of a point by a bend of 1 along each axis, by id."""
+        """(2, 3) displacement of a point by each parameter of 1, by id."""
         form = board_form(np.array(list(self.places.values())))
-        return {id_: shape[:, None] * form.normal for id_, shape in zip(self.places, form.shapes, strict=True)}
+        directions = form.strain_directions if self.is_strained else form.shapes[:, :, None] * form.normal
+        return dict(zip(self.places, directions, strict=True))
 
 
 @dataclass(frozen=True)

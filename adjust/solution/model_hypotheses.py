@@ -1,8 +1,8 @@
 """Hypotheses on errors of a network's model, each as the same problem with additional unknowns.
 
-Lens terms, non-square pixels, different interior orientations of images, a bent board, wrong coordinates of a given
-point. Each problem starts where the
-adjustment without its unknowns ended, so that one linearised step estimates the fall of v'Pv.
+Lens terms, non-square pixels, different interior orientations of images, a bent or stretched board, wrong coordinates
+of a given point. Each problem starts where the adjustment without its unknowns ended, so that one linearised step
+estimates the fall of v'Pv.
 
 Two groups of images: with orientation and film of one image eliminated from its rows, the shift (c, x0', y0') of that
 image alone has normal equations N d = g. Separate shifts of two groups lower v'Pv by the sum of g' N⁻¹ g of both. The
@@ -165,6 +165,7 @@ FREE = Prior(0.0, np.inf)
 TERMS_TOGETHER = 2  # radial terms tested jointly
 OTHERS = " (other images)"  # suffix of a camera's name for the images with a different interior orientation
 FEWEST_GIVEN, FEWEST_IMAGES = 5, 2  # given points, and images of one, that tell a wrong one
+CLEAR = 3.0  # standard deviations above which one of two changes of a board is told
 NAMED = 5  # images named in a message
 ALIKE = 7.0  # difference of chi-square plus twice the unknowns below which two readings are not distinguished
 
@@ -195,7 +196,7 @@ def model_hypotheses(run: Run) -> Iterator[ModelHypothesis]:
         for camera in cameras:
             yield from hypotheses(run, camera)
     yield from _scanner_pixels(run)
-    yield from _bent_board(run)
+    yield from _board(run)
     yield from _wrong_point(run)
 
 
@@ -249,18 +250,19 @@ def _second_interior_orientation(run: Run, camera: Camera) -> Iterator[ModelHypo
     yield ModelHypothesis("groups", words, problem, added, groups.choices, contrasts, groups.p_scatter)
 
 
-def _bent_board(run: Run) -> Iterator[ModelHypothesis]:
-    """A bent board of all given points, where they form a flat one."""
+def _board(run: Run) -> Iterator[ModelHypothesis]:
+    """A bend, or a stretch and shear, of the board of all given points, where they form a flat one."""
     network = run.problem.network
     places = network.known_places
     if network.boards or not places or len(places) < len(network.observed_points):
         return
-    try:
-        board = Board("board", places, (FREE, FREE))
-    except ValueError:
-        return
-    problem = _continued(run, replace(network, boards=(board,)))
-    yield ModelHypothesis("board", _board_words, problem, problem.unknowns.board[board.name])
+    for is_strained, words in ((False, _bend_words), (True, _strain_words)):
+        try:
+            board = Board("board", places, (FREE, FREE), is_strained)
+        except ValueError:
+            return
+        problem = _continued(run, replace(network, boards=(board,)))
+        yield ModelHypothesis("board", words, problem, problem.unknowns.board[board.name])
 
 
 def _wrong_point(run: Run) -> Iterator[ModelHypothesis]:
@@ -393,7 +395,7 @@ def _pixel_words(camera: str, per_mm: float, run: Run, added: Indices, _: float)
     )
 
 
-def _board_words(run: Run, added: Indices, _: float) -> tuple[str, str]:
+def _bend_words(run: Run, added: Indices, _: float) -> tuple[str, str]:
     value, covariance = _estimate(run, added)
     sigma = np.sqrt(np.diag(covariance))
     cause = (
@@ -404,6 +406,26 @@ def _board_words(run: Run, added: Indices, _: float) -> tuple[str, str]:
     return (
         cause,
         'Put it on a flat plate, or let its bend be adjusted: board_bend = "free" under [object] in project.toml.',
+    )
+
+
+def _strain_words(run: Run, added: Indices, _: float) -> tuple[str, str]:
+    (stretch, shear), covariance = _estimate(run, added)
+    sigma = np.sqrt(np.diag(covariance))
+    changes = (
+        (
+            stretch,
+            sigma[0],
+            100.0,
+            f"% {'longer' if stretch > 0.0 else 'shorter'} along its first axis than along its second",
+        ),
+        (shear, sigma[1], 1000.0, "mrad off in the angle of the two"),
+    )
+    significant = [each for each in changes if abs(each[0]) > CLEAR * each[1]] or changes
+    found = " and ".join(f"{abs(unit * v):.3g} ± {unit * s:.1g} {what}" for v, s, unit, what in significant)
+    return (
+        f"The board of the given points has another shape than given: it is {found}",
+        "Measure its sides and give the coordinates that they have: printers stretch paper in one direction.",
     )
 
 

@@ -536,6 +536,7 @@ class Effects:
     crop: float = 0.0
     scale: float = 0.0
     bend: float = 0.0
+    stretch: float = 0.0
     point: float = 0.0
     noise: float = 1.0
     pitch: float = 1.0
@@ -626,6 +627,7 @@ def _projected(made: Scene, effects: Effects, kind: Misfit, image: int, rotation
     low, high = points.min(axis=0), points.max(axis=0)
     relative = (2.0 * points - low - high)[:, :2] / (high - low)[:2]
     points[:, 2] += effects.bend * (1.0 - relative[:, 0] ** 2)
+    points[:, 1] *= 1.0 + effects.stretch
     points[WRONG_POINT, :2] -= effects.point
     u, v, w = rotation @ (points - station).T
     x, y = -u / w, v / w
@@ -670,6 +672,9 @@ MISFITS = {
         lens={"k1": -0.2, "k2": 0.1}, size=2
     ),
     "board bent": Misfit(lambda e: Effects(bend=0.5 * e), ("is not flat",), size=2, fields=False),
+    "board stretched": Misfit(
+        lambda e: Effects(stretch=1e-3 * e), ("has another shape than given",), size=2, fields=False
+    ),
     "a point is elsewhere": Misfit(
         lambda e: Effects(point=0.1 * e), (f"Point p{WRONG_POINT} is not where it is given",), size=3
     ),
