@@ -5,6 +5,7 @@ the type and the count of its numbers, and these themselves or, where they take 
 """
 
 import logging
+import math
 import re
 import struct
 from collections.abc import Iterator
@@ -221,34 +222,37 @@ def _main_page(file: TiffFile, path: Path) -> tuple[TiffPage, tuple[str, ...]]:
     if not pictures:
         raise damage_error(path, "it holds no picture")
     pages = ", ".join(map(str, pictures))
-    if isinstance(path, ScanPart) and path.page:
-        if path.page not in pictures:
-            raise MeasurementError(
-                f"{path}: page {path.page} of this file is no picture of full size; such are {pages}"
-            )
-        return pictures[path.page], ()
-    first, page = next(iter(pictures.items()))
-    if len(pictures) == 1:
-        return page, ()
-    message = f"the file holds {len(pictures)} pictures of full size (pages {pages}), and page {first} was measured"
-    return page, (f"{message}: name those that are frames in images.csv, by the column page",)
+    number = path.page if isinstance(path, ScanPart) and path.page else next(iter(pictures))
+    if number not in pictures:
+        raise MeasurementError(f"{path}: page {number} of this file is no picture of full size; such are {pages}")
+    page, *others = pictures[number]
+    problems = []
+    if len(pictures) > 1 and not (isinstance(path, ScanPart) and path.page):
+        message = (
+            f"the file holds {len(pictures)} pictures of full size (pages {pages}), and page {number} was measured"
+        )
+        problems.append(f"{message}: name those that are frames in images.csv, by the column page")
+    if others:
+        message = f"page {number} holds {1 + len(others)} pictures of full size (SubIFDs), and one of them was measured"
+        problems.append(f"{message}: save the others as pages or files of their own if they are frames")
+    return page, tuple(problems)
 
 
-def _full_pictures(file: TiffFile) -> dict[int, TiffPage]:
-    """The pictures by their pages, from 1: each the largest of what stands on the page and below it, without masks and
-    without what is small beside others, a thumbnail or an overview, whether the file says so or not."""
-    largest: dict[int, TiffPage] = {}
+def _full_pictures(file: TiffFile) -> dict[int, list[TiffPage]]:
+    """The pictures of each page, from 1, and of its SubIFDs, the largest first, without masks and without what is small
+    beside others, a thumbnail or an overview, whether the file says so or not."""
+    held: dict[int, list[TiffPage]] = {}
     for number, page in enumerate((page.aspage() for page in file.pages), 1):
         below = page.pages if page.subifds and page.pages is not None else ()
         own = [one for one in (page, *(one.aspage() for one in below)) if _is_picture(one)]
-        if own:
-            largest[number] = max(own, key=lambda one: one.imagewidth * one.imagelength)
-    side = max((np.sqrt(page.imagewidth * page.imagelength) for page in largest.values()), default=0.0)
-    return {
-        number: page
-        for number, page in largest.items()
-        if np.sqrt(page.imagewidth * page.imagelength) > _FULL_SIZE * side
-    }
+        held[number] = sorted(own, key=_mean_side, reverse=True)
+    side = max((_mean_side(page) for own in held.values() for page in own), default=0.0)
+    full = {number: [page for page in own if _mean_side(page) > _FULL_SIZE * side] for number, own in held.items()}
+    return {number: own for number, own in full.items() if own}
+
+
+def _mean_side(page: TiffPage) -> float:
+    return math.sqrt(page.imagewidth * page.imagelength)
 
 
 def _is_picture(page: TiffPage) -> bool:

@@ -248,6 +248,19 @@ def test_a_full_picture_below_a_thumbnail_is_read(flag: int, tmp_path: Path) -> 
         assert not scan.problems
 
 
+def test_a_second_full_picture_below_a_page_is_told(tmp_path: Path) -> None:
+    """No column of images.csv names a SubIFD: without a word its frame would be lost."""
+    with tifffile.TiffWriter(tmp_path / "s.tif") as file:
+        file.write(picture(), subifds=2, metadata=None)
+        file.write(np.zeros_like(picture()), metadata=None)
+        file.write(picture()[::2, ::2], metadata=None)
+    np.testing.assert_array_equal(whole(tmp_path / "s.tif"), picture())
+    for path in (tmp_path / "s.tif", f"{tmp_path / 's.tif'}#page=1"):
+        with open_scan(path) as scan:
+            (finding,) = scan.problems
+            assert finding.startswith("page 1 holds 2 pictures of full size (SubIFDs), and one of them was measured")
+
+
 def test_which_band_is_used_is_stated(tmp_path: Path) -> None:
     bands = np.stack([picture()] * 5, axis=-1)
     result = []
