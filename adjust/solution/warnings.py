@@ -1,7 +1,7 @@
 """Warnings about a result, each with its remedy."""
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -21,6 +21,7 @@ from adjust.solution.reweighting import ROUNDS
 
 GROSS = 20.0  # in a-priori standard deviations: a larger residual may come from a confused mark
 NEARER = 0.5  # fraction of the distance of two marks: largest offset of one from the other's expected place
+NAMED = 5  # images named in a warning
 UNCHECKED = 1e-6  # redundancy of all targets of an image below which its orientation is unchecked
 
 
@@ -116,16 +117,19 @@ def _swapped_numbers(run: Run, residuals: Residuals) -> list[str]:
     started = computed_observations(problem, problem.start())
     if started is None:
         return []
-    found, gross = [], _is_gross(observations, started - observations.xy_mm)
-    for rows in _rows_by_image(observations).values():
+    found = defaultdict[tuple[bool, str, str], list[str]](list)
+    gross = _is_gross(observations, started - observations.xy_mm)
+    for image, rows in _rows_by_image(observations).items():
         fiducial = observations.is_fiducial[rows]
         for kind in (False, True):
             marks = rows[fiducial == kind]
             pairs = combinations(marks[gross[marks]].tolist(), 2)
             crossed = [(i, j) for i, j in pairs if _cross(observations.xy_mm, started, i, j)]
             if 2 * len({row for pair in crossed for row in pair}) < len(marks):
-                found += [_swapped(observations, i, j) for i, j in crossed]
-    return found
+                for i, j in crossed:
+                    first, second = sorted((observations.point[i], observations.point[j]))
+                    found[kind, first, second].append(image)
+    return [_swapped(*pair, images) for pair, images in found.items()]
 
 
 def _unchecked_orientations(observations: Observations, residuals: Residuals) -> list[str]:
@@ -155,10 +159,10 @@ def _cross(observed_mm: Array, expected_mm: Array, i: int, j: int) -> bool:
     return bool(off.max() < NEARER * np.linalg.norm(observed_mm[i] - observed_mm[j]))
 
 
-def _swapped(observations: Observations, i: int, j: int) -> str:
-    what = "fiducial marks" if observations.kind[i] == "fiducial" else "points"
-    first, second = sorted((observations.point[i], observations.point[j]))
+def _swapped(is_fiducial: bool, first: str, second: str, images: Sequence[str]) -> str:
+    what, several = "fiducial marks" if is_fiducial else "points", len(images) > 1
+    where = f"the images {shortened(images, NAMED)}" if several else f"image {images[0]}"
     return (
-        f"The {what} {first} and {second} of image {observations.image[i]} each lie "
-        f"where the other is expected: their numbers may be swapped."
+        f"The {what} {first} and {second} of {where} each lie where the other is expected: "
+        f"their numbers{', or the coordinates given to them,' if several else ''} may be swapped."
     )
