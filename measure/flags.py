@@ -78,7 +78,7 @@ class Code(MeaningfulWord):
     PLATE = "plate", "The plate in the image contradicts the camera."
     FEW_TIES = "few-ties", "Fewer natural points were found than wanted."
     OTHER_PART = "other-part", "Another part of the same frame shows it."
-    COPY = "copy", "The scan's file is a copy of another one, whose marks are used."
+    COPY = "copy", "The scan is a copy of another one, or shows the board where that does; its marks are used."
     SECOND_PICTURE = "second-picture", "The file holds a second image of full size, or the scan shows a second frame."
     CLICKED = "clicked", "A person pointed at it, and nothing could be matched there."
     DECIDED = "decided", "A person decided so."

@@ -17,7 +17,7 @@ from pipeline.archive.work import Work
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.measuring.camera_identification import add_plates
-from pipeline.measuring.roll import check_scans, name_roll, note_same_frames
+from pipeline.measuring.roll import check_scans, name_roll, note_same_frames, reject_repeated_views
 from pipeline.measuring.scan_task import ScanTask
 from pipeline.provenance import alike_groups, content_hash, fingerprint, shard_number
 from pipeline.results.measured_record import MeasuredScan
@@ -156,7 +156,9 @@ def _check_camera(
 ) -> tuple[MeasuredScan, ...]:
     """Second step of the measurement. Scans whose marks get other names by it are measured again."""
     scans = name_roll(tasks, [work.read(task.name) for task in tasks], camera.writing, work.measure)
-    return check_scans(camera, scans, project.film)
+    checked = check_scans(camera, scans, project.film)
+    has_board = project.targets is not None and project.targets.board is not None
+    return tuple(reject_repeated_views(checked)) if has_board else checked
 
 
 def _writing_remarks(project: Project, tasks: Sequence[ScanTask], work: Work) -> Remarks:

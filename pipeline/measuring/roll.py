@@ -31,6 +31,8 @@ _READ_FIRST = 4  # frames of a camera on which all text is read
 _WAYS = 2  # scan orientations searched by known lines: more would take as long as reading all text
 _LEAST = 6  # letters and digits that a known line needs
 _TURNS = ("0", "90", "180", "270")  # directions of text in the camera's frame
+_SAME_VIEW = 0.005  # fraction of an image's longer side; in sets of boards no two images are nearer than 0.04
+_FEWEST_COMMON = 4  # points in both of two images
 _SAME = ("run", "frames", "date")  # fields that identify a frame together with its number
 
 
@@ -219,6 +221,46 @@ def check_scans(camera: CameraFile, measured: Sequence[MeasuredScan], film: Beli
         frames = check_frames(frames, camera.layout(), [scan.pitch_um for scan in scans], film).frames
     by_image = {scan.frame.image: replace(scan, frame=frame) for scan, frame in zip(scans, frames, strict=True)}
     return tuple(by_image.get(scan.frame.image, scan) for scan in measured)
+
+
+def reject_repeated_views(scans: Sequence[MeasuredScan]) -> list[MeasuredScan]:
+    """Reject a board's points in images that show it where another image does.
+
+    The errors of lens, board and picture's processing repeat in such an image, so that it adds nothing to the other.
+    """
+    points = {name: at for at, name in enumerate(dict.fromkeys(m.point for s in scans for m in s.frame.marks))}
+    places_px = np.full((len(scans), len(points), 2), np.nan)
+    for row, scan in enumerate(scans):
+        for mark in scan.frame.marks:
+            if mark.status.is_observation and mark.kind == "target":
+                places_px[row, points[mark.point]] = mark.center_px
+    is_known = np.isfinite(places_px[..., 0])
+    kept, repeated = list[int](), dict[int, tuple[int, float]]()
+    for row in np.argsort(-is_known.sum(axis=1), kind="stable").tolist():
+        apart_px = np.nan_to_num(np.hypot(*np.moveaxis(places_px[kept] - places_px[row], 2, 0))).max(axis=1, initial=0)
+        is_comparable = (is_known[kept] & is_known[row]).sum(axis=1) >= _FEWEST_COMMON
+        apart_px[~is_comparable] = np.inf
+        if apart_px.min(initial=np.inf) < _SAME_VIEW * max(scans[row].width_px, scans[row].height_px):
+            repeated[row] = kept[int(apart_px.argmin())], float(apart_px.min())
+        else:
+            kept.append(row)
+    return [
+        _repeated_view(scan, scans[repeated[row][0]].frame.image, repeated[row][1]) if row in repeated else scan
+        for row, scan in enumerate(scans)
+    ]
+
+
+def _repeated_view(scan: MeasuredScan, original: str, apart_px: float) -> MeasuredScan:
+    what = f"it shows the board where {original} does to within {max(apart_px, 0.1):.1f} px"
+    reason = Reason(f"{what}, which counts", Code.COPY)
+    marks = [
+        replace(mark, status=Status.REJECTED, reason=reason)
+        if mark.kind == "target" and mark.status.is_observation
+        else mark
+        for mark in scan.frame.marks
+    ]
+    remedy = "its points count once. Move the board or the camera from picture to picture."
+    return scan.changed(marks, [Reason(f"{what}: {remedy}", Code.COPY)])
 
 
 def note_same_frames(scans: Sequence[MeasuredScan], part_of: Callable[[str], str]) -> list[MeasuredScan]:

@@ -19,6 +19,7 @@ import pytest
 from networks import board_network
 from numpy.typing import NDArray
 from PIL import Image
+from projects import made_record
 from rich.console import Console
 from scipy.spatial.distance import cdist
 
@@ -44,8 +45,10 @@ from pipeline.calibration.lens_choice import LensChoice, LensModel, choose_lens
 from pipeline.calibration.pictures import find_pictures
 from pipeline.cli import run
 from pipeline.files.target_table import read_targets
+from pipeline.measuring.roll import reject_repeated_views
 from pipeline.opencv_check.opencv_calibration import NAMES, Freedom, ImagePoints, OpenCvCalibration, calibrate
 from pipeline.opencv_check.opencv_corners import BoardPictures, compare_corners, detector_name, find_points
+from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.tables import Table
 
 Array = NDArray[np.float64]
@@ -403,6 +406,24 @@ def test_pictures_of_other_focal_lengths_are_of_other_cameras(tmp_path: Path) ->
         "camera-24mm",
         "camera-50mm",
     }
+
+
+def test_a_board_at_the_same_place_counts_once() -> None:
+    """Errors of lens and board repeat there: ten exposures without a movement had passed as ten pictures."""
+
+    def scan(name: str, shift_px: float, marks: int = 8) -> MeasuredScan:
+        made = made_record(1, marks)
+        moved = (
+            replace(mark, kind="target", center_px=np.asarray(mark.center_px) + shift_px) for mark in made.frame.marks
+        )
+        return replace(made, frame=replace(made.frame, image=name, marks=tuple(moved)))
+
+    shifts_px = {"few": 1.0, "first": 0.0, "again": 10.0, "next": 18.0}
+    scans = [scan(name, shift_px, 7 if name == "few" else 8) for name, shift_px in shifts_px.items()]
+    checked = {each.frame.image: each for each in reject_repeated_views(scans)}  # 0.5 % of a side is 25 px
+    kept = {name for name, each in checked.items() if any(mark.status.is_observation for mark in each.frame.marks)}
+    assert kept == {"first", "next"}
+    assert "it shows the board where first does to within 14.1 px" in checked["again"].frame.problems[0]
 
 
 def test_boards_as_project_files_have_them() -> None:
