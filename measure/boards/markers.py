@@ -201,6 +201,9 @@ def find_charuco(picture: Bytes, spec: CharucoSpec) -> FoundBoard:
     # Sides of the squares at each corner from a homography of the board, since neighbours may be missing.
     across = spec.columns - 1
     board = np.stack([ids % across, ids // across], axis=-1).astype(float)
+    if np.linalg.matrix_rank(board - board[0]) < 2:
+        message = f"only {len(ids)} corners of one line were found, which do not place the board"
+        return FoundBoard({}, Reason(message, Code.NO_BOARD), read.refused)
     homography = np.asarray(cv2.findHomography(board, places)[0], float)
     found = {
         f"c{number}": FoundCorner(place, homography_steps(homography, on_board))

@@ -82,6 +82,18 @@ def test_the_markers_tell_the_layout_of_a_charuco_board(legacy: bool) -> None:
     assert f"but as with legacy = {str(legacy).lower()}" in refused.reason
 
 
+def test_a_charuco_board_of_which_one_line_of_corners_is_seen_is_not_placed() -> None:
+    """All of it but two rows of squares is covered: one line had ended in a traceback."""
+    spec = CharucoSpec("4X4_50", 6, 4, 32.0, 24.0)
+    drawing = charuco_board(spec).generateImage((400, 300), marginSize=50)
+    tilt = np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.0], [0.0, 4e-4, 1.0]])
+    picture = np.asarray(cv2.warpPerspective(drawing, tilt, (400, 300), borderValue=(255,)), np.uint8)
+    picture[145:] = 255
+    board = find_charuco(picture, spec)
+    assert not board.corners
+    assert "only 5 corners of one line were found" in board.reason
+
+
 def test_exchanged_counts_and_another_first_number_at_once() -> None:
     """Each alone does not make the markers agree; both together are named."""
     spec = CharucoSpec("4X4_50", 6, 5, 32.0, 24.0, first_id=9)
