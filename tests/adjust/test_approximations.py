@@ -358,17 +358,13 @@ def test_exchanged_numbers_are_named_whether_the_adjustment_ends_or_not(seed: in
     ]
 
 
-def test_points_whose_coordinates_are_exchanged_are_named_once() -> None:
+def test_points_exchanged_in_all_images_are_named_once() -> None:
     rng = np.random.default_rng(8)
     network, start = simulated(rng, points=field_points(rng, POINTS), free={"k3": np.inf})
-    first, second = (point for point in network.points if point.id in ("3", "4"))
-    places = {"3": second, "4": first}
-    points = tuple(
-        replace(point, X=other.X, Y=other.Y, Z=other.Z) if (other := places.get(point.id)) else point
-        for point in network.points
-    )
-    (named,) = (warning for warning in adjust(replace(network, points=points), start).warnings if "swapped" in warning)
-    assert named.startswith("The points 3 and 4 of the images f0, f1, f2, f3 each lie where the other is expected: ")
+    for image in ("f0", "f1", "f2", "f3"):
+        network = exchanged(network, image, "3", "7")
+    (named,) = (warning for warning in adjust(network, start).warnings if "swapped" in warning)
+    assert named.startswith("The points 3 and 7 of the images f0, f1, f2, f3 each lie where the other is expected: ")
     assert named.endswith("their numbers, or the coordinates given to them, may be swapped.")
 
 
