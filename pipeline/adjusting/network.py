@@ -175,7 +175,18 @@ def _orientable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[lis
     lost = [image for image in few if not _has_film_transformation(image, fiducials[image.name])]
     if len(lost) == len(images):
         raise InputError(f"{project.comparator}: {_why_nothing(lost, targets, fiducials)}")
+    short = [
+        image for image in images if image not in few and fiducials[image.name] < fewest_marks(image.transformation)
+    ]
+    if len(lost) + len(short) == len(images):
+        short = []  # the adjustment says what is wrong with all
     sentences = [
+        f"Image {image.name!r} has no part in the adjustment: it shows {fiducials[image.name]} fiducial marks, and its "
+        f"{image.transformation} transformation needs {fewest_marks(image.transformation)}. Look at the reasons of the "
+        "others."
+        for image in short
+    ]
+    sentences += [
         f"Image {image.name!r} has no part in the adjustment: it shows {targets[image.name]} targets and needs "
         f"{FEWEST_TARGETS}. Look at the reasons of its marks; or observe its orientation in images.csv, with standard "
         "deviations."
@@ -187,8 +198,8 @@ def _orientable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[lis
         for image in few
         if image not in lost and _expects_targets(project)
     ]
-    dropped = {image.name for image in lost}
-    bare = {image.name for image in few}
+    dropped = {image.name for image in (*lost, *short)}
+    bare = dropped | {image.name for image in few}
     kept = [mark for mark in marks if _frame(project, mark.image) not in (dropped if mark.kind in ON_FILM else bare)]
     return kept, tuple(sentences)
 

@@ -36,6 +36,18 @@ def test_film_is_added_to_the_covariance_of_every_mark(film_um: float, tmp_path:
     np.testing.assert_allclose(built.observations.covariance_mm2, expected, rtol=1e-9)
 
 
+def test_one_frame_with_too_few_fiducials_does_not_end_the_others(tmp_path: Path) -> None:
+    network, _ = simulated(np.random.default_rng(1))
+    project = read_project(write_network_project(network, tmp_path))
+    marks = read_comparator(project.comparator)
+    few = [mark for mark in marks if mark.kind != "fiducial" or mark.image != "f1" or mark.point in "12"]
+    built, (left_out,) = build_network(project, few)
+    assert left_out.startswith("Image 'f1' has no part in the adjustment: it shows 2 fiducial marks, and its affine ")
+    assert [image.name for image in built.images] == ["f0", "f2", "f3"]
+    assert set(built.observations.image) == {"f0", "f2", "f3"}
+    assert build_network(project, [mark for mark in marks if mark.kind != "fiducial"])[1] == ()
+
+
 DRAWN_MM = 0.005  # of a pixel, as the pictures were projected
 
 
