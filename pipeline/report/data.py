@@ -192,6 +192,14 @@ class Mark:
         return not self.status.is_observation and not {Code.DECIDED, Code.OTHER_PART} & set(self.codes)
 
     @property
+    def is_contradicted(self) -> bool:
+        """Whether it is an observation that other marks or frames contradict, without a review decision."""
+        codes = set(self.codes)
+        return (
+            self.status is Status.WEAK and bool(codes & {Code.OFF_GIVEN, Code.OFF_FRAMES}) and Code.DECIDED not in codes
+        )
+
+    @property
     def sigma_px(self) -> Array | None:
         """(2,) standard deviations in column and row."""
         return None if self.covariance is None else np.sqrt(np.diag(self.covariance.px2))

@@ -221,6 +221,13 @@ def _measurement_problems(frame: Frame) -> Iterator[Problem]:
             + (" The frame is used; its film transformation is less precise." if found else ""),
             marks=tuple((frame.image, mark.kind, mark.point) for mark in lost),
         )
+    contradicted = [mark for mark in frame.marks if mark.is_fiducial and mark.is_contradicted]
+    if contradicted:
+        yield Problem(
+            f"{counted(len(contradicted), 'fiducial mark')} contradicted by the others. {_reasons(contradicted)}.",
+            "Settle them with `reseau review`, or leave them: their standard deviations allow for it.",
+            marks=tuple((frame.image, mark.kind, mark.point) for mark in contradicted),
+        )
     targets = [mark for mark in frame.marks if not mark.is_fiducial]
     is_lost = frame.scan is not None and frame.scan.failure is not None
     is_copy = measured is not None and any(Code.COPY in problem.codes for problem in measured.problems)

@@ -315,6 +315,29 @@ def test_a_rejected_fiducial_is_a_problem_with_its_reason(adjusted_data: ReportD
     assert "7 of 8 (1 rejected)" in text
 
 
+@pytest.mark.parametrize("code", [Code.OFF_GIVEN, Code.OFF_FRAMES])
+def test_a_weak_fiducial_that_the_others_contradict_is_a_problem(measured_data: ReportData, code: Code) -> None:
+    """Without it the clearer case, one mark of eight 0.1 mm off, passed as good where bent film did not."""
+    sentence, row = "it lies 0.100 mm from where the other marks have it", measured_data.comparator[2]
+    data = set_mark(measured_data, 2, Status.WEAK, sentence)
+    assert data.measurement is not None
+    scan = data.measurement[row.image]
+    texts = []
+    for codes in ((code,), (code, Code.DECIDED)):
+        reason = Reason(sentence, *codes)
+        marks = tuple(
+            replace(mark, status=Status.WEAK, reason=reason)
+            if (mark.kind, mark.point) == (row.kind, row.point)
+            else mark
+            for mark in scan.frame.marks
+        )
+        known = {**data.measurement, row.image: replace(scan, frame=replace(scan.frame, marks=marks))}
+        texts.append(rendered(replace(data, measurement=known)).text)
+    assert f"f1: 1 fiducial mark contradicted by the others. {row.point} weak: {sentence}." in texts[0]
+    assert "! Needs a look" in texts[0]
+    assert "contradicted by the others" not in texts[1]
+
+
 def test_reasons_that_differ_by_their_numbers_are_reported_once(measured_data: ReportData) -> None:
     data = set_mark(measured_data, 2, Status.REJECTED, "4.2 px off the other marks' places")
     data = set_mark(data, 4, Status.REJECTED, "3.1 px off the other marks' places")
