@@ -62,7 +62,6 @@ class Found:
     search : of the attempt that found the frame.
     placements : of that attempt, best first.
     frame : best frame so far, None without one.
-    failing : placements in which fits failed, to be tried with other tone curves.
     is_taken : whether the frame is accepted as significant.
     unsure : frames found only under another pixel pitch; possible false alarms, accepted if the user gives that pitch.
     faint : expected number of false alarms and the best rejected frame.
@@ -72,7 +71,6 @@ class Found:
     search: FrameSearch
     placements: Sequence[Placement] = ()
     frame: Frame | None = None
-    failing: tuple[Placement, ...] = ()
     is_taken: bool = False
     unsure: tuple[Frame, ...] = ()
     faint: tuple[float, Frame] | None = None
@@ -137,18 +135,14 @@ def find_frame(
             every += len(attempt.hypotheses)
             at_given += len(attempt.hypotheses) if attempt.is_given or attempt.at_given else 0
         tried = at_given if attempt.at_given else every
-        placements, frames = make_attempt(attempt, tried, found)
+        placements, frames = make_attempt(attempt, tried)
         expected, frame = frames[0] if frames else (np.inf, None)
         if expected <= FRAMES_BY_CHANCE:
             found = replace(found, search=attempt.search, placements=placements, frame=frame, is_taken=True)
         elif attempt.is_given:
             if not attempt.is_repeated or (frame is not None and frame.is_nearer_than(found.frame)):
                 misfit = frame.misfit(ids) if frame else _NOTHING
-                failing = tuple(each.placement for _, each in frames if each.failed_fits)
-                failing = found.failing if attempt.is_repeated else failing
-                found = replace(
-                    found, placements=placements, frame=frame, failing=failing, is_taken=False, misfit=misfit
-                )
+                found = replace(found, placements=placements, frame=frame, is_taken=False, misfit=misfit)
         else:
             likely = [] if attempt.at_given else [each for each in frames if _is_taken_if_given(each, at_given / tried)]
             rejected = [each for each in (found.faint, *frames) if each and each not in likely]
@@ -184,20 +178,18 @@ def list_attempts(wide: FrameSearch, hypotheses: Sequence[Hypotheses], is_given:
     ]
 
 
-def make_attempt(attempt: Attempt, tried: int, before: Found) -> Result:
+def make_attempt(attempt: Attempt, tried: int) -> Result:
     """Search, measure the frame in the likely placements, and estimate the expected number of false frames as good.
 
     An accepted frame of the prior belief needs no such test. Under another pitch or film model only unblemished marks
     count, since the additional freedom yields false frames too; a perspective has to fit nearly all marks. Faint marks
-    need not be clear, only agree: `tried`, the number of hypotheses so far, limits which placements are measured. With
-    another tone curve only those are measured in which fits failed `before`.
+    need not be clear, only agree: `tried`, the number of hypotheses so far, limits which placements are measured.
     """
     search, hypotheses, kind = attempt.search, attempt.hypotheses, attempt.kind
-    if attempt.is_repeated:
-        return before.placements, _given_frames(search, before.failing)
     found = search.search_middle(hypotheses[0]) if kind == "middle" else search.search_scan(hypotheses)
     if attempt.is_given:
-        return found, _given_frames(search, _places_to_try(found[:1] if kind == "middle" else found))
+        frame = best_frame(search, found[:1] if kind == "middle" else found)
+        return found, [] if frame is None else [(0.0 if frame.accepted else np.inf, frame)]
     if kind == "faint":
         results = [_faint_frame(search, place, tried) for place in _likely_placements(search, found, tried)]
         return found, sorted((each for each in results if each is not None), key=itemgetter(0))
@@ -218,25 +210,23 @@ def _is_taken_if_given(result: tuple[float, Frame], at_given: float) -> bool:
     return result[1].accepted or result[0] * at_given <= FRAMES_BY_CHANCE
 
 
-def _given_frames(search: FrameSearch, places: Sequence[Placement]) -> list[tuple[float, Frame]]:
-    """Measure the frame in likely placements under the prior belief, best first; expected false alarms 0 if accepted.
+def best_frame(search: FrameSearch, found: Sequence[Placement]) -> Frame | None:
+    """Measure the frame in the best placements and select one.
 
-    Best is the first frame that is sure and not outdone by a placement with more supporting marks; else the sure frame
-    with most measured marks; else the first accepted one; else one whose fits failed; else by inliers. Frames whose
-    marks are all among those of an accepted frame tried before are skipped.
+    Selected is the first frame that is sure and not outdone by a placement with more supporting marks; else the sure
+    frame with most measured marks; else the first accepted one; else one whose fits failed; else by inliers. Frames
+    whose marks are all among those of an accepted frame tried before are skipped.
     """
-    frames = list[Frame]()
+    places, frames = _places_to_try(found), list[Frame]()
     for placement in places:
         frame = _measure(search, placement)
         if any(before.accepted and before.contains(frame) for before in frames):
             continue
         is_outdone = any(place.supported > frame.measured_count for place in places)
         if frame.is_sure and not (is_outdone and doubt_frame(search, frame)):
-            frames = [frame]
-            break
+            return frame
         frames.append(frame)
-    frames.sort(key=_preference, reverse=True)
-    return [(0.0 if frame.accepted else np.inf, frame) for frame in frames]
+    return max(frames, key=_preference, default=None)
 
 
 def _preference(frame: Frame) -> tuple[int, ...]:

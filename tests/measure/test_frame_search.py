@@ -145,7 +145,6 @@ class Stand:
         self.name, self.is_complete, self.accepted, self.measured_count = name, False, False, 0
         self.is_sure, self.agrees, self.scan = False, False, SCAN
         self.failed_fits: list[int] = []
-        self.placement: Placement | None = None
         self.inliers, self.pixel_from_camera = np.ones(3, bool), np.eye(2, 3)
 
     def misfit(self, ids: Sequence[str]) -> Reason:
@@ -169,7 +168,7 @@ def search_attempts(
             cast(Kind, kind), cast(FrameSearch, SimpleNamespace(number=number)), [GIVEN, GIVEN], number == at_given
         )
 
-    def make(attempt: Attempt, tried: int, _: Found) -> Any:
+    def make(attempt: Attempt, tried: int) -> Any:
         number = cast(Any, attempt.search).number
         each = expected[number]
         checked.append(tried)
@@ -251,7 +250,6 @@ def test_marks_are_fitted_from_other_tone_curves_only_where_their_fits_failed(mo
         def measure(scan: Scan, *_: object, begun: list[float] = begun, failed: list[int] = failed) -> Any:
             begun.append(round(scan.tone.equivalent_power(0.1, 0.9)[0], 1))
             frame = Stand("right")
-            frame.placement = place
             frame.failed_fits, frame.accepted, frame.measured_count = failed, begun[-1] < 0.7, 4
             frame.is_sure = frame.is_complete = frame.accepted
             return frame
