@@ -283,7 +283,7 @@ def test_a_lattice_that_shows_only_in_part_keeps_its_names(tmp_path: Path) -> No
 
 
 @parametrize_with_studies(
-    ("blot_dn", "said"), [(20000.0, "no candidate within"), (500.0, "the ground at its place is so dark")]
+    ("blot_dn", "said"), [(20000.0, "no candidate within"), (500.0, "the background at its place is so dark")]
 )
 def test_a_missing_mark_is_stated_to_be_hidden_only_where_its_ground_hides_it(
     blot_dn: float, said: str, tmp_path: Path
