@@ -33,7 +33,7 @@ from pipeline.results.assessment_record import (
     SuspectRecord,
 )
 from pipeline.results.image_unit import FILM_UNIT, ImageUnit
-from pipeline.results.record_json import FOREIGN, Finite, Flag, Number, NumberOrNone, Whole, WithRest
+from pipeline.results.record_json import FOREIGN, Finite, Flag, Number, NumberOrNone, Sigma, Whole, WithRest
 from pipeline.types import Array
 
 
@@ -53,7 +53,7 @@ class Quantity:
     """
 
     value: Number
-    sigma: Number
+    sigma: Sigma
     given: GivenQuantity | None = None
     t: NumberOrNone = None
     p: NumberOrNone = None

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from pipeline.results.record_json import Finite, Number, Whole, read_record
+from pipeline.results.record_json import Finite, Number, Sigma, Whole, read_record
 
 Verdict = Literal["agrees", "differs", "not possible"]
 
@@ -15,7 +15,7 @@ class Estimate:
     """Value with its a-posteriori standard deviation."""
 
     value: Number
-    sigma: Number
+    sigma: Sigma
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Serialisation of records, dataclasses and named tuples, as JSON, for all result files.
 
 The fields of a record are the keys of the file, in order; an alias is the name of a key that is no name of a field.
-Readers check values against the annotations and ignore unknown keys. `Number` is a number, or null for NaN; `Finite` is
-never null. A field with default None is written only if it is set.
+Readers check values against the annotations and ignore unknown keys. `Number` is a number, or null for NaN; `Sigma`
+such a number that is not negative; `Finite` is never null. A field with default None is written only if it is set.
 """
 
 import json
@@ -37,6 +37,13 @@ def _number(value: Any) -> float:
     return math.nan if value is None else _finite(value, " or null")
 
 
+def _sigma(value: Any) -> float:
+    sigma = _number(value)
+    if sigma < 0.0:
+        raise ValueError(_wrong(value, "a number of at least 0, or null"))
+    return sigma
+
+
 def _finite(value: Any, others: str = "") -> float:
     if type(value) is not float and type(value) is not int:
         raise ValueError(_wrong(value, f"a number{others}"))
@@ -56,6 +63,7 @@ def _wrong(value: Any, expected: str) -> str:
 Flag = Annotated[bool, Strict()]
 Whole = Annotated[int, Strict()]
 Number = Annotated[float, PlainValidator(_number)]
+Sigma = Annotated[float, PlainValidator(_sigma)]
 NumberOrNone = Annotated[float | None, PlainValidator(_number)]
 Finite = Annotated[float, PlainValidator(_finite)]
 _EXPECTED = {

@@ -178,6 +178,7 @@ def test_a_file_that_is_missing_or_no_json_is_named_with_what_to_do(path: Path) 
         (("sigma0",), "1.0", r"sigma0 is '1\.0'; it should be a number"),
         (("iterations",), True, r"iterations is True; it should be a whole number"),
         (("cameras", "RC 20", "principal_distance_mm"), {"value": 1.0}, r"\['RC 20'\]\.principal_distance_mm has no"),
+        (("cameras", "RC 20", "principal_distance_mm", "sigma"), -1.0, r"is -1\.0; .* at least 0, or null"),
         (("made_from",), 5, r"made_from is 5; it should be a table"),
         (("residuals",), [{"image": "f1"}], r"residuals\[0\] has no key 'point'"),
         (("cameras", "RC 20", "distortion", "family"), "no such", "a distortion family must be one of"),
@@ -306,6 +307,10 @@ def test_a_check_with_a_value_of_a_wrong_type_is_refused_with_its_place(tmp_path
         path.write_text(json.dumps(spoilt["file"]), encoding="utf-8")
         with pytest.raises(InputError, match=r"is True; it should be .* Run `reseau check` again"):
             read_check(path)
+    negative = replace(camera, rows=(replace(row, opencv=Estimate(1.0, -0.1)),))
+    path.write_text(json.dumps(plain_json(Check.from_cameras({"K": negative}))), encoding="utf-8")
+    with pytest.raises(InputError, match=r"opencv\.sigma is -0\.1; it should be a number of at least 0, or null"):
+        read_check(path)
     del content["cameras"]["K"]["corners_px"]  # of an earlier version
     path.write_text(json.dumps(content), encoding="utf-8")
     assert read_check(path).cameras["K"].corners_px is None
