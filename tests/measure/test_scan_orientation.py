@@ -326,17 +326,17 @@ def block_picture(pose: str) -> tuple[Array, Array]:
 def test_blocks_at_the_border_are_measured_alike_with_their_pose_open_and_set(pose: str) -> None:
     grey, matrix = block_picture(pose)
     truth = right_mm(BLOCKS) @ matrix[:, :2].T + matrix[:, 2]
-    statuses = []
     for requests in ("auto", pose):
         options = replace(OPTIONS, pose=requests)
         frame = measure_fiducials(scan_of(grey), BLOCKS, (1000 / PX_PER_MM,) * 2, options)
         assert frame.pose is not None
         assert frame.pose.name == pose
-        statuses.append([mark.status for mark in frame.marks])  # the texture of the border may leave them weak
+        statuses = [mark.status for mark in frame.marks]
+        assert statuses.count(Status.MEASURED) >= 3  # of one the standard deviation is at the limit
+        assert {*statuses} <= {Status.MEASURED, Status.WEAK}
+        assert not frame.problems
         for mark, place in zip(frame.marks, truth, strict=True):
             assert mark.center_px == pytest.approx(place, abs=0.25)
-    assert statuses[0] == statuses[1]
-    assert {*statuses[0]} <= {Status.MEASURED, Status.WEAK}
 
 
 @pytest.mark.study
