@@ -168,7 +168,7 @@ def _rivals(search: FrameSearch, found: Sequence[Placement], frame: Frame) -> li
     """Warn of other placements in the same pose that are nearly as good, or that show another frame."""
     problems, best = [], frame.placement
     for other in found:
-        if other.pose != best.pose or other.same_place(best) or _has_same_names(other, frame):
+        if other.pose != best.pose or other.same_place(best) or _leads_to(other, frame):
             continue
         as_good = other.score >= _AMBIGUOUS * best.score and other.supported >= best.supported - 1
         if not (as_good or _is_another_frame(search, other, frame)):
@@ -191,11 +191,12 @@ def _rivals(search: FrameSearch, found: Sequence[Placement], frame: Frame) -> li
     return problems[:3]
 
 
-def _has_same_names(placement: Placement, frame: Frame) -> bool:
-    """Whether a placement gives all marks found in a frame the names that they have."""
+def _leads_to(placement: Placement, frame: Frame) -> bool:
+    """Whether all marks found in a frame lie where they would be searched from a placement."""
     fits = frame.inlier_fits
     places = np.array([fit.center_px for fit in fits.values()]).reshape(-1, 2)
-    return bool(fits) and np.array_equal(placement.names(places, frame.camera_mm), list(fits))
+    off_px = np.hypot(*(placement.places_px(frame.camera_mm[list(fits)]) - places).T)
+    return bool(fits) and bool(off_px.max() <= frame.first_search_px())
 
 
 def _is_another_frame(search: FrameSearch, other: Placement, frame: Frame) -> bool:
