@@ -1,10 +1,13 @@
 """Verdicts on scans, in one table: source of the documentation and of `reseau status`."""
 
 from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from measure.flags import Code, MeaningfulWord, Status
-from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.wording import count_sentence
+
+if TYPE_CHECKING:
+    from pipeline.results.measured_record import MeasuredScan  # with numpy, for which `reseau --help` would wait
 
 
 class Verdict(MeaningfulWord):
@@ -49,7 +52,7 @@ def scan_counts(counts: Mapping[Verdict, int]) -> str:
     )
 
 
-def scan_verdict(scan: MeasuredScan) -> Verdict:
+def scan_verdict(scan: "MeasuredScan") -> Verdict:
     """Verdict on a scan."""
     frame, marks = scan.frame, [(mark.kind, mark.status, mark.reason.codes) for mark in scan.frame.marks]
     if scan.failure:
@@ -57,7 +60,7 @@ def scan_verdict(scan: MeasuredScan) -> Verdict:
     return frame_verdict(marks, frame.pixel_from_camera is not None, has_problem(scan), bool(scan.decided_by))
 
 
-def has_problem(scan: MeasuredScan) -> bool:
+def has_problem(scan: "MeasuredScan") -> bool:
     """Whether the frame as a whole needs a look, for example because its pose is assumed."""
     frame = scan.frame
     return bool(frame.problems) or (frame.pose is not None and not frame.pose.decided)
