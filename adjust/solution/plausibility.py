@@ -139,18 +139,18 @@ def _both_sides(result: Adjustment, trials: Trials) -> Iterator[str]:
     turned = trials.adjust(mirrored_images(network, fewer))
     same = turned is not None and len(set(_sides(turned).values())) == 1
     one, figures, even = len(fewer) == 1, "", ", or the others," if 2 * len(fewer) == len(sides) else ""
-    if turned is not None and same and (trials.explains(turned) or turned.sigma0 < 1.05 * result.sigma0):
+    if turned is not None and same and turned.sigma0 < 1.05 * result.sigma0:
         figures = (
             f" With {'it' if one else 'them'} mirrored, all stations lie on one side and all observations agree as well"
             f" (σ₀ = {turned.sigma0:.2f}; as it stands {result.sigma0:.2f})."
         )
     yield (
         f"{'Image' if one else 'The images'} {shortened(fewer, NAMED)}{even}"
-        f" {'is' if one else 'are'} mirrored, or the flat board of the given points is transparent: "
+        f" {'is' if one else 'are'} mirrored, or numbered as in a mirror, or the flat board is transparent: "
         f"{'its station lies' if one else 'their stations lie'} on the other side of it than those of the "
         f"{len(sides) - len(fewer)} other images, which an opaque board hides.{figures} Mirror "
-        f"{'the image' if one else 'the images'} and measure again, or write transparent = true under [targets] or "
-        "[object]."
+        f"{'the image' if one else 'the images'} and measure again, correct the point numbers, or write transparent = "
+        "true under [targets] or [object]."
     )
 
 

@@ -32,7 +32,14 @@ from adjust.solution.blunder_hypotheses import AXES, reversed_y
 from adjust.solution.explanations import explain
 from adjust.solution.unmodelled_error import adjust_unmodelled
 
-QUICK = ("lens: no radial term", "mm for m, stations in m", "noise too small")
+QUICK = (
+    "lens: no radial term",
+    "lens: k2 held",
+    "board stretched",
+    "a point is elsewhere",
+    "mm for m, stations in m",
+    "noise too small",
+)
 SOUND = MISFITS[NOTHING]
 
 
@@ -129,6 +136,20 @@ def sound(frame_mm: tuple[float, float] = (12.8, 9.6), seed: int = 6) -> Network
 @pytest.mark.study
 def test_a_sound_network_has_nothing_implausible() -> None:
     assert misfit_sentences(sound())[0] == []
+
+
+def test_an_image_numbered_as_in_a_mirror_is_not_said_to_agree_with_its_picture_mirrored() -> None:
+    made = scene(10, flat=True)
+    given = misfit_network(made, Effects(), SOUND, np.random.default_rng(4))
+    columns = len(np.unique(made.points[:, 0]))
+    mirrored = {f"p{k}": f"p{k + columns - 1 - 2 * (k % columns)}" for k in range(len(made.points))}
+    seen = given.observations
+    names = tuple(
+        mirrored[point] if image == "im01" else point for image, point in zip(seen.image, seen.point, strict=True)
+    )
+    (sentence,) = adjust(replace(given, observations=replace(seen, point=names))).misread
+    assert sentence.startswith("Image im01 is mirrored, or numbered as in a mirror, or the flat board is transparent")
+    assert "agree" not in sentence
 
 
 @pytest.mark.study

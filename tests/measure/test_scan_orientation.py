@@ -321,22 +321,21 @@ def block_picture(pose: str) -> tuple[Array, Array]:
     return light * ground + (1 - light) * border + rng.normal(0, 200, (size, size)), matrix
 
 
-@pytest.mark.study
-@pytest.mark.parametrize("pose", ["90m", "180"])
-def test_blocks_at_the_border_are_measured_alike_with_their_pose_open_and_set(pose: str) -> None:
+@parametrize_with_studies(
+    ("pose", "requested"), [("180", "auto"), ("180", "180"), ("90m", "auto"), ("90m", "90m")], quick=(0,)
+)
+def test_blocks_at_the_border_are_measured_alike_with_their_pose_open_and_set(pose: str, requested: str) -> None:
     grey, matrix = block_picture(pose)
     truth = right_mm(BLOCKS) @ matrix[:, :2].T + matrix[:, 2]
-    for requests in ("auto", pose):
-        options = replace(OPTIONS, pose=requests)
-        frame = measure_fiducials(scan_of(grey), BLOCKS, (1000 / PX_PER_MM,) * 2, options)
-        assert frame.pose is not None
-        assert frame.pose.name == pose
-        statuses = [mark.status for mark in frame.marks]
-        assert statuses.count(Status.MEASURED) >= 3  # of one the standard deviation is at the limit
-        assert {*statuses} <= {Status.MEASURED, Status.WEAK}
-        assert not frame.problems
-        for mark, place in zip(frame.marks, truth, strict=True):
-            assert mark.center_px == pytest.approx(place, abs=0.25)
+    frame = measure_fiducials(scan_of(grey), BLOCKS, (1000 / PX_PER_MM,) * 2, replace(OPTIONS, pose=requested))
+    assert frame.pose is not None
+    assert frame.pose.name == pose
+    assert not frame.problems
+    statuses = [mark.status for mark in frame.marks]
+    assert statuses.count(Status.MEASURED) >= 3  # of one the standard deviation is at the limit
+    assert {*statuses} <= {Status.MEASURED, Status.WEAK}
+    for mark, place in zip(frame.marks, truth, strict=True):
+        assert mark.center_px == pytest.approx(place, abs=0.25)
 
 
 @pytest.mark.study
