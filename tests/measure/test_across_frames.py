@@ -381,7 +381,8 @@ def test_of_four_good_marks_on_bent_film_none_is_called_wrong(count: int) -> Non
         result = check_network([make_frame(str(k), bent_film(rng, bend), rng) for k, bend in enumerate(bends)])
         reasons = {str(mark.reason).split(",")[0] for frame in result.frames for mark in frame.marks if mark.reason}
         assert reasons <= {"it may be wrong"}
-        assert {image for image, _ in named(result)} <= {"0"}
+        bent = {str(k) for k, bend in enumerate(bends) if bend > 2 * FILM_MM}  # of 0.02 mm some are seen, rightly
+        assert {image for image, _ in named(result)} <= bent
         assert result.frames[0].problems
 
 
