@@ -16,8 +16,7 @@ import numpy as np
 from measure.flags import Cause, Code, Reason, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from pipeline.archive.checked_statuses import CheckedResult, checked_marks, find_judging, judge, remember_written
-from pipeline.archive.made_from import measured_from
-from pipeline.archive.measurement import pitches, remember_place
+from pipeline.archive.measurement import measured_from, pitches, remember_place
 from pipeline.archive.results_database import Kept, Store
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_measurement import MeasuredFile

@@ -20,10 +20,9 @@ from matplotlib.figure import Figure
 
 import synthetic_images
 from adjust.problem.parameter import Parameter
-from pipeline.design.alternatives import gains
-from pipeline.design.expected import INTERIOR, UM_PER_MM, alone, expect, rms
+from pipeline.design.expected import INTERIOR, UM_PER_MM, alone, expect, gains, rms
 from pipeline.design.sweeps import Swept, Variations, over_layouts, sweep
-from pipeline.rendered.design_table import Sweep
+from pipeline.rendered.scene_tables import Sweep
 
 Row = Sequence[str | float]
 

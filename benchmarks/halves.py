@@ -30,8 +30,7 @@ from measure.boards.corners import one_definition
 from measure.boards.measure import measure_board
 from measure.boards.specs import ChessboardSpec
 from measure.scans.opening import open_scan
-from pipeline.calibration.intrinsics import camera_intrinsics
-from pipeline.calibration.lens_choice import LensModel, free_lens
+from pipeline.calibration.intrinsics import LensModel, camera_intrinsics, free_lens
 from pipeline.calibration.pictures import CameraPictures
 from pipeline.results.comparator_file import read_comparator
 

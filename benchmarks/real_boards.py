@@ -21,7 +21,7 @@ from measure.boards.corners import one_definition
 from measure.boards.measure import measure_board
 from measure.boards.specs import BoardSpec, ChessboardSpec, CircleGridSpec
 from measure.scans.opening import open_scan
-from pipeline.opencv_check.opencv_corners import CRITERIA, FLAGS, NEAREST
+from pipeline.opencv_check.check import CRITERIA, FLAGS, NEAREST
 
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]

@@ -3,8 +3,8 @@ from .archive.measurement import read_measurement as read_measurement
 from .calibration.calibrate_stage import calibrate as calibrate
 from .errors import InputError as InputError
 from .files.camera_file import read_camera as read_camera
-from .files.images_file import read_images as read_images
-from .files.points_file import read_points as read_points
+from .files.object_files import read_images as read_images
+from .files.object_files import read_points as read_points
 from .files.project_file import read_project as read_project
 from .results.adjustment_file import read_adjustment as read_adjustment
 from .results.adjustment_file import write_adjustment as write_adjustment

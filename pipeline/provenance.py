@@ -19,7 +19,7 @@ from measure.scans.metadata import DECODING_ERRORS
 from measure.scans.opening import open_scan
 from measure.scans.remote import Address, tiff_file, whole_file
 from measure.scans.scan import Scan
-from pipeline.text.text_file import read_bytes
+from pipeline.text.files import read_bytes
 
 _PLAIN = {str, int, bool, type(None)}  # types of most values, tested first
 NO_FINGERPRINT = {"fingerprint": False}  # metadata of a field that is not part of a value's fingerprint

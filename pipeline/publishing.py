@@ -13,7 +13,7 @@ from types import FrameType
 
 from pipeline.errors import InputError, WriteError
 from pipeline.files.project_file import Project
-from pipeline.text.atomic import writing
+from pipeline.text.files import writing
 
 _HEAD = 4096
 _JSON = rb'\s*\{\s*("reseau"|"verdict": "[a-z ]+",\s*"reason"|"chosen": (null|\{\s*"transformation"))'

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 
 from adjust.solution.result import Adjustment
 from pipeline.adjusting.adjust_stage import adjust_marks
-from pipeline.adjusting.network import anything_to_adjust, check_transformation
-from pipeline.adjusting.turned_pictures import sensor_size_mm
+from pipeline.adjusting.network import anything_to_adjust, check_transformation, sensor_size_mm
 from pipeline.archive.checked_statuses import (
     checked_marks,
     drop_all_but,
@@ -23,9 +22,10 @@ from pipeline.archive.checked_statuses import (
     rejudge,
     remember_written,
 )
-from pipeline.archive.made_from import adjusted_from, differing
 from pipeline.archive.measurement import (
+    adjusted_from,
     count_decisions,
+    differing,
     measured_scans,
     picture_sizes_mm,
     pitches,
@@ -35,11 +35,11 @@ from pipeline.archive.measurement import (
     written_scans,
 )
 from pipeline.archive.results_database import Merged, Store, merge
-from pipeline.archive.results_integrity import DamagedError
+from pipeline.archive.schema import DamagedError
 from pipeline.archive.status import archive_status
 from pipeline.archive.thumbnails import Thumbnails, ThumbnailStore
 from pipeline.errors import InputError, WriteError
-from pipeline.files.images_file import WRITTEN, fill_images
+from pipeline.files.object_files import WRITTEN, fill_images
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
 from pipeline.provenance import hash_file
@@ -56,14 +56,13 @@ from pipeline.results.comparator_file import (
     write_comparator,
 )
 from pipeline.results.covariance_file import covariance_path
-from pipeline.results.frames_file import for_images, write_frames
-from pipeline.results.measured_record import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan, for_images, write_frames
 from pipeline.results.record_json import write_record
 from pipeline.summary import Summary, archive_summary, shard_summary, summarise
 from pipeline.workers import NotMeasured, WorkOptions
 
 if TYPE_CHECKING:
-    from pipeline.opencv_check.opencv_corners import BoardPictures
+    from pipeline.opencv_check.check import BoardPictures
 
 _ONE_BY_ONE = 2000  # scans; for more, the summary is read from the store: totals and what needs a look
 
@@ -330,7 +329,7 @@ class _Run:
 
     def _board_pictures(self) -> "BoardPictures | None":
         """Images of the board for OpenCV; None where there is no scan, or OpenCV has no detector for it."""
-        from pipeline.opencv_check.opencv_corners import BoardPictures, detector_name
+        from pipeline.opencv_check.check import BoardPictures, detector_name
 
         project = self.project
         board = project.targets.board if project.targets else None

@@ -21,7 +21,7 @@ from pipeline.files.project_file import Project
 from pipeline.report.data import Problem, ReportData, current_scans
 from pipeline.report.data import frames as report_frames
 from pipeline.report.fiducials import Distance, correction_sentence, figure
-from pipeline.report.many_frames import frame_counts
+from pipeline.report.load import frame_counts
 from pipeline.report.numbers import value_and_sigma
 from pipeline.report.parameters import CameraValue, camera_values
 from pipeline.report.verdict import Level, ReportVerdict, judge, sigma0_bounds

@@ -62,5 +62,5 @@ def test_mypy_sees_types_in_a_script_that_uses_the_wheel(tmp_path: Path) -> None
     mypy = [sys.executable, "-m", "mypy", "--config-file", os.devnull, str(script)]
     done = subprocess.run(mypy, capture_output=True, text=True, env=variables, cwd=tmp_path)
     assert 'Revealed type is "str"' in done.stdout
-    assert 'Revealed type is "pipeline.files.points_file' in done.stdout
+    assert 'Revealed type is "pipeline.files.object_files' in done.stdout
     assert 'Argument 1 to "adjust" has incompatible type "int"; expected "Network"' in done.stdout

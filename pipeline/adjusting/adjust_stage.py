@@ -1,12 +1,19 @@
-"""Adjust comparator coordinates, with scanner terms and the eccentricity correction of disks."""
+"""`reseau adjust` and `reseau choose`: adjust comparator coordinates, with scanner terms and the eccentricity of disks;
+select film deformation and distortion model."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from adjust.functional_model.scanner import carriage_terms, smooth_terms
+from adjust.model_selection.candidates import Candidate
+from adjust.model_selection.model_choice import Choice, choose
 from adjust.model_selection.scanner_choice import bent_network, choose_bends
 from adjust.problem.estimates import adjusted_image, adjusted_places
 from adjust.problem.network import Network
@@ -15,10 +22,15 @@ from adjust.solution.result import Adjustment
 from adjust.solution.unmodelled_error import adjust_unmodelled
 from measure.results import ON_FILM
 from pipeline.adjusting.network import build_network
+from pipeline.archive.measurement import adjusted_from
 from pipeline.errors import InputError
 from pipeline.files.project_file import ASSUMED_PITCH_UM, Project
 from pipeline.measuring.target_field import across, disk_normals, eccentricity_mm, plane_normal
-from pipeline.results.comparator_file import ComparatorPoint, has_pixels_alone
+from pipeline.progress import Reporter
+from pipeline.publishing import unpublished
+from pipeline.results.choice_file import ChoiceRecord, choice_record
+from pipeline.results.comparator_file import ComparatorPoint, has_pixels_alone, read_comparator
+from pipeline.results.record_json import write_record
 from pipeline.text.wording import listed
 from pipeline.types import Array
 
@@ -212,4 +224,58 @@ def _not_corrected(network: Network, possible_mm: Array) -> tuple[str, ...]:
         f"The disks' eccentricity is not corrected, for their normals are not known; it can reach {worst:.1f} sigma "
         f"({1000.0 * float(np.abs(possible_mm).max()):.2f} µm). Add the columns nX, nY, nZ to the points, or use "
         "smaller disks.",
+    )
+
+
+def run_choose(project: Project, reporter: Reporter) -> tuple[Choice, ChoiceRecord]:
+    """Compare models on the observations of the project's own adjustment, with disks corrected for eccentricity; write
+    and return the result.
+
+    Raises InputError or AdjustmentError where the project cannot be adjusted.
+    """
+    with unpublished(project) as new:
+        with reporter.stage("comparing") as count:
+            marks = read_comparator(project.comparator, project.list_pitch_um)
+            sizes = {camera.name: camera.frame_mm for camera in project.cameras.values() if camera.frame_mm}
+            half_mm = {name: (width / 2.0, height / 2.0) for name, (width, height) in sizes.items()}
+            own = adjust_marks(project, marks)
+            choice = choose(
+                replace(own, network=name_scanners(project, own.network)),
+                adjustment_options(project),
+                half_mm,
+                lambda name, done: count(name, done, done + 1),
+            )
+        record = choice_record(choice, adjusted_from(project, marks))
+        write_record(record, new.place(project.choice_path))
+        new.publish()
+    return choice, record
+
+
+def print_choice(choice: Choice, console: Console, path: Path) -> None:
+    """Print a table of the candidates, the verdict and the reasons."""
+    columns = ("model", "unknowns", "redundancy", "sigma0", "v'Pv", "AIC", "AICc", "left out, µm", "correlated")
+    table = Table(*columns, title="Candidates", title_justify="left")
+    for each in choice.candidates:
+        style = "bold green" if each is choice.chosen else ""
+        table.add_row(Text(each.model.name), *_numbers(each), style=style)
+    console.print(table)
+    console.print(Text(choice.verdict, style="bold"))
+    for reason in choice.reasons:
+        console.print(Text(f"- {reason}"))
+    console.print(f"choice: {path}", soft_wrap=True, markup=False, highlight=False)
+
+
+def _numbers(candidate: Candidate) -> tuple[str, ...]:
+    if candidate.problem:
+        return ("no solution",)
+    predicted = candidate.cross_validation
+    return (
+        str(candidate.unknowns),
+        str(candidate.redundancy),
+        f"{candidate.sigma0:.3f}",
+        f"{candidate.vpv:.1f}",
+        f"{candidate.aic:.1f}",
+        f"{candidate.aicc:.1f}",
+        "none" if predicted is None else f"{predicted.rms_um:.2f}",
+        str(len(candidate.correlated)),
     )

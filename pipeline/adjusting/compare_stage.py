@@ -22,7 +22,7 @@ from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.comparison_file import DRIFT, ComparisonRecord, ParameterDifference, comparison_record
 from pipeline.results.covariance_file import read_own_covariance
 from pipeline.results.record_json import write_record
-from pipeline.text.atomic import check_writable
+from pipeline.text.files import check_writable
 from pipeline.text.wording import did_you_mean, listed
 from pipeline.types import Array
 

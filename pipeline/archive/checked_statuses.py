@@ -16,7 +16,7 @@ from typing import Any
 from measure.flags import Code, Reason
 from measure.results import FrameMeasurement
 from pipeline.archive.results_database import Store, places
-from pipeline.archive.results_integrity import (
+from pipeline.archive.schema import (
     FRAMES_DIGEST,
     MARKS,
     check_judging,

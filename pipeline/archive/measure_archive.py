@@ -10,7 +10,7 @@ from measure.errors import MeasurementError
 from measure.scans.remote import fetch_location, scan_path
 from pipeline.archive.checked_statuses import judge_lots, latest
 from pipeline.archive.cross_scan_checks import check_lots, find_copies, hash_inputs
-from pipeline.archive.made_from import measured_from
+from pipeline.archive.measurement import measured_from
 from pipeline.archive.results_database import Store
 from pipeline.archive.review_decisions import tell_inapplicable
 from pipeline.archive.thumbnails import ThumbnailStore

@@ -27,9 +27,8 @@ from pipeline.files.camera_file import read_camera
 from pipeline.files.library import PREFIX, camera_words, library_path, read_library
 from pipeline.measuring.camera_identification import is_solid
 from pipeline.progress import Reporter
-from pipeline.text.atomic import write_atomically
 from pipeline.text.csv_table import csv_line
-from pipeline.text.names import image_name, names_below
+from pipeline.text.files import image_name, names_below, write_atomically
 from pipeline.text.wording import count_sentence, counted, listed, quoted
 from pipeline.workers import worker_pool
 

@@ -16,17 +16,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from measure.results import MEASURE_REVISION
-from pipeline.archive.results_integrity import (
+from pipeline.archive.schema import (
     COLUMNS,
     MARKS,
     DamagedError,
+    Database,
     damaged_result,
+    forget,
     is_result_sound,
     is_sound,
     measured_marks_digest,
     row_digest,
 )
-from pipeline.archive.schema import Database, forget
 from pipeline.archive.verdicts import Verdict, scan_verdict
 from pipeline.errors import InputError
 from pipeline.provenance import FileState, Identity, hash_text, result_key

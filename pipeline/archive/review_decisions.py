@@ -14,7 +14,7 @@ from measure.flags import Cause, Code, Reason, Status
 from measure.results import MEASURE_REVISION, Covariance, MarkMeasurement
 from pipeline.archive.checked_statuses import find_judging
 from pipeline.archive.results_database import Store
-from pipeline.archive.results_integrity import row_digest
+from pipeline.archive.schema import row_digest
 from pipeline.files.decisions_file import LEARNED, About, Choice, Decision, push_decision, standing
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_task import ScanTask, image_options

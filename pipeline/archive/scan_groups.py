@@ -27,7 +27,7 @@ from pipeline.measuring.camera_identification import Identification, is_solid
 from pipeline.measuring.camera_trials import identify
 from pipeline.progress import Count, Reporter
 from pipeline.provenance import alike_groups, content_hash, parts_hash
-from pipeline.text.names import SCAN_ENDINGS
+from pipeline.text.files import SCAN_ENDINGS
 from pipeline.text.wording import counted
 
 SAMPLES = 3  # scans tried of each group

@@ -14,7 +14,6 @@ from rich.text import Text
 
 from pipeline.archive.checked_statuses import checked_scans, latest
 from pipeline.archive.results_database import Store
-from pipeline.archive.results_integrity import check_judging, is_sound
 from pipeline.archive.review_decisions import (
     decisions_hash,
     group_decisions,
@@ -23,6 +22,7 @@ from pipeline.archive.review_decisions import (
     shortened,
     unknown_images,
 )
+from pipeline.archive.schema import check_judging, is_sound
 from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_counts
 from pipeline.files.project_file import Project
 from pipeline.files.scan_files import as_named

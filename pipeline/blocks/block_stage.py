@@ -2,32 +2,227 @@
 
 Scans are resampled into the fiducial system of their camera. COLMAP extracts and matches features and estimates poses
 with the given camera. Its poses serve as initial values, its tracks as observations in the scans. One adjustment
-combines them with film deformations, fiducials, lens and control.
-"""
+combines them with film deformations, fiducials, lens and control."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import nnls
 
 from adjust.functional_model.rotation import angles_from_rotation
-from adjust.problem.network import Exterior
-from pipeline.blocks.mapping import given_interior, mapped, quiet_colmap
-from pipeline.blocks.pictures import write_pictures
-from pipeline.blocks.ties import oriented_by_control, tie_marks
+from adjust.initial_values.intersection import intersect
+from adjust.initial_values.model_formation import absolute_orientation
+from adjust.problem.network import Exterior, ObjectPoint
+from measure.flags import Status
+from pipeline.blocks.mapping import (
+    BlockPicture,
+    BlockScan,
+    Mapped,
+    Sight,
+    given_interior,
+    mapped,
+    quiet_colmap,
+    write_pictures,
+)
 from pipeline.errors import InputError
-from pipeline.files.images_file import ELEMENTS, GivenImages
+from pipeline.exchange.pinhole import Y_DOWN_Z_FORWARD
+from pipeline.files.object_files import ELEMENTS, GivenImages
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
 from pipeline.resampling.resample_stage import FAST, Resampled, resample, resample_tasks
-from pipeline.results.comparator_file import ComparatorPoint, points_text, read_comparator, read_pitches
-from pipeline.text.atomic import write_atomically
+from pipeline.results.comparator_file import (
+    ComparatorPoint,
+    comparator_from_pixel,
+    points_text,
+    read_comparator,
+    read_pitches,
+)
 from pipeline.text.csv_table import csv_line
+from pipeline.text.files import write_atomically
 from pipeline.text.wording import counted
 from pipeline.types import Array
+
+CELLS = 8  # per side of an image, over which ties are spread
+A_CELL = 3  # ties taken per cell, the longest tracks first
+FEWEST_CONTROL = 3
+_CONSISTENT = 3.0  # largest rms reprojection error of a track, in standard deviations
+_FEWEST_SIGHTS = 3
+_ROUNDS = 5
+
+
+@dataclass(frozen=True)
+class FeaturePrecision:
+    """Precision of a feature's coordinate: variance grain² + (share · size)², since larger features are less
+    precise."""
+
+    grain_px: float
+    share: float
+
+    def sigma_px(self, size_px: float) -> float:
+        return float(np.hypot(self.grain_px, self.share * size_px))
+
+    @property
+    def variances_px2(self) -> Array:
+        return np.array([self.grain_px**2, self.share**2])
+
+
+def tie_marks(mapped: Mapped, pictures: Sequence[BlockPicture]) -> tuple[ComparatorPoint, ...]:
+    """Tie marks of the selected tracks in the scans, with standard deviations estimated by feature size."""
+    by_image = {picture.image: picture for picture in pictures}
+    precision = feature_precision(mapped)
+    marks = []
+    for number in chosen_tracks(mapped, by_image, precision):
+        for sight in mapped.tracks[number]:
+            picture = by_image[sight.image]
+            shown = picture.scan_place(picture.lattice.camera_from_pixel(np.array([sight.col, sight.row])))
+            if shown is None:
+                continue
+            scan, place_px = shown
+            place = comparator_from_pixel(place_px, scan.chain.pitch_um)
+            sigma = np.full(2, precision.sigma_px(sight.size_px) * picture.lattice.pitch_mm)
+            marks.append(ComparatorPoint(scan.image, f"tie-{number}", "tie", place, sigma, 0.0, Status.MEASURED, ""))
+    return tuple(marks)
+
+
+def feature_precision(mapped: Mapped) -> FeaturePrecision:
+    """Estimate the precision of features from the reprojection errors of tracks with three or more observations.
+
+    Of the 2n coordinates of a track, three degrees of freedom determine the point. The initial value is the median of
+    all squares (that of chi-square with two degrees of freedom is 2 ln 2). Then the squares of consistent tracks are
+    fitted, each weighted by its expectation. Raises InputError where no track has three observations.
+    """
+    tracks = [track for track in mapped.tracks.values() if len(track) >= _FEWEST_SIGHTS]
+    if not tracks:
+        raise InputError("COLMAP found no point in three frames: a block needs more overlap.")
+    squares = np.concatenate([_squares_px2(track) for track in tracks])
+    design = np.concatenate([_design(track) for track in tracks])
+    ends = np.cumsum([len(track) for track in tracks])
+    precision = FeaturePrecision(float(np.sqrt(np.median(squares / design[:, 0]) / np.log(2.0))), 0.0)
+    for _ in range(_ROUNDS):
+        expected = design @ precision.variances_px2
+        agree = [part.mean() < _CONSISTENT**2 for part in np.split(squares / expected, ends[:-1])]
+        used = np.repeat(agree, np.diff(ends, prepend=0))
+        weight = 1.0 / expected[used]
+        grain2, share2 = nnls(weight[:, None] * design[used], weight * squares[used])[0]
+        precision = FeaturePrecision(float(np.sqrt(grain2)), float(np.sqrt(share2)))
+    return precision
+
+
+def _squares_px2(track: Sequence[Sight]) -> Array:
+    """(n,) mean squared reprojection error of a coordinate, px²."""
+    return np.array([sight.off_px**2 / 2.0 for sight in track])
+
+
+def _design(track: Sequence[Sight]) -> Array:
+    """(n, 2) design matrix: coefficients of grain² and share² in the expectation of these squares.
+
+    With the redundancy f of a coordinate, the variance of a residual is f² times the observation's own plus f (1 - f)
+    times the mean of all, as for a projection in a random direction: the actual one depends on the geometry.
+    """
+    free = (2 * len(track) - 3) / (2 * len(track))
+    squares = np.array([sight.size_px**2 for sight in track])
+    return np.stack([np.full(len(track), free), free * (free * squares + (1.0 - free) * squares.mean())], axis=1)
+
+
+def chosen_tracks(mapped: Mapped, pictures: Mapping[str, BlockPicture], precision: FeaturePrecision) -> list[int]:
+    """Select consistent tracks for each cell of each image: the longest ones, among these the most precise."""
+    usable = [
+        number
+        for number, track in mapped.tracks.items()
+        if len({sight.image for sight in track}) == len(track)
+        and (_squares_px2(track) / (_design(track) @ precision.variances_px2)).mean() < _CONSISTENT**2
+    ]
+    usable.sort(key=lambda number: (-len(mapped.tracks[number]), max(s.size_px for s in mapped.tracks[number])))
+    taken: dict[tuple[str, int, int], int] = defaultdict(int)
+    chosen = []
+    for number in usable:
+        cells = [_cell(pictures[sight.image], sight.col, sight.row) for sight in mapped.tracks[number]]
+        if any(taken[cell] < A_CELL for cell in cells):
+            chosen.append(number)
+            for cell in cells:
+                taken[cell] += 1
+    return sorted(chosen)
+
+
+def _cell(picture: BlockPicture, col: float, row: float) -> tuple[str, int, int]:
+    lattice = picture.lattice
+    return picture.image, int(CELLS * col / lattice.width_px), int(CELLS * row / lattice.height_px)
+
+
+def oriented_by_control(
+    mapped: Mapped,
+    pictures: Sequence[BlockPicture],
+    marks: Sequence[ComparatorPoint],
+    points: Mapping[str, ObjectPoint],
+    camera_rays: Mapping[str, Array],
+) -> dict[str, tuple[Array, Array]]:
+    """Transform COLMAP's poses into the control system.
+
+    Parameters
+    ----------
+    marks, points : marks in the scans, and the object points.
+    camera_rays : by image, the principal distance and point (3,) that COLMAP used, mm.
+
+    Returns
+    -------
+    By image, rotation (3, 3) to axes x right, y up, looking along -z, and projection centre (3,).
+
+    Raises
+    ------
+    InputError
+        Fewer than three control points are observed in two oriented images each.
+    """
+    given = {id: np.array([prior.value for prior in (p.X, p.Y, p.Z) if prior is not None]) for id, p in points.items()}
+    rays: dict[str, dict[str, tuple[Array, Array]]] = defaultdict(dict)
+    scans = {scan.image: (picture.image, scan) for picture in pictures for scan in picture.scans}
+    for mark in marks:
+        if mark.kind == "target" and mark.status.is_observation and mark.image in scans:
+            frame, scan = scans[mark.image]
+            if frame in mapped.poses and len(given.get(mark.point, ())) == 3:
+                rays[mark.point].setdefault(
+                    frame, _ray(mapped.poses[frame], _camera_mm(mark, scan), camera_rays[frame])
+                )
+    control = sorted(point for point, own in rays.items() if len(own) > 1)
+    if len(control) < FEWEST_CONTROL:
+        raise InputError(
+            f"{len(control)} points with coordinates are marked in two of the frames that COLMAP oriented; "
+            f"{FEWEST_CONTROL} are needed to place the block. Mark more control points, as targets in comparator.csv."
+        )
+    numbered = [(number, *ray) for number, point in enumerate(control) for ray in rays[point].values()]
+    numbers, centers, directions = (np.array(each) for each in zip(*numbered, strict=True))
+    theirs, _ = intersect(centers, directions, numbers, np.full((len(control), 3), np.nan))
+    ours = np.array([given[point] for point in control])
+    stations = {image: -rotation.T @ translation for image, (rotation, translation) in mapped.poses.items()}
+    found = np.isfinite(theirs).all(axis=1)
+    block = absolute_orientation(theirs[found], ours[found], np.array(list(stations.values())))
+    if block is None:
+        raise InputError(
+            "The control points that COLMAP's frames show do not determine how the block lies. Mark others."
+        )
+    return {
+        image: (np.asarray(Y_DOWN_Z_FORWARD @ rotation @ block.rotation.T), block.apply(stations[image]))
+        for image, (rotation, _) in mapped.poses.items()
+    }
+
+
+def _camera_mm(mark: ComparatorPoint, scan: BlockScan) -> Array:
+    """(2,) place of a mark in the camera frame, mm."""
+    assert mark.xy_mm is not None
+    straight = scan.chain.bend.apply(scan.chain.bend_parameters, mark.xy_mm[None])
+    return np.asarray(scan.chain.film.camera_from_comparator(straight)[0])
+
+
+def _ray(pose: tuple[Array, Array], place_mm: Array, interior: Array) -> tuple[Array, Array]:
+    """Projection centre (3,) and direction (3,) of the ray to a place (2,) of the camera frame, in COLMAP's
+    coordinates."""
+    (rotation, translation), (c, x0, y0) = pose, interior
+    return -rotation.T @ translation, rotation.T @ np.array([(place_mm[0] - x0) / c, (y0 - place_mm[1]) / c, 1.0])
+
 
 MOST_PX = 3000  # pixels along the longer side of a frame, unless the user gives a pitch
 

@@ -22,12 +22,16 @@ from adjust.solution.result import Adjustment
 from adjust.solution.unmodelled_error import adjust_unmodelled
 from pipeline.adjusting.adjust_stage import adjust_marks, adjustment_options
 from pipeline.adjusting.network import build_network
-from pipeline.calibration.board_options import board_options
-from pipeline.calibration.intrinsics import CameraIntrinsics, camera_intrinsics
-from pipeline.calibration.lens_choice import LensChoice, LensModel, LensSetting, choose_lens
-from pipeline.calibration.picture_turns import find_turns
-from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures, find_pictures
-from pipeline.calibration.project_files import CalibrationOptions, camera_files, write_project
+from pipeline.calibration.intrinsics import (
+    CameraIntrinsics,
+    LensChoice,
+    LensModel,
+    LensSetting,
+    camera_intrinsics,
+    choose_lens,
+)
+from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures, find_pictures, find_turns
+from pipeline.calibration.project_files import CalibrationOptions, board_options, camera_files, write_project
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
@@ -35,7 +39,7 @@ from pipeline.results.check_file import read_check
 from pipeline.results.comparator_file import ComparatorPoint, read_comparator
 from pipeline.stages import run_all, run_measure
 from pipeline.summary import Summary
-from pipeline.text.atomic import write_atomically
+from pipeline.text.files import write_atomically
 from pipeline.text.wording import counted, did_you_mean, listed
 from pipeline.workers import WorkOptions
 

@@ -49,7 +49,7 @@ def check(project: ProjectFile, as_json: AsJson = False) -> int:
 
 def choose(project: ProjectFile, as_json: AsJson = False) -> int:
     """Select lens and film models by tests and cross-validation."""
-    from pipeline.adjusting.choose_stage import print_choice, run_choose
+    from pipeline.adjusting.adjust_stage import print_choice, run_choose
     from pipeline.progress import Reporter
 
     settings = read(project)
@@ -127,8 +127,7 @@ def design(
     as_json: AsJson = False,
 ) -> int:
     """Expected precision of planned photographs."""
-    from pipeline.design.run import run_design
-    from pipeline.design.summary import print_design
+    from pipeline.design.summary import print_design, run_design
     from pipeline.progress import Reporter
 
     planned = run_design(scene, out_dir, Reporter())

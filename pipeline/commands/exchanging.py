@@ -179,7 +179,7 @@ def template(
     if is_sized and (kind != "camera" or marks is None):
         raise InputError("--square, --side, --frame and --c go with `reseau template camera --marks KIND`.")
     if marks is not None:
-        from pipeline.files.camera_template import CameraSizes, camera_template
+        from pipeline.files.library import CameraSizes, camera_template
 
         text = camera_template(CameraSizes.from_words(marks, square, side, frame, distance, name))
     elif kind == "keys":

@@ -14,7 +14,7 @@ import typer
 
 from pipeline.archive.verdicts import Verdict
 from pipeline.terminal import PlainConsole, plain
-from pipeline.text.text_file import FINEST_PITCH_UM
+from pipeline.text.files import FINEST_PITCH_UM
 from pipeline.text.wording import counted
 
 if TYPE_CHECKING:

@@ -12,8 +12,7 @@ from adjust.functional_model.families import parameter_names
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.problem.network import EXTERIOR_NAMES, Image
 from adjust.problem.parameter import Parameter
-from pipeline.design.alternatives import Alternative
-from pipeline.design.expected import Expected, error_unit, rms
+from pipeline.design.expected import Alternative, Expected, error_unit, rms
 from pipeline.design.sweeps import Layouts, Swept
 from pipeline.results.adjustment_content import ANGLES, DEG_PER_RAD
 

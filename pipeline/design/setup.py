@@ -18,8 +18,8 @@ from pipeline.adjusting.network import FEWEST_TARGETS
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import DEFAULT_SCANNER
-from pipeline.rendered.design_table import DesignSettings
 from pipeline.rendered.scene_project import SceneFile, film_transformation
+from pipeline.rendered.scene_tables import DesignSettings
 from pipeline.text.wording import did_you_mean
 from pipeline.types import Array
 from synthetic_images.film import turn

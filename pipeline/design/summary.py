@@ -11,12 +11,14 @@ from rich.table import Table
 from rich.text import Text
 
 from adjust.problem.parameter import Parameter, description
-from pipeline.design.alternatives import FOUND
 from pipeline.design.design_file import Design
-from pipeline.design.expected import GroupReliability, error_unit, rms
-from pipeline.design.sweeps import Swept
+from pipeline.design.expected import FOUND, Alternative, GroupReliability, alone, alternatives, error_unit, expect, rms
+from pipeline.design.sweeps import Swept, Variations, over_layouts, sweep
 from pipeline.drawing import svg
+from pipeline.progress import Reporter
 from pipeline.report.numbers import NONE, fixed, significant, value_and_sigma
+from pipeline.results.record_json import write_record
+from pipeline.text.files import check_writable
 
 WIDE_RANGE = 2.0  # ratio of the largest to the smallest value, from which the axis is logarithmic
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555")  # colour-blind safe
@@ -230,3 +232,40 @@ def _gain(percent: float) -> str:
     if percent == FOUND:
         return "found"
     return "lost" if math.isinf(percent) else fixed(percent, 0)
+
+
+def run_design(scene_path: Path, out_dir: Path | None, reporter: Reporter) -> Design:
+    """Plan a scene, vary it, and write design.json and the plots of its sweeps.
+
+    Parameters
+    ----------
+    out_dir : None: a folder next to the scene file, with its name and "-design".
+
+    Raises
+    ------
+    InputError, AdjustmentError : the scene cannot be planned.
+    """
+    folder = out_dir or scene_path.with_name(f"{scene_path.stem}-design")
+    scene = Variations.read(scene_path)
+    setup = scene.setup()
+    check_writable(folder)
+    with reporter.stage("planning") as count:
+        count(scene_path.name, 0, 1)
+        expected = expect(setup)
+        without_given = alone(expected)
+        layouts = over_layouts(scene, expected)
+    helpful: tuple[Alternative, ...] = ()
+    if setup.settings.alternatives:
+        with reporter.stage("trying") as count:
+            helpful = alternatives(expected, count)
+    swept = []
+    files = {"design": folder / "design.json"}
+    for number, each in enumerate(setup.settings.sweep, 1):
+        with reporter.stage("varying") as count:
+            swept.append(sweep(scene, number, each, count))
+        word = f"sweep of {each.quantity}" if f"sweep of {each.quantity}" not in files else f"sweep {number}"
+        files[word] = folder / f"sweep-{number}-{each.quantity}.svg"
+        plot_sweep(swept[-1], files[word])
+    design = Design(scene.path, expected, without_given, layouts, helpful, tuple(swept), files)
+    write_record(design.content(), files["design"])
+    return design

@@ -12,8 +12,8 @@ import numpy as np
 from pipeline.design.expected import Expected, expect
 from pipeline.design.setup import Setup, scene_setup
 from pipeline.errors import InputError
-from pipeline.rendered.design_table import Sweep
 from pipeline.rendered.scene_file import parse_scene
+from pipeline.rendered.scene_tables import Sweep
 from pipeline.text.tables import Table, read_toml
 from pipeline.text.wording import did_you_mean
 

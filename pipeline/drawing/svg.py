@@ -10,7 +10,7 @@ from markupsafe import Markup, escape
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
-from pipeline.text.atomic import write_atomically
+from pipeline.text.files import write_atomically
 from pipeline.types import Array
 
 

@@ -12,7 +12,7 @@ from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.exchange.incoming import ImportOptions, Incoming, foreign_pose, opencv_camera
 from pipeline.exchange.pinhole import BROWN, RATIONAL, PinholeFrame, pinhole_frames, pinholes_written
 from pipeline.opencv_check.opencv_calibration import INTERIOR
-from pipeline.text.names import image_name
+from pipeline.text.files import image_name
 
 CONVENTION = Convention(
     (0.5, 0.5),

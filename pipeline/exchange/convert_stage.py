@@ -28,7 +28,7 @@ from pipeline.results.adjustment_record import (
 )
 from pipeline.results.covariance_file import Covariance, covariance_path, read_own_covariance
 from pipeline.results.record_json import json_text, plain_json
-from pipeline.text.text_file import read_bytes
+from pipeline.text.files import read_bytes
 from pipeline.text.wording import did_you_mean, listed
 from pipeline.types import Array
 

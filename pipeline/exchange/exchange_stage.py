@@ -20,7 +20,7 @@ from pipeline.exchange.formats import Convention, ExportOptions, Written, format
 from pipeline.exchange.incoming import ForeignMark, ForeignPose, ImportOptions, Incoming
 from pipeline.files.camera_file import CameraFile, camera_text
 from pipeline.files.camera_tables import DEFAULT_SIGMA_MM
-from pipeline.files.images_file import ELEMENTS
+from pipeline.files.object_files import ELEMENTS
 from pipeline.files.project_file import Project
 from pipeline.results.comparator_file import (
     ComparatorPoint,
@@ -29,9 +29,8 @@ from pipeline.results.comparator_file import (
     points_text,
     read_decision_counts,
 )
-from pipeline.text.atomic import write_atomically, writing
 from pipeline.text.csv_table import csv_line
-from pipeline.text.names import file_word, path_below
+from pipeline.text.files import file_word, path_below, write_atomically, writing
 
 README = "README.txt"
 _HEAD = "Written by reseau"

@@ -14,7 +14,7 @@ from pipeline.exchange.xml_tree import child_numbers, read_xml, xml_text
 from pipeline.files.camera_file import CameraFile
 from pipeline.opencv_check.opencv_calibration import INTERIOR
 from pipeline.resampling.canvas import Canvas
-from pipeline.text.names import file_word
+from pipeline.text.files import file_word
 
 CONVENTION = Convention(
     (0.5, 0.5),

@@ -23,7 +23,7 @@ from pipeline.exchange.xml_tree import Content, Element, child_numbers, child_te
 from pipeline.opencv_check.opencv_calibration import INTERIOR
 from pipeline.resampling.canvas import Canvas
 from pipeline.results.comparator_file import ComparatorPoint
-from pipeline.text.names import file_word, image_name
+from pipeline.text.files import file_word, image_name
 from pipeline.types import Array
 
 CONVENTION = Convention(

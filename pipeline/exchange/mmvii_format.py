@@ -11,7 +11,7 @@ from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.exchange.incoming import ForeignMark, ImportOptions, Incoming
 from pipeline.exchange.xml_tree import Content, child_numbers, child_text, read_xml, xml_text
 from pipeline.results.comparator_file import ComparatorPoint
-from pipeline.text.names import image_name
+from pipeline.text.files import image_name
 
 CONVENTION = Convention(
     (0.0, 0.0),

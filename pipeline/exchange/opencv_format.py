@@ -13,7 +13,7 @@ from pipeline.exchange.pinhole import BROWN, PRISMS, PinholeFrame, pinhole_frame
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.opencv_file import FISHEYE, read_pixel_camera
 from pipeline.opencv_check.opencv_calibration import NAMES
-from pipeline.text.names import image_name
+from pipeline.text.files import image_name
 
 CONVENTION = Convention(
     (0.0, 0.0),

@@ -27,7 +27,7 @@ from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, F
 from pipeline.results.comparator_file import read_comparator
 from pipeline.results.covariance_file import read_own_covariance
 from pipeline.results.record_json import json_text
-from pipeline.text.atomic import write_atomically
+from pipeline.text.files import write_atomically
 from pipeline.text.wording import counted, listed
 from pipeline.types import Array
 

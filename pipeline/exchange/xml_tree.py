@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from pipeline.errors import InputError
-from pipeline.text.text_file import read_bytes
+from pipeline.text.files import read_bytes
 from pipeline.types import Array
 
 Element = ElementTree.Element

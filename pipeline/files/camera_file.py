@@ -26,10 +26,9 @@ from pipeline.files.camera_tables import (
 )
 from pipeline.files.earlier_calibration import EarlierCalibration, read_calibration
 from pipeline.files.mark_table import Clicks, Drawing, LearnedFrom, SavePicture, read_marks, template_values
-from pipeline.text.names import image_name
+from pipeline.text.files import SMALLEST_SIGMA, image_name
 from pipeline.text.table_models import read_model
 from pipeline.text.tables import Table, list_words, read_toml
-from pipeline.text.text_file import SMALLEST_SIGMA
 from pipeline.text.wording import did_you_mean, table_lines
 
 FIELD_RATIO = 50.0  # largest half diagonal over principal distance, or frame over fiducials' extent: 178° field of view

@@ -21,9 +21,8 @@ from measure.flags import MeaningfulWord
 from measure.geometry import POSES
 from pipeline.errors import InputError
 from pipeline.provenance import NO_FINGERPRINT
-from pipeline.text.atomic import write_atomically, writing
+from pipeline.text.files import quote_value, read_bytes, refuse_constant, write_atomically, writing
 from pipeline.text.table_models import WrongKey
-from pipeline.text.text_file import quote_value, read_bytes, refuse_constant
 from pipeline.text.wording import did_you_mean
 
 try:

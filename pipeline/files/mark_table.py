@@ -15,7 +15,7 @@ from measure.errors import MeasurementError
 from measure.geometry import POSES
 from measure.marks import shapes
 from measure.marks.shapes import MarkTemplate, Point
-from pipeline.text.atomic import write_atomically
+from pipeline.text.files import write_atomically
 from pipeline.text.table_models import (
     Entries,
     FilePath,

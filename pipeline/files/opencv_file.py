@@ -13,7 +13,7 @@ from adjust.functional_model.lens import Distortion, Lens
 from measure.scans.scan import Scan
 from pipeline.errors import InputError
 from pipeline.results.comparator_file import comparator_from_pixel, pixel_from_comparator
-from pipeline.text.text_file import read_bytes
+from pipeline.text.files import read_bytes
 from pipeline.types import Array
 
 FISHEYE = "fisheye"  # model of cv2.fisheye, also called "equidistant", and the key that ROS and others use

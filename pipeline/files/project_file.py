@@ -16,16 +16,22 @@ from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.decisions_file import FILE as DECISIONS
 from pipeline.files.decisions_file import Decision, cut_short_line, decisions_bytes, learned_from, parse_decisions
-from pipeline.files.images_file import GivenImages, read_images
 from pipeline.files.library import PREFIX, camera_path
 from pipeline.files.mark_table import Clicks
-from pipeline.files.points_file import GivenDistance, GivenPoints, read_distances, read_points
+from pipeline.files.object_files import (
+    GivenDistance,
+    GivenImages,
+    GivenPoints,
+    read_distances,
+    read_images,
+    read_points,
+)
 from pipeline.files.project_tables import UNITS_MM, AdjustSettings, ProjectTable
 from pipeline.files.scan_files import FoundScans, add_cuts, as_named, find_scans
 from pipeline.files.target_table import TargetSettings, TieSettings, read_targets, read_ties
 from pipeline.provenance import hash_content
 from pipeline.results.covariance_file import covariance_path
-from pipeline.text.names import path_below
+from pipeline.text.files import path_below
 from pipeline.text.table_models import read_model
 from pipeline.text.tables import Table, read_toml
 from pipeline.text.wording import nearest

@@ -14,6 +14,7 @@ from measure.geometry import POSES
 from pipeline.files.camera_tables import CameraTable, DistortionTable, FiducialTable, SigmaTable, Source
 from pipeline.files.mark_table import MARK_TABLES
 from pipeline.files.target_table import TARGET_TABLES, TieTable
+from pipeline.text.files import FINEST_PITCH_UM
 from pipeline.text.table_models import (
     FilePath,
     FilePaths,
@@ -32,7 +33,6 @@ from pipeline.text.table_models import (
     text,
     texts,
 )
-from pipeline.text.text_file import FINEST_PITCH_UM
 
 Datum = Literal["control", "minimal", "free"]
 Method = Literal["combined", "elements"]

@@ -12,8 +12,8 @@ from pathlib import Path
 from measure.errors import MeasurementError
 from measure.scans.remote import find_addresses, is_address, part_text, public_text, scan_path
 from pipeline.errors import InputError
-from pipeline.files.images_file import GivenImages
-from pipeline.text.names import names_below
+from pipeline.files.object_files import GivenImages
+from pipeline.text.files import names_below
 from pipeline.text.tables import Table
 
 _ANY_DEPTH = "**"

@@ -28,7 +28,7 @@ from pipeline.measuring.scan_task import Measure, Memory, ScanTask, sample_names
 from pipeline.progress import Reporter
 from pipeline.provenance import content_hash, fingerprint, hash_content, hash_file
 from pipeline.results.measured_record import read_tone_information, tone_information_record
-from pipeline.text.atomic import write_atomically
+from pipeline.text.files import write_atomically
 
 _SAMPLES = 8  # scans of a scanner from which its curve is estimated
 _SET = "it is set in the project"

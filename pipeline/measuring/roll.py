@@ -20,8 +20,7 @@ from measure.results import FrameMeasurement, Pose
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.scan_task import Measure, ScanOptions, ScanTask, sample_names
 from pipeline.progress import Reporter
-from pipeline.results.frames_file import unique_fields
-from pipeline.results.measured_record import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan, unique_fields
 
 _ONE_QUESTION = (
     "the frames are named so that what is written lies alike in all of the camera whose writing was read; nothing says "

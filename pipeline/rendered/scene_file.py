@@ -13,9 +13,8 @@ from measure.marks import shapes
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile, parse_camera, read_camera
 from pipeline.files.library import camera_path
-from pipeline.rendered.design_table import DesignSettings
-from pipeline.rendered.field_table import read_field
 from pipeline.rendered.scene_project import Given, SceneFile, write_project
+from pipeline.rendered.scene_tables import DesignSettings, read_field
 from pipeline.text.table_models import (
     Key,
     NotNegative,

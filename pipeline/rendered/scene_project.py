@@ -15,9 +15,9 @@ from measure.marks import shapes
 from pipeline.files.camera_file import CameraFile, GivenFiducial, camera_text
 from pipeline.files.mark_table import picture_writer
 from pipeline.files.project_tables import UNITS_MM
-from pipeline.rendered.design_table import DesignSettings
-from pipeline.text.atomic import write_atomically
+from pipeline.rendered.scene_tables import DesignSettings
 from pipeline.text.csv_table import csv_line
+from pipeline.text.files import write_atomically
 from pipeline.text.table_models import NotNegative, NumberOrPair, WrongKey, table_model
 from pipeline.types import Array
 from synthetic_images.film import frame_geometry

@@ -24,14 +24,14 @@ from pipeline.report.frame_problems import (
     places_px,
 )
 from pipeline.report.frame_views import FrameView, arrow_scale, cards_to_show, frame_views
-from pipeline.report.many_frames import totals_view
+from pipeline.report.load import totals_view
 from pipeline.report.numbers import fixed, fixed_list, significant, value_and_sigma
 from pipeline.report.parameters import axes_sentence, group_sentences, spoken_name
 from pipeline.report.vectors import joined_view
 from pipeline.report.verdict import A_PRIORI, contradiction, critical_w, judge, lens_sentences, sigma0_bounds
 from pipeline.results.adjustment_record import AdjustmentRecord, PointRecord
 from pipeline.results.image_unit import FILM_UNIT
-from pipeline.text.atomic import write_atomically
+from pipeline.text.files import write_atomically
 from pipeline.types import Array
 
 LIST_LIMIT = 200  # rows of a long table

@@ -15,8 +15,7 @@ from pipeline.report.data import ReportData
 from pipeline.report.frame_views import residuals_by_image
 from pipeline.report.lens import lens
 from pipeline.results.adjustment_record import CameraRecord
-from pipeline.text.atomic import atomic_path
-from pipeline.text.names import file_word
+from pipeline.text.files import atomic_path, file_word
 from pipeline.types import Array
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from tifffile import TiffFile, TiffFileError, TiffWriter
 
 from pipeline.resampling.canvas import Canvas
 from pipeline.resampling.interpolation import Tile
-from pipeline.text.atomic import atomic_path
+from pipeline.text.files import atomic_path
 from pipeline.types import Mask, Samples
 
 TILE_PX = 512

@@ -23,13 +23,20 @@ from pipeline.progress import Reporter
 from pipeline.provenance import file_state
 from pipeline.resampling.canvas import FrameChain, adjusted_chain, measured_chain, outline_canvas
 from pipeline.resampling.frame_file import TILE_PX, Description, read_description, write_frame
-from pipeline.resampling.interpolation import MARGIN_PX, Degree, Tile, open_source
-from pipeline.resampling.seam import Part, find_inner_edges, joined_tile, seams_mm
+from pipeline.resampling.interpolation import (
+    MARGIN_PX,
+    Degree,
+    Part,
+    Tile,
+    find_inner_edges,
+    joined_tile,
+    open_source,
+    seams_mm,
+)
 from pipeline.results.adjustment_file import read_adjustment
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.measured_record import MeasuredScan
-from pipeline.text.atomic import check_writable
-from pipeline.text.names import path_below
+from pipeline.text.files import check_writable, path_below
 from pipeline.workers import worker_pool
 
 BEST: Degree = 5

@@ -13,7 +13,7 @@ from pipeline.results.adjustment_content import adjustment_record
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.covariance_file import AGAIN, covariance_arrays, covariance_path
 from pipeline.results.record_json import json_text, read_record
-from pipeline.text.atomic import atomic_path
+from pipeline.text.files import atomic_path
 from pipeline.types import Array
 
 

@@ -19,10 +19,8 @@ from adjust.problem.observations import ObservationKind
 from measure.flags import Status
 from measure.results import FrameMeasurement
 from pipeline.errors import InputError
-from pipeline.text.atomic import atomic_path
 from pipeline.text.csv_table import Row, csv_line, read_csv
-from pipeline.text.names import image_name
-from pipeline.text.text_file import read_bytes
+from pipeline.text.files import atomic_path, image_name, read_bytes
 from pipeline.types import Array
 
 COLUMNS = (

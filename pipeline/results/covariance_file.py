@@ -16,7 +16,7 @@ from adjust.problem.parameter import Parameter, as_parameter, parameters_from_te
 from adjust.solution.result import Adjustment
 from pipeline.errors import InputError
 from pipeline.provenance import hash_file
-from pipeline.text.text_file import MOST_MB, read_bytes
+from pipeline.text.files import MOST_MB, read_bytes
 from pipeline.types import Array, Indices
 
 AGAIN = "Run `reseau adjust` again; it writes both files."

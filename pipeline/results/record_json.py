@@ -26,9 +26,8 @@ from pydantic import (
 )
 
 from pipeline.errors import InputError
-from pipeline.text.atomic import write_atomically
+from pipeline.text.files import parse_json, quote_value, read_bytes, write_atomically
 from pipeline.text.table_models import name_in_file
-from pipeline.text.text_file import parse_json, quote_value, read_bytes
 
 Record = TypeVar("Record")
 

@@ -22,7 +22,7 @@ from pipeline.files.camera_file import CameraFile, camera_text, parse_camera, re
 from pipeline.files.camera_tables import DEFAULT_SIGMA_MM
 from pipeline.files.mark_table import SavePicture, picture_writer, template_values
 from pipeline.review.requests import parse_values
-from pipeline.text.atomic import write_atomically
+from pipeline.text.files import write_atomically
 from pipeline.text.tables import Table
 from pipeline.text.wording import listed, table_lines
 from pipeline.types import Array

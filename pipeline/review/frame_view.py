@@ -13,7 +13,7 @@ from measure.marks.shapes import Bar, Disk, FrameCorner, LayoutMark, Mark, MarkS
 from measure.results import MarkMeasurement
 from pipeline.archive.checked_statuses import Judging, checked_scans, latest
 from pipeline.archive.results_database import Store
-from pipeline.archive.results_integrity import DamagedError
+from pipeline.archive.schema import DamagedError
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.mark_table import Clicks

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 from measure.flags import Code, Status
 from measure.scans.remote import fetch_location
 from pipeline.archive.results_database import Store
-from pipeline.archive.results_integrity import check_judging, damaged_frames, damaged_result
+from pipeline.archive.schema import check_judging, damaged_frames, damaged_result
 from pipeline.archive.verdicts import Verdict
 from pipeline.errors import InputError
 from pipeline.files.decisions_file import (

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import InputError
-from pipeline.text.text_file import LARGEST, SMALLEST_SIGMA, quote_value, read_bytes
+from pipeline.text.files import LARGEST, SMALLEST_SIGMA, quote_value, read_bytes
 from pipeline.text.wording import did_you_mean
 
 SEPARATORS = {";": "semicolons", "\t": "tabs"}

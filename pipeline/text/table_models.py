@@ -30,8 +30,8 @@ from pydantic.dataclasses import is_pydantic_dataclass
 from pydantic.fields import FieldInfo
 
 from pipeline.errors import InputError
+from pipeline.text.files import LARGEST, quote_value
 from pipeline.text.tables import Table, list_words
-from pipeline.text.text_file import LARGEST, quote_value
 from pipeline.text.wording import LISTED, did_you_mean, nearest
 
 Model = TypeVar("Model")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import InputError
-from pipeline.text.text_file import read_bytes
+from pipeline.text.files import read_bytes
 from pipeline.text.wording import did_you_mean
 
 MOST_MB = 4  # size of a camera file with marks learned from 12,000 scans

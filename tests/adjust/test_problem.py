@@ -310,9 +310,9 @@ def test_no_other_module_takes_names_apart_or_builds_them() -> None:
                 found += [f"{file.relative_to(ROOT)}: {what}" for what in dotted_names(file)]
     assert set(found) == {
         "pipeline/archive/work.py: rpartition",  # a scan's suffix
-        "pipeline/report/many_frames.py: rpartition",  # a scan's suffix
+        "pipeline/report/load.py: rpartition",  # a scan's suffix
         "pipeline/design/sweeps.py: split",  # a key of a scene's table
-        "pipeline/rendered/design_table.py: split",  # a key of a scene's table
+        "pipeline/rendered/scene_tables.py: split",  # a key of a scene's table
         "pipeline/review/mark_handles.py: split",  # a key of a drawing's table
     }
 

@@ -23,8 +23,7 @@ from studies import parametrize_with_studies
 from measure import MarkShape, Pose, polygon
 from pipeline import read_project
 from pipeline.archive.measurement import picture_sizes_mm
-from pipeline.archive.results_integrity import add_digests
-from pipeline.archive.schema import MEASUREMENTS, Schema, opened
+from pipeline.archive.schema import MEASUREMENTS, Schema, add_digests, opened
 from pipeline.archive.status import archive_status
 from pipeline.archive.verdicts import NEXT_STEP, Verdict
 from pipeline.cli import run

@@ -37,17 +37,17 @@ from measure.boards.specs import (
 )
 from measure.errors import MissingError
 from pipeline import InputError
-from pipeline.adjusting.turned_pictures import turned_back
-from pipeline.calibration import calibrate_stage, lens_choice
-from pipeline.calibration.board_options import board_options
+from pipeline.adjusting.network import turned_back
+from pipeline.calibration import calibrate_stage, intrinsics
 from pipeline.calibration.calibrate_stage import Calibration
-from pipeline.calibration.lens_choice import LensChoice, LensModel, choose_lens
+from pipeline.calibration.intrinsics import LensChoice, LensModel, choose_lens
 from pipeline.calibration.pictures import find_pictures
+from pipeline.calibration.project_files import board_options
 from pipeline.cli import run
 from pipeline.files.target_table import read_targets
 from pipeline.measuring.roll import reject_repeated_views
+from pipeline.opencv_check.check import BoardPictures, compare_corners, detector_name, find_points
 from pipeline.opencv_check.opencv_calibration import NAMES, Freedom, ImagePoints, OpenCvCalibration, calibrate
-from pipeline.opencv_check.opencv_corners import BoardPictures, compare_corners, detector_name, find_points
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.tables import Table
 
@@ -462,7 +462,7 @@ ERROR_PX = 0.1  # in x and y
 def choices() -> dict[float, LensChoice]:
     """By the third radial term that the lens has."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.delitem(lens_choice.PARAMETERS, "opencv8")  # as slow as both others together
+        patch.delitem(intrinsics.PARAMETERS, "opencv8")  # as slow as both others together
         return {
             k3: choose_lens(
                 board_network(np.random.default_rng(4), 6, ERROR_PX * PIXEL_MM, k3=k3), True, PIXEL_MM, adjust
@@ -483,17 +483,17 @@ def test_a_richer_lens_is_taken_where_it_predicts_other_pictures_better(
 
 def test_a_fisheye_is_tried_where_the_field_is_wide(monkeypatch: pytest.MonkeyPatch) -> None:
     """Half the diagonal of these pictures is 0.74 of the principal distance."""
-    monkeypatch.delitem(lens_choice.PARAMETERS, "opencv5")
-    monkeypatch.delitem(lens_choice.PARAMETERS, "opencv8")
+    monkeypatch.delitem(intrinsics.PARAMETERS, "opencv5")
+    monkeypatch.delitem(intrinsics.PARAMETERS, "opencv8")
     network = board_network(np.random.default_rng(4), 6, ERROR_PX * PIXEL_MM)
     for limit, tried in ((1.0, {"opencv4"}), (0.7, {"opencv4", "fisheye"})):
-        monkeypatch.setattr(lens_choice, "WIDE", limit)
+        monkeypatch.setattr(intrinsics, "WIDE", limit)
         choice = choose_lens(network, True, PIXEL_MM, adjust)
         assert set(choice.rms_px) == tried
 
 
 @pytest.mark.parametrize("model", ["opencv4", "opencv5", "opencv8", "fisheye"])
 def test_focal_lengths_are_apart_unless_pixels_are_square(model: LensModel) -> None:
-    assert lens_choice.free_lens(model, square_pixels=False).parameters.keys() - lens_choice.free_lens(
+    assert intrinsics.free_lens(model, square_pixels=False).parameters.keys() - intrinsics.free_lens(
         model, square_pixels=True
     ).parameters.keys() == {"b1"}

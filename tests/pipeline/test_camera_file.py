@@ -17,7 +17,7 @@ from pipeline import InputError, read_adjustment, read_project
 from pipeline.cli import DONE, LOOK, run
 from pipeline.exchange.saved_cameras import _archive_variances, save_cameras
 from pipeline.files.camera_file import CameraFile, read_camera
-from pipeline.files.camera_template import MARK_KINDS, CameraSizes, camera_template
+from pipeline.files.library import MARK_KINDS, CameraSizes, camera_template
 from pipeline.measuring.target_identification import misplaced_principal_point
 from pipeline.rendered.scene_file import render_project
 from pipeline.results.adjustment_record import CameraRecord, Quantity

@@ -11,12 +11,11 @@ import pytest
 
 from pipeline import InputError
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
-from pipeline.design.alternatives import alternatives, gains
-from pipeline.design.expected import alone, expect, rms
+from pipeline.design.expected import alone, alternatives, expect, gains, rms
 from pipeline.design.setup import planned_network, scene_setup
 from pipeline.design.sweeps import Swept, Variations, over_layouts, sweep
-from pipeline.rendered.design_table import Sweep
 from pipeline.rendered.scene_file import read_scene
+from pipeline.rendered.scene_tables import Sweep
 
 SCENES = Path(str(resources.files("synthetic_images").joinpath("scenes")))
 JUHL = SCENES / "juhl_example.toml"

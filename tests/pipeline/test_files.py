@@ -28,8 +28,7 @@ from pipeline.results.comparator_file import (
     write_comparator,
 )
 from pipeline.results.measured_record import MeasuredScan
-from pipeline.text.atomic import atomic_path, check_writable, write_atomically
-from pipeline.text.names import image_name
+from pipeline.text.files import atomic_path, check_writable, image_name, write_atomically
 from pipeline.text.tables import read_toml
 
 CAMERA = """

@@ -20,7 +20,7 @@ from pipeline import InputError
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
 from pipeline.exchange.formats import FORMATS, IMPORTED
 from pipeline.files.camera_file import CameraFile, read_camera
-from pipeline.text.names import file_word, path_below
+from pipeline.text.files import file_word, path_below
 from synthetic_images.projection import camera_from_object, object_rotation
 from synthetic_images.scene import Distortion as SceneDistortion
 from synthetic_images.scene import Family, SceneCamera

@@ -31,7 +31,7 @@ from pipeline.exchange.incoming import ImportOptions
 from pipeline.files.decisions_file import Choice, Decision, append_decisions, read_decisions
 from pipeline.results.measured_record import FailureCode, mark_row, scan_detail
 from pipeline.review.session import build_queue
-from pipeline.text.names import names_below
+from pipeline.text.files import names_below
 
 REFUSED = (InputError, MeasurementError, AdjustmentError)
 SECRETS = ("hunter2", "s3cr3t-signature", "AKIAEXAMPLE")

@@ -25,8 +25,7 @@ from pipeline.archive.thumbnails import Thumbnails, ThumbnailStore, thumbnails_p
 from pipeline.cli import run
 from pipeline.report import ReportData, Thumbnail, judge, render_report
 from pipeline.report.frame_views import MOST_CARDS
-from pipeline.report.load import report_data
-from pipeline.report.many_frames import MOST_FRAMES, frame_counts, reduced
+from pipeline.report.load import MOST_FRAMES, frame_counts, reduced, report_data
 from pipeline.report.page import render_frame_page
 from pipeline.results.comparator_file import ComparatorPoint, mark_rows, read_measurement_hash, write_comparator
 from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan

@@ -23,10 +23,16 @@ from measure.tie_points.features import TieFrame
 from measure.tie_points.find_points import TieOptions, measure_ties
 from measure.tie_points.tracks import TieCandidate
 from pipeline import InputError, build_network, read_images, read_project
-from pipeline.blocks.block_stage import written_block
-from pipeline.blocks.mapping import Mapped, Sight, camera_params
-from pipeline.blocks.pictures import BlockPicture, BlockScan, camera_lattice, write_pictures
-from pipeline.blocks.ties import A_CELL, CELLS, feature_precision, oriented_by_control, tie_marks
+from pipeline.blocks.block_stage import A_CELL, CELLS, feature_precision, oriented_by_control, tie_marks, written_block
+from pipeline.blocks.mapping import (
+    BlockPicture,
+    BlockScan,
+    Mapped,
+    Sight,
+    camera_lattice,
+    camera_params,
+    write_pictures,
+)
 from pipeline.exchange.incoming import fiducial_camera
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.tie_stage import check_tie_names

@@ -20,15 +20,14 @@ from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from pipeline import InputError, read_measurement
 from pipeline.cli import run
 from pipeline.files.camera_file import camera_text, parse_camera, read_camera
-from pipeline.files.images_file import WRITTEN, fill_images, read_images
+from pipeline.files.object_files import WRITTEN, fill_images, read_images
 from pipeline.measuring.camera_identification import Identification, Trial, add_plates, contradictions, parse_plate
 from pipeline.measuring.roll import add_known_lines, known_lines, note_same_frames, poses_of_roll
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
 from pipeline.progress import Reporter
 from pipeline.rendered.scene_file import render_project
 from pipeline.report.frame_views import writing_picture
-from pipeline.results.frames_file import for_images, write_frames
-from pipeline.results.measured_record import MeasuredScan
+from pipeline.results.measured_record import MeasuredScan, for_images, write_frames
 from pipeline.text.tables import Table
 
 WILD = (WrittenPlace("left", "90"), WrittenPlace("right", "270", plate=True))
