@@ -1,7 +1,7 @@
 """Matplotlib plots of a calibrated camera: residuals, distortion, uncertainty of projected points, coverage."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -215,6 +215,7 @@ class CameraPlots:
 
 def adjusted_camera_plots(
     estimates: Estimates,
+    covariance_of: Callable[[Sequence[Parameter]], Array],
     camera: Camera,
     v_mm: Array,
     uncertainty: Callable[[float], tuple[Array, Array]],
@@ -228,7 +229,7 @@ def adjusted_camera_plots(
     keys = [Parameter.interior(camera.name, each) for each in lens.quantities]
     return CameraPlots(
         name=camera.name,
-        lens=replace(lens, covariance=estimates.sigma0**2 * estimates.cofactor_of(keys)),
+        lens=replace(lens, covariance=covariance_of(keys)),
         places_mm=observed,
         vectors_mm=adjusted - observed,
         is_fiducial=observations.is_fiducial[rows],

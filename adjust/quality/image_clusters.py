@@ -11,6 +11,7 @@ from adjust.least_squares.numbering import Numbering
 FEWEST_IMAGES = 5  # needed to estimate standard deviations, then to about a third
 MOST_SHARED = 300  # shared quantities: with many unknown points the dense matrix would be too large
 LARGEST_SHARE = 0.999  # of one image in the information on some combination of unknowns; above, it rests on that image
+RANK = 1e-12  # eigenvalue of a scaled covariance, below which a direction is fixed
 
 
 def shared_positions(numbering: Numbering) -> Indices:
@@ -46,6 +47,19 @@ def cluster_covariance(numbering: Numbering, end: Linearised, cofactor: Array) -
     spread = np.array(moves) @ np.linalg.cholesky(cofactor).T
     spread -= spread.mean(axis=0)
     return np.asarray((len(shares) - 1) / len(shares) * spread.T @ spread)
+
+
+def larger_covariance(model: Array, clusters: Array) -> Array:
+    """Covariance (k, k) of the adjustment, enlarged in each direction in which the jackknife's is larger."""
+    total = model + clusters
+    scale = np.sqrt(np.where(np.diagonal(total) > 0.0, np.diagonal(total), 1.0))
+    variances, axes = np.linalg.eigh(total / np.outer(scale, scale))
+    known = variances > RANK
+    root = axes[:, known] * np.sqrt(variances[known])
+    inverse = root.T / variances[known, None] / scale
+    shares, directions = np.linalg.eigh(inverse @ model @ inverse.T)  # of the model in the total
+    spread = scale[:, None] * root @ directions * np.sqrt(np.maximum(shares, 1.0 - shares))
+    return np.asarray(spread @ spread.T)
 
 
 def prediction_errors(numbering: Numbering, end: Linearised, cofactor: Array, folds: int) -> Array | None:

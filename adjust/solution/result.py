@@ -20,7 +20,13 @@ from adjust.problem.problem import Problem
 from adjust.problem.tested import Probabilities
 from adjust.quality.cofactor import NoCofactor, free_cofactor, inner_cofactor
 from adjust.quality.correlation import Correlation, correlations
-from adjust.quality.image_clusters import MOST_SHARED, cluster_covariance, prediction_errors, shared_positions
+from adjust.quality.image_clusters import (
+    MOST_SHARED,
+    cluster_covariance,
+    larger_covariance,
+    prediction_errors,
+    shared_positions,
+)
 from adjust.quality.lens_reach import LensReach, lens_reach
 from adjust.quality.projection_uncertainty import ProjectionUncertainty, only_camera, projection_uncertainty
 from adjust.quality.reliability import Reliability, reliability
@@ -133,6 +139,15 @@ class Adjustment(Estimates, PlottedResult):
         numbers = [place.get(self.index(each), len(at)) for each in parameters]
         return np.pad(found, (0, 1))[np.ix_(numbers, numbers)]
 
+    def larger_covariance_of(self, parameters: Sequence[Parameter]) -> Array:
+        """Return the covariance (k, k) of quantities of cameras.
+
+        With an unmodelled error it is enlarged in each direction in which that by leaving out images is larger.
+        """
+        covariance = self.sigma0**2 * self.cofactor_of(parameters)
+        clusters = self.cluster_covariance_of(parameters) if self.unmodelled_mm else None
+        return covariance if clusters is None else larger_covariance(covariance, clusters)
+
     def prediction_errors(self, folds: int) -> Array | None:
         """Cross-validate the images in `folds` groups.
 
@@ -197,7 +212,8 @@ class Adjustment(Estimates, PlottedResult):
             found = self.projection_uncertainty(shown.name, distance)
             return found.places_mm, found.sigma_mm
 
-        return adjusted_camera_plots(self, shown, self.residuals.v_mm, uncertainty, pixel_mm)
+        covariance_of = self.larger_covariance_of
+        return adjusted_camera_plots(self, covariance_of, shown, self.residuals.v_mm, uncertainty, pixel_mm)
 
     def to_pandas(self, table: Literal["parameters", "residuals"] = "parameters") -> Any:
         """Return a table as pandas.DataFrame: one row per quantity or per observation.

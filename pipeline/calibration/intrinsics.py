@@ -135,7 +135,7 @@ class CameraIntrinsics:
     Attributes
     ----------
     values : fx, fy, cx, cy, then the distortion parameters.
-    covariance : of these, scaled to the larger standard deviations.
+    covariance : of these, the larger of model and left-out images in each direction.
     correlations : pairs above HIGHLY_CORRELATED.
     left_out : by image, the reason.
     used : number of images.
@@ -296,7 +296,6 @@ def camera_intrinsics(
     v_px = adjustment.residuals.v_mm / pixel_mm
     reach = adjustment.lens_reach(camera, (pictures.width_px * pixel_mm, pictures.height_px * pixel_mm))
     correlation = covariance / np.outer(sigmas, sigmas)
-    usable = sigmas if scatter is None else np.maximum(sigmas, scatter)
     return CameraIntrinsics(
         pictures=pictures,
         family=camera.distortion.family,
@@ -304,7 +303,7 @@ def camera_intrinsics(
             name: Intrinsic(value, float(sigmas[row]), None if scatter is None else float(scatter[row]))
             for row, (name, value) in enumerate(values.items())
         },
-        covariance=correlation * np.outer(usable, usable),
+        covariance=by_mm @ adjustment.larger_covariance_of(keys) @ by_mm.T,
         correlations=tuple(
             (one, other, float(correlation[row, column]))
             for (row, one), (column, other) in combinations(enumerate(values), 2)

@@ -51,7 +51,7 @@ class Conversion:
     Attributes
     ----------
     lens : the converted lens.
-    sigmas : (3 + k,) of c, x0', y0' and the parameters; inf: free.
+    sigmas : (3 + k,) of c, x0', y0' and the parameters, the larger of model and left-out images; inf: free.
     sentences : lines of the README.
     files : names of the written files.
     """
@@ -150,8 +150,9 @@ def _converted_adjustment(path: Path, folder: Path, options: ConvertOptions) -> 
     corners_mm = np.array([places.min(axis=0), places.max(axis=0)])
     lens, sentences = _convert(given, known, corners_mm, options)
     moved = _moved_covariance(covariance, name, given, lens)
-    sigmas = np.sqrt(np.diag(moved.select(_parameters(name, lens.lens))))
-    entry = _camera_entry(content.cameras[name], given.distortion, lens, sigmas)
+    keys = _parameters(name, lens.lens)
+    model, sigmas = (np.sqrt(np.diag(select(keys))) for select in (moved.select, moved.select_larger))
+    entry = _camera_entry(content.cameras[name], given.distortion, lens, model)
     gone = {Parameter.interior(name, each).text for each in given.quantities[3:]}
     correlations = tuple(row for row in content.correlations if not gone & set(row.parameters))
     converted = replace(content, cameras={**content.cameras, name: entry}, correlations=correlations)
@@ -159,11 +160,7 @@ def _converted_adjustment(path: Path, folder: Path, options: ConvertOptions) -> 
     arrays = io.BytesIO()
     with np.load(io.BytesIO(read_bytes(covariance_path(path))), allow_pickle=False) as stored:
         kept = {key: stored[key] for key in stored.files}
-    kept |= {
-        "names": np.array([each.text for each in moved.parameters]),
-        "values": moved.values,
-        "matrix": moved.matrix,
-    }
+    kept |= moved.arrays()
     kept["fingerprint"] = np.array(hash_content(text.encode("utf-8")))
     np.savez_compressed(arrays, allow_pickle=False, **kept)
     return lens, sigmas, sentences, {"adjustment.json": text, "adjustment.npz": arrays.getvalue()}
@@ -174,7 +171,7 @@ def _parameters(camera: str, lens: Lens) -> tuple[Parameter, ...]:
 
 
 def _moved_covariance(covariance: Covariance, camera: str, source: Lens, lens: ConvertedLens) -> Covariance:
-    """Covariance of all parameters after the conversion of one camera, by propagation with the derivatives of its
+    """Covariances of all parameters after the conversion of one camera, by propagation with the derivatives of its
     lens."""
     old, new = _parameters(camera, source), _parameters(camera, lens.lens)
     others = tuple(each for each in covariance.parameters if each not in old)
@@ -184,7 +181,8 @@ def _moved_covariance(covariance: Covariance, camera: str, source: Lens, lens: C
     matrix = by_old @ covariance.select((*old, *others)) @ by_old.T
     value = dict(zip(covariance.parameters, covariance.values, strict=True))
     values = np.concatenate([lens.lens.values, [value[each] for each in others]])
-    return Covariance((*new, *others), values, (matrix + matrix.T) / 2.0)
+    clusters = covariance.clusters and _moved_covariance(covariance.clusters, camera, source, lens)
+    return Covariance((*new, *others), values, (matrix + matrix.T) / 2.0, clusters=clusters)
 
 
 def _camera_entry(camera: CameraRecord, source: Distortion, lens: ConvertedLens, sigmas: Array) -> CameraRecord:

@@ -25,7 +25,7 @@ from pipeline.files.project_file import Project
 from pipeline.results.adjustment_file import write_with_covariance
 from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, FiducialRecord, Quantity
 from pipeline.results.comparator_file import read_comparator
-from pipeline.results.covariance_file import read_own_covariance
+from pipeline.results.covariance_file import Covariance, read_own_covariance
 from pipeline.results.record_json import json_text
 from pipeline.text.files import write_atomically
 from pipeline.text.wording import counted, listed
@@ -105,7 +105,9 @@ def _calibrations(project: Project) -> list[_Calibration]:
         scanners = {project.image_scanner(image) for image in images}
         numbers = np.array([values[one] for one in own])
         found.append(
-            _Calibration(project, camera, record, own, numbers, covariance.select(own), len(frames), len(scanners))
+            _Calibration(
+                project, camera, record, own, numbers, covariance.select_larger(own), len(frames), len(scanners)
+            )
         )
     return found
 
@@ -120,8 +122,7 @@ def _save(calibrations: Sequence[_Calibration], path: Path) -> SavedCamera:
     labels = {one.label_in_camera: value for one, value in spread.items()}
     source = Source(text=text, frames=frames, scanners=scanners, archives=len(calibrations), spread_mm=labels)
     earlier = path.with_name(f"{path.stem}-calibration.json")
-    names = np.array([each.text for each in first.parameters], dtype=np.str_)
-    write_with_covariance(earlier, json_text(record), lambda: {"names": names, "values": values, "matrix": covariance})
+    write_with_covariance(earlier, json_text(record), Covariance(first.parameters, values, covariance).arrays)
     camera = _adjusted_camera(first, record.cameras[first.camera.name], earlier, path, source)
     body = camera_text(camera, picture_writer(path.parent, f"{path.stem}-"))
     write_atomically(path, f"{_HEAD}: values, and in {earlier.name} their covariance.\n{body}")

@@ -197,7 +197,7 @@ def _calibration(
         parameters += [Parameter.fiducial(there, id, axis) for id in camera.fiducials for axis in "xy"]
     value = dict(zip(covariance.parameters, covariance.values.tolist(), strict=True))
     parameters = [each for each in parameters if each in value]
-    matrix = covariance.select(parameters)
+    matrix = covariance.select_larger(parameters)
     values = np.array([value[each] for each in parameters])
     free = np.diag(matrix) > 0.0
     return EarlierCalibration(

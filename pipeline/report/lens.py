@@ -82,7 +82,8 @@ def lens(name: str, camera: CameraRecord, covariance: Covariance | None = None) 
     known = camera.lens()
     if covariance is None:
         return known
-    return replace(known, covariance=covariance.select(Parameter.interior(name, each) for each in known.quantities))
+    keys = [Parameter.interior(name, each) for each in known.quantities]
+    return replace(known, covariance=covariance.select_larger(keys))
 
 
 def largest_effects_um(lens: Lens, radius_mm: float) -> dict[str, float]:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.problem.parameter import Parameter, as_parameter, parameters_from_texts
+from adjust.quality.image_clusters import larger_covariance
 from adjust.solution.result import Adjustment
 from pipeline.errors import InputError
 from pipeline.provenance import hash_file
@@ -54,15 +55,14 @@ class Covariance:
     def select_larger(self, parameters: Sequence[Parameter]) -> Array:
         """Covariance as by `select`, enlarged in each direction in which that of `clusters` is larger."""
         block = self.select(parameters)
-        free = np.flatnonzero(np.diagonal(block) > 0.0)
-        if self.clusters is None or not len(free):
-            return block
-        root = np.linalg.cholesky(block[np.ix_(free, free)])
-        scatter = self.clusters.select(parameters)[np.ix_(free, free)]
-        ratios, directions = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, scatter).T))
-        spread = root @ directions * np.sqrt(np.maximum(ratios, 1.0))
-        block[np.ix_(free, free)] = spread @ spread.T
-        return block
+        return block if self.clusters is None else larger_covariance(block, self.clusters.select(parameters))
+
+    def arrays(self) -> dict[str, NDArray[np.generic]]:
+        """Arrays of the covariance file by name; without values for `clusters`."""
+        names = np.array([each.text for each in self.parameters], dtype=np.str_)
+        own = {"names": names, "values": self.values, "matrix": self.matrix}
+        clusters = {} if self.clusters is None else self.clusters.arrays()
+        return own | {f"cluster_{name}": clusters[name] for name in ("names", "matrix") if clusters}
 
     @cached_property
     def _positions(self) -> dict[Parameter, int]:

@@ -287,7 +287,9 @@ def test_a_folder_of_pictures_gives_intrinsics_in_pixels(result: dict[str, Any],
     covariance = storage.getNode("intrinsics_covariance").mat()
     sigmas = [camera[f"{k}_px"]["sigma"] for k in ("fx", "fy", "cx", "cy")]
     sigmas += [camera["distortion"][k]["sigma"] for k in ("k1", "k2", "p1", "p2")]
-    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), sigmas)
+    enlarged = np.sqrt(np.diag(covariance)) / sigmas  # in each direction, not only along the parameters
+    assert (enlarged > 1.0 - 1e-6).all()
+    assert (enlarged < 1.5).all()
     assert covariance[4, 5] < -0.5 * sigmas[4] * sigmas[5]  # k1 and k2 take one another's place
     assert "distortion_model: plumb_bob" in (out / "camera-ros.yaml").read_text(encoding="utf-8")
     assert re.search(r"fx = 520\.\d+ ± 0\.\d+ px", (out / "out" / "report.html").read_text(encoding="utf-8"))

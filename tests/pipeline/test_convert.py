@@ -14,10 +14,13 @@ from projects import write_network_project
 
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Lens
+from adjust.problem.parameter import Parameter
 from pipeline import read_adjustment, read_camera
 from pipeline.adjusting.compare_stage import _labels
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
 from pipeline.exchange.certificate import fit, read_certificate
+from pipeline.exchange.saved_cameras import save_cameras
+from pipeline.files.project_file import read_project
 from pipeline.provenance import hash_file
 from pipeline.report.lens import ANGLES_DEG, certificate
 from pipeline.results.comparison_file import read_comparison
@@ -81,6 +84,38 @@ def test_an_adjustment_keeps_its_covariance(tmp_path: Path) -> None:
     (there / "adjustment.npz").write_bytes(first.with_suffix(".npz").read_bytes())
     assert run(["convert", str(there / "adjustment.json"), "australis", str(tmp_path / "mixed")]) == 2
     assert not (tmp_path / "mixed").exists()
+
+
+def test_the_larger_covariance_is_converted_saved_and_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Images of unlike distortion: by leaving them out the camera is less precise than by the model."""
+    network = lens_network("australis", np.random.default_rng(7))
+    xy_mm, images = network.observations.xy_mm, [int(image[1:]) for image in network.observations.image]
+    unlike = 1e-5 * np.random.default_rng(8).normal(size=len(network.images))[images, None]
+    observed = replace(network.observations, xy_mm=xy_mm * (1.0 + unlike * (xy_mm**2).sum(axis=1, keepdims=True)))
+    project = write_network_project(replace(network, observations=observed), tmp_path)
+    project.write_text(project.read_text(encoding="utf-8") + 'unmodelled = "estimate"\n', encoding="utf-8")
+    run(["adjust", str(project)])
+    first, out = tmp_path / "out" / "adjustment.json", tmp_path / "brown"
+    known, names = read_covariance(first), ("c", "x0", "y0", "k1", "k2", "p1", "p2", "b1", "b2")
+    keys = [Parameter.interior("L", name) for name in names]
+    sigmas = np.sqrt(np.diag(known.select_larger(keys)))
+    assert sigmas[3] > 3.0 * np.sqrt(known.select(keys[3:4])[0, 0])
+    capsys.readouterr()
+    assert run(["convert", str(first), "brown", str(out), "--json"]) == DONE
+    values = json.loads(capsys.readouterr().out)["values"]
+    assert [values[name]["sigma"] for name in names] == pytest.approx(sigmas, rel=1e-6)
+    converted = read_covariance(out / "adjustment.json")
+    np.testing.assert_allclose(np.sqrt(np.diag(converted.select_larger(keys))), sigmas, rtol=1e-6)
+    (saved,) = save_cameras([read_project(project)], tmp_path / "saved")
+    text = (tmp_path / "camera.toml").read_text(encoding="utf-8")
+    (tmp_path / "later.toml").write_text(
+        text.replace("[sigma]\n", '[sigma]\ncalibration = "out/adjustment.json"\n'), encoding="utf-8"
+    )
+    for path in (saved.path, tmp_path / "later.toml"):
+        calibration = read_camera(path).calibration
+        assert calibration is not None
+        rows = [calibration.parameters.index(key) for key in keys]
+        assert np.sqrt(np.diag(calibration.covariance))[rows] == pytest.approx(sigmas, rel=1e-6)
 
 
 @pytest.mark.study

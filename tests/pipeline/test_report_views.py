@@ -15,6 +15,7 @@ from projects import write_network_project
 
 from adjust import Parameter, adjust, approximate
 from adjust.functional_model.lens import Lens
+from adjust.quality.image_clusters import larger_covariance
 from adjust.quality.lens_reach import distortion_curves
 from measure.flags import NO_REASON, Status
 from pipeline import build_network, read_comparator, read_project
@@ -257,6 +258,9 @@ def test_a_covariance_is_enlarged_in_the_directions_in_which_leaving_out_images_
     assert np.linalg.eigvalsh(larger[:2, :2] - clusters.matrix).min() > -1e-9
     assert not larger[2].any()
     assert Covariance(keys, np.zeros(2), model).select_larger(keys).tolist() == model.tolist()
+    fixed = np.array([[4.0, 2.0], [2.0, 1.0]])  # of one direction: a converted lens with more parameters than before
+    np.testing.assert_allclose(larger_covariance(fixed, 9.0 * fixed), 9.0 * fixed, atol=1e-12)
+    np.testing.assert_allclose(larger_covariance(fixed, 0.0 * fixed), fixed, atol=1e-12)
 
 
 def test_the_radial_curve_of_torlegard_is_its_polynomial_and_its_sigma_follows() -> None:
