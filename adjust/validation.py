@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
@@ -289,7 +288,7 @@ def _image_faults(network: Network) -> Faults:
     """Frames with too few marks."""
     frames = {image.frame: image for image in network.images}
     for (frame, image), shown in zip(frames.items(), _mark_counts(network).tolist()[: len(frames)], strict=True):
-        yield from _mark_faults(replace(image, name=frame), *shown)
+        yield from _mark_faults(frame, image, *shown)
 
 
 def _mark_counts(network: Network) -> Indices:
@@ -302,20 +301,20 @@ def _mark_counts(network: Network) -> Indices:
     return np.bincount(marks, minlength=3 * len(network.images)).reshape(-1, 3)[:, :2]
 
 
-def _mark_faults(image: Image, targets: int, fiducials: int) -> Faults:
+def _mark_faults(frame: str, image: Image, targets: int, fiducials: int) -> Faults:
     needed = marks_needed(image.transformation)
     fewest = fewest_marks(image.transformation) if targets else needed
     if fiducials < fewest:
         alone = f", {needed} where its targets tell nothing of it" if needed > fewest else ""
         yield (
-            f"image {image.name} shows {fiducials} fiducial marks; its {image.transformation} transformation needs "
+            f"image {frame} shows {fiducials} fiducial marks; its {image.transformation} transformation needs "
             f"{fewest}{alone}. Measure more of them, choose a transformation that needs fewer, or leave the image out."
         )
     if not targets and not fiducials:
-        yield f"image {image.name} shows neither fiducial marks nor object points. Leave the image out."
+        yield f"image {frame} shows neither fiducial marks nor object points. Leave the image out."
     if 0 < targets < TARGETS_NEEDED and not image.is_observed:
         yield (
-            f"image {image.name} shows {targets} object points; its exterior orientation needs {TARGETS_NEEDED}. "
+            f"image {frame} shows {targets} object points; its exterior orientation needs {TARGETS_NEEDED}. "
             f"Measure more targets in it, give its orientation with standard deviations, or leave its targets out: its "
             f"fiducial marks alone give its film transformation."
         )

@@ -129,7 +129,9 @@ def _interior(camera: Camera, frames: Frames, resected: dict[str, Pose]) -> Arra
     fields = list(of_images.values())
     if family(camera.distortion.family).is_pinhole_at_zero:
         found, poses = find_principal_distance(fields)
-        if not camera.distortion.values.any() and not _has_approximate_points(frames.network):
+        values, sigmas = frames.network.point_priors
+        has_approximate_points = bool((np.isinf(sigmas) & ~np.isnan(values)).any())  # which the adjustment does not use
+        if not camera.distortion.values.any() and not has_approximate_points:
             resected |= {name: poses[field] for name, field in of_images.items() if field in poses}
     else:
         found = find_wide_distance(fields, camera.distortion)
@@ -137,12 +139,6 @@ def _interior(camera: Camera, frames: Frames, resected: dict[str, Pose]) -> Arra
         why = _why_no_distance(fields)
         raise AdjustmentError(f"the principal distance of camera {camera.name} cannot be found from its images: {why}")
     return np.array([found, x0, y0])
-
-
-def _has_approximate_points(network: Network) -> bool:
-    """Whether coordinates are given that the adjustment does not observe."""
-    given = (prior for point in network.points for prior in point.priors if prior is not None)
-    return any(prior.sigma == np.inf for prior in given)
 
 
 def _why_no_distance(fields: Sequence[KnownField]) -> str:
@@ -168,7 +164,8 @@ def _known_fields(camera: Camera, frames: Frames, principal_point_mm: Array) -> 
     """For each image of a camera, sorted by name, the points of which X, Y and Z are known."""
     network = frames.network
     names, number = network.observations.numbered_points
-    xyz = np.array([_known_place(network, name) for name in names])[number[frames.rows]]
+    given, nowhere = network.coordinates(firm=False), np.full(3, np.nan)
+    xyz = np.array([given.get(name, nowhere) for name in names])[number[frames.rows]]
     is_known = ~np.isnan(xyz).any(axis=1)
     fields = {}
     for i in sorted(frames.camera_images(camera.name), key=lambda i: network.images[i].name):
@@ -176,13 +173,6 @@ def _known_fields(camera: Camera, frames: Frames, principal_point_mm: Array) -> 
         xy_mm = frames.xy_mm[part][known] - principal_point_mm
         fields[network.images[i].name] = KnownField(xyz[part][known], xy_mm, frames.sigma_mm[i])
     return fields
-
-
-def _known_place(network: Network, name: str) -> tuple[float, float, float]:
-    point = network.point_by_id.get(name)
-    if point is None or point.X is None or point.Y is None or point.Z is None:
-        return np.nan, np.nan, np.nan
-    return point.X.value, point.Y.value, point.Z.value
 
 
 def _sights(camera: Camera, frames: Frames, interior: Array) -> dict[str, Sight]:

@@ -205,15 +205,16 @@ def triple_poses(points: Array, tangents: Array) -> tuple[Array, Array, Indices]
     """
     rays = np.concatenate([tangents, np.full((*tangents.shape[:2], 1), -1.0)], axis=2)
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
-    a2, b2, c2 = (((points[:, i] - points[:, j]) ** 2).sum(axis=1) for i, j in ((1, 2), (0, 2), (0, 1)))
-    cos_a, cos_b, cos_g = ((rays[:, i] * rays[:, j]).sum(axis=1) for i, j in ((1, 2), (0, 2), (0, 1)))
+    first, second = [1, 0, 0], [2, 2, 1]  # of the sides a, b, c
+    a2, b2, c2 = ((points[:, first] - points[:, second]) ** 2).sum(axis=2).T
+    cos_a, cos_b, cos_g = (rays[:, first] * rays[:, second]).sum(axis=2).T
     with np.errstate(all="ignore"):  # degenerate triples give nan or inf and are dropped below
         ratio_v = _quartic_roots(_grunert_quartic(a2 / b2, c2 / b2, cos_a, cos_b, cos_g))
         d = ((a2 - c2) / b2)[:, None]
         numerator = (d - 1) * ratio_v**2 - 2 * d * cos_b[:, None] * ratio_v + 1 + d
         ratio_u = numerator / (2 * (cos_g[:, None] - ratio_v * cos_a[:, None]))
-        first = np.sqrt(b2[:, None] / (1 + ratio_v**2 - 2 * ratio_v * cos_b[:, None]))
-        distances = np.stack([first, ratio_u * first, ratio_v * first], axis=2)  # (m, 4, 3)
+        distance = np.sqrt(b2[:, None] / (1 + ratio_v**2 - 2 * ratio_v * cos_b[:, None]))
+        distances = np.stack([distance, ratio_u * distance, ratio_v * distance], axis=2)  # (m, 4, 3)
         in_camera = distances[..., None] * rays[:, None]
         rotations = _triad(in_camera) @ np.swapaxes(_triad(points), 1, 2)[:, None]
         shifts = in_camera.mean(axis=2) - np.einsum("mkij,mj->mki", rotations, points.mean(axis=1))

@@ -270,11 +270,19 @@ class Network:
         """(3,) coordinates of the points given in X, Y and Z, by id."""
         return {id_: xyz for id_, xyz in self.coordinates(firm=True).items() if not np.isnan(xyz).any()}
 
+    @cached_property
+    def point_priors(self) -> tuple[Array, Array]:
+        """Given coordinates of all points (points, 3), nan where unknown, and their sigmas, inf where unknown."""
+        priors = [prior for point in self.points for prior in (point.X, point.Y, point.Z)]
+        pairs = [(np.nan, np.inf) if prior is None else (prior.value, prior.sigma) for prior in priors]
+        values, sigmas = np.array(pairs).reshape(-1, 3, 2).transpose(2, 0, 1)
+        return values, sigmas
+
     def coordinates(self, firm: bool) -> dict[str, Array]:
         """(3,) known coordinates of every point, nan where unknown; firm: without approximations (infinite sigma)."""
-        priors = [prior for point in self.points for prior in point.priors]
-        values = [np.nan if p is None or (firm and p.sigma == np.inf) else p.value for p in priors]
-        return dict(zip((point.id for point in self.points), np.array(values).reshape(-1, 3), strict=True))
+        values, sigmas = self.point_priors
+        shown = np.where(np.isinf(sigmas), np.nan, values) if firm else values
+        return dict(zip((point.id for point in self.points), shown, strict=True))
 
     @cached_property
     def observed_points(self) -> frozenset[str]:
@@ -322,8 +330,9 @@ class Network:
     def extent_by_image(self) -> dict[str, Extent]:
         numbers = self.image_numbers
         lowest, highest = np.full((len(self.images), 2), np.inf), np.full((len(self.images), 2), -np.inf)
-        np.minimum.at(lowest, numbers, self.observations.xy_mm)
-        np.maximum.at(highest, numbers, self.observations.xy_mm)
+        for axis, places_mm in enumerate(self.observations.xy_mm.T):  # quicker than both axes at once
+            np.minimum.at(lowest[:, axis], numbers, places_mm)
+            np.maximum.at(highest[:, axis], numbers, places_mm)
         return {image.name: _extent(lowest[i], highest[i]) for i, image in enumerate(self.images)}
 
 

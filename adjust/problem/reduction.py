@@ -97,7 +97,7 @@ class Reduction:
 
 def _given_places(network: Network) -> Array:
     """(n, 3) given coordinates of the points, else of the stations; nan where not given."""
-    places = np.array(list(network.coordinates(firm=False).values())).reshape(-1, 3)
+    places, _ = network.point_priors
     if not np.isnan(places).all():
         return places
     return np.array([image.exterior.center for image in network.images if image.exterior is not None]).reshape(-1, 3)

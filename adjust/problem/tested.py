@@ -118,7 +118,8 @@ class TestedUnits:
         shared = dict.fromkeys(tuple(pair) for pair in unknowns.fiducial.values())  # cameras may share marks
         pairs = [pair for pair in shared if given[list(pair)].all()]
         paired = np.array(pairs, dtype=np.intp).reshape(-1, 2)
-        alone = np.setdiff1d(np.flatnonzero(given), paired)
+        given[paired] = False
+        alone = np.flatnonzero(given)
         return np.concatenate([paired, np.column_stack([alone, np.full(len(alone), ABSENT)])])
 
     @cached_property
