@@ -31,7 +31,7 @@ _FAINT_SIGNIFICANCE = 2.0  # the same where noise hardly gives such a peak: ther
 _MARGIN_PX = 4.0  # width of the background around a mark, used to estimate its offset and slopes
 _BLUR_PX = 0.8  # blur of a mark's image, the initial value of a match
 _CLEAR_PEAK = 0.25  # NCC before the fit that corresponds to the likeness of a clear mark after it
-_TRIALS = 6  # about this many marks are used to choose the channels
+_TRIALS = 6  # about this many marks are used to choose the channels, or to test a placement
 _SHRINK = 0.1  # shrinkage of the noise covariance towards a multiple of the unit matrix: few pixels determine it poorly
 _ROUNDS = 2  # of detecting faint marks: the first marks found improve the predictions of the others
 
@@ -53,6 +53,13 @@ def detect_clear_marks(scan: Scan, layout: FiducialLayout, placement: Placement,
     """Detect the marks of a frame around the places predicted by its placement, and orient the frame."""
     frame = choose_channels(Frame.from_placement(scan, layout, placement, options))
     return orient_frame(_detect(frame, range(len(layout.marks)), frame.first_search_px()))
+
+
+def shows_marks(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> bool:
+    """Whether any of some marks, spread over the frame, is clear in a placement."""
+    frame = choose_channels(Frame.from_placement(scan, layout, placement, options))
+    some = range(0, len(layout.marks), max(1, len(layout.marks) // _TRIALS))
+    return any(_detect(frame, [index], frame.first_search_px()).is_clear(index) for index in some)
 
 
 def rename_frame(scan: Scan, frame: Frame, pose: str) -> Frame:

@@ -20,7 +20,7 @@ from measure.detection.correlation import CLOSE, GRAINY
 from measure.detection.localisation import highest_peak
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
-from measure.fiducials.measure_frame import measure_frame, rename_frame
+from measure.fiducials.measure_frame import measure_frame, rename_frame, shows_marks
 from measure.fiducials.options import AFFINITY_SIGMA, FiducialOptions
 from measure.fiducials.scan_orientation import decide_pose
 from measure.fiducials.search import FrameSearch, Hypotheses, is_searched_by_windows, slightly_longer
@@ -184,11 +184,15 @@ def make_attempt(attempt: Attempt, tried: int) -> Result:
     An accepted frame of the prior belief needs no such test. Under another pitch or film model only unblemished marks
     count, since the additional freedom yields false frames too; a perspective has to fit nearly all marks. Faint marks
     need not be clear, only agree: `tried`, the number of hypotheses so far, limits which placements are measured.
+    Placements under another tone curve or pitch are measured only if some marks are clear there.
     """
     search, hypotheses, kind = attempt.search, attempt.hypotheses, attempt.kind
     found = search.search_middle(hypotheses[0]) if kind == "middle" else search.search_scan(hypotheses)
     if attempt.is_given:
-        frame = best_frame(search, found[:1] if kind == "middle" else found)
+        places = _places_to_try(found[:1] if kind == "middle" else found)
+        if attempt.is_repeated:
+            places = _showing_marks(search, places)
+        frame = best_frame(search, places)
         return found, [] if frame is None else [(0.0 if frame.accepted else np.inf, frame)]
     if kind == "faint":
         results = [_faint_frame(search, place, tried) for place in _likely_placements(search, found, tried)]
@@ -197,7 +201,7 @@ def make_attempt(attempt: Attempt, tried: int) -> Result:
         most = max(_OBLIQUE, len(search.layout.marks) - _GAINED + 1)
         places = [place for place in found[:1] if place.supported >= most]
     else:
-        places = _likely_placements(search, found, len(hypotheses))
+        places = _showing_marks(search, _likely_placements(search, found, len(hypotheses)))
     frames = [frame for frame in (_measure(search, place) for place in places) if frame.accepted]
     if kind == "oblique":
         frames = [frame for frame in frames if frame.measured_count >= max(_OBLIQUE, frame.inside - _GAINED + 1)]
@@ -210,14 +214,14 @@ def _is_taken_if_given(result: tuple[float, Frame], at_given: float) -> bool:
     return result[1].accepted or result[0] * at_given <= FRAMES_BY_CHANCE
 
 
-def best_frame(search: FrameSearch, found: Sequence[Placement]) -> Frame | None:
-    """Measure the frame in the best placements and select one.
+def best_frame(search: FrameSearch, places: Sequence[Placement]) -> Frame | None:
+    """Measure the frame in some placements and select one.
 
     Selected is the first frame that is sure and not outdone by a placement with more supporting marks; else the sure
     frame with most measured marks; else the first accepted one; else one whose fits failed; else by inliers. Frames
     whose marks are all among those of an accepted frame tried before are skipped.
     """
-    places, frames = _places_to_try(found), list[Frame]()
+    frames = list[Frame]()
     for placement in places:
         frame = _measure(search, placement)
         if any(before.accepted and before.contains(frame) for before in frames):
@@ -262,6 +266,10 @@ def _faint_frame(search: FrameSearch, placement: Placement, tried: int) -> tuple
 def _likely_placements(search: FrameSearch, found: Sequence[Placement], tried: int) -> list[Placement]:
     """Best placement and its rivals, without those with too many expected false placements."""
     return [place for place in _places_to_try(found) if tried * search.false_placements(place) <= PLACEMENTS_BY_CHANCE]
+
+
+def _showing_marks(search: FrameSearch, places: Sequence[Placement]) -> list[Placement]:
+    return [place for place in places if shows_marks(search.scan, search.layout, place, search.options)]
 
 
 def _places_to_try(found: Sequence[Placement]) -> list[Placement]:

@@ -238,13 +238,16 @@ def test_the_attempts_in_their_order(times: float | None, looks: int) -> None:
     assert [each.at_given for each in close] == 2 * closer_each
 
 
-def test_marks_are_fitted_from_other_tone_curves_only_where_their_fits_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_marks_are_fitted_from_other_tone_curves_only_where_their_fits_failed_and_some_fit_then(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     scan, options = SCAN.replace_tone(Tone.unknown()), FiducialOptions(pose="0")
     place = Placement("0", np.eye(2, 3), 1.0, 4, 1, 1, GIVEN.mm)
     monkeypatch.setattr(FrameSearch, "search_scan", lambda *_: [place])
     monkeypatch.setattr(stages, "_likely_placements", lambda *_: [place])
     monkeypatch.setattr(stages, "doubt_frame", lambda *_: NO_REASON)
-    for failed, expected in (([1], [1.6, 1.0, 0.5]), ([], [1.6, 1.6, 1.6])):
+    cases = [([1], True, [1.6, 1.0, 0.5]), ([], True, [1.6, 1.6, 1.6]), ([1], False, [1.6, 1.6, 1.6])]
+    for failed, shows, expected in cases:
         begun: list[float] = []
 
         def measure(scan: Scan, *_: object, begun: list[float] = begun, failed: list[int] = failed) -> Any:
@@ -255,8 +258,9 @@ def test_marks_are_fitted_from_other_tone_curves_only_where_their_fits_failed(mo
             return frame
 
         monkeypatch.setattr(stages, "measure_frame", measure)
+        monkeypatch.setattr(stages, "shows_marks", lambda *_, shows=shows: shows)
         found = find_frame(scan, ALIKE, [[GIVEN], [GIVEN]], True, options)
-        assert found.is_taken == bool(failed)
+        assert found.is_taken == bool(failed and shows)
         assert begun[:3] == expected
 
 
