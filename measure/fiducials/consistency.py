@@ -388,8 +388,9 @@ def gross_errors(marks: FrameMarks, film: Scatter, gate_mm: float) -> NDArray[np
     """Find the marks of a single frame that are excluded from its interior orientation.
 
     Marks are removed one by one, of many marks some at a time, the most likely gross errors first, until the others
-    agree. Of these, the set with the highest evidence is taken, if it explains the frame significantly better than no gross error. Each of its marks is
-    then tested with the agreeing marks: it is excluded if its gross error is accepted, or exceeds the gate.
+    agree. Of these, the set with the highest evidence is taken, if it explains the frame significantly better than no
+    gross error. Each of its marks is then tested with the agreeing marks: it is excluded if its gross error is
+    accepted, or exceeds the gate.
 
     Returns
     -------
