@@ -1,7 +1,6 @@
 """Number of scans measured again after various changes: six small frames, counted by the results in the database."""
 
 import os
-import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
@@ -11,6 +10,7 @@ from tempfile import TemporaryDirectory
 import tifffile
 from projects import write_project
 
+from benchmarks.archive_real import results
 from benchmarks.harness import Row
 from pipeline.cli import run
 
@@ -75,11 +75,3 @@ def count_measured(folder: Path) -> int:
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
         assert run(["measure", str(folder / "project.toml")]) in (0, 1)
     return results(folder) - before
-
-
-def results(folder: Path) -> int:
-    path = folder / "out" / "measurement.db"
-    if not path.exists():
-        return 0
-    with sqlite3.connect(path) as db:
-        return int(db.execute("select count(*) from result").fetchone()[0])

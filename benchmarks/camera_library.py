@@ -15,42 +15,13 @@ import math
 import sys
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.mark_drawings import (
-    ALIKE_CORNERS,
-    ALIKE_SIDES,
-    CHECK,
-    CORNERS,
-    CURVED_FLAT,
-    EACH_SIDE,
-    EIGHT,
-    GALLERY,
-    KC6A,
-    KC6A_SIDES,
-    LEARNED,
-    NOTCHES,
-    OTHER_WINGS,
-    PARK,
-    RMK,
-    RMK_EIGHT,
-    SIDES,
-    SMALL_FLAT,
-    T5,
-    T11_NOTCH,
-    T12_CROSS,
-    T12_NOTCH,
-    TALL_FLAT,
-    WILD_ALL_PLAIN,
-    WILD_PLAIN,
-    WILD_RING,
-    WILD_RING_SIDES,
-    WINGS,
-)
+from benchmarks.camera_kinds import CORNERS, KINDS, LEARNED, SIDES, Kind
 from measure.noise.robust_estimation import SIGMA_OF_DEVIATION
 
 # Numbers of the marks as in the reports of the US Geological Survey, x' to the right and y' up. Their form, as in
@@ -90,39 +61,6 @@ class Report:
 
 
 @dataclass(frozen=True)
-class Kind:
-    """Type of camera: its models in the reports, and data that the reports lack.
-
-    A type may stand for some cameras of a model only, those with such marks.
-
-    Attributes
-    ----------
-    cones_mm : nominal focal lengths.
-    gate_mm : larger deviations from the median mean another type of mark or a typing error.
-    sigma_mm : of coordinates with too few reports for a spread.
-    shape : source of the drawings, in words.
-    separated : whether the places of the marks are computed from their separations.
-    drawn : by place, which of the drawings `marks` its mark has.
-    writing : line on the places where the camera writes, if known.
-    """
-
-    file: str
-    title: str
-    models: tuple[str, ...]
-    cones_mm: tuple[int, ...]
-    frame_mm: float
-    places: tuple[str, ...]
-    gate_mm: float
-    sigma_mm: float
-    shape: str
-    separated: bool = False
-    drawn: Mapping[str, str] = field(default_factory=dict)
-    marks: Mapping[str, str] = field(default_factory=dict)
-    notes: tuple[str, ...] = field(default=())
-    writing: str = ""
-
-
-@dataclass(frozen=True)
 class TypicalMark:
     """Typical mark: median of a number of reports. spread: whether sigma_mm is the spread of the reports."""
 
@@ -148,78 +86,10 @@ class TypicalMark:
         return [*lines, f'mark = "{name}"' + ("" if name != "none" else " " * 27 + "# its shape is not known")]
 
 
-BY_FORM = 'writing = ["left"]                       # as the form of the reports has it (OSL/1785)'
-OF_WILD = (
-    'writing = ["left: reads upward", "right: plate reads downward"]   '
-    "# side: the reports' form (OSL/1785); direction: frames of 1968 to 1997"
-)
-OF_ZEISS = 'writing = ["left: reads upward"]         # side: the reports\' form (OSL/1785); direction: a frame of 1979'
 LEARNED_NOTE = (
     "# They are learned from the scans, from what recurs in all of them or from clicks in one; or draw them. A learned",
     "# mark lies off the reported one by as much as its template does, and its sigma grows by that.",
 )
-OLD_WILD = "the corners: from two Wild frames of 1968 and 1972 that do not name their model"
-NEW_WILD = "the corners: from three Wild frames of 1985 to 1997 that do not name their model"
-UNKNOWN = "not known"
-NO_PICTURE = "not known, for sPyMicMac's gallery of fiducial patterns has no picture of such marks"
-T11_OR_T12 = (
-    "T-11 and T-12 have the same notches on three sides. The left one, larger in the picture of a T-11, does not tell",
-    "the two apart: a T-12 of 1968 has the T-11's. Where the left mark is not found, try the other file.",
-)
-K17 = ("K-17", "K-17 (modified)", "K-17B", "K-17B (modified)", "K-17C (modified)")
-KINDS = (
-    Kind("wild-rc5", "Wild RC5", ("RC5", "RC5A", "RC5/8"), (153,), 228.0, CORNERS, 0.3, 0.01, OLD_WILD, False,
-         ALIKE_CORNERS, WILD_PLAIN, writing=OF_WILD),
-    Kind("wild-rc8", "Wild RC8", ("RC8",), (153,), 228.0, CORNERS + SIDES, 0.3, 0.01, OLD_WILD, False,
-         ALIKE_CORNERS, WILD_PLAIN, writing=OF_WILD),
-    Kind("wild-rc9", "Wild RC9", ("RC9",), (88,), 228.0, CORNERS, 0.3, 0.01, OLD_WILD, False, ALIKE_CORNERS, WILD_PLAIN,
-         writing=BY_FORM),
-    Kind("wild-rc10", "Wild RC10", ("RC10", "RC10A", "RC10A*"), (88, 153, 214, 305), 228.0, CORNERS + SIDES, 0.3,
-         0.01, NEW_WILD, False, ALIKE_CORNERS, WILD_RING,
-         ("Eleven reports, rejected here, have the side marks at 112.5 mm.",), writing=OF_WILD),
-    Kind("wild-rc30", "Wild RC30", ("RC30",), (153,), 228.0, CORNERS + SIDES, 0.3, 0.01, NEW_WILD, False,
-         ALIKE_CORNERS, WILD_RING),
-    Kind("zeiss-rmk-a", "Zeiss RMK A",
-         ("RMK A 8.5/23", "RMK A 15/23", "RMK 15/23", "RMK AR 15/23", "RMK A 21/23", "RMK A 30/23", "RMK 30/23",
-          "RMK AR 30/23"), (86, 153, 209, 305), 234.0, CORNERS + SIDES, 0.5, 0.02,
-         "the sides: from a frame of 1978 with four notches 226 mm apart", False, ALIKE_SIDES, RMK,
-         ("Many cameras have no corner marks; seven reports, rejected here, have them at 105.0 mm.",
-          "The frame of 1978 ends 117 mm from the middle, 4 mm beyond its notches."), writing=OF_ZEISS),
-    Kind("zeiss-rmk-top", "Zeiss RMK TOP", ("RMK TOP",), (153, 305), 230.0, CORNERS + SIDES, 0.3, 0.02, NO_PICTURE),
-    Kind("jena-lmk", "Jena LMK", ("LMK",), (153,), 228.0, CORNERS + SIDES, 0.3, 0.01, NO_PICTURE, writing=BY_FORM),
-    Kind("fairchild-k17", "Fairchild K-17", K17, (153, 210, 305), 228.6, SIDES, 2.0, 0.2, UNKNOWN, True),
-    Kind("fairchild-t11", "Fairchild T-11", ("T-11",), (153,), 228.6, SIDES, 2.0, 0.1, UNKNOWN),
-    Kind("fairchild-t12", "Fairchild T-12", ("T-12", "T-12A"), (152,), 228.6, SIDES, 1.5, 0.1, UNKNOWN, notes=(
-        "Corner marks, where there are any, lie anywhere from 105.6 to 116.3 mm: none are given.",
-        "Seven reports, rejected here, have the side marks at 110 mm.")),
-    Kind("fairchild-kc1", "Fairchild KC-1", ("KC-1", "KC-1A", "KC-1B"), (153,), 228.6, SIDES, 1.0, 0.1, NO_PICTURE),
-    Kind("fairchild-kc6a", "Fairchild KC-6A", ("KC-6A",), (152,), 228.6, SIDES, 1.0, 0.1, GALLERY, False, KC6A_SIDES,
-         KC6A),
-    Kind("wild-rc8-eight", "Wild RC8 with plain side crosses", ("RC8",), (153,), 228.0, CORNERS + SIDES, 0.3, 0.01,
-         f"{OLD_WILD}; the sides: {GALLERY}", False, EIGHT, WILD_ALL_PLAIN, writing=OF_WILD),
-    Kind("wild-rc10-eight", "Wild RC10 with plain corners and ringed sides", ("RC10", "RC10A", "RC10A*"),
-         (88, 153, 214, 305), 228.0, CORNERS + SIDES, 0.3, 0.01, f"{OLD_WILD}; the sides: {GALLERY}", False, EIGHT,
-         WILD_RING_SIDES, writing=OF_WILD),
-    Kind("zeiss-rmk-a-eight", "Zeiss RMK A with corner crosses", ("RMK A 15/23", "RMK 15/23", "RMK AR 15/23"), (153,),
-         234.0, CORNERS + SIDES, 0.5, 0.02, f"the sides: from a frame of 1978; the corners: {GALLERY}", False, EIGHT,
-         RMK_EIGHT, writing=OF_ZEISS),
-    Kind("park", "Park with ringed crosses", ("Park",), (153,), 228.6, CORNERS + SIDES, 0.5, 0.03, GALLERY, False,
-         EIGHT, PARK),
-    Kind("fairchild-t5", "Fairchild T-5", ("T-5",), (153,), 229.8, SIDES, 2.0, 0.2, GALLERY, True, EACH_SIDE, T5),
-    Kind("fairchild-t11-notch", "Fairchild T-11 with notches", ("T-11",), (153,), 228.6, SIDES, 2.0, 0.1, GALLERY,
-         False, NOTCHES, T11_NOTCH, T11_OR_T12),
-    Kind("fairchild-t11-check", "Fairchild T-11 with checked squares", ("T-11",), (153,), 228.6, SIDES, 2.0, 0.1,
-         GALLERY, False, ALIKE_SIDES, CHECK),
-    Kind("fairchild-t12-notch", "Fairchild T-12 with notches", ("T-12", "T-12A"), (152,), 228.6, SIDES, 1.5, 0.1,
-         GALLERY, False, NOTCHES, T12_NOTCH, T11_OR_T12),
-    Kind("fairchild-t12-cross", "Fairchild T-12 with crosses", ("T-12", "T-12A"), (152,), 228.6, SIDES, 1.5, 0.1,
-         GALLERY, False, ALIKE_SIDES, T12_CROSS),
-    *(Kind(f"fairchild-k17-{name}", f"Fairchild K-17, {words} wings", K17, (153, 210, 305), 228.6, SIDES, 2.0, 0.2,
-           GALLERY, True, sides, marks)
-      for name, words, sides, marks in (("small-flat", "small flat", OTHER_WINGS, SMALL_FLAT),
-                                        ("tall-flat", "tall flat", WINGS, TALL_FLAT),
-                                        ("curved-flat", "curved and flat", WINGS, CURVED_FLAT))),
-)  # fmt: skip
 
 
 def main() -> None:

@@ -11,11 +11,7 @@ With several seeds, each has its own sub-folder.
 
 import csv
 import json
-import resource
-import subprocess
 import sys
-import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +20,7 @@ from numpy.typing import NDArray
 
 import synthetic_images
 from adjust.initial_values.model_formation import absolute_orientation
+from benchmarks.harness import reseau, rms
 from pipeline.blocks.mapping import quiet_colmap
 from pipeline.rendered.scene_file import read_scene, render_project
 from pipeline.results.comparator_file import comparator_from_pixel
@@ -104,25 +101,19 @@ def one_block(folder: Path, seed: int) -> None:
     if not comparator.exists():
         project.write_text(PROJECT, encoding="utf-8")
         give_control(folder, scene, seed)
-        reseau("measure", str(project))
+        run_timed("measure", project)
         click_control(comparator, scene, seed)
-    print(reseau("block", str(project), str(folder / "block")))
+    print(run_timed("block", project, folder / "block"))
     adjustment = json.loads((folder / "block" / "out" / "adjustment.json").read_text(encoding="utf-8"))
     tell(adjustment, scene)
     tell_alone(folder / "block", scene)
 
 
-def reseau(*arguments: str) -> str:
+def run_timed(command: str, *arguments: object) -> str:
     """Run a command and print its time; returns its output."""
-    start, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
-    command = [str(Path(sys.executable).with_name("reseau")), *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    print(f"reseau {arguments[0]}: exit code {done.returncode}, {cpu:.0f} s of CPU in {time.monotonic() - start:.0f} s")
-    if done.returncode not in (0, 1):
-        sys.exit(done.stderr)
-    return done.stdout
+    done = reseau(command, *arguments)
+    print(f"reseau {command}: exit code {done.code}, {done.cpu_seconds:.0f} s of CPU in {done.seconds:.0f} s")
+    return done.out
 
 
 def rendered(folder: Path, seed: int) -> Scene:
@@ -187,15 +178,6 @@ def click_control(comparator: Path, scene: Scene, seed: int) -> None:
     comparator.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-@dataclass(frozen=True)
-class Errors:
-    """Errors (n,) of a quantity and their standard deviations (n,)."""
-
-    name: str
-    error: Array
-    sigma: Array
-
-
 def tell(adjustment: dict[str, Any], scene: Scene) -> None:
     """Print the errors of orientations, lens and fiducials against the true values."""
     truth = {image.name: np.array(image.exterior) for image in scene.images}
@@ -207,17 +189,15 @@ def tell(adjustment: dict[str, Any], scene: Scene) -> None:
         off = np.array([unit * own["value"] for own in stored]) - [truth[name][number] for name in images]
         if number >= 3:
             off = (off + np.pi) % (2.0 * np.pi) - np.pi
-        rows.append(Errors(element, off, np.array([unit * own["sigma"] for own in stored])))
+        rows.append((element, off, np.array([unit * own["sigma"] for own in stored])))
     groups = {name: round(group["sigma0"], 3) for name, group in adjustment["groups"].items() if group["sigma0"]}
     print(f"sigma0 {adjustment['sigma0']:.3f}, redundancy {adjustment['redundancy']}, of groups {groups}")
     print(f"{'element':10} {'rms error':>12} {'rms sigma':>12} {'error/sigma':>12}   (m, urad)")
-    for row in rows:
-        unit = 1e6 if row.name.endswith("deg") else 1.0
-        rms, sigma = (unit * float(np.sqrt((each**2).mean())) for each in (row.error, row.sigma))
-        ratio = float(np.sqrt(((row.error / row.sigma) ** 2).mean()))
-        print(f"{row.name:10} {rms:12.4f} {sigma:12.4f} {ratio:12.3f}")
-    ratios = np.concatenate([row.error / row.sigma for row in rows])
-    print(f"all orientation elements: error over sigma {np.sqrt((ratios**2).mean()):.3f}")
+    for element, off, sigma in rows:
+        unit = 1e6 if element.endswith("deg") else 1.0
+        print(f"{element:10} {unit * rms(off):12.4f} {unit * rms(sigma):12.4f} {rms(off / sigma):12.3f}")
+    ratios = np.concatenate([off / sigma for _, off, sigma in rows])
+    print(f"all orientation elements: error over sigma {rms(ratios):.3f}")
     camera, (own,) = scene.camera, adjustment["cameras"].values()
     point, lens = own["principal_point_mm"], own["distortion"]
     quantities = {"c": own["principal_distance_mm"], "x0": point["x"], "y0": point["y"]}
@@ -231,7 +211,7 @@ def tell(adjustment: dict[str, Any], scene: Scene) -> None:
         for mark in camera.fiducials
         for axis, value in zip("xy", mark.xy_mm, strict=True)
     ]
-    print(f"fiducials: rms {np.sqrt(np.mean(np.square(worst))):.2f}, at most {max(worst):.2f} sigmas")
+    print(f"fiducials: rms {rms(worst):.2f}, at most {max(worst):.2f} sigmas")
     ties = [point for id, point in adjustment["points"].items() if id.startswith("tie-")]
     ground = np.array([[point[axis]["value"] for axis in "XYZ"] for point in ties])
     tell_ground("ground", ground, scene)
@@ -239,7 +219,7 @@ def tell(adjustment: dict[str, Any], scene: Scene) -> None:
 
 def tell_ground(name: str, points: Array, scene: Scene) -> None:
     above = points[:, 2] - scene_terrain(scene).heights(points[:, :2])
-    print(f"{name}: {np.mean(above):+.3f} m, rms {np.sqrt(np.mean(above**2)):.3f} m beside the terrain")
+    print(f"{name}: {np.mean(above):+.3f} m, rms {rms(above):.3f} m beside the terrain")
 
 
 def tell_alone(folder: Path, scene: Scene) -> None:
@@ -262,9 +242,8 @@ def tell_alone(folder: Path, scene: Scene) -> None:
     for name, own in zip(poses, turns, strict=True):
         rotation = np.diag([1.0, -1.0, -1.0]) @ own @ found.rotation.T
         angles.append(np.arccos(np.clip((np.trace(rotation @ object_rotation(*truth[name][3:]).T) - 1.0) / 2.0, -1, 1)))
-    plan, height = (float(np.sqrt((part**2).mean())) for part in (off[:, :2], off[:, 2]))
-    print(f"COLMAP alone, {len(poses)} images laid on the true stations: rms {plan:.3f} m in plan, {height:.3f} m in "
-          f"height, {1e6 * np.sqrt(np.mean(np.square(angles))):.0f} urad")  # fmt: skip
+    errors = f"rms {rms(off[:, :2]):.3f} m in plan, {rms(off[:, 2]):.3f} m in height, {1e6 * rms(angles):.0f} urad"
+    print(f"COLMAP alone, {len(poses)} images laid on the true stations: {errors}")
     tell_ground("  its ground", found.apply(np.array([each.xyz for each in model.points3D.values()])), scene)
     pitch_mm = read_pitch(folder)
     focal_px = np.mean([camera.mean_focal_length() for camera in model.cameras.values()])

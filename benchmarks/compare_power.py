@@ -1,20 +1,20 @@
 """Significance level and power of the drift test `adjust.quality.lens_comparison`: equal calibrations, and ones that
-differ by 2, 3, 5 sigmas.
+differ by 2, 3, 5 joint sigmas.
 
-    python -m benchmarks compare_power [pairs] [--series | --adjustment]
-
---series: four calibrations with a linear change of c. --adjustment: the test of an adjustment against an earlier
-calibration as observations, with `pairs` of simulated networks each.
+Rates of drift in pairs of calibrations; with --series, of drift and of a significant trend in four calibrations with a
+linear change of c; with --adjustment, of an adjustment contradicted by an earlier calibration as observations. The
+change of k5 is beyond what k3 takes up.
 """
 
-import sys
-from pathlib import Path
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
+from test_lens_comparison import contradicted
 
 from adjust.functional_model.lens import Distortion, Lens
 from adjust.quality.lens_comparison import CameraCalibration, compare
+from benchmarks.harness import Row
 
 Array = NDArray[np.float64]
 
@@ -48,52 +48,34 @@ def draw_camera(rng: np.random.Generator, change: Array) -> CameraCalibration:
     return CameraCalibration("K", Lens(Distortion("torlegard"), values[:3], values[3:]), marks, covariance(), 5000)
 
 
-def share(rng: np.random.Generator, change: Array, pairs: int) -> float:
-    same = (
-        compare([draw_camera(rng, 0 * change), draw_camera(rng, change)], HALF).same.probability for _ in range(pairs)
-    )
-    return float(np.mean([probability < LEVEL for probability in same]))
+COLUMNS = {"quantity": "", "sigmas": "g", "drift": ".3f", "trend": ".3f"}
+SEED = 9
 
 
-def main(pairs: int = 300) -> None:
-    rng = np.random.default_rng(9)
-    print(f"{pairs} pairs each, at a level of {LEVEL:.0%}")
-    print(f"alike: {share(rng, np.zeros(len(NAMES)), pairs):.3f}")
-    print("changed by | c | k5, beyond what k3 takes up")
-    alone = np.sqrt(1 - TIED[3, 4] ** 2)
-    for sigmas in (2.0, 3.0, 5.0):
-        c, k5 = np.zeros(len(NAMES)), np.zeros(len(NAMES))
-        c[0], k5[4] = sigmas * np.sqrt(2) * SIGMAS[0], sigmas * np.sqrt(2) * alone * SIGMAS[4]
-        print(f"{sigmas:g} joint sigmas | {share(rng, c, pairs):.2f} | {share(rng, k5, pairs):.2f}")
+def cells() -> Iterator[Row]:
+    yield {"quantity": "none", "sigmas": 0.0}
+    yield from ({"quantity": quantity, "sigmas": sigmas} for sigmas in (2.0, 3.0, 5.0) for quantity in ("c", "k5"))
 
 
-def print_series(count: int = 300) -> None:
-    """Print the rates of drift and of a significant trend; changes are from the first calibration to the last."""
-    rng = np.random.default_rng(10)
-    for sigmas in (0.0, 2.0, 3.0, 5.0):
-        change = np.zeros(len(NAMES))
-        change[0] = sigmas * np.sqrt(2) * SIGMAS[0] / np.ptp(YEARS)
-        series = [
-            compare([draw_camera(rng, change * (year - YEARS[0])) for year in YEARS], HALF, YEARS) for _ in range(count)
-        ]
-        result = np.mean([each.probability < LEVEL for each in series])
-        trends = np.mean([each.trend is not None and each.trend.probability < LEVEL for each in series])
-        print(f"c changes by {sigmas:g} joint sigmas: drift {result:.3f}, trend {trends:.3f}", flush=True)
-
-
-def print_adjustments(pairs: int = 200) -> None:
-    sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "adjust"))
-    from test_lens_comparison import contradicted
-
-    for sigmas in (0.0, 2.0, 3.0, 5.0):
-        print(f"c changed by {sigmas:g} joint sigmas: {contradicted(sigmas, pairs, LEVEL):.3f}", flush=True)
-
-
-if __name__ == "__main__":
-    given = [int(word) for word in sys.argv[1:] if word.isdigit()]
-    if "--adjustment" in sys.argv:
-        print_adjustments(*given)
-    elif "--series" in sys.argv:
-        print_series(*given)
+def case(
+    quantity: str, sigmas: float, seed: int, pairs: int = 300, series: bool = False, adjustment: bool = False
+) -> Row:
+    if adjustment:
+        return {"drift": contradicted(sigmas, pairs, LEVEL)} if quantity != "k5" else {}
+    rng, change = np.random.default_rng(seed), np.zeros(len(NAMES))
+    if quantity == "k5":
+        change[4] = sigmas * np.sqrt(2) * np.sqrt(1 - TIED[3, 4] ** 2) * SIGMAS[4]
     else:
-        main(*given)
+        change[0] = sigmas * np.sqrt(2) * SIGMAS[0]
+    years = YEARS if series else YEARS[[0, -1]]
+    of_year = (years - years[0]) / np.ptp(years)
+    found = [
+        compare([draw_camera(rng, change * part) for part in of_year], HALF, years if series else None)
+        for _ in range(pairs)
+    ]
+    drift = np.mean([(each if series else each.same).probability < LEVEL for each in found])
+    return {"drift": drift} | (
+        {"trend": np.mean([each.trend is not None and each.trend.probability < LEVEL for each in found])}
+        if series
+        else {}
+    )

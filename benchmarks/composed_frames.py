@@ -1,27 +1,22 @@
 """Notches, blocks, curves and triangles of real cameras: templates learned, found in any pose and measured.
 
-python -m benchmarks composed_frames MARKS_FOLDER OUT.jsonl [--frames 8] [--first 0]
-
-A folder of four crops (L, T, R, B) is one camera. Frames are composed from them: each crop at its side of a textured
-square, its background (above Otsu's threshold) replaced by another, averaged over a few pixels with a different offset
-in each frame, so that the marks shift by known fractions of a pixel. Templates are learned from three frames, then a
-fourth is measured with unknown pose: in all eight poses in turn, with backgrounds as light as in the learned frames or
-not, and with the origins of the marks at the centres of the crops or off them.
-
-A line per frame is appended to OUT.jsonl, and frames already in it are skipped; then all its lines are summarised.
+A folder of four crops (L, T, R, B) within --marks is one camera. Frames are composed from them: each crop at its side
+of a textured square, its background (above Otsu's threshold) replaced by another, averaged over a few pixels with a
+different offset in each frame, so that the marks shift by known fractions of a pixel. Templates are learned from three
+frames, then a fourth is measured with unknown pose: in all eight poses in turn, with backgrounds as light as in the
+learned frames or not, and with the origins of the marks at the centres of the crops or off them.
 """
 
-import argparse
-import json
+from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.search import OUTCOMES, POSE_OUTCOMES, judge_case, lines, print_table
+from benchmarks.harness import Row
+from benchmarks.search import OUTCOMES, POSE_OUTCOMES, counts, judge_case
 from benchmarks.search_frames import Case
 from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import FiducialLayout, LayoutMark
@@ -44,23 +39,16 @@ LANDSCAPES_DN = ((150, 150), (245, 245), (200, 200), (150, 200), (200, 245), (15
 OFF_PX = (0, 5)  # px, offsets of the origins from the crops' centres, used in turn
 
 
-def main() -> None:
-    """Measure the missing frames, and print the outcomes of all."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("marks", type=Path)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--frames", type=int, default=8)
-    parser.add_argument("--first", type=int, default=0)
-    given = parser.parse_args()
-    cameras = find_cameras(given.marks)
-    done = {(line["kind"], line["frame"]) for line in lines(given.out)}
-    for index in range(given.first, given.first + given.frames):
-        for number, name in enumerate(cameras):
-            if (name, index) not in done:
-                line = judge_case(draw_case(given.marks / name, index, index + number))
-                with given.out.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps({"frame": index, **line, "kind": name}) + "\n")
-    tell(lines(given.out), cameras)
+def cells(marks: Path, frames: int = 8, first: int = 0) -> Iterator[Row]:
+    for frame in range(first, first + frames):
+        yield from (
+            {"marks": marks, "camera": name, "frame": frame, "turn": frame + number}
+            for number, name in enumerate(find_cameras(marks))
+        )
+
+
+def case(marks: Path, camera: str, frame: int, turn: int) -> Row:
+    return {**judge_case(draw_case(marks / camera, frame, turn)), "kind": camera}
 
 
 def find_cameras(marks: Path) -> list[str]:
@@ -162,16 +150,10 @@ def make_scan(name: str, grey: NDArray[np.uint8]) -> Scan:
     return Scan(Path(name), WholePicture(grey[..., None]), NO_TAGS)
 
 
-def tell(done: list[dict[str, Any]], cameras: list[str]) -> None:
-    pictures = sorted({line["picture"] for line in done})
-    print_table("pose", "kind", cameras, "pose", POSE_OUTCOMES, done)
-    print_table("pose, learned beside", "picture", pictures, "pose", POSE_OUTCOMES, done)
-    print_table("marks", "kind", cameras, "outcome", OUTCOMES, done)
-    for title, key in (("pose", "pose"), ("mark", "outcome")):
-        print(
-            f"frames with a wrong {title}: {[(line['kind'], line['frame']) for line in done if line[key] == 'WRONG']}"
-        )
-
-
-if __name__ == "__main__":
-    main()
+def report(rows: Sequence[Row]) -> Iterator[str]:
+    cameras, pictures = (sorted({row[key] for row in rows}) for key in ("kind", "picture"))
+    yield from counts("kind", cameras, "pose", POSE_OUTCOMES, rows)
+    yield from counts("picture", pictures, "pose", POSE_OUTCOMES, rows)
+    yield from counts("kind", cameras, "outcome", OUTCOMES, rows)
+    for key in ("pose", "outcome"):
+        yield f"frames with a wrong {key}: {[(row['kind'], row['frame']) for row in rows if row[key] == 'WRONG']}"

@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 
 import synthetic_images
 from adjust.problem.parameter import Parameter
+from benchmarks.harness import table
 from pipeline.design.expected import INTERIOR, UM_PER_MM, alone, expect, gains, rms
 from pipeline.design.sweeps import Swept, Variations, over_layouts, sweep
 from pipeline.rendered.scene_tables import Sweep
@@ -264,9 +265,8 @@ def tables(folder: Path) -> str:
 
 def markdown(heads: Sequence[str], rows: Iterable[Row]) -> str:
     """Markdown table; numbers to two digits, a dash for undetermined ones."""
-    lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
-    lines += ["| " + " | ".join(_cell(cell) for cell in cells) + " |" for cells in rows]
-    return "\n".join(lines) + "\n"
+    lines = (dict(zip(heads, map(_cell, row), strict=True)) for row in rows)
+    return "\n".join(table(dict.fromkeys(heads, ""), lines)) + "\n"
 
 
 def _cell(cell: str | float) -> str:
@@ -279,19 +279,12 @@ def _cell(cell: str | float) -> str:
 
 def draw_study(path: Path, title: str, rows: list[tuple[str, list[float]]]) -> None:
     """Plot the standard deviations over the quantity of a table."""
-    figure, axes = _figure()
     places = np.arange(len(rows))
-    for k, head in enumerate(HEADS):
-        values = [values[k] if math.isfinite(values[k]) else math.nan for _, values in rows]
-        axes.plot(places, values, marker="o", markersize=4, label=head)
-    axes.set_yscale("log")
+    axes = _draw(places, {head: [values[k] for _, values in rows] for k, head in enumerate(HEADS)})
+    axes.set(yscale="log", xlabel=title)
     axes.yaxis.set_major_formatter("{x:g}")
     axes.set_xticks(places, [words for words, _ in rows])
-    axes.set_xlabel(title)
-    axes.set_ylabel("expected sigma, µm")
-    axes.grid(visible=True, which="both", color="0.9")
-    axes.legend(frameon=False, fontsize=8)
-    figure.savefig(path)
+    _save(path, axes)
 
 
 def juhl(folder: Path) -> str:
@@ -333,44 +326,42 @@ def _fourth(scene: Variations) -> dict[str, Any]:
 
 
 def _draw_points(path: Path, swept: Swept) -> None:
-    figure, axes = _figure()
     counts = np.array([float(step.value) for step in swept.steps])
-    for name in PAPER_UM:
-        axes.plot(counts, [step.sigmas.mean[name] for step in swept.steps], marker="o", markersize=4, label=name)
+    axes = _draw(counts, {name: [step.sigmas.mean[name] for step in swept.steps] for name in PAPER_UM})
     first = swept.steps[0].sigmas.mean["t1"]
     for slope, style in ((-0.5, ":"), (-0.62, "--")):
         axes.plot(counts, 1.8 * first * (counts / counts[0]) ** slope, style, color="0.5", label=f"slope {slope}")
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    axes.set_xticks(counts, [f"{count:g}" for count in counts])
-    axes.set_xticks([], minor=True)
-    axes.set_yticks([0.3, 0.5, 1.0, 2.0, 3.0], ["0.3", "0.5", "1", "2", "3"])
-    axes.set_yticks([], minor=True)
-    axes.set_xlabel("number of points")
-    axes.set_ylabel("expected sigma, µm")
-    axes.grid(visible=True, color="0.9")
-    figure.legend(frameon=False, fontsize=8, ncols=6, loc="outside upper center")
-    figure.savefig(path)
+    axes.set(xscale="log", yscale="log", xlabel="number of points")
+    for axis, places in ((axes.xaxis, counts), (axes.yaxis, np.array([0.3, 0.5, 1.0, 2.0, 3.0]))):
+        axis.set_ticks(places, [f"{place:g}" for place in places])
+        axis.set_ticks([], minor=True)
+    _save(path, axes)
 
 
 def _draw_heights(path: Path, swept: Swept) -> None:
-    figure, axes = _figure()
     per_mille = [1000 * float(step.value) / 1500 for step in swept.steps]
-    for name in ("r1", "r2", "t1", "af"):
-        axes.plot(per_mille, [step.sigmas.mean[name] for step in swept.steps], marker="o", markersize=4, label=name)
+    curves = {name: [step.sigmas.mean[name] for step in swept.steps] for name in ("r1", "r2", "t1", "af")}
+    axes = _draw(per_mille, curves)
     axes.axvline(0.05, color="0.5", linestyle=":", label='0.05 ‰, the paper\'s "maybe"')
-    axes.set_xlabel("standard deviation of the heights, ‰ of the flying height")
-    axes.set_ylabel("expected sigma, µm")
-    axes.set_ylim(bottom=0.0)
-    axes.grid(visible=True, color="0.9")
-    axes.legend(frameon=False, fontsize=8)
-    figure.savefig(path)
+    axes.set(xlabel="standard deviation of the heights, ‰ of the flying height", ylim=(0.0, None))
+    _save(path, axes)
 
 
-def _figure() -> tuple[Figure, Axes]:
+def _draw(places: Sequence[float] | np.ndarray[Any, Any], curves: dict[str, list[float]]) -> Axes:
+    """Axes with standard deviations over a quantity; those not determined are left out."""
     figure = Figure(figsize=(6.0, 4.0), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
-    return figure, figure.add_subplot()
+    axes = figure.add_subplot()
+    for name, values in curves.items():
+        axes.plot(places, np.where(np.isfinite(values), values, np.nan), marker="o", markersize=4, label=name)
+    axes.set_ylabel("expected sigma, µm")
+    axes.grid(visible=True, which="both", color="0.9")
+    return axes
+
+
+def _save(path: Path, axes: Axes) -> None:
+    axes.figure.legend(frameon=False, fontsize=8, ncols=6, loc="outside upper center")
+    axes.figure.canvas.print_figure(path)
 
 
 def main() -> None:

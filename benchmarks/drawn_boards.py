@@ -1,7 +1,5 @@
 """Boards of nine kinds, drawn by OpenCV's generators and imaged by a known lens: corners compared with OpenCV's.
 
-    python -m benchmarks drawn_boards
-
 Three tilted images of 640 x 480 px per kind, with 5 % radial distortion at the corner, a blur of 0.7 px and noise of 2
 grey values. OpenCV's function for each kind is used with its customary settings, as in `reseau check`.
 """
@@ -16,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from benchmarks.harness import Row, rms
 from measure.boards.measure import measure_board
 from measure.boards.specs import (
     AprilGridSpec,
@@ -54,7 +53,7 @@ class Case:
     cut_px: int = 0
 
 
-def cases() -> Iterator[Case]:
+def drawings() -> Iterator[Case]:
     chess = ChessboardSpec(9, 6, 20.0)
     yield Case("chessboard 9 x 6", chess, _squares(chess), (-20.0, 120.0))
     yield Case("the same, two columns outside of the picture", chess, _squares(chess), (-20.0, 120.0), cut_px=150)
@@ -82,25 +81,38 @@ def cases() -> Iterator[Case]:
     yield Case("asymmetric circle grid 4 x 11", staggered, _circles(staggered), (-18.0, 198.0))
 
 
-def main() -> None:
-    print("| board | points | this program | rms px | largest px | OpenCV | rms px | largest px |")
-    print("|---|---|---|---|---|---|---|---|")
-    for case in cases():
-        own, other, shown = [], [], 0
-        for number in range(len(TURNS)):
-            picture, truth = photographed(case, number)
-            height, width = picture.shape
-            visible = {name: at for name, at in truth.items() if 3 < at[0] < width - 4 and 3 < at[1] < height - 4}
-            shown += len(visible)
-            scan = Scan(Path("drawn"), WholePicture(picture[:, :, None], 1.0), Pitch(None))
-            marks = measure_board(scan, case.spec).marks
-            own += [np.asarray(mark.center_px) - truth[mark.point] for mark in marks if mark.status.is_observation]
-            places = np.array(list(visible.values()))
-            found = found_by_opencv(picture, case.spec)
-            if len(found):
-                far, nearest = KDTree(places).query(found)
-                other += list((found - places[nearest])[np.asarray(far) < NEAR_PX])
-        print(f"| {case.name} | {shown} | {_figures(own)} | {_figures(other)} |")
+COLUMNS = {
+    "board": "", "points": "d", "this program": "d", "rms_px": ".3f", "largest_px": ".3f", "OpenCV": "d",
+    "opencv_rms_px": ".3f", "opencv_largest_px": ".3f",
+}  # fmt: skip
+
+
+def cells() -> Iterator[Row]:
+    yield from ({"board": each.name} for each in drawings())
+
+
+def case(board: str) -> Row:
+    drawing = next(each for each in drawings() if each.name == board)
+    own, other, shown = [], [], 0
+    for number in range(len(TURNS)):
+        picture, truth = photographed(drawing, number)
+        height, width = picture.shape
+        visible = {name: at for name, at in truth.items() if 3 < at[0] < width - 4 and 3 < at[1] < height - 4}
+        shown += len(visible)
+        scan = Scan(Path("drawn"), WholePicture(picture[:, :, None], 1.0), Pitch(None))
+        marks = measure_board(scan, drawing.spec).marks
+        own += [np.asarray(mark.center_px) - truth[mark.point] for mark in marks if mark.status.is_observation]
+        places = np.array(list(visible.values()))
+        found = found_by_opencv(picture, drawing.spec)
+        if len(found):
+            far, nearest = KDTree(places).query(found)
+            other += list((found - places[nearest])[np.asarray(far) < NEAR_PX])
+    row: dict[str, float] = {"points": shown, "this program": len(own), "OpenCV": len(other)}
+    for name, errors in (("", own), ("opencv_", other)):
+        if errors:
+            far = np.hypot(*np.array(errors).T)
+            row |= {f"{name}rms_px": rms(far), f"{name}largest_px": far.max()}
+    return row
 
 
 def photographed(case: Case, number: int) -> tuple[Bytes, dict[str, Array]]:
@@ -153,13 +165,6 @@ def found_by_opencv(picture: Bytes, spec: BoardSpec) -> Array:
     return find_points(picture, spec)
 
 
-def _figures(errors: list[Array]) -> str:
-    if not errors:
-        return "0 | | "
-    far = np.hypot(*np.array(errors).T)
-    return f"{len(far)} | {np.sqrt((far**2).mean()):.3f} | {far.max():.3f}"
-
-
 def _squares(spec: ChessboardSpec) -> Bytes:
     places = np.indices((spec.rows + 1, spec.columns + 1)).sum(axis=0) % 2
     side = round(spec.square_mm * PX_PER_MM)
@@ -187,7 +192,3 @@ def _april_grid(spec: AprilGridSpec) -> Bytes:
             marker = cv2.aruco.generateImageMarker(aruco_dictionary(spec.dictionary), number, side, borderBits=2)
             drawing[top + gap : top + gap + side, left + gap : left + gap + side] = marker
     return drawing
-
-
-if __name__ == "__main__":
-    main()

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Range = tuple[float, float]
 
-DUST_SNR, BLUR_PX = 20.0, 1.0
+DUST_SNR = 20.0
 BLUR_SPREAD = 0.05  # sigma of the logarithms of the blurs of a frame's marks
 FRAME_MM, AT_MM, PX_PER_MM, GIVEN_MM = 230.0, 106.0, 10.0, 0.005
 PLACED_PX, PLACED = 1.0, 1e-3  # standard deviations of a frame's placement: centre, px; rotation and scale

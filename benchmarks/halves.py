@@ -108,25 +108,17 @@ def listed(folder: Path, pitch_mm: float) -> list[Corners]:
 
 
 BOUGUET = "chessboards/bouguet/Image*.tif"
-SETS = {
-    "OpenCV left": BoardSet(
-        (640, 480), "opencv4", partial(measure_pattern, "chessboards/opencv/left[01]*.jpg", ChessboardSpec(9, 6, 25.0))
-    ),
-    "OpenCV right": BoardSet(
-        (640, 480), "opencv4", partial(measure_pattern, "chessboards/opencv/right[01]*.jpg", ChessboardSpec(9, 6, 25.0))
-    ),
-    "Bouguet left": BoardSet((640, 480), "opencv4", partial(published, "Calib_Results_left.mat")),
-    "Bouguet right": BoardSet((640, 480), "opencv4", partial(published, "Calib_Results_right.mat")),
-    "Bouguet, 25 pictures": BoardSet(
-        (640, 480), "opencv4", partial(measure_pattern, BOUGUET, ChessboardSpec(13, 12, 30.0))
-    ),
-    "BoofCV": BoardSet(
-        (640, 480), "opencv4", partial(measure_pattern, "circles/boofcv/*_Chess/frame*.jpg", ChessboardSpec(6, 4, 30.0))
-    ),
-    "carnd_34": BoardSet(
-        (1280, 960), "opencv5", partial(listed, DATA.parent / "reports" / "calibration" / "carnd_34", 0.01)
-    ),
+VGA: dict[str, Callable[[], Sequence[Corners]]] = {
+    "OpenCV left": partial(measure_pattern, "chessboards/opencv/left[01]*.jpg", ChessboardSpec(9, 6, 25.0)),
+    "OpenCV right": partial(measure_pattern, "chessboards/opencv/right[01]*.jpg", ChessboardSpec(9, 6, 25.0)),
+    "Bouguet left": partial(published, "Calib_Results_left.mat"),
+    "Bouguet right": partial(published, "Calib_Results_right.mat"),
+    "Bouguet, 25 pictures": partial(measure_pattern, BOUGUET, ChessboardSpec(13, 12, 30.0)),
+    "BoofCV": partial(measure_pattern, "circles/boofcv/*_Chess/frame*.jpg", ChessboardSpec(6, 4, 30.0)),
 }
+CARND = partial(listed, DATA.parent / "reports" / "calibration" / "carnd_34", 0.01)
+SETS = {name: BoardSet((640, 480), "opencv4", corners) for name, corners in VGA.items()}
+SETS |= {"carnd_34": BoardSet((1280, 960), "opencv5", CARND)}
 
 
 def cells() -> Iterator[dict[str, Any]]:

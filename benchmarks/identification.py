@@ -1,21 +1,21 @@
 """Identification of targets without orientation, by simulated frames: rates of correct, refused and wrong, and time.
 
-python -m benchmarks identification [--frames 50] [--points 20 100 500] [--shares 0 10 20] [--seed 1] [--unknown]
-
 Fields of 20, 100 and 500 points, planar (jittered lattice) and spatial (random in a box); frames from random directions
 and distances with random roll; 0, 10 or 20 % of the points missing and as many false marks; principal distance wrong by
-2 %, or unknown; radial distortion unknown; noise of 0.5 px.
+2 %, or unknown (--unknown: 0.6 to 4 frame diagonals); radial distortion unknown; noise of 0.5 px.
 """
 
-import argparse
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adjust.initial_values.pose import Pose
 from adjust.target_identification.naming import Names, name_marks
+from benchmarks.harness import Row
 
 Array = NDArray[np.float64]
 
@@ -86,33 +86,33 @@ def verdict(one: Frame, names: Names | str) -> str:
     return "right" if good >= 0.8 * (one.point >= 0).sum() else "few"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--frames", type=int, default=50)
-    parser.add_argument("--points", type=int, nargs="+", default=[20, 100, 500])
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--shares", type=int, nargs="+", default=[0, 10, 20], help="missing and false, percent")
-    parser.add_argument("--unknown", action="store_true", help="principal distances of 0.6 to 4 diagonals, not known")
-    options = parser.parse_args()
-    print("| points | field | missing, false | right | few named | refused | wrong | s of a core, median | longest |")
-    print("|---|---|---|---|---|---|---|---|---|")
-    for n in options.points:
-        for name, field in (("planar", planar), ("spatial", spatial)):
-            for percent in options.shares:
-                results, seconds = [], []
-                for index in range(options.frames):
-                    rng = np.random.default_rng([options.seed, n, name == "planar", percent, index])
-                    points = field(n, rng)
-                    zoom = np.exp(rng.uniform(*np.log(ZOOMS))) if options.unknown else 1.0
-                    one = frame(*points, percent / 100, rng, zoom)
-                    start = time.process_time()
-                    names = named(one, None if options.unknown else C_MM)
-                    seconds.append(time.process_time() - start)
-                    results.append(verdict(one, names))
-                counts = " | ".join(str(results.count(kind)) for kind in ("right", "few", "refused", "wrong"))
-                times = f"{np.median(seconds):.2f} | {max(seconds):.2f}"
-                print(f"| {n} | {name} | {percent} % | {counts} | {times} |", flush=True)
+OUTCOMES = ("right", "few", "refused", "wrong")
+COLUMNS = {
+    "count": "d",
+    "field": "",
+    "percent": "d",
+    **dict.fromkeys(OUTCOMES, "d"),
+    "median_s": ".2f",
+    "longest_s": ".2f",
+}
 
 
-if __name__ == "__main__":
-    main()
+def cells(points: tuple[int, ...] = (20, 100, 500), shares: tuple[int, ...] = (0, 10, 20)) -> Iterator[Row]:
+    """Numbers of points, fields, and per cent of missing points and false marks."""
+    for count, field, percent in product(points, ("planar", "spatial"), shares):
+        yield {"count": count, "field": field, "percent": percent}
+
+
+def case(count: int, field: str, percent: int, seed: int, frames: int = 50, unknown: bool = False) -> Row:
+    outcomes, seconds = [], []
+    for index in range(frames):
+        rng = np.random.default_rng([seed, count, field == "planar", percent, index])
+        points = (planar if field == "planar" else spatial)(count, rng)
+        zoom = np.exp(rng.uniform(*np.log(ZOOMS))) if unknown else 1.0
+        one = frame(*points, percent / 100, rng, zoom)
+        start = time.process_time()
+        names = named(one, None if unknown else C_MM)
+        seconds.append(time.process_time() - start)
+        outcomes.append(verdict(one, names))
+    counts = {each: outcomes.count(each) for each in OUTCOMES}
+    return {**counts, "median_s": np.median(seconds), "longest_s": max(seconds)}

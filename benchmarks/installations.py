@@ -1,13 +1,12 @@
 """Installation test of wheel and sdist in fresh environments, with the lowest versions that pyproject.toml allows and
 with the newest, on each Python. The demonstration is run, and then, with all extras, every command.
 
-    python -m benchmarks installations [--only wheel|sdist] [--versions lowest|newest] [PYTHON...]
+    python -m benchmarks installations [PYTHON...]
 
 PYTHON: interpreters; by default every python3.11 and newer on the PATH. The committed state is built. Each lower bound
 must be an existing version. Exit code 1 if anything fails.
 """
 
-import argparse
 import json
 import os
 import re
@@ -19,18 +18,20 @@ import time
 import tomllib
 import zipfile
 from collections.abc import Iterator, Sequence
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from urllib.request import HTTPCookieProcessor, build_opener
 
-ROOT = Path(__file__).parents[1]
+from benchmarks.harness import ROOT
+
 PACKAGES = ("reseau", "measure", "adjust", "compiled", "pipeline", "synthetic_images")
 NEWEST_MINOR = 30  # newest Python 3 searched for
 WITHOUT_ANSWER = {"http", "s3"}  # extras whose calls need a server
 LAST_LINES = 5  # lines printed of a failure
 
 
-def main(pythons: Sequence[str], kinds: Sequence[str], versions: Sequence[str]) -> int:
+def main(pythons: Sequence[str]) -> int:
     """Build, install and run; print a line for each installation."""
     problems = 0
     with TemporaryDirectory() as place:
@@ -44,13 +45,12 @@ def main(pythons: Sequence[str], kinds: Sequence[str], versions: Sequence[str]) 
         bounds.write_text("\n".join(lowest_versions()), encoding="utf-8")
         print("python | distribution | versions | demonstration | s | with all extras", flush=True)
         for python in pythons:
-            for kind in kinds:
-                for which in versions:
-                    environment = folder / "environment"
-                    line, failed = tried(python, built[kind], bounds if which == "lowest" else None, environment)
-                    problems += failed
-                    print(f"{read_version(python)} | {kind} | {which} | {line}", flush=True)
-                    shutil.rmtree(environment, ignore_errors=True)
+            for kind, which in product(("wheel", "sdist"), ("lowest", "newest")):
+                environment = folder / "environment"
+                line, failed = tried(python, built[kind], bounds if which == "lowest" else None, environment)
+                problems += failed
+                print(f"{read_version(python)} | {kind} | {which} | {line}", flush=True)
+                shutil.rmtree(environment, ignore_errors=True)
     return min(problems, 1)
 
 
@@ -172,12 +172,4 @@ def found_pythons() -> list[str]:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("pythons", nargs="*", metavar="PYTHON")
-    parser.add_argument("--only", choices=("wheel", "sdist"))
-    parser.add_argument("--versions", choices=("lowest", "newest"))
-    given = parser.parse_args()
-    kinds = [given.only] if given.only else ["wheel", "sdist"]
-    sys.exit(
-        main(given.pythons or found_pythons(), kinds, [given.versions] if given.versions else ["lowest", "newest"])
-    )
+    sys.exit(main(sys.argv[1:] or found_pythons()))

@@ -1,28 +1,25 @@
 """Frames scanned in halves: claimed against realised standard deviations, by many adjustments.
 
-    python -m benchmarks joins [--runs 200] [--pictures]
-
 Four frames of known points, each in two halves with separate film transformations, with new errors in each run (seeds
 from 0). --pictures: errors of measured tie points between the halves of rendered frames, relative to their sigmas.
 """
 
-import argparse
 import json
-import sys
 from collections import Counter
+from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from networks import Halves, halves
 from numpy.typing import NDArray
 
 from adjust import Adjustment, adjust
+from benchmarks.harness import Row, rms
 from measure.tie_points.features import TieFrame
 from measure.tie_points.joins import measure_joins
 from pipeline.cli import run
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "adjust"))
-from networks import Halves, halves
 
 Array = NDArray[np.float64]
 
@@ -39,25 +36,25 @@ CORNERS = np.array([[-110.0, -110.0], [-110.0, 110.0], [110.0, -110.0], [110.0, 
 ELEMENTS = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--runs", type=int, default=200)
-    parser.add_argument("--pictures", action="store_true")
-    options = parser.parse_args()
-    if options.pictures:
-        pictures()
-        return
-    print(f"{options.runs} networks a line; errors over standard deviations, rms")
-    print("| joins a frame | overlap, mm | right halves | joins | films | orientations | c | far corner, um | sigma0 |")
-    print("|---|---|---|---|---|---|---|---|---|")
-    for count, overlap_mm, turned in CASES:
-        found = [_errors(count, overlap_mm, turned, seed) for seed in range(options.runs)]
-        rms = {name: np.sqrt(np.mean(np.concatenate([each[name] for each in found]) ** 2)) for name in found[0]}
-        lies = "turned by 180 degrees" if turned else "as the left ones"
-        cells = [f"{rms[name]:.3f}" for name in ("joins", "films", "orientations", "c")]
-        print(
-            f"| {count} | {overlap_mm:g} | {lies} | {' | '.join(cells)} | {rms['corner']:.1f} | {rms['sigma0']:.3f} |"
-        )
+COLUMNS = {"count": "d", "grain": "g", "overlap_mm": ".0f", "turned": "d"}
+COLUMNS |= dict.fromkeys(("joins", "films", "orientations", "c", "corner_um", "sigma0"), ".3f")
+COLUMNS |= {"measured": "d", "weak": "d", "off_px": ".4f", "of_sigma": ".3f"}
+
+
+def cells(pictures: bool = False) -> Iterator[Row]:
+    if pictures:
+        for grain, share, turned in product((0.0, 0.01, 0.03), (0.6, 0.54), (False, True)):
+            yield {"grain": grain, "overlap_mm": (2 * share - 1) * 65.0, "turned": turned}
+    else:
+        yield from ({"count": count, "overlap_mm": overlap, "turned": turned} for count, overlap, turned in CASES)
+
+
+def case(overlap_mm: float, turned: bool, count: int = 0, grain: float | None = None, runs: int = 200) -> Row:
+    """RMS errors over standard deviations of `runs` networks; if a grain is given, of measured tie points."""
+    if grain is not None:
+        return _pictured(grain, (overlap_mm / 65.0 + 1) / 2, turned)
+    found = [_errors(count, overlap_mm, turned, seed) for seed in range(runs)]
+    return {name: rms([each[name] for each in found]) for name in found[0]}
 
 
 def _errors(count: int, overlap_mm: float, turned: bool, seed: int) -> dict[str, Array]:
@@ -83,7 +80,7 @@ def _errors(count: int, overlap_mm: float, turned: bool, seed: int) -> dict[str,
         "films": np.array(films),
         "orientations": np.array(orientations),
         "c": np.array([_error_sigmas(adjustment, "IO.K.c", simulated.truth.c)]),
-        "corner": _corner_errors_um(simulated, adjustment),
+        "corner_um": _corner_errors_um(simulated, adjustment),
         "sigma0": np.array([adjustment.sigma0]),
     }
 
@@ -156,26 +153,16 @@ pose = "{pose}"
 """
 
 
-def pictures() -> None:
-    """Measure tie points between halves of rendered frames; every other right half is rotated by 180 degrees."""
-    print("| grain | overlap, mm | scans | measured | weak | difference, rms px | over sigma |")
-    print("|---|---|---|---|---|---|---|")
-    for grain in (0.0, 0.01, 0.03):
-        for share in (0.6, 0.54):
-            for seed in (1, 2):
-                print(_pictured(grain, share, seed), flush=True)
-
-
-def _pictured(grain: float, share: float, seed: int) -> str:
+def _pictured(grain: float, share: float, turned: bool) -> Row:
+    """Measure tie points between halves of a rendered frame."""
     with TemporaryDirectory() as name:
         folder = Path(name)
-        turned = seed % 2 == 0
         halves_text = IMAGE.format(half="a", first=0.0, end=share, pose="0")
         # A scan rotated by 180 degrees has the other end of the frame on its left.
         first, end = (0.0, share) if turned else (1.0 - share, 1.0)
         halves_text += IMAGE.format(half="b", first=first, end=end, pose="180" if turned else "0")
         scene = folder / "scene.toml"
-        scene.write_text(SCENE.format(seed=seed, grain=grain) + halves_text, encoding="utf-8")
+        scene.write_text(SCENE.format(seed=1 + turned, grain=grain) + halves_text, encoding="utf-8")
         run(["render", str(scene), str(folder)])
         truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))["images"]
         parts = [
@@ -190,12 +177,12 @@ def _pictured(grain: float, share: float, seed: int) -> str:
         off = (places[0] - places[1]) / 0.02
         sigma = np.sqrt(np.sum(sigmas, axis=0))[:, None]
         counts = Counter(str(mark.status) for mark in first_marks)
-        lies = "turned against one another" if turned else "alike"
-        overlap_mm = (2 * share - 1) * 65.0
-        return (
-            f"| {grain} | {overlap_mm:.0f} | {lies} | {counts['measured']} | {counts['weak']} | "
-            f"{np.sqrt(np.mean(off**2)):.4f} | {np.sqrt(np.mean((off / sigma) ** 2)):.3f} |"
-        )
+        return {
+            "measured": counts["measured"],
+            "weak": counts["weak"],
+            "off_px": rms(off),
+            "of_sigma": rms(off / sigma),
+        }
 
 
 def _camera_mm(image: dict[str, dict[str, dict[str, float]]], pixels: Array) -> Array:
@@ -204,7 +191,3 @@ def _camera_mm(image: dict[str, dict[str, dict[str, float]]], pixels: Array) -> 
     x, y = (pixels * [0.02, -0.02]).T
     a1, a2, a3, b1, b2, b3 = (image["transformation"][name]["value"] for name in ("a1", "a2", "a3", "b1", "b2", "b3"))
     return np.stack([a1 + a2 * x + a3 * y, b1 + b2 * x + b3 * y], axis=1)
-
-
-if __name__ == "__main__":
-    main()

@@ -14,6 +14,7 @@ from measure.results import FrameMeasurement
 
 PITCH_UM = 1000 / PX_PER_MM
 POSES = ("0", "90", "180", "270m")
+TEN_SIGMAS_PX = 10 * float(np.hypot(SIGMA_PX, FILM_MM * PX_PER_MM))
 COUNTS = (1, 2, 3, 6, 12)
 Frames = list[FrameMeasurement]
 Made = Callable[[FiducialLayout, int, np.random.Generator], tuple[Frames, str]]
@@ -44,12 +45,7 @@ def kinds() -> list[tuple[str, list[tuple[float, float]], float, Made]]:
         ("eight marks, given to 5 um, film 3 um", EIGHT, 0.005, good),
         ("eight marks, given to 5 um, film 10 um", EIGHT, 0.005, scattering),
         ("eight marks of unknown places, film 3 um", EIGHT, 1.0, good),
-        (
-            "eight: a mark 10 sigmas off, places unknown",
-            EIGHT,
-            1.0,
-            one_mark(10 * np.hypot(SIGMA_PX, FILM_MM * PX_PER_MM)),
-        ),
+        ("eight: a mark 10 sigmas off, places unknown", EIGHT, 1.0, one_mark(TEN_SIGMAS_PX)),
         ("eight: a mark 0.05 mm off", EIGHT, 0.005, one_mark(0.05 * PX_PER_MM)),
         ("eight: a frame's film bent by 0.03 mm", EIGHT, 0.005, bent),
         ("four: a frame's film bent by 0.1 mm", FOUR, 0.005, strongly_bent),

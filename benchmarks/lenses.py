@@ -1,16 +1,15 @@
 """Lens families and bent boards: claimed against realised standard deviations, and comparison with mrcal.
 
-    python -m benchmarks lenses [SETS]          # sets of errors per case, 200 by default; about a minute for 40
-    python -m benchmarks lenses mrcal           # comparison of a bent board with mrcal 2.2 (Debian's package)
-
+RMS errors over standard deviations by parameter, and chi-square per degree of freedom with its two-sided 1 % limits;
+with --lens mrcal, one bent board compared with mrcal 2.2 (Debian's package).
 Image coordinates are computed by the renderer, which has its own formulas, or by OpenCV; boards bend as in mrcal.
 """
 
 import json
 import subprocess
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from typing import cast
 
 import cv2
 import numpy as np
@@ -25,6 +24,7 @@ from adjust.problem.camera import Camera
 from adjust.problem.network import Board, Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
 from adjust.solution.adjustment import adjust
+from benchmarks.harness import Row, table
 from synthetic_images.projection import camera_from_object
 from synthetic_images.scene import Distortion as SceneDistortion
 from synthetic_images.scene import Family, SceneCamera
@@ -43,7 +43,7 @@ LENSES: dict[Family, tuple[float, dict[str, float]]] = {
     "opencv_fisheye": (11.0, {"k1": 0.03, "k2": -0.01, "k3": 0.002, "b1": 4e-4, "b2": -3e-4}),
 }
 ATTITUDES = [(0.0, 0.0, 0.1), (0.5, 0.1, 1.6), (-0.5, 0.2, 3.1), (0.1, 0.5, -1.5), (-0.1, -0.5, 0.8), (0.3, -0.3, 2.3)]
-COLUMNS, ROWS, SPACING_MM = 10, 7, 30.0
+ACROSS, DOWN, SPACING_MM = 10, 7, 30.0
 BENDS_MM = (0.9, -0.5)
 TURNS = [(0.0, 0.0, 0.0), (0.5, 0.0, 0.3), (-0.5, 0.1, 1.2), (0.1, 0.55, -0.7), (0.0, -0.5, 2.0), (0.4, -0.4, -2.1)]
 MRCAL = """
@@ -69,28 +69,32 @@ print(json.dumps({"warp": inputs["calobject_warp"].tolist(), "intrinsics": input
 """
 
 
-def main() -> None:
-    if sys.argv[1:] == ["mrcal"]:
-        compare_mrcal()
-        return
-    sets = int(sys.argv[1]) if len(sys.argv) > 1 else 200
-    print(
-        "| case | parameters | sets | rms error over sigma, least, largest | chi-square a degree of freedom | within |"
-    )
-    print("|---|---|---|---|---|---|")
-    for name, (c, values) in LENSES.items():
-        true = {
-            f"IO.C.{each}": value for each, value in (values | dict(zip(("x0", "y0"), POINT_MM, strict=True))).items()
-        }
-        simulate(name, partial(lens_network, name), true | {"IO.C.c": c}, sets)
-    bends = dict(zip(("BD.board.bend_x", "BD.board.bend_y"), BENDS_MM, strict=True))
-    simulate("bent board", lambda rng: board_network(rng)[0], bends | {"IO.C.c": 20.0, "IO.C.k1": -0.08}, sets)
+def cells() -> Iterator[Row]:
+    yield from ({"lens": lens} for lens in (*LENSES, "bent board"))
 
 
-def simulate(name: str, drawn: Drawn, true: dict[str, float], sets: int) -> None:
-    """Adjust with random errors from one start; print the errors relative to their covariance, and the two-sided 1 %
-    limits of chi-square."""
-    rng = np.random.default_rng(SEED)
+def case(lens: str, seed: int, sets: int = 200) -> Row:
+    """Adjust `sets` of random errors from one start. sets: about a minute for 40."""
+    if lens == "mrcal":
+        return {"compared": list(compare_mrcal(seed))}
+    if lens == "bent board":
+        true = dict(zip(("BD.board.bend_x", "BD.board.bend_y"), BENDS_MM, strict=True)) | {"IO.C.k1": -0.08}
+        return simulate(lambda rng: board_network(rng)[0], true | {"IO.C.c": 20.0}, sets, seed)
+    family = cast(Family, lens)
+    c, values = LENSES[family]
+    true = {f"IO.C.{name}": value for name, value in {**values, "x0": POINT_MM[0], "y0": POINT_MM[1], "c": c}.items()}
+    return simulate(partial(lens_network, family), true, sets, seed)
+
+
+def report(rows: Sequence[Row]) -> Iterator[str]:
+    figures = dict.fromkeys(("least", "largest", "chi-square", "from", "to"), ".3f")
+    yield from table({"lens": "", "parameters": "d"} | figures, [row for row in rows if "least" in row])
+    columns = {"": "", "mrcal": ".8g", "here": ".8g", "sigma": ".2g", "differs by, sigmas": ".1e"}
+    yield from table(columns, (line for row in rows for line in row.get("compared", ())))
+
+
+def simulate(drawn: Drawn, true: dict[str, float], sets: int, seed: int) -> Row:
+    rng = np.random.default_rng(seed)
     start = approximate(drawn(None))
     errors, total = [], 0.0
     for _ in range(sets):
@@ -99,10 +103,10 @@ def simulate(name: str, drawn: Drawn, true: dict[str, float], sets: int) -> None
         cofactor = found.cofactor_of(list(true))
         errors.append(error / np.sqrt(np.diag(cofactor)))
         total += float(error @ np.linalg.solve(cofactor, error))
-    rms, freedom = np.sqrt(np.mean(np.square(errors), axis=0)), sets * len(true)
+    ratios, freedom = np.sqrt(np.mean(np.square(errors), axis=0)), sets * len(true)
     low, high = (float(chi2.ppf(share, freedom)) / freedom for share in (0.005, 0.995))
-    spread = f"{rms.min():.3f} {rms.max():.3f} | {total / freedom:.3f} | {low:.3f} {high:.3f}"
-    print(f"| {name} | {len(true)} | {sets} | {spread} |", flush=True)
+    spread = {"least": ratios.min(), "largest": ratios.max(), "chi-square": total / freedom, "from": low, "to": high}
+    return {"parameters": len(true), **spread}
 
 
 def lens_network(name: Family, rng: np.random.Generator | None) -> Network:
@@ -125,8 +129,8 @@ def lens_network(name: Family, rng: np.random.Generator | None) -> Network:
 
 def board_network(rng: np.random.Generator | None) -> tuple[Network, Array, Array]:
     """Six views of a bent board by OpenCV: network, poses of the board in mrcal's form (v, 6), and places (v, n, 2)."""
-    t, u = np.meshgrid(np.linspace(0.0, 1.0, COLUMNS), np.linspace(0.0, 1.0, ROWS))
-    flat = np.stack([t.ravel() * (COLUMNS - 1), u.ravel() * (ROWS - 1), 0.0 * t.ravel()], axis=1) * SPACING_MM
+    t, u = np.meshgrid(np.linspace(0.0, 1.0, ACROSS), np.linspace(0.0, 1.0, DOWN))
+    flat = np.stack([t.ravel() * (ACROSS - 1), u.ravel() * (DOWN - 1), 0.0 * t.ravel()], axis=1) * SPACING_MM
     real = flat.copy()
     real[:, 2] = (4.0 * (t - t**2) * BENDS_MM[0] + 4.0 * (u - u**2) * BENDS_MM[1]).ravel()
     rows: list[tuple[int, int, Array]] = []
@@ -172,11 +176,11 @@ def make_network(
     )
 
 
-def compare_mrcal() -> None:
+def compare_mrcal(seed: int) -> Iterator[Row]:
     """Calibrate the same noisy views by both programs, with fx, fy, cx, cy, k1, k2, p1, p2 and the bends as
     unknowns."""
     pixel_mm = 0.005
-    network, poses, places = board_network(np.random.default_rng(SEED))
+    network, poses, places = board_network(np.random.default_rng(seed))
     free = dict.fromkeys(("k1", "k2", "p1", "p2", "b1"), Prior(0.0, np.inf))
     network = Network(
         (Camera("C", None, None, None, Distortion("opencv", free)),),
@@ -189,7 +193,7 @@ def compare_mrcal() -> None:
     middle = np.array([2000.0, 1500.0])
     pixels = places * [1.0, -1.0] / pixel_mm + middle
     start = [20.0 / pixel_mm, 20.0 / pixel_mm, *middle, -0.08, 0.0, 0.0, 0.0]
-    task = {"pixels": pixels.reshape(len(TURNS), ROWS, COLUMNS, 2).tolist(), "start": start, "frames": poses.tolist()}
+    task = {"pixels": pixels.reshape(len(TURNS), DOWN, ACROSS, 2).tolist(), "start": start, "frames": poses.tolist()}
     text = json.dumps(task | {"spacing": SPACING_MM})
     done = subprocess.run(["/usr/bin/python3", "-c", MRCAL], input=text, capture_output=True, text=True, check=True)
     output = json.loads(done.stdout)
@@ -203,11 +207,6 @@ def compare_mrcal() -> None:
         "IO.C.y0": (middle[1] - cy) * pixel_mm,
         **dict(zip((f"IO.C.{name}" for name in ("k1", "k2", "p1", "p2")), lens, strict=True)),
     }
-    print("| | mrcal | here | sigma | differs by, sigmas |\n|---|---|---|---|---|")
     for name, value in theirs.items():
         here, sigma = found.value(name), found.sigma(name)
-        print(f"| {name} | {value:.8g} | {here:.8g} | {sigma:.2g} | {(value - here) / sigma:.1e} |")
-
-
-if __name__ == "__main__":
-    main()
+        yield {"": name, "mrcal": value, "here": here, "sigma": sigma, "differs by, sigmas": (value - here) / sigma}

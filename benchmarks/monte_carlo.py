@@ -1,14 +1,11 @@
 """Claimed against realised standard deviations: Monte Carlo simulation of reference cases.
 
-python -m benchmarks monte_carlo [RUNS]
-
 For each kind of parameter: RMS error over the RMS a-posteriori standard deviation, averaged over the parameters of the
 kind, and its smallest and largest value. v'Pv against chi-square (Kolmogorov-Smirnov), and coverage of the true radial
 distortion curve by its confidence bands.
 """
 
-import sys
-import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +15,7 @@ from scipy import stats
 
 from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
+from benchmarks.harness import Row, rms, table
 
 Array = NDArray[np.float64]
 
@@ -42,15 +40,13 @@ class Runs:
     curves: Array
 
 
-def main() -> None:
-    """Print a table for each case."""
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 400
-    for name, words in CASES.items():
-        begin = time.perf_counter()
-        case = load(name)
-        runs = many(exact(case), case["r0"], count)
-        print(f"\n{words}: {count} runs, {time.perf_counter() - begin:.0f} s", flush=True)
-        print_table(runs)
+def cells() -> Iterator[Row]:
+    yield from ({"network": name} for name in CASES)
+
+
+def case(network: str, runs: int = 400) -> Row:
+    loaded = load(network)
+    return {"runs": runs, **figures(many(exact(loaded), loaded["r0"], runs))}
 
 
 def many(case: Exact, r0_mm: float, count: int) -> Runs:
@@ -102,27 +98,31 @@ def parameter_kind(name: str) -> str:
             return "stations" if quantity in ("X0", "Y0", "Z0") else "attitudes"
 
 
-def print_table(runs: Runs) -> None:
-    """Print the figures of one case."""
+def figures(runs: Runs) -> Row:
+    """Figures of one case: a line per kind of parameter, and sentences."""
     ratio = np.sqrt((runs.errors**2).mean(axis=0) / (runs.sigmas**2).mean(axis=0))
-    mean = runs.errors.mean(axis=0) / np.sqrt((runs.sigmas**2).mean(axis=0) / len(runs.errors))
+    mean = np.abs(runs.errors.mean(axis=0) / np.sqrt((runs.sigmas**2).mean(axis=0) / len(runs.errors)))
     kinds = np.array([parameter_kind(name) for name in runs.names])
-    print(f"{'realised over claimed':30} {'number':>7} {'average':>8} {'least':>7} {'most':>7} {'mean error':>11}")
-    for kind in dict.fromkeys(kinds):
-        of_kind = ratio[kinds == kind]
-        bias = np.abs(mean[kinds == kind]).max()
-        print(f"{kind:30} {len(of_kind):7d} {np.sqrt((of_kind**2).mean()):8.3f}", end="")
-        print(f" {of_kind.min():7.3f} {of_kind.max():7.3f} {bias:11.2f}")
-    inside = ((ratio > 0.9) & (ratio < 1.1)).mean()
-    print(f"{'all':30} {len(ratio):7d} {np.sqrt((ratio**2).mean()):8.3f} {ratio.min():7.3f} {ratio.max():7.3f}", end="")
-    print(f"   {100 * inside:.0f} % within 0.9 to 1.1")
+    lines = []
+    for kind in (*dict.fromkeys(kinds), "all"):
+        own = ratio[(kinds == kind) | (kind == "all")]
+        spread = {"average": rms(own), "least": own.min(), "most": own.max()}
+        lines.append({"kind": kind, "number": len(own), **spread, "mean error": mean[kinds == kind].max(initial=0.0)})
     test = stats.kstest(runs.vpv, stats.chi2(runs.redundancy).cdf)
-    print(f"v'Pv: mean {runs.vpv.mean():.1f}, chi-square {runs.redundancy}; Kolmogorov-Smirnov p = {test.pvalue:.3f}")
+    sentences = [
+        f"{100 * ((ratio > 0.9) & (ratio < 1.1)).mean():.0f} % of the parameters within 0.9 to 1.1",
+        f"v'Pv: mean {runs.vpv.mean():.1f}, chi-square {runs.redundancy}; Kolmogorov-Smirnov p = {test.pvalue:.3f}",
+    ]
     for band, factor in BANDS.items():
-        held = (np.abs(runs.curves) < factor).mean(axis=0)
-        print(f"band of {band}: holds the curve in {100 * held.mean():.1f} % (by radius {100 * held.min():.1f}", end="")
-        print(f" to {100 * held.max():.1f} %)")
+        held = 100 * (np.abs(runs.curves) < factor).mean(axis=0)
+        by_radius = f"by radius {held.min():.1f} to {held.max():.1f} %"
+        sentences.append(f"band of {band}: holds the curve in {held.mean():.1f} % ({by_radius})")
+    return {"lines": lines, "sentences": sentences}
 
 
-if __name__ == "__main__":
-    main()
+def report(rows: Sequence[Row]) -> Iterator[str]:
+    columns = {"kind": "", "number": "d", **dict.fromkeys(("average", "least", "most"), ".3f"), "mean error": ".2f"}
+    for row in rows:
+        yield f"\n{CASES[row['network']]}: {row['runs']} runs; realised over claimed standard deviations"
+        yield from table(columns, row["lines"])
+        yield from row["sentences"]

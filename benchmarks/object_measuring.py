@@ -1,15 +1,12 @@
 """Requests and bytes read from a tiled TIFF file on a server to measure a scan, with and without overviews.
 
-    python -m benchmarks object_measuring [--side 11500] [--seed 1]
-
 The frame has the eight ring-crosses of an aerial camera on grainy film, at the scan's centre or so far off that a mark
 must be searched first; the server counts requests and bytes.
 """
 
-import argparse
-import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
 
@@ -17,11 +14,9 @@ import cv2
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-
 from range_server import range_server
 
+from benchmarks.harness import Row
 from measure.marks.rendering import extent_px, picture
 from measure.marks.shapes import FiducialLayout
 from pipeline.files.camera_file import read_camera
@@ -49,35 +44,31 @@ def camera_text(edge_mm: float) -> str:
     )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--side", type=int, default=11_500, help="of the scan, px")
-    parser.add_argument("--seed", type=int, default=1)
-    options = parser.parse_args()
+COLUMNS = {
+    "tile_px": "d", "overviews": "d", "off_px": "d", "measured": "d", "marks": "d", "requests": "d", "bytes": ",d",
+    "of_file": ".1%", "cpu_s": ".1f",
+}  # fmt: skip
+
+
+def cells() -> Iterator[Row]:
+    for overviews, off_px, tile_px in product((True, False), (0, 350), (256, 512)):
+        yield {"tile_px": tile_px, "overviews": overviews, "off_px": off_px}
+
+
+def case(tile_px: int, overviews: bool, off_px: int, seed: int, side: int = 11_500) -> Row:
     with tempfile.TemporaryDirectory() as place:
-        folder = Path(place)
+        folder, file = Path(place), Path(place) / "scan.tif"
         (folder / "camera.toml").write_text(camera_text(_EDGE_MM), encoding="utf-8")
         layout = read_camera(folder / "camera.toml").layout()
-        print("| tiles, px | overviews | off, px | marks | requests | bytes | share of the file | CPU, s |")
-        print("|---" * 8 + "|")
-        for overviews, off_px, tile_px in product((True, False), (0, 350), (256, 512)):
-            name = f"{tile_px}-{off_px}{'-with' if overviews else ''}.tif"
-            _write(
-                folder / name,
-                drawn_frame(layout, options.side, np.random.default_rng(options.seed), off_px),
-                tile_px,
-                overviews,
-            )
-            with range_server(folder) as server:
-                start_s = time.process_time()
-                found = _measure(folder, f"{server.url}/{name}")
-                cpu_s = time.process_time() - start_s
-                share = server.sent_bytes / (folder / name).stat().st_size
-                marks = found.scan.frame.marks
-                result = f"{sum(mark.status == 'measured' for mark in marks)} of {len(marks)}"
-                kind = f"{tile_px} | {'yes' if overviews else 'no'} | {off_px}"
-                took = f"{server.gets} | {server.sent_bytes:,} | {100 * share:.1f} % | {cpu_s:.1f}"
-                print(f"| {kind} | {result} | {took} |", flush=True)
+        _write(file, drawn_frame(layout, side, np.random.default_rng(seed), off_px), tile_px, overviews)
+        with range_server(folder) as server:
+            start_s = time.process_time()
+            marks = _measure(folder, f"{server.url}/{file.name}").scan.frame.marks
+            cpu_s = time.process_time() - start_s
+        return {
+            "measured": sum(mark.status == "measured" for mark in marks), "marks": len(marks), "cpu_s": cpu_s,
+            "requests": server.gets, "bytes": server.sent_bytes, "of_file": server.sent_bytes / file.stat().st_size,
+        }  # fmt: skip
 
 
 def _measure(folder: Path, address: str) -> MeasuredFile:
@@ -119,7 +110,3 @@ def _write(path: Path, grey: NDArray[np.uint8], tile_px: int, overviews: bool) -
     with tifffile.TiffWriter(path) as file:
         for number, one in enumerate(smaller):
             file.write(one, tile=(tile_px, tile_px), compression="zlib", subfiletype=int(number > 0), metadata=None)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,5 @@
 """Convergence from poor approximate values, or from none, for five types of networks.
 
-python -m benchmarks poor_starts [RUNS]
-
 Attitudes are rotated by 30 degrees around random axes, stations shifted by 20 % of their distance in random directions,
 the principal distance is wrong by 20 %, and unknown points by 20 % of their distance. The correct minimum is that
 reached from the true values; iterations: median and maximum. Then without approximate values, with gross errors of up
@@ -9,12 +7,11 @@ to a tenth of the frame in some of the targets and robust estimation (igg3): cor
 deviations of that minimum.
 """
 
-import sys
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +26,7 @@ from adjust.problem.network import Approximations, Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
 from adjust.solution.adjustment import Options, adjust
 from adjust.solution.result import Adjustment
+from benchmarks.harness import Row as TableRow
 
 Array = NDArray[np.float64]
 Ended = tuple[str, int]
@@ -58,41 +56,39 @@ class Scene:
     options: Options
 
 
-def main() -> None:
-    """Print a line for each network and type of error: rate of correct results, and the outcome of the others."""
-    runs = int(sys.argv[1]) if len(sys.argv) > 1 else 100
-    print(f"{'network':18} {'start':12} {'right':>7} {'iterations':>11} {'seconds':>8}  others")
-    for name, scene in scenes().items():
-        right = adjust(scene.network, scene.truth, scene.options)
-        for label, errors in STARTS.items():
-            study(f"{name:18} {label:12}", partial(from_a_start, scene, right, errors), runs)
-        for percent in GROSS_PERCENT:
-            study(f"{name:18} {f'none, {percent} %':12}", partial(from_nothing, scene, right, percent), runs)
+COLUMNS = {"network": "", "start": "", "right": ".1%", "iterations": "", "cpu_s": ".3f", "others": ""}
 
 
-def from_a_start(scene: Scene, right: Adjustment, errors: set[str], rng: np.random.Generator) -> Ended:
-    return outcome(scene, right, poor_start(scene, errors, rng), SAME)
+def cells() -> Iterator[TableRow]:
+    for network in scenes():
+        yield from ({"network": network, "start": start} for start in (*STARTS, *GROSS_PERCENT))
 
 
-def from_nothing(scene: Scene, right: Adjustment, percent: int, rng: np.random.Generator) -> Ended:
-    return outcome(spoilt(scene, percent, rng), right, None, NEAR)
-
-
-def study(title: str, one: Callable[[np.random.Generator], Ended], runs: int) -> None:
-    """Run random adjustments and print the outcomes."""
-    ends: Counter[str] = Counter()
-    iterations = []
-    begin = time.process_time()
+def case(network: str, start: str | int, runs: int = 100) -> TableRow:
+    """Rate of correct results, and the outcome of the others. start: errors of the approximate values, or per cent of
+    gross errors without approximate values."""
+    scene, right = right_adjustment(network)
+    ends, iterations, begin = Counter[str](), [], time.process_time()
     for seed in range(runs):
-        end, count = one(np.random.default_rng(seed))
+        rng = np.random.default_rng(seed)
+        if isinstance(start, str):
+            end, count = outcome(scene, right, poor_start(scene, STARTS[start], rng), SAME)
+        else:
+            end, count = outcome(spoilt(scene, start, rng), right, None, NEAR)
         ends[end] += 1
-        if end == "right":
-            iterations.append(count)
-    took = (time.process_time() - begin) / runs
-    share = ends.pop("right", 0) / runs
-    others = ", ".join(f"{end} {count}" for end, count in ends.most_common())
-    median = f"{np.median(iterations):.0f}, {max(iterations)}" if iterations else ""
-    print(f"{title} {share:7.1%} {median:>11} {took:8.3f}  {others}", flush=True)
+        iterations += [count] if end == "right" else []
+    return {
+        "right": ends.pop("right", 0) / runs,
+        "iterations": f"{np.median(iterations):.0f}, {max(iterations)}" if iterations else None,
+        "cpu_s": (time.process_time() - begin) / runs,
+        "others": ", ".join(f"{end} {count}" for end, count in ends.most_common()),
+    }
+
+
+@cache
+def right_adjustment(network: str) -> tuple[Scene, Adjustment]:
+    scene = scenes()[network]
+    return scene, adjust(scene.network, scene.truth, scene.options)
 
 
 def outcome(scene: Scene, right: Adjustment, start: Approximations | None, near: float) -> Ended:
@@ -305,7 +301,3 @@ def looking_at_origin(station: list[float], kappa: float) -> Array:
     level = np.stack([right, np.cross(back, right), back])
     turn = rotation_from_angles(np.array([0.0, 0.0, kappa]))
     return np.concatenate([station, angles_from_rotation(turn @ level)])
-
-
-if __name__ == "__main__":
-    main()

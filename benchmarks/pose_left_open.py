@@ -158,18 +158,17 @@ def other_statuses(one: FrameMeasurement, other: FrameMeasurement) -> int:
 def right(case: Case, frame: FrameMeasurement) -> list[np.ndarray]:
     """Places of the marks found that coincide with true marks, whatever their names."""
     truth = np.array(list(case.centers_px.values()))
-    measured_marks = [
-        mark.center_px for mark in frame.marks if mark.status.is_observation and mark.center_px is not None
-    ]
-    return [place for place in measured_marks if np.hypot(*(truth - place).T).min() < SAME_PX]
+    return [place for place in observed_places(frame) if np.hypot(*(truth - place).T).min() < SAME_PX]
 
 
 def lost(found: list[np.ndarray], auto: FrameMeasurement) -> int:
     """Number of places found that were not found with automatic pose."""
-    measured_marks = [
-        mark.center_px for mark in auto.marks if mark.status.is_observation and mark.center_px is not None
-    ]
-    return sum(not any(np.hypot(*(place - other)) < SAME_PX for other in measured_marks) for place in found)
+    places = observed_places(auto)
+    return sum(not any(np.hypot(*(place - other)) < SAME_PX for other in places) for place in found)
+
+
+def observed_places(frame: FrameMeasurement) -> list[np.ndarray]:
+    return [mark.center_px for mark in frame.marks if mark.status.is_observation and mark.center_px is not None]
 
 
 def report(rows: Sequence[Row]) -> Iterator[str]:

@@ -1,19 +1,14 @@
 """Effects of resampling on an image, compared with other programs: shifts of marks, loss of noise and contrast.
 
-    python -m benchmarks resampling [side_px] [--large]
-
-The image is synthetic, rotated by 0.37 degrees at a scale of 0.9985. --large: time and peak memory for a scan of
-side_px (11,500; 23,000 takes about five minutes), 16 bit, in strips, rotated by 90 degrees; each program runs in its
-own process. libvips and GDAL are included if pyvips and rasterio are installed, which the project does not require.
+The image is synthetic, rotated by 0.37 degrees at a scale of 0.9985, and resampled to the result and back (`_back`).
+--large: time and peak memory for a scan of that side (11500 px; 23000 take about five minutes), 16 bit, LZW in
+strips, rotated by 90 degrees. libvips and GDAL are included if pyvips and rasterio are installed, which the project
+does not require.
 """
 
-import multiprocessing
-import resource
-import sys
 import tempfile
 import time
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -23,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from adjust.functional_model.transformation import Film
+from benchmarks.harness import Row, rms
 from pipeline.resampling.canvas import FrameChain
 from pipeline.resampling.interpolation import Degree
 from pipeline.resampling.resample_stage import BEST, FAST, FrameScan, ResampleTask, resampled
@@ -117,20 +113,16 @@ def marks(side: int, rng: np.random.Generator) -> tuple[Array, Array]:
     return picture, middles
 
 
-def target_places(side: int) -> tuple[Array, Array]:
-    """Inverse: columns and rows in the result of the pixels of the image."""
-    col, row = np.meshgrid(np.arange(side, dtype=float), np.arange(side, dtype=float))
-    u, v = (col - side / 2) / SCALE, (row - side / 2) / SCALE
-    return (
-        np.cos(TURN) * u + np.sin(TURN) * v + side / 2,
-        -np.sin(TURN) * u + np.cos(TURN) * v + side / 2,
-    )
-
-
 def shift_middles(middles: Array, side: int) -> Array:
-    """Transform the centres (n, 2) of marks from the image to the result."""
+    """Transform places (n, 2) from the image to the result."""
     u, v = (middles - side / 2).T / SCALE
     return np.stack([np.cos(TURN) * u + np.sin(TURN) * v, -np.sin(TURN) * u + np.cos(TURN) * v], axis=1) + side / 2
+
+
+def target_places(side: int) -> Array:
+    """Inverse of `source_places`: columns and rows in the result of the pixels of the image."""
+    pixels = np.stack(np.meshgrid(*2 * [np.arange(side, dtype=float)]), axis=-1)
+    return shift_middles(pixels.reshape(-1, 2), side).T.reshape(2, side, side)
 
 
 def shift_rms_px(picture: Array, places: Array, blur_px: float) -> float:
@@ -144,38 +136,46 @@ def shift_rms_px(picture: Array, places: Array, blur_px: float) -> float:
         design = np.stack([form, np.ones_like(form), *(PEAK * slope for slope in slopes)], axis=-1).reshape(-1, 4)
         view = picture[row - WINDOW_PX : row + WINDOW_PX + 1, col - WINDOW_PX : col + WINDOW_PX + 1]
         off.append(np.linalg.lstsq(design, view.ravel())[0][2:])
-    return float(np.sqrt(np.mean(np.square(off))))
+    return rms(off)
 
 
-def compare(side: int) -> None:
-    """Print the effects of resampling once, and of resampling to the result and back."""
+OWN_PROCESS = True
+FIGURES = ("marks_px", "noise", "contrast")
+COLUMNS = {"program": "", **dict.fromkeys((*FIGURES, *(f"{name}_back" for name in FIGURES)), ".4f")}
+COLUMNS |= {"result": "", "cpu_seconds": ".2f", "seconds": ".2f", "mib": ".0f", "says": ""}
+
+
+def cells(large: int = 0) -> Iterator[Row]:
+    yield from ({"program": name, "large": large} for name in (PROGRAMS if large else METHODS))
+
+
+def case(program: str, large: int = 0, side: int = 1600) -> Row:
+    try:
+        return resampled_scan(program, large) if large else compare(METHODS[program], side)
+    except ImportError as error:
+        return {"says": str(error)}
+
+
+def compare(method: Method, side: int) -> Row:
+    """Effects of one interpolation."""
     rng = np.random.default_rng(5)
     there, back = source_places(side), target_places(side)
     inner = slice(side // 8, -side // 8)
     picture, middles = marks(side, rng)
     noise = rng.normal(0, 100.0, (side, side))
     wave = 1000.0 * np.cos(2 * np.pi * HALF_NYQUIST * np.arange(side))[None, :] * np.ones((side, 1))
-    print("| | there | | | there and back | | | |")
-    print("| interpolation | marks off, px | noise | contrast | marks off, px | noise | contrast | CPU s a picture |")
-    print("|---|---|---|---|---|---|---|---|")
-    for name, method in METHODS.items():
-        start = time.process_time()
-        try:
-            once = [method(each, *there) for each in (picture, noise, wave)]
-        except ImportError as error:
-            print(f"| {name} | {error} |")
-            continue
-        seconds = (time.process_time() - start) / 3.0
-        twice = [method(each, *back) for each in once]
-        cells = []
-        for (view, grain, waves), places, blur_px in (
-            (once, shift_middles(middles, side), BLUR_PX / SCALE),
-            (twice, middles, BLUR_PX),
-        ):
-            contrast = waves[inner, inner].std() / (1000.0 / np.sqrt(2))
-            cells += [f"{shift_rms_px(view, places, blur_px):.4f}", f"{grain[inner, inner].std() / 100.0:.3f}"]
-            cells += [f"{contrast:.3f}"]
-        print(f"| {name} | {' | '.join(cells)} | {seconds:.2f} |", flush=True)
+    start = time.process_time()
+    once = [method(each, *there) for each in (picture, noise, wave)]
+    row = {"cpu_seconds": (time.process_time() - start) / 3.0}
+    for end, views, places, blur_px in (
+        ("", once, shift_middles(middles, side), BLUR_PX / SCALE),
+        ("_back", [method(each, *back) for each in once], middles, BLUR_PX),
+    ):
+        view, grain, waves = views
+        row[f"marks_px{end}"] = shift_rms_px(view, places, blur_px)
+        row[f"noise{end}"] = grain[inner, inner].std() / 100.0
+        row[f"contrast{end}"] = waves[inner, inner].std() / (1000.0 / np.sqrt(2))
+    return row
 
 
 STRIP_PX = 64
@@ -222,38 +222,13 @@ PROGRAMS: dict[str, tuple[Callable[[Path, Degree], str], Degree]] = {
 }
 
 
-def print_measures(name: str, folder: Path) -> None:
-    """Run one program in this process, and print its time and peak memory."""
-    program, degree = PROGRAMS[name]
-    start = time.perf_counter()
-    try:
-        size = program(folder, degree)
-    except ImportError as error:
-        print(f"| {name} | {error} |", flush=True)
-        return
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    cpu, peak = used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
-    print(f"| {name} | {size} | {cpu:.0f} | {time.perf_counter() - start:.0f} | {peak:.0f} |", flush=True)
-
-
-def large(side: int = 11500) -> None:
-    spawn = multiprocessing.get_context("spawn")  # so that peak memory counts for each program alone
+def resampled_scan(program: str, side: int) -> Row:
+    """Size of the result of one program, its time and, with that of making the scan, its peak memory."""
+    function, degree = PROGRAMS[program]
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        print(f"a scan of {side} px, 16 bit, LZW in strips of {STRIP_PX} rows, turned by 90 degrees", flush=True)
-        print("| program | result, px | CPU s | wall s | peak MiB |\n|---|---|---|---|---|", flush=True)
-        work = [
-            partial(make_scan, folder / "scan.tif", side),
-            *(partial(print_measures, of, folder) for of in PROGRAMS),
-        ]
-        for each in work:
-            process = spawn.Process(target=each)
-            process.start()
-            process.join()
-
-
-if __name__ == "__main__":
-    if "--large" in sys.argv:
-        large(*(int(word) for word in sys.argv[1:] if word.isdigit()))
-    else:
-        compare(int(sys.argv[1]) if len(sys.argv) > 1 else 1600)
+        make_scan(Path(name) / "scan.tif", side)
+        start_s, before_s = time.perf_counter(), time.process_time()
+        result = function(Path(name), degree)
+        return {
+            "result": result, "cpu_seconds": time.process_time() - before_s, "seconds": time.perf_counter() - start_s
+        }  # fmt: skip

@@ -3,38 +3,35 @@
 Do the decisions lead to correct marks? Do only the rows change that were decided on? How many keys and how much time
 does it take?
 
-    python -m benchmarks review_faults [SEED] [FOLDER]
-
 The reviewer is simulated: it accepts a mark measured at its true place, places a mark that is visible elsewhere,
 rejects a measurement where no mark is visible, and otherwise states that the mark is absent. The true values are those
-of the renderer. FOLDER: where the project is kept for inspection. Requires Chromium.
+of the renderer. --folder: where the project is kept for inspection. Requires Chromium.
 """
 
 import csv
 import json
-import shutil
-import subprocess
-import sys
-import tempfile
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Page
 
-from benchmarks.review_load import START
+from benchmarks.harness import Row, reseau
+from benchmarks.review_load import served_page
 from measure.geometry import POSES
 from synthetic_images import areas, scene
 from synthetic_images.render import render_scene
 
 Array = NDArray[np.float64]
-Rows = Mapping[tuple[str, str], Mapping[str, str]]
+Marks = Mapping[tuple[str, str], Mapping[str, str]]
 
 FRAMES = 40
 PITCH_UM, PX_PER_MM = 50.0, 20.0
@@ -118,42 +115,37 @@ class Session:
     decisions: Counter[str] = field(default_factory=Counter)
 
 
-def main(seed: int, folder: Path) -> int:
-    truths = planted(folder, np.random.default_rng(seed))
-    project = folder / "project.toml"
-    measure_project(project)
-    before, session = rows(folder), Session()
-    for _ in range(ROUNDS):
-        if reviewed(project, truths, session) == 0:
-            break
-        measure_project(project)
-    return print_outcome(seed, truths, before, rows(folder), decisions(folder), session)
-
-
-def print_outcome(
-    seed: int, truths: Mapping[str, Truth], before: Rows, after: Rows, made: list[dict[str, Any]], session: Session
-) -> int:
-    """Print the outcome; returns 1 if a mark is wrong or a row changed without a decision, else 0."""
-    kinds = Counter(fault.kind for fault in FAULTS)
-    print(f"{FRAMES} frames of {len(PLACES)} marks, seed {seed}; faults: "
-          f"{', '.join(f'{count} {kind}' for kind, count in kinds.items())}")  # fmt: skip
-    print(f"decided: {', '.join(f'{count} {what}' for what, count in session.decisions.items())}")
-    print(f"{session.keys} keys, {session.clock_s:.0f} s in the browser; of these {session.keys_of_marks} keys "
-          f"for {session.marks} marks")  # fmt: skip
+def case(seed: int, folder: Path | None = None) -> Row:
+    """Counts of a review, and the marks that are wrong or changed without a decision afterwards."""
+    with nullcontext(folder) if folder else TemporaryDirectory() as place:
+        folder = Path(place)
+        folder.mkdir(parents=True, exist_ok=True)
+        truths, project, session = planted(folder, np.random.default_rng(seed)), folder / "project.toml", Session()
+        reseau("measure", project)
+        before = rows(folder)
+        for _ in range(ROUNDS):
+            if reviewed(project, truths, session) == 0:
+                break
+            reseau("measure", project)
+        after, made = rows(folder), decisions(folder)
     expected = {(one["image"], one["point"]) for one in made if one.get("point")}
     whole = {one["image"] for one in made if one["decision"] == "pose"}
     whole |= {image for image, truth in truths.items() if sum(key[0] == image for key in expected) >= 3}
     expected |= {key for key in before if key[0] in whole}
     changed = {key for key in before if before[key] != after[key]}
-    wrong = [key for key, row in after.items() if not is_right(row, truths[key[0]])]
-    first = [key for key, row in before.items() if not is_right(row, truths[key[0]])]
-    print(f"marks that are right: {len(before) - len(first)} of {len(before)} before, {len(after) - len(wrong)} after")
-    print(f"rows that changed: {len(changed)}; decided about, or of a frame found or turned: {len(changed & expected)}")
-    for key in wrong:
-        print(f"wrong: {key}: {after[key]['status']}: {after[key]['reason']}")
-    for key in sorted(changed - expected):
-        print(f"changed, undecided: {key}: {before[key]} -> {after[key]}")
-    return int(bool(wrong) or bool(changed - expected))
+    wrong_before, wrong = ([key for key in each if not is_right(each[key], truths[key[0]])] for each in (before, after))
+    return {
+        "decided": dict(session.decisions), "keys": session.keys, "clock_s": session.clock_s, "marks": session.marks,
+        "keys_of_marks": session.keys_of_marks, "right_before": len(before) - len(wrong_before),
+        "right": len(after) - len(wrong), "changed": len(changed), "decided_about": len(changed & expected),
+        "wrong": [f"{key}: {after[key]['status']}: {after[key]['reason']}" for key in wrong],
+        "changed_undecided": [f"{key}: {before[key]} -> {after[key]}" for key in sorted(changed - expected)],
+    }  # fmt: skip
+
+
+def report(rows: Sequence[Row]) -> Iterator[str]:
+    for row in rows:
+        yield from (f"{name}: {value}" for name, value in row.items())
 
 
 def is_right(row: Mapping[str, str], truth: Truth) -> bool:
@@ -246,25 +238,15 @@ def plant(path: Path, fault: Fault, px: Mapping[str, Array], rng: np.random.Gene
 
 def reviewed(project: Path, truths: Mapping[str, Truth], session: Session) -> int:
     """Answer all questions of the queue; returns the number of answers."""
-    command = [sys.executable, "-c", START, "review", str(project), "--no-browser", "--who", "ann"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
-        assert server.stdout is not None
-        try:
-            with sync_playwright() as playwright:
-                found = shutil.which("chromium") or shutil.which("chromium-browser")
-                browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
-                page = browser.new_context(viewport={"width": 1300, "height": 900}, bypass_csp=True).new_page()
-                page.goto(server.stdout.readline().strip())
-                page.wait_for_function("document.getElementById('left').textContent !== '…'")
-                began, answers = time.monotonic(), 0
-                while (left := page.inner_text("#left"))[0].isdigit():
-                    Person(page, truths, session).answers()
-                    page.wait_for_function("left => document.getElementById('left').textContent !== left", arg=left)
-                    answers += 1
-                session.clock_s += time.monotonic() - began
-                browser.close()
-        finally:
-            server.kill()
+    with served_page(project) as (page, address, _):
+        page.goto(address)
+        page.wait_for_function("document.getElementById('left').textContent !== '…'")
+        began, answers = time.monotonic(), 0
+        while (left := page.inner_text("#left"))[0].isdigit():
+            Person(page, truths, session).answers()
+            page.wait_for_function("left => document.getElementById('left').textContent !== left", arg=left)
+            answers += 1
+        session.clock_s += time.monotonic() - began
     return answers
 
 
@@ -349,11 +331,7 @@ _SHOWN = """() => {
 # --- files
 
 
-def measure_project(project: Path) -> None:
-    subprocess.run([sys.executable, "-c", START, "measure", str(project)], check=False, capture_output=True)
-
-
-def rows(folder: Path) -> Rows:
+def rows(folder: Path) -> Marks:
     lines = (folder / "comparator.csv").read_text(encoding="utf-8").splitlines()
     table = csv.DictReader(line for line in lines if not line.startswith("#"))
     return {(row["image"], row["point"]): row for row in table}
@@ -361,11 +339,3 @@ def rows(folder: Path) -> Rows:
 
 def decisions(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / "decisions.jsonl").read_text(encoding="utf-8").splitlines()]
-
-
-if __name__ == "__main__":
-    given = sys.argv[1:]
-    with tempfile.TemporaryDirectory() as temporary:
-        kept = Path(given[1]) if len(given) > 1 else Path(temporary) / "faults"
-        kept.mkdir(parents=True)
-        sys.exit(main(int(given[0]) if given else 1, kept))

@@ -1,16 +1,15 @@
 """Robust initial values of orientations with gross errors, compared with OpenCV's RANSAC and USAC.
 
-python -m benchmarks robust_searches [--count 60]
-
 Orientations of aerial images from 12 or 40 points, a fraction of which is elsewhere in the frame. Correct is an
 orientation that projects the true points to within 10 standard deviations (one image), or is correct to 0.03 rad (two).
 RANSAC requires a threshold: once it is set to the noise, and once to the distortion of an unknown lens. The searches of
 `adjust` estimate it.
 """
 
-import argparse
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import product
 
 import cv2
 import numpy as np
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from adjust.initial_values.model_formation import relative_poses
 from adjust.initial_values.pose import Pose
 from adjust.initial_values.resection import resect
+from benchmarks.harness import Row
 
 Array = NDArray[np.float64]
 Found = Sequence[Pose]
@@ -123,34 +123,26 @@ def _angle(rotation: Array) -> float:
     return float(np.linalg.norm(cv2.Rodrigues(rotation)[0]))
 
 
-def main() -> None:
-    """Print the table: correct orientations of `count`, and CPU time per orientation, ms."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--count", type=int, default=60)
-    count = parser.parse_args().count
-    for what, study, own, theirs in (
-        ("resection", one_image, resected, solved_pnp),
-        ("relative orientation", two_images, from_rays, essential),
-    ):
-        methods: dict[str, Callable[..., Found]] = {"own": own}
-        for usac in (False, True):
-            for text, gate in GATES_MM.items():
-                methods[f"{'USAC' if usac else 'RANSAC'}, {text}"] = _select_found(theirs, gate, usac)
-        for relief in (200.0, 0.0):
-            for points, share in ((12, 0.0), (12, 1 / 4), (12, 1 / 3), (40, 1 / 3)):
-                result = []
-                for name, method in methods.items():
-                    start = time.process_time()
-                    right = sum(study(method, points, share, relief, number) for number in range(count))
-                    result.append(f"{name} {right}, {1000 * (time.process_time() - start) / count:.1f} ms")
-                print(
-                    f"{what}, {points} points, {share:.0%} wrong, relief {relief:g} m: {'; '.join(result)}", flush=True
-                )
+STUDIES = {"resection": (one_image, resected, solved_pnp), "relative orientation": (two_images, from_rays, essential)}
+METHODS = {
+    "own": None,
+    **{f"{name}, {text}": (gate, name == "USAC") for name in ("RANSAC", "USAC") for text, gate in GATES_MM.items()},
+}
+COLUMNS = {"study": "", "points": "d", "share": ".0%", "relief_m": "g", "method": "", "right": "d", "ms": ".1f"}
 
 
-def _select_found(theirs: Callable[..., Found], gate_mm: float, usac: bool) -> Callable[..., Found]:
-    return lambda *given: theirs(gate_mm, usac, *given)
+def cells() -> Iterator[Row]:
+    for study, relief_m in product(STUDIES, (200.0, 0.0)):
+        for points, share in ((12, 0.0), (12, 1 / 4), (12, 1 / 3), (40, 1 / 3)):
+            for method in METHODS:
+                yield {"study": study, "points": points, "share": share, "relief_m": relief_m, "method": method}
 
 
-if __name__ == "__main__":
-    main()
+def case(study: str, points: int, share: float, relief_m: float, method: str, count: int = 60) -> Row:
+    """Number of correct orientations of `count`, and CPU time per orientation, ms."""
+    run, own, theirs = STUDIES[study]
+    options = METHODS[method]
+    found = own if options is None else partial(theirs, *options)
+    start = time.process_time()
+    right = sum(run(found, points, share, relief_m, number) for number in range(count))
+    return {"right": right, "ms": 1000 * (time.process_time() - start) / count}

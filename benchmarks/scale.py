@@ -10,11 +10,7 @@ its covariances, and in "free" the approximate values; vpv is the weighted sum o
 Ceres is measured if pycolmap, which includes it, is installed.
 """
 
-import json
-import os
 import resource
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -27,13 +23,15 @@ from scipy.optimize import least_squares
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import splu
 
+from adjust.functional_model.lens import Prior
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.least_squares.iteration import linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.problem.network import Exterior
 from adjust.problem.problem import ABSENT, number
-from adjust.solution.adjustment import adjust
-from benchmarks.harness import ONE_THREAD, Row
+from adjust.solution.adjustment import Options, adjust
+from adjust.solution.result import Adjustment
+from benchmarks.harness import Row
 from benchmarks.large_networks import (
     CONTROL_EVERY,
     FLIP,
@@ -60,6 +58,8 @@ STRIPS, STRIPS_OF_RESEAU_ALONE, HANGING = (500,), (1000, 2000, 4000), 1000  # im
 LEAST_SCIPY_IMAGES = 200  # largest number of images for SciPy, which takes minutes
 PATIENCE_S = 300.0  # s, limit of the CPU time of SciPy
 GUESS = 2.0  # principal distance in units of the true one, for programs that require one
+OFF = 1.005  # the same where it is given
+PIXELS_PER_MM = 10.0
 
 
 def cells() -> Iterator[Row]:
@@ -86,7 +86,7 @@ def case(case: str, program: str, images: int, points: int = 0, flat: bool = Fal
         "hanging strip": lambda: strip(images, 0),
     }[case]()
     programs: dict[str, Callable[[Scene], Figures]] = {
-        "reseau": reseau_alone if case == "free" else reseau,
+        "reseau": reseau_from_points if case == "free" else reseau,
         "opencv": lambda scene: opencv(scene, free=case == "free", flat=flat),
         "scipy": scipy,
         "ceres": ceres,
@@ -106,15 +106,6 @@ def report(rows: Sequence[Row]) -> Iterator[str]:
             same = "the same" if abs(other["vpv"] / first["vpv"] - 1.0) < 1e-6 else "another"
             ratio = first["cpu_seconds"] / other["cpu_seconds"]
             yield f"{name}, {images} images: {ratio:.2f} of the time of {other['program']}, {same} minimum"
-
-
-def run_timed(program: str, *, images: int, points: int) -> Figures:
-    """Measure one program on an aerial block in its own process."""
-    options = ["--case", "unknown", "--program", program, "--images", str(images), "--points", str(points), "--json"]
-    command = [sys.executable, "-m", "benchmarks", "scale", *options]
-    environment = os.environ | ONE_THREAD
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
-    return {} if done.returncode else dict(json.loads(done.stdout.splitlines()[-1]))
 
 
 def _timed(work: Callable[[], Any]) -> tuple[Any, float]:
@@ -141,20 +132,18 @@ def reseau(scene: Scene) -> Figures:
     return figures | {"tests_seconds": tests, "mib_with_tests": _peak_mib()}
 
 
-def reseau_alone(scene: Scene) -> Figures:
-    """Measure approximate values and adjustment with only the points given, not even a principal distance."""
-    cameras = tuple(
-        replace(camera, principal_distance_mm=None, x0_mm=None, y0_mm=None) for camera in scene.network.cameras
-    )
-    network = replace(scene.network, cameras=cameras)
+def reseau_from_points(scene: Scene, c: Prior | None = None, options: Options | None = None) -> Figures:
+    """Measure approximate values and adjustment with only the points given, and a principal distance or not even
+    that."""
+    cameras = tuple(replace(each, principal_distance_mm=c, x0_mm=None, y0_mm=None) for each in scene.network.cameras)
 
-    def adjusted() -> Figures:
-        result = adjust(network)
+    def adjusted() -> Adjustment:
+        result = adjust(replace(scene.network, cameras=cameras), None, options)
         assert len(result.cofactor.variances)  # OpenCV computes them, too
-        return {"vpv": result.vpv}
+        return result
 
-    figures, seconds = _timed(adjusted)
-    return {**figures, "cpu_seconds": seconds, "mib": _peak_mib()}
+    result, seconds = _timed(adjusted)
+    return {"cpu_seconds": seconds, "mib": _peak_mib(), "vpv": result.vpv, "c_mm": result.value("IO.K.c")}
 
 
 def opencv(scene: Scene, free: bool, flat: bool) -> Figures:
@@ -162,15 +151,20 @@ def opencv(scene: Scene, free: bool, flat: bool) -> Figures:
     one for points in relief, which require one."""
     cv2.setNumThreads(1)
     model = [scene.points[inside].astype(np.float32) for inside, _ in scene.seen]
-    imaged = [((places * (1.0, -1.0) + FRAME_MM / 2) * 10.0).astype(np.float32) for _, places in scene.seen]
-    size, c = int(10 * FRAME_MM), 10 * FOCAL_MM * (GUESS if free else 1.005)
+    imaged = [pixels.astype(np.float32) for pixels in pixels_of_images(scene)]
+    size, c = int(PIXELS_PER_MM * FRAME_MM), PIXELS_PER_MM * FOCAL_MM * (GUESS if free else OFF)
     start = np.array([[c, 0.0, size / 2], [0.0, c, size / 2], [0.0, 0.0, 1.0]])
     flags = cv2.CALIB_FIX_ASPECT_RATIO | (0 if free and flat else cv2.CALIB_USE_INTRINSIC_GUESS)
     found, seconds = _timed(
         lambda: cv2.calibrateCameraExtended(model, imaged, (size, size), start, np.zeros(5), flags=flags)
     )
-    count = sum(len(inside) for inside, _ in scene.seen)
-    return {"cpu_seconds": seconds, "mib": _peak_mib(), "vpv": found[0] ** 2 * count / (10 * SIGMA_MM) ** 2}
+    vpv = found[0] ** 2 * sum(map(len, imaged)) / (PIXELS_PER_MM * SIGMA_MM) ** 2
+    return {"cpu_seconds": seconds, "mib": _peak_mib(), "vpv": vpv, "c_mm": float(found[1][0, 0]) / PIXELS_PER_MM}
+
+
+def pixels_of_images(scene: Scene) -> list[Array]:
+    """Pixel coordinates (m, 2) of the marks of each image, y down."""
+    return [(places * (1.0, -1.0) + FRAME_MM / 2) * PIXELS_PER_MM for _, places in scene.seen]
 
 
 class SparseProblem:

@@ -1,16 +1,13 @@
 """Separation of scanner errors from film deformations and fiducials: claimed against realised standard deviations.
 
-python -m benchmarks scanner [NETWORKS]
-
 Simulated networks, each adjusted with the terms of the scanner error in addition to all other unknowns: frames in two
 scan orientations, in four, and convergent photographs of targets. For each setup: RMS error over the RMS claimed
 standard deviation, over all terms and the extremes over terms; then how often frames in equal orientation are reported,
-and which terms the tests select.
+and which terms the tests select, of a tenth of the networks.
 """
 
-import sys
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, partial
 
 import numpy as np
@@ -23,6 +20,7 @@ from adjust.model_selection.scanner_choice import choose_bends
 from adjust.problem.network import Approximations, Network
 from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
+from benchmarks.harness import Row, table
 
 Array = NDArray[np.float64]
 Made = Callable[[np.random.Generator, Mapping[str, Prior]], tuple[Network, Approximations]]
@@ -38,30 +36,26 @@ HALVES, QUARTERS = (0.0, 180.0), (0.0, 90.0, 180.0, 270.0)
 CHOSEN = {"a20": 0.02, "b11": -0.015, "b02": 0.01}
 
 
-def main() -> None:
-    """Print the tables."""
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 200
-    setups: tuple[tuple[str, Sequence[str], Made], ...] = (
-        ("8 frames, 8 marks each, turned by 0 and 180 degrees", EVEN, partial(laid, HALVES * 4, EVEN)),
-        (
-            "8 frames, 8 marks each, in all four quarters",
-            TOLD_BY_QUARTERS,
-            partial(laid, QUARTERS * 2, TOLD_BY_QUARTERS),
-        ),
-        ("4 convergent photographs of 40 known targets, 5 marks each", tuple(BEND_MM), photographs),
-    )
-    print(f"{count} networks a setup\n")
-    for words, terms, made in setups:
-        print(f"{words}: {len(terms)} terms free\n  {_ratios(count, terms, made)}", flush=True)
-    few = max(count // 10, 5)
-    alike = (laid((0.0,) * 8, EVEN, np.random.default_rng(seed), dict.fromkeys(EVEN, FREE)) for seed in range(few))
-    result = sum(_names_bend(adjust(*network)) for network in alike)
-    print(f"\nframes that all lie alike, 6 terms free: told in {result} of {few} networks")
-    for truth, words in ((CHOSEN, ", ".join(CHOSEN)), ({}, "none")):
-        chosen = Counter(_chosen(truth, seed) for seed in range(few))
-        print(f"terms that bend: {words}; chosen by the tests, of {few} networks:")
-        for names, number in chosen.most_common():
-            print(f"  {number} times {', '.join(names) or 'none'}")
+def cells(networks: int = 200) -> Iterator[Row]:
+    yield from ({"study": setup, "networks": networks} for setup in SETUPS)
+    few = max(networks // 10, 5)
+    yield from ({"study": study, "networks": few} for study in ("all alike, 6 terms", *CHOICES))
+
+
+def case(study: str, networks: int) -> Row:
+    if study in SETUPS:
+        return _ratios(networks, *SETUPS[study])
+    if study in CHOICES:
+        return {"chosen": dict(Counter(", ".join(_chosen(CHOICES[study], seed)) or "none" for seed in range(networks)))}
+    free = dict.fromkeys(EVEN, FREE)
+    alike = (laid((0.0,) * 8, EVEN, np.random.default_rng(seed), free) for seed in range(networks))
+    return {"chosen": {"told": sum(_names_bend(adjust(*network)) for network in alike)}}
+
+
+def report(rows: Sequence[Row]) -> Iterator[str]:
+    figures = dict.fromkeys(("ratio", "least", "largest", "claimed_um", "to_um", "sigma0"), ".3f")
+    yield from table({"study": "", "terms": "d", "networks": "d", **figures}, [row for row in rows if "terms" in row])
+    yield from (f"{row['study']}, of {row['networks']}: {row['chosen']}" for row in rows if "chosen" in row)
 
 
 def laid(
@@ -82,7 +76,15 @@ def photographs(rng: np.random.Generator, free: Mapping[str, Prior]) -> tuple[Ne
     return bend_in_scanner(network, BEND_MM, free), start
 
 
-def _ratios(count: int, terms: Sequence[str], made: Made) -> str:
+SETUPS: dict[str, tuple[Sequence[str], Made]] = {
+    "8 frames, 8 marks each, turned by 0 and 180 degrees": (EVEN, partial(laid, HALVES * 4, EVEN)),
+    "8 frames, 8 marks each, in all four quarters": (TOLD_BY_QUARTERS, partial(laid, QUARTERS * 2, TOLD_BY_QUARTERS)),
+    "4 convergent photographs of 40 known targets, 5 marks each": (tuple(BEND_MM), photographs),
+}
+CHOICES: dict[str, Mapping[str, float]] = {f"chosen for {', '.join(CHOSEN)}": CHOSEN, "chosen for none": {}}
+
+
+def _ratios(count: int, terms: Sequence[str], made: Made) -> Row:
     errors, sigmas, sigma0 = np.empty((count, len(terms))), np.empty((count, len(terms))), np.empty(count)
     for seed in range(count):
         result = adjust(*made(np.random.default_rng(seed), dict.fromkeys(terms, FREE)))
@@ -92,12 +94,10 @@ def _ratios(count: int, terms: Sequence[str], made: Made) -> str:
         sigmas[seed] = [result.sigma(f"SC.S.{name}") for name in terms]
         sigma0[seed] = result.sigma0
     each = np.sqrt((errors**2).mean(axis=0) / (sigmas**2).mean(axis=0))
-    together = float(np.sqrt((errors**2 / (sigmas**2).mean(axis=0)).mean()))
-    typical = 1e3 * np.sqrt((sigmas**2).mean(axis=0))
-    return (
-        f"realised over claimed {together:.3f}, by term {each.min():.2f} to {each.max():.2f}; claimed "
-        f"{typical.min():.2f} to {typical.max():.2f} um; mean sigma0 {sigma0.mean():.3f}"
-    )
+    together = np.sqrt((errors**2 / (sigmas**2).mean(axis=0)).mean())
+    um = 1e3 * np.sqrt((sigmas**2).mean(axis=0))
+    spread = {"least": each.min(), "largest": each.max(), "claimed_um": um.min(), "to_um": um.max()}
+    return {"terms": len(terms), "ratio": together, **spread, "sigma0": sigma0.mean()}
 
 
 def _names_bend(result: Adjustment) -> bool:
@@ -109,7 +109,3 @@ def _chosen(truth: Mapping[str, float], seed: int) -> tuple[str, ...]:
     network = bent_films(turns, truth, {}, np.random.default_rng(seed))
     choice = choose_bends(network, partial(adjust, approximations=_start(turns)))
     return tuple(choice.network.scanners[0].terms)
-
-
-if __name__ == "__main__":
-    main()

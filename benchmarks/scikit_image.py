@@ -1,13 +1,10 @@
 """Methods of scikit-image compared with those of the program, on the same synthetic images and points.
 
-python -m benchmarks scikit_image [--only NAME] [--count 24]
-
 Each row is one method: its figure of merit, and that of the method used by the program.
 """
 
-import argparse
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
@@ -27,6 +24,7 @@ from true_marks import KIND, TrueMark, some_mark
 
 from adjust.functional_model.transformation import film_kind
 from adjust.initial_values.fiducial_fit import fit_transformation
+from benchmarks.harness import Row, rms
 from benchmarks.measured_marks import CONTRAST, GROUND, draw_mark, measure_mark, start_off
 from measure.boards.corners import junctions
 from measure.fiducials.consistency import FrameMarks, Scatter, gross_errors
@@ -52,7 +50,7 @@ def ellipse_model(count: int) -> str:
         found, place = measure_mark(mark, noisy, rng, off=start_off(mark, rng)), mark.place[:, 2]
         ours += [] if found is None else [found.center_px - place]
         theirs += [contour_center(noisy, place) - place]
-    return f"{_rms(theirs)} px | least-squares matching {_rms(ours)} px"
+    return f"{rms(theirs):.4f} px | least-squares matching {rms(ours):.4f} px"
 
 
 def contour_center(grey: Array, about_px: Array) -> Array:
@@ -86,7 +84,7 @@ def phase_correlation(count: int) -> str:
         tapered = [(each - each.mean()) * window("hann", each.shape) for each in pictures]
         moved, _error, _phase = phase_cross_correlation(*tapered[::-1], upsample_factor=100, normalization=None)
         theirs.append(np.asarray(moved)[::-1] - shift)
-    return f"{_rms(theirs)} px | matching in both {_rms(ours)} px"
+    return f"{rms(theirs):.4f} px | matching in both {rms(ours):.4f} px"
 
 
 def blobs(_: int) -> str:
@@ -173,7 +171,7 @@ def corners(count: int) -> str:
         ours.append(junctions(grey[None], start[None], 7.0)[0] - center)
         theirs.append(corner_subpix(grey, start[None, ::-1].astype(int), window_size=13)[0, ::-1] - center)
     lost = int(np.isnan(np.array(theirs)).any(axis=1).sum())
-    return f"{_rms(theirs)} px, none for {lost} of {4 * count} | OpenCV {_rms(ours)} px"
+    return f"{rms(theirs):.4f} px, none for {lost} of {4 * count} | OpenCV {rms(ours):.4f} px"
 
 
 def morphology(count: int) -> str:
@@ -215,10 +213,6 @@ def film(count: int) -> str:
     return f"{' | '.join(result)}; {lost:.0%} of the places outside of all triangles"
 
 
-def _rms(errors: Sequence[Array]) -> str:
-    return f"{np.sqrt(np.nanmean(np.square(errors))):.4f}" if len(errors) else "-"
-
-
 METHODS: dict[str, Callable[[int], str]] = {
     "EllipseModel": ellipse_model,
     "phase_cross_correlation": phase_correlation,
@@ -230,16 +224,12 @@ METHODS: dict[str, Callable[[int], str]] = {
 }
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--only", choices=METHODS)
-    parser.add_argument("--count", type=int, default=24)
-    given = parser.parse_args()
-    for name, method in METHODS.items():
-        if given.only in (None, name):
-            print(f"| {name} | {method(given.count)} |", flush=True)
+COLUMNS = {"method": "", "figures": ""}
 
 
-if __name__ == "__main__":
-    main()
+def cells() -> Iterator[Row]:
+    yield from ({"method": method} for method in METHODS)
+
+
+def case(method: str, count: int = 24) -> Row:
+    return {"figures": METHODS[method](count)}

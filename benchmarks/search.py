@@ -1,29 +1,19 @@
 """Search of marks and scan orientation (pose) in rendered frames, against the true values.
 
-python -m benchmarks search OUT.jsonl [--frames 600] [--first 0] [--seed 1]
-
-A line per frame is appended to OUT.jsonl, and frames already in it are skipped, so that a run can be continued; two
-runs with different frames may share the file. Then the tables of all its lines are printed. With --only INDEX one frame
-is printed mark by mark, and its image is written to the folder of OUT.jsonl.
+Tables of outcomes by kind of mark, exposure and symmetry of the marks, and the numbers of frames that went wrong.
 """
 
-import argparse
-import json
 import time
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator, Sequence
 
-import cv2
 import numpy as np
 
+from benchmarks.harness import Row, table
 from benchmarks.search_frames import KINDS, SYMMETRIES, Case, draw_case
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.flags import Status
 from measure.results import FrameMeasurement, MarkMeasurement
-
-Json = dict[str, Any]
 
 WRONG_SIGMAS = 5.0
 WRONG_PX = 0.5  # px; a mark is wrong if its error exceeds this and WRONG_SIGMAS
@@ -31,32 +21,15 @@ OUTCOMES = ("all marks", "some marks", "refused", "wrong, weak", "WRONG")
 POSE_OUTCOMES = ("right", "assumed", "WRONG", "none")
 
 
-def main() -> None:
-    """Measure the missing frames, and print the tables."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--frames", type=int, default=600)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", type=int)
-    given = parser.parse_args()
-    if given.only is not None:
-        tell(draw_case(given.seed, given.only), given.out.with_name(f"{given.only}.png"))
-        return
-    done = {line["frame"] for line in lines(given.out)}
-    for index in range(given.first, given.first + given.frames):
-        if index not in done:
-            with given.out.open("a", encoding="utf-8") as file:
-                file.write(json.dumps({"frame": index, **judge_case(draw_case(given.seed, index))}) + "\n")
-    print_tables(lines(given.out))
+def cells(frames: int = 600, first: int = 0) -> Iterator[Row]:
+    yield from ({"frame": index} for index in range(first, first + frames))
 
 
-def lines(path: Path) -> list[Json]:
-    """Results of the frames done."""
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
+def case(frame: int, seed: int) -> Row:
+    return judge_case(draw_case(seed, frame))
 
 
-def judge_case(case: Case) -> Json:
+def judge_case(case: Case) -> Row:
     """Measure a frame and compare it with the true values."""
     begin = time.perf_counter()
     result = measure_case(case)
@@ -75,7 +48,7 @@ def judge_case(case: Case) -> Json:
         "outcome": outcome(case, marks, observed, wrong),
         "pose": pose_outcome(case, result) if observed else "none",
         "weak": sum(mark.status is Status.WEAK for mark in marks.values()),
-        "seconds": round(seconds, 2),
+        "seconds": seconds,
     }
 
 
@@ -114,44 +87,22 @@ def pose_outcome(case: Case, result: FrameMeasurement) -> str:
     return "right" if result.pose.name == case.pose else "WRONG"
 
 
-def print_tables(done: Sequence[Json]) -> None:
-    """Print outcomes by kind of mark and exposure, and poses by the symmetry of the marks."""
-    print(f"{len(done)} frames, median {np.median([line['seconds'] for line in done]):.2f} s a frame\n")
-    print_table("marks", "kind", KINDS, "outcome", OUTCOMES, done)
-    print_table("picture", "picture", sorted({line["picture"] for line in done}), "outcome", OUTCOMES, done)
-    print_table("pose", "symmetry", SYMMETRIES, "pose", POSE_OUTCOMES, done)
-    for name, key in (("frames with a wrong mark", "wrong"),):
-        print(f"{name}: {[line['frame'] for line in done if line[key]]}")
-    print(f"frames with a wrong pose: {[line['frame'] for line in done if line['pose'] == 'WRONG']}")
-    print(f"frames refused: {[line['frame'] for line in done if line['outcome'] == 'refused']}")
+def report(rows: Sequence[Row]) -> Iterator[str]:
+    """Outcomes by kind of mark and exposure, and poses by the symmetry of the marks."""
+    yield f"{len(rows)} frames, median {np.median([row['seconds'] for row in rows]):.2f} s a frame"
+    yield from counts("kind", KINDS, "outcome", OUTCOMES, rows)
+    yield from counts("picture", sorted({row["picture"] for row in rows}), "outcome", OUTCOMES, rows)
+    yield from counts("symmetry", SYMMETRIES, "pose", POSE_OUTCOMES, rows)
+    yield f"frames with a wrong mark: {[row['frame'] for row in rows if row['wrong']]}"
+    yield f"frames with a wrong pose: {[row['frame'] for row in rows if row['pose'] == 'WRONG']}"
+    yield f"frames refused: {[row['frame'] for row in rows if row['outcome'] == 'refused']}"
 
 
-def print_table(
-    title: str, row_key: str, rows: Sequence[str], column_key: str, columns: Sequence[str], done: Sequence[Json]
-) -> None:
-    """Print the number of frames by row and outcome."""
-    print(f"{title:24}" + "".join(f"{column:>13}" for column in columns) + f"{'frames':>9}")
-    for row in rows:
-        own = [line[column_key] for line in done if line[row_key] == row]
-        print(f"{row:24}" + "".join(f"{own.count(column):13d}" for column in columns) + f"{len(own):9d}")
-    print()
-
-
-def tell(case: Case, picture: Path) -> None:
-    """Print one frame mark by mark, and write its image."""
-    result = measure_case(case)
-    print(f"{case.kind}, {case.symmetry}, {case.picture}; true pose {case.pose}; hidden {sorted(case.hidden)}")
-    print(f"pose {result.pose}\nproblems {result.problems}")
-    for mark in result.marks:
-        true = case.centers_px[mark.point]
-        place = "" if mark.center_px is None else f"{np.round(mark.center_px, 2)}"
-        wrong = mark.status.is_observation and is_wrong(case, mark, result)
-        print(
-            f"{mark.point:3} true {np.round(true, 2)} {place:20} {mark.status} {'WRONG' if wrong else ''} {mark.reason}"
-        )
-    grey = case.scan.window(0, 0, case.scan.width_px, case.scan.height_px)
-    cv2.imwrite(str(picture), (grey / case.scan.full_scale_dn * 255).astype(np.uint8))
-
-
-if __name__ == "__main__":
-    main()
+def counts(key: str, groups: Sequence[str], column: str, columns: Sequence[str], rows: Sequence[Row]) -> Iterator[str]:
+    """Yield a table of the number of frames by group and outcome."""
+    lines = []
+    for group in groups:
+        own = [row[column] for row in rows if row[key] == group]
+        lines.append({key: group, **{each: own.count(each) for each in columns}, "frames": len(own)})
+    yield ""
+    yield from table({key: "", **dict.fromkeys(columns, "d"), "frames": "d"}, lines)

@@ -89,14 +89,6 @@ def draw_case(seed: int, index: int, pitch_um: float = PITCH_UM) -> Case:
     return make_case(rng, kind, symmetry, _layout(rng, kind, symmetry), f"{index}.tif", pitch_um=pitch_um)
 
 
-def is_overexposed(seed: int, index: int) -> bool:
-    """Whether that frame is overexposed, without rendering it."""
-    rng = np.random.default_rng([seed, index])
-    kind, symmetry = str(rng.choice(KINDS)), str(rng.choice(SYMMETRIES))
-    _layout(rng, kind, symmetry)
-    return kind != "wing" and _tones(rng)[1] == "overexposed"
-
-
 def make_case(
     rng: Generator,
     kind: str,

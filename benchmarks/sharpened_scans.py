@@ -16,7 +16,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from true_marks import KIND, some_mark
 
-from benchmarks.harness import Row
+from benchmarks.harness import Row, table
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.flags import Status
@@ -97,17 +97,16 @@ def draw(
     return FiducialLayout(layout, (36.0, 36.0)), light, true_px
 
 
-def report(rows: Sequence[Row]) -> list[str]:
+def report(rows: Sequence[Row]) -> Iterator[str]:
     lines = []
     for low, high in pairwise(GROUPS):
         group = [row for row in rows if low <= row["amount"] < high]
-        if group:
-            count = sum(row["measured"] for row in group)
-            squares = sum(row["measured"] * row["whitened"] ** 2 for row in group if row["measured"])
-            share, wrong = count / (len(PLACES) * len(group)), sum(row["wrong"] for row in group)
-            taken = sum(row["found"] > 0 for row in group)
-            lines.append(
-                f"amount {low:g} to {high:g}: {len(group)} frames, {share:.1%} measured, error over claim "
-                f"{np.sqrt(squares / max(count, 1)):.2f}, {wrong} beyond 5 sigma, {taken} taken for sharpened"
-            )
-    return lines
+        count = sum(row["measured"] for row in group)
+        squares = sum(row["measured"] * row["whitened"] ** 2 for row in group if row["measured"])
+        lines.append({
+            "amount": low, "to": high, "frames": len(group), "measured": count / max(len(PLACES) * len(group), 1),
+            "whitened": np.sqrt(squares / max(count, 1)), "beyond 5 sigmas": sum(row["wrong"] for row in group),
+            "taken for sharpened": sum(row["found"] > 0 for row in group),
+        })  # fmt: skip
+    specs = {"measured": ".1%", "whitened": ".2f", "amount": "g", "to": "g"}
+    return table({name: specs.get(name, "d") for name in lines[0]}, lines)

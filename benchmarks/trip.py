@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 import tifffile
 
-ROOT = Path(__file__).parents[1]
-sys.path += [str(ROOT / "tests" / "pipeline"), str(ROOT / "tests" / "measure")]
+from benchmarks.harness import ROOT
+
 PACKAGES = ("measure", "adjust", "pipeline")
 # Modules that call functions passed to them, as `map` does, or in each Gauss-Newton step: not counted.
 CALLERS = ("measure/scans/parallel.py", "measure/matching/gauss_newton.py", "pipeline/provenance.py")

@@ -1,17 +1,13 @@
 """Scan orientation (pose) from the writing in rendered frames, against the true pose.
 
-python -m benchmarks writing [FRAMES] [WITHOUT] [ROWS.jsonl]
-
 Frames with four equal marks, in all poses, with all backgrounds, negatives included, blurred, grainy, compressed.
 Titles of 6 to 40 characters are at one side, some with words that read the same upside down or mirrored; some frames
 have a data plate at the opposite side, or a handwritten number anywhere. Three of four cameras specify where they
-write. The frames WITHOUT writing are of such cameras, too. ROWS keeps the results, so that a stopped run continues.
+write. The frames without writing are of such cameras, too.
 """
 
-import json
-import sys
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, get_args
@@ -19,6 +15,7 @@ from typing import Any, get_args
 import cv2
 import numpy as np
 
+from benchmarks.harness import Row, table
 from benchmarks.lone_frames import lone_frame, make_fiducials, make_image, painted
 from benchmarks.search_frames import SIDES
 from benchmarks.writing_lines import ALIKE, line_text
@@ -41,7 +38,6 @@ from synthetic_images.scene import (
 from synthetic_images.writing import FONTS, HANDWRITING
 
 Generator = np.random.Generator
-Row = dict[str, Any]
 
 SEED = 63
 FRAME_MM, PITCH_UM, MARGIN_MM, AT_MM = 24.0, 40.0, 4.2, 10.6
@@ -51,25 +47,15 @@ OPPOSITE: Mapping[Side, Side] = {"left": "right", "right": "left", "top": "botto
 TURNED: Mapping[str, str] = {"0": "180", "180": "0", "90": "270", "270": "90"}
 
 
-def main() -> None:
-    """Print the tables."""
-    written, without = (int(text) for text in (*sys.argv[1:3], "500", "200")[:2])
-    path = Path(sys.argv[3]) if len(sys.argv) > 3 else None
-    kept = [json.loads(line) for line in path.read_text().splitlines()] if path and path.exists() else []
-    rows = {row["index"]: row for row in kept}
-    total = written + without
+def cells(frames: int = 500, without: int = 200) -> Iterator[Row]:
+    """Frames, those without writing spread over the run."""
+    total = frames + without
     for index in range(total):
-        if index not in rows:
-            bare = (index + 1) * without // total > index * without // total  # spread over the run
-            rows[index] = make_row(index, not bare)
-            if path:
-                with path.open("a") as file:
-                    file.write(json.dumps(rows[index]) + "\n")
-    report(list(rows.values()))
+        yield {"index": index, "written": (index + 1) * without // total == index * without // total}
 
 
-def report(rows: list[Row]) -> None:
-    """Print the outcomes of the poses, and the rate of correct ones by log-odds."""
+def report(rows: Sequence[Row]) -> Iterator[str]:
+    """Outcomes of the poses, and the rate of correct ones by log-odds."""
     known = [row for row in rows if row["places"] and row["letters"] >= READABLE]
     classes = {
         f"places known, {READABLE} and more characters": known,
@@ -79,17 +65,13 @@ def report(rows: list[Row]) -> None:
         "nothing written": [r for r in rows if not r["letters"]],
     }
     for name, own in classes.items():
-        counts = Counter(outcome(row) for row in own)
-        print(
-            f"{name}: {len(own)} frames: {', '.join(f'{count} {result}' for result, count in sorted(counts.items()))}"
-        )
-    for row in rows:
-        if "WRONG" in outcome(row):
-            print(row)
+        outcomes = sorted(Counter(outcome(row) for row in own).items())
+        yield f"{name}: {len(own)} frames: {', '.join(f'{count} {result}' for result, count in outcomes)}"
+    yield from (str(row) for row in rows if "WRONG" in outcome(row))
     read = [row for row in rows if row["letters"] and row["likelihoods"]]
-    print("\nlog-odds of mirrored or not, and of the turn among the four (places known): told, frames, right")
-    table("mirror", [mirror_lead(row) for row in read])
-    table("turn", [turn_lead(row) for row in read if row["places"]])
+    leads = {"mirrored or not": [mirror_lead(row) for row in read]}
+    leads["turn among the four, places known"] = [turn_lead(row) for row in read if row["places"]]
+    yield from table({"log-odds of": "", "from": ".1f", "to": ".1f", "frames": "d", "right": "d"}, _by_lead(leads))
 
 
 def legible(row: Row) -> float:
@@ -125,15 +107,15 @@ def turn_lead(row: Row) -> tuple[float, bool]:
     return own[best] - own[second], best == row["true"]
 
 
-def table(name: str, leads: Iterable[tuple[float, bool]]) -> None:
-    result = list(leads)
-    for low, high in pairwise(BINS):
-        inside = [right for lead, right in result if low <= lead < high]
-        if inside:
-            print(f"  {name} {low:.1f} to {high:.1f}: {len(inside):4d} frames, {sum(inside):4d} right")
+def _by_lead(leads: Mapping[str, Iterable[tuple[float, bool]]]) -> Iterator[Row]:
+    for name, result in leads.items():
+        for low, high in pairwise(BINS):
+            inside = [right for lead, right in result if low <= lead < high]
+            if inside:
+                yield {"log-odds of": name, "from": low, "to": high, "frames": len(inside), "right": sum(inside)}
 
 
-def make_row(index: int, written: bool) -> Row:
+def case(index: int, written: bool) -> Row:
     """Render and measure one frame."""
     rng = np.random.default_rng([SEED, index])
     side = SIDES[rng.integers(4)]
@@ -153,7 +135,6 @@ def make_row(index: int, written: bool) -> Row:
     layout = FiducialLayout(marks, (FRAME_MM, FRAME_MM), places)
     found = measure_fiducials(scan, layout, (PITCH_UM, PITCH_UM), FiducialOptions(writing="pose"))
     return {
-        "index": index,
         "true": made.images[0].pose,
         "places": [(place.side, place.pose, place.plate) for place in places],
         "letters": sum(len(line.text.replace(" ", "")) for line in lines) if written else 0,
@@ -243,7 +224,3 @@ def stored(rng: Generator, grey: np.ndarray[Any, np.dtype[np.uint16]]) -> np.nda
         _, packed = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(40, 95))])
         picture = np.asarray(cv2.imdecode(packed, cv2.IMREAD_GRAYSCALE), np.uint8)
     return picture
-
-
-if __name__ == "__main__":
-    main()

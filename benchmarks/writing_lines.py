@@ -1,7 +1,5 @@
 """Orientation of single lines of writing: rate at which the best reading is correct, by its lead over the others.
 
-python -m benchmarks writing_lines [SCANS] [FIRST]
-
 Four lines per scan, one at each side, as on films: titles, dates, heights, numbers, data plates, names, words that read
 the same upside down or mirrored; in all fonts, 8 to 30 px high, blurred, grainy, faint, compressed, light or dark, the
 scan in any pose. The log-odds of readings in the program are taken from this table.
@@ -9,13 +7,14 @@ scan in any pose. The log-odds of readings in the program are taken from this ta
 
 import itertools
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.harness import Row, table
 from measure.annotations.text import MISSING, networks, read_writing
 from measure.geometry import POSES, pose_in_camera
 from measure.scans.cache import WholePicture
@@ -40,29 +39,32 @@ NAMES = (
 )
 
 
-def main() -> None:
-    """Print the table."""
-    scans, first = (int(text) for text in (*sys.argv[1:], "250", "0")[:2])
-    mirror, turn, short = [], [], []
-    for index in range(first, first + scans):
-        for found_mirror, found_turn, legible in count_turns(index):
-            mirror.append(found_mirror)
-            turn.append(found_turn)
-            short.append(legible)
-    print(f"{len(mirror)} lines read of {4 * scans}")
-    table("mirrored or not, by how many more characters are legible", np.array(mirror))
-    table("upside down or not, likewise", np.array(turn))
+def cells(scans: int = 250, first: int = 0) -> Iterator[Row]:
+    yield from ({"scan": index} for index in range(first, first + scans))
 
 
-def table(title: str, lead: Array) -> None:
-    """Print a table. lead: legible characters of the true orientation minus those of the other."""
-    print(f"\n{title}\n   lead of    lines  wrong   log-odds   a character   by maximum likelihood: {slope(lead):.2f}")
+def case(scan: int) -> Row:
+    """Leads of the lines found: legible characters of the true orientation minus those of the other."""
+    mirror, turn = np.reshape(count_turns(scan), (-1, 2)).T
+    return {"mirrored": mirror, "upside down": turn}
+
+
+def report(rows: Sequence[Row]) -> Iterator[str]:
+    columns = {"question": "", "lead": "", "lines": "d", "wrong": "d", "log-odds": ".1f", "a character": ".2f"}
+    leads = {name: np.concatenate([row[name] for row in rows]) for name in ("mirrored", "upside down")}
+    for name, lead in leads.items():
+        yield f"{name} or not: {len(lead)} lines, log-odds a character by maximum likelihood {slope(lead):.2f}"
+    yield from table(columns, (line for name, lead in leads.items() for line in _by_lead(name, lead)))
+
+
+def _by_lead(name: str, lead: Array) -> Iterator[Row]:
     for low, high in itertools.pairwise(BINS):
         inside = lead[(np.abs(lead) >= low) & (np.abs(lead) < high)]
         wrong = int((inside < 0).sum())
         odds = np.log((len(inside) - wrong + 0.5) / (wrong + 0.5))
         mean = float(np.abs(inside).mean()) if len(inside) else np.nan
-        print(f"{low:5.1f} to {high:4.1f}  {len(inside):5d}  {wrong:5d}   {odds:8.1f}   {odds / mean:8.2f}")
+        figures = {"lines": len(inside), "wrong": wrong, "log-odds": odds, "a character": odds / mean}
+        yield {"question": name, "lead": f"{low} to {high}", **figures}
 
 
 def slope(lead: Array) -> float:
@@ -71,9 +73,8 @@ def slope(lead: Array) -> float:
     return float(trials[np.argmin([np.logaddexp(0.0, -each * lead).sum() for each in trials])])
 
 
-def count_turns(index: int) -> list[tuple[float, float, float]]:
-    """For each line found: lead of the true orientation, in characters, for mirroring and for rotation, and the number
-    of legible characters."""
+def count_turns(index: int) -> list[tuple[float, float]]:
+    """For each line found: lead of the true orientation, in characters, for mirroring and for rotation."""
     rng = np.random.default_rng([SEED, index])
     pose = str(rng.choice(POSES))
     grey = picture(rng)
@@ -86,7 +87,7 @@ def count_turns(index: int) -> list[tuple[float, float, float]]:
     for line in read_writing(scan, nets):
         legible = {pose_in_camera(each, pose): reading.legible for each, reading in line.ways.items()}
         right, down, *mirrored = (legible.get(each, -1.0) for each in _possible_turns(legible))
-        found.append((max(right, down) - max(mirrored), right - down, max(legible.values())))
+        found.append((max(right, down) - max(mirrored), right - down))
     return found
 
 
@@ -152,7 +153,3 @@ def line_text(rng: Generator) -> str:
         "".join(rng.choice(list("ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789.-/"), int(rng.integers(1, 14)))),
     )
     return choices[int(rng.integers(len(choices)))]
-
-
-if __name__ == "__main__":
-    main()

@@ -1,19 +1,19 @@
 """Four marks on deformed film, one with an error of 1 mm or none: rates of detection and coverage, by simulation.
 
-python -m benchmarks wrong_marks [FRAMES] [--seed 1]
-
 Each film has a random affinity of the given standard deviation, and a deformation of random size within the range:
 quadratic (opposite corners move in opposite directions) or independent by mark. In one frame of a folder one mark is
 wrong.
 """
 
-import argparse
+from collections.abc import Iterator
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 from test_across_frames import FOUR, PX_PER_MM, make_layout
 
+from benchmarks.harness import Row
 from measure.fiducials.across_frames import check_frames
 from measure.flags import Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
@@ -23,28 +23,30 @@ SIGMA_PX, OFF_MM = 0.03, 1.0
 CLAIMED = 3.0  # standard deviations within which an error is covered
 
 
-def main() -> None:
-    """Print a line for each kind of folder."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("frames", type=int, nargs="?", default=200)
-    parser.add_argument("--seed", type=int, default=1)
-    given = parser.parse_args()
-    print("bend | range, mm | affinity | frames a folder | off, mm | named | another named | flagged | covered")
-    for bend in ("quadratic", "mark by mark"):
-        for range_mm, affinity, count, off_mm in kinds():
-            rng = np.random.default_rng(given.seed)
-            rows = [outcome(rng, bend, range_mm, affinity, count, off_mm) for _ in range(given.frames)]
-            shares = " | ".join(f"{share:.1%}" for share in np.mean(rows, axis=0))
-            print(f"{bend} | {range_mm[0]} to {range_mm[1]} | {affinity} | {count} | {off_mm} | {shares}", flush=True)
+SHARES = ("named", "another named", "flagged", "covered")
+COLUMNS = {"bend": "", "least_mm": "g", "most_mm": "g", "affinity": "g", "count": "d", "off_mm": "g"}
+COLUMNS |= dict.fromkeys(SHARES, ".1%")
 
 
-def kinds() -> list[tuple[tuple[float, float], float, int, float]]:
-    """Range of the deformation, standard deviation of the affinity, number of frames, and error of the mark."""
-    rows: list[tuple[tuple[float, float], float, int, float]] = []
-    for count in (1, 3, 10, 20):
-        rows += [((0.02, 0.1), affinity, count, OFF_MM) for affinity in (2e-4, 4e-4)]
-        rows += [((0.15, 0.15), 2e-4, count, 0.0), ((0.0, 0.005), 2e-4, count, 0.0)]
-    return rows
+def cells(frames: int = 200) -> Iterator[Row]:
+    """Kinds of folders: range of the deformation, standard deviation of the affinity, number of frames, and error of
+    the mark. frames: folders of each kind."""
+    for bend, count in product(("quadratic", "mark by mark"), (1, 3, 10, 20)):
+        for least, most, affinity, off_mm in (
+            (0.02, 0.1, 2e-4, OFF_MM), (0.02, 0.1, 4e-4, OFF_MM), (0.15, 0.15, 2e-4, 0.0), (0.0, 0.005, 2e-4, 0.0),
+        ):  # fmt: skip
+            yield {
+                "bend": bend, "least_mm": least, "most_mm": most, "affinity": affinity, "count": count,
+                "off_mm": off_mm, "frames": frames,
+            }  # fmt: skip
+
+
+def case(
+    bend: str, least_mm: float, most_mm: float, affinity: float, count: int, off_mm: float, frames: int, seed: int
+) -> Row:
+    rng = np.random.default_rng(seed)
+    outcomes = [outcome(rng, bend, (least_mm, most_mm), affinity, count, off_mm) for _ in range(frames)]
+    return dict(zip(SHARES, np.mean(outcomes, axis=0), strict=True))
 
 
 def outcome(
@@ -88,7 +90,3 @@ def bent_frame(rng: np.random.Generator, name: str, bend: str, bend_mm: float, a
     )
     matrix = np.column_stack([pixel_from_film @ linear, [6000.0, 6000.0]])
     return FrameMeasurement(name, marks, Pose("0", True), matrix)
-
-
-if __name__ == "__main__":
-    main()
