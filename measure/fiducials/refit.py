@@ -114,7 +114,7 @@ def _refit_with_tone(frame: Frame) -> Frame:
     """Refit the marks with the tone curve estimated from them; if they disagree, from further initial curves."""
     prior = frame.scan.tone.prior
     best = _refit_from_curve(frame, prior, frame.scan.tone)
-    is_open = best.tone.disagreement > _AGREED and not best.tone.is_doubted and _depends_on_tone(best)
+    is_open = best.tone.disagreement > _AGREED and _depends_on_tone(best)
     for power in _OTHER_STARTS if is_open else ():
         other = _refit_from_curve(best, prior, prior.shift_to_power(power))
         best = other if other.tone.disagreement < best.tone.disagreement else best
@@ -126,7 +126,11 @@ def _refit_from_curve(frame: Frame, prior: Tone, start: Tone) -> Frame:
     if start is frame.scan.tone:
         pending = {index for index, fit in frame.clear_fits.items() if _needs_frame(frame, index, fit)}
     else:
-        frame, pending = replace(frame, scan=frame.scan.replace_tone(start)), set(_mark_tones(frame))
+        frame = _refit(
+            replace(frame, scan=frame.scan.replace_tone(start)),
+            dict.fromkeys(_mark_tones(frame), frame.options.match),
+        )
+        pending = set()
     for _ in range(_TONE_ROUNDS):
         estimate = FrameTone.from_marks(prior, _mark_tones(frame), frame.scan.tone)
         moved = _moved_by_tone(frame, estimate)

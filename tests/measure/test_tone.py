@@ -4,13 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drawn import scan_of
+from drawn import ALIKE, frame_picture, pixel_from_camera, scan_of
 from studies import parametrize_with_studies
 from true_marks import KIND, Kind, TrueMark, some_mark, whitened_rms
 
-from measure import MarkFit, MarkShape, MatchOptions, match, polygon
+from measure import FiducialOptions, MarkFit, MarkShape, MatchOptions, match, polygon
 from measure.detection.localisation import MarkPrediction
+from measure.fiducials.constellation import Placement
 from measure.fiducials.mark_fit import detect_mark, options_for
+from measure.fiducials.measure_frame import measure_frame
 from measure.matching.covariance import Landscape, LinearFit
 from measure.matching.tone_information import mark_tone_information
 from measure.matching.window import Coding, read_window
@@ -357,3 +359,16 @@ def test_curves_to_begin_with_are_others_than_the_one_believed(tone: Tone, power
     starts = tone.starting_curves
     assert [start.equivalent_power(0.1, 0.9)[0] for start in starts] == pytest.approx(powers, abs=0.04)
     assert all(start.prior is tone and np.array_equal(start.covariance, tone.covariance) for start in starts)
+
+
+def test_a_curve_far_from_the_first_one_is_reached_from_another_start() -> None:
+    """Light stored as its power of 1.5: the first linearisation led to a power of 0.3, which no scanner has."""
+    matrix = pixel_from_camera("0", turn_rad=0.004)
+    light = (6000.0 + 40000.0 * (frame_picture(ALIKE, matrix) - 7382.0) / 7500.0) / FULL
+    scan = scan_of(FULL * np.clip(light, 0.0, 1.0) ** 1.5).replace_tone(Tone.unknown())
+    placement = Placement("0", matrix, 4.0, 4, 1, 1, (0.05, 0.05))
+    frame = measure_frame(scan, ALIKE, placement, FiducialOptions(pose="0"))
+    power, sigma = frame.tone.tone.equivalent_power(frame.tone.least, frame.tone.greatest)
+    assert abs(power - 1 / 1.5) < 3 * sigma < 0.2
+    for fit, given in zip(frame.inlier_fits.values(), ALIKE.marks, strict=True):
+        assert np.hypot(*(fit.center_px - matrix @ (*given.xy_mm, 1.0))) < 4 * fit.sigma_px
