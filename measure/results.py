@@ -156,6 +156,7 @@ class FrameMeasurement:
     weights : channel weights with which the fiducials of a colour scan were measured; None for its grey value.
     tone : tone curve of the scan; None if no frame was found.
     writing : lines of text read around the frame; None if text was not searched.
+    notes : remarks that need no action; the stored result of a scan keeps them with its own.
     """
 
     image: str
@@ -166,6 +167,7 @@ class FrameMeasurement:
     weights: tuple[float, ...] | None = None
     tone: FrameTone | None = None
     writing: tuple[Line, ...] | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def px_per_mm(self) -> float | None:

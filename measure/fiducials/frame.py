@@ -55,6 +55,7 @@ class Frame:
     certain : (n,) marks that stand out from the texture clearly enough to be exempt from the outlier test.
     linear_sigma : standard deviation of the rotation (rad), scale, stretch and shear; inf before the adjustment.
     weights : of the channels.
+    channel_note : note on channels that do not coincide.
     tone : tone curve estimated from the marks.
     film : terms of the project's film deformation model beyond pixel_from_camera, None for an affine one.
     """
@@ -69,6 +70,7 @@ class Frame:
     certain: Mask
     linear_sigma: float = np.inf
     weights: tuple[float, ...] | None = None
+    channel_note: str = ""
     tone: FrameTone = field(default_factory=lambda: FrameTone(LINEAR))
     film: FilmFit | None = None
 

@@ -6,6 +6,7 @@ predicts them, and all marks are refitted with the frame's rotation, scale, stre
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import permutations
 
 import numpy as np
 
@@ -32,6 +33,8 @@ _MARGIN_PX = 4.0  # width of the background around a mark, used to estimate its 
 _BLUR_PX = 0.8  # blur of a mark's image, the initial value of a match
 _CLEAR_PEAK = 0.25  # NCC before the fit that corresponds to the likeness of a clear mark after it
 _TRIALS = 6  # about this many marks are used to choose the channels, or to test a placement
+_CHANNELS = "red", "green", "blue"
+_COINCIDING_PX, _FEWEST_SHIFTS = 0.5, 3  # px between two channels below which they coincide, by this many marks
 _SHRINK = 0.1  # shrinkage of the noise covariance towards a multiple of the unit matrix: few pixels determine it poorly
 _ROUNDS = 2  # of detecting faint marks: the first marks found improve the predictions of the others
 
@@ -71,7 +74,8 @@ def rename_frame(scan: Scan, frame: Frame, pose: str) -> Frame:
     placement = frame.fitted_placement.posed(pose, frame.camera_mm)
     found = np.array([fit.center_px for fit in frame.fits if fit])
     names = placement.names(found, frame.camera_mm).tolist() if len(found) else []
-    renamed = replace(Frame.from_placement(scan, frame.layout, placement, frame.options), weights=frame.weights)
+    renamed = Frame.from_placement(scan, frame.layout, placement, frame.options)
+    renamed = replace(renamed, weights=frame.weights, channel_note=frame.channel_note)
     places = {name: place for name, place in zip(names, found, strict=True) if name >= 0}
     renamed = orient_frame(
         renamed.replace_detections(
@@ -164,31 +168,70 @@ def choose_channels(frame: Frame) -> Frame:
     """Choose the channel weights of a colour scan.
 
     Some marks are located, each in the channel (or the luminance) with the highest correlation peak. The weights are
-    then estimated from these marks.
+    then estimated from these marks. Where channels do not coincide, only those count that do with one another.
     If no mark is drawn as light or dark, the weights also determine the polarity.
     """
     if frame.scan.channels == 1:
         return frame
     marks = frame.layout.marks
+    tried = range(0, len(marks), max(1, len(marks) // _TRIALS))
+    predictions = [frame.prediction(index, frame.first_search_px()) for index in tried]
+    peaks = [
+        [highest_peak(frame.scan, replace(expected, weights=weights)) for weights in (*SINGLE_CHANNELS, LUMINANCE)]
+        for expected in predictions
+    ]
+    among, note = registered_channels([each[:-1] for each in peaks])
     places = []
-    for index in range(0, len(marks), max(1, len(marks) // _TRIALS)):
-        expected = frame.prediction(index, frame.first_search_px())
-        peaks = [
-            highest_peak(frame.scan, replace(expected, weights=weights)) for weights in (LUMINANCE, *SINGLE_CHANNELS)
-        ]
-        place, height = max(peaks, key=lambda peak: peak[1])
+    for expected, own in zip(predictions, peaks, strict=True):
+        place, height = max((own[each] for each in (among if note else range(len(own)))), key=lambda peak: peak[1])
         if height > _CLEAR_PEAK:
             places.append((expected.mark, expected.shift_to(place).pixel_from_mark, expected.polarity))
     unsaid = all(mark.mark.polarity == "auto" for mark in marks)
-    best = best_weights(frame.scan, places, (1, -1) if unsaid else (1,))
+    best = best_weights(frame.scan, places, (1, -1) if unsaid else (1,), among)
     if best is None:
         return frame
     weights, sign = best
-    return replace(frame, weights=weights, placement=replace(frame.placement, polarity=sign * frame.placement.polarity))
+    placement = replace(frame.placement, polarity=sign * frame.placement.polarity)
+    return replace(frame, weights=weights, channel_note=note, placement=placement)
+
+
+def registered_channels(peaks: Sequence[Sequence[tuple[Array, float]]]) -> tuple[list[int], str]:
+    """Find the largest group of channels that coincide.
+
+    Parameters
+    ----------
+    peaks : place (px) and height of the correlation peak of each mark in red, green and blue.
+
+    Returns
+    -------
+    Indices of these channels, and a note if others do not coincide with them.
+    """
+    places, heights = (np.array([[peak[part] for peak in each] for each in peaks]) for part in (0, 1))
+    count, clear = len(SINGLE_CHANNELS), heights > _CLEAR_PEAK
+    shifts = np.zeros((count, count, 2))
+    for one, other in permutations(range(count), 2):
+        between = (places[:, other] - places[:, one])[clear[:, one] & clear[:, other]]
+        shift = np.median(between, axis=0) if len(between) >= _FEWEST_SHIFTS else np.zeros(2)
+        if len(between) and np.median(np.hypot(*(between - shift).T)) < _COINCIDING_PX:  # else peaks of something else
+            shifts[one, other] = shift
+    coincide = np.hypot(*np.moveaxis(shifts, -1, 0)) <= _COINCIDING_PX
+    best = max(range(count), key=lambda each: (coincide[each].sum(), heights[:, coincide[each]].sum()))
+    among, apart = (np.flatnonzero(coincide[best] == one).tolist() for one in (True, False))
+    if not apart:
+        return among, ""
+    own = " and ".join(_CHANNELS[each] for each in among)
+    shifted = " and ".join(
+        f"{_CHANNELS[each]} lies ({shifts[best, each, 0]:+.1f}, {shifts[best, each, 1]:+.1f}) px" for each in apart
+    )
+    note = f"The colour channels do not coincide: {shifted} from {own}. Marks are measured in {own} alone."
+    return among, note
 
 
 def best_weights(
-    scan: Scan, marks: Sequence[tuple[Mark, Array, int]], signs: Sequence[int] = (1,)
+    scan: Scan,
+    marks: Sequence[tuple[Mark, Array, int]],
+    signs: Sequence[int] = (1,),
+    among: Sequence[int] = (0, 1, 2),
 ) -> tuple[tuple[float, ...], int] | None:
     """Estimate channel weights by Fisher's linear discriminant.
 
@@ -197,6 +240,7 @@ def best_weights(
     scan : colour scan.
     marks : marks with pixel_from_mark (2, 3) and sign: +1 lighter than the background, -1 darker.
     signs : common factors of all signs to try, since a mark may be lighter in one channel and darker in another.
+    among : channels that may have a weight.
 
     Returns
     -------
@@ -208,12 +252,11 @@ def best_weights(
     """
     if scan.channels == 1 or not marks:
         return None
-    contrast, covariance = np.zeros(scan.channels), np.zeros((scan.channels, scan.channels))
+    units = np.eye(scan.channels)[list(among)]
+    contrast, covariance = np.zeros(len(units)), np.zeros((len(units), len(units)))
     for mark, pixel_from_mark, sign in marks:
         col0, row0, width, height = mark_window(mark, pixel_from_mark, _MARGIN_PX)
-        channels = np.stack(
-            [scan.window(col0, row0, width, height, unit).ravel() for unit in np.eye(scan.channels).tolist()]
-        )
+        channels = np.stack([scan.window(col0, row0, width, height, unit).ravel() for unit in units.tolist()])
         shifted = np.array(pixel_from_mark)
         shifted[:, 2] -= (col0, row0)
         value = picture(mark, shifted, width, height, _BLUR_PX).ravel()
@@ -221,7 +264,7 @@ def best_weights(
         design = np.stack([value, np.ones_like(value), col, row], axis=1)
         solution, *_ = np.linalg.lstsq(design, channels.T, rcond=None)
         contrast += sign * solution[0]
-        covariance += np.cov(channels - (design @ solution).T)
+        covariance += np.atleast_2d(np.cov(channels - (design @ solution).T))
     covariance += _SHRINK * np.trace(covariance) / len(covariance) * np.eye(len(covariance))
     if not np.linalg.det(covariance) > 0:
         return None
@@ -235,5 +278,5 @@ def best_weights(
     best = max(signs, key=contrast_over_noise)
     if not contrast_over_noise(best) > 0:
         return None
-    weights = np.maximum(best * discriminant, 0.0)
+    weights = np.maximum(best * discriminant, 0.0) @ units
     return tuple(float(weight) for weight in weights / weights.sum()), best

@@ -106,7 +106,9 @@ def present_frame(
         )
     problems = (*problems, *_problems(frame, pitch_um))
     tone = replace(frame.tone, tone=frame.tone.tone.without_priors)
-    return FrameMeasurement(frame.scan.name, marks, pose, frame.pixel_from_camera, problems, frame.weights, tone)
+    notes = (frame.channel_note,) if frame.channel_note else ()
+    orientation = frame.pixel_from_camera
+    return FrameMeasurement(frame.scan.name, marks, pose, orientation, problems, frame.weights, tone, notes=notes)
 
 
 def _predicted_frame(frame: Frame, why: Reason) -> FrameMeasurement:

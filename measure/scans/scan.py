@@ -124,13 +124,16 @@ class Scan:
         scan.tone = tone
         return scan
 
-    def green_channel(self) -> "Scan":
-        """The scan with green as its grey value, if it has colours. Lateral chromatic aberration scales red and blue by
-        some 1e-4, so that a mark in a mixture of channels has no unique place."""
+    def replace_weights(self, weights: Sequence[float]) -> "Scan":
+        """The scan with another weighted mean (channels,) of its channels as its grey value."""
         scan = copy(self)
-        if self.channels == len(_GREEN):
-            scan._grey_weights = _GREEN
+        scan._grey_weights = weights
         return scan
+
+    def green_channel(self) -> "Scan":
+        """The scan with green as its grey value, if it has colours and no weights of its own. Lateral chromatic
+        aberration scales red and blue by some 1e-4, so that a mark in a mixture of channels has no unique place."""
+        return self.replace_weights(_GREEN) if self.weights == LUMINANCE else self
 
     def window(self, col0: int, row0: int, width: int, height: int, weights: Sequence[float] | None = None) -> Array:
         """(height, width) float32 grey values; outside of the scan its edge is repeated.

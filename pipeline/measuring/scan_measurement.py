@@ -145,11 +145,12 @@ def _measure(task: ScanTask, scan: Scan, options: ScanOptions) -> MeasuredScan:
     frame = replace(frame, problems=(*of_file, *frame.problems, *problems))
     curve = (frame.tone.note,) if frame.tone else ()
     file_notes = (f"{capitalised(note)}." for note in scan.notes)
-    notes = (*file_notes, *notes, *curve, *_missing_input(options, frame))
+    notes = (*file_notes, *frame.notes, *notes, *curve, *_missing_input(options, frame))
     measured = MeasuredScan(task.shown_scan, scan.width_px, scan.height_px, pitch, frame, notes)
     if misplaced := misplaced_principal_point(options.camera, measured):
         measured = measured.changed(problems=[Reason(misplaced, Code.OFF_GIVEN)])
-    measured = measure_targets(options, scan, measured)
+    registered = scan.replace_weights(frame.weights) if frame.weights and frame.notes else scan
+    measured = measure_targets(options, registered, measured)
     return replace(measured, frame=with_damage(scan, measured.frame))
 
 

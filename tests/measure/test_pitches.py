@@ -30,7 +30,7 @@ from small_scene import hidden_field
 from studies import parametrize_with_studies
 
 from measure.fiducials.constellation import NARROW, Placement
-from measure.fiducials.measure_frame import best_weights, measure_frame
+from measure.fiducials.measure_frame import best_weights, measure_frame, registered_channels
 from measure.fiducials.measurement import measure_fiducials, second_frame
 from measure.fiducials.options import CLICK_SIGMA_PX, Click, FiducialOptions
 from measure.fiducials.rows import pitch_problem
@@ -288,6 +288,27 @@ def test_channels_are_those_of_the_polarity_or_of_the_better_one(tmp_path: Path)
             np.testing.assert_allclose(best[0], weights, atol=0.06)  # noise makes it some 0.02
             assert best[1] == sign
         assert best_weights(scan, [], (1, -1)) is None
+
+
+def test_where_channels_do_not_coincide_marks_are_measured_in_those_that_do(tmp_path: Path) -> None:
+    """Green lies three columns to the right: marks had been `measured` where the channels' mean has them."""
+    red = frame_picture(NUMBERED, MATRIX)
+    grain = np.random.default_rng(2).normal(0.0, NOISE_DN, (2, *red.shape))
+    result = measured(np.dstack([red, np.roll(red + grain[0], 3, axis=1), red + grain[1]]), NUMBERED, tmp_path)
+    assert_right(result, NUMBERED, MATRIX)
+    assert result.weights is not None
+    assert result.weights[1] == 0.0
+    (note,) = result.notes
+    assert "green lies (+3.0, " in note
+    assert "measured in red and blue alone" in note
+
+
+def test_channels_coincide_where_their_peaks_do_or_are_not_the_marks() -> None:
+    """Of marks at four places, with blue shifted by less than half a pixel, and with blue peaks anywhere."""
+    places, rng = np.array([(10.0, 10.0), (90.0, 12.0), (88.0, 95.0), (7.0, 91.0)]), np.random.default_rng(3)
+    for blue in (places + np.array([0.3, 0.0]), places + rng.uniform(-9.0, 9.0, (4, 2))):
+        peaks = [[(place, 0.8) for place in of_mark] for of_mark in zip(places, places, blue, strict=True)]
+        assert registered_channels(peaks) == ([0, 1, 2], "")
 
 
 def test_learned_marks_are_cut_in_the_channels_they_are_measured_in(tmp_path: Path) -> None:
