@@ -21,7 +21,7 @@ Kind = Literal["fiducial", "target", "tie", "join"]
 ON_FILM: tuple[Kind, ...] = ("fiducial", "join")  # kinds that are points of the film, not of the object
 # Stored results are reused only if this is unchanged. Increase it whenever measurements would change:
 # tests/measure/test_revision.py fails if that was forgotten.
-MEASURE_REVISION = 24
+MEASURE_REVISION = 25
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -156,7 +156,7 @@ class FrameMeasurement:
     weights : channel weights with which the fiducials of a colour scan were measured; None for its grey value.
     tone : tone curve of the scan; None if no frame was found.
     writing : lines of text read around the frame; None if text was not searched.
-    notes : remarks that need no action; the stored result of a scan keeps them with its own.
+    notes : remarks that need no action.
     """
 
     image: str

@@ -15,7 +15,11 @@ class Verdict(MeaningfulWord):
 
     GOOD = "good", "All marks are measured and passed all checks."
     DECIDED = "decided", "Good after review decisions: nothing is open."
-    LOOK = "look", "Usable, but a mark is weak, missing or rejected, or the frame has a problem (assumed pose, ...)."
+    LOOK = (
+        "look",
+        "Usable, but a fiducial is weak, missing or rejected, no target is measured, or the frame has a problem "
+        "(assumed pose, ...).",
+    )
     POOR = "poor", "Hardly usable: too few marks for an interior orientation, or for a check of it."
     FAILED = "failed", "Nothing was measured: the file is missing, damaged or not a scan, or its process was killed."
     WAITING = "waiting", "Not measured yet."
@@ -74,8 +78,9 @@ def frame_verdict(marks: Sequence[MarkState], has_frame: bool, is_doubtful: bool
     too_few = observed.count("fiducial") < min(_LEAST_FIDUCIALS, len(fiducials))
     if not observed or too_few or (fiducials and not has_frame):
         return Verdict.POOR
-    worst = max((_mark_verdict(*mark) for mark in marks), key=list(Verdict).index)
-    if is_doubtful or worst is Verdict.LOOK:
+    worst = max((mark_verdict(*mark) for mark in marks), key=list(Verdict).index)
+    misses_targets = len(marks) > len(fiducials) and observed.count("fiducial") == len(observed)
+    if is_doubtful or misses_targets or worst is Verdict.LOOK:
         return Verdict.LOOK
     return Verdict.DECIDED if has_decisions else worst
 
@@ -85,11 +90,11 @@ def is_answered(codes: Collection[str]) -> bool:
     return not _ANSWERED.isdisjoint(codes)
 
 
-def _mark_verdict(kind: str, status: Status, codes: Collection[str]) -> Verdict:
+def mark_verdict(kind: str, status: Status, codes: Collection[str]) -> Verdict:
     """Verdict on one mark."""
-    # An unobserved target does not affect the others; a fiducial must be found, unless it lies on another part.
+    # Targets are many, and the adjustment tests each; a fiducial must be found, unless it lies on another part.
     if is_answered(codes):
         return Verdict.DECIDED
-    if Code.OTHER_PART in codes or (status is Status.PREDICTED and kind != "fiducial"):
+    if Code.OTHER_PART in codes or kind != "fiducial":
         return Verdict.GOOD
     return _MARK_VERDICTS[status]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from measure.flags import Code, Reason, Status
 from measure.results import Covariance as MarkCovariance
 from measure.results import MarkMeasurement
+from pipeline.archive.verdicts import Verdict, frame_verdict, has_problem, mark_verdict
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.assessment_record import ResidualRecord
 from pipeline.results.check_file import Check
@@ -187,17 +188,9 @@ class Mark:
         return self.reason.codes
 
     @property
-    def is_open(self) -> bool:
-        """Whether it is not an observation, without a review decision and not measured in another part of the frame."""
-        return not self.status.is_observation and not {Code.DECIDED, Code.OTHER_PART} & set(self.codes)
-
-    @property
-    def is_contradicted(self) -> bool:
-        """Whether it is an observation that other marks or frames contradict, without a review decision."""
-        codes = set(self.codes)
-        return (
-            self.status is Status.WEAK and bool(codes & {Code.OFF_GIVEN, Code.OFF_FRAMES}) and Code.DECIDED not in codes
-        )
+    def needs_look(self) -> bool:
+        """Whether it is a reason to look at its frame, as in `reseau status`."""
+        return mark_verdict(self.kind, self.status, self.codes).needs_look
 
     @property
     def sigma_px(self) -> Array | None:
@@ -220,6 +213,16 @@ class Frame:
 
     def count(self, *statuses: Status) -> int:
         return sum(mark.status in statuses for mark in self.marks)
+
+    @property
+    def verdict(self) -> Verdict:
+        """Verdict as in `reseau status`, for the marks currently in comparator.csv."""
+        scan, marks = self.scan, [(mark.kind, mark.status, mark.codes) for mark in self.marks]
+        if scan is None:
+            return frame_verdict(marks, True, False, False)
+        if scan.failure:
+            return Verdict.FAILED
+        return frame_verdict(marks, scan.frame.pixel_from_camera is not None, has_problem(scan), bool(scan.decided_by))
 
 
 def frames(data: ReportData) -> list[Frame]:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import bdtrik, chdtrc
 
 from measure.flags import Code
+from pipeline.archive.verdicts import NEXT_STEP
 from pipeline.drawing import svg
 from pipeline.report.data import Frame, Mark, Problem
 from pipeline.report.numbers import fixed
@@ -156,7 +157,7 @@ def _columns(axes: svg.Axes, edges: Array, counts: NDArray[np.int64]) -> Iterato
 def single_frame_problems(frame: Frame) -> Iterator[Problem]:
     """Yield the problems of one frame, an undetermined scan orientation (pose) first."""
     yield from _assumed_pose(frame)
-    yield from _measurement_problems(frame)
+    yield from _other_problems(frame)
 
 
 def masked_text(sentence: str) -> str:
@@ -167,7 +168,7 @@ def masked_text(sentence: str) -> str:
 def frame_problems(shots: list[Frame]) -> Iterator[Problem]:
     """Yield the problems of all frames, scan orientations (poses) first. Problems that differ only in numbers are
     merged."""
-    for evidence in (_assumed_pose, _measurement_problems):
+    for evidence in (_assumed_pose, _other_problems):
         gathered: Gathered = {}
         for frame in shots:
             gather(gathered, frame.image, evidence(frame))
@@ -205,6 +206,15 @@ def _assumed_pose(frame: Frame) -> Iterator[Problem]:
         )
 
 
+def _other_problems(frame: Frame) -> Iterator[Problem]:
+    """Yield problems but for an assumed pose: at least one where the verdict on the scan asks for a look."""
+    problems = list(_measurement_problems(frame))
+    if problems or any(_assumed_pose(frame)) or frame.scan is None or not frame.verdict.needs_look:
+        yield from problems
+    else:
+        yield Problem(frame.verdict.meaning, NEXT_STEP[frame.verdict])
+
+
 def _measurement_problems(frame: Frame) -> Iterator[Problem]:
     measured = frame.scan.frame if frame.scan else None
     pose = measured.pose if measured else None
@@ -212,7 +222,8 @@ def _measurement_problems(frame: Frame) -> Iterator[Problem]:
     for problem in measured.problems if measured else ():
         if problem not in evidence:
             yield Problem(drop_file_name(problem, frame.scan.scan) if frame.scan else problem)
-    lost = [mark for mark in frame.marks if mark.is_fiducial and mark.is_open]
+    doubtful = [mark for mark in frame.marks if mark.needs_look]
+    lost, weak = ([mark for mark in doubtful if mark.status.is_observation is is_used] for is_used in (False, True))
     found = sum(mark.is_fiducial and mark.status.is_observation for mark in frame.marks)
     if lost and (found or pose):  # otherwise the frame was not found, which is a problem of its own
         yield Problem(
@@ -221,12 +232,11 @@ def _measurement_problems(frame: Frame) -> Iterator[Problem]:
             + (" The frame is used; its film transformation is less precise." if found else ""),
             marks=tuple((frame.image, mark.kind, mark.point) for mark in lost),
         )
-    contradicted = [mark for mark in frame.marks if mark.is_fiducial and mark.is_contradicted]
-    if contradicted:
+    if weak:
         yield Problem(
-            f"{counted(len(contradicted), 'fiducial mark')} contradicted by the others. {_reasons(contradicted)}.",
+            f"{counted(len(weak), 'weak fiducial mark')}. Reasons: {_reasons(weak)}.",
             "Settle them with `reseau review`, or leave them: their standard deviations allow for it.",
-            marks=tuple((frame.image, mark.kind, mark.point) for mark in contradicted),
+            marks=tuple((frame.image, mark.kind, mark.point) for mark in weak),
         )
     targets = [mark for mark in frame.marks if not mark.is_fiducial]
     is_lost = frame.scan is not None and frame.scan.failure is not None

@@ -207,7 +207,7 @@ class FrameView:
     def badness(self) -> tuple[bool, float, int]:
         """Sort key, larger is worse: no mark observed, then residuals, then number of open marks."""
         is_lost = not any(mark.status.is_observation for mark in self.frame.marks)
-        return is_lost, sum(self.rms or (0.0,)), sum(mark.is_open for mark in self.frame.marks)
+        return is_lost, sum(self.rms or (0.0,)), sum(mark.needs_look for mark in self.frame.marks)
 
 
 def frame_views(data: ReportData, shots: list[Frame], every_mark: bool = False) -> list[FrameView]:

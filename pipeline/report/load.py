@@ -26,7 +26,7 @@ from pipeline.archive.measurement import (
 )
 from pipeline.archive.results_database import Store
 from pipeline.archive.review_decisions import inapplicable
-from pipeline.archive.verdicts import Verdict, frame_verdict, has_problem, scan_counts
+from pipeline.archive.verdicts import Verdict, scan_counts
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
@@ -130,7 +130,7 @@ def reduced(
         """Count all frames; yield those that need a look with a sort key, the worst first."""
         for one in _one_by_one(data, scans):
             (frame,) = frames(one)
-            verdict, problems = _verdict(frame), list(single_frame_problems(frame))
+            verdict, problems = frame.verdict, list(single_frame_problems(frame))
             kind = camera_of(frame.image), _ending(frame.scan.scan) if frame.scan else "given"
             totals.add(frame, kind, verdict, problems)
             if problems or verdict.needs_look or frame.image in suspect:
@@ -174,16 +174,6 @@ def _one_by_one(data: ReportData, scans: Iterable[MeasuredScan]) -> Iterator[Rep
         yield frame_data(image, None)
 
 
-def _verdict(frame: Frame) -> Verdict:
-    """Verdict as in `reseau status`, for the marks currently in comparator.csv."""
-    scan, marks = frame.scan, [(mark.kind, mark.status, mark.codes) for mark in frame.marks]
-    if scan is None:
-        return frame_verdict(marks, True, False, False)
-    if scan.failure:
-        return Verdict.FAILED
-    return frame_verdict(marks, scan.frame.pixel_from_camera is not None, has_problem(scan), bool(scan.decided_by))
-
-
 def _listed(problems: Gathered) -> Iterator[Problem]:
     """Yield problems, those of most frames first."""
     ordered = sorted(problems.values(), key=lambda each: -len(each.images))
@@ -224,7 +214,7 @@ def verdict_counts(data: ReportData, shots: Sequence[Frame]) -> Mapping[tuple[st
     for frame in shots:
         camera = stored.image_camera(frame.image) if stored and frame.image in stored.images else "none"
         kind = camera, _ending(frame.scan.scan) if frame.scan else "given"
-        counts[kind][_verdict(frame)] += 1
+        counts[kind][frame.verdict] += 1
     return counts
 
 

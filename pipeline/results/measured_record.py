@@ -115,6 +115,7 @@ def scan_detail(measured: MeasuredScan, uri: str) -> dict[str, object]:
         "problems": list(frame.problems),
         "problem_codes": [problem.code for problem in frame.problems],
         "notes": list(measured.notes),
+        "frame_notes": list(frame.notes),
     }
     return detail | ({"decided_by": dict(measured.decided_by)} if measured.decided_by else {})
 
@@ -134,6 +135,7 @@ def read_scan(image: str, detail: Mapping[str, Any], marks: Sequence[MarkMeasure
         weights=None if detail["weights"] is None else tuple(map(float, detail["weights"])),
         tone=detail["tone"] and _read_frame_tone(detail["tone"]),
         writing=None if detail["writing"] is None else tuple(_read_line(line) for line in detail["writing"]),
+        notes=tuple(detail.get("frame_notes", ())),
     )
     failure = detail["failure"] and Failure(FailureCode(detail["failure"]["code"]), detail["failure"]["sentence"])
     size = (int(detail["width_px"]), int(detail["height_px"]))

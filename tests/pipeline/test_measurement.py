@@ -338,6 +338,7 @@ RICH = MeasuredScan(
         (0.25, 1 / 3, -0.1),
         TONE,
         (LINE,),
+        ("a note on the frame",),
     ),
     ("a note",),
     Failure(FailureCode.ENDED, "it was ended"),

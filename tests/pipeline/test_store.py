@@ -34,6 +34,8 @@ from pipeline.archive.results_database import Store, merge
 from pipeline.archive.schema import MEASUREMENTS, MIGRATIONS, VERSION, opened
 from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_verdict
 from pipeline.provenance import content_hash, file_state, hash_text, parts_hash, result_key, shard_number
+from pipeline.report.data import ReportData, frames
+from pipeline.report.frame_problems import single_frame_problems
 from pipeline.results.comparator_file import mark_rows
 from pipeline.results.measured_record import MeasuredScan
 
@@ -343,8 +345,15 @@ def test_verdicts_of_scans() -> None:
         (replace(good, decided_by=counts), Verdict.DECIDED),
         (replace(made_record(status=Status.WEAK), decided_by=counts), Verdict.LOOK),
     ]
+    target = replace(good.frame.marks[0], kind="target", point="t", status=Status.REJECTED, reason=LOOK)
+    for status, verdict in ((Status.WEAK, Verdict.GOOD), (Status.REJECTED, Verdict.LOOK)):
+        targets = (target, replace(target, point="u", status=status))
+        verdicts.append((replace(good, frame=replace(good.frame, marks=(*good.frame.marks, *targets))), verdict))
     assert [scan_verdict(scan) for scan, _ in verdicts] == [verdict for _, verdict in verdicts]
     assert set(NEXT_STEP) == set(Verdict)
+    for scan, verdict in verdicts:  # the summary, and so the exit code, say the same
+        (frame,) = frames(ReportData("", measurement={scan.frame.image: scan}))
+        assert any(single_frame_problems(frame)) is verdict.needs_look, verdict
 
 
 def test_the_key_depends_on_all_that_it_names() -> None:
