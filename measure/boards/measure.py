@@ -82,11 +82,13 @@ def _measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> BoardMeasurement:
         absent = (MarkMeasurement(name, "target", None, None, Status.ABSENT, grid.reason) for name in names.values())
         return BoardMeasurement(tuple(absent), grid.reason)
     detected = {place: patches[index] for place, index in grid.assignment.items()}
-    starts = [detected.get(place) or _predicted(place, detected) for place in names]
+    starts = {place: detected.get(place) or _predicted(place, detected) for place in names}
+    starts = {place: start for place, start in starts.items() if _is_whole(scan, start)}
     gap = 1 - spec.diameter_mm / spec.shortest_distance_mm
-    shorter_px = [float(np.linalg.svd(start.pixel_from_disk, compute_uv=False)[1]) for start in starts]
-    disks = fit_plain_disks(scan, starts, [2 * gap / (1 - gap) * axis_px for axis_px in shorter_px])
-    marks = [_dot_mark(names[place], disk, place in detected) for place, disk in zip(names, disks, strict=True)]
+    shorter_px = [float(np.linalg.svd(start.pixel_from_disk, compute_uv=False)[1]) for start in starts.values()]
+    fits = fit_plain_disks(scan, list(starts.values()), [2 * gap / (1 - gap) * axis_px for axis_px in shorter_px])
+    disks = {place: fit for place, fit in zip(starts, fits, strict=True) if fit.reason or _is_whole(scan, fit)}
+    marks = [_dot_mark(name, disks.get(place), place in detected) for place, name in names.items()]
     measured = BoardMeasurement(tuple(marks), notes=grid.notes, is_mirrored=is_mirrored)
     return _unless_alone(measured, f"grids of {spec.columns} x {spec.rows} dots", grid.others_px)
 
@@ -118,8 +120,17 @@ def _predicted(place: Place, detected: Mapping[Place, Candidate]) -> Candidate:
     return Candidate(np.array([x / w, y / w]), shape, float(alike.contrasts.mean()))
 
 
-def _dot_mark(name: str, disk: FittedDisk, is_detected: bool) -> MarkMeasurement:
+def _is_whole(scan: Scan, disk: Candidate | FittedDisk) -> bool:
+    """Whether a dot lies in the scan with all of its edge: lens and drawing put others up to 7 sigmas off."""
+    reach_px, size_px = np.linalg.norm(disk.pixel_from_disk, axis=1), np.array([scan.width_px, scan.height_px])
+    return bool(np.all(np.abs(2 * disk.center_px + 1 - size_px) + 2 * reach_px <= size_px))
+
+
+def _dot_mark(name: str, disk: FittedDisk | None, is_detected: bool) -> MarkMeasurement:
     """Measurement record of a dot."""
+    if disk is None:
+        outside = Reason("outside of the picture, or cut by its edge", Code.OUTSIDE)
+        return MarkMeasurement(name, "target", None, None, Status.ABSENT, outside)
     if disk.reason:
         status = Status.REJECTED if is_detected else Status.PREDICTED
         reason = disk.reason.reword(f"not fitted: {disk.reason}")

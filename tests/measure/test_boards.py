@@ -39,6 +39,7 @@ from measure.boards.specs import (
     CircleGridSpec,
     SquareGridSpec,
 )
+from measure.flags import Code
 from measure.results import Covariance, MarkMeasurement
 
 Array = NDArray[np.float64]
@@ -94,6 +95,20 @@ def test_circle_grids(spec: CircleGridSpec) -> None:
     assert board.reason == ""
     errors = errors_px(board, read_truth(spec, homography))
     assert len(errors) == len(spec.places())
+    assert np.abs(errors).max() < 0.06
+
+
+@pytest.mark.parametrize(("left_px", "cut"), [(-3, 1), (10, 2)])
+def test_dots_that_the_edge_of_the_picture_cuts_are_not_measured(left_px: int, cut: int) -> None:
+    """left_px: edge beside the centre of the first dot, whose radius is 7 px."""
+    spec, homography = CircleGridSpec(6, 5, 30.0, 14.0), board_from_pixel(20.0, tilt=5e-5)
+    truth = read_truth(spec, homography)
+    left = round(truth["r0c0"][0]) + left_px
+    board = measure_board(scan_of(take_picture(spec, homography, circles_dark(spec))[:, left:]), spec)
+    outside = [mark for mark in board.marks if mark.reason.codes == (Code.OUTSIDE,)]
+    assert [(mark.point, mark.status) for mark in outside] == [(f"r{row}c0", Status.ABSENT) for row in range(cut)]
+    errors = errors_px(board, {name: place - [left, 0] for name, place in truth.items()})
+    assert len(errors) == 30 - cut
     assert np.abs(errors).max() < 0.06
 
 
