@@ -40,7 +40,7 @@ from pipeline.results.comparator_file import ComparatorPoint, read_comparator
 from pipeline.stages import run_all, run_measure
 from pipeline.summary import Summary
 from pipeline.text.files import write_atomically
-from pipeline.text.wording import counted, did_you_mean, listed
+from pipeline.text.wording import counted, did_you_mean, listed_by_reason
 from pipeline.workers import WorkOptions
 
 GENEROUS = 2.0  # factor on the unmodelled standard deviation, for lens models with larger misfit than the first
@@ -273,7 +273,7 @@ def _nothing(pictures: BoardPictureFiles, left_out: Mapping[str, str], not_calib
             "the picture."
         )
     return "; ".join(f"{camera}: {why}" for camera, why in not_calibrated.items()) + (
-        f" Left out: {listed([f'{name} ({why})' for name, why in left_out.items()])}." if left_out else ""
+        f" Left out: {listed_by_reason(left_out)}." if left_out else ""
     )
 
 

@@ -17,7 +17,7 @@ from adjust.solution.result import Adjustment
 from pipeline.calibration.pictures import CameraPictures
 from pipeline.results.check_file import CameraCheck, PixelCalibration
 from pipeline.results.image_unit import CENTRE, pixel_intrinsics
-from pipeline.text.wording import counted, listed
+from pipeline.text.wording import counted, listed, listed_by_reason
 from pipeline.types import Array
 
 LensModel = Literal["opencv4", "opencv5", "opencv8", "fisheye"]
@@ -264,7 +264,7 @@ class CameraIntrinsics:
                 "fit equally, for the principal point lies in the middle and the distortion is symmetric."
             )
         if self.left_out:
-            yield f"Left out: {listed([f'{name} ({why})' for name, why in self.left_out.items()])}."
+            yield f"Left out: {listed_by_reason(self.left_out)}."
 
 
 def camera_intrinsics(

@@ -240,8 +240,9 @@ def _measurement_problems(frame: Frame) -> Iterator[Problem]:
         )
     targets = [mark for mark in frame.marks if not mark.is_fiducial]
     is_lost = frame.scan is not None and frame.scan.failure is not None
-    is_copy = measured is not None and any(Code.COPY in problem.codes for problem in measured.problems)
-    if targets and not is_lost and not is_copy and not any(mark.status.is_observation for mark in targets):
+    problems = measured.problems if measured else ()
+    is_explained = any({Code.COPY, Code.NO_BOARD} & {*problem.codes} for problem in problems)
+    if targets and not is_lost and not is_explained and not any(mark.status.is_observation for mark in targets):
         yield Problem(
             f"none of its {len(targets)} targets was measured.",
             "Look at their reasons in comparator.csv: a wrong pose, diameter or orientation misses them all.",

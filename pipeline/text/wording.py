@@ -31,6 +31,12 @@ def listed(names: Sequence[str]) -> str:
     return ", ".join(names[:LISTED]) + (f" and {more} more" if more > 0 else "")
 
 
+def listed_by_reason(reasons: Mapping[str, str]) -> str:
+    """List names with the reason of each, names of one reason together."""
+    alike = {why: [name for name, its in reasons.items() if its == why] for why in dict.fromkeys(reasons.values())}
+    return "; ".join(f"{listed(names)} ({why})" for why, names in alike.items())
+
+
 def counted(number: int, one: str, many: str = "") -> str:
     """Number with its noun, singular or plural."""
     return f"{number} {one if number == 1 else many or one + 's'}"

@@ -264,6 +264,7 @@ def result(calibrated_folder: Path, calibrations: list[Calibration]) -> dict[str
 def test_a_folder_of_pictures_gives_intrinsics_in_pixels(result: dict[str, Any], calibrated_folder: Path) -> None:
     (camera,), out = result["cameras"], calibrated_folder / "calibration"
     assert list(result["unreadable"]) == ["torn"]
+    assert not any("targets was measured" in problem for problem in result["problems"])  # each has its own reason
     assert result["not_calibrated"] == {"camera-440x360": TOO_FEW}  # and costs the other camera nothing
     assert (camera["name"], camera["image_size_px"], camera["images_used"]) == ("camera-400x320", list(SIZE_PX), 5)
     assert (camera["images_turned_deg"], camera["unsure_turns"]) == ({"p4": 90}, [])
@@ -301,7 +302,9 @@ def test_the_lens_that_was_chosen_is_printed_with_what_it_was_chosen_from(
     (camera,) = calibrations[0].cameras
     scores: dict[LensModel, float | None] = {"opencv4": 0.1624, "opencv5": 0.158, "fisheye": None}
     text = io.StringIO()
-    replace(camera, lens=LensChoice("opencv5", scores)).print(Console(file=text, width=200))
+    left_out = {"p5": "no board", "p6": "blurred", "p7": "no board"}
+    replace(camera, lens=LensChoice("opencv5", scores), left_out=left_out).print(Console(file=text, width=200))
+    assert text.getvalue().endswith("Left out: p5, p7 (no board); p6 (blurred).\n")
     line = next(line for line in text.getvalue().splitlines() if line.startswith("Lens opencv5"))
     assert line.endswith("rms 0.158 px in pictures left out (opencv4 0.162 px, fisheye no solution).")
 
