@@ -1,11 +1,23 @@
-"""Bend of a nearly flat calibration board: offsets of its points from the plane.
+"""Deformations of an object of given points: displacements of its points by each parameter of 1.
 
-Two parabolas, as in mrcal (`ref_calibration_object`, calobject_warp): with ξ and η from -1 to 1 over the board's
-points, a point lies bend_x (1 - ξ²) + bend_y (1 - η²) off the plane. The corners do not move; in the middle the two
-bends add up.
+Bend of a nearly flat board: two parabolas, as in mrcal (`ref_calibration_object`, calobject_warp). With ξ and η from -1
+to 1 over the board's points, a point lies bend_x (1 - ξ²) + bend_y (1 - η²) off the plane. The corners do not move; in
+the middle the two bends add up.
+
+Strain of any object: stretches along its axes relative to the last one, and shears. A change of scale is one of the
+stations.
+
+Disks on a flat board: the centre of gravity of their images. With the map f from the board to the image, its gradient J
+and its second derivatives f_kk along two axes of the board, it is to second order the image of a point that lies
+
+    r²/4 (J⁻¹ (f_11 + f_22) / 2 + grad ln |J|)
+
+off the centre of a disk of radius r.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -31,15 +43,34 @@ class BoardForm:
     places: Array
     shapes: Array
 
-    def offsets(self, bends: Array) -> Array:
-        """(n, 3) offsets of the points for bends (2,), in object units."""
-        return np.asarray((self.shapes @ bends)[:, None] * self.normal)
-
     @property
-    def strain_directions(self) -> Array:
-        """(n, 2, 3) displacements of the points by a stretch of 1, first axis over second, and by a shear of 1."""
-        (along, across), (x, y) = self.axes, self.places.T[..., None]
-        return np.stack([x * along - y * across, y * along + x * across], axis=1) / 2.0
+    def bend_directions(self) -> Array:
+        """(n, 2, 3) displacements of the points by a bend of 1 along each axis."""
+        return np.asarray(self.shapes[:, :, None] * self.normal)
+
+
+def strain_directions(xyz: Array, axes: Array) -> Array:
+    """(n, k, 3) displacements of points (n, 3) by stretches along the axes (m, 3) but the last, and by shears, of 1."""
+    places, count = (xyz - xyz.mean(axis=0)) @ axes.T, len(axes)
+    stretches = [places[:, i, None] * axes[i] for i in range(count - 1)]
+    shears = [
+        (places[:, i, None] * axes[j] + places[:, j, None] * axes[i]) / 2.0 for i, j in combinations(range(count), 2)
+    ]
+    return np.stack([*stretches, *shears], axis=1)
+
+
+def disk_directions(at: Mapping[tuple[int, int], Array], axes: Array, radius: float) -> Array:
+    """(n, 1, 3) displacements of disks' centres by a squared radius of 1.
+
+    at: images (n, 2) of points that lie (i, j) radii off the centres along the axes (2, 3) of the board, i and j from
+    -1 to 1.
+    """
+    gradient = np.stack([at[1, 0] - at[-1, 0], at[0, 1] - at[0, -1]], axis=-1) / 2.0
+    first, second = at[1, 0] + at[-1, 0] - 2.0 * at[0, 0], at[0, 1] + at[0, -1] - 2.0 * at[0, 0]
+    mixed = (at[1, 1] + at[-1, -1] - at[1, -1] - at[-1, 1]) / 4.0
+    first, mixed, second = np.linalg.solve(gradient, np.stack([first, mixed, second], axis=-1)).transpose(2, 0, 1)
+    by_area = np.stack([first[:, 0] + mixed[:, 1], mixed[:, 0] + second[:, 1]], axis=1)  # gradient of ln |J|
+    return np.asarray((((first + second) / 2.0 + by_area) / (4.0 * radius) @ axes)[:, None])
 
 
 def board_form(xyz: Array) -> BoardForm:

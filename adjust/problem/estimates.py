@@ -8,7 +8,6 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 
 from adjust.array_types import Array, Indices
-from adjust.functional_model.board import BOARD_NAMES
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import INTERIOR_NAMES, Lens
 from adjust.functional_model.projection import ImageModel
@@ -188,7 +187,7 @@ def lifted(estimates: Estimates, points: Sequence[str]) -> Array:
     """(n, 3) displacements of object points from their flat places by the bends of boards."""
     offsets = np.zeros((len(points), 3))
     for board in estimates.network.boards:
-        bends = estimates.values_of(Parameter.board(board.name, name) for name in BOARD_NAMES)
+        bends = estimates.values_of(Parameter.board(board.name, name) for name in board.names)
         for row, point in enumerate(points):
             if point in board.places:
                 offsets[row] = bends @ board.lift_directions[point]

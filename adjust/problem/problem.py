@@ -3,10 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.rotation import angles_near, rotation_from_angles, rotation_from_vector, vector_by_angles
@@ -15,8 +14,6 @@ from adjust.functional_model.transformation import FilmKind, film_kind
 from adjust.problem.further_observations import FurtherObservation, further_observations
 from adjust.problem.network import Approximations, Network, Transformation
 from adjust.problem.unknowns import Unknowns, list_unknowns
-
-Number = TypeVar("Number", np.float64, np.intp)
 
 _NOWHERE = np.full(3, -1, dtype=np.intp)
 ABSENT = -1  # position in a column that an observation does not use
@@ -259,24 +256,30 @@ class Problem:
 
     @cached_property
     def board_positions(self) -> Indices:
-        """(n, 2) positions of the bends of each point's board, ABSENT for points on none."""
-        of_point = {id_: self.unknowns.board[board.name] for board in self.network.boards for id_ in board.places}
-        return self._point_values(of_point, np.full(2, ABSENT, dtype=np.intp))
+        """(n, k) positions of the parameters of each point's boards, padded with ABSENT."""
+        names, of_name = self.network.observations.numbered_points
+        none = np.empty(0, dtype=np.intp)
+        of_boards = [
+            [self.unknowns.board[each.name] for each in self.network.boards if name in each.places] for name in names
+        ]
+        positions = side_by_side([np.concatenate([none, *own]) for own in of_boards])[of_name]
+        positions[self.is_fiducial] = ABSENT
+        return positions
 
     @cached_property
     def lift_directions(self) -> Array:
-        """(n, 2, 3) displacement of the point by a bend of 1 along each axis of its board; 0 for points on none."""
-        of_point = {id_: lifted for board in self.network.boards for id_, lifted in board.lift_directions.items()}
-        return self._point_values(of_point, np.zeros((2, 3)))
-
-    def _point_values(self, of_point: Mapping[str, NDArray[Number]], of_others: NDArray[Number]) -> NDArray[Number]:
-        """Look up a value for each observation's point; of_others for all other points."""
+        """(n, k, 3) displacement of the point by each parameter of its boards of 1; 0 where there is none."""
         names, of_name = self.network.observations.numbered_points
-        if not of_point:
-            return np.repeat(of_others[None], len(of_name), axis=0)
-        rows = np.stack([of_point.get(name, of_others) for name in names])[of_name]
-        rows[self.is_fiducial] = of_others
-        return rows
+        lifted = np.zeros((*self.board_positions.shape, 3))
+        for board in self.network.boards:
+            row, column = np.nonzero(self.board_positions == self.unknowns.board[board.name][0])
+            if board.by_observation is not None:
+                directions = board.by_observation[row]
+            else:
+                directions = np.array([board.lift_directions[names[i]] for i in of_name[row]])
+            for k in range(len(board.bends)):
+                lifted[row, column + k] = directions[:, k]
+        return lifted
 
     @cached_property
     def columns(self) -> Indices:

@@ -8,7 +8,6 @@ import numpy as np
 
 from adjust.array_types import Array, Indices, Mask
 from adjust.errors import AdjustmentError
-from adjust.functional_model.board import BOARD_NAMES
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.transformation import film_parameter_names
@@ -100,7 +99,9 @@ def list_unknowns(network: Network, approximations: Approximations) -> Unknowns:
         for each in network.scanners
     }
     board = {
-        each.name: rows.add("board", each.name, "", list(zip(BOARD_NAMES, each.bends, (None, None), strict=True)))
+        each.name: rows.add(
+            "board", each.name, "", [(name, prior, None) for name, prior in zip(each.names, each.bends, strict=True)]
+        )
         for each in network.boards
     }
     point = rows.add_points([each for each in network.points if each.id in network.observed_points], approximations)

@@ -15,7 +15,6 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc, ndtr, stdtr
 
 from adjust.array_types import Array, Mask
-from adjust.functional_model.board import BOARD_NAMES
 from adjust.functional_model.families import family
 from adjust.functional_model.lens import Prior
 from adjust.problem.estimates import Estimates, GivenGroup
@@ -76,7 +75,7 @@ def significance_tests(estimates: Estimates) -> dict[tuple[str, str], tuple[Sign
     for scanner in network.scanners:
         tests["scanner", scanner.name] = _against_zero(estimates, "scanner", scanner.name, scanner.terms)
     for board in network.boards:
-        bends = dict(zip(BOARD_NAMES, board.bends, strict=True))
+        bends = dict(zip(board.names, board.bends, strict=True))
         tests["board", board.name] = _against_zero(estimates, "board", board.name, bends)
     return tests
 

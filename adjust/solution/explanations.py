@@ -76,11 +76,10 @@ def explain(
 ) -> tuple[tuple[Explanation, ...], Run]:
     """Explanations of residuals larger than the given standard deviations, largest first, and a run that includes them.
 
-    There are none where the adjustment has no solution, nor where sigma0 is at most 1, unless the standard deviation of
-    unmodelled errors was estimated from the residuals (is_noise_fitted).
+    There are none where the adjustment has no solution. is_noise_fitted: whether the standard deviation of unmodelled
+    errors was estimated from the residuals.
     """
-    is_large = is_noise_fitted or run.end.vpv > redundancy
-    if not (run.converged and run.is_tested and redundancy >= CHECKED and is_large):
+    if not (run.converged and run.is_tested and redundancy >= CHECKED):
         return (), run
     first = last = _Model(run, redundancy, probabilities, is_noise_fitted)
     found: list[Explanation] = []

@@ -8,17 +8,22 @@ estimates the fall of v'Pv.
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations, product
 
 import numpy as np
 
 from adjust.array_types import Array, Indices
+from adjust.functional_model.board import disk_directions
 from adjust.functional_model.families import DECENTERING, EXTENDED, RADIAL, family
 from adjust.functional_model.lens import INTERIOR_NAMES, Prior
 from adjust.functional_model.scanner import is_left
+from adjust.least_squares.iteration import linearise
+from adjust.least_squares.numbering import Numbering
 from adjust.problem.camera import Camera
+from adjust.problem.condition_equations import computed_observations
 from adjust.problem.network import Approximations, Board, Network, Scanner
 from adjust.problem.parameter import shortened
-from adjust.problem.problem import Problem, number
+from adjust.problem.problem import Problem, State, number
 from adjust.quality.cofactor import free_cofactor
 from adjust.quality.run import Run
 from adjust.solution.image_groups import ImageGroups, two_groups
@@ -27,6 +32,7 @@ FREE = Prior(0.0, np.inf)
 TERMS_TOGETHER = 2  # radial terms tested jointly
 OTHERS = " (other images)"  # suffix of a camera's name for the images with a different interior orientation
 FEWEST_GIVEN, FEWEST_IMAGES = 5, 2  # given points, and images of one, that tell a wrong one
+MISMEASURED = 0.1  # relative error of the given diameter of disks whose effect is reported
 CLEAR = 3.0  # standard deviations above which one of two changes of a board is told
 NAMED = 5  # images named in a message
 ALIKE = 7.0  # difference of chi-square plus twice the unknowns below which two readings are not distinguished
@@ -58,8 +64,30 @@ def model_hypotheses(run: Run) -> Iterator[ModelHypothesis]:
         for camera in cameras:
             yield from hypotheses(run, camera)
     yield from _scanner_pixels(run)
-    yield from _board(run)
+    given = {each.deformation for each in network.boards}
+    yield from (each for each in _deformations(run) if each.problem.network.boards[-1].deformation not in given)
     yield from _wrong_point(run)
+
+
+def diameter_notes(run: Run) -> Iterator[str]:
+    """Note where a wrong diameter of the disks, taken as exact, changes c by more than its standard deviation."""
+    for each in _deformations(run) if run.problem.network.disk_radius > 0.0 and run.converged else ():
+        if each.kind != "disks":
+            continue
+        unknowns, (radius_squared,) = each.problem.unknowns, each.added
+        weighted, covariance = run.weighting.applied(each.problem)
+        numbering = Numbering(weighted)
+        if (at := linearise(numbering, covariance, weighted.start())) is None:
+            return
+        cofactor = free_cofactor(numbering, at.state, at.factor)
+        for camera, (c, *_) in unknowns.camera.items():
+            (own, common), (_, square) = cofactor.part(np.array([c, radius_squared]))
+            change = ((1.0 + MISMEASURED) ** 2 - 1.0) * run.problem.network.disk_radius**2 * common / square
+            if abs(change) > np.sqrt(own - common**2 / square):
+                yield (
+                    f"The diameter of the disks is taken as exact: if it is {100.0 * MISMEASURED:.0f} % larger, c of "
+                    f"camera {camera} changes by {change:+.2g} mm."
+                )
 
 
 def _lens_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
@@ -112,19 +140,43 @@ def _second_interior_orientation(run: Run, camera: Camera) -> Iterator[ModelHypo
     yield ModelHypothesis("groups", words, problem, added, groups.choices, contrasts, groups.p_scatter)
 
 
-def _board(run: Run) -> Iterator[ModelHypothesis]:
-    """A bend, or a stretch and shear, of the board of all given points, where they form a flat one."""
+def _deformations(run: Run) -> Iterator[ModelHypothesis]:
+    """A bend, a strain, or another diameter of the disks, of the object of all given points."""
     network = run.problem.network
     places = network.known_places
-    if network.boards or not places or len(places) < len(network.observed_points):
+    if len(places) < max(FEWEST_GIVEN, len(network.observed_points)):
         return
-    for is_strained, words in ((False, _bend_words), (True, _strain_words)):
-        try:
-            board = Board("board", places, (FREE, FREE), is_strained)
-        except ValueError:
-            return
-        problem = _continued(run, replace(network, boards=(board,)))
-        yield ModelHypothesis("board", words, problem, problem.unknowns.board[board.name])
+    strain = Board("strain", places, (), "strain")
+    count = len(strain.axes)
+    strain = replace(strain, bends=(FREE,) * (count - 1 + count * (count - 1) // 2))
+    yield _deformed(run, "board", partial(_strain_words, count), strain)
+    if count == 2:
+        yield _deformed(run, "board", _bend_words, Board("bend", places))
+        if network.disk_radius > 0.0 and (disks := _disks(run, places)) is not None:
+            yield _deformed(run, "disks", _disk_words, disks)
+
+
+def _disks(run: Run, places: Mapping[str, Array]) -> Board | None:
+    """Board of disks whose squared radius differs from the given one; None where some have no image."""
+    problem, state, radius = run.problem, run.end.state, run.problem.network.disk_radius
+    board = Board("disks", places, (FREE,), "disks")
+    points = np.array([at for id_, at in problem.unknowns.point.items() if id_ in places])
+    shown, at = problem.network.observations.has_kind("target"), dict[tuple[int, int], Array]()
+    for i, j in product((-1, 0, 1), repeat=2):
+        values = state.values.copy()
+        values[points] += radius * (np.array([i, j]) @ board.form.axes)
+        if (computed := computed_observations(problem, State(values, state.rotations))) is None:
+            return None
+        at[i, j] = computed[shown]
+    directions = np.zeros((len(shown), 1, 3))
+    directions[shown] = disk_directions(at, board.form.axes, radius)
+    return replace(board, by_observation=directions)
+
+
+def _deformed(run: Run, kind: str, words: Words, board: Board) -> ModelHypothesis:
+    network = run.problem.network
+    problem = _continued(run, replace(network, boards=(*network.boards, board)))
+    return ModelHypothesis(kind, words, problem, problem.unknowns.board[board.name])
 
 
 def _wrong_point(run: Run) -> Iterator[ModelHypothesis]:
@@ -271,23 +323,45 @@ def _bend_words(run: Run, added: Indices, _: float) -> tuple[str, str]:
     )
 
 
-def _strain_words(run: Run, added: Indices, _: float) -> tuple[str, str]:
-    (stretch, shear), covariance = _estimate(run, added)
-    sigma = np.sqrt(np.diag(covariance))
-    changes = (
-        (
-            stretch,
-            sigma[0],
-            100.0,
-            f"% {'longer' if stretch > 0.0 else 'shorter'} along its first axis than along its second",
-        ),
-        (shear, sigma[1], 1000.0, "mrad off in the angle of the two"),
-    )
+def _strain_words(count: int, run: Run, added: Indices, _: float) -> tuple[str, str]:
+    """Describe stretches and shears of a flat board (count 2) or of an object in space (3)."""
+    value, covariance = _estimate(run, added)
+    names = ("X", "Y", "Z") if count > 2 else ("its first axis", "its second")
+    middle = int(np.argsort([*value[: count - 1], 0.0])[(count - 1) // 2 if count > 2 else 1])
+    # Stretches relative to the axis in the middle.
+    by_value = np.vstack([np.eye(len(value))[: count - 1], np.zeros(len(value))])
+    by_value -= by_value[middle]
+    rows = [
+        (row, 100.0, f"% {{}} along {names[i]} than along {names[middle]}")
+        for i, row in enumerate(by_value)
+        if i != middle
+    ]
+    rows += [
+        (row, 1000.0, f"mrad off in the angle of {names[i]} and {names[j]}")
+        for row, (i, j) in zip(np.eye(len(value))[count - 1 :], combinations(range(count), 2), strict=True)
+    ]
+    changes = [(float(row @ value), float(np.sqrt(row @ covariance @ row)), unit, what) for row, unit, what in rows]
     significant = [each for each in changes if abs(each[0]) > CLEAR * each[1]] or changes
-    found = " and ".join(f"{abs(unit * v):.3g} ± {unit * s:.1g} {what}" for v, s, unit, what in significant)
+    found = " and ".join(
+        f"{abs(unit * v):.3g} ± {unit * s:.1g} {what.format('longer' if v > 0.0 else 'shorter')}"
+        for v, s, unit, what in significant
+    )
+    what = "board" if count == 2 else "object"
     return (
-        f"The board of the given points has another shape than given: it is {found}",
-        "Measure its sides and give the coordinates that they have: printers stretch paper in one direction.",
+        f"The {what} of the given points has another shape than given: it is {found}",
+        f"Measure the {what} and give the coordinates that it has: printers stretch paper in one direction.",
+    )
+
+
+def _disk_words(run: Run, added: Indices, _: float) -> tuple[str, str]:
+    value, covariance = _estimate(run, added)
+    given = run.problem.network.disk_radius
+    square, sigma = given**2 + float(value[0]), float(np.sqrt(covariance[0, 0]))
+    diameter = 2.0 * np.sqrt(max(square, 0.0))
+    return (
+        f"The disks do not have the diameter of {2.0 * given:.4g} that is given, or the points another spacing: by the "
+        f"coordinates it is found as {diameter:.3g} ± {2.0 * sigma / max(diameter, np.sqrt(sigma)):.1g} (points' unit)",
+        "Measure a disk, and from one to the next; correct diameter_mm or the coordinates and their unit.",
     )
 
 

@@ -36,6 +36,7 @@ from adjust.quality.snooping import Snooping, Suspect
 from adjust.quality.variance_components import factor_sigmas, variance_factor
 from adjust.rank_defect.flat_valleys import held_directions, inseparable
 from adjust.solution.explanations import Explanation, explain
+from adjust.solution.model_hypotheses import diameter_notes
 from adjust.solution.warnings import run_warnings
 
 
@@ -256,7 +257,7 @@ class Adjustment(Estimates, PlottedResult):
     @cached_property
     def notes(self) -> tuple[str, ...]:
         """Notes that need no action."""
-        return (*self.unused, *(sentence for _, sentence in self._inseparable.values()))
+        return (*self.unused, *(sentence for _, sentence in self._inseparable.values()), *diameter_notes(self.run))
 
     def inseparable(self, camera: str) -> list[str]:
         """Distortion parameters of a camera that the observations do not separate."""

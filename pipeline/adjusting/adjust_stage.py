@@ -25,7 +25,14 @@ from pipeline.adjusting.network import build_network
 from pipeline.archive.measurement import adjusted_from
 from pipeline.errors import InputError
 from pipeline.files.project_file import ASSUMED_PITCH_UM, Project
-from pipeline.measuring.target_field import across, disk_normals, eccentricity_mm, plane_normal
+from pipeline.measuring.target_field import (
+    across,
+    check_spacing,
+    disk_normals,
+    eccentricity_mm,
+    plane_normal,
+    target_field,
+)
 from pipeline.progress import Reporter
 from pipeline.publishing import unpublished
 from pipeline.results.choice_file import ChoiceRecord, choice_record
@@ -99,6 +106,8 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
 
     Raises InputError or AdjustmentError where no adjustment is possible.
     """
+    if project.disk_radius > 0.0:
+        check_spacing(project, target_field(project))
     network, left_out = build_network(project, marks)
     options = adjustment_options(project)
     adjusted = partial(adjust, options=options)

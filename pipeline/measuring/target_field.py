@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_vector
@@ -15,6 +16,7 @@ from measure.targets.consistency import TargetPlaces, compare_targets
 from measure.targets.crosses import CrossSearch, cross_candidates
 from measure.targets.disk_detection import DiskSearch, disk_candidates
 from measure.targets.identification import TargetOptions, TargetPrediction, measure_crosses, measure_disks
+from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
 from pipeline.results.comparator_file import pixel_from_comparator
@@ -191,6 +193,20 @@ def target_field(project: Project) -> Field:
     )
     normals = dict(project.given_points.normals) if project.given_points else {}
     return Field(tuple(complete), xyz, sigmas, normals, project.target_radius)
+
+
+def check_spacing(project: Project, field: Field) -> None:
+    """Raise InputError where most targets would cover one another."""
+    if len(field.xyz) < 2:
+        return
+    nearest = cKDTree(field.xyz).query(field.xyz, k=[2])[0]
+    spacing, diameter = float(np.quantile(nearest, 0.9)), 2.0 * field.radius
+    if diameter > spacing:  # probably the unit of the coordinates is wrong
+        raise InputError(
+            f"{project.path}: [targets] of {diameter * project.unit_mm:g} mm would cover one another: nine of ten "
+            f"points of [object] lie within {spacing * project.unit_mm:.3g} mm of the next one if their coordinates "
+            f'are in {project.unit}. Give the unit that they are in, as [object] unit = "m".'
+        )
 
 
 def target_candidates(scan: Scan, settings: TargetSettings, diameters_px: tuple[float, float]) -> list[Candidate]:

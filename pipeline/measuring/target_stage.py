@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
@@ -23,6 +22,7 @@ from pipeline.measuring.target_field import (
     LEAST_DIAMETER_PX,
     Field,
     absent_targets,
+    check_spacing,
     checked_places,
     measure_single_targets,
     target_candidates,
@@ -108,14 +108,7 @@ def _check(project: Project, settings: TargetSettings, field: Field) -> None:
             f"{project.path}: [object] points: {len(field.ids)} points with X, Y and Z name no targets; give "
             f"{LEAST_PAIRS}, if only roughly."
         )
-    nearest = cKDTree(field.xyz).query(field.xyz, k=[2])[0]
-    spacing, diameter = float(np.quantile(nearest, 0.9)), 2.0 * field.radius
-    if diameter > spacing:  # probably the unit of the coordinates is wrong
-        raise InputError(
-            f"{project.path}: [targets] of {diameter * project.unit_mm:g} mm would cover one another: nine of ten "
-            f"points of [object] lie within {spacing * project.unit_mm:.3g} mm of the next one if their coordinates "
-            f'are in {project.unit}. Give the unit that they are in, as [object] unit = "m".'
-        )
+    check_spacing(project, field)
 
 
 # The image model before the targets are known: the camera from its file, and the film from the fiducials.

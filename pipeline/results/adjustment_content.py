@@ -8,7 +8,6 @@ from importlib.metadata import version
 
 import numpy as np
 
-from adjust.functional_model.board import BOARD_NAMES
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.transformation import film_parameter_names
@@ -270,7 +269,7 @@ def _projection(adjustment: Adjustment, camera: str) -> Iterator[ProjectionRecor
 
 def _board(adjustment: Adjustment, number: int) -> BoardRecord:
     board = adjustment.network.boards[number]
-    bends = dict(zip(BOARD_NAMES, board.bends, strict=True))
+    bends = dict(zip(board.names, board.bends, strict=True))
     terms, together = _terms(adjustment, "board", board.name, bends)
     return BoardRecord(points=len(board.places), terms=terms, significance=together)
 
@@ -331,7 +330,7 @@ def _point(adjustment: Adjustment, point: ObjectPoint) -> PointRecord:
     for board in adjustment.network.boards:
         if point.id in board.places:
             unknowns = [Parameter.point(point.id, axis) for axis in "XYZ"]
-            unknowns += [Parameter.board(board.name, each) for each in BOARD_NAMES]
+            unknowns += [Parameter.board(board.name, each) for each in board.names]
             by_unknowns = np.hstack([np.eye(3), board.lift_directions[point.id].T])
             values = by_unknowns @ adjustment.values_of(unknowns)
             variances = np.diag(by_unknowns @ adjustment.cofactor_of(unknowns) @ by_unknowns.T)

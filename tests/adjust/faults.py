@@ -537,6 +537,9 @@ class Effects:
     scale: float = 0.0
     bend: float = 0.0
     stretch: float = 0.0
+    shear: float = 0.0
+    height: float = 0.0
+    disk: float = 0.0
     point: float = 0.0
     noise: float = 1.0
     pitch: float = 1.0
@@ -564,6 +567,8 @@ class Misfit:
     c_given: bool = False
     stations_given: bool = False
     frame_given: bool = False
+    disk_radius: float = 0.0
+    sigma: float = 1.0
 
 
 def scene(seed: int, flat: bool) -> Scene:
@@ -597,7 +602,7 @@ def misfit_network(made: Scene, effects: Effects, kind: Misfit, rng: np.random.G
         places.append(projected[inside])
     xy_mm = np.concatenate(places)
     if rng is not None:
-        xy_mm = xy_mm + rng.normal(0.0, SIGMA_MM * effects.noise, xy_mm.shape)
+        xy_mm = xy_mm + rng.normal(0.0, SIGMA_MM * kind.sigma * effects.noise, xy_mm.shape)
     xy_mm = effects.pitch * xy_mm * [1.0, -1.0 if effects.y_down else 1.0]
     given = {name: Prior(0.0, np.inf) for name in kind.free}
     middle = effects.pitch * MIDDLE_MM * [1.0, -1.0 if effects.y_down else 1.0]
@@ -607,9 +612,9 @@ def misfit_network(made: Scene, effects: Effects, kind: Misfit, rng: np.random.G
     exterior = _exteriors(made) if kind.stations_given else {}
     rows = [(*name, xy) for name, xy in zip(names, xy_mm, strict=True)]
     points = {f"p{k}": effects.object_unit * xyz for k, xyz in enumerate(made.points)}
-    given_network = digital_network(camera, rows, points, effects.pitch * SIGMA_MM)
+    given_network = digital_network(camera, rows, points, effects.pitch * kind.sigma * SIGMA_MM)
     images = tuple(replace(image, exterior=exterior.get(image.name)) for image in given_network.images)
-    return replace(given_network, images=images)
+    return replace(given_network, images=images, disk_radius=kind.disk_radius)
 
 
 def _exteriors(made: Scene) -> dict[str, Exterior]:
@@ -628,23 +633,43 @@ def _projected(made: Scene, effects: Effects, kind: Misfit, image: int, rotation
     relative = (2.0 * points - low - high)[:, :2] / (high - low)[:2]
     points[:, 2] += effects.bend * (1.0 - relative[:, 0] ** 2)
     points[:, 1] *= 1.0 + effects.stretch
+    points[:, 2] *= 1.0 + effects.height
+    points[:, 0] += effects.shear * points[:, 1]
     points[WRONG_POINT, :2] -= effects.point
-    u, v, w = rotation @ (points - station).T
-    x, y = -u / w, v / w
+
+    def imaged(places: Array) -> Array:
+        u, v, w = np.moveaxis((places - station) @ rotation.T, -1, 0)
+        return _through_lens(effects, kind, -u / w, v / w, C_MM + own * effects.zoom)
+
+    own = float(made.groups[image])
+    at = imaged(points) + made.point_mm
+    if effects.disk:
+        angles = np.linspace(0.0, 2.0 * np.pi, 40, endpoint=False)
+        circle = np.sqrt(abs(effects.disk)) * np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
+        at += np.sign(effects.disk) * (center_of_gravity(imaged(points[:, None] + circle)) - imaged(points))
+    at[:, 0] += own * effects.crop
+    at[:, 1] += 0.7 * own * effects.crop
+    if effects.mirrored and image == int(np.argmax(made.groups)):
+        at[:, 0] = 2.0 * MIDDLE_MM[0] - at[:, 0]
+    return np.asarray(at * (1.0 + own * effects.scale))
+
+
+def _through_lens(effects: Effects, kind: Misfit, x: Array, y: Array, c: float) -> Array:
+    """Places (..., 2) of rays in mm from the principal point, y up."""
     lens = dict.fromkeys(("k1", "k2", "p1", "p2", "k3"), 0.0) | kind.lens
     r2 = x**2 + y**2
     radial = 1.0 + lens["k1"] * r2 + lens["k2"] * r2**2 + lens["k3"] * r2**3 + effects.radial * r2**2
     p1, p2 = lens["p1"] + effects.tangential, lens["p2"] - effects.tangential
     xd = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x**2)
     yd = y * radial + p1 * (r2 + 2.0 * y**2) + 2.0 * p2 * x * y
-    c, own = C_MM, float(made.groups[image])
-    c += own * effects.zoom
-    at = np.stack([c * xd * (1.0 + effects.b1), -c * yd], axis=1) + made.point_mm
-    at[:, 0] += own * effects.crop
-    at[:, 1] += 0.7 * own * effects.crop
-    if effects.mirrored and image == int(np.argmax(made.groups)):
-        at[:, 0] = 2.0 * MIDDLE_MM[0] - at[:, 0]
-    return np.asarray(at * (1.0 + own * effects.scale))
+    return np.stack([c * xd * (1.0 + effects.b1), -c * yd], axis=-1)
+
+
+def center_of_gravity(outline: Array) -> Array:
+    """Of polygons (n, k, 2)."""
+    following = np.roll(outline, -1, axis=1)
+    area = outline[..., 0] * following[..., 1] - following[..., 0] * outline[..., 1]
+    return np.asarray(((outline + following) * area[..., None]).sum(axis=1) / (3.0 * area.sum(axis=1))[:, None])
 
 
 WRONG_POINT = 17
@@ -674,6 +699,18 @@ MISFITS = {
     "board bent": Misfit(lambda e: Effects(bend=0.5 * e), ("is not flat",), size=2, fields=False),
     "board stretched": Misfit(
         lambda e: Effects(stretch=1e-3 * e), ("has another shape than given",), size=2, fields=False
+    ),
+    "object stretched": Misfit(
+        lambda e: Effects(stretch=1e-3 * e), ("object of the given points has another shape",), size=5, boards=False
+    ),
+    "object: heights too large": Misfit(
+        lambda e: Effects(height=1e-3 * e), ("object of the given points has another shape",), size=5, boards=False
+    ),
+    "object sheared": Misfit(
+        lambda e: Effects(shear=1e-3 * e), ("object of the given points has another shape",), size=5, boards=False
+    ),
+    "disks of another diameter": Misfit(
+        lambda e: Effects(disk=50.0 * e), ("disks do not have the diameter",), fields=False, disk_radius=11.0, sigma=0.1
     ),
     "a point is elsewhere": Misfit(
         lambda e: Effects(point=0.1 * e), (f"Point p{WRONG_POINT} is not where it is given",), size=3

@@ -5,12 +5,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from faults import center_of_gravity
 from networks import digital_network, view_rows
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from adjust import Adjustment, AdjustmentError, Camera, Distortion, Parameter, Prior, adjust, approximate
-from adjust.functional_model.board import board_form
+from adjust.functional_model.board import board_form, disk_directions
 from adjust.model_selection.model_choice import choose
 from adjust.problem.condition_equations import compute, computed_observations, derivatives
 from adjust.problem.estimates import adjusted_places
@@ -115,6 +116,25 @@ def test_derivatives_by_the_bends_are_differences_of_the_functions() -> None:
         assert below is not None
         by_bend = -(at.by_unknowns * (problem.columns == position)[:, None, :]).sum(axis=2)
         np.testing.assert_allclose(by_bend, (numeric - below) / 2e-3, atol=1e-8)
+
+
+def test_the_centre_of_gravity_of_an_imaged_disk() -> None:
+    """By an outline of 400 points through OpenCV's strong lens."""
+    rotation, shift, radius = np.array([0.5, -0.3, 0.2]), np.array([10.0, 20.0, 400.0]), 3.0
+    lens, matrix = np.array([-0.3, 0.1, 2e-3, -1e-3]), np.diag([C_MM, C_MM, 1.0])
+    centres, angles = flat_board() - [100.0, 60.0, 0.0], np.linspace(0.0, 2.0 * np.pi, 400, endpoint=False)
+
+    def image(points: Array) -> Array:
+        return np.reshape(
+            cv2.projectPoints(points.reshape(-1, 3), rotation, shift, matrix, lens)[0], (*points.shape[:-1], 2)
+        )
+
+    circle = radius * np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
+    gravity = center_of_gravity(image(centres[:, None] + circle))
+    axes = np.eye(3)[:2]
+    at = {(i, j): image(centres + radius * (np.array([i, j]) @ axes)) for i in (-1, 0, 1) for j in (-1, 0, 1)}
+    moved = image(centres + radius**2 * disk_directions(at, axes, radius)[:, 0])
+    np.testing.assert_allclose(moved - at[0, 0], gravity - at[0, 0], atol=0.01 * np.abs(gravity - at[0, 0]).max())
 
 
 def test_the_form_is_1_in_the_middle_and_0_at_the_corners() -> None:

@@ -145,6 +145,13 @@ def adjust_network(folder: Path) -> Adjustment:
     return adjust_marks(project, read_comparator(project.comparator))
 
 
+def test_disks_larger_than_their_spacing_are_refused(tmp_path: Path) -> None:
+    """As where coordinates are in m and said to be in mm: the iteration diverged."""
+    free_project(tmp_path, '[targets]\nkind = "disk"\ndiameter_mm = 1e6\n')
+    with pytest.raises(InputError, match="would cover one another"):
+        adjust_network(tmp_path)
+
+
 def test_chosen_datum_coordinates(tmp_path: Path) -> None:
     """Other seven coordinates than the reference holds: its camera, and the seven where points.csv has them."""
     held = ["2.X", "2.Y", "2.Z", "9.X", "9.Y", "9.Z", "4.Z"]
