@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from measure.scans.opening import open_scan
 from pipeline.errors import InputError
-from pipeline.exchange.colmap_format import CONVENTION, import_pycolmap
+from pipeline.exchange.pinhole_formats import COLMAP, import_pycolmap
 from pipeline.files.camera_file import CameraFile
 from pipeline.resampling.canvas import Canvas, FrameChain
 from pipeline.resampling.resample_stage import ResampleTask
@@ -244,7 +244,7 @@ def read_model(model: Any, database: Any, pictures: Sequence[BlockPicture]) -> M
             image, row = images[element.image_id], element.point2D_idx
             place_px = image.points2D[row].xy
             off_px = float(np.linalg.norm(place_px - image.project_point(point.xyz)))
-            place = place_px - CONVENTION.first_pixel_px
+            place = place_px - COLMAP.first_pixel_px
             size_px = float(sizes_px[element.image_id][row])
             sights.append(Sight(names[image.name], float(place[0]), float(place[1]), size_px, off_px))
         tracks[int(number)] = sights
@@ -276,7 +276,7 @@ def camera_params(camera: CameraFile, lattice: Canvas) -> list[float]:
     """fx, fy, cx, cy, k1, k2, p1, p2 of COLMAP's OPENCV model: given principal distance and point, no distortion."""
     interior = given_interior(camera)
     focal = float(interior[0]) / lattice.pitch_mm
-    center = lattice.pixel_from_camera(interior[1:]) + CONVENTION.first_pixel_px
+    center = lattice.pixel_from_camera(interior[1:]) + COLMAP.first_pixel_px
     return [focal, focal, *center.tolist(), 0.0, 0.0, 0.0, 0.0]
 
 

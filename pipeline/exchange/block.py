@@ -25,7 +25,6 @@ from pipeline.results.covariance_file import Covariance, read_own_covariance
 from pipeline.types import Array
 
 if TYPE_CHECKING:
-    from measure.scans.remote import Window
     from measure.scans.scan import Scan
 
 NO_PITCH = (1000.0, 1000.0)  # µm, where pixel coordinates are not needed
@@ -39,7 +38,7 @@ class OutFrame:
     ----------
     marks : the marks that are observations.
     scan, pitch_um : path and pixel pitch; None if unknown.
-    model, lens : adjusted; None for images without a part in the adjustment.
+    model : adjusted; None for images without a part in the adjustment.
     is_oriented : whether the exterior orientation was adjusted, too.
     """
 
@@ -49,7 +48,6 @@ class OutFrame:
     pitch_um: tuple[float, float] | None
     marks: tuple[ComparatorPoint, ...]
     model: ImageModel | None
-    lens: Lens | None
     is_oriented: bool
 
     def observed(self, fiducials: bool) -> tuple[ComparatorPoint, ...]:
@@ -68,6 +66,12 @@ class OutFrame:
     def frame_mm(self, marks: tuple[ComparatorPoint, ...], with_lens: bool) -> Array:
         """Observed places (n, 2) in the resampled frame, mm. with_lens: its distortion is removed."""
         return self.chain(with_lens).frame_from_scan(self.pixels(marks))[0]
+
+    @property
+    def lens(self) -> Lens:
+        """Adjusted lens, of images with a part in the adjustment."""
+        assert self.model is not None
+        return self.model.lens
 
     @property
     def known_pitch_um(self) -> tuple[float, float]:
@@ -90,7 +94,7 @@ class OutFrame:
         """Transformations from the scan to the camera's frame."""
         model = self.model
         assert model is not None
-        lens = self.lens if with_lens else None
+        lens = model.lens if with_lens else None
         return FrameChain(self.known_pitch_um, model.film, model.bend, model.bend_parameters, lens)
 
     @property
@@ -116,7 +120,7 @@ class WholeFrame:
         return self.scans[0].model
 
     @property
-    def lens(self) -> Lens | None:
+    def lens(self) -> Lens:
         return self.scans[0].lens
 
     @property
@@ -186,17 +190,8 @@ class Block:
             return {id: mark.xy_mm for id, mark in adjusted.fiducials.items()}
         return {fiducial.id: fiducial.xy_mm for fiducial in self.camera_file(camera).fiducials}
 
-    def size_px(self, frame: OutFrame) -> tuple[int, int]:
-        """Width and height of an image's scan. Raises InputError where there is no scan."""
-        with self._open_scan(frame) as scan:
-            return scan.width_px, scan.height_px
-
-    def part_px(self, frame: OutFrame) -> "Window":
-        """Window of the scan that shows an image. Raises InputError where there is no scan."""
-        with self._open_scan(frame) as scan:
-            return scan.part_px
-
-    def _open_scan(self, frame: OutFrame) -> "Scan":
+    def open_scan(self, frame: OutFrame) -> "Scan":
+        """Open the scan of an image. Raises InputError where there is none."""
         if frame.scan is None:
             raise InputError(
                 f"the scan of image {frame.image!r} is not known, and this format needs its size. Name the scans in "
@@ -279,7 +274,7 @@ def _frame(
     known = adjustment.images.get(image) if adjustment else None
     camera, scan = project.image_camera(image).name, project.scans.get(image)
     if adjustment is None or known is None:
-        return OutFrame(image, camera, scan, pitch_um, marks, None, None, False)
+        return OutFrame(image, camera, scan, pitch_um, marks, None, False)
     lens = adjustment.cameras[adjustment.image_camera(image)].lens()
     places = _places_mm(marks)
     middle_mm = (places.min(axis=0) + places.max(axis=0)) / 2.0 if len(places) else np.zeros(2)
@@ -295,7 +290,7 @@ def _frame(
         chain.bend,
         chain.bend_parameters,
     )
-    return OutFrame(image, camera, scan, pitch_um, marks, model, lens, known.exterior.is_oriented)
+    return OutFrame(image, camera, scan, pitch_um, marks, model, known.exterior.is_oriented)
 
 
 def _variance(mark: ComparatorPoint) -> float:

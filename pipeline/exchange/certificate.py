@@ -29,7 +29,7 @@ from pipeline.text.table_models import Key, Positive, WrongKey, numbers, read_mo
 from pipeline.text.tables import read_toml
 from pipeline.types import Array
 
-CONVENTION = Convention(
+CERTIFICATE = Convention(
     (float("nan"), float("nan")),
     "radial distortion in µm, positive away from the centre, at angles from the axis or at radii in mm",
     "U.S. Geological Survey, Report of Calibration of Aerial Mapping Camera (OSL): Lens Distortion by field angle",
@@ -87,7 +87,7 @@ class FittedTable:
     residuals_um: Array
 
 
-def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
+def import_certificate(paths: Sequence[Path], options: ImportOptions) -> Incoming:
     """Read certificates from TOML files, as camera files with the equivalent principal distance and tables of the
     residuals."""
     certificates = [read_certificate(path) for path in paths]

@@ -2,7 +2,6 @@
 all files of a folder or none."""
 
 import os
-import re
 import shutil
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,7 +15,7 @@ from adjust.functional_model.rotation import angles_from_rotation
 from measure.flags import Status
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, read_block
-from pipeline.exchange.formats import Convention, ExportOptions, Written, format_reader, format_writer
+from pipeline.exchange.formats import ExportOptions, Written, format_function
 from pipeline.exchange.incoming import ForeignMark, ForeignPose, ImportOptions, Incoming
 from pipeline.files.camera_file import CameraFile, camera_text
 from pipeline.files.camera_tables import DEFAULT_SIGMA_MM
@@ -42,23 +41,20 @@ def run_export(project: Project, format: str, folder: Path, options: ExportOptio
     Raises InputError for an unknown format, a folder that holds anything else, and whatever the format cannot
     represent.
     """
-    write, convention = format_writer(format)
+    write, convention = format_function("write", format)
     check_folder(folder)
     block = read_block(project)
     _check_names(block)
-    written = write(block, options)
+    written: Written = write(block, options)
     decisions = describe_decisions(read_decision_counts(project.comparator))
     written = replace(written, notes=tuple(filter(None, [*written.notes, *block.lens_reach.values(), decisions])))
     parts = {"Lost": written.lost, "Notes": written.notes, "Left out": written.left_out}
-    readme_text = readme(format, _convention_lines(convention), parts)
-    publish(folder, written.files, readme_text)
-    return replace(written, readme_text=readme_text)
-
-
-def _convention_lines(convention: Convention) -> list[str]:
     col, row = convention.first_pixel_px
     pixel = [] if col != col else [f"The centre of the first pixel is ({col:g}, {row:g})."]
-    return [*pixel, f"Axes: {convention.axes}.", f"Source: {convention.source}."]
+    head = [*pixel, f"Axes: {convention.axes}.", f"Source: {convention.source}."]
+    readme_text = readme(format, head, parts)
+    publish(folder, written.files, readme_text)
+    return replace(written, readme_text=readme_text)
 
 
 def readme(what: str, head: Sequence[str], parts: Mapping[str, Sequence[str]]) -> str:
@@ -71,14 +67,11 @@ def readme(what: str, head: Sequence[str], parts: Mapping[str, Sequence[str]]) -
 
 def check_folder(folder: Path) -> None:
     """Raise InputError for a folder with anything other than an earlier export, which would be overwritten."""
-    if folder.exists() and (not folder.is_dir() or (any(folder.iterdir()) and not _is_own(folder / README))):
+    text = (folder / README).read_bytes() if (folder / README).is_file() else b""
+    if folder.exists() and (not folder.is_dir() or (any(folder.iterdir()) and not text.startswith(_HEAD.encode()))):
         raise InputError(
             f"{folder}: holds something that is no export of reseau. Name another folder, or an empty one."
         )
-
-
-def _is_own(path: Path) -> bool:
-    return path.is_file() and re.match(_HEAD.encode(), path.read_bytes()[: len(_HEAD)]) is not None
 
 
 def publish(folder: Path, files: Mapping[str, str | bytes], readme_text: str) -> None:
@@ -124,7 +117,7 @@ def run_import(format: str, paths: Sequence[Path], folder: Path, options: Import
 
     Raises InputError for an unknown format and for files that do not have it.
     """
-    read = format_reader(format)
+    read, _ = format_function("import", format)
     check_folder(folder)
     incoming: Incoming = read(paths, options)
     files: dict[str, str | bytes] = dict(incoming.tables)

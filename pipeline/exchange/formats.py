@@ -1,9 +1,9 @@
-"""Table of the exchange formats: writer, reader, and coordinate conventions of each."""
+"""The exchange formats: writer, importer and coordinate convention of each, imported on demand."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from typing import Any, Literal
 
 from pipeline.errors import InputError
 from pipeline.text.wording import did_you_mean
@@ -11,31 +11,18 @@ from pipeline.text.wording import did_you_mean
 LARGEST_MISFIT_PX = 0.05  # of a lens in another program's model: a third of the standard deviation of a good mark
 
 
-@dataclass(frozen=True)
-class Format:
-    """An exchange format. module: in this folder, imported on demand; writer, reader: names of its functions, ""
-    without."""
-
-    module: str
-    writer: str = ""
-    reader: str = ""
-
-
-TABLE = {
-    "csv": Format("tables", "write_csv"),
-    "parquet": Format("tables", "write_parquet"),
-    "opencv": Format("opencv_format", "write", "read"),
-    "colmap": Format("colmap_format", "write", "read"),
-    "micmac": Format("micmac_format", "write", "read"),
-    "mmvii": Format("mmvii_format", "write", "read"),
-    "metashape": Format("metashape_format", "write", "read"),
-    "asp": Format("asp_format", "write"),
-    "bingo": Format("bingo_format", "write"),
-    "geojson": Format("geojson_format", "write"),
-    "certificate": Format("certificate", "", "read"),
+MODULES = {  # by format: where its functions write_FORMAT and import_FORMAT, and its convention FORMAT, are
+    **dict.fromkeys(("csv", "parquet"), "tables"),
+    **dict.fromkeys(("opencv", "colmap"), "pinhole_formats"),
+    **dict.fromkeys(("micmac", "mmvii"), "micmac_format"),
+    "metashape": "metashape_format",
+    "asp": "pinhole_formats",
+    "bingo": "tables",
+    "geojson": "geojson_format",
+    "certificate": "certificate",
 }
-FORMATS = tuple(name for name, each in TABLE.items() if each.writer)
-IMPORTED = tuple(name for name, each in TABLE.items() if each.reader)
+FORMATS = tuple(name for name in MODULES if name != "certificate")
+IMPORTED = ("opencv", "colmap", "micmac", "mmvii", "metashape", "certificate")
 
 
 @dataclass(frozen=True)
@@ -83,21 +70,11 @@ class Written:
     readme_text: str = ""
 
 
-def format_writer(name: str) -> tuple[Callable[..., Written], Convention]:
-    """Writer of a format, and its convention. Raises InputError for a format that cannot be written."""
-    module, known = _module(name, FORMATS, "")
-    return getattr(module, known.writer), module.CONVENTION
-
-
-def format_reader(name: str) -> Callable[..., Any]:
-    """Reader of a format. Raises InputError for a format that cannot be read."""
-    module, known = _module(name, IMPORTED, " to import")
-    reader: Callable[..., Any] = getattr(module, known.reader)
-    return reader
-
-
-def _module(name: str, possible: tuple[str, ...], use: str) -> tuple[Any, Format]:
+def format_function(use: Literal["write", "import"], name: str) -> tuple[Callable[..., Any], Convention]:
+    """Writer or importer of a format, and its convention. Raises InputError for a format that has none."""
+    possible = FORMATS if use == "write" else IMPORTED
     if name not in possible:
-        hint = did_you_mean(name, possible)
-        raise InputError(f"there is no format {name!r}{use}; possible are {', '.join(possible)}.{hint}")
-    return import_module(f"pipeline.exchange.{TABLE[name].module}"), TABLE[name]
+        words = f"{name!r}{' to import' if use == 'import' else ''}; possible are {', '.join(possible)}"
+        raise InputError(f"there is no format {words}.{did_you_mean(name, possible)}")
+    module = import_module(f"pipeline.exchange.{MODULES[name]}")
+    return getattr(module, f"{use}_{name}"), getattr(module, name.upper())

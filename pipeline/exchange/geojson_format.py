@@ -17,7 +17,7 @@ _AXIS_M, _FLATTENING = 6378137.0, 1.0 / 298.257222101
 _SCALE, _EASTING_M, _SOUTHERN_M = 0.9996, 500_000.0, 10_000_000.0
 _DEGREES = ("EPSG:4326", "EPSG:4258")
 
-CONVENTION = Convention(
+GEOJSON = Convention(
     (float("nan"), float("nan")),
     "no pixels: longitude and latitude in degrees, WGS 84, counter-clockwise",
     "RFC 7946, sections 3.1.6 and 4",
@@ -79,7 +79,7 @@ def _from_utm(xy: Array, zone: int, southern: bool) -> Array:
     return np.asarray(np.degrees(np.column_stack([lon, np.arctan(tan)])) + np.array([6.0 * zone - 183.0, 0.0]))
 
 
-def write(block: Block, options: ExportOptions) -> Written:
+def write_geojson(block: Block, options: ExportOptions) -> Written:
     """Write footprints.geojson: outlines of the frames, projected by the adjusted lens and orientation to the mean
     height of their points."""
     crs = block.project.crs

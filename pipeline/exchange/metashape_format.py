@@ -7,16 +7,15 @@ from pathlib import Path
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, OutFrame
 from pipeline.exchange.formats import Convention, ExportOptions, Written
-from pipeline.exchange.incoming import ImportOptions, Incoming, opencv_camera
+from pipeline.exchange.incoming import ImportOptions, Incoming, child_numbers, opencv_camera, read_xml, xml_text
 from pipeline.exchange.micmac_format import film_box
 from pipeline.exchange.pinhole import BROWN, FittedLens, checked_misfits, sheared_lens
-from pipeline.exchange.xml_tree import child_numbers, read_xml, xml_text
 from pipeline.files.camera_file import CameraFile
 from pipeline.opencv_check.opencv_calibration import INTERIOR
 from pipeline.resampling.canvas import Canvas
 from pipeline.text.files import file_word
 
-CONVENTION = Convention(
+METASHAPE = Convention(
     (0.5, 0.5),
     "column right, row down, from the outer corner of the first pixel; camera x right, y down, z forward",
     "Agisoft Metashape Professional manual, appendix Camera models: u = w/2 + cx + x'f + x'B1 + y'B2, v = h/2 + cy + "
@@ -27,7 +26,7 @@ _MOST_REASONS = 3  # largest number in a message
 NAMES = ("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "b1", "b2")
 
 
-def write(block: Block, options: ExportOptions) -> Written:
+def write_metashape(block: Block, options: ExportOptions) -> Written:
     """Write reseau_to_metashape.py with its data, and CAMERA.xml where there is an adjustment."""
     reasons = {frame.image: _hindrance(frame) for frame in block.frames}
     frames = [frame for frame in block.frames if not reasons[frame.image]]
@@ -85,7 +84,7 @@ def _image(frame: OutFrame) -> dict[str, object]:
     marks = {
         key: {
             mark.point: place.tolist()
-            for mark, place in zip(own, frame.pixels(own) + CONVENTION.first_pixel_px, strict=True)
+            for mark, place in zip(own, frame.pixels(own) + METASHAPE.first_pixel_px, strict=True)
         }
         for key, own in (("fiducials_px", frame.observed(True)), ("points_px", frame.observed(False)))
     }
@@ -118,7 +117,7 @@ def _calibration(lens: FittedLens, box: Canvas) -> str:
     return xml_text("calibration", {**size, **in_px, **{name: float(value) for name, value in terms.items()}})
 
 
-def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
+def import_metashape(paths: Sequence[Path], options: ImportOptions) -> Incoming:
     """Read calibrations in Agisoft's XML as camera files."""
     return Incoming(cameras=tuple(_read_camera(path, options) for path in paths))
 
@@ -146,4 +145,4 @@ def _read_camera(path: Path, options: ImportOptions) -> CameraFile:
     f, b1, b2, size = values["f"], values["b1"], values["b2"], (given["width"], given["height"])
     interior = (f + b1, f, size[0] / 2 + values["cx"], size[1] / 2 + values["cy"])
     lens = {name: values[name] for name in ("k1", "k2", "k3")} | {"p1": values["p2"], "p2": values["p1"], "b2": b2 / f}
-    return opencv_camera(path, path.stem, interior, lens, size, options, CONVENTION)
+    return opencv_camera(path, path.stem, interior, lens, size, options, METASHAPE)

@@ -1,4 +1,5 @@
-"""MicMac: fiducials of unresampled scans for its ReSampFid; camera and orientations for the frames that it creates."""
+"""MicMac: fiducials of unresampled scans for its ReSampFid, camera and orientations for the frames that it creates;
+MMVII: marks of unresampled scans with their full covariances, which no other of these formats supports."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from math import ceil, floor
@@ -10,7 +11,18 @@ import numpy as np
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, OutFrame
 from pipeline.exchange.formats import Convention, ExportOptions, Written
-from pipeline.exchange.incoming import ForeignMark, ImportOptions, Incoming, fiducial_camera
+from pipeline.exchange.incoming import (
+    Content,
+    Element,
+    ForeignMark,
+    ImportOptions,
+    Incoming,
+    child_numbers,
+    child_text,
+    fiducial_camera,
+    read_xml,
+    xml_text,
+)
 from pipeline.exchange.pinhole import (
     BROWN,
     Y_DOWN_Z_FORWARD,
@@ -19,14 +31,13 @@ from pipeline.exchange.pinhole import (
     frame_corners_mm,
     sheared_lens,
 )
-from pipeline.exchange.xml_tree import Content, Element, child_numbers, child_text, read_xml, xml_text
 from pipeline.opencv_check.opencv_calibration import INTERIOR
 from pipeline.resampling.canvas import Canvas
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.text.files import file_word, image_name
 from pipeline.types import Array
 
-CONVENTION = Convention(
+MICMAC = Convention(
     (0.0, 0.0),
     "column right, row down; camera mm with x right and y DOWN; camera x right, y down, z forward; X = R P + C",
     "micmac, include/general: TIm2D::getr; DefautChantierDescripteur.xml, Key-Assoc-STD-Orientation-Interne (names of "
@@ -40,7 +51,7 @@ _DIGITS = 12
 _FEWEST = 3  # marks needed for an affine transformation
 
 
-def write(block: Block, options: ExportOptions) -> Written:
+def write_micmac(block: Block, options: ExportOptions) -> Written:
     """Write Ori-InterneScan with the fiducials and, where there is an adjustment, Ori-Reseau with camera and
     orientations.
 
@@ -76,7 +87,7 @@ def _camera_files(block: Block, camera: str, options: ExportOptions) -> Written:
         frames = [frame for frame in frames if frame.image not in few]
         for frame in frames:
             marks = found[frame.image]
-            places = dict(zip(_names(marks), frame.pixels(marks) + CONVENTION.first_pixel_px, strict=True))
+            places = dict(zip(_names(marks), frame.pixels(marks) + MICMAC.first_pixel_px, strict=True))
             own = _marks(frame.file_name, places, _sigmas_px(marks, sum(frame.known_pitch_um) / 2000.0))
             files[f"Ori-InterneScan/MeasuresIm-{frame.file_name}.xml"] = xml_text(*own)
     oriented = [frame for frame in frames if frame.is_oriented]
@@ -117,7 +128,8 @@ def _picture_box(block: Block, frame: OutFrame) -> Canvas:
         raise InputError(
             f"micmac: a pixel of {frame.image!r} is {x_um:g} x {y_um:g} µm. Resample it, and export colmap."
         )
-    return Canvas(0.0, 0.0, x_um / 1000.0, *block.size_px(frame))
+    with block.open_scan(frame) as scan:
+        return Canvas(0.0, 0.0, x_um / 1000.0, scan.width_px, scan.height_px)
 
 
 def _names(marks: Sequence[ComparatorPoint]) -> list[str]:
@@ -145,7 +157,7 @@ def _calibration(lens: FittedLens, box: Canvas) -> str:
     fx, fy, x0, y0 = lens.named(INTERIOR)
     k1, k2, p1, p2, k3 = lens.named(BROWN)
     focal = float(fy / box.pitch_mm)
-    point = box.pixel_from_camera(np.array([x0, y0])) + CONVENTION.first_pixel_px
+    point = box.pixel_from_camera(np.array([x0, y0])) + MICMAC.first_pixel_px
     radial: list[tuple[str, Content]] = [("CDist", point)]
     radial += [("CoeffDist", float(k / focal ** (2 * i))) for i, k in enumerate((k1, k2, k3), 1)]
     affine = {"b1": float(fx / fy - 1.0), "b2": float(lens.shear)}
@@ -180,7 +192,7 @@ def _measures(block: Block, frames: Sequence[OutFrame], box: Canvas, reech: str)
     images = []
     for frame in frames:
         marks = frame.observed(fiducials=False)
-        pixels = box.pixel_from_camera(frame.camera_mm(marks)) + CONVENTION.first_pixel_px
+        pixels = box.pixel_from_camera(frame.camera_mm(marks)) + MICMAC.first_pixel_px
         places = {point: pixel for point, pixel in zip(_names(marks), pixels, strict=True) if point in block.points}
         images.append(_marks(f"{reech}{frame.file_name}", places, _sigmas_px(marks, box.pitch_mm)))
     return xml_text("SetOfMesureAppuisFlottants", images)
@@ -223,7 +235,7 @@ def _affine_misfit_px(frame: OutFrame, fiducials: Mapping[str, Array], box: Canv
     return float(np.linalg.norm(fitted - frame.camera_mm(marks), axis=1).max()) / box.pitch_mm
 
 
-def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
+def import_micmac(paths: Sequence[Path], options: ImportOptions) -> Incoming:
     """Read MeasuresIm-*.xml (fiducials), MeasuresCamera.xml (gives a camera file) and sets of marks (object points)."""
     marks: list[ForeignMark] = []
     cameras = []
@@ -246,7 +258,7 @@ def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
             name = image_name(child_text(image, "NameIm", path))
             for point, place, sigma_px in _points(image, path):
                 covariance = None if sigma_px is None else sigma_px**2 * np.eye(2)
-                marks.append(ForeignMark(name, point, kind, place - CONVENTION.first_pixel_px, covariance))
+                marks.append(ForeignMark(name, point, kind, place - MICMAC.first_pixel_px, covariance))
     return Incoming(tuple(marks), tuple(cameras))
 
 
@@ -255,3 +267,67 @@ def _points(image: Element, path: Path) -> Iterator[tuple[str, Array, float | No
     for mark in image.findall("OneMesureAF1I"):
         sigma_px = child_numbers(mark, "PrecPointe", 1, path)[0] if mark.find("PrecPointe") is not None else None
         yield child_text(mark, "NamePt", path), np.array(child_numbers(mark, "PtIm", 2, path)), sigma_px
+
+
+MMVII = Convention(
+    (0.0, 0.0),
+    "column right, row down; Sigma2 is the covariance xx xy yy in px",
+    "micmac, MMVII/src/Sensors/Measures.cpp (Name, Pt, Sigma2; SetMesIm, NameIm, Measures) and cGenerateTarget.cpp",
+)
+_FOLDERS = {True: "Fiducials", False: "Targets"}
+
+
+def write_mmvii(block: Block, options: ExportOptions) -> Written:
+    """Write MMVII-PhgrProj/PointsMeasure/{Fiducials, Targets}/MesIm-IMAGE.xml."""
+    kinds = [(frame, folder, frame.observed(is_f)) for frame in block.frames for is_f, folder in _FOLDERS.items()]
+    files = {
+        f"MMVII-PhgrProj/PointsMeasure/{folder}/MesIm-{frame.file_name}.xml": _mmvii_measures(frame, marks)
+        for frame, folder, marks in kinds
+        if marks
+    }
+    without_sigma = sum(mark.sigma_mm is None for *_, marks in kinds for mark in marks)
+    lost = ("of the marks nothing; camera, poses and points do not go out",)
+    note = f"{without_sigma} marks have no standard deviation of their own: Sigma2 is 1 0 1 px."
+    return Written(files, lost, (note,) if without_sigma else ())
+
+
+def _mmvii_measures(frame: OutFrame, marks: tuple[ComparatorPoint, ...]) -> str:
+    places = frame.pixels(marks) + MMVII.first_pixel_px
+    measures: list[tuple[str, Content]] = [
+        ("el", {"Name": f'"{mark.point}"', "Pt": place, "Sigma2": np.array(_sigma2(mark, frame.known_pitch_um))})
+        for mark, place in zip(marks, places, strict=True)
+    ]
+    data: Content = {"SetMesIm": {"NameIm": f'"{frame.file_name}"', "Measures": measures}}
+    return xml_text("Root", {"Type": '"MMVII_Serialization"', "Version": '"0.0.0"', "Data": data})
+
+
+def _sigma2(mark: ComparatorPoint, pitch_um: tuple[float, float]) -> tuple[float, float, float]:
+    """Covariance xx, xy, yy in px. The rows point down, so xy changes its sign."""
+    if mark.sigma_mm is None:
+        return 1.0, 0.0, 1.0
+    sx, sy = (float(sigma) for sigma in mark.sigma_mm / (np.array(pitch_um) / 1000.0))
+    return sx * sx, -mark.rho * sx * sy, sy * sy
+
+
+def import_mmvii(paths: Sequence[Path], options: ImportOptions) -> Incoming:
+    """Read MesIm-*.xml: marks with their covariances. Those in a folder Fiducials are fiducials."""
+    return Incoming(tuple(mark for path in paths for mark in _mmvii_marks(path, options)))
+
+
+def _mmvii_marks(path: Path, options: ImportOptions) -> Iterator[ForeignMark]:
+    is_fiducial = options.fiducials or path.resolve().parent.name == _FOLDERS[True]
+    measures = read_xml(path).find("Data/SetMesIm")
+    if measures is None:
+        raise InputError(f"{path}: has no <SetMesIm>. Files MesIm-*.xml are read.")
+    image = image_name(_unquoted(child_text(measures, "NameIm", path)))
+    for element in measures.iterfind("Measures/el"):
+        place = np.array(child_numbers(element, "Pt", 2, path)) - MMVII.first_pixel_px
+        xx, xy, yy = child_numbers(element, "Sigma2", 3, path)
+        known = xx > 0.0 and yy > 0.0 and xx * yy > xy * xy
+        covariance = np.array([[xx, xy], [xy, yy]]) if known else None
+        name = _unquoted(child_text(element, "Name", path))
+        yield ForeignMark(image, name, "fiducial" if is_fiducial else "target", place, covariance)
+
+
+def _unquoted(text: str) -> str:
+    return text[1:-1] if len(text) > 1 and text[0] == text[-1] == '"' else text

@@ -59,7 +59,6 @@ def nearest_lens(block: Block, frame: Frame, models: Sequence[Sequence[str]], op
     distortion is removed from the frames, the result is a lens without distortion.
     """
     lens = frame.lens
-    assert lens is not None
     if options.with_lens or lens.distortion.family == "none":
         return FittedLens(_undistorted(lens), 0.0)
     for names in models:
@@ -76,7 +75,6 @@ def fisheye_lens(block: Block, frame: Frame, options: ExportOptions) -> FittedLe
     """The lens of an image's camera if it is OpenCV's fisheye. Its shear, which programs leave out, becomes the
     misfit."""
     lens = frame.lens
-    assert lens is not None
     if lens.distortion.family != FISHEYE or options.with_lens:
         return None
     farthest_mm = float(np.abs(frame_corners_mm(block, frame)[:, 1] - lens.interior[2]).max())
@@ -91,7 +89,6 @@ def sheared_lens(block: Block, frame: Frame, at_ideal: bool) -> FittedLens:
     at_ideal : affinity and shear apply to the ideal point, as in MicMac, and not to the distorted one, as in Metashape.
     """
     lens = frame.lens
-    assert lens is not None
     family = lens.distortion.family
     if family == "none":
         return FittedLens(_undistorted(lens), 0.0)
@@ -99,7 +96,9 @@ def sheared_lens(block: Block, frame: Frame, at_ideal: bool) -> FittedLens:
         return FittedLens(lens, 0.0)
     if family in _ONE_SCALE or not at_ideal:
         return _fit_opencv(block, frame, (*BROWN, *_AFFINE))
-    rays, observed_mm = _over_frame(block, frame)
+    grid_mm = frame_grid_mm(frame_corners_mm(block, frame))
+    rays, found = lens.ray_from_observed(grid_mm)
+    rays, observed_mm = rays[found], grid_mm[found]
     fitted = _sheared_fit(rays, observed_mm)
     return FittedLens(fitted, float(np.linalg.norm(_sheared(fitted, rays) - observed_mm, axis=1).max()))
 
@@ -131,19 +130,9 @@ def _has_only(lens: Lens, names: Sequence[str]) -> bool:
     return family == "opencv" and not any(value for name, value in known if name not in names)
 
 
-def _over_frame(block: Block, frame: Frame) -> tuple[Array, Array]:
-    """Rays (n, 2) over the frame, y up, and their images (n, 2), mm."""
-    lens = frame.lens
-    assert lens is not None
-    grid_mm = frame_grid_mm(frame_corners_mm(block, frame))
-    rays, found = lens.ray_from_observed(grid_mm)
-    return rays[found], grid_mm[found]
-
-
 def _fit_opencv(block: Block, frame: Frame, names: Sequence[str]) -> FittedLens:
     """Fit parameters of these names in OpenCV's model."""
     lens = frame.lens
-    assert lens is not None
     family = lens.distortion.family
     estimated = [name for name in names if name not in _AFFINE] if family in _ONE_SCALE else [*names, "b1"]
     own = zip(parameter_names(family), lens.parameters.tolist(), strict=True)
@@ -294,7 +283,10 @@ def sight_misfit_mm(block: Block, frame: Frame) -> float:
 def _pinhole(block: Block, frame: WholeFrame, lens: FittedLens, options: ExportOptions) -> PinholeFrame:
     """Pinhole of one frame. Raises MeasurementError where the lens folds within the scan."""
     pitch_um = options.pitch_um or float(np.sqrt(np.prod(frame.known_pitch_um)))
-    scans = [(scan.chain(options.with_lens), block.part_px(scan)) for scan in frame.scans]
+    scans = []
+    for each in frame.scans:
+        with block.open_scan(each) as scan:
+            scans.append((each.chain(options.with_lens), scan.part_px))
     canvas = outline_canvas(scans, pitch_um / 1000.0)
     misfit_mm = lens.largest_mm + sight_misfit_mm(block, frame)
     return PinholeFrame(frame, canvas, lens, misfit_mm / canvas.pitch_mm, options.with_lens)

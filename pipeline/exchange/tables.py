@@ -1,8 +1,10 @@
-"""Export of all results as tables in this program's own conventions, in CSV and Parquet."""
+"""Tables of results: all, in this program's own conventions, in CSV and Parquet; image coordinates for BINGO."""
 
 import io
 import math
 from collections.abc import Iterable, Mapping
+
+import numpy as np
 
 from adjust.problem.parameter import Parameter
 from pipeline.errors import missing_extra
@@ -12,7 +14,7 @@ from pipeline.results.adjustment_record import AdjustmentRecord, Quantity
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.text.csv_table import csv_line
 
-CONVENTION = Convention(
+CSV = PARQUET = Convention(
     (0.0, 0.0),
     "column right, row down; comparator and camera mm with x right and y up; rotation R3(kappa) R2(phi) R1(omega)",
     "this program's own, docs/method/theory.md",
@@ -132,7 +134,7 @@ def _table(rows: list[Row]) -> Table:
 
 
 def _csv_text(table: Table) -> str:
-    head = f"# {CONVENTION.axes}; the CENTRE of the top-left pixel is (0, 0)"
+    head = f"# {CSV.axes}; the CENTRE of the top-left pixel is (0, 0)"
     rows = zip(*table.values(), strict=True)
     return "\n".join([head, csv_line(list(table)), *(csv_line([_cell(value) for value in row]) for row in rows)]) + "\n"
 
@@ -149,7 +151,50 @@ def _parquet_bytes(table: Table) -> bytes:
         import pyarrow.parquet
     except ImportError:
         raise missing_extra("the format parquet", "pyarrow", "parquet") from None
-    made = pyarrow.table(table).replace_schema_metadata({"conventions": CONVENTION.axes})
+    made = pyarrow.table(table).replace_schema_metadata({"conventions": CSV.axes})
     written = io.BytesIO()
     pyarrow.parquet.write_table(made, written)
     return written.getvalue()
+
+
+BINGO = Convention(
+    (float("nan"), float("nan")),
+    "no pixels: x right, y up in mm from the fiducial frame's middle, of a digital camera from its principal point",
+    "support.pix4d.com, article 203590305: a line with image and camera, one a point with x and y in mm from the "
+    "centre of the image, an empty line behind each image. Which way y points it does not say: up, as everywhere in "
+    "photogrammetry",
+)
+
+
+def write_bingo(block: Block, options: ExportOptions) -> Written:
+    """Write bingo.txt with the corrected coordinates of every point of every adjusted image."""
+    block.needs_orientation("bingo")
+    unknown = (scan.image for scan in block.frames if scan.model is None)
+    left_out = [f"{image}: it has no part in the adjustment, so its film is not known." for image in unknown]
+    texts, interior = [], dict[str, str]()
+    for frame in block.whole(scan for scan in block.frames if scan.model is not None):
+        lens, camera, marks = frame.lens, _word(frame.camera), frame.observed(fiducials=False)
+        # From the centre of the fiducial frame; of a digital camera, which has none, from the principal point.
+        origin = np.zeros(2) if block.camera_file(frame.camera).fiducials else lens.interior[1:]
+        x, y = lens.interior[1:] - origin
+        point = f"principal point {x:.5f}, {y:.5f} mm"
+        interior[camera] = f"Camera {camera}: c = {lens.interior[0]:.5f} mm, {point}, no distortion."
+        refined, found = lens.ideal_from_observed(frame.camera_mm(marks))
+        lines = [f"{_word(frame.image)} {camera}"]
+        for mark, (x, y), usable in zip(marks, (refined - origin).tolist(), found, strict=True):
+            if usable:
+                lines.append(f"{_word(mark.point)} {x:.6f} {y:.6f}")
+            else:
+                left_out.append(f"{frame.image}, point {mark.point}: the lens folds there.")
+        texts.append("\n".join(lines) + "\n")
+    lost = (
+        "standard deviations (BINGO takes them by groups)",
+        "poses and object points, whose files no public text describes",
+        "fiducial marks",
+    )
+    return Written({"bingo.txt": "\n".join(texts)}, lost, tuple(interior.values()), tuple(left_out))
+
+
+def _word(name: str) -> str:
+    """The name without blanks, which separate the words of a line."""
+    return "_".join(name.split())

@@ -6,7 +6,6 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 from unittest.mock import MagicMock
 
@@ -36,7 +35,7 @@ from studies import parametrize_with_studies
 from adjust import LineOfSight
 from pipeline import read_project
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
-from pipeline.exchange import asp_format, colmap_format, micmac_format, mmvii_format, opencv_format, pinhole
+from pipeline.exchange import micmac_format, pinhole, pinhole_formats
 from pipeline.exchange.block import read_block
 from pipeline.exchange.formats import FORMATS
 from pipeline.exchange.geojson_format import lon_lat
@@ -44,10 +43,10 @@ from pipeline.exchange.geojson_format import lon_lat
 Array = NDArray[np.float64]
 
 SAME_PX = 1e-6
-PINHOLES: dict[str, tuple[Callable[[Path, str, Array], Array], ModuleType]] = {
-    "opencv": (opencv_px, opencv_format),
-    "colmap": (colmap_px, colmap_format),
-    "asp": (asp_px, asp_format),
+PINHOLES: dict[str, tuple[Callable[[Path, str, Array], Array], str]] = {
+    "opencv": (opencv_px, "OPENCV"),
+    "colmap": (colmap_px, "COLMAP"),
+    "asp": (asp_px, "ASP"),
 }
 
 
@@ -93,11 +92,12 @@ def test_frames_with_their_lens_are_off_by_no_more_than_is_reported(format: str,
 def test_half_a_pixel_and_the_y_axis_are_visible(
     format: str, project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    reader, module = PINHOLES[format]
+    reader, convention = PINHOLES[format]
     there = frame_px(0, ideal_mm(0), ideal=True)
-    wrong = replace(module.CONVENTION, first_pixel_px=tuple(c + 0.5 for c in module.CONVENTION.first_pixel_px))
+    right = getattr(pinhole_formats, convention)
+    wrong = replace(right, first_pixel_px=tuple(c + 0.5 for c in right.first_pixel_px))
     with monkeypatch.context() as broken:
-        broken.setattr(module, "CONVENTION", wrong)
+        broken.setattr(pinhole_formats, convention, wrong)
         off = reader(exported(project, format, tmp_path, "--lens"), "f0", POINTS) - there
     np.testing.assert_allclose(off, 0.5, atol=SAME_PX)
     with monkeypatch.context() as broken:
@@ -143,9 +143,9 @@ def test_micmac_makes_the_frames_that_its_camera_is_for(project: Path, tmp_path:
 def test_micmac_with_half_a_pixel_or_y_up_is_visible(
     project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    wrong = replace(micmac_format.CONVENTION, first_pixel_px=(0.5, 0.5))
+    wrong = replace(micmac_format.MICMAC, first_pixel_px=(0.5, 0.5))
     with monkeypatch.context() as broken:
-        broken.setattr(micmac_format, "CONVENTION", wrong)
+        broken.setattr(micmac_format, "MICMAC", wrong)
         matrix, shift = micmac_affine(exported(project, "micmac", tmp_path), "f0")
     off = scan_px(0, camera_mm(0)) @ matrix.T + shift - camera_mm(0) * (1, -1)
     assert np.linalg.norm(off, axis=1).min() > 0.4 * PITCH_MM
@@ -173,7 +173,7 @@ def test_mmvii_has_the_whole_covariance(project: Path, tmp_path: Path) -> None:
 
 def test_rho_changes_its_sign_where_rows_run_down(project: Path) -> None:
     mark = replace(read_block(read_project(project)).frames[0].marks[0], rho=0.3, sigma_mm=np.array([0.002, 0.004]))
-    xx, xy, yy = mmvii_format._sigma2(mark, (20.0, 20.0))
+    xx, xy, yy = micmac_format._sigma2(mark, (20.0, 20.0))
     assert (xx, yy) == pytest.approx((0.01, 0.04))
     assert xy == pytest.approx(-0.3 * 0.1 * 0.2)
 

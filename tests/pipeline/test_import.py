@@ -20,7 +20,7 @@ from adjust.problem.camera import FiducialDistance
 from pipeline import InputError, read_images
 from pipeline.cli import DONE, WRONG_INPUT, run
 from pipeline.exchange.certificate import balanced_mm, fit, read_certificate
-from pipeline.exchange.xml_tree import read_xml
+from pipeline.exchange.incoming import read_xml
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.results.comparator_file import read_comparator, read_pitches
 
