@@ -26,9 +26,9 @@ from pipeline.report.numbers import value_and_sigma
 from pipeline.report.parameters import CameraValue, camera_values
 from pipeline.report.verdict import Level, ReportVerdict, judge, sigma0_bounds
 from pipeline.results.adjustment_record import AdjustmentRecord
-from pipeline.results.check_file import Check
 from pipeline.results.image_unit import FILM_UNIT, ImageUnit
 from pipeline.results.measured_record import pose_record
+from pipeline.results.stage_files import Check
 from pipeline.text.wording import counted
 
 WORDS = {"good": "Good", "look": "Needs a look", "failed": "No result"}

@@ -35,9 +35,9 @@ from pipeline.measuring.target_field import (
 )
 from pipeline.progress import Reporter
 from pipeline.publishing import unpublished
-from pipeline.results.choice_file import ChoiceRecord, choice_record
 from pipeline.results.comparator_file import ComparatorPoint, has_pixels_alone, read_comparator
 from pipeline.results.record_json import write_record
+from pipeline.results.stage_files import ChoiceRecord, choice_record
 from pipeline.text.wording import listed
 from pipeline.types import Array
 

@@ -19,9 +19,9 @@ from pipeline.drawing import svg
 from pipeline.errors import InputError
 from pipeline.results.adjustment_file import observed_mm, read_adjustment
 from pipeline.results.adjustment_record import AdjustmentRecord
-from pipeline.results.comparison_file import DRIFT, ComparisonRecord, ParameterDifference, comparison_record
 from pipeline.results.covariance_file import read_own_covariance
 from pipeline.results.record_json import write_record
+from pipeline.results.stage_files import DRIFT, ComparisonRecord, ParameterDifference, comparison_record
 from pipeline.text.files import check_writable
 from pipeline.text.wording import did_you_mean, listed
 from pipeline.types import Array

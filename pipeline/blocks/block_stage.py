@@ -21,7 +21,6 @@ from adjust.problem.network import Exterior, ObjectPoint
 from measure.flags import Status
 from pipeline.blocks.mapping import (
     BlockPicture,
-    BlockScan,
     Mapped,
     Sight,
     given_interior,
@@ -34,10 +33,11 @@ from pipeline.exchange.pinhole import Y_DOWN_Z_FORWARD
 from pipeline.files.object_files import ELEMENTS, GivenImages
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
-from pipeline.resampling.resample_stage import FAST, Resampled, resample, resample_tasks
+from pipeline.resampling.resample_stage import FAST, resample, resample_tasks
 from pipeline.results.comparator_file import (
     ComparatorPoint,
     comparator_from_pixel,
+    pixel_from_comparator,
     points_text,
     read_comparator,
     read_pitches,
@@ -184,9 +184,12 @@ def oriented_by_control(
         if mark.kind == "target" and mark.status.is_observation and mark.image in scans:
             frame, scan = scans[mark.image]
             if frame in mapped.poses and len(given.get(mark.point, ())) == 3:
-                rays[mark.point].setdefault(
-                    frame, _ray(mapped.poses[frame], _camera_mm(mark, scan), camera_rays[frame])
-                )
+                assert mark.xy_mm is not None
+                pixel = pixel_from_comparator(mark.xy_mm[None], scan.chain.pitch_um)
+                (x, y), (c, x0, y0) = scan.chain.frame_from_scan(pixel)[0][0], camera_rays[frame]
+                rotation, translation = mapped.poses[frame]
+                ray = -rotation.T @ translation, rotation.T @ np.array([(x - x0) / c, (y0 - y) / c, 1.0])
+                rays[mark.point].setdefault(frame, ray)
     control = sorted(point for point, own in rays.items() if len(own) > 1)
     if len(control) < FEWEST_CONTROL:
         raise InputError(
@@ -208,20 +211,6 @@ def oriented_by_control(
         image: (np.asarray(Y_DOWN_Z_FORWARD @ rotation @ block.rotation.T), block.apply(stations[image]))
         for image, (rotation, _) in mapped.poses.items()
     }
-
-
-def _camera_mm(mark: ComparatorPoint, scan: BlockScan) -> Array:
-    """(2,) place of a mark in the camera frame, mm."""
-    assert mark.xy_mm is not None
-    straight = scan.chain.bend.apply(scan.chain.bend_parameters, mark.xy_mm[None])
-    return np.asarray(scan.chain.film.camera_from_comparator(straight)[0])
-
-
-def _ray(pose: tuple[Array, Array], place_mm: Array, interior: Array) -> tuple[Array, Array]:
-    """Projection centre (3,) and direction (3,) of the ray to a place (2,) of the camera frame, in COLMAP's
-    coordinates."""
-    (rotation, translation), (c, x0, y0) = pose, interior
-    return -rotation.T @ translation, rotation.T @ np.array([(place_mm[0] - x0) / c, (y0 - place_mm[1]) / c, 1.0])
 
 
 MOST_PX = 3000  # pixels along the longer side of a frame, unless the user gives a pitch
@@ -259,26 +248,27 @@ def run_block(project: Project, folder: Path, pitch_um: float | None, reporter: 
         raise InputError(f"{project.comparator}: there is no such file. Run `reseau measure` first: films come by it.")
     marks = read_comparator(project.comparator, project.list_pitch_um)
     pitch_um = pitch_um or coarse_pitch_um(project)
-    clock = _Clock()
-    with clock.step("resampling"):
+    seconds = dict[str, float]()
+    with _step(seconds, "resampling"):
         frames = folder / "frames"
         results = resample(project, frames, pitch_um, False, True, reporter)
         made = {result.image for result in results if not result.problem}
         tasks = [task for task in resample_tasks(project, frames, pitch_um, False, FAST)[0] if task.image in made]
     if len(tasks) < 2:
-        raise InputError(f"a block needs two frames, and {len(tasks)} could be resampled. {_problems(results)}")
+        problems = " ".join(f"{result.image}: {result.problem}." for result in results if result.problem)
+        raise InputError(f"a block needs two frames, and {len(tasks)} could be resampled. {problems}")
     cameras = {camera.name: camera for camera in project.cameras.values()}
-    with clock.step("pictures"):
+    with _step(seconds, "pictures"):
         pictures = write_pictures(tasks, cameras, folder)
-    with clock.step("features, matches and mapping"):
+    with _step(seconds, "features, matches and mapping"):
         found = mapped(pictures, cameras, folder)
-    with clock.step("tracks and poses back"):
+    with _step(seconds, "tracks and poses back"):
         ties = tie_marks(found, pictures)
         interior = {picture.image: given_interior(cameras[picture.camera]) for picture in pictures}
         poses = oriented_by_control(found, pictures, marks, project.object_points, interior)
         own = written_block(project, folder, (*marks, *ties), poses)
     left_out = tuple(sorted({project.scanned_frame(mark.image) or mark.image for mark in marks} - set(poses)))
-    return OrientedBlock(own, len(found.poses), clock.seconds, left_out, len(ties), len({tie.point for tie in ties}))
+    return OrientedBlock(own, len(found.poses), seconds, left_out, len(ties), len({tie.point for tie in ties}))
 
 
 def coarse_pitch_um(project: Project) -> float | None:
@@ -339,18 +329,9 @@ def written_block(
     )
 
 
-def _problems(results: Sequence[Resampled]) -> str:
-    return " ".join(f"{result.image}: {result.problem}." for result in results if result.problem)
-
-
-class _Clock:
-    """Duration of each step, s."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def step(self, name: str) -> Iterator[None]:
-        start = time.monotonic()
-        yield
-        self.seconds[name] = time.monotonic() - start
+@contextmanager
+def _step(seconds: dict[str, float], name: str) -> Iterator[None]:
+    """Add the duration of the block, s."""
+    start = time.monotonic()
+    yield
+    seconds[name] = time.monotonic() - start

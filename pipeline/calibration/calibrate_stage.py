@@ -35,8 +35,8 @@ from pipeline.calibration.project_files import CalibrationOptions, board_options
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
-from pipeline.results.check_file import read_check
 from pipeline.results.comparator_file import ComparatorPoint, read_comparator
+from pipeline.results.stage_files import read_check
 from pipeline.stages import run_all, run_measure
 from pipeline.summary import Summary
 from pipeline.text.files import write_atomically

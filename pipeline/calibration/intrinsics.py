@@ -15,8 +15,8 @@ from adjust.problem.network import Network
 from adjust.problem.parameter import Parameter
 from adjust.solution.result import Adjustment
 from pipeline.calibration.pictures import CameraPictures
-from pipeline.results.check_file import CameraCheck, PixelCalibration
 from pipeline.results.image_unit import CENTRE, pixel_intrinsics
+from pipeline.results.stage_files import CameraCheck, PixelCalibration
 from pipeline.text.wording import counted, listed, listed_by_reason
 from pipeline.types import Array
 

@@ -104,7 +104,7 @@ def compare(
 ) -> int:
     """Compare calibrations of a camera: `drift` or `no drift`."""
     from pipeline.adjusting.compare_stage import print_comparison, run_compare
-    from pipeline.results.comparison_file import DRIFT
+    from pipeline.results.stage_files import DRIFT
 
     when = None if times is None else _numbers(times)
     comparison, record = run_compare(adjustments, camera, when, "flat" if flat else "space", level, out)

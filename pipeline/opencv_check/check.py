@@ -48,8 +48,8 @@ from pipeline.opencv_check.opencv_calibration import (
     can_begin,
     model_names,
 )
-from pipeline.results.check_file import CameraCheck, Check, CornersCheck, Estimate, PixelCalibration, Row, Verdict
 from pipeline.results.comparator_file import comparator_from_pixel
+from pipeline.results.stage_files import CameraCheck, Check, CornersCheck, Estimate, PixelCalibration, Row, Verdict
 from pipeline.types import Array
 
 Bytes = NDArray[np.uint8]

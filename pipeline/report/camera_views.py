@@ -26,9 +26,9 @@ from pipeline.report.parameters import (
 from pipeline.report.vectors import contour_plot, coverage_plot, grid_mm, longest_vector, padded_plane, strokes_and_dots
 from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, ScannerRecord
 from pipeline.results.assessment_record import ResidualRecord
-from pipeline.results.check_file import CameraCheck
 from pipeline.results.covariance_file import Covariance
 from pipeline.results.image_unit import ImageUnit
+from pipeline.results.stage_files import CameraCheck
 from pipeline.types import Array
 
 PLOT_PX = 400.0

@@ -16,11 +16,11 @@ from measure.results import MarkMeasurement
 from pipeline.archive.verdicts import Verdict, frame_verdict, has_problem, mark_verdict
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.assessment_record import ResidualRecord
-from pipeline.results.check_file import Check
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.results.covariance_file import Covariance
 from pipeline.results.image_unit import FILM_UNIT, ImageUnit
 from pipeline.results.measured_record import MeasuredScan
+from pipeline.results.stage_files import Check
 from pipeline.results.thumbnail import Thumbnail
 from pipeline.types import Array
 

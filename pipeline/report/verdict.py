@@ -24,7 +24,7 @@ from pipeline.results.assessment_record import (
     ResidualRecord,
     SuspectRecord,
 )
-from pipeline.results.check_file import Check
+from pipeline.results.stage_files import Check
 from pipeline.text.wording import counted, listed
 
 Observed = DistanceRecord | FiducialDistanceRecord | ObservedQuantity

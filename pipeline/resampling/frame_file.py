@@ -1,8 +1,7 @@
 """TIFF file of a resampled frame: tiles, reduced pages, a mask, and a description of the position of its pixels."""
 
 import json
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -24,44 +23,6 @@ _CLASSIC_BYTES = 3_900_000_000  # above it BigTIFF is written: classic TIFF has 
 _REDUCED, _MASK = 1, 4  # TIFF 6.0, NewSubfileType
 
 
-@dataclass(frozen=True)
-class Description:
-    """Description stored in the file.
-
-    Attributes
-    ----------
-    pose : scan orientation that was removed.
-    lens : whether the lens distortion was removed.
-    parts : scans of which the frame is composed; empty for a single scan.
-    seams_mm : seams between them, polylines in the camera frame; empty for a single scan.
-    """
-
-    image: str
-    camera: str
-    canvas: Canvas
-    pose: str
-    lens: bool
-    fingerprint: str
-    parts: Sequence[str] = ()
-    seams_mm: Sequence[Sequence[tuple[float, float]]] = ()
-
-    def text(self) -> str:
-        """JSON text; x_mm, y_mm are camera coordinates of the centre of the first pixel."""
-        content = {
-            "reseau": version("reseau"),
-            "image": self.image,
-            "camera": self.camera,
-            "x_mm": self.canvas.x_mm,
-            "y_mm": self.canvas.y_mm,
-            "pitch_mm": self.canvas.pitch_mm,
-            "pose": self.pose,
-            "lens": self.lens,
-            "fingerprint": self.fingerprint,
-            **({"parts": list(self.parts), "seams_mm": self.seams_mm} if self.parts else {}),
-        }
-        return json.dumps(content, ensure_ascii=True)
-
-
 def read_description(path: Path) -> dict[str, Any] | None:
     """Read the description of a resampled frame; None for any other or missing file."""
     try:
@@ -73,7 +34,12 @@ def read_description(path: Path) -> dict[str, Any] | None:
 
 
 def write_frame(
-    path: Path, described: Description, channels: int, dtype: type, make_tile: Callable[[int, int], Tile]
+    path: Path,
+    canvas: Canvas,
+    description: Mapping[str, object],
+    channels: int,
+    dtype: type,
+    make_tile: Callable[[int, int], Tile],
 ) -> int:
     """Write the frame, tile by tile.
 
@@ -81,6 +47,7 @@ def write_frame(
 
     Parameters
     ----------
+    description : stored in the file as JSON, with the canvas: x_mm, y_mm are of the centre of the first pixel.
     make_tile : returns the tile at (col0, row0).
 
     Returns
@@ -91,7 +58,6 @@ def write_frame(
     ------
     InputError : the file cannot be written.
     """
-    canvas = described.canvas
     reduced = _Reduced(canvas, channels, dtype)
     masks: dict[tuple[int, int], NDArray[np.uint8] | bool] = {}  # most tiles are entirely inside or outside
     clamped = 0
@@ -117,6 +83,7 @@ def write_frame(
     size = canvas.width_px * canvas.height_px * channels * np.dtype(dtype).itemsize
     shape = (canvas.height_px, canvas.width_px, *([channels] if channels > 1 else []))
     per_cm = 10.0 / canvas.pitch_mm
+    place = {"x_mm": canvas.x_mm, "y_mm": canvas.y_mm, "pitch_mm": canvas.pitch_mm}
     options: dict[str, Any] = {"compression": "zlib", "photometric": "rgb" if channels > 1 else "minisblack"}
     options |= {"tile": (TILE_PX, TILE_PX), "metadata": None, "resolutionunit": "CENTIMETER"}
     with atomic_path(path) as temporary, TiffWriter(temporary, bigtiff=size > _CLASSIC_BYTES) as file:
@@ -127,7 +94,7 @@ def write_frame(
             predictor=True,
             subifds=pages,
             resolution=(per_cm, per_cm),
-            description=described.text(),
+            description=json.dumps({"reseau": version("reseau"), **place, **description}),
             **options,
         )
         for factor, page in reduced.pages():

@@ -22,7 +22,7 @@ from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
 from pipeline.provenance import file_state
 from pipeline.resampling.canvas import FrameChain, adjusted_chain, measured_chain, outline_canvas
-from pipeline.resampling.frame_file import TILE_PX, Description, read_description, write_frame
+from pipeline.resampling.frame_file import TILE_PX, read_description, write_frame
 from pipeline.resampling.interpolation import (
     MARGIN_PX,
     Degree,
@@ -216,16 +216,16 @@ def _resampled(task: ResampleTask) -> Resampled:
             rows = _rows_at_a_time(chain, task.pitch_mm, canvas.width_px)
             parts.append(Part(opened.enter_context(open_source(scan, rows, task.target.parent)), chain))
         parts = find_inner_edges(parts)
-        names = [each.image for each in task.scans if each.image != task.image]
-        has_lens = task.scans[0].chain.lens is not None
-        seams = seams_mm(parts, canvas) if len(parts) > 1 else ()
-        described = Description(task.image, task.camera, canvas, task.pose, has_lens, fingerprint, names, seams)
+        described: dict[str, object] = {"image": task.image, "camera": task.camera, "pose": task.pose}
+        described |= {"lens": task.scans[0].chain.lens is not None, "fingerprint": fingerprint}
+        if names := [each.image for each in task.scans if each.image != task.image]:
+            described |= {"parts": names, "seams_mm": seams_mm(parts, canvas)}
 
         def make_tile(col0: int, row0: int) -> Tile:
             return joined_tile(parts, canvas, col0, row0, TILE_PX, task.degree)
 
         source = parts[0].source
-        clamped = write_frame(task.target, described, source.channels, source.dtype, make_tile)
+        clamped = write_frame(task.target, canvas, described, source.channels, source.dtype, make_tile)
     return replace(done, clamped=clamped)
 
 

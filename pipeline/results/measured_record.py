@@ -4,14 +4,15 @@ around each frame, by line, with the fields recognised in it."""
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
+from pydantic import TypeAdapter
 
-from measure.annotations.fields import Field, Line, Reading, find_fields
+from measure.annotations.fields import Field, Line, find_fields
 from measure.flags import Cause, MeaningfulWord, Reason, Status
 from measure.results import Covariance, FrameMeasurement, Kind, MarkMeasurement, Pose
 from measure.tone.curve import Tone, ToneInformation, power, srgb
@@ -28,6 +29,7 @@ MARK_COLUMNS = (
 )  # fmt: skip
 _KINDS: Mapping[str, Kind] = {kind: kind for kind in get_args(Kind)}
 _TONE_NUMBERS = ("least", "greatest", "scatter", "apart")
+_POSE, _LINES = TypeAdapter(Pose), TypeAdapter(tuple[Line, ...])
 
 
 class FailureCode(MeaningfulWord):
@@ -108,7 +110,8 @@ def scan_detail(measured: MeasuredScan, uri: str) -> dict[str, object]:
         "pitch_um": _numbers(measured.pitch_um),
         "failure": measured.failure and {"code": str(measured.failure.code), "sentence": measured.failure.sentence},
         "pose": frame.pose and pose_record(frame.pose),
-        "writing": None if frame.writing is None else [_line(line) for line in frame.writing],
+        # The text is the chosen reading, for other readers of the database.
+        "writing": None if frame.writing is None else [{"text": one.text, **_plain(one)} for one in frame.writing],
         "pixel_from_camera": _numbers(frame.pixel_from_camera),
         "weights": _numbers(frame.weights),
         "tone": frame.tone and _frame_tone(frame.tone),
@@ -129,12 +132,12 @@ def read_scan(image: str, detail: Mapping[str, Any], marks: Sequence[MarkMeasure
     frame = FrameMeasurement(
         image=image,
         marks=tuple(marks),
-        pose=detail["pose"] and _read_pose(detail["pose"]),
+        pose=detail["pose"] and _POSE.validate_python(detail["pose"]),
         pixel_from_camera=None if detail["pixel_from_camera"] is None else _array(detail["pixel_from_camera"]),
         problems=tuple(map(Reason.read, detail["problems"], detail["problem_codes"])),
         weights=None if detail["weights"] is None else tuple(map(float, detail["weights"])),
         tone=detail["tone"] and _read_frame_tone(detail["tone"]),
-        writing=None if detail["writing"] is None else tuple(_read_line(line) for line in detail["writing"]),
+        writing=None if detail["writing"] is None else _LINES.validate_python(detail["writing"]),
         notes=tuple(detail.get("frame_notes", ())),
     )
     failure = detail["failure"] and Failure(FailureCode(detail["failure"]["code"]), detail["failure"]["sentence"])
@@ -192,36 +195,25 @@ def _numbers(values: Any) -> Any:
     return number if np.isfinite(number) else repr(number)
 
 
+def _plain(value: Any) -> Any:
+    """JSON of a record with its mappings and sequences; non-finite numbers as strings."""
+    if is_dataclass(value):
+        return {each.name: _plain(getattr(value, each.name)) for each in fields(value)}
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    return value if isinstance(value, str | bool) else _numbers(value)
+
+
 def _array(values: Any) -> Array:
     return np.array(values, dtype=np.float64)
 
 
 def pose_record(pose: Pose) -> dict[str, object]:
     """Scan orientation (pose) with its evidence, as JSON."""
-    return {**asdict(pose), "written": {name: _numbers(value) for name, value in pose.written.items()},
-            "evidence": list(pose.evidence), "rivals": list(pose.rivals)}  # fmt: skip
-
-
-def _read_pose(pose: Mapping[str, Any]) -> Pose:
-    written = {name: float(value) for name, value in pose["written"].items()}
-    return Pose(**{**pose, "written": written, "evidence": tuple(pose["evidence"]), "rivals": tuple(pose["rivals"])})
-
-
-def _line(line: Line) -> dict[str, object]:
-    """JSON of a line of writing; text is the chosen reading, for other readers of the database."""
-    ways = {pose: {"text": one.text, "confidence": _numbers(one.confidence), "legible": _numbers(one.legible)}
-            for pose, one in line.ways.items()}  # fmt: skip
-    outline = [_numbers(corner) for corner in line.outline_px]
-    return {"text": line.text, "pose": line.pose, "side": line.side, "outline_px": outline, "ways": ways}
-
-
-def _read_line(line: Mapping[str, Any]) -> Line:
-    ways = {
-        pose: Reading(one["text"], float(one["confidence"]), float(one["legible"]))
-        for pose, one in line["ways"].items()
-    }
-    outline = tuple((float(col), float(row)) for col, row in line["outline_px"])
-    return Line(ways, line["pose"], outline, line["side"])
+    record: dict[str, object] = _plain(pose)
+    return record
 
 
 def _frame_tone(tone: FrameTone) -> dict[str, object]:
@@ -254,11 +246,7 @@ def sharpening_record(sharpening: Sharpening) -> dict[str, object] | None:
     """Sharpening as JSON; None if there is none."""
     if not sharpening:
         return None
-    return {
-        "amount": _numbers(sharpening.amount),
-        "radius_px": _numbers(sharpening.radius_px),
-        "covariance": _numbers(sharpening.covariance),
-    }
+    return {name: _numbers(getattr(sharpening, name)) for name in ("amount", "radius_px", "covariance")}
 
 
 def read_sharpening(record: Mapping[str, Any] | None) -> Sharpening:

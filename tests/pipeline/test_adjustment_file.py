@@ -16,9 +16,9 @@ from adjust import Adjustment, ObjectPoint, Parameter, Prior, adjust
 from adjust.quality.run import Residuals
 from pipeline import InputError, read_adjustment, write_adjustment
 from pipeline.results import covariance_file
-from pipeline.results.check_file import CameraCheck, Check, CornersCheck, Estimate, PixelCalibration, Row, read_check
 from pipeline.results.covariance_file import covariance_path, read_covariance
 from pipeline.results.record_json import plain_json
+from pipeline.results.stage_files import CameraCheck, Check, CornersCheck, Estimate, PixelCalibration, Row, read_check
 
 
 @pytest.fixture

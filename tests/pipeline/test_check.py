@@ -44,8 +44,8 @@ from pipeline.opencv_check.opencv_calibration import (
     opencv_values,
     to_opencv_model,
 )
-from pipeline.results.check_file import CameraCheck, Check
 from pipeline.results.record_json import plain_json
+from pipeline.results.stage_files import CameraCheck, Check
 
 Array = NDArray[np.float64]
 

@@ -23,9 +23,9 @@ from pipeline.exchange.saved_cameras import save_cameras
 from pipeline.files.project_file import read_project
 from pipeline.provenance import hash_file
 from pipeline.report.lens import ANGLES_DEG, certificate
-from pipeline.results.comparison_file import read_comparison
 from pipeline.results.covariance_file import read_covariance
 from pipeline.results.record_json import plain_json
+from pipeline.results.stage_files import read_comparison
 
 CAMERA = """\
 name = "C"

@@ -20,8 +20,8 @@ from pipeline import InputError, build_network, read_comparator, read_project
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
 from pipeline.results.adjustment_record import LensReachRecord
-from pipeline.results.choice_file import read_choice
 from pipeline.results.record_json import plain_json
+from pipeline.results.stage_files import read_choice
 
 
 @pytest.mark.parametrize("film_um", [0.0, 7.0])

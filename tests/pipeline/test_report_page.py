@@ -16,7 +16,7 @@ from measure import Code, FrameMeasurement, Reason, Status
 from pipeline.report import Problem, ReportData, render_report, write_report
 from pipeline.results.adjustment_record import Sigma0Record
 from pipeline.results.assessment_record import CorrelationRecord
-from pipeline.results.check_file import Check
+from pipeline.results.stage_files import Check
 
 VOID = {"meta", "br", "img", "hr", "input", "link"}
 

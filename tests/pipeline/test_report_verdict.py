@@ -19,7 +19,7 @@ from pipeline.report.parameters import spoken_name
 from pipeline.report.verdict import NEEDS_A_LOOK, critical_w, sigma0_bounds
 from pipeline.results.adjustment_record import Quantity
 from pipeline.results.assessment_record import SuspectRecord
-from pipeline.results.check_file import Check
+from pipeline.results.stage_files import Check
 
 
 def test_the_bounds_of_sigma0_are_those_of_the_chi_square_table() -> None:
