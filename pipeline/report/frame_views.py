@@ -24,7 +24,7 @@ from pipeline.results.adjustment_record import ImageRecord
 from pipeline.results.assessment_record import ResidualRecord
 from pipeline.results.image_unit import ImageUnit
 from pipeline.results.measured_record import MeasuredScan
-from pipeline.results.thumbnail import Thumbnail
+from pipeline.results.thumbnail import Thumbnail, stretch
 
 SIZE_PX = 92.0  # a picture's width and height on the page
 TARGETS = 600  # largest number of target pictures; beyond it only the worst of each frame are shown
@@ -90,13 +90,11 @@ def mark_picture(mark: Mark, thumbnail: Thumbnail, px_per_um: float, most_px: fl
 
 
 def _png_uri(pixels: NDArray[np.generic], most_px: float) -> str:
-    """Encode grey values as an 8-bit PNG data URI, stretched between the 0.1 and 99.9 percentiles."""
-    grey = pixels.astype(np.float64)
-    low, high = np.percentile(grey, [0.1, 99.9])
-    stretched = np.clip((grey - low) / max(high - low, 1e-12), 0.0, 1.0) * 255.0
-    if max(grey.shape) > most_px:
-        factor = most_px / max(grey.shape)
-        stretched = cv2.resize(stretched, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    """Encode stretched grey values as an 8-bit PNG data URI."""
+    stretched = stretch(pixels)
+    if max(pixels.shape) > most_px:
+        factor = most_px / max(pixels.shape)
+        stretched = np.asarray(cv2.resize(stretched, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA))
     _, data = cv2.imencode(".png", np.rint(stretched).astype(np.uint8), [cv2.IMWRITE_PNG_COMPRESSION, 9])
     return "data:image/png;base64," + base64.b64encode(data.tobytes()).decode("ascii")
 

@@ -10,14 +10,21 @@ from numpy.typing import NDArray
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
 from pipeline.results.measured_record import MeasuredScan
+from pipeline.types import Array
 
 _FIDUCIAL_PX, _TARGET_PX = 81, 41  # px, smallest width of a window
 _SHOWN_PX = 96  # px, larger windows are reduced to about this width
 _REACH_SIZES = 2.0  # width of a window in widths of the mark
 _WHOLE_PX = 480  # px, largest side of the thumbnail of the whole scan
 _WHOLE = ("", "frame")  # point and kind of the thumbnail of the whole scan
-_LOST_PER_MILLE = 1  # per mille of the pixels clipped at each end of the grey values
+_CLIPPED = 0.1  # per cent of the pixels clipped at each end of the grey values
 _QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 75]
+
+
+def stretch(grey: NDArray[np.generic]) -> Array:
+    """Stretch grey values to 0 to 255 between their extreme percentiles."""
+    low, high = np.percentile(values := grey.astype(np.float64), [_CLIPPED, 100.0 - _CLIPPED])
+    return np.asarray(np.clip((values - low) / max(high - low, 1e-12), 0.0, 1.0) * 255.0)
 
 
 @dataclass(frozen=True)
@@ -40,11 +47,8 @@ class Thumbnail:
 
     @property
     def jpeg(self) -> bytes:
-        """JPEG in 8 bits, stretched between the extreme percentiles of the grey values."""
-        grey = self.pixels.astype(np.float64)
-        low, high = np.percentile(grey, [_LOST_PER_MILLE / 10, 100 - _LOST_PER_MILLE / 10])
-        stretched = np.rint(np.clip((grey - low) / max(high - low, 1e-12), 0.0, 1.0) * 255.0)
-        return bytes(cv2.imencode(".jpg", stretched.astype(np.uint8), _QUALITY)[1])
+        """JPEG in 8 bits, with stretched grey values."""
+        return bytes(cv2.imencode(".jpg", np.rint(stretch(self.pixels)).astype(np.uint8), _QUALITY)[1])
 
 
 @dataclass(frozen=True)

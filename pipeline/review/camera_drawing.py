@@ -150,7 +150,12 @@ def place_frame(
     if len(known) >= 2:
         places, given = (np.array(values, dtype=float) for values in zip(*known, strict=True))
         pixel_mm = np.array(pitch_um or (1000.0, 1000.0)) / 1000.0
-        up = _through_coordinates(places * pixel_mm * (1.0, -1.0), given, drawing.pose)
+        up_mm = places * pixel_mm * (1.0, -1.0)
+        # Mirrored if that fits better, or, with too few points to decide, if the pose is.
+        tells_mirror = len(given) >= LEAST_CLICKS and not are_collinear(given)
+        mirrors = ("0", "0m") if tells_mirror else ("0m" if "m" in drawing.pose else "0",)
+        fits = [fit_frame(given, up_mm, np.full(len(up_mm), _CLICK_MM), up_from_camera(one)) for one in mirrors]
+        up = min(fits, key=lambda fit: round(fit.chi_square, 6)).up_from_camera
         if pitch_um is None:
             pixel_mm = pixel_mm / linear_scale(up)
             up, source = up / linear_scale(up), "the coordinates of the marks"
@@ -159,7 +164,7 @@ def place_frame(
         raise InputError(_NO_PITCH)
     linear = _FLIP @ up_from_camera(drawing.pose) / (np.array(pitch_um)[:, None] / 1000.0)
     places = np.array([one.px for one in drawing.marks], dtype=float).reshape(-1, 2)
-    linear = linear @ _turn(_skew_rad(places @ np.linalg.inv(linear).T))
+    linear = linear @ rotation(_skew_rad(places @ np.linalg.inv(linear).T))
     camera = places @ np.linalg.inv(linear).T
     middle = np.array(drawing.corners_px or [(-0.5, -0.5), np.subtract(size_px, 0.5)]).mean(axis=0)
     if len(known) == 1:
@@ -182,15 +187,6 @@ def _pitch(drawing: CameraDrawing, known_um: Point | None, source: str) -> tuple
     return known_um, source
 
 
-def _through_coordinates(up_mm: Array, given_mm: Array, pose: str) -> Array:
-    """(2, 3) matrix, camera to the scan's (right, up), mm."""
-    # Mirrored if that fits better, or, with too few points to decide, if the pose is.
-    tells_mirror = len(given_mm) >= LEAST_CLICKS and not are_collinear(given_mm)
-    mirrors = ("0", "0m") if tells_mirror else ("0m" if "m" in pose else "0",)
-    fits = [fit_frame(given_mm, up_mm, np.full(len(up_mm), _CLICK_MM), up_from_camera(one)) for one in mirrors]
-    return min(fits, key=lambda fit: round(fit.chi_square, 6)).up_from_camera
-
-
 def _skew_rad(places_mm: Array) -> float:
     """Rotation of the marks against the axes, by lines through the means of the marks on opposite sides."""
     if len(places_mm) < 2:
@@ -207,7 +203,8 @@ def _skew_rad(places_mm: Array) -> float:
     return float(np.mean(skews))
 
 
-def _turn(angle_rad: float) -> Array:
+def rotation(angle_rad: float) -> Array:
+    """(2, 2) counter-clockwise rotation."""
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     return np.array([[c, -s], [s, c]])
 

@@ -32,6 +32,7 @@ from pipeline.review.camera_drawing import (
     learned_remarks,
     parse_drawing,
     place_frame,
+    rotation,
     save_drawing,
     save_learned,
 )
@@ -104,9 +105,8 @@ def drawn_mark(drawing: CameraDrawing, placement: FramePlacement) -> DrawnMark |
 
 
 def _pixel_from_mark(placement: FramePlacement, clicked: ClickedMark) -> Array:
-    turn = math.radians(clicked.turn_deg)
-    c, s = math.cos(turn), math.sin(turn)
-    return np.column_stack([np.array([[c, -s], [s, c]]) @ placement.pixel_from_camera[:, :2], clicked.px])
+    turn = rotation(math.radians(clicked.turn_deg))
+    return np.column_stack([turn @ placement.pixel_from_camera[:, :2], clicked.px])
 
 
 def drawing_json(drawing: CameraDrawing, placement: FramePlacement) -> Json:

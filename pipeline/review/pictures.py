@@ -14,6 +14,7 @@ from measure.marks.rendering import picture
 from measure.marks.shapes import Mark
 from measure.scans.opening import open_scan
 from measure.scans.scan import Scan
+from pipeline.results.thumbnail import stretch
 from pipeline.types import Array
 
 Result = TypeVar("Result")
@@ -26,7 +27,6 @@ _POSE_PX = 180
 _NOTHING = 128  # grey value outside the scan
 _ROUNDS, _OUTLYING = 6, 5.0  # iterations of the robust fit; outlier limit in median residuals, 3.5 standard deviations
 _DRAWN_BGR, _COVERED = (61, 163, 22), 0.55  # colour and opacity of a drawing over the scan
-_SHARE = 0.1  # per cent of the pixels clipped at each end of the grey values
 
 
 class Pictures:
@@ -78,12 +78,8 @@ class Pictures:
         scan = self._scan(name)
         factor = max(1, -(-max(scan.width_px, scan.height_px) // _FRAME_PX))  # cached, for both sizes
         grey = np.asarray(scan.reduced(factor), dtype=np.float64)
-        smaller = side_px / max(grey.shape)
-        return (
-            grey
-            if smaller >= 1
-            else np.asarray(cv2.resize(grey, None, fx=smaller, fy=smaller, interpolation=cv2.INTER_AREA))
-        )
+        smaller = min(side_px / max(grey.shape), 1.0)
+        return np.asarray(cv2.resize(grey, None, fx=smaller, fy=smaller, interpolation=cv2.INTER_AREA))
 
     def _png(self, key: tuple[object, ...], make: Callable[[], NDArray[np.uint8]]) -> bytes:
         with self._lock:
@@ -111,8 +107,7 @@ class Pictures:
 
 def stretched(grey: Array) -> NDArray[np.uint8]:
     """Stretch grey values to 8 bits between their extreme percentiles."""
-    low, high = np.percentile(grey, [_SHARE, 100.0 - _SHARE])
-    return np.asarray(np.rint(np.clip((grey - low) / max(high - low, 1e-12), 0.0, 1.0) * 255.0), dtype=np.uint8)
+    return np.asarray(np.rint(stretch(grey)), dtype=np.uint8)
 
 
 def upright(grey: NDArray[np.uint8], pose: str) -> NDArray[np.uint8]:
@@ -135,12 +130,12 @@ def _window(scan: Scan, col0: int, row0: int, size: int) -> NDArray[np.uint8]:
 def _reduced_window(scan: Scan, col0: int, row0: int, side: int, step: int) -> NDArray[np.uint8]:
     """(side, side) means over squares of step x step pixels, read within the scan, one row of means at a time."""
     shown = np.full((side, side), _NOTHING, np.uint8)
-    cols, rows = (
-        _overlapping_pixels(col0, scan.width_px, side, step),
-        _overlapping_pixels(row0, scan.height_px, side, step),
-    )
+    extents = (col0, scan.width_px), (row0, scan.height_px)
+    cols, rows = (_overlapping_pixels(*extent, side, step) for extent in extents)
     if cols and rows:
-        means = [_means(scan, col0 + step * cols.start, row0 + step * row, len(cols), step) for row in rows]
+        starts = ((col0 + step * cols.start, row0 + step * row) for row in rows)
+        bands = (scan.window(*start, len(cols) * step, step).reshape(step, len(cols), step) for start in starts)
+        means = [np.asarray(band.mean(axis=(0, 2), dtype=np.float64)) for band in bands]
         shown[rows.start : rows.stop, cols.start : cols.stop] = stretched(np.stack(means))
     return shown
 
@@ -148,12 +143,6 @@ def _reduced_window(scan: Scan, col0: int, row0: int, side: int, step: int) -> N
 def _overlapping_pixels(start_px: int, extent_px: int, side: int, step: int) -> range:
     """Indices of the reduced pixels of a row or column that overlap the scan."""
     return range(max(0, -start_px // step), min(side, -((start_px - extent_px) // step)))
-
-
-def _means(scan: Scan, col0: int, row0: int, count: int, step: int) -> Array:
-    """(count,) means of adjacent squares in one row."""
-    grey = scan.window(col0, row0, count * step, step)
-    return np.asarray(grey.reshape(step, count, step).mean(axis=(0, 2), dtype=np.float64))
 
 
 def window_start(pixel_from_mark: Array, half: int) -> tuple[int, int]:

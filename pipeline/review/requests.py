@@ -8,6 +8,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from pipeline.errors import InputError
+from pipeline.text.files import refuse_constant
 
 _MOST_PX = 1e7  # larger than any scan
 Pixels = Annotated[float, Field(strict=True, gt=-_MOST_PX, lt=_MOST_PX)]
@@ -96,10 +97,6 @@ class Query:
 def parse_json(text: str | bytes) -> Any:
     """Parse JSON with finite numbers only. Raises InputError for anything else."""
     try:
-        return json.loads(text, parse_constant=_refuse_constant)
+        return json.loads(text, parse_constant=refuse_constant)
     except (ValueError, RecursionError):
         raise InputError("that is no JSON.") from None
-
-
-def _refuse_constant(text: str) -> float:
-    raise ValueError(f"{text} is no number of JSON")
