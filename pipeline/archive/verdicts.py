@@ -56,12 +56,14 @@ def scan_counts(counts: Mapping[Verdict, int]) -> str:
     )
 
 
-def scan_verdict(scan: "MeasuredScan") -> Verdict:
-    """Verdict on a scan."""
-    frame, marks = scan.frame, [(mark.kind, mark.status, mark.reason.codes) for mark in scan.frame.marks]
+def scan_verdict(scan: "MeasuredScan", marks: Sequence[MarkState] | None = None) -> Verdict:
+    """Verdict on a scan. marks: to judge instead of its own."""
     if scan.failure:
         return Verdict.FAILED
-    return frame_verdict(marks, frame.pixel_from_camera is not None, has_problem(scan), bool(scan.decided_by))
+    if marks is None:
+        marks = [(mark.kind, mark.status, mark.reason.codes) for mark in scan.frame.marks]
+    has_frame = scan.frame.pixel_from_camera is not None
+    return frame_verdict(marks, has_frame, has_problem(scan), bool(scan.decided_by))
 
 
 def has_problem(scan: "MeasuredScan") -> bool:

@@ -338,7 +338,13 @@ def _trials(search: LayoutSearch, tries: Mapping[Names, Tried], count: Count) ->
         each, standing = tries[names], [trial for trial in trials if trial.stands_out]
         limits = [_expected_at_most(trial, len(each.layout.marks)) for trial in standing]
         if each.answer.expected > min([*limits, _HOPELESS]):
-            trials.append(_skipped_trial(names, each))
+            expected = each.answer.expected
+            why = "no constellation of its marks correlates anywhere in the scan"
+            if np.isfinite(expected):
+                why = f"{expected:.1g} false alarms expected in such a scan"
+            drawn = len(each.layout.marks)
+            none = Trial(names, 0, drawn, 0.0, 0.0, 0.0, None, None, None, f"not measured: {why}", 0.0, expected)
+            trials.append(none)
         else:
             count(", ".join(names), done, 2 * len(ranked))
             trials.append(_trial(search, names, each, CLOSE * max((trial.score for trial in standing), default=0.0)))
@@ -350,15 +356,6 @@ def _expected_at_most(seen: Trial, marks: int) -> float:
     # Fewer marks may be a part of those found: nine crosses of a larger réseau match a layout of nine.
     most = CAMERA_BY_CHANCE if seen.expected <= CAMERA_BY_CHANCE else _BY_CHANCE
     return min(most, _ODDS * seen.expected) if seen.found > marks else most
-
-
-def _skipped_trial(names: Names, each: Tried) -> Trial:
-    expected = each.answer.expected
-    if np.isfinite(expected):
-        reason = f"not measured: {expected:.1g} false alarms expected in such a scan"
-    else:
-        reason = "not measured: no constellation of its marks correlates anywhere in the scan"
-    return Trial(names, 0, len(each.layout.marks), 0.0, 0.0, 0.0, None, None, None, reason, 0.0, expected)
 
 
 def _alike(cameras: Mapping[str, CameraFile]) -> list[Names]:

@@ -4,7 +4,6 @@ all images."""
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -143,7 +142,9 @@ def measure_sheet(scan: Scan, sheet: CodedPoints) -> tuple[tuple[MarkMeasurement
     if coded:
         alike = [i for i, dot in enumerate(found) if dot.contrast_dn * _sign(found, coded) > 0.0]
         found, coded = [found[i] for i in alike], {new: coded[i] for new, i in enumerate(alike) if i in coded}
-        naming = name_dots(sheet.places, _dots(found, coded), (scan.width_px, scan.height_px))
+        centers_px = np.array([dot.center_px for dot in found]).reshape(-1, 2)
+        dots_found = Dots(centers_px, np.array([dot.pixel_from_disk for dot in found]).reshape(-1, 2, 2), coded)
+        naming = name_dots(sheet.places, dots_found, (scan.width_px, scan.height_px))
     if isinstance(naming, str):
         return absent_targets(sheet.ids, naming), (*notes, f"No target has a name: {naming}.")
     misread = [sheet.ids[coded[dot]] for dot in naming.misread]
@@ -159,14 +160,6 @@ def measure_sheet(scan: Scan, sheet: CodedPoints) -> tuple[tuple[MarkMeasurement
 def _sign(found: Sequence[Candidate], coded: dict[int, int]) -> float:
     """1 for light coded dots, -1 for dark ones."""
     return float(np.sign(np.sum([np.sign(found[dot].contrast_dn) for dot in coded]))) or 1.0
-
-
-def _dots(found: Sequence[Candidate], coded: dict[int, int]) -> Dots:
-    return Dots(
-        np.array([dot.center_px for dot in found]).reshape(-1, 2),
-        np.array([dot.pixel_from_disk for dot in found]).reshape(-1, 2, 2),
-        coded,
-    )
 
 
 def _predictions(sheet: CodedPoints, found: Sequence[Candidate], naming: Naming) -> list[TargetPrediction]:
@@ -258,13 +251,15 @@ def check_sheet(project: Project, scans: Sequence[MeasuredScan]) -> tuple[Measur
         most_px = FLAT * float(np.hypot(*np.ptp(image.targets.places_px, axis=0)))
         far_px, p_values = np.hypot(*one.off_px.T).tolist(), (shown.total() * one.chance).tolist()
         verdicts = {
-            names[point]: _SheetTest(off_px, p, shown[point] - 1, off_px > most_px)
+            names[point]: (off_px, p, shown[point] - 1, off_px > most_px)
             for point, off_px, p in zip(image.index.tolist(), far_px, p_values, strict=True)
         }
         scan = checked[name]
         checked[name] = scan.changed(
             [
-                _tested_mark(mark, verdicts.get(mark.point)) if mark.kind == "target" else mark
+                _tested_mark(mark, *verdict)
+                if mark.kind == "target" and (verdict := verdicts.get(mark.point))
+                else mark
                 for mark in scan.frame.marks
             ]
         )
@@ -293,34 +288,18 @@ def _sheet_image(scan: MeasuredScan, row: Mapping[str, int]) -> SheetImage:
     )
 
 
-class _SheetTest(NamedTuple):
-    """Test result of one mark.
-
-    Attributes
-    ----------
-    off_px : distance from its predicted place.
-    chance : p-value, corrected for the number of marks in all images.
-    others : number of other images that show the point.
-    is_beyond : whether it is farther off than the point can lie off its sheet.
-    """
-
-    off_px: float
-    chance: float
-    others: int
-    is_beyond: bool
-
-
-def _tested_mark(mark: MarkMeasurement, verdict: _SheetTest | None) -> MarkMeasurement:
-    """Set the status of a mark by its test."""
+def _tested_mark(mark: MarkMeasurement, off_px: float, chance: float, others: int, is_beyond: bool) -> MarkMeasurement:
+    """Set the status of a mark by its distance from its place and p-value, of all images; others: that show the point;
+    is_beyond: farther off than the point can lie off its sheet."""
     # Without another image, the mark and the point on the sheet may be at fault; with few others, any of them.
-    if verdict is None or verdict.chance > SHEET_POINT_OFF_PLACE:
+    if chance > SHEET_POINT_OFF_PLACE:
         return mark
-    witnesses = "the sheet's other points" + (" and other pictures" if verdict.others else "")
-    how = f"it lies {verdict.off_px:.2f} px from where {witnesses} put it"
-    if (verdict.others >= _WITNESSES or verdict.is_beyond) and verdict.chance < SHEET_POINT_ELSEWHERE:
+    witnesses = "the sheet's other points" + (" and other pictures" if others else "")
+    how = f"it lies {off_px:.2f} px from where {witnesses} put it"
+    if (others >= _WITNESSES or is_beyond) and chance < SHEET_POINT_ELSEWHERE:
         return replace(
             mark, status=Status.REJECTED, reason=Reason(f"another mark, or one disturbed: {how}", Code.OFF_PLACE)
         )
-    alone = "" if verdict.others else ", and no other picture tells whether it does so on the sheet"
-    reason = Reason(f"{how}{alone}; p = {verdict.chance:.1g}", Code.OFF_PLACE)
+    alone = "" if others else ", and no other picture tells whether it does so on the sheet"
+    reason = Reason(f"{how}{alone}; p = {chance:.1g}", Code.OFF_PLACE)
     return replace(mark, status=Status.WEAK, reason=Reason.combine((mark.reason, reason)))

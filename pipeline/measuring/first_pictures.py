@@ -197,9 +197,14 @@ def _through_clicks(options: ScanOptions, scan: Scan, px: Places) -> Array:
     pitch = np.array(_pitch_mm(options, scan))
     xy = np.array([one.xy_mm for one in camera.learned])
     up = np.array([px[one.id] for one in camera.learned]) * pitch * (1.0, -1.0)
-    fits = [fit_frame(xy, up, np.full(len(xy), _CLICK_MM), up_from_camera(pose)) for pose in ("0", "0m")]
-    best = min(fits, key=lambda fit: round(fit.chi_square, 6))
-    return np.asarray(np.diag([1.0, -1.0]) @ best.up_from_camera / pitch[:, None])
+    return np.asarray(np.diag([1.0, -1.0]) @ fit_clicks(xy, up, ("0", "0m")) / pitch[:, None])
+
+
+def fit_clicks(xy_mm: Array, up_mm: Array, poses: Sequence[str]) -> Array:
+    """(2, 3) transformation from camera coordinates to clicks (right, up); of the scan orientations the best-fitting
+    one."""
+    fits = [fit_frame(xy_mm, up_mm, np.full(len(xy_mm), _CLICK_MM), up_from_camera(pose)) for pose in poses]
+    return min(fits, key=lambda fit: round(fit.chi_square, 6)).up_from_camera
 
 
 def _start(

@@ -78,7 +78,11 @@ def add_known_lines(
         has_marks = bool(task.options.camera.fiducials)  # pictures of a digital camera have none, and no writing
         if has_marks and task.options.fiducials.pose == "auto" and task.options.fiducials.writing == "pose":
             of_camera[id(task.options.camera)].append(task)
-    rolls = {camera: _first(own) for camera, own in of_camera.items() if len(own) > _READ_FIRST}
+    rolls = dict[int, list[ScanTask]]()  # the sample of each camera on which all text is read
+    for camera, own in of_camera.items():
+        if len(own) > _READ_FIRST:
+            few = sample_names([task.name for task in own], _READ_FIRST)
+            rolls[camera] = [task for task in own if task.name in few]
     first = [task for own in rolls.values() for task in own]
     measured = dict[str, MeasuredScan]()
     with reporter.stage("read the writing of") as count:
@@ -95,12 +99,6 @@ def add_known_lines(
             task = replace(task, options=options[id(task.options)])
         knowing.append(task)
     return tuple(knowing), measured
-
-
-def _first(tasks: Sequence[ScanTask]) -> list[ScanTask]:
-    """The sample of a camera's tasks on which all text is read."""
-    few = sample_names([task.name for task in tasks], _READ_FIRST)
-    return [task for task in tasks if task.name in few]
 
 
 def known_lines(frames: Sequence[FrameMeasurement]) -> tuple[KnownLine, ...]:
@@ -251,15 +249,9 @@ def reject_repeated_views(scans: Sequence[MeasuredScan]) -> list[MeasuredScan]:
 
 def _repeated_view(scan: MeasuredScan, original: str, apart_px: float) -> MeasuredScan:
     what = f"it shows the board where {original} does to within {max(apart_px, 0.1):.1f} px"
-    reason = Reason(f"{what}, which counts", Code.COPY)
-    marks = [
-        replace(mark, status=Status.REJECTED, reason=reason)
-        if mark.kind == "target" and mark.status.is_observation
-        else mark
-        for mark in scan.frame.marks
-    ]
     remedy = "its points count once. Move the board or the camera from picture to picture."
-    return scan.changed(marks, [Reason(f"{what}: {remedy}", Code.COPY)])
+    rejected = scan.restated("target", Status.REJECTED, Reason(f"{what}, which counts", Code.COPY))
+    return rejected.changed(problems=[Reason(f"{what}: {remedy}", Code.COPY)])
 
 
 def note_same_frames(scans: Sequence[MeasuredScan], part_of: Callable[[str], str]) -> list[MeasuredScan]:

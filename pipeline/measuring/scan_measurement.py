@@ -3,7 +3,7 @@
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,6 +35,13 @@ from pipeline.text.wording import capitalised
 SecondPass = Callable[[Scan, MeasuredScan], None]
 
 
+_FAILURES: Mapping[type[Exception], FailureCode] = {  # the first that fits
+    TooLargeError: FailureCode.TOO_LARGE,
+    MissingError: FailureCode.MISSING,
+    UnreachableError: FailureCode.UNREACHABLE,
+    MeasurementError: FailureCode.UNREADABLE,
+    InputError: FailureCode.PITCH,
+}
 _COUNTED = Path("/proc/self/io")
 
 
@@ -81,24 +88,14 @@ def failed_scan(task: ScanTask, code: FailureCode, sentence: str) -> MeasuredSca
 
 def _failure(task: ScanTask, error: Exception) -> tuple[FailureCode, str]:
     sentence = " ".join(str(error).split())
-    match error:
-        case TooLargeError():
-            return FailureCode.TOO_LARGE, sentence
-        case MissingError():
-            return FailureCode.MISSING, sentence
-        case UnreachableError():
-            return FailureCode.UNREACHABLE, sentence
-        case MeasurementError():
-            return FailureCode.UNREADABLE, sentence
-        case InputError():
-            return FailureCode.PITCH, sentence
-        case MemoryError():
-            return (
-                FailureCode.MEMORY,
-                f"{task.shown_scan}: the memory was full. Close other programs, and measure it again.",
-            )
-        case OSError():
-            return FailureCode.UNREADABLE, f"{task.shown_scan}: {error.strerror or sentence}. {what_to_do(error)}"
+    if isinstance(error, MemoryError):
+        what = f"{task.shown_scan}: the memory was full. Close other programs, and measure it again."
+        return FailureCode.MEMORY, what
+    if isinstance(error, OSError):
+        return FailureCode.UNREADABLE, f"{task.shown_scan}: {error.strerror or sentence}. {what_to_do(error)}"
+    for kind, code in _FAILURES.items():
+        if isinstance(error, kind):
+            return code, sentence
     where = traceback.extract_tb(error.__traceback__)[-1]
     return (
         FailureCode.FAULT,

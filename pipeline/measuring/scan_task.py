@@ -205,7 +205,9 @@ def _sought(project: Project, camera: CameraFile) -> CameraFile:
         number="",
         principal_distance_sigma_mm=0.0,
         principal_point_sigma_mm=(0.0, 0.0),
-        distortion=_values(camera.distortion),
+        distortion=replace(
+            camera.distortion, parameters={name: Prior(one.value) for name, one in camera.distortion.parameters.items()}
+        ),
         calibration=None,
         source=None,
         clicks=None,
@@ -215,7 +217,3 @@ def _sought(project: Project, camera: CameraFile) -> CameraFile:
         return camera
     camera = replace(camera, principal_distance_mm=None, distortion=Distortion())
     return replace(camera, principal_point_mm=None) if camera.fiducials else camera
-
-
-def _values(distortion: Distortion) -> Distortion:
-    return replace(distortion, parameters={name: Prior(one.value) for name, one in distortion.parameters.items()})

@@ -55,9 +55,7 @@ def eccentricity_mm(model: ImageModel, centers: Array, normals: Array, radius: f
     reach = c[:, 2] ** 2 - radius**2 * tilt
     off_axis = n[:, :2] * n[:, 2:] + c[:, :2] / c[:, 2:] * tilt[:, None]
     middle = c[:, :2] / c[:, 2:] + radius**2 * off_axis / reach[:, None]
-    axes = np.stack(
-        [radius * (v[:, :2] - c[:, :2] / c[:, 2:] * v[:, 2:]) / c[:, 2:] for v in across(n)], axis=-1
-    )  # fmt: skip
+    axes = np.stack([radius * (v[:, :2] - c[:, :2] / c[:, 2:] * v[:, 2:]) / c[:, 2:] for v in across(n)], axis=-1)
 
     def imaged(places: Array) -> Array:
         rays = np.column_stack([places, np.ones(len(places))]) * c[:, 2:]
@@ -173,7 +171,7 @@ class Field:
         return tuple(
             TargetPrediction(self.ids[i], centers[i], maps[i], search_px, perspective[i])
             for i in np.flatnonzero(visible)
-        )  # fmt: skip
+        )
 
 
 def absent_targets(ids: Sequence[str], text: str, code: Code = Code.UNNAMED) -> tuple[MarkMeasurement, ...]:
@@ -215,9 +213,7 @@ def target_candidates(scan: Scan, settings: TargetSettings, diameters_px: tuple[
     sizes = (smallest, max(diameters_px[1], smallest))
     if settings.cross_line is None:
         return disk_candidates(scan, DiskSearch(sizes, settings.polarity))
-    return cross_candidates(
-        scan, CrossSearch((sizes[0] / 2.0, sizes[1] / 2.0), settings.cross_line, settings.polarity)
-    )  # fmt: skip
+    return cross_candidates(scan, CrossSearch((sizes[0] / 2.0, sizes[1] / 2.0), settings.cross_line, settings.polarity))
 
 
 def measure_single_targets(

@@ -14,14 +14,12 @@ from adjust.functional_model.lens import Lens
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.transformation import Film
 from adjust.initial_values.resection import MAX_TRIPLES
-from adjust.target_identification.naming import Names, name_marks
+from adjust.target_identification.naming import name_marks
 from adjust.target_identification.unnamed_marks import chance_of_a_mark, log10_of_agreement, mark_density
 from measure.targets.block_search import Candidate
 from measure.targets.identification import TargetPrediction
 from pipeline.files.camera_file import CameraFile
-from pipeline.measuring.target_field import (
-    Field,
-)
+from pipeline.measuring.target_field import Field
 from pipeline.results.comparator_file import comparator_from_pixel, pixel_from_comparator
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.types import Array, Indices, Mask
@@ -228,7 +226,10 @@ def name_field(
     The oriented image, or the reason of the failure.
     """
     places = np.array([one.center_px for one in candidates]).reshape(-1, 2)
-    ideal = _ideal(model, measured, places)
+    # mm, relative to the principal point, corrected for the known distortion
+    camera_mm = model.camera_from_comparator(comparator_from_pixel(places, measured.pitch_um))
+    observed, is_found = model.lens.ideal_from_observed(camera_mm)
+    ideal = np.where(is_found[:, None], observed, camera_mm) - model.lens.interior[1:]
     frame = frame_mm(camera, model, measured) - model.lens.interior[1:]
     inside = np.flatnonzero(((ideal >= frame[0]) & (ideal <= frame[1])).all(axis=1))
     strongest = inside if codes else inside[: int(_STRAYS * len(field.ids)) + 1]
@@ -239,23 +240,10 @@ def name_field(
     names = name_marks(*known, {row[one]: point for one, point in codes.items() if one in row} if codes else None)
     if isinstance(names, str):
         return names
-    return _named(names, field, model, [candidates[i] for i in strongest], pitch_mm)
-
-
-def _named(
-    names: Names, field: Field, model: ImageModel, candidates: Sequence[Candidate], pitch_mm: float
-) -> NamedField:
     lens = replace(model.lens, interior=np.array([names.principal_distance_mm, *model.lens.interior[1:]]))
     oriented = replace(model, lens=lens, rotation=names.pose.rotation, station=names.pose.center)
-    by_id = {field.ids[point]: candidates[mark] for point, mark in names.mark.items()}
+    by_id = {field.ids[point]: candidates[strongest[mark]] for point, mark in names.mark.items()}
     return NamedField(oriented, by_id, max(names.gate_mm / pitch_mm, _FOUND_WITHIN_PX))
-
-
-def _ideal(model: ImageModel, measured: MeasuredScan, places_px: Array) -> Array:
-    """(n, 2) mm, image coordinates relative to the principal point, corrected for the known distortion."""
-    camera = model.camera_from_comparator(comparator_from_pixel(places_px, measured.pitch_um))
-    ideal, found = model.lens.ideal_from_observed(camera)
-    return np.asarray(np.where(found[:, None], ideal, camera) - model.lens.interior[1:])
 
 
 def camera_model(camera: CameraFile, measured: MeasuredScan) -> ImageModel | str:

@@ -62,7 +62,11 @@ def _join_parts(
         )
         return [scan.changed(problems=[lacking]) for scan in parts]
     parts = sorted(parts, key=lambda scan: scan.frame.image)
-    joins = measure_joins([_part_frame(project, scan) for scan in parts], workers=workers)
+    frames = []
+    for scan in parts:
+        marks = _taken([mark for mark in scan.frame.marks if mark.kind == "fiducial"])
+        frames.append(TieFrame(scan.frame.image, scan_path(scan.scan), np.eye(2, 3), None, marks, project.max_pixels))
+    joins = measure_joins(frames, workers=workers)
     problems = {image: (problem,) for image, problem in joins.problems.items()}
     return _agreed([_add_marks(scan, joins.marks, problems) for scan in parts])
 
@@ -73,11 +77,6 @@ def _add_marks(
     """Add the marks and problems of an image, by name."""
     image = scan.frame.image
     return scan.changed((*scan.frame.marks, *marks.get(image, ())), problems.get(image, ()))
-
-
-def _part_frame(project: Project, scan: MeasuredScan) -> TieFrame:
-    marks = _taken([mark for mark in scan.frame.marks if mark.kind == "fiducial"])
-    return TieFrame(scan.frame.image, scan_path(scan.scan), np.eye(2, 3), None, marks, project.max_pixels)
 
 
 def _taken(marks: Sequence[MarkMeasurement]) -> Array:
@@ -170,7 +169,7 @@ def _contradicted(scan: MeasuredScan, other: MeasuredScan, off_mm: float) -> Mea
         Code.AMBIGUOUS,
     )
     if len(_fiducials(scan)) <= len(_fiducials(other)):
-        scan = _changed(scan, Status.REJECTED, Reason(what, Code.AMBIGUOUS))
+        scan = scan.restated("fiducial", Status.REJECTED, Reason(what, Code.AMBIGUOUS))
     return scan.changed(problems=[problem])
 
 
@@ -181,17 +180,8 @@ def _unchecked(scan: MeasuredScan, is_checked: bool) -> MeasuredScan:
         return replace(scan, frame=replace(scan.frame, problems=problems))
     if 0 < len(_fiducials(scan)) < _CHECKED:
         reason = Reason("so few fiducials fit many frames, and no other part of this one checks them", Code.NO_CHECK)
-        return _changed(scan, Status.WEAK, reason)
+        return scan.restated("fiducial", Status.WEAK, reason)
     return scan
-
-
-def _changed(scan: MeasuredScan, status: Status, reason: Reason) -> MeasuredScan:
-    """Scan with another status of those fiducials that are observations."""
-    marks = [
-        replace(mark, status=status, reason=reason) if mark.kind == "fiducial" and mark.status.is_observation else mark
-        for mark in scan.frame.marks
-    ]
-    return scan.changed(marks)
 
 
 def check_tie_names(project: Project) -> None:

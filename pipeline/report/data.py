@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from measure.flags import Code, Reason, Status
 from measure.results import Covariance as MarkCovariance
 from measure.results import MarkMeasurement
-from pipeline.archive.verdicts import Verdict, frame_verdict, has_problem, mark_verdict
+from pipeline.archive.verdicts import Verdict, frame_verdict, mark_verdict, scan_verdict
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.assessment_record import ResidualRecord
 from pipeline.results.comparator_file import ComparatorPoint
@@ -217,12 +217,8 @@ class Frame:
     @property
     def verdict(self) -> Verdict:
         """Verdict as in `reseau status`, for the marks currently in comparator.csv."""
-        scan, marks = self.scan, [(mark.kind, mark.status, mark.codes) for mark in self.marks]
-        if scan is None:
-            return frame_verdict(marks, True, False, False)
-        if scan.failure:
-            return Verdict.FAILED
-        return frame_verdict(marks, scan.frame.pixel_from_camera is not None, has_problem(scan), bool(scan.decided_by))
+        marks = [(mark.kind, mark.status, mark.codes) for mark in self.marks]
+        return frame_verdict(marks, True, False, False) if self.scan is None else scan_verdict(self.scan, marks)
 
 
 def frames(data: ReportData) -> list[Frame]:

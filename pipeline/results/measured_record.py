@@ -96,6 +96,17 @@ class MeasuredScan:
         frame = replace(frame, marks=marks, problems=(*frame.problems, *problems))
         return replace(self, frame=frame, notes=(*self.notes, *notes))
 
+    def restated(self, kind: Kind, status: Status, reason: Reason) -> "MeasuredScan":
+        """Copy in which the observed marks of a kind have another status."""
+        return self.changed(
+            [
+                replace(mark, status=status, reason=reason)
+                if mark.kind == kind and mark.status.is_observation
+                else mark
+                for mark in self.frame.marks
+            ]
+        )
+
 
 # JSON has no non-finite numbers: they are written as strings that `float` reads.
 

@@ -12,7 +12,6 @@ import numpy as np
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from measure.fiducials.clicked_frame import LEAST_CLICKS, are_collinear
-from measure.fiducials.interior_orientation import fit_frame
 from measure.geometry import POSES, Affine, linear_scale, up_from_camera
 from measure.marks.shapes import MarkTemplate, Point
 from measure.marks.templates import cut, learn_template
@@ -21,6 +20,7 @@ from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile, camera_text, parse_camera, read_camera
 from pipeline.files.camera_tables import DEFAULT_SIGMA_MM
 from pipeline.files.mark_table import SavePicture, picture_writer, template_values
+from pipeline.measuring.first_pictures import fit_clicks
 from pipeline.review.requests import parse_values
 from pipeline.text.files import write_atomically
 from pipeline.text.tables import Table
@@ -30,7 +30,6 @@ from pipeline.types import Array
 MARK = "drawn"  # NAME of the table [mark.NAME]
 _DRAWN_BY = f"# Drawn on the review page by reseau {version('reseau')}"
 _FILE_NAME = re.compile(r"\w[\w .-]{0,99}")
-_CLICK_MM = 0.3  # mm, standard deviation of a click
 _ONE_SIDE = 0.5  # fraction of half the marks' extent; marks farther out belong to one side of the frame
 _FLIP = np.diag([1.0, -1.0])  # (right, up) to (column, row)
 _NO_PITCH = (
@@ -154,8 +153,7 @@ def place_frame(
         # Mirrored if that fits better, or, with too few points to decide, if the pose is.
         tells_mirror = len(given) >= LEAST_CLICKS and not are_collinear(given)
         mirrors = ("0", "0m") if tells_mirror else ("0m" if "m" in drawing.pose else "0",)
-        fits = [fit_frame(given, up_mm, np.full(len(up_mm), _CLICK_MM), up_from_camera(one)) for one in mirrors]
-        up = min(fits, key=lambda fit: round(fit.chi_square, 6)).up_from_camera
+        up = fit_clicks(given, up_mm, mirrors)
         if pitch_um is None:
             pixel_mm = pixel_mm / linear_scale(up)
             up, source = up / linear_scale(up), "the coordinates of the marks"
