@@ -266,7 +266,15 @@ def cluster_executor(address: str, scans: Sequence[str], workers: int | None = N
             ) from None
         stack.callback(client.close)
         _check_workers(client, address, _one_a_folder(scans))
-        client.register_plugin(_alone_plugin(), name="reseau")
+        from distributed.diagnostics.plugin import WorkerPlugin
+
+        class WorkAlone(WorkerPlugin):  # type: ignore[misc]
+            """Limits every worker, including replacements, to one thread."""
+
+            def setup(self, worker: Any) -> None:
+                work_alone()
+
+        client.register_plugin(WorkAlone(), name="reseau")
         yield SubmittedAgain(client.get_executor(retries=_RETRIES, pure=False))
 
 
@@ -370,14 +378,3 @@ def _one_a_folder(scans: Sequence[str]) -> list[str]:
         if folder not in firsts and (is_there := not _why_unreadable(scan)) | is_address(scan):
             firsts[folder] = (scan if is_address(scan) else os.path.abspath(scan)) if is_there else ""
     return [first for first in firsts.values() if first]
-
-
-def _alone_plugin() -> Any:
-    """Dask plugin that limits every worker, including replacements, to one thread."""
-    from distributed.diagnostics.plugin import WorkerPlugin
-
-    class WorkAlone(WorkerPlugin):  # type: ignore[misc]
-        def setup(self, worker: Any) -> None:
-            work_alone()
-
-    return WorkAlone()

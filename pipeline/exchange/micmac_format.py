@@ -108,7 +108,13 @@ def _camera_files(block: Block, camera: str, options: ExportOptions) -> Written:
     files["Measures-S3D.xml"] = _ground(block)
     notes = [f"{camera}: the lens was fitted over the frame: it is off by {misfit_px:.2g} px at most."]
     if fiducials:
-        notes = [_resampling(camera, box), *notes, _affine_note(oriented, fiducials, box)]
+        misfits = {frame.image: _affine_misfit_px(frame, fiducials, box) for frame in oriented}
+        worst = max(misfits, key=lambda image: misfits[image])
+        notes.insert(0, _resampling(camera, box))
+        notes.append(
+            f"MicMac fits its affine transformation without weights: in image {worst} it lies up to "
+            f"{misfits[worst]:.2g} px from the adjusted one."
+        )
     return Written(files, notes=tuple(notes), left_out=left_out)
 
 
@@ -213,15 +219,6 @@ def _resampling(camera: str, box: Canvas) -> str:
     corners = ",".join(f"{value:.{_DIGITS}g}" for value in (box.x_mm, -box.y_mm, right, -bottom))
     command = f'mm3d ReSampFid ".*tif" {box.pitch_mm:.{_DIGITS}g} BoxCh=[{corners}]'
     return f"{camera}: {command} makes the frames; name your scans in the place of .*tif."
-
-
-def _affine_note(frames: Sequence[OutFrame], fiducials: Mapping[str, Array], box: Canvas) -> str:
-    misfits = {frame.image: _affine_misfit_px(frame, fiducials, box) for frame in frames}
-    worst = max(misfits, key=lambda image: misfits[image])
-    return (
-        f"MicMac fits its affine transformation without weights: in image {worst} it lies up to "
-        f"{misfits[worst]:.2g} px from the adjusted one."
-    )
 
 
 def _affine_misfit_px(frame: OutFrame, fiducials: Mapping[str, Array], box: Canvas) -> float:

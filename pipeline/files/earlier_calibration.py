@@ -15,7 +15,7 @@ from adjust.problem.observations import Calibration
 from adjust.problem.parameter import Parameter
 from pipeline.files.camera_tables import SigmaTable
 from pipeline.results.adjustment_file import read_adjustment
-from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, DistortionRecord, Quantity
+from pipeline.results.adjustment_record import CameraRecord, DistortionRecord
 from pipeline.results.covariance_file import Covariance, covariance_path, read_covariance
 from pipeline.results.record_json import plain_json
 from pipeline.text.tables import Table
@@ -94,7 +94,13 @@ def read_calibration(sigma: Table, given: SigmaTable, camera: Camera) -> Earlier
     content, covariance = read_adjustment(path), read_covariance(path)
     if not content.converged:
         raise sigma.error("calibration", f"{path} holds no calibration: its adjustment did not converge.")
-    name = _find_camera(sigma, path, content, camera.name)
+    names = list(content.cameras)
+    if camera.name not in names and len(names) != 1:
+        raise sigma.error(
+            "calibration",
+            f"{path} holds the cameras {', '.join(names)}, but none with the name {camera.name!r} of this file.",
+        )
+    name = camera.name if camera.name in names else names[0]
     distortion = content.cameras[name].distortion
     _check_family(sigma, path, distortion, camera.distortion)
     earlier = _calibration(path, distortion, covariance, name, camera, given.calibration_fiducials)
@@ -107,7 +113,9 @@ def read_calibration(sigma: Table, given: SigmaTable, camera: Camera) -> Earlier
 
 def _check_agreement(sigma: Table, path: Path, name: str, camera: CameraRecord, covariance: Covariance) -> None:
     """Check that JSON and covariance file agree on the camera; the network uses the latter."""
-    stored = _quantities(name, camera)
+    stored = {Parameter.interior(name, key): quantity for key, quantity in camera.interior.items()}
+    for id, mark in camera.fiducials.items():
+        stored |= {Parameter.fiducial(name, id, "x"): mark.x_mm, Parameter.fiducial(name, id, "y"): mark.y_mm}
     listed = {each for each in covariance.parameters if each.kind in ("interior", "fiducial") and each.owner == name}
     for each in sorted(stored.keys() ^ listed):
         has, lacks = (path, covariance_path(path)) if each in stored else (covariance_path(path), path)
@@ -131,17 +139,6 @@ def _check_agreement(sigma: Table, path: Path, name: str, camera: CameraRecord, 
         raise sigma.error("calibration", f"{covariance_path(path)}: {wrong}. {_TOGETHER}")
 
 
-def _quantities(name: str, camera: CameraRecord) -> dict[Parameter, Quantity]:
-    """Quantities of a camera in adjustment.json."""
-    quantities = {Parameter.interior(name, key): quantity for key, quantity in camera.interior.items()}
-    for id, mark in camera.fiducials.items():
-        quantities[Parameter.fiducial(name, id, "x")], quantities[Parameter.fiducial(name, id, "y")] = (
-            mark.x_mm,
-            mark.y_mm,
-        )
-    return quantities
-
-
 def _no_covariance(parameters: Sequence[Parameter], matrix: Array) -> str:
     """Why a matrix is not a covariance matrix, and where; "" if it is one."""
     finite = np.isfinite(matrix)
@@ -160,16 +157,6 @@ def _no_covariance(parameters: Sequence[Parameter], matrix: Array) -> str:
     if np.linalg.eigvalsh(matrix[np.ix_(free, free)] / scale[np.ix_(free, free)]).min(initial=0.0) < -_ALIKE:
         return "the matrix gives some combinations of the camera's quantities a negative variance"
     return ""
-
-
-def _find_camera(sigma: Table, path: Path, content: AdjustmentRecord, name: str) -> str:
-    """Name of the camera in the file: the given one, or the file's only camera."""
-    names = list(content.cameras)
-    if name not in names and len(names) != 1:
-        raise sigma.error(
-            "calibration", f"{path} holds the cameras {', '.join(names)}, but none with the name {name!r} of this file."
-        )
-    return name if name in names else names[0]
 
 
 def _check_family(sigma: Table, path: Path, earlier: DistortionRecord, distortion: Distortion) -> None:

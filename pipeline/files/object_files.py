@@ -165,20 +165,16 @@ def read_images(path: Path, antenna: tuple[float, float, float] = (0.0, 0.0, 0.0
         page, window = _page(row), _window(row)
         if page or window:
             cuts[name] = page, window
-        if turned := _turned(row):
+        text = row.text("turned_deg")
+        if text not in ("", "0", "90", "180", "270"):
+            raise row.error(
+                "turned_deg", f"is {text!r}: 0, 90, 180 or 270 is right, the counter-clockwise turn of a picture."
+            )
+        if turned := int(text or 0):
             turned_deg[name] = turned
         asks_writing = any(column in row.cells for column in WRITTEN)
     _join(path, exterior, camera, part_of)
     return GivenImages(exterior, camera, scanner, asks_writing, turned_deg, part_of, cuts)
-
-
-def _turned(row: Row) -> int:
-    text = row.text("turned_deg")
-    if text not in ("", "0", "90", "180", "270"):
-        raise row.error(
-            "turned_deg", f"is {text!r}: 0, 90, 180 or 270 is right, the counter-clockwise turn of a picture."
-        )
-    return int(text or 0)
 
 
 def _page(row: Row) -> int | None:

@@ -195,18 +195,11 @@ def _find_files(pattern: str, folder: Path) -> Sequence[Named]:
         return find_addresses(pattern)
     if (folder / pattern).is_file():
         return [str(folder / pattern)]
-    return _drop_folders(_below(folder, sorted(found_names(pattern, folder))))
-
-
-def _below(folder: Path, names: Sequence[str]) -> list[str]:
-    """Full paths of names in a folder, without names that end with a separator (folders)."""
+    names = sorted(found_names(pattern, folder))
     places = [(name[: (end := name.rfind(os.sep) + 1)], name[end:]) for name in names]
     begins = {place: str(folder / place / "_")[:-1] for place in {place for place, _ in places}}
-    return [begins[place] + name for place, name in places if name]
-
-
-def _drop_folders(files: Sequence[str]) -> list[str]:
-    """Drop folders. Each parent folder is listed only once."""
+    # Names that end with a separator are folders; so may others be. Each parent folder is listed only once.
+    files = [begins[place] + name for place, name in places if name]
     folders = set[str]()
     for parent in {text[: text.rfind(os.sep) + 1] for text in files}:
         with suppress(OSError), os.scandir(parent or os.curdir) as entries:  # it may be accessible but not listable

@@ -77,7 +77,8 @@ def write_frame(
     def masked() -> Iterator[Mask]:
         for (row0, col0), mask in masks.items():  # in the order of the tiles
             tile = np.unpackbits(mask, axis=1) if isinstance(mask, np.ndarray) else np.full((TILE_PX,) * 2, mask)
-            yield _filled(tile[: canvas.height_px - row0, : canvas.width_px - col0].astype(bool), TILE_PX)
+            part = tile[: canvas.height_px - row0, : canvas.width_px - col0].astype(bool)
+            yield np.pad(part, ((0, TILE_PX - part.shape[0]), (0, TILE_PX - part.shape[1])))
 
     pages = reduced.count
     size = canvas.width_px * canvas.height_px * channels * np.dtype(dtype).itemsize
@@ -137,8 +138,3 @@ def _averaged(samples: Samples, factor: int) -> Samples:
     whole = np.pad(samples, ((0, height - samples.shape[0]), (0, width - samples.shape[1]), (0, 0)), mode="edge")
     means = whole.reshape(height // factor, factor, width // factor, factor, -1).mean(axis=(1, 3))
     return np.asarray(np.rint(means).astype(samples.dtype))
-
-
-def _filled(part: Mask, side: int) -> Mask:
-    """Pad a tile at the frame's edge to its full size."""
-    return np.pad(part, ((0, side - part.shape[0]), (0, side - part.shape[1])))

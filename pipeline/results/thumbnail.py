@@ -82,7 +82,8 @@ def cut(scan: Scan, mark: MarkMeasurement) -> Thumbnail | None:
     does."""
     if mark.center_px is None:
         return None
-    half = _half_px(mark)
+    least = _FIDUCIAL_PX if mark.kind == "fiducial" else _TARGET_PX
+    half = max(least // 2, int(np.ceil(_REACH_SIZES * mark.quality.get("size_px", 0.0) / 2.0)))
     col0, row0 = (round(float(value)) - half for value in mark.center_px)
     width = 2 * half + 1
     if col0 >= scan.width_px or row0 >= scan.height_px or col0 + width <= 0 or row0 + width <= 0:
@@ -93,12 +94,6 @@ def cut(scan: Scan, mark: MarkMeasurement) -> Thumbnail | None:
     pixels = cv2.resize(window[: size * step, : size * step], (size, size), interpolation=cv2.INTER_AREA)
     middle = (step - 1) / 2.0
     return Thumbnail(np.asarray(pixels), (col0 + middle, row0 + middle), float(step))
-
-
-def _half_px(mark: MarkMeasurement) -> int:
-    """Half the width of the window around a mark."""
-    least = _FIDUCIAL_PX if mark.kind == "fiducial" else _TARGET_PX
-    return max(least // 2, int(np.ceil(_REACH_SIZES * mark.quality.get("size_px", 0.0) / 2.0)))
 
 
 def _whole(scan: Scan) -> Iterator[Thumbnail]:
