@@ -48,12 +48,10 @@ class Summary:
     verdict : verdict with problems and notes.
     frames : numbers of marks by frame and status.
     poses : scan orientations with their evidence, as in measurement.db.
-    adjustment, check : results of these stages.
     files : files that were written, by a word for each.
     corrections : corrections to the fiducials of cameras without calibration, in words, and distances between them.
     values : of the calibrated cameras.
     unit : of lengths in images.
-    verdicts : number of scans by verdict.
     parts : number of shards of the scans, if these are the scans of one.
     """
 

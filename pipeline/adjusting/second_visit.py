@@ -32,11 +32,8 @@ class Visit:
 
     Attributes
     ----------
-    image : name of the image.
     scan : path or address of its file.
     sought : predictions of the missed targets.
-    settings : description of the targets.
-    max_pixels : limit for the scan.
     """
 
     image: str

@@ -52,7 +52,6 @@ class Judging:
 
     Attributes
     ----------
-    row : row in the database.
     digest : SHA-256 of its whole content.
     made_from : {name: fingerprint} of its inputs, as from `made_from`.
     input : SHA-256 of the results that were checked.
@@ -71,7 +70,6 @@ class CheckedResult:
     Attributes
     ----------
     result : row of the raw result.
-    scan : the scan with its checked statuses.
     decisions : hash of the review decisions about the image that were considered.
     """
 

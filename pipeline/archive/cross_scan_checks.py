@@ -39,9 +39,6 @@ def check_lots(
 
     Parameters
     ----------
-    project : with its learned marks.
-    tasks : of all scans.
-    work : access to the results.
     copies : {image: image whose file its own is a copy of}.
     share : third step of the measurement: targets and natural points shared between scans.
     input_hash : `hash_inputs` of all scans.

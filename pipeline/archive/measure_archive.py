@@ -100,12 +100,6 @@ def measure_archive(
 ) -> str:
     """Measure the missing scans of a project and check all of them together, unless nothing has changed.
 
-    Parameters
-    ----------
-    project, store : project and its results database.
-    learned_folder : folder for the learned marks.
-    reporter, options : progress, and how the work is done.
-
     Returns
     -------
     Digest of the judging; "" for a shard, which has no cross-scan checks.

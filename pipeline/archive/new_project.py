@@ -50,9 +50,7 @@ class NewProject:
 
     Attributes
     ----------
-    folder : for project.toml and images.csv.
     given : files and folders that were searched.
-    found : catalogue of the scans.
     left_out : {reason: files that are not measured}.
     """
 

@@ -54,10 +54,6 @@ class Kept:
 
     Attributes
     ----------
-    identity : of the scan's file.
-    options_json : options of the measurement.
-    scan : the measured scan.
-    bytes_read : bytes read for the measurement.
     camera : name of the camera's file.
     """
 

@@ -46,9 +46,6 @@ class ScanGroup:
 
     Attributes
     ----------
-    folder : of the scans.
-    head : of the first scan.
-    paths : of the scans.
     samples : identifications of the scans that were tried.
     """
 
@@ -209,7 +206,6 @@ class Catalogue:
 
     Attributes
     ----------
-    groups : groups of readable scans, without copies.
     unread : {file: why it cannot be read}.
     copies : {file: the file with the same bytes that stands for it}.
     endings : number of files that are not scans, by file name ending.

@@ -50,7 +50,6 @@ class BlockPicture:
 
     Attributes
     ----------
-    image, camera : names.
     name : file, in its camera's folder.
     lattice : pixel grid of its camera's images.
     scans : scan of the frame, or several of its parts.
@@ -160,7 +159,6 @@ class Sight:
 
     Attributes
     ----------
-    image : name of the image.
     col, row : of the feature; (0, 0) is the centre of the first pixel.
     size_px : size of the feature: standard deviation of the Gaussian that detected it.
     off_px : length of the reprojection error.

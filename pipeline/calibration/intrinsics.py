@@ -138,7 +138,6 @@ class CameraIntrinsics:
     covariance : of these, the larger of model and left-out images in each direction.
     correlations : pairs above HIGHLY_CORRELATED.
     left_out : by image, the reason.
-    used : number of images.
     worst : images with the largest residuals: name, and rms of a point, px.
     known_share : radius up to which the lens was observed, as a fraction of the distance to the corner.
     lens : selection of the lens model; None where it was given.

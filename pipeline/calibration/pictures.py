@@ -150,10 +150,6 @@ def find_turns(project: Project, marks: Sequence[ComparatorPoint], camera: Camer
     The principal point and the decentring distortion, which turn with the image, distinguish the turns. Each image is
     resected with the lens of those with known turns; where these are too few, all are adjusted with either turn. Raises
     AdjustmentError or InputError where the images with known turns have no solution.
-
-    Parameters
-    ----------
-    marks : of the camera's images
     """
     open_turns = [name for name in camera.images if camera.turned_deg.get(name, 0) is None]
     known = {name: turn for name, turn in camera.turned_deg.items() if turn is not None}

@@ -34,7 +34,6 @@ class BoardOptions:
     spacing_mm : side of a square, or distance from one marker or circle to the next; of an asymmetric grid the distance
         of its rows, which is half the distance between two circles of a row.
     size_mm : of a marker or a circle.
-    first_id : number of the first marker.
     """
 
     kind: BoardKind

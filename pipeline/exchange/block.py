@@ -36,7 +36,6 @@ class OutFrame:
 
     Attributes
     ----------
-    marks : the marks that are observations.
     scan, pitch_um : path and pixel pitch; None if unknown.
     model : adjusted; None for images without a part in the adjustment.
     is_oriented : whether the exterior orientation was adjusted, too.

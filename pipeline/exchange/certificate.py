@@ -49,10 +49,8 @@ class Certificate:
     principal_distance_mm : the one that the table refers to.
     principal_point_mm : of autocollimation.
     symmetry_mm : principal point of best symmetry, if given separately.
-    fiducials, distances : coordinates of the marks and distances between them.
     radius_mm : (n,).
     tangent : (n,) of the angle from the axis.
-    radial_um : (n,) radial distortion.
     sigma_um : standard deviation of one value.
     """
 

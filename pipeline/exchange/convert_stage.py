@@ -50,10 +50,8 @@ class Conversion:
 
     Attributes
     ----------
-    lens : the converted lens.
     sigmas : (3 + k,) of c, x0', y0' and the parameters, the larger of model and left-out images; inf: free.
     sentences : lines of the README.
-    files : names of the written files.
     """
 
     lens: ConvertedLens

@@ -131,7 +131,6 @@ class ImportOptions:
     pitch_um : pixel pitch of the other program's images.
     sigma_px : standard deviation of marks that have none.
     from_middle : the principal point refers to the centre of the image, as for a film camera.
-    fiducials : the marks are fiducials.
     """
 
     pitch_um: float | None = None

@@ -81,7 +81,6 @@ class GivenFiducial:
 
     Attributes
     ----------
-    id : name of the mark.
     xy_mm, sigma_mm : given coordinates and their standard deviations, mm.
     mark : drawing; None if the fiducial can be adjusted but not measured.
     passed_over : whether it is not to be measured.

@@ -80,12 +80,9 @@ class Decision:
 
     Attributes
     ----------
-    image : name of the image.
-    decision : kind of decision.
     point, kind : of the mark; "" for a pose.
     col_px, row_px : place of the mark (`place`).
     pose : of the scan (`pose`).
-    note, who : remark and person.
     when : ISO 8601.
     fingerprint : of the result that was reviewed; for `learn` SHA-256 of the scan's file.
     window : part of the scan that was visible: first column, first row, width, height, px.

@@ -34,7 +34,6 @@ class EarlierCalibration:
     Attributes
     ----------
     path : of adjustment.json.
-    distortion : its distortion model.
     parameters : its n estimated parameters; its camera may have another name than the present one.
     values, covariance : (n,) and (n, n) of these parameters.
     held : values of parameters that it held fixed.

@@ -217,8 +217,6 @@ class CameraSizes:
     marks : kinds of the marks of corners and sides, in this order.
     square, side : distances of corner marks and of side marks (width, height), mm; None where there are none.
     frame : size of the frame (width, height), mm; None: derived from the marks.
-    distance : principal distance, mm.
-    name : of the camera.
     """
 
     marks: tuple[str, ...]

@@ -61,7 +61,6 @@ class Project:
     scans : by image name, in their order.
     comparator, output : comparator.csv and the folder of the results.
     pitch_um : pixel pitch of the scans; None: from the files.
-    pose : scan orientation.
     tone : tone curve of the scans: auto, one of TONES, or the exponent p of light ~ (grey value)^p.
     unit_mm : user's unit of object coordinates, mm.
     max_pixels : limit for a scan, if the user states one.

@@ -150,7 +150,6 @@ class Trial:
 
     Attributes
     ----------
-    cameras : names.
     found : number of marks observed, out of drawn.
     likeness : mean correlation of the found marks with the drawing.
     snr : median of contrast over noise.

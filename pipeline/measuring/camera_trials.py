@@ -63,7 +63,6 @@ class Tried:
 
     Attributes
     ----------
-    layout : the marks to be measured.
     bold : its boldest marks, which are searched.
     picture : the searched image, the scan at reduced size.
     hypotheses : pixel pitches that were tried.

@@ -47,11 +47,9 @@ class CodedPoints:
 
     Attributes
     ----------
-    ids : names.
     xyz : (n, 3) coordinates.
     places : (n, 2) coordinates in the best-fitting plane.
     is_flat : whether the points lie in that plane.
-    settings : kind of the targets.
     """
 
     ids: tuple[str, ...]
@@ -96,7 +94,6 @@ class _CodedDots:
     read : point, by index, that the ring around each dot names, right or wrong.
     named : without points that were read at several places: these do not identify anything, until the others tell which
         is right.
-    notes : on these points.
     none_named : reason why no dot is identified by its code, if none is.
     """
 

@@ -42,10 +42,6 @@ _NOT_COMMON = (
 def first_pictures(camera: CameraFile, tasks: Sequence[ScanTask], workers: Executor | None) -> CameraFile:
     """Learn first templates of the marks from one scan.
 
-    Parameters
-    ----------
-    tasks : measure the drawn marks of this camera's scans.
-
     Returns
     -------
     The camera with the templates, and with the scan they come from.

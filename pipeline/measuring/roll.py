@@ -40,11 +40,6 @@ def name_roll(
 ) -> list[MeasuredScan]:
     """Name the marks of one camera's scans by scan orientations from all of its frames together. Scans whose marks get
     other names by this are measured again.
-
-    Parameters
-    ----------
-    tasks : the tasks by which the scans were measured.
-    places : where the camera writes text.
     """
     both = list(zip(tasks, scans, strict=True))
     free = [scan for task, scan in both if task.options.fiducials.pose == "auto" and not scan.failure]
@@ -135,7 +130,6 @@ def poses_of_roll(scans: Sequence[MeasuredScan], places: Sequence[WrittenPlace])
     Parameters
     ----------
     scans : of one camera, with scan orientations that nobody has set.
-    places : where the camera writes text.
     """
     frames = [scan.frame for scan in scans]
     poses = {frame.image: frame.pose for frame in frames if frame.pose is not None and frame.pose.writing}

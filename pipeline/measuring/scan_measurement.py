@@ -236,8 +236,6 @@ class MeasuredFile:
 
     Attributes
     ----------
-    scan : the measurements, or the failure.
-    parts_hash : hash of the file.
     bytes_read : from the file; -1 where the system does not count them.
     thumbnails : cut from the decoded samples.
     """

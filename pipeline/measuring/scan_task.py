@@ -46,9 +46,7 @@ class ScanOptions:
     pitch_um : as given in the project; None: from the file or the marks.
     fiducials : scan orientation, film and reading of text.
     known_pose : scan orientation of a scan from which marks were learned.
-    tone : the tone curve as set in the project.
     said : information on the curve from other scans of the scanner.
-    targets : the targets to be measured.
     exterior : approximate exterior orientation for the identification of targets.
     """
 
@@ -74,7 +72,6 @@ class ScanTask:
 
     Attributes
     ----------
-    name : of the image.
     scan : path or address of the file; "" where images.csv names an image without a file.
     max_pixels : limit for `open_scan`; it does not change the result of a scan that can be read.
     """

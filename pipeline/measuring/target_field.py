@@ -147,7 +147,6 @@ class Field:
 
     Attributes
     ----------
-    ids : names.
     xyz : (n, 3) coordinates.
     sigmas : (n, 3) their standard deviations, inf where they are free.
     normals : by id.

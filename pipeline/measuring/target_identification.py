@@ -178,7 +178,6 @@ class NamedField:
 
     Attributes
     ----------
-    model : the oriented image.
     candidates : the identified candidates, by point.
     gate_px : largest distance of a target from its place by the model.
     """

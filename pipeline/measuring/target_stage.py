@@ -62,12 +62,9 @@ class SoughtTargets:
 
     Attributes
     ----------
-    settings : kind of the targets.
     field : the targets with coordinates, known at least approximately.
     coded : the points of a sheet or field with coded targets; None without codes.
     surveyed : whether a file of points gives their coordinates.
-    unit : of the coordinates.
-    unit_mm : length of the unit in mm.
     """
 
     settings: TargetSettings

@@ -60,8 +60,6 @@ class CameraView:
 
     Attributes
     ----------
-    images : number of images.
-    values : values to cite.
     effect_where : place at which the effects of distortion parameters are stated.
     parameters : table of parameters with their priors and significance.
     vectors, coverage : plots of the residuals and of the number of observations over the frame.

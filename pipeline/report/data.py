@@ -70,7 +70,6 @@ class FrameTotals:
     marks : number of marks by image and status.
     of_targets : number of marks other than fiducials, by kind and status.
     verdicts : number of frames by (camera, kind of file) and verdict.
-    problems : of the frames.
     places_px : distinct positions of the observed marks by axis, see `frame_problems.places_px`.
     """
 
@@ -87,8 +86,6 @@ class ReportData:
 
     Attributes
     ----------
-    comparator : rows of comparator.csv.
-    measurement : scans of measurement.db by image.
     adjustment, check : content of adjustment.json and check.json.
     covariance : content of adjustment.npz.
     frame_mm : width and height of the exposed frame by camera.
@@ -96,7 +93,6 @@ class ReportData:
     thumbnail : returns the thumbnail of a mark from image, point and kind (a fiducial and a target may share a name).
     problems, notes : further ones of the caller.
     made_from : fingerprints of the files by name.
-    unit : of the object coordinates.
     given_by : source of the given fiducial coordinates by camera.
     totals : of all frames if these are many; comparator and measurement then hold only the frames shown.
     """
@@ -164,7 +160,6 @@ class Mark:
     center_px, covariance : (2,) column and row, and covariance in the scan; None if nothing was fitted.
     sigma_um : (2,) standard deviations in x and y; None if unknown.
     residual : row of adjustment.json; None if the mark was not an observation of the adjustment.
-    quality : quality measures of the fit by name.
     """
 
     image: str

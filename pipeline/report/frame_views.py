@@ -181,10 +181,8 @@ class FrameView:
 
     Attributes
     ----------
-    id : HTML anchor.
     fiducials, targets : numbers of observed marks, in words.
     rms : of the residuals in x and y, in `unit`; None without an adjustment.
-    largest_w : largest absolute standardised residual.
     plot, writing : drawings of the residuals and of the writing around the frame.
     stored : record in adjustment.json, None if not adjusted.
     """

@@ -81,7 +81,6 @@ def open_source(scan: Scan, rows_at_a_time: int, scratch: Path) -> Iterator[Sour
     Parameters
     ----------
     rows_at_a_time : rows of the scan that a row of tiles needs.
-    scratch : folder of the decoded file.
     """
     wide = scan.segment_px[1] >= scan.width_px
     if not wide or rows_at_a_time <= scan.rows_kept:

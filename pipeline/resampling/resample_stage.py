@@ -58,8 +58,6 @@ class ResampleTask:
 
     Attributes
     ----------
-    pitch_mm : of the result.
-    max_pixels : limit for `open_scan`.
     scans : one, named as the frame, or several partial ones.
     """
 

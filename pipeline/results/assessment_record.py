@@ -25,12 +25,8 @@ class ResidualRecord:
 
     Attributes
     ----------
-    vx_um, vy_um : residual in comparator coordinates.
-    redundancy_x, redundancy_y : redundancy numbers.
     w_x, w_y, w : standardised residuals by axis, and that of larger absolute value.
     weight : weight factor of the robust estimation, 1 if it was not used.
-    sx_um, sy_um : a-priori standard deviations.
-    x_mm, y_mm : comparator coordinates.
     camera_x_mm, camera_y_mm, camera_vx_um, camera_vy_um : camera coordinates and the residual in them.
     tau_x, tau_y, statistic, smallest_error_x_um, smallest_error_y_um, effect_sigmas : see `Reliability`; effect_sigmas
         is the larger of both axes. None if the reliability was not computed.

@@ -230,7 +230,6 @@ def read_comparator(path: Path, pitch_um: tuple[float, float] | None = None) -> 
 
     Parameters
     ----------
-    path : the file
     pitch_um : pixel width and height for files without mm columns; None: such files are refused
 
     Raises

@@ -256,7 +256,6 @@ def measured_as_shown(project: Project, shown: str, px: Mapping[str, tuple[float
     ----------
     shown : scan from which the templates are learned.
     px : column and row by mark.
-    image : scan to measure.
 
     Raises
     ------
