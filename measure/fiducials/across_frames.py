@@ -6,7 +6,7 @@ places are not changed: film deformation adds a variance to the marks of its fra
 becomes weak.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -93,11 +93,12 @@ def check_frames(
     misfits = {place: each for place, each in found.items() if each is not None}
     if misfits:
         shared, problem = _explain_together(misfits, layout, film.sigma_mm)
+        common = [each for each in (problem, _scattering_film(shared, film)) if each]
         for place, own in shared.frames.items():
             names = [layout.marks[index].id for index in own.sites]
             checked[place], films[place] = _add_findings(checked[place], own, shared, names, film)
-            if problem and own.marks.redundancy:
-                checked[place] = replace(checked[place], problems=(*checked[place].problems, problem))
+            if own.marks.redundancy:
+                checked[place] = replace(checked[place], problems=(*checked[place].problems, *common))
     return CheckedFrames(tuple(checked), tuple(films))
 
 
@@ -179,32 +180,23 @@ def _add_findings(
         reason = Reason(f"it lies {off:.3f} mm from where {has_it}", code)
         frame = add_doubts(frame, {names[mark]: Doubt((off * px_per_mm) ** 2 / 2, cause, reason)})
     added = film_mm**2 - film.added_later_mm**2 if film_mm > film.sigma_mm else 0.0
-    suspect_mm2 = own.suspect_mm2 * np.ones(len(names))
-    variances = np.maximum(added, suspect_mm2)
-    suspects = {name: float(np.sqrt(2 * mm2)) for name, mm2 in zip(names, suspect_mm2, strict=True) if mm2 > 0}
+    variances = np.maximum(added, own.suspect_mm2 * np.ones(len(names)))
     bent = {
-        name: Doubt(variance * px_per_mm**2, Cause.FILM, _suspicion(suspects[name]) if name in suspects else NO_REASON)
+        name: Doubt(variance * px_per_mm**2, Cause.FILM)
         for name, variance in zip(names, variances.tolist(), strict=True)
         if variance > 0
     }
     known_um = 1000 * float(np.sqrt(max(variances.max(), film_mm**2)))  # including what the adjustment adds later
     moved = {names[mark]: Doubt(own.weak_mm2 * px_per_mm**2, cause) for mark in np.flatnonzero(own.weak).tolist()}
-    problem = _problem(own, shared, names, suspects, known_um)
+    problem = _problem(own, shared, names, known_um)
     is_known = own.hypothesis is Hypothesis.PITCH and any(Code.PITCH in each.codes for each in frame.problems)
     other_problems = [each for each in frame.problems if not {*each.codes} & {*problem.codes} & {Code.PERSPECTIVE}]
     problems = (*other_problems, problem) if problem and not is_known else frame.problems
     return replace(add_doubts(add_doubts(frame, bent), moved), problems=problems), film_mm
 
 
-def _suspicion(off_mm: float) -> Reason:
-    """Reason why a mark is weak: it may have the gross error of its frame."""
-    return Reason(f"it may be wrong, by {off_mm:.3f} mm then: its frame is bent or one mark is off", Code.BENT_FRAME)
-
-
-def _problem(
-    own: FrameMisfit, shared: Explanation, names: Sequence[str], suspects: Collection[str], known_um: float
-) -> Reason:
-    """Problem of an outlying frame, empty for any other. suspects: its weak marks; known_um: set standard deviation."""
+def _problem(own: FrameMisfit, shared: Explanation, names: Sequence[str], known_um: float) -> Reason:
+    """Problem of an outlying frame, empty for any other. known_um: standard deviation that its marks are given."""
     if own.film_mm is None:
         return NO_REASON
     alone = len(shared.frames) == 1
@@ -212,7 +204,6 @@ def _problem(
     than = "the given coordinates" if alone else "what the camera's frames have in common"
     p_value = f"p = {own.p_value:.1g} for film deformation alone"
     widened = f"The standard deviation of its marks is set to {known_um:.0f} µm."
-    listed = f"{', '.join(list(suspects)[:_NAMED_MARKS])}{' and others' * (len(suspects) > _NAMED_MARKS)}"
     if own.hypothesis is Hypothesis.PITCH:
         return Reason(
             f"the frame is stretched against {than}; {p_value}. A wrong pitch, or film that is stretched more, "
@@ -239,10 +230,11 @@ def _problem(
         cause = (
             "Film or scanner bent it, or the coordinates are not those of this camera; one frame does not tell which."
         )
-    wrong = f" Or a mark is wrong, which {listed} may be: these are weak." if suspects else ""
+    if own.suspect_mm2.any():
+        cause += " Or one of its marks is wrong: look at all of them."
     return Reason(
         f"the frame is deformed against {than} by up to {most_mm:.3f} mm after an affine transformation; {p_value}. "
-        f"{cause}{wrong} {widened}",
+        f"{cause} {widened}",
         Code.BENT_FRAME,
     )
 
@@ -263,6 +255,18 @@ def _bent_scans(shared: Explanation) -> Reason:
         f"all scans are bent in the same way in the scanner's axes, by up to {most:.3f} mm after an affine "
         f"transformation (p = {shared.pattern.p_value:.1g} without): the scanner does it.",
         Code.BENT_SCANS,
+    )
+
+
+def _scattering_film(shared: Explanation, film: BelievedFilm) -> Reason:
+    """Problem of all frames where film scatters more than it should: next to such frames a wrong mark hides."""
+    if not shared.film_is_more:
+        return NO_REASON
+    return Reason(
+        f"in this camera's frames film or scanner displaces the marks by {1000 * shared.film.sigma:.0f} µm along an "
+        f"axis, where {1000 * film.sigma_mm:.0f} µm are expected: a mark that is wrong by several times as much is not "
+        "seen. Their standard deviations are set to it. If it is right, state film_sigma_um under [adjust].",
+        Code.BENT_FRAME,
     )
 
 

@@ -128,15 +128,15 @@ def test_a_mark_ten_standard_deviations_off_is_mostly_found_in_six_frames() -> N
 
 
 def test_of_four_marks_it_is_the_frame_that_does_not_fit() -> None:
-    """A mark of four may be off, or film bent: the frame says so, and each of its marks is weak, for it may be that."""
+    """A mark of four may be off, or film bent: the frame says so, and its marks are known no better than that."""
     rng = np.random.default_rng(3)
     layout = make_layout(FOUR, sigma_mm=1.0)
     frames = make_frames(layout, 5, rng)
     frames[1] = shift_mark(frames[1], 0, (4.0, 4.0))
     result = check_frames(frames, layout, [(20.0, 20.0)] * 5)
-    assert weak(result.frames) == {("1", mark.point) for mark in result.frames[1].marks}
+    assert weak(result.frames) == set()
     assert [len(frame.problems) for frame in result.frames] == [0, 1, 0, 0, 0]
-    assert "a mark is wrong, which 0, 1, 2, 3 may be: these are weak" in result.frames[1].problems[0]
+    assert "Or one of its marks is wrong: look at all of them." in result.frames[1].problems[0]
     most = re.search(r"by up to (0\.\d+) mm", result.frames[1].problems[0])
     assert most is not None
     assert float(most[1]) == pytest.approx(0.028, abs=0.006)  # a quarter of 0.113 mm at each mark
@@ -186,7 +186,7 @@ def test_a_bent_frame_is_a_problem_of_the_frame(count: int) -> None:
 def test_given_coordinates_that_all_frames_contradict(places: list[tuple[float, float]], count: int) -> None:
     rng, layout = np.random.default_rng(8), make_layout(places)
     result = check_frames(make_frames(layout, count, rng, camera_mm=0.4), layout, [(20.0, 20.0)] * count)
-    assert bool(weak(result.frames)) == (len(places) == 4 and count == 1)  # one of four may be wrong instead
+    assert weak(result.frames) == set()
     for frame in result.frames:
         (problem,) = frame.problems
         assert "given coordinates" in problem
@@ -224,7 +224,7 @@ def test_ordinary_frames_have_no_problem() -> None:
 def test_no_problem_names_a_mark_as_wrong_that_is_measured(places: list[tuple[float, float]], count: int) -> None:
     """Over frames of bent film, with wrong marks and on wrong coordinates: what a problem says of single marks is
     their status, and a measured mark is blamed by none."""
-    rng, blamed, problems = np.random.default_rng(12), 0, 0
+    rng, problems = np.random.default_rng(12), 0
     for off_px, film_mm, camera_mm in [(4.0, 0.005, 0.0), (0.0, 0.08, 0.0), (0.0, 0.005, 0.3), (30.0, 0.02, 0.0)]:
         layout = make_layout(places)
         frames = make_frames(layout, count, rng, camera_mm=camera_mm)
@@ -232,16 +232,11 @@ def test_no_problem_names_a_mark_as_wrong_that_is_measured(places: list[tuple[fl
             make_frames(layout, 1, rng, film_mm=film_mm, camera_mm=camera_mm)[0], 1, (off_px, -off_px)
         )
         for frame in checked_together(frames, layout):
-            measured = {mark.point for mark in frame.marks if mark.status is Status.MEASURED}
             for problem in frame.problems:
                 problems += 1
-                named = re.search(r"a mark is wrong, which ([\d, ]+) ", problem)
-                blamed += bool(named)
-                assert not named or measured.isdisjoint(named[1].split(", ")), (problem, frame.marks)
-                assert "lie off" not in problem
+                assert not re.search(r"mark \d|which \d", problem)
             assert all(bool(mark.reason) == (mark.status is Status.WEAK) for mark in frame.marks)
     assert problems
-    assert blamed or places is EIGHT
 
 
 def test_judging_does_not_depend_on_the_order_of_frames() -> None:
@@ -365,12 +360,26 @@ def test_a_lone_frame_with_a_wrong_mark_is_flagged_and_its_marks_cover_the_error
     for _ in range(10):
         frames, wrong, error_mm = folder(rng, 1)
         result = check_network(frames)
-        assert named(result) == {("0", str(mark)) for mark in range(4)}  # each may be the wrong one, and is weak
+        assert named(result) == set()  # each may be the wrong one, which is the frame's problem
         assert len(result.frames[0].problems) == 1
         known = result.frames[0].marks[wrong].covariance_px2
         assert known is not None
         assert (np.abs(error_mm) <= 2 * np.sqrt(np.diag(known)) / WRONG_MARKS_PX_PER_MM).all()
         assert np.sqrt(known[0, 0]) < 1.5 * WRONG_MARKS_PX_PER_MM
+
+
+def test_film_that_scatters_more_than_expected_is_a_problem_of_all_frames() -> None:
+    """Next to two frames that are bent as well, a mark that is 1 mm off does not stand out."""
+    rng = np.random.default_rng(4)
+    for _ in range(5):
+        frames, wrong, _ = folder(rng, 3)
+        result = check_network(frames)
+        assert named(result) <= {("0", str(wrong))}
+        assert all("state film_sigma_um" in frame.problems[-1] for frame in result.frames)
+        stated = check_frames(
+            frames, make_layout(FOUR), [(1000 / WRONG_MARKS_PX_PER_MM,) * 2] * 3, BelievedFilm(1.0, is_stated=True)
+        )
+        assert not any(frame.problems for frame in stated.frames)
 
 
 @parametrize_with_studies("count", [1, 10])
@@ -379,10 +388,7 @@ def test_of_four_good_marks_on_bent_film_none_is_called_wrong(count: int) -> Non
     for _ in range(5):
         bends = [0.15] + [rng.uniform(0.0, 0.02) for _ in range(count - 1)]
         result = check_network([make_frame(str(k), bent_film(rng, bend), rng) for k, bend in enumerate(bends)])
-        reasons = {str(mark.reason).split(",")[0] for frame in result.frames for mark in frame.marks if mark.reason}
-        assert reasons <= {"it may be wrong"}
-        bent = {str(k) for k, bend in enumerate(bends) if bend > 2 * FILM_MM}  # of 0.02 mm some are seen, rightly
-        assert {image for image, _ in named(result)} <= bent
+        assert named(result) == set()
         assert result.frames[0].problems
 
 
