@@ -6,7 +6,7 @@ import shutil
 import signal
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -32,16 +32,16 @@ _COMPARATOR = rb'(\xef\xbb\xbf)?"?# comparator coordinates, reseau'
 class Unpublished:
     """Results of a command that are not yet published, in a temporary folder beside the earlier results."""
 
-    def __init__(self, project: Project) -> None:
-        self._project = project
-        self.folder = project.output / f".unfinished.{socket.gethostname()}.{os.getpid()}"
+    def __init__(self, output: Path, comparator: Path) -> None:
+        self._output, self._comparator = output, comparator
+        self.folder = output / f".unfinished.{socket.gethostname()}.{os.getpid()}"
         self._removed: list[Path] = []
 
     def place(self, path: Path) -> Path:
         """Temporary path of the result that will be published at `path`."""
-        if path == self._project.comparator:
+        if path == self._comparator:
             return path.with_name(f".{path.stem}{self.folder.name}{path.suffix}")
-        return self.folder / path.relative_to(self._project.output)
+        return self.folder / path.relative_to(self._output)
 
     def current_path(self, path: Path) -> Path:
         """Present path of the result of `path`: the unpublished one, if there is one, else the earlier one."""
@@ -58,13 +58,13 @@ class Unpublished:
         Raises InputError, before anything is changed, where an existing file may not be replaced, and WriteError where
         a file cannot be moved.
         """
-        comparator = self._project.comparator
+        comparator = self._comparator
         files = {self.place(comparator): comparator} if self.place(comparator).exists() else {}
         for file in sorted(self.folder.rglob("*")):
             if file.is_file():
-                files[file] = self._project.output / file.relative_to(self.folder)
+                files[file] = self._output / file.relative_to(self.folder)
         for path in (*files.values(), *self._removed):
-            check_replaceable(self._project, path)
+            _check_replaceable(path, comparator)
         done: list[str] = []
         with _undisturbed():
             try:
@@ -81,14 +81,14 @@ class Unpublished:
 
     def spoken(self, text: str) -> str:
         """Message with final instead of temporary paths."""
-        comparator = self._project.comparator
+        comparator = self._comparator
         return text.replace(str(self.place(comparator)), str(comparator)).replace(f"{self.folder.name}{os.sep}", "")
 
     def discard(self) -> None:
         """Delete everything that was not published."""
         shutil.rmtree(self.folder, ignore_errors=True)
         with suppress(OSError):
-            self.place(self._project.comparator).unlink(missing_ok=True)
+            self.place(self._comparator).unlink(missing_ok=True)
 
 
 @contextmanager
@@ -98,9 +98,9 @@ def unpublished(project: Project) -> Iterator[Unpublished]:
     Raises InputError where they could not be written, before any work is done.
     """
     for path in project.results:
-        check_replaceable(project, path)
-    _clear(project)
-    new = Unpublished(project)
+        _check_replaceable(path, project.comparator)
+    _clear({project.output, project.comparator.parent})
+    new = Unpublished(project.output, project.comparator)
     try:
         with writing(project.output):
             new.folder.mkdir(parents=True, exist_ok=True)
@@ -135,7 +135,7 @@ def _undisturbed() -> Iterator[None]:
             signal.raise_signal(sign)
 
 
-def check_replaceable(project: Project, path: Path) -> None:
+def _check_replaceable(path: Path, comparator: Path) -> None:
     """Raise InputError for a path where something exists that is not a result of this kind: a device, a user's file."""
     if path.is_dir() or (path.exists() and not path.is_file()):
         raise InputError(f"{path}: a result is to be written there, but it is no regular file. Name another place.")
@@ -143,11 +143,11 @@ def check_replaceable(project: Project, path: Path) -> None:
         return
     with path.open("rb") as file:
         head = file.read(_HEAD)
-    form = _COMPARATOR if path == project.comparator else _HEADS.get(path.suffix, rb"(?!)")
+    form = _COMPARATOR if path == comparator else _HEADS.get(path.suffix, rb"(?!)")
     if head and not re.match(form, head, re.DOTALL):
         raise InputError(
             f"{path}: a result is to be written there, but the file that stands there was not written by reseau. Move "
-            f"it away, or name another {'comparator' if path == project.comparator else 'output'} in the project."
+            f"it away, or name another {'comparator' if path == comparator else 'output'} in the project."
         )
 
 
@@ -159,10 +159,10 @@ def outside_note(project: Project) -> str:
     return f"Results are written outside the project's folder: to {', '.join(outside)}." if outside else ""
 
 
-def _clear(project: Project) -> None:
+def _clear(folders: Iterable[Path]) -> None:
     """Delete temporary results of processes that ended before they could do so."""
     pattern = re.compile(rf".*\.unfinished\.{re.escape(socket.gethostname())}\.(\d+)(\..*)?")
-    for folder in {project.output, project.comparator.parent}:
+    for folder in folders:
         for path in folder.glob(".*unfinished.*") if folder.is_dir() else ():
             found = pattern.fullmatch(path.name)
             if found is None or _is_alive(int(found[1])):

@@ -84,7 +84,7 @@ def run_all(project: Project, reporter: Reporter, work: WorkOptions | None = Non
                 for path in (project.adjustment_path, covariance_path(project.adjustment_path), project.check_path):
                     run.new.remove(path)  # of an earlier run
             else:
-                run.write_adjustment(adjustment)
+                run.write_adjustment(adjustment, run.marks())
                 run.write_check(adjustment)
             summary = run.report()
         except WriteError:
@@ -131,7 +131,8 @@ def run_adjust(project: Project, reporter: Reporter) -> Summary:
     with _running(project, reporter) as run:
         with run.stage("adjusting", project.comparator.name):
             # The result is not kept: it takes as much memory as the file that the summary reads.
-            run.write_adjustment(adjust_marks(project, run.marks()))
+            marks = run.marks()
+            run.write_adjustment(adjust_marks(project, marks), marks)
         earlier = project.adjustment_path
         if earlier.exists() and hash_file(earlier) != hash_file(run.new.current_path(earlier)):
             run.new.remove(project.check_path)  # it belongs to the earlier adjustment
@@ -303,8 +304,8 @@ class _Run:
         if self.project.images_path is not None:
             fill_images(self.project.images_path, for_images(scans, WRITTEN))
 
-    def write_adjustment(self, adjustment: Adjustment) -> None:
-        made_from = adjusted_from(self.project, self.marks())
+    def write_adjustment(self, adjustment: Adjustment, marks: Sequence[ComparatorPoint]) -> None:
+        made_from = adjusted_from(self.project, marks)
         write_adjustment(adjustment, self.new.place(self.project.adjustment_path), made_from, self._frames_mm())
 
     def _frames_mm(self) -> dict[str, tuple[float, float]]:

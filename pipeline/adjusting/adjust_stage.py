@@ -1,7 +1,7 @@
 """`reseau adjust` and `reseau choose`: adjust comparator coordinates, with scanner terms and the eccentricity of disks;
 select film deformation and distortion model."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -25,6 +25,7 @@ from pipeline.adjusting.network import build_network
 from pipeline.archive.measurement import adjusted_from
 from pipeline.errors import InputError
 from pipeline.files.project_file import ASSUMED_PITCH_UM, Project
+from pipeline.files.project_tables import AdjustSettings
 from pipeline.measuring.target_field import (
     across,
     check_spacing,
@@ -109,41 +110,45 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
     if project.disk_radius > 0.0:
         check_spacing(project, target_field(project))
     network, left_out = build_network(project, marks)
-    options = adjustment_options(project)
+    misnamed, notes = _misnamed(project, marks), (*_assumed_pitch(project), *_unmeasured(project, marks))
+    options = adjustment_options(project.adjust)
     adjusted = partial(adjust, options=options)
     network, untold = add_scanner_bends(project, network, adjusted)
     first = adjust_unmodelled(network, adjusted) if project.adjust.unmodelled == "estimate" else adjusted(network)
     adjustment, network = first, first.network  # without images that were left out
     uncorrected = np.zeros_like(network.observations.xy_mm)
     if project.disk_radius > 0.0:
-        adjustment, uncorrected = _correct_eccentricity(project, network, adjustment, options)
-    warnings = (*left_out, *untold, *_misnamed(project, marks), *_not_corrected(network, uncorrected))
-    notes = (*_assumed_pitch(project), *_unmeasured(project, marks))
-    remarks = (*adjustment.remarks, *warnings)
+        normals = project.given_points.normals if project.given_points else {}
+        eccentricities = partial(_eccentricities, given=normals, radius=project.disk_radius)
+        adjustment, uncorrected = _correct_eccentricity(network, adjustment, options, eccentricities)
+    remarks = (*adjustment.remarks, *left_out, *untold, *misnamed, *_not_corrected(network, uncorrected))
     return replace(adjustment, unmodelled_mm=first.unmodelled_mm, remarks=remarks, unused=notes)
 
 
-def adjustment_options(project: Project) -> Options:
+def adjustment_options(settings: AdjustSettings) -> Options:
     return Options(
-        datum=project.adjust.datum,
-        datum_coordinates=project.adjust.datum_coordinates,
-        datum_points=project.adjust.datum_points,
-        robust=project.adjust.robust,
-        variance_components=project.adjust.variance_components,
-        snooping=project.adjust.snooping,
-        method=project.adjust.method,
+        datum=settings.datum,
+        datum_coordinates=settings.datum_coordinates,
+        datum_points=settings.datum_points,
+        robust=settings.robust,
+        variance_components=settings.variance_components,
+        snooping=settings.snooping,
+        method=settings.method,
     )
 
 
 def _correct_eccentricity(
-    project: Project, network: Network, adjustment: Adjustment, options: Options
+    network: Network,
+    adjustment: Adjustment,
+    options: Options,
+    eccentricities: Callable[[Adjustment], tuple[Array, Array]],
 ) -> tuple[Adjustment, Array]:
     """Iterate adjustment and correction of disks; also return the largest uncorrected eccentricities (n, 2), mm."""
     applied = uncorrected = np.zeros_like(network.observations.xy_mm)
     for _ in range(_ROUNDS):
         if not adjustment.converged:
             break
-        wanted, uncorrected = _eccentricities(project, adjustment)
+        wanted, uncorrected = eccentricities(adjustment)
         if _largest_sigmas(network, wanted - applied) < _SETTLED_SIGMAS:
             break
         applied = wanted
@@ -154,16 +159,14 @@ def _correct_eccentricity(
     return adjustment, uncorrected
 
 
-def _eccentricities(project: Project, adjustment: Adjustment) -> tuple[Array, Array]:
+def _eccentricities(adjustment: Adjustment, given: Mapping[str, Array], radius: float) -> tuple[Array, Array]:
     """(n, 2) mm, eccentricities to be subtracted, and largest possible ones of disks with unknown normals."""
     network = adjustment.network
     observations = network.observations
     ids = [point.id for point in network.points]
     coordinates = adjusted_places(adjustment, ids)
     row_of = {id: row for row, id in enumerate(ids)}
-    given = project.given_points.normals if project.given_points else {}
     plane = plane_normal(coordinates)
-    radius = project.disk_radius
     known_part, unknown_part = np.zeros_like(observations.xy_mm), np.zeros_like(observations.xy_mm)
     for image in network.images:
         rows = [
@@ -250,7 +253,7 @@ def run_choose(project: Project, reporter: Reporter) -> tuple[Choice, ChoiceReco
             own = adjust_marks(project, marks)
             choice = choose(
                 replace(own, network=name_scanners(project, own.network)),
-                adjustment_options(project),
+                adjustment_options(project.adjust),
                 half_mm,
                 lambda name, done: count(name, done, done + 1),
             )

@@ -4,6 +4,7 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -45,17 +46,17 @@ def check_fiducials(project: Project, marks: Sequence[ComparatorPoint]) -> None:
                     f"{mark.point!r}. It has {', '.join(ids) or 'none'}."
                 )
         if not project.scans:
-            _check_fiducial_unit(project, camera, own)
+            _check_fiducial_unit(project.comparator, camera, own)
 
 
-def _check_fiducial_unit(project: Project, camera: CameraFile, marks: Sequence[ComparatorPoint]) -> None:
+def _check_fiducial_unit(comparator: Path, camera: CameraFile, marks: Sequence[ComparatorPoint]) -> None:
     """Compare extents: in µm, inches or pixels they differ from the camera's by more than film deformation."""
     given = {one.id: one.xy_mm for one in camera.fiducials if max(one.sigma_mm) < math.inf}
     known = [(mark.xy_mm, given[mark.point]) for mark in marks if mark.xy_mm is not None and mark.point in given]
     diagonals = np.hypot(*np.ptp(np.array(known), axis=0).T).tolist() if known else [0.0, 0.0]  # measured, given
     if all(diagonals) and not 1 / OTHER_UNIT < diagonals[0] / diagonals[1] < OTHER_UNIT:
         raise InputError(
-            f"{project.comparator}, line {marks[0].line}: the fiducials of image {marks[0].image!r} stand "
+            f"{comparator}, line {marks[0].line}: the fiducials of image {marks[0].image!r} stand "
             f"{diagonals[0] / diagonals[1]:.3g} times as far apart as those of {camera.path}. Give both in mm: not in "
             "µm, inches or pixels."
         )
@@ -87,8 +88,8 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
     used, lonely = _locatable(project, used)
     used, left_out = _orientable(project, used)
     names = dict.fromkeys(mark.image for mark in used)
-    of_frame = {name: rank for rank, name in enumerate(dict.fromkeys(_frame(project, name) for name in names))}
-    names_by_frame = sorted(names, key=lambda name: of_frame[_frame(project, name)])
+    of_frame = {name: rank for rank, name in enumerate(dict.fromkeys(project.image_frame(name) for name in names))}
+    names_by_frame = sorted(names, key=lambda name: of_frame[project.image_frame(name)])
     images = tuple(_image(project, name) for name in names_by_frame)
     distances, without_end = _distances(project, used)
     cameras, calibrations = _cameras(project, images, used)
@@ -115,7 +116,7 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
 def anything_to_adjust(project: Project, marks: Sequence[ComparatorPoint]) -> bool:
     """Whether there is anything to adjust: object points, or film deformations where fiducials suffice."""
     observed = (mark for mark in marks if mark.kind == "fiducial" and mark.status.is_observation)
-    fiducials = {(_frame(project, mark.image), mark.point): mark.image for mark in observed}
+    fiducials = {(project.image_frame(mark.image), mark.point): mark.image for mark in observed}
     counts = Counter(frame for frame, _ in fiducials)
     image_of = {frame: image for (frame, _), image in fiducials.items()}
     return _expects_targets(project) or any(
@@ -129,27 +130,22 @@ def check_transformation(project: Project) -> None:
         _transformation(project, camera)
 
 
-def _frame(project: Project, image: str) -> str:
-    """Name of the frame that an image is a scan of."""
-    return project.scanned_frame(image) or image
-
-
 def _drop_single_joins(project: Project, marks: Sequence[ComparatorPoint]) -> list[ComparatorPoint]:
     """Drop joins that only one scan of their frame shows."""
-    shown = Counter((_frame(project, mark.image), mark.point) for mark in marks if mark.kind == "join")
+    shown = Counter((project.image_frame(mark.image), mark.point) for mark in marks if mark.kind == "join")
     for mark in marks:
         if mark.kind == "join" and not project.scanned_frame(mark.image):
             raise InputError(
                 f"{project.comparator}, line {mark.line}: image {mark.image!r} shows the join {mark.point!r}, but is "
                 "no part of a frame. Name the frame in the column part_of of images.csv, for all of its scans."
             )
-    return [mark for mark in marks if mark.kind != "join" or shown[_frame(project, mark.image), mark.point] > 1]
+    return [mark for mark in marks if mark.kind != "join" or shown[project.image_frame(mark.image), mark.point] > 1]
 
 
 def _locatable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[ComparatorPoint], tuple[str, ...]]:
     """Drop marks of points that cannot be located: without coordinates, and in one image only."""
     given = {id for id, point in project.object_points.items() if any((point.X, point.Y, point.Z))}
-    shown_points = {(mark.point, _frame(project, mark.image)) for mark in marks if mark.kind not in ON_FILM}
+    shown_points = {(mark.point, project.image_frame(mark.image)) for mark in marks if mark.kind not in ON_FILM}
     images = Counter(point for point, _ in shown_points)
     lonely = {point for point, count in images.items() if count < 2 and point not in given}
     image_of = {point: image for point, image in shown_points if point in lonely}
@@ -166,10 +162,10 @@ def _orientable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[lis
     """Drop marks of images that cannot be oriented, with a sentence on each."""
     # Of an image with too few targets the fiducials remain if they suffice for its film deformation model. Marks in
     # several parts of a frame count once.
-    shown = {(_frame(project, mark.image), mark.kind, mark.point) for mark in marks}
+    shown = {(project.image_frame(mark.image), mark.kind, mark.point) for mark in marks}
     targets = Counter(frame for frame, kind, _ in shown if kind not in ON_FILM)
     fiducials = Counter(frame for frame, kind, _ in shown if kind == "fiducial")
-    first = {_frame(project, mark.image): mark.image for mark in reversed(marks)}
+    first = {project.image_frame(mark.image): mark.image for mark in reversed(marks)}
     images = [replace(_image(project, image), name=frame) for frame, image in reversed(first.items())]
     few = [image for image in images if targets[image.name] < FEWEST_TARGETS and not image.is_observed]
     lost = [image for image in few if not _has_film_transformation(image, fiducials[image.name])]
@@ -200,7 +196,9 @@ def _orientable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[lis
     ]
     dropped = {image.name for image in (*lost, *short)}
     bare = dropped | {image.name for image in few}
-    kept = [mark for mark in marks if _frame(project, mark.image) not in (dropped if mark.kind in ON_FILM else bare)]
+    kept = [
+        mark for mark in marks if project.image_frame(mark.image) not in (dropped if mark.kind in ON_FILM else bare)
+    ]
     return kept, tuple(sentences)
 
 

@@ -143,7 +143,7 @@ def _camera_lots(project: Project, tasks: Sequence[ScanTask]) -> list[OfCamera]:
             lots *= 2
         some = defaultdict[int, list[ScanTask]](list)
         for task in own:
-            some[shard_number(project.scanned_frame(task.name) or task.name, lots)].append(task)
+            some[shard_number(project.image_frame(task.name), lots)].append(task)
         found += [(camera, some[lot]) for lot in sorted(some)]
     return found
 

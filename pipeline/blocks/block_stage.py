@@ -267,7 +267,7 @@ def run_block(project: Project, folder: Path, pitch_um: float | None, reporter: 
         interior = {picture.image: given_interior(cameras[picture.camera]) for picture in pictures}
         poses = oriented_by_control(found, pictures, marks, project.object_points, interior)
         own = written_block(project, folder, (*marks, *ties), poses)
-    left_out = tuple(sorted({project.scanned_frame(mark.image) or mark.image for mark in marks} - set(poses)))
+    left_out = tuple(sorted({project.image_frame(mark.image) for mark in marks} - set(poses)))
     return OrientedBlock(own, len(found.poses), seconds, left_out, len(ties), len({tie.point for tie in ties}))
 
 
@@ -299,7 +299,7 @@ def written_block(
 ) -> Project:
     """Write comparator.csv and images.csv of a block, and return the project that uses them."""
     pitches, given = read_pitches(project.comparator), project.given_images or GivenImages({}, {})
-    frames = {mark.image: project.scanned_frame(mark.image) or mark.image for mark in marks}
+    frames = {mark.image: project.image_frame(mark.image) for mark in marks}
     kept = [mark for mark in marks if mark.kind != "target" or frames[mark.image] in poses]
     write_atomically(folder / "comparator.csv", points_text(kept, pitches))
     exterior: dict[str, Exterior | None] = {}

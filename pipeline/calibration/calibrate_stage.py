@@ -236,7 +236,7 @@ def _chosen_lens(
     if options.lens != "auto":
         return None
     network, _ = build_network(project, marks)
-    adjusted = partial(adjust, options=adjustment_options(project))
+    adjusted = partial(adjust, options=adjustment_options(project.adjust))
     unmodelled_mm = adjust_unmodelled(network, adjusted).unmodelled_mm[camera.name]
     alike = _alike(network, unmodelled_mm)
     return choose_lens(alike, options.square_pixels, options.pixel_mm, adjusted)

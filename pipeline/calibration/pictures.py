@@ -158,7 +158,7 @@ def find_turns(project: Project, marks: Sequence[ComparatorPoint], camera: Camer
     if not sought:
         return replace(camera, turned_deg=known | dict.fromkeys(open_turns, QUARTERS_DEG[0]))
     fixed = sorted(shown - set(sought))
-    adjusted = partial(adjust, options=adjustment_options(project))
+    adjusted = partial(adjust, options=adjustment_options(project.adjust))
 
     def turned_network(images: Collection[str], turns: Mapping[str, int]) -> Network:
         given = project.given_images or GivenImages({}, {})

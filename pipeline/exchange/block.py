@@ -205,7 +205,7 @@ class Block:
         """Group scans into exposed frames (column part_of)."""
         parts: dict[str, list[OutFrame]] = {}
         for scan in scans:
-            parts.setdefault(self.project.scanned_frame(scan.image) or scan.image, []).append(scan)
+            parts.setdefault(self.project.image_frame(scan.image), []).append(scan)
         return [WholeFrame(name, tuple(own)) for name, own in parts.items()]
 
     def unoriented_note(self) -> tuple[str, ...]:

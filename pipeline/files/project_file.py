@@ -231,6 +231,10 @@ class Project:
         """Frame of which an image is one of several scans; "" for a whole frame."""
         return self.given_images.part_of.get(image, "") if self.given_images else ""
 
+    def image_frame(self, image: str) -> str:
+        """Frame that an image shows, as a whole or in part."""
+        return self.scanned_frame(image) or image
+
     def turned_deg(self, image: str) -> int:
         """Counter-clockwise rotation of a digital image relative to the sensor."""
         return self.given_images.turned_deg.get(image, 0) if self.given_images else 0

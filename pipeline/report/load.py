@@ -288,10 +288,10 @@ def _frame_count(data: ReportData) -> int:
     return len({row.image for row in data.comparator})
 
 
-def unread_scans(data: ReportData, project: Project, images: Collection[str] | None = None) -> Iterator[MeasuredScan]:
+def unread_scans(data: ReportData, path: Path, images: Collection[str] | None = None) -> Iterator[MeasuredScan]:
     """Yield the scans of all or some images from measurement.db; none if it belongs to other marks."""
-    digest = data.made_from.get(project.measurement_path.name)
-    return iter(()) if digest is None else measured_scans(project.measurement_path, digest, images)
+    digest = data.made_from.get(path.name)
+    return iter(()) if digest is None else measured_scans(path, digest, images)
 
 
 def report_data(project: Project, at: At, most_frames: int = MOST_FRAMES) -> ReportData:
@@ -305,7 +305,11 @@ def report_data(project: Project, at: At, most_frames: int = MOST_FRAMES) -> Rep
         needed = stored.names - {frame.image for frame in stored.plain}
         return reduced(measured_data(project, at, rows=stored.rows(needed)), stored.scans(needed), camera_of, stored)
     data = adjusted_data(project, at, most_frames)
-    return data if _frame_count(data) <= most_frames else reduced(data, unread_scans(data, project), camera_of)
+    return (
+        data
+        if _frame_count(data) <= most_frames
+        else reduced(data, unread_scans(data, project.measurement_path), camera_of)
+    )
 
 
 def frame_data(project: Project, at: At, images: Collection[str]) -> ReportData:
@@ -316,7 +320,7 @@ def frame_data(project: Project, at: At, images: Collection[str]) -> ReportData:
     for image in images:
         if image not in known:
             raise InputError(f"{project.comparator}: has no image {image!r}.{did_you_mean(image, known)}")
-    scans = {scan.frame.image: scan for scan in unread_scans(data, project, images)}
+    scans = {scan.frame.image: scan for scan in unread_scans(data, project.measurement_path, images)}
     return replace(data, comparator=[row for row in data.comparator if row.image in images], measurement=scans)
 
 

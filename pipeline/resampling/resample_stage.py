@@ -146,7 +146,7 @@ def resample_tasks(
     failed = []
     for measured in read_measurement(project.measurement_path):
         image = measured.frame.image
-        frame = project.scanned_frame(image) or image
+        frame = project.image_frame(image)
         taking_lens = None if project.lens is None else project.lens.lens
         chain = _chain(measured, adjustment, with_lens, frame != image, taking_lens)
         if isinstance(chain, str):
