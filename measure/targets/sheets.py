@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 _RADIAL_FROM, _SECOND_RADIAL_FROM = 10, 30  # points needed to estimate k1, and k2
-_LARGEST_RADIAL = 0.6  # at the image corner, relative
+_LARGEST_RADIAL = 3.0  # at the image corner, relative; a fisheye has up to 1.5
 _SETTLING = 5  # rounds of outlier rejection and refit
 _FAR = 4.0  # in median distances: a point farther off is an outlier
 _LEAST_FAR_PX = 1.0  # lower bound of that distance

@@ -29,7 +29,7 @@ PARAMETERS: dict[LensModel, tuple[str, ...]] = {
     "opencv5": ("k1", "k2", "p1", "p2", "k3"),
     "opencv8": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "fisheye": ("k1", "k2", "k3", "k4"),
-}  # from the simplest; each but the last extends the one before
+}  # each but the last extends the one before
 FOLDS = 5
 FEWEST_PICTURES = 6  # images needed for the cross-validation
 WIDE = 1.0  # half the image's diagonal over the principal distance, above which a fisheye is tried: 45 degrees
@@ -80,8 +80,8 @@ def choose_lens(network: Network, square_pixels: bool, pixel_mm: float, adjusted
         if model == "opencv4":
             c_mm = 0.0 if fitted is None else fitted.value(Parameter.interior(camera.name, "c"))
             is_wide = float(np.hypot(*camera.frame_mm)) / 2.0 > WIDE * c_mm
-        elif _is_better(squares[model], squares[best]):
-            best = model
+        simple, rich = sorted((best, model), key=lambda each: len(PARAMETERS[each]))
+        best = rich if _is_better(squares[rich], squares[simple]) else simple
     sigma_px = np.sqrt(network.observations.covariance_mm2[0, 0, 0]) / pixel_mm
     rms_px = {
         model: None if each is None else float(np.sqrt(each.mean()) * sigma_px) for model, each in squares.items()

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from contextlib import redirect_stdout
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -24,7 +25,7 @@ from rich.console import Console
 from scipy.spatial.distance import cdist
 
 import reseau
-from adjust import adjust
+from adjust import Network, adjust
 from measure import Scan, open_scan
 from measure.boards.specs import (
     ArucoSpec,
@@ -495,6 +496,30 @@ def test_a_fisheye_is_tried_where_the_field_is_wide(monkeypatch: pytest.MonkeyPa
         monkeypatch.setattr(intrinsics, "WIDE", limit)
         choice = choose_lens(network, True, PIXEL_MM, adjust)
         assert set(choice.rms_px) == tried
+
+
+@pytest.mark.parametrize(
+    ("errors", "wanted"),
+    [
+        ({4: 1.0, 5: 1.0, 8: 1.0, "fisheye": 1.0}, "opencv4"),
+        ({4: 9.0, 5: 3.0, 8: 1.0, "fisheye": 1.0}, "fisheye"),
+        ({4: 9.0, 5: 3.0, 8: 1.0, "fisheye": 2.0}, "opencv8"),
+        ({4: 3.0, 5: 3.0, 8: 3.0, "fisheye": 1.0}, "fisheye"),
+    ],
+)
+def test_of_lenses_that_predict_as_well_the_one_with_fewer_parameters_is_taken(
+    errors: dict[int | str, float], wanted: LensModel
+) -> None:
+    network = board_network(np.random.default_rng(4), 6, ERROR_PX * PIXEL_MM)
+    scatter = np.random.default_rng(1).uniform(0.9, 1.1, (9, len(network.images)))
+
+    def adjusted(network: Network) -> Any:
+        distortion = network.cameras[0].distortion
+        count = len(distortion.parameters)
+        squares = errors["fisheye" if "fisheye" in distortion.family else count] * scatter[count]
+        return SimpleNamespace(converged=True, value=lambda _: 1.0, prediction_errors=lambda _: squares)
+
+    assert choose_lens(network, True, PIXEL_MM, adjusted).model == wanted
 
 
 @pytest.mark.parametrize("model", ["opencv4", "opencv5", "opencv8", "fisheye"])
