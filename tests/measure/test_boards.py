@@ -223,7 +223,8 @@ def test_the_lines_of_a_board_are_evenly_spaced_in_a_fisheye(left_out: int | Non
     points = np.stack([*np.meshgrid(25.0 * np.arange(9), 25.0 * np.arange(6)), np.zeros((6, 9))], axis=-1)
     turn = np.array([0.45, -0.2, 0.0])
     shift = np.array([-22.0, 28.0, 175.5]) - cv2.Rodrigues(turn)[0] @ [100.0, 62.5, 0.0]
-    grid = cv2.fisheye.projectPoints(points.reshape(1, -1, 3), turn, shift, matrix, lens)[0].reshape(6, 9, 2)
+    places = cv2.fisheye.projectPoints(points.reshape(1, -1, 3), turn, shift, matrix, lens)[0]
+    grid: Array = np.asarray(places, float).reshape(6, 9, 2)
     if left_out is not None:
         grid = np.delete(grid, left_out, axis=1)
     assert is_even(grid, (640, 480)) == (left_out is None)
