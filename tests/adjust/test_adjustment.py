@@ -14,7 +14,6 @@ from reference_cases import CAMERA, Case, case_approximations, case_network, loa
 from studies import parametrize_with_studies
 
 from adjust import Adjustment, Camera, Distortion, Prior
-from adjust.functional_model.rotation import rotation_from_angles
 from adjust.problem.network import Approximations, Exterior, LineOfSight, Network, ObjectPoint, Transformation
 from adjust.problem.reduction import Reduction
 from adjust.solution.adjustment import Datum, Options, adjust
@@ -320,17 +319,6 @@ def test_variant(case: Callable[[], Variant]) -> None:
         assert np.sqrt(variance) == pytest.approx(sigma, rel=1e-6), name
 
 
-def test_steep_angles_are_the_true_ones() -> None:
-    """Whatever the triple, it is the true rotation to the noise."""
-    network, start = steep_angles()
-    result = adjust(network, start)
-    for i, image in enumerate(network.images):
-        found = rotation_from_angles(
-            np.array([result.value(f"EO.{image.name}.{each}") for each in ("omega", "phi", "kappa")])
-        )
-        assert np.abs(found - rotation_from_angles(np.array(STEEP[i]))).max() < 2e-3
-
-
 Array = NDArray[np.float64]
 
 FAR = np.array([500_000.0, 5_400_000.0, 300.0])
@@ -403,12 +391,6 @@ def test_fixed_coordinates_come_back_as_they_were_given() -> None:
     given = [prior.value for point in network.points for prior in (point.X, point.Y, point.Z) if prior]
     assert [there.value(f"PT.{point.id}.{axis}") for point in network.points for axis in "XYZ"] == given
     assert there.network is network
-
-
-def test_a_field_about_the_origin_is_left_as_it_is() -> None:
-    network = small_network()[0]
-    assert Reduction.to_centroid(network).is_none
-    assert Reduction.to_centroid(network).network(network) is network
 
 
 def test_heights_stay_where_the_line_of_sight_depends_on_them() -> None:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from networks import (
     CONVERGENT_STATIONS,
-    PROJECTED_C_MM,
     SIX_MARKS_MM,
     VERTICAL_STATIONS,
     Projected,
@@ -22,7 +21,7 @@ from reference_cases import case_approximations, case_network, load, own_name
 from scipy.spatial.transform import Rotation
 from studies import parametrize_with_studies
 
-from adjust import AdjustmentError, Distortion, Observations, Options, Prior, adjust, approximate
+from adjust import AdjustmentError, Observations, Options, Prior, adjust, approximate
 from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles, rotation_from_vector
 from adjust.problem.network import EXTERIOR_NAMES, Approximations, Exterior, Network, ObjectPoint, Transformation
 
@@ -67,34 +66,6 @@ def test_every_film_transformation(kind: Transformation, mirrored: bool) -> None
 def test_distortion_known_beforehand_is_taken_off() -> None:
     truth = project_field(relief_field(300.0), CONVERGENT_STATIONS, noise_mm=0.0, distortion=(-0.25, 0.13, 1e-3, -5e-4))
     assert_near(approximate(truth.network), truth, meters=1e-2, radians=1e-5)
-
-
-def test_unknown_distortion_leaves_a_usable_start() -> None:
-    truth = project_field(relief_field(300.0), CONVERGENT_STATIONS, distortion=(-0.2, 0.05, 0.0, 0.0))
-    camera = replace(truth.network.cameras[0], distortion=Distortion("opencv", {"k1": Prior(0.0, np.inf)}))
-    assert_near(approximate(replace(truth.network, cameras=(camera,))), truth, meters=100.0, radians=0.05)
-
-
-def test_unknown_principal_distance_from_a_deep_field() -> None:
-    truth = project_field(relief_field(300.0), CONVERGENT_STATIONS, outliers=0.05)
-    found = approximate(drop_interior(truth.network))
-    assert abs(found.interior["rc20"][0] - PROJECTED_C_MM) < 0.3
-    assert_near(found, truth, meters=5.0, radians=5e-3)
-
-
-def test_unknown_principal_distance_from_twenty_boards() -> None:
-    board = np.array([[x, y, 0.0] for x in range(-4, 5) for y in range(-3, 4)]) * 100.0
-    rng = np.random.default_rng(8)
-    stations = []
-    for _ in range(20):
-        direction = Rotation.from_euler("XYZ", [*rng.uniform(-0.6, 0.6, 2), rng.uniform(-3, 3)])
-        center = direction.apply([0.0, 0.0, rng.uniform(900.0, 1300.0)])
-        stations.append((*center, *direction.as_euler("XYZ")))
-    truth = project_field(board, stations, kind="none", outliers=0.05, distortion=(-0.05, 0.01, 0.0, 0.0))
-    camera = replace(truth.network.cameras[0], distortion=Distortion("opencv", {"k1": Prior(0.0, np.inf)}))
-    found = approximate(replace(drop_interior(truth.network), cameras=(replace(camera, principal_distance_mm=None),)))
-    assert abs(found.interior["rc20"][0] / PROJECTED_C_MM - 1) < 0.05
-    assert_near(found, truth, meters=80.0, radians=0.05)
 
 
 def test_a_principal_distance_that_nothing_shows_is_requested() -> None:

@@ -75,20 +75,6 @@ def test_the_bends_of_exact_views_are_found() -> None:
     assert flat.sigma0 > 5.0  # without them the board does not fit
 
 
-@pytest.mark.study
-def test_claimed_sigmas_of_bends_are_realised() -> None:
-    """Thirty sets of errors: chi-square per degree of freedom of both bends, c and k1 within three sigmas of 1."""
-    rng = np.random.default_rng(8)
-    start = approximate(make_network(None))
-    names = ["BD.board.bend_x", "BD.board.bend_y", "IO.C.c", "IO.C.k1"]
-    squares = []
-    for _ in range(30):
-        found = adjust(make_network(rng), start)
-        errors = np.array([found.value(name) for name in names]) - [*BENDS_MM, C_MM, K1]
-        squares.append(errors @ np.linalg.solve(found.cofactor_of(names), errors))
-    assert abs(np.mean(squares) / 4.0 - 1.0) < 3.0 * np.sqrt(2.0 / (4.0 * len(squares)))
-
-
 @pytest.mark.parametrize("turn", [(0.0, 90.0, 0.0), (40.0, -25.0, 70.0), (10.0, 20.0, -30.0)])
 def test_a_board_lies_anyhow_in_the_object(turn: tuple[float, float, float]) -> None:
     """The same images, the board on another plane and turned in it: the same places but for that turn."""

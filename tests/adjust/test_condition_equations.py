@@ -14,12 +14,11 @@ from studies import parametrize_with_studies
 from adjust import Options, adjust
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Decentering, Distortion, Lens, Prior
-from adjust.functional_model.projection import EARTH_RADIUS_M, rays, sight_vectors
+from adjust.functional_model.projection import EARTH_RADIUS_M, sight_vectors
 from adjust.functional_model.rotation import (
     angles_from_rotation,
     rotation_from_angles,
     rotation_from_vector,
-    vector_by_angles,
 )
 from adjust.problem.condition_equations import compute, computed_observations, derivatives
 from adjust.problem.estimates import adjusted_image
@@ -71,25 +70,6 @@ def test_image_equations_by_complex_steps(family: str, decentering: Decentering)
             np.testing.assert_allclose(derivative[..., column], numeric, rtol=0, atol=2e-14 * scale)
 
 
-def test_rotation_is_the_product_of_three() -> None:
-    omega, phi, kappa = 0.3, -0.7, 2.1
-    so, co, sp, cp, sk, ck = (f(a) for a in (omega, phi, kappa) for f in (np.sin, np.cos))
-    r1 = [[1, 0, 0], [0, co, so], [0, -so, co]]
-    r2 = [[cp, 0, -sp], [0, 1, 0], [sp, 0, cp]]
-    r3 = [[ck, sk, 0], [-sk, ck, 0], [0, 0, 1]]
-    product = np.array(r3) @ np.array(r2) @ np.array(r1)
-    np.testing.assert_allclose(rotation_from_angles(np.array([omega, phi, kappa])), product, atol=1e-15)
-
-
-def test_rotation_vector_by_angles() -> None:
-    """M(angles + d) is, to first order, the rotation by J d on top of M(angles)."""
-    angles = np.array([0.3, -0.7, 2.1])
-    jacobian = vector_by_angles(angles)
-    step = 1e-7 * np.array([0.4, -1.0, 0.7])
-    moved = rotation_from_vector(jacobian @ step) @ rotation_from_angles(angles)
-    np.testing.assert_allclose(moved, rotation_from_angles(angles + step), atol=1e-13)
-
-
 @pytest.mark.parametrize("length", [1e-9, 0.3, 1.4, 3.1])
 def test_a_rotation_vector_is_the_rotation_of_other_programs(length: float) -> None:
     vector = length * np.array([2.0, -3.0, 6.0]) / 7.0
@@ -101,18 +81,6 @@ def test_angles_of_any_rotation() -> None:
         np.testing.assert_allclose(rotation_from_angles(angles_from_rotation(matrix)), matrix, atol=1e-12)
     locked = rotation_from_angles(np.array([0.4, np.pi / 2, 0.3]))
     np.testing.assert_allclose(rotation_from_angles(angles_from_rotation(locked)), locked, atol=1e-12)
-
-
-def test_rays_accept_complex_steps() -> None:
-    rng = np.random.default_rng(5)
-    rotation = rotation_from_angles(np.array([0.1, 0.2, 0.3]))
-    xyz = rng.uniform(-1, 1, (4, 3)).astype(complex)
-    xyz[:, 2] += -10 + 1j * STEP
-    ray, in_camera = rays(rotation, xyz)
-    u, v, w = in_camera.real.T
-    m = rotation[:, 2]
-    expected = np.stack([-m[0] / w + u * m[2] / w**2, -m[1] / w + v * m[2] / w**2], axis=1)
-    np.testing.assert_allclose(ray.imag / STEP, expected, rtol=1e-13)
 
 
 @pytest.mark.parametrize("by_elements", [False, True])
@@ -235,30 +203,6 @@ def test_curvature_is_spherical_geometry() -> None:
         geocentric = (EARTH_RADIUS_M + point[2]) * direction - [0.0, 0.0, EARTH_RADIUS_M + station[2]]
         np.testing.assert_allclose(vector, geocentric, atol=1e-6)
         assert vector[2] - (point[2] - station[2]) == pytest.approx(-(plan @ plan) / (2 * EARTH_RADIUS_M), rel=5e-4)
-
-
-def test_published_formulas() -> None:
-    """dr = H r³ / (2 R c²) of the curvature, dr = K (r + r³/c²) of the refraction, K by Saastamoinen; r in the image.
-
-    Saastamoinen: K = 13 (H - h) (1 - 0.02 (2 H + h)) 1e-6, heights in km. The older K of the Manual of Photogrammetry,
-    from the ARDC atmosphere of 1959, agrees to 4e-6.
-    """
-    c, r = 153.0, 110.0
-    for station_km, point_km in ((1.0, 0.0), (4.0, 0.5), (8.0, 0.0)):
-        flying_m = 1000.0 * (station_km - point_km)
-        station, xyz = np.array([0.0, 0.0, flying_m]), np.array([[flying_m * r / c, 0.0, 0.0]])
-        x, _, z = sight_vectors(LineOfSight(curvature=True), station, xyz).vector[0]
-        assert -c * x / z - r == pytest.approx(-flying_m * r**3 / (2 * EARTH_RADIUS_M * c**2), rel=1e-3)
-        above_sea = [0.0, 0.0, 1000.0 * point_km]
-        x, _, z = sight_vectors(LineOfSight(refraction=True), station + above_sea, xyz + above_sea).vector[0]
-        k = (-c * x / z - r) / (r + r**3 / c**2)
-        saastamoinen = 13e-6 * (station_km - point_km) * (1 - 0.02 * (2 * station_km + point_km))
-        assert k == pytest.approx(saastamoinen, rel=0.02)
-
-        def ardc(height: float) -> float:
-            return 2410e-6 * height / (height**2 - 6 * height + 250)
-
-        assert k == pytest.approx(ardc(station_km) - ardc(point_km) * point_km / station_km, abs=4e-6)
 
 
 def test_the_unit_of_the_object_does_not_matter() -> None:

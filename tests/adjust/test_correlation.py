@@ -61,14 +61,6 @@ def test_the_datum_of_the_fiducials_does_not_hide_a_correlation() -> None:
         assert second.rho == pytest.approx(third.rho, abs=1e-4)
 
 
-def test_the_remedy_lowers_the_correlation() -> None:
-    """Relief of 500 m, and images tilted by 20 degrees: c and Z0 are no longer told."""
-    tilted = replace(LOW_RELIEF, attitudes=CONVERGENT, relief=500.0)
-    for setup, result in ((LOW_RELIEF, True), (tilted, False)):
-        pairs = [each.parameters[0].text for each in adjust(*setup.network()).correlations]
-        assert ("IO.K.c" in pairs) == result
-
-
 def test_a_wider_field_tells_the_principal_point_from_tilts_and_decentering() -> None:
     text = " ".join(sentences(adjust(*MISHAPS["narrow-field"].network())))
     assert "x0' and p1 of camera K are correlated by" in text
@@ -96,10 +88,6 @@ def test_powers_of_the_radius_and_decentering_are_reported() -> None:
     assert powers
     assert all("neighbouring powers of the radius" in each.cause for each in powers)
     assert all("Compare the curve" in each.remedy for each in powers)
-
-
-def test_nothing_is_reported_without_a_solution() -> None:
-    assert adjust(*Setup(CONVERGENT).network()).correlations == ()
 
 
 Array = NDArray[np.float64]
@@ -224,13 +212,6 @@ def test_redundancy_counts_what_pseudo_observations_determine() -> None:
     observed = 2 * len(result.network.observations)
     assert observed - result.unknowns < result.redundancy <= observed - result.unknowns + 4
     assert result.redundancy == pytest.approx(result.residuals.redundancy.sum(), abs=1.0)
-
-
-def test_the_other_lenses_have_no_pseudo_observations() -> None:
-    network = board_network(0, ("k1", "k2", "p1", "p2", "k3"))
-    result = adjust(network)
-    assert not result.notes
-    assert result.redundancy == 2 * len(network.observations) - result.unknowns
 
 
 @pytest.mark.study

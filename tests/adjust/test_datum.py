@@ -8,11 +8,9 @@ from networks import Truth, rotation, simulated
 from numpy.typing import NDArray
 from reference_cases import case_approximations, case_network, load
 
-from adjust import Adjustment, AdjustmentError, Fiducial, Prior, approximate
+from adjust import Adjustment, AdjustmentError, Prior, approximate
 from adjust.functional_model.rotation import angles_from_rotation
 from adjust.problem.network import EXTERIOR_NAMES, Exterior, Image, Network, ObjectPoint
-from adjust.problem.problem import number
-from adjust.rank_defect.datum import object_datum
 from adjust.solution.adjustment import Datum, Options, adjust
 
 Array = NDArray[np.float64]
@@ -186,18 +184,6 @@ def test_a_coordinate_that_is_given_needs_no_holding() -> None:
         adjust(network, start, Options("minimal", ("0.X",)))
 
 
-def test_a_generator_moves_a_point_at_the_fields_root_mean_square_distance_by_one_unit() -> None:
-    network, start = simulated(np.random.default_rng(5), point_sigma=np.inf)
-    problem = number(network, start)
-    datum = object_datum(problem, problem.start())
-    points = np.array(list(start.points.values()))
-    spread = np.sqrt(((points - points.mean(axis=0)) ** 2).sum() / len(points))
-    assert datum.extent == pytest.approx(spread, rel=1e-9)
-    positions = np.array([problem.unknowns.point[name] for name in start.points])
-    motions = datum.generators[positions, 6]
-    np.testing.assert_allclose(motions, (points - points.mean(axis=0)) / spread, atol=1e-9)
-
-
 @pytest.mark.parametrize("carrying", [(), ("1", "5", "7")], ids=["all", "some"])
 def test_inner_constraints_have_the_least_trace_and_leave_centre_turn_and_size(carrying: tuple[str, ...]) -> None:
     """The pseudo-inverse of the points' normal equations: no datum gives a smaller trace of their cofactors."""
@@ -297,23 +283,3 @@ def test_a_datum_that_is_given_is_left_alone(datum: Datum) -> None:
         assert other.unknowns == plain.unknowns
         np.testing.assert_array_equal(other.values, plain.values)
         np.testing.assert_allclose(whole(other), whole(plain), rtol=1e-9)
-
-
-@pytest.mark.parametrize("held", [True, False])
-def test_fiducials_alone_are_adjusted(held: bool) -> None:
-    """No object point at all, orientations known: the films' transformations and the mean of the fiducials."""
-    truth = Truth()
-    network, start = simulated(np.random.default_rng(14), truth, points=np.zeros((0, 3)))
-    camera = network.cameras[0]
-    if not held:
-        free = {
-            id_: Fiducial(Prior(m.x_mm.value, np.inf), Prior(m.y_mm.value, np.inf))
-            for id_, m in camera.fiducials.items()
-        }
-        network = replace(network, cameras=(replace(camera, fiducials=free),))
-    result = adjust(set_exteriors(network, np.zeros(6), truth), start)
-    if held:
-        assert result.converged
-        assert result.groups["fiducial"].redundancy == pytest.approx(4 * 10 - 4 * 6 - 10 + 6, abs=0.1)
-    else:
-        assert len(result.singular) == 6

@@ -9,12 +9,8 @@ from numpy.typing import NDArray
 
 from adjust import AdjustmentError, adjust, approximate
 from adjust.functional_model.transformation import (
-    HIGHEST_ORDER,
     Film,
-    fewest_marks,
     film_kind,
-    film_parameter_names,
-    marks_needed,
 )
 from adjust.initial_values.fiducial_fit import fit_transformation
 from adjust.problem.network import Image, Network, Transformation
@@ -56,24 +52,6 @@ def test_derivatives_by_complex_steps(kind: Transformation, mirrored: bool) -> N
 
 
 @mirrors
-@pytest.mark.parametrize("kind", [*KINDS, f"conformal({HIGHEST_ORDER})", f"polynomial({HIGHEST_ORDER})"])
-def test_centred_parameters_are_those_of_the_formula_about_the_middle(kind: Transformation, mirrored: bool) -> None:
-    """What they move, through the parameters as reported, is their own design; and that design is well conditioned."""
-    formula = film_kind(kind, mirrored)
-    rng = np.random.default_rng(2)
-    parameters = rng.uniform(-1.0, 1.0, len(formula.names)) * 1e-3
-    half = np.asarray(110.0)
-    places = MIDDLE_MM + rng.uniform(-110.0, 110.0, (60, 2))
-    centred = formula.design(parameters, places, MIDDLE_MM, half)
-    back = formula.centred_jacobian(parameters, MIDDLE_MM, half)
-    raw = formula.design(parameters, places, np.zeros(2), ONE)
-    np.testing.assert_allclose(raw @ back, centred, rtol=0, atol=1e-10)
-    if parameters.size and kind != "projective":
-        flat = centred.reshape(-1, len(parameters))
-        assert np.linalg.cond(flat / np.linalg.norm(flat, axis=0)) < 100.0
-
-
-@mirrors
 @all_kinds
 def test_the_inverse_leads_back(kind: Transformation, mirrored: bool) -> None:
     film = Film(kind, make_parameters(kind, mirrored), MIDDLE_MM, mirrored)
@@ -99,25 +77,6 @@ def test_what_folds_over_is_not_found(
     xy, regular = film.comparator_from_camera(np.array(camera, dtype=float))
     assert regular.tolist() == found
     np.testing.assert_allclose(film.camera_from_comparator(xy)[regular], np.array(camera)[regular], atol=1e-9)
-
-
-def test_numbers_of_parameters_and_marks() -> None:
-    counts = {kind: (len(film_parameter_names(kind)), marks_needed(kind), fewest_marks(kind)) for kind in KINDS}
-    assert counts == {
-        "none": (0, 0, 0),
-        "congruent": (3, 2, 2),
-        "similarity": (4, 2, 2),
-        "affine": (6, 3, 3),
-        "projective": (8, 4, 3),
-        "bilinear": (8, 4, 3),
-        "conformal(1)": (4, 2, 2),
-        "conformal(2)": (6, 3, 2),
-        "conformal(3)": (8, 4, 2),
-        "polynomial(1)": (6, 3, 3),
-        "polynomial(2)": (12, 6, 3),
-        "polynomial(3)": (20, 10, 3),
-    }
-    assert film_parameter_names("projective") == ("a1", "a2", "a3", "b1", "b2", "b3", "c1", "c2")
 
 
 @pytest.mark.parametrize(
@@ -233,12 +192,6 @@ def test_small_residuals_are_no_gross_errors() -> None:
     design = np.column_stack([np.ones(8), comparator])
     least_squares = np.linalg.lstsq(design, MARKS_MM)[0]
     np.testing.assert_allclose(found, [*least_squares[:, 0], *least_squares[:, 1]], atol=1e-9)
-
-
-def test_none_has_no_parameters() -> None:
-    found, mirrored = fit_transformation("none", np.zeros((0, 2)), np.zeros((0, 2)))
-    assert found.shape == (0,)
-    assert not mirrored
 
 
 BENT = ["projective", "bilinear", "conformal(2)", "conformal(3)", "polynomial(2)", "polynomial(3)"]

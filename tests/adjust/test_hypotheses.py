@@ -29,7 +29,6 @@ from studies import parametrize_with_studies
 
 from adjust import Adjustment, AdjustmentError, Distortion, Network, ObjectPoint, Options, Prior, adjust, approximate
 from adjust.problem.tested import Probabilities
-from adjust.solution.blunder_hypotheses import AXES, reversed_y
 from adjust.solution.explanations import explain
 from adjust.solution.unmodelled_error import adjust_unmodelled
 
@@ -422,26 +421,6 @@ def test_flat_fields_are_mirrored_by_their_stations_alone() -> None:
     ]
     assert ["X and Y of all points are exchanged" in each for each in finding] == [True]
     assert not [each for each in adjust(given).warnings if "nowhere near" in each]
-
-
-def test_every_mirror_is_its_own_inverse_and_turns_the_hand() -> None:
-    for words, moved in AXES.items():
-        np.testing.assert_array_equal(moved @ moved, np.eye(3), err_msg=words)
-        assert np.linalg.det(moved) == pytest.approx(-1.0)
-
-
-def test_y_is_reversed_in_the_comparator_and_in_the_cameras() -> None:
-    network = blunder_network(4)
-    half = [replace(each, transformation="none") if i % 2 else each for i, each in enumerate(network.images)]
-    network = replace(network, images=tuple(half))
-    turned = reversed_y(network)
-    digital = np.array([image.transformation == "none" for image in network.images])[network.image_numbers]
-    sign = np.where(digital[:, None], [1.0, -1.0], 1.0)
-    np.testing.assert_array_equal(turned.observations.xy_mm, sign * network.observations.xy_mm)
-    assert [each.center_mm[1] for each in turned.cameras] == [-each.center_mm[1] for each in network.cameras]
-    back = reversed_y(turned)
-    np.testing.assert_array_equal(back.observations.xy_mm, network.observations.xy_mm)
-    assert back.cameras == network.cameras
 
 
 def test_sigmas_that_are_somewhat_too_small_are_no_slip() -> None:

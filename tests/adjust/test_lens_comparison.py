@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from networks import field_points, join_networks, map_priors, rename_network, simulated
 from numpy.typing import NDArray
-from studies import parametrize_with_studies
 
 from adjust import Adjustment, AdjustmentError, Calibration, Parameter, adjust
 from adjust.functional_model.lens import Distortion, Lens, Prior
 from adjust.problem.network import Approximations, Network, Transformation
-from adjust.quality.lens_comparison import CameraCalibration, compare, sigmas
+from adjust.quality.lens_comparison import CameraCalibration, compare
 from adjust.quality.significance import CalibrationTest
 
 Array = NDArray[np.float64]
@@ -88,30 +87,6 @@ def test_a_trend_is_tested_at_its_level_and_found() -> None:
     still = compare([calibration(TRUE + drift * (year - years[0])) for year in years], HALF, years)
     ends = compare([calibration(TRUE), calibration(TRUE + drift * 18.0)], HALF)
     assert still.trend_um == pytest.approx(ends.field_um[0], abs=0.05)
-
-
-@pytest.mark.study
-def test_the_sigmas_of_the_field_hold() -> None:
-    rng = np.random.default_rng(3)
-    compared = [compare([draw_calibration(rng), draw_calibration(rng)], HALF) for _ in range(200)]
-    claimed = sigmas(compared[0].field_covariance_um2[0])
-    realised = np.std([each.field_um[0] for each in compared], axis=0)
-    view = claimed > 0.1
-    assert view.sum() > 60
-    assert np.median(realised[view] / claimed[view]) == pytest.approx(1.0, abs=0.06)
-    of_marks = np.std([each.fiducials_um[0] for each in compared], axis=0)
-    assert np.median(of_marks / sigmas(compared[0].fiducials_covariance_um2[0])) == pytest.approx(1.0, abs=0.08)
-
-
-@parametrize_with_studies(("sigmas", "least"), [(3.0, 0.1), (8.0, 0.9)], quick=(1,))
-def test_a_change_is_found_the_oftener_the_larger_it_is(sigmas: float, least: float) -> None:
-    rng = np.random.default_rng(4)
-    change = np.zeros(7)
-    change[4] = sigmas * np.sqrt(2 * (1 - 0.81)) * SIGMAS[4]  # of k5, of which k3 can take up most
-    found = [
-        compare([draw_calibration(rng), draw_calibration(rng, change)], HALF).same.probability < 0.05 for _ in range(60)
-    ]
-    assert np.mean(found) >= least
 
 
 def test_another_fiducial_frame_is_no_change() -> None:

@@ -9,13 +9,12 @@ import pytest
 from networks import Truth, camera_point, digital_network, field_points, given_interior, simulated
 from numpy.typing import NDArray
 
-from adjust import AdjustmentError, Approximations, Camera, Network, adjust, approximate
+from adjust import AdjustmentError, Camera, Network, adjust, approximate
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Lens, Prior
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.transformation import Film
-from adjust.problem.estimates import adjusted_image
 
 Array = NDArray[np.float64]
 
@@ -116,31 +115,6 @@ def test_corrected_points_are_opencvs_undistorted_points() -> None:
     np.testing.assert_allclose(ideal, expected, atol=1e-9)
 
 
-def test_adjustment_recovers_opencvs_parameters() -> None:
-    """Exact images by OpenCV, its parameters and fx/fy free: estimated as they went in."""
-    rng = np.random.default_rng(6)
-    x, y = (100.0 * each.ravel() for each in np.meshgrid(np.arange(-6.0, 7.0), np.arange(-5.0, 6.0)))
-    relief = np.stack([x, y, 150 * np.sin(x / 70)], axis=1)
-    tilts = [(0.0, 0.0, 0.0), (0.4, 0.1, 1.5), (-0.4, 0.2, 3.0), (0.1, 0.45, -1.5), (-0.1, -0.4, 0.7)]
-    poses = [(np.array(tilt), np.array([1200 * tilt[1], -1200 * tilt[0], 1150.0])) for tilt in tilts]
-    rows = [
-        (f"i{i}", str(j), xy) for i, pose in enumerate(poses) for j, xy in enumerate(mm(opencv_pixels(*pose, relief)))
-    ]
-    start = Approximations(
-        {"D": INTERIOR * [1.01, 1.0, 1.0] + [0.0, 0.1, -0.1]},
-        {f"i{i}": np.concatenate([s + rng.uniform(-10, 10, 3), a + rng.uniform(-0.02, 0.02, 3)])
-         for i, (a, s) in enumerate(poses)},
-        {}, {},
-    )  # fmt: skip
-    result = adjust(digital_network(camera(True), rows, numbered(relief), 0.0005), start)
-    assert result.converged
-    assert result.vpv < 1e-12
-    expected = dict(zip((*NAMES, "c", "x0", "y0", "b1"), (*DISTORTION, *INTERIOR, FX / FY - 1), strict=True))
-    for name, value in expected.items():
-        i = result.index(f"IO.D.{name}")
-        assert result.values[i] == pytest.approx(value, abs=1e-3 * np.sqrt(result.cofactor.variances[i]))
-
-
 def test_torlegard_is_inverted() -> None:
     truth = Truth()
     xyz = field_points(np.random.default_rng(1), 30)
@@ -173,18 +147,6 @@ def test_what_has_no_image_is_reported() -> None:
     model = ImageModel(Lens(Distortion(), np.array([100.0, 0.0, 0.0]), np.empty(0)), np.eye(3), np.zeros(3), NO_FILM)
     _, visible = model.comparator_from_object(np.array([[0.0, 0.0, -5.0], [0.0, 0.0, 5.0], [1.0, 0.0, 0.0]]))
     assert list(visible) == [True, False, False]
-
-
-def test_adjusted_image_predicts_its_observations() -> None:
-    xyz = field_points(np.random.default_rng(1), 12)
-    network, start = simulated(np.random.default_rng(9), points=xyz, noise=False)
-    result = adjust(network, start)
-    predicted, visible = adjusted_image(result, "f2").comparator_from_object(xyz)
-    observations = network.observations
-    keys = zip(observations.image, observations.kind, strict=True)
-    rows = [row for row, key in enumerate(keys) if key == ("f2", "target")]
-    assert visible.all()
-    np.testing.assert_allclose(predicted, observations.xy_mm[rows], atol=1e-8)
 
 
 RATIONAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")

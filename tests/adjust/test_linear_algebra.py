@@ -19,7 +19,7 @@ from adjust.least_squares.rows import WhitenedRows, prior_root_weights
 from adjust.linear_algebra import elimination, fronts, sparse_factor
 from adjust.linear_algebra.elimination import eliminate
 from adjust.linear_algebra.factor import Blocks, Factor
-from adjust.linear_algebra.fronts import Fronts, make_fronts
+from adjust.linear_algebra.fronts import make_fronts
 from adjust.problem.problem import number
 from adjust.rank_defect import diagnosis
 
@@ -101,15 +101,6 @@ def test_the_condition_is_not_squared() -> None:
     block = single(np.array([2, 3]), np.array([0, 1]), matrix, matrix @ truth)
     factor = eliminate([block], 4, np.zeros(4), np.zeros(4))
     np.testing.assert_allclose(factor.solution, truth[[2, 3, 0, 1]], atol=1e-4)
-
-
-def test_all_shared_unknowns_fixed() -> None:
-    rng = np.random.default_rng(3)
-    matrix = rng.normal(size=(10, 3))
-    block = single(np.arange(3), np.empty(0, dtype=np.intp), matrix, matrix @ np.array([1.0, 2.0, 3.0]))
-    factor = eliminate([block], 3, np.zeros(3), np.zeros(3))
-    np.testing.assert_allclose(factor.solution, [1.0, 2.0, 3.0], rtol=1e-12)
-    np.testing.assert_allclose(whole(factor), np.linalg.inv(matrix.T @ matrix), rtol=1e-10)
 
 
 @pytest.fixture
@@ -204,28 +195,6 @@ def test_normal_equations_give_what_reflections_give(count: int, monkeypatch: py
     expected = whole(by_reflections) / np.outer(sigmas, sigmas)
     np.testing.assert_allclose(whole(factor) / np.outer(sigmas, sigmas), expected, atol=1e-8)
     assert factor.length() == pytest.approx(by_reflections.length(), rel=1e-10)
-
-
-def test_what_is_cheap_to_reflect_is_squared_only_where_that_costs_no_digits(monkeypatch: pytest.MonkeyPatch) -> None:
-    numbering, at = linearised(18)
-    exact = factorise(numbering, at).variances()
-    monkeypatch.setattr(elimination, "CHEAP", 0.0)
-    monkeypatch.setattr(elimination, "TEN_DIGITS", 1e-6)
-    squared = factorise(numbering, at).variances()
-    assert not np.array_equal(squared, exact)
-    np.testing.assert_allclose(squared, exact, rtol=1e-6)
-    monkeypatch.setattr(elimination, "TEN_DIGITS", 1.0)  # as if the condition were worse
-    np.testing.assert_allclose(factorise(numbering, at).variances(), exact, rtol=1e-10)
-
-
-def test_roots_of_cofactors_are_local_where_many_unknowns_are_shared(monkeypatch: pytest.MonkeyPatch) -> None:
-    numbering, at = linearised(18)
-    factor = factorise(numbering, at)
-    wide, variances = list(row_roots(factor, at.rows)), factor.variances()
-    monkeypatch.setattr(sparse_factor, "WIDE", 0)
-    np.testing.assert_allclose(factor.variances(), variances, rtol=1e-9)
-    for here, there in zip(row_roots(factor, at.rows), wide, strict=True):
-        np.testing.assert_allclose(here @ here.swapaxes(1, 2), there @ there.swapaxes(1, 2), atol=1e-9)
 
 
 def test_what_is_badly_conditioned_is_reflected(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -409,18 +378,6 @@ def test_variances_along_a_line_are_those_of_its_differences(
     np.testing.assert_allclose(factor.variances(), weight**-2 + 0.5 * np.arange(count), rtol=1e-9)
     (roots,) = row_roots(factor, blocks)
     np.testing.assert_allclose(roots @ roots.swapaxes(1, 2), np.full((count - 1, 2, 2), 0.5), atol=1e-9)
-
-
-def test_fronts_hold_all_that_is_met_in_elimination() -> None:
-    """A ring of ten: the first and the last meet, so that the last stays in all fronts."""
-    pairs = np.stack([np.arange(10), (np.arange(10) + 1) % 10], axis=1)
-    met = csr_array((np.ones(20), (np.repeat(np.arange(10), 2), pairs.ravel())))
-    of_ring = make_fronts(csr_array(met.T @ met), np.full(10, 50, dtype=np.intp), 3)
-    assert isinstance(of_ring, Fronts)
-    assert of_ring.count == 503
-    for front in of_ring:
-        assert 499 in front.columns
-        assert 502 in front.columns
 
 
 @pytest.mark.parametrize("cost", [0.0, 30.0, 300.0, 3000.0])

@@ -1,6 +1,5 @@
 """Bad input, one thing at a time, and the keys of quantities."""
 
-import ast
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 from networks import Name, Truth, simulated, two_cameras, with_errors
 
-from adjust import Approximations, Camera, Distortion, Exterior, Image, Network, ObjectPoint, Prior
+from adjust import Camera, Distortion, Exterior, Image, Network, ObjectPoint, Prior
 from adjust.errors import AdjustmentError, DatumError
 from adjust.problem.parameter import (
     CODES,
@@ -20,7 +19,6 @@ from adjust.problem.parameter import (
     object_coordinate,
     parameter_from_text,
     parameters_from_texts,
-    shortened,
 )
 from adjust.solution.adjustment import Datum, Options, adjust
 
@@ -180,17 +178,6 @@ def test_a_single_resection() -> None:
     assert result.value("EO.f1.Z0") == pytest.approx(truth.stations[1][2], abs=5 * result.sigma("EO.f1.Z0"))
 
 
-def test_approximations_of_other_things_do_no_harm() -> None:
-    network, start = simulated(np.random.default_rng(1))
-    more = Approximations(
-        dict(start.interior) | {"other": np.zeros(3)},
-        dict(start.exterior) | {"other": np.zeros(6)},
-        dict(start.transformation) | {"other": np.zeros(6)},
-        dict(start.points) | {"other": np.zeros(3)},
-    )
-    assert adjust(network, more).vpv == adjust(network, start).vpv
-
-
 ROOT = Path(__file__).parents[2]
 CODE = re.compile(rf"({'|'.join(CODES.values())})\.")
 
@@ -208,12 +195,6 @@ def test_ordinary_names_are_written_as_they_always_were() -> None:
     }
     assert {key.text: key for key in keys.values()} == keys
     assert parameters_from_texts(list(keys)) == tuple(keys.values())
-
-
-def test_a_dot_in_the_second_of_two_names_is_distinguished_from_that_between_them() -> None:
-    one, other = Parameter.fiducial("A", "B.1", "x"), Parameter.fiducial("A.B", "1", "x")
-    assert (one.text, other.text) == ("FID.A.B%2E1.x", "FID.A.B.1.x")
-    assert [parameter_from_text(each.text) for each in (one, other)] == [one, other]
 
 
 def random_name(rng: np.random.Generator) -> str:
@@ -301,27 +282,6 @@ def test_names_that_would_run_together_have_values_of_their_own(
     assert min(plain.sigma(each) for each in own) > 1e-4
 
 
-def test_no_other_module_takes_names_apart_or_builds_them() -> None:
-    """No text begins with a code and a dot; none is split at dots but for suffixes of files and keys of tables."""
-    found = []
-    for package in ("adjust", "pipeline"):
-        for file in sorted((ROOT / package).rglob("*.py")):
-            if file != ROOT / "adjust" / "problem" / "parameter.py":
-                found += [f"{file.relative_to(ROOT)}: {what}" for what in dotted_names(file)]
-    assert set(found) == {
-        "pipeline/archive/work.py: rpartition",  # a scan's suffix
-        "pipeline/report/load.py: rpartition",  # a scan's suffix
-        "pipeline/design/sweeps.py: split",  # a key of a scene's table
-        "pipeline/rendered/scene_tables.py: split",  # a key of a scene's table
-        "pipeline/review/mark_handles.py: split",  # a key of a drawing's table
-    }
-
-
-def test_long_lists_tell_how_many_names_are_left_out() -> None:
-    assert shortened(["a", "b"], 2) == "a, b"
-    assert shortened(["a", "b", "c", "d", "e"], 2) == "a, b and 3 more"
-
-
 def test_approximations_are_no_known_coordinates() -> None:
     points = (
         ObjectPoint("1", Prior(1.0), Prior(2.0, 0.1), Prior(3.0, np.inf)),
@@ -333,15 +293,3 @@ def test_approximations_are_no_known_coordinates() -> None:
     np.testing.assert_array_equal(network.coordinates(firm=False)["1"], [1.0, 2.0, 3.0])
     np.testing.assert_array_equal(network.coordinates(firm=False)["2"], [np.nan, 5.0, np.nan])
     assert list(network.known_places) == ["3"]
-
-
-def dotted_names(file: Path) -> list[str]:
-    found = []
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and CODE.match(node.value):
-            found.append(repr(node.value))
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
-            texts = [each.value for each in node.args if isinstance(each, ast.Constant)]
-            if "split" in node.func.attr or "partition" in node.func.attr:
-                found += [node.func.attr] if "." in texts else []
-    return found

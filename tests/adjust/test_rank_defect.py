@@ -71,16 +71,6 @@ def test_each_prior_that_is_requested_ends_one_direction(name: str) -> None:
             assert len(mended.singular) == len(failure.words) - 1, f"{words} against {direction.cause}"
 
 
-@pytest.mark.parametrize("name", ["known-relief", "known-flat-tilted", "known-flat-two"])
-def test_fiducials_with_priors_end_what_they_are_to_end(name: str) -> None:
-    """Two marks: shifts, rotation and scale; three: affinity and shear too."""
-    failure = CATALOGUE[name]
-    network, start = failure.setup.network()
-    for marks, gone in ((2, AXES), (3, AXES + DEFORMATIONS)):
-        mended = adjust(give_values(network, {"x": 1.0, "y": 1.0}, marks), start, failure.options)
-        assert not causes(mended, gone)
-
-
 @pytest.mark.parametrize("name", [n if n not in DEAR else pytest.param(n, marks=pytest.mark.study) for n in MISHAPS])
 def test_other_mishaps_are_reported_in_words(name: str) -> None:
     mishap = MISHAPS[name]
@@ -263,14 +253,6 @@ def kind(name: str) -> str:
     """`EO.3.X0` is of the kind EO.X0, a fiducial of the kind FID."""
     owner, quantity = name.split(".")[0], name.rsplit(".", 1)[1]
     return "FID" if owner == "FID" else f"{owner}.{quantity}"
-
-
-def test_a_singular_result_keeps_the_approximations() -> None:
-    case = load("v_singular_K3D_conv_affine")
-    result = adjust_network(dropped(case, {5, 6, 7, 8, 9}))
-    assert result.value("EO.2.X0") == case["state"]["EO2.X0"]
-    assert not result.converged
-    assert result.history == ()
 
 
 @pytest.mark.parametrize("datum", ["minimal", "free"])

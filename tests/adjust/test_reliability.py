@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from networks import Truth, field_points, row_of, simulated, with_errors, without_rows
 from numpy.typing import NDArray
-from scipy import special
 
 from adjust import Adjustment, Calibration, Fiducial, Options, Parameter, Prior, adjust
 from adjust.problem.network import Approximations, Exterior, Network
@@ -209,34 +208,6 @@ def test_critical_tau_is_the_quantile_of_a_residual_over_the_sigma0_that_it_is_p
         tau = np.abs(z[:, 0]) / np.sqrt((z**2).mean(axis=1))
         assert Probabilities(alpha=0.01).critical_tau(redundancy) == pytest.approx(np.quantile(tau, 0.99), rel=0.005)
     assert np.isinf(Probabilities().critical_tau(1))
-
-
-@pytest.mark.study
-def test_the_smallest_detectable_error_is_detected_as_often_as_stated() -> None:
-    """Four errors in five at a level of 0.1 %, by the test of the coordinate and by that of the point."""
-    points = field_points(np.random.default_rng(0), 12)
-    exact, start = simulated(np.random.default_rng(0), points=points, noise=False)
-    reliability = assess_reliability(adjust(exact, start))
-    unit, runs = row_of(exact, "target", "f1", "4"), 400
-    limit = -special.ndtri(0.0005)
-    _, directions = np.linalg.eigh(weight_of_point(exact, start, unit))
-    found = np.zeros(2)
-    for seed in range(runs):
-        noisy, _ = simulated(np.random.default_rng(1000 + seed), points=points)
-        coordinate = assess_reliability(adjust(with_errors(noisy, {unit: reliability.smallest[unit, 0] * X}), start))
-        worst = reliability.smallest_together[unit] * directions[:, 0]
-        point = assess_reliability(adjust(with_errors(noisy, {unit: worst}), start))
-        found += abs(coordinate.w[unit, 0]) > limit, point.statistic[unit] > special.chdtri(2, 0.001)
-    assert found / runs == pytest.approx([0.8, 0.8], abs=0.06)
-
-
-def weight_of_point(exact: Network, start: Approximations, unit: int) -> Array:
-    """P Q_v P (2, 2) of a point, from what its statistic becomes with small errors."""
-    size = 1e-4
-    e = [X, Y, X + Y]
-    s = [assess_reliability(adjust(with_errors(exact, {unit: size * each}), start)).statistic[unit] for each in e]
-    mixed = 0.5 * (s[2] - s[0] - s[1])
-    return np.array([[s[0], mixed], [mixed, s[1]]]) / size**2
 
 
 def checkable(seed: int, points: int = 15) -> tuple[Network, Approximations]:

@@ -9,26 +9,23 @@ import numpy as np
 import pytest
 from networks import (
     RESEAU_MM,
-    SCAN_HALF_MM,
     SCAN_MIDDLE_MM,
     STATIONS,
     Truth,
     bend_in_scanner,
     bent,
     bent_films,
-    displacement,
     field_points,
     simulated,
 )
 from numpy.typing import NDArray
 
-from adjust import Adjustment, AdjustmentError, Options, Parameter, adjust, approximate
+from adjust import Adjustment, AdjustmentError, Options, adjust, approximate
 from adjust.functional_model.lens import Distortion, Lens, Prior
-from adjust.functional_model.scanner import Bend, carriage_terms, smooth_terms
+from adjust.functional_model.scanner import Bend, smooth_terms
 from adjust.model_selection.scanner_choice import bent_network, choose_bends, network_with_terms
 from adjust.problem.estimates import adjusted_image
 from adjust.problem.network import Approximations, Network, Scanner, Transformation
-from adjust.rank_defect.directions import NamedDirection, Reason
 
 Array = NDArray[np.float64]
 
@@ -40,7 +37,6 @@ BEND_MM = {
     "a20": 0.02, "a11": -0.015, "a02": 0.01, "b20": -0.012, "b11": 0.008, "b02": -0.02,
     "a30": 0.006, "a21": -0.004, "a12": 0.005, "a03": 0.003, "b30": -0.005, "b21": 0.004, "b12": -0.006, "b03": 0.007,
 }  # fmt: skip
-EVERY = (*BEND_MM, "stretch", "shear", "tilt_x", "tilt_y", "a40", "b50", "a06", "b06")
 PLACES_MM = np.random.default_rng(3).uniform([10.0, -240.0], [240.0, -5.0], (7, 2))
 
 
@@ -50,35 +46,6 @@ def solved(network: Network, options: Options | None = None) -> Adjustment:
 
 def free(*names: str) -> dict[str, Prior]:
     return dict.fromkeys(names, FREE)
-
-
-def test_every_term_is_the_one_that_is_printed() -> None:
-    bend = Bend(EVERY, SCAN_MIDDLE_MM, SCAN_HALF_MM)
-    for k, name in enumerate(EVERY):
-        found = bend.displacement(np.eye(len(EVERY))[k], PLACES_MM).value
-        np.testing.assert_allclose(found, displacement({name: 1.0}, PLACES_MM), atol=1e-13, err_msg=name)
-
-
-def test_derivatives_by_complex_steps() -> None:
-    bend, parameters = Bend(EVERY, SCAN_MIDDLE_MM, SCAN_HALF_MM), 0.02 * np.cos(np.arange(len(EVERY)))
-    at = bend.displacement(parameters, PLACES_MM)
-    for axis in (0, 1):
-        stepped = bend.apply(parameters, PLACES_MM + 1j * STEP * np.eye(2)[axis]).imag / STEP
-        np.testing.assert_allclose(bend.gradient(parameters, PLACES_MM)[..., axis], stepped, rtol=0, atol=1e-15)
-    for k in range(len(EVERY)):
-        stepped = bend.apply(parameters + 1j * STEP * np.eye(len(EVERY))[k], PLACES_MM).imag / STEP
-        np.testing.assert_allclose(-at.parameter_jacobian[..., k], stepped, rtol=0, atol=1e-14)
-
-
-def test_a_bend_there_and_back() -> None:
-    bend, parameters = Bend(EVERY, SCAN_MIDDLE_MM, SCAN_HALF_MM), 0.02 * np.cos(np.arange(len(EVERY)))
-    scan_mm, found = bend.inverse(parameters, bend.apply(parameters, PLACES_MM))
-    assert found.all()
-    np.testing.assert_allclose(scan_mm, PLACES_MM, atol=1e-11)
-    _, found = Bend(("a20",), SCAN_MIDDLE_MM, SCAN_HALF_MM).inverse(
-        np.array([-200.0]), PLACES_MM - np.array([300.0, 0.0])
-    )
-    assert not found.any()
 
 
 @pytest.mark.parametrize(
@@ -106,12 +73,6 @@ def test_what_is_left_no_film_transformation_can_make_up(kind: Transformation) -
     result = solved(bent_films([0.0], {}, free(*names), kind=kind, sigma_given_mm=1e-3, marks_mm=RESEAU_MM))
     assert result.converged
     assert max(result.sigma(f"SC.S.{name}") for name in names) / result.sigma0 < 0.02
-
-
-def test_carriages_have_terms_along_one_axis_up_to_degree_6() -> None:
-    degrees = ("40", "50", "60", "04", "05", "06")
-    assert set(carriage_terms(["affine"])) == {f"{axis}{k}" for axis in "ab" for k in degrees}
-    assert set(carriage_terms(["polynomial(4)"])) == {f"{axis}{k}" for axis in "ab" for k in ("50", "60", "05", "06")}
 
 
 @pytest.mark.parametrize("method", ["combined", "elements"])
@@ -190,25 +151,6 @@ def test_given_fiducials_separate_the_scanner_in_one_pose_too() -> None:
     assert 0.2e-3 < result.sigma("SC.S.a20") / result.sigma0 < 2e-3  # as good as the marks are known
 
 
-def test_a_prior_makes_a_bend_regular_and_is_stated_to_be_all() -> None:
-    result = solved(bent_films([0.0] * 4, {}, {"a20": Prior(0.0, 0.01)}, sigma_given_mm=np.inf))
-    assert "SC.S.a20" not in [moved.text for each in result.singular for moved in each.parameters]
-
-
-def test_claimed_sigmas_are_realised() -> None:
-    """Frames in four poses, marks nobody knows: the bend's errors over its standard deviations."""
-    names = ("a20", "a11", "b02", "a30", "b21")
-    truth = {name: BEND_MM[name] for name in names}
-    errors, sigmas, start = [], [], approximate(bent_films([0.0, 90.0, 180.0, 270.0], {}, {}))
-    for seed in range(14):
-        network = bent_films([0.0, 90.0, 180.0, 270.0], truth, free(*names), np.random.default_rng(seed))
-        result = adjust(network, start)
-        errors.append([result.value(f"SC.S.{name}") - truth[name] for name in names])
-        sigmas.append([result.sigma(f"SC.S.{name}") for name in names])
-    ratio = np.sqrt((np.array(errors) ** 2).mean() / (np.array(sigmas) ** 2).mean())
-    assert 0.8 < ratio < 1.2
-
-
 def test_the_bend_is_tested_for_significance() -> None:
     network = bent_films([0.0, 90.0, 180.0, 270.0], {"a20": 0.02}, free("a20", "b02"), np.random.default_rng(2))
     result = solved(network)
@@ -274,19 +216,6 @@ def test_a_bend_that_the_films_make_too_is_laid_to_the_films() -> None:
     (direction,) = solved(network).singular
     assert "the polynomial(2) transformation of its films does the same" in direction.cause
     assert direction.remedy.endswith("or leave it out.")
-
-
-def test_a_direction_is_explained_by_what_moves_along() -> None:
-    reasons = {each: Reason(f"{each} do the same", "it", "") for each in ("lens", "marks")}
-    bend = NamedDirection(-2, np.zeros(1), "It can change", Reason("nothing shows it", "it", ""), None, reasons)
-    mark, k3, c = Parameter.fiducial("K", "1", "x"), Parameter.interior("K", "k3"), Parameter.interior("K", "c")
-    for moved, because in (
-        ((), "nothing shows"),
-        ((c,), "nothing shows"),
-        ((c, mark), "marks do"),
-        ((mark, k3), "lens do"),
-    ):
-        assert because in bend.sentence(moved)[0]
 
 
 QUARTERS = [0.0, 90.0, 180.0, 270.0]
