@@ -22,10 +22,9 @@ from drawn import (
 from studies import parametrize_with_studies
 
 from measure import FiducialOptions, FrameMeasurement, Scan, Status, measure_fiducials, open_scan
-from measure.fiducials.search import FrameSearch, PitchHypothesis, is_lattice, room_mm
+from measure.fiducials.search import FrameSearch, PitchHypothesis, is_lattice
 from measure.marks.shapes import FiducialLayout, MarkShape, ring_cross
-from measure.scans.cache import WholePicture
-from measure.scans.metadata import NO_TAGS, Samples
+from measure.scans.metadata import Samples
 
 PITCH_UM = (50.0, 50.0)
 
@@ -141,9 +140,3 @@ def test_a_frame_that_the_scan_holds_is_found_by_windows_as_by_the_whole(
     assert found.pose == whole.pose
     assert found.same_place(whole)
     assert np.hypot(*(found.pixel_from_camera - matrix)[:, 2]) < 3.0
-
-
-def test_a_frame_has_as_much_room_as_the_scan_is_larger() -> None:
-    scan = Scan(Path("a.tif"), WholePicture(np.zeros((100, 120, 1), np.uint8)), NO_TAGS)
-    layout = replace(NUMBERED, frame_mm=(90.0, 110.0))
-    assert room_mm(scan, layout, (1.0, 1.0)) == pytest.approx(15.0 + 3.0)

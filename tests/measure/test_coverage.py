@@ -6,7 +6,7 @@ from drawn import Array, brute_picture, placed
 
 from measure.marks.coverage import CELLS, cell_coverage
 from measure.marks.rendering import picture, render
-from measure.marks.shapes import Disk, MarkShape, MarkTemplate, Part, cross, dot, polygon, ring_cross, ring_dot
+from measure.marks.shapes import MarkShape, MarkTemplate, cross, dot, polygon, ring_cross, ring_dot
 
 SHEARED = np.array([[8.1, 0.9, 20.3], [-0.4, -8.6, 19.7]])
 MARKS = {
@@ -41,36 +41,6 @@ def test_a_blurred_disks_centroid_and_area_are_exact(phase: float) -> None:
     shown = picture(MarkShape(dot(0.5)), placed(10.0, (15 + phase, 14 - phase)), 31, 31, 0.8)
     np.testing.assert_allclose(_centroid(shown), [15 + phase, 14 - phase], atol=0.001)
     assert shown.sum() == pytest.approx(np.pi * 25, rel=5e-4)
-
-
-@pytest.mark.parametrize("name", MARKS)
-@pytest.mark.parametrize("corner", [(0, 0), (14, 3), (3, 14), (17, 17)])
-def test_what_a_small_window_shows_is_a_part_of_the_whole(name: str, corner: tuple[int, int]) -> None:
-    mark, (col0, row0) = MarkShape(MARKS[name]), corner
-    moved = SHEARED - np.array([[0, 0, col0], [0, 0, row0]])
-    whole = coverage(mark, SHEARED, 41, 41)[row0 : row0 + 9, col0 : col0 + 9]
-    np.testing.assert_allclose(coverage(mark, moved, 9, 9), whole, atol=1e-6)
-
-
-def test_a_polygons_area_is_exact() -> None:
-    triangle = MarkShape(polygon([(0.0, 0.0), (1.1, 0.2), (0.3, 0.9)]))
-    area_mm2 = 0.5 * (1.1 * 0.9 - 0.2 * 0.3)
-    shown = coverage(triangle, SHEARED, 41, 41)
-    assert shown.sum() == pytest.approx(area_mm2 * abs(np.linalg.det(SHEARED[:, :2])), rel=1e-6)
-
-
-def test_overlapping_parts_count_once() -> None:
-    twice: tuple[Part, ...] = (*dot(0.5), Disk((0.0, 0.0), 0.5))
-    once = coverage(MarkShape(dot(0.5)), SHEARED, 41, 41)
-    both = coverage(MarkShape(twice), SHEARED, 41, 41)
-    inside = once > 0.999
-    np.testing.assert_allclose(both[inside], once[inside], atol=1e-3)
-    assert both.max() <= 1.0
-
-
-def test_y_points_up_in_the_mark_and_down_in_the_picture() -> None:
-    above = MarkShape((Disk((0.0, 1.0), 0.2),))
-    assert _centroid(coverage(above, placed(10.0, (20.0, 20.0)), 41, 41))[1] == pytest.approx(10.0, abs=1e-3)
 
 
 @pytest.mark.parametrize("blur_px", [0.4, 0.8, 1.7])

@@ -15,7 +15,7 @@ from measure import FiducialOptions, MatchOptions, Scan, measure_fiducials
 from measure.detection.correlation import CLOSE, GRAINY, WIDE, Map, Surroundings, correlation
 from measure.detection.faint_marks import FaintMark, detect_faint
 from measure.detection.localisation import MarkPrediction, localise
-from measure.detection.responses import FULL, ByteCache, Dilation, ResponseMap, Responses, ScanMaps, TemplateSet
+from measure.detection.responses import ByteCache, Dilation, Responses, ScanMaps, TemplateSet
 from measure.fiducials.mark_fit import detect_mark
 from measure.flags import Cause
 from measure.marks.shapes import Bar, MarkShape, cross, dot, polygon, ring_cross
@@ -277,36 +277,6 @@ def responses_to(
     return correlation(flat, *surroundings.pattern(template, detail_px, flat))
 
 
-def response_map(map_: Map, cache: ByteCache[Dilation]) -> ResponseMap:
-    return Responses({(0, 1): map_}, (0,), 1, cache, ORIGIN[None]).by_key[0, 1]
-
-
-def test_share_of_a_place_is_its_rank() -> None:
-    exact = response_map(MAP, ByteCache(1 << 30)).dilated(0.0)
-    for rank, place in enumerate(np.argsort(-MAP, axis=None)[:60]):
-        row, col = divmod(int(place), MAP.shape[1])
-        assert np.isclose(exact.share(np.array([col + 0.3, row - 0.4]) + ORIGIN), (rank + 1) / MAP.size)
-
-
-def test_places_about_the_strongest_answer_as_it_does() -> None:
-    single = np.zeros_like(MAP)
-    single[20, 30] = 1.0
-    near = response_map(single, ByteCache(1 << 30)).dilated(2.0)
-    assert np.isclose(near.share(np.array([31.0, 19.0]) + ORIGIN), near.area_px / MAP.size)
-    assert near.share(np.array([34.0, 20.0]) + ORIGIN) == 1.0
-
-
-def test_only_the_dilations_used_last_are_cached() -> None:
-    cache = ByteCache[Dilation](2 * MAP.nbytes)
-    layers = [response_map(k * MAP, cache) for k in range(3)]
-    first, second, third = (each.dilated(4.0) for each in layers)
-    assert layers[2].dilated(4.0) is third
-    assert layers[1].dilated(4.0) is second
-    assert layers[0].dilated(4.0) is not first
-    np.testing.assert_array_equal(layers[0].dilated(4.0).map, first.map)
-    assert layers[2].dilated(4.0) is not third
-
-
 def test_responses_are_freed_with_the_search_and_not_by_the_next_garbage_collection() -> None:
     responses = Responses({(0, 1): MAP}, (0,), 1, ByteCache[Dilation](1 << 30))
     assert responses.by_key[0, 1].dilated(2.0).map.shape == MAP.shape
@@ -327,11 +297,6 @@ SET = TemplateSet(TURNED, [2.0, 3.0] * 4, (1, -1), WIDE, 100.0)
 MAP_BYTES = 4 * 90 * 110
 
 
-def test_a_small_scan_caches_a_few_maps_of_its_size_and_a_large_one_what_the_effort_allows() -> None:
-    assert FULL.scan_cache_bytes(1000**2) == 32 * 4 * 1000**2
-    assert FULL.scan_cache_bytes(20_000**2) == FULL.cache_bytes
-
-
 def maps(cache: ByteCache[Map]) -> ScanMaps:
     return ScanMaps(SCAN, 1, SET, cache)
 
@@ -344,23 +309,6 @@ def test_a_map_is_the_strongest_correlation_of_all_channels() -> None:
         answers = [responses_to(WIDE, each, TURNED[kind], detail, 100.0) for each in whole]
         assert map_.shape == (90, 110)
         np.testing.assert_array_equal(map_[inner], np.max([sign * each[inner] for each in answers], axis=0))
-
-
-def test_what_is_not_cached_any_more_is_made_again() -> None:
-    every, few = maps(ByteCache(100 * MAP_BYTES)), maps(ByteCache(5 * MAP_BYTES))
-    assert few[0, 1] is few[0, 1]
-    first = few[0, 1]
-    for key, map_ in every.items():
-        np.testing.assert_array_equal(few[key], map_)
-    assert few[0, 1] is not first
-
-
-def test_a_map_of_which_only_the_other_polarity_is_cached_is_made_again() -> None:
-    every, cache = maps(ByteCache(100 * MAP_BYTES)), ByteCache[Map](3 * MAP_BYTES)
-    few = maps(cache)
-    for key in ((0, -1), (0, 1), (1, 1), (0, -1), (1, 1), (1, -1), (0, -1)):
-        np.testing.assert_array_equal(few[key], every[key])
-        assert cache._bytes == sum(size for _, size in cache._entries.values()) <= cache.limit_bytes
 
 
 def test_a_faint_mark_next_to_the_frames_edge_is_what_answers_most() -> None:

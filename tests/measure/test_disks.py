@@ -10,8 +10,8 @@ from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 
 from measure import Scan
-from measure.targets.block_search import Candidate, search_blocks
-from measure.targets.disk_detection import DiskSearch, disk_candidates, disk_octaves
+from measure.targets.block_search import Candidate
+from measure.targets.disk_detection import DiskSearch, disk_candidates
 from measure.targets.disks import FittedDisk, fit_disk, fit_plain_disks
 
 Array = NDArray[np.float64]
@@ -126,19 +126,6 @@ def test_a_disk_on_the_border_of_two_blocks_is_found_once() -> None:
     found = fitted_disks(scan_of(picture), DiskSearch((8.0, 24.0)))
     assert len(found) == 1
     assert np.abs(found[0].center_px - center).max() < 0.03
-
-
-@pytest.mark.study
-def test_texture_holds_hardly_any_disks() -> None:
-    """Of all the round patches of a cloudy ground, a fifth at most passes for a disk."""
-    rng = np.random.default_rng(5)
-    picture = GROUND + 30000 * gaussian_filter(rng.normal(size=(160, 180)), 2) + rng.normal(0, NOISE, (160, 180))
-    scan, search = scan_of(picture), DiskSearch((6.0, 30.0))
-    patches = search_blocks(scan, disk_octaves(search, scan.full_scale_dn))
-    disks = disk_candidates(scan, search)
-    assert len(patches) > 20
-    assert len(disks) <= len(patches) / 2
-    assert len(fitted_disks(scan, search)) <= len(patches) / 5
 
 
 @pytest.mark.parametrize(("snr", "blur_px"), [(10.0, 0.7), (50.0, 1.5)])

@@ -17,7 +17,6 @@ from measure.noise.robust_estimation import (
     least_distances,
     solution,
     student_weights,
-    tukey_fit,
     tukey_loss,
     tukey_weights,
 )
@@ -46,14 +45,6 @@ class Arctangent:
 
     def cost(self) -> float:
         return float(np.arctan(self.state) ** 2)
-
-
-def test_a_model_is_stepped_until_it_stands_still() -> None:
-    model = Arctangent(1.0)
-    outcome = gauss_newton(model, 1e-6, 10)
-    assert not outcome.reason
-    assert outcome.moved_px < 1e-6
-    assert model.state == pytest.approx(0.0, abs=1e-12)
 
 
 def test_steps_that_do_not_lessen_the_cost_are_halved() -> None:
@@ -118,29 +109,11 @@ def test_normal_equations_are_solved_for_what_is_free_and_refused_where_they_tel
     assert solution(np.diag([1.0, -1e-18, 1.0]), truth, np.ones(3, bool)) is None  # as rounding leaves it
 
 
-def test_a_line_by_tukeys_weights_leaves_outliers_aside() -> None:
-    along = np.arange(30.0)
-    values = 3.0 - 0.2 * along + 0.01 * np.random.default_rng(3).standard_normal(30)
-    values[[4, 11, 25]] += [5.0, -7.0, 9.0]
-    fit = tukey_fit(np.stack([np.ones_like(along), along]), values, 20, 1e-3)
-    np.testing.assert_allclose(fit.factors, [3.0, -0.2], atol=0.01)
-    assert np.flatnonzero(fit.weights == 0.0).tolist() == [4, 11, 25]
-    np.testing.assert_allclose(fit.residuals[[4, 11, 25]], [5.0, -7.0, 9.0], atol=0.05)
-
-
 def test_least_distances_leave_false_places_aside() -> None:
     design, there = _mapped(FALSE)
     both = least_distances(np.stack([design, design]), np.stack([there, 2.0 * there]), 0.1, 30)
     np.testing.assert_allclose(both[0], MAP, atol=0.02)
     np.testing.assert_allclose(both[1], 2.0 * MAP, atol=0.04)
-
-
-def test_least_distances_hold_to_what_a_map_usually_is() -> None:
-    design, there = _mapped([])
-    usual = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    held = least_distances(design, there, 5.0, 6, 1e9 * np.diag([0.0, 1.0, 1.0]), usual)
-    np.testing.assert_allclose(held[1:], np.eye(2), atol=1e-4)
-    np.testing.assert_allclose(least_distances(design, there, 5.0, 6, 1e-9 * np.diag([0.0, 1.0, 1.0]), usual), MAP)
 
 
 MAP = np.array([[7.0, -4.0], [1.02, 0.1], [-0.1, 0.97]])
@@ -251,22 +224,6 @@ def test_places_are_freed_of_the_bending_and_what_stays_is_as_large_as_stated() 
     left = moved - np.array([shift for shift, _ in found])
     assert np.mean(left**2) < 0.5 * np.mean(moved**2)
     assert np.cov(left.T) == pytest.approx(np.mean([rest for _, rest in found], axis=0), abs=0.2 * np.var(left[:, 0]))
-
-
-def test_without_noise_there_is_nothing_to_weigh_by() -> None:
-    assert Bending(np.zeros(6), np.eye(6), np.eye(6), ON_PLACE).has_noise
-    assert not Bending(np.zeros(6), np.eye(6), np.zeros((6, 6)), ON_PLACE).has_noise
-    assert not Bending(np.zeros(6), np.eye(6), np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -0.1]), ON_PLACE).has_noise
-
-
-def test_flat_ground_and_few_patches_change_next_to_nothing() -> None:
-    rng = np.random.default_rng(2)
-    bendings, _ = patches(rng, np.zeros(2))
-    assert np.abs(bending_variance(bendings)).max() < 0.02
-    few, _ = patches(rng, np.array([0.5, 0.2]), 10)
-    shift, left = few[0].estimated(bending_variance(few))
-    assert not shift.any()
-    assert not left.any()
 
 
 def test_the_covariance_of_a_mark_is_the_sum_of_its_causes() -> None:

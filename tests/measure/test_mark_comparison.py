@@ -117,10 +117,6 @@ def test_a_match_with_the_others_blur_rarely_contradicts_it_unless_its_own_is_an
     assert not result.is_confirmed(fits([1.1], [np.inf])[0])
 
 
-def test_too_few_marks_tell_nothing() -> None:
-    assert shared_blurs(fits([1.2, 1.2, 1.2, 0.6], [0.01, np.inf, np.inf, 0.1])) == [None] * 4
-
-
 def test_marks_of_one_size_are_rarely_doubted_and_another_size_is() -> None:
     rng = np.random.default_rng(2)
     doubted, found = 0, 0
@@ -157,34 +153,6 @@ def test_what_touches_one_side_of_a_dot_widens_its_variance_and_chance_hardly_do
 def touch(ratio: float, sigma: float, radius_px: float, px_per_mm: float = 36.0) -> Touch:
     shape = SharedShape(np.log([ratio]), np.array([sigma]), differs=False)
     return touch_of_round(shape, radius_px, px_per_mm, is_damaged=False)
-
-
-@pytest.mark.parametrize(("radius_px", "pitch_um"), [(5.0, 60.0), (50.0, 20.0), (150.0, 7.0)])
-def test_a_speck_is_no_larger_next_to_a_large_mark(radius_px: float, pitch_um: float) -> None:
-    """A mark of a fine scan, as large as all others, is known no worse for what might touch it."""
-    for off in (-1.0, 0.0, 1.0):
-        one = touch(1 + 0.007 * off, 0.007, radius_px, 1000 / pitch_um)
-        assert one.variance_px2 < 1e-4
-        assert one.exceedance(0.5) < 0.0015
-
-
-def test_how_likely_a_touched_dot_is_far_off_is_what_drawing_at_random_finds() -> None:
-    rng, radius_px, sigma = np.random.default_rng(4), 5.3, 0.022
-    changes = rng.normal(0.0, 0.00125 * 36.0**2 / radius_px**2, 400_000)
-    alike = np.abs(changes + rng.normal(0.0, sigma, len(changes)) + 0.054) < 0.002  # of those that look so small
-    one = touch(np.exp(-0.054), sigma, radius_px)
-    expected = float(np.mean(np.abs(2 * radius_px * changes[alike]) > 0.5))
-    assert one.exceedance(0.5) / one.probability == pytest.approx(expected, abs=0.02)
-
-
-def test_two_other_marks_tell_a_size_and_an_odd_one_does_not_spoil_the_others() -> None:
-    small = shared_shapes(*sized(np.array([1.0, 1.002, 0.998, 0.9]), np.full(4, 0.01)))
-    assert [size is not None and size.differs for size in small] == [False, False, False, True]
-    assert small[0] is not None
-    assert abs(small[0].off[0]) < 0.01
-    assert all(shared_shapes(*sized(np.array([1.0, 1.0, 0.95]), np.full(3, 0.01))))
-    pair = shared_shapes(*sized(np.array([1.0, 0.9]), np.array([0.01, 0.01])))
-    assert pair == [None, None]
 
 
 def sized(sizes: Any, sigmas: Any) -> tuple[Any, Any]:

@@ -11,7 +11,7 @@ from measure import FiducialOptions, MarkFit, MatchOptions, match
 from measure.detection.localisation import MarkPrediction
 from measure.fiducials.mark_fit import detect_mark
 from measure.matching.covariance import second_order
-from measure.matching.window import Coding, censored, clipped_sides, noise_scale, read_window
+from measure.matching.window import Coding, clipped_sides, noise_scale, read_window
 from measure.noise.grain import _KERNELS, GRAIN_PX, PATCH_PX, PLANE, grain_model
 from measure.noise.noise_model import influence_covariances, noise_model, steadiness
 from measure.targets.disks import fit_disk
@@ -222,18 +222,6 @@ def test_the_sigma_of_a_clipped_mark_says_what_was_lost(name: str) -> None:
         whole.append(np.trace(mark.bound(1 / 20.0)))
     assert 0.7 < whitened_rms(errors, covariances) < 1.3
     assert np.mean([np.trace(each) for each in covariances]) > 1.4 * np.mean(whole)
-
-
-def test_a_censored_residual_is_twice_the_log_probability_and_derivatives_agree() -> None:
-    residuals, step = np.array([-30.0, -2.0, -0.3, 0.0, 0.8, 5.0, 300.0]), 1e-6
-    upper = np.ones(len(residuals), np.int8)
-    value, slope, information = censored(residuals, upper, 2.0)
-    (more, steeper, _), (less, flatter, _) = (censored(residuals + off, upper, 2.0) for off in (step, -step))
-    np.testing.assert_allclose(slope, (more - less) / (2 * step), atol=1e-5)
-    np.testing.assert_allclose(information, (more * steeper - less * flatter) / (2 * step), atol=1e-3)
-    assert value[3] == pytest.approx(2.0 * np.sqrt(2 * np.log(2)))
-    np.testing.assert_allclose((value[0], value[-1]), (0.0, 300.0), atol=0.1)
-    np.testing.assert_allclose(censored(-residuals, np.negative(upper), 2.0)[0], -value)
 
 
 @pytest.mark.parametrize("within", [-1.0, 0.0, 1.0])

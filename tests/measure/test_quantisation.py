@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from measure import MarkShape, Scan, ScanWindow, match, open_scan, ring_cross
 from measure.scans.cache import WholePicture
 from measure.scans.compression import covariance_of_compression
-from measure.scans.jpeg import UNKNOWN_DN, rounding_step_dn
+from measure.scans.jpeg import rounding_step_dn
 from measure.scans.metadata import NO_TAGS
 
 # Annex K of ITU-T T.81, luminance, the first 15 in zigzag order: what "quality 50" is.
@@ -40,10 +40,6 @@ def test_tiff_files_have_it_too_and_what_is_not_compressed_with_loss_has_none(tm
     with open_scan(tmp_path / "whole.tif") as scan:
         assert scan.rounding_step_dn == 0.0
         assert not scan.is_lossy
-
-
-def test_a_file_without_tables_is_taken_for_a_poor_one() -> None:
-    assert rounding_step_dn(b"\xff\xd8\xff\xd9") == UNKNOWN_DN
 
 
 def film() -> NDArray[np.uint8]:

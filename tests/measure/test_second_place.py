@@ -7,8 +7,7 @@ import pytest
 from drawn import Array, brute_picture, drawn, ellipse, placed, scan_of
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
-from studies import parametrize_with_studies
-from true_marks import ALL_MOVES, KIND, Kind, TrueMark, grain_correlation, grainy, some_mark, whitened_rms
+from true_marks import ALL_MOVES, KIND, Kind, TrueMark, grainy, some_mark, whitened_rms
 from true_marks import WING as TRUE_WING
 
 from measure import FiducialOptions, MatchOptions, ScanWindow, match, measure_fiducials
@@ -28,7 +27,7 @@ from measure.marks.shapes import (
     ring_cross,
     turned,
 )
-from measure.matching.covariance import LinearFit, across_edges
+from measure.matching.covariance import LinearFit
 from measure.noise.noise_model import NoiseModel, combined, correlated, products, weighted
 from measure.results import MarkFit, SecondPlace
 from measure.targets.disks import UNIT_DISK, fit_disk
@@ -74,12 +73,6 @@ def assert_as_likely(found: Array) -> None:
     assert found.min() > 1e-4
 
 
-@parametrize_with_studies(("mark", "options"), [(RING_CROSS, OPTIONS), (WING, replace(OPTIONS, freedom="shift"))])
-def test_noise_alone_makes_every_probability_of_edges_as_likely(mark: MarkShape, options: MatchOptions) -> None:
-    place = placed(10.0, (20.2, 19.7))
-    assert_as_likely(edge_chances(mark, brute_picture(mark, place, SIZE, SIZE, 1.0), place, options, 40))
-
-
 def test_damage_that_no_mask_takes_out_is_visible_by_the_edges() -> None:
     place = placed(10.0, (20.2, 19.7))
     grey = brute_picture(RING_CROSS, place, SIZE, SIZE, 1.0)
@@ -98,20 +91,6 @@ def test_where_paint_slopes_its_place_is_nearer_than_the_matched_one() -> None:
     assert off > 0.05
     assert np.hypot(*(fit.center_px + fit.sloping.offset_px - DISK_PLACE)) < 0.7 * off
     assert fit.sloping.chance < 1e-6
-
-
-def test_the_sums_are_of_second_derivatives_across_the_edges() -> None:
-    """Of a picture with the same second derivatives everywhere, n'Hn summed over the edges' pixels is known."""
-    rng = np.random.default_rng(8)
-    slopes = np.zeros((2, SIZE, SIZE))
-    slopes[:, 15:-15, 15:-15] = rng.normal(size=(2, SIZE - 30, SIZE - 30))
-    weights = across_edges(slopes, 1.6)
-    row, col = np.mgrid[:SIZE, :SIZE] - SIZE / 2
-    for hessian in (np.diag([1.0, 0.0]), np.array([[0.0, 1.0], [1.0, 0.0]]), np.array([[0.4, -0.7], [-0.7, 1.1]])):
-        picture = (hessian[0, 0] * col**2 + 2 * hessian[0, 1] * col * row + hessian[1, 1] * row**2) / 2
-        across = np.einsum("irc,ij,jrc->rc", slopes, hessian, slopes) / np.maximum((slopes**2).sum(axis=0), 1e-300)
-        expected = (slopes * across).sum(axis=(1, 2))
-        np.testing.assert_allclose((weights * picture).sum(axis=(1, 2)), expected, rtol=0.01, atol=0.02)
 
 
 CROSS = MarkShape(cross(1.5, 0.15))
@@ -236,24 +215,6 @@ def sighted(mark: TrueMark, grey: np.ndarray, rng: np.random.Generator, rounding
     return fit
 
 
-@parametrize_with_studies(("name", "grain_px"), [("ring-dot", 0.0), ("wing", 0.0), ("dot", 1.0)])
-def test_marks_are_at_the_bound_with_honest_sigmas_in_white_noise_and_in_grain(name: str, grain_px: float) -> None:
-    rng = np.random.default_rng(1)
-    correlation = grain_correlation(grain_px) if grain_px else None
-    marks = [some_mark(KIND[name], 1.0, rng) for _ in range(2)]
-    errors, covariances, best, bounds = [], [], [], []
-    for number in range(16):
-        mark = marks[number % len(marks)]
-        unit = grainy(mark.size, grain_px, rng) if grain_px else rng.standard_normal((mark.size, mark.size))
-        fit = sighted(mark, GROUND + PRECISION_CONTRAST * (mark.picture + unit / SNR), rng)
-        errors.append(fit.center_px - mark.place[:, 2])
-        covariances.append(fit.covariance_px2)
-        best.append(mark.best_errors(unit / SNR, 1 / SNR, None, correlation))
-        bounds.append(mark.bound(1 / SNR, None, correlation))
-    assert np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(best))) < 1.12
-    assert 0.9 < whitened_rms(errors, covariances) / whitened_rms(best, bounds) < 1.1
-
-
 def test_marks_say_how_well_the_frame_s_stretch_and_shear_are_known_that_move_them() -> None:
     """A few marks close together, say, that are given a little off: all their tips are then off alike."""
     rng, roughly = np.random.default_rng(8), 2e-3
@@ -273,19 +234,6 @@ def test_marks_say_how_well_the_frame_s_stretch_and_shear_are_known_that_move_th
             bounds.append(true.bound(1 / 200))
     assert np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(best))) < 1.15
     assert 0.9 < whitened_rms(errors, covariances) / whitened_rms(best, bounds) < 1.1
-
-
-def test_a_disk_on_plain_ground_uses_more_of_it() -> None:
-    rng = np.random.default_rng(2)
-    mark = some_mark(KIND["ellipse"], 1.0, rng)
-    grey = GROUND + PRECISION_CONTRAST * mark.picture + 300 * rng.standard_normal((mark.size, mark.size))
-    plain = fit_disk(scan_of(grey), mark.place[:, 2] + 0.3, mark.place[:, :2])
-    near = fit_disk(scan_of(grey), mark.place[:, 2] + 0.3, mark.place[:, :2], longest_margin_px=2.5)
-    col = np.arange(mark.size) - mark.place[0, 2]
-    neighbour = fit_disk(scan_of(grey + 9000 * (col > 10)), mark.place[:, 2] + 0.3, mark.place[:, :2])
-    assert np.trace(plain.covariance_px2) < 0.85 * np.trace(near.covariance_px2)
-    np.testing.assert_allclose(neighbour.center_px, mark.place[:, 2], atol=0.06)
-    assert not neighbour.reason
 
 
 def test_faint_soft_disks_are_at_the_bound() -> None:

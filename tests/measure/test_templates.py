@@ -14,7 +14,7 @@ from scipy.special import ndtr
 from measure import ScanWindow
 from measure.detection.recurrence import recurrence
 from measure.fiducials.across_frames import check_frames
-from measure.fiducials.mark_comparison import OwnFigure, check_own_figures, unlike_blur, unlike_others
+from measure.fiducials.mark_comparison import check_own_figures, unlike_blur, unlike_others
 from measure.flags import Cause, Code, Reason, Status
 from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import Bar, MarkShape, MarkTemplate, cross, polygon
@@ -256,20 +256,6 @@ def test_lengths_of_arms_are_those_drawn_and_known_as_well_as_they_are_said_to_b
     assert np.abs(errors).max() < 0.05
     assert np.abs(np.mean(errors, axis=0)).max() < 0.016  # the estimate is linear in the lengths
     assert 0.7 < np.std(normalised, axis=0).mean() < 1.3
-
-
-def test_good_figures_are_doubted_as_seldom_as_stated_and_frames_that_do_not_agree_tell_nothing() -> None:
-    rng, off = np.random.default_rng(2), list[float]()
-    for _ in range(300):
-        sigmas = rng.uniform(0.005, 0.03, 8)
-        own = OwnFigure.from_frames(rng.normal(-0.1, np.hypot(sigmas, 0.014)), sigmas, is_blur=False)
-        assert own is not None
-        assert own.value == pytest.approx(-0.1, abs=5 * own.sigma)
-        off += (own.off / own.off_sigma).tolist()
-    assert 0.85 < np.std(off) < 1.15
-    apart, sigmas = np.array([-0.1, 0.0, 0.1, 0.2]), np.full(4, 0.01)
-    assert OwnFigure.from_frames(apart, sigmas, is_blur=False) is None
-    assert OwnFigure.from_frames(np.full(2, -0.1), sigmas[:2], is_blur=False) is None
 
 
 @pytest.mark.parametrize(("poses", "agree"), [(("0", "0", "0m"), True), (("0", "0", "0"), False)])

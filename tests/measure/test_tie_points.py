@@ -137,15 +137,6 @@ def test_a_frame_that_one_pair_alone_shows_is_left_out() -> None:
     assert tracks_of_pairs(chain) == []
 
 
-def test_what_one_pair_alone_has_is_a_track_of_two() -> None:
-    assert tracks_of_pairs({(0, 1): pairs((4, 5)), (1, 2): pairs((7, 8))}) == [{0: 4, 1: 5}, {1: 7, 2: 8}]
-
-
-def test_two_features_in_one_frame_are_no_track() -> None:
-    shared = {(0, 1): pairs((4, 5), (8, 9)), (0, 2): pairs((4, 6), (8, 6)), (1, 2): pairs((5, 6), (9, 6))}
-    assert tracks_of_pairs(shared) == []
-
-
 def test_scans_of_one_exposed_frame_are_one_sight_of_a_point() -> None:
     """Frame a in two scans that overlap, b whole, and c that shows a part of the ground: every candidate is in one scan
     of a, in b and in c. The scans of a are no pair, and a point of theirs that b alone shows has two sights only."""
@@ -202,12 +193,6 @@ def test_a_tree_of_the_next_row_is_an_outlier() -> None:
         first, second = seen_twice(rng, relief=1.0)
         second[7] += [TREES_PX, 0.0]
         assert np.flatnonzero(neighbour_outliers(first, second)).tolist() == [7]
-
-
-def test_in_which_frame_a_point_is_wrong_does_not_matter() -> None:
-    first, second = seen_twice(np.random.default_rng(2), relief=2.0)
-    first[7] += [0.0, 400.0]
-    assert np.flatnonzero(neighbour_outliers(first, second)).tolist() == [7]
 
 
 def test_a_false_point_takes_none_of_its_neighbours_with_it() -> None:
@@ -276,16 +261,6 @@ def off_and_sigma(joins: Joins, move: Array) -> tuple[Array, Array]:
         off.append(other.center_px - one.center_px - move)
         variance.append(np.trace(one.covariance_px2 + other.covariance_px2) / 2.0)
     return np.array(off), np.sqrt(np.array(variance))[:, None]
-
-
-@pytest.mark.study
-def test_errors_of_joins_are_as_large_as_their_standard_deviations(tmp_path: Path) -> None:
-    parts, move = scanned(tmp_path, 1500.0)
-    joins = measure_joins(parts, 30)
-    assert len(joins.marks["a"]) == 30
-    off, sigma = off_and_sigma(joins, move)
-    assert 0.8 < np.sqrt(np.mean((off / sigma) ** 2)) < 1.25
-    assert np.abs(off.mean(axis=0)).max() < 0.02
 
 
 @pytest.mark.study

@@ -86,11 +86,6 @@ def test_pixels_that_the_pictures_own_unknowns_take_up_whole_tell_nothing_of_the
     ).information.matrix.any()
 
 
-def test_noise_that_is_none_is_raised_to_a_floor() -> None:
-    raised = NoiseModel(0.0, np.zeros((1, 1)), 0.0).floored(4.0)
-    assert raised.variance_dn2 == raised.autocovariance_dn2[0, 0] == 4.0
-
-
 @pytest.mark.parametrize(("tone", "code", "light"), [
     (LINEAR, 1000.0, 1000.0),
     (Tone(power(2.2)), FULL / 2, FULL * 0.5**2.2),
@@ -174,14 +169,6 @@ def test_the_linearised_effect_of_a_curve_is_that_of_a_fit_at_another_one() -> N
         np.testing.assert_allclose((more - less) / 0.2, estimate.on_place[:, k], atol=0.03)
 
 
-def test_a_cross_does_not_move_by_the_curve() -> None:
-    rng = np.random.default_rng(6)
-    mark = some_mark(KIND["cross"], 1.0, rng)
-    fit = fit_mark(mark, encode_mark(mark, 2.2, 50.0, rng), Tone.unknown())
-    assert fit.tone is not None
-    assert np.abs(fit.tone.on_place).max() < 0.02
-
-
 @pytest.mark.study
 def test_marks_that_contradict_one_another_on_the_curve_are_known_no_better_than_that() -> None:
     rng = np.random.default_rng(6)
@@ -221,14 +208,6 @@ def test_a_picture_that_contradicts_the_others_hardly_moves_the_curve() -> None:
     assert together.scatter > 0.3
     off = together.tone.mean - np.eye(5)[0]
     assert np.sqrt(off @ np.linalg.solve(together.tone.covariance, off)) < 3
-
-
-def test_what_a_picture_says_of_a_curve_of_its_own_has_the_variance_of_that_next_to_its_own() -> None:
-    information = mark_tone(np.arange(5.0)).information
-    loose = ToneInformation.pooled([information], 0.5)
-    np.testing.assert_allclose(np.linalg.inv(loose.matrix), np.linalg.inv(information.matrix) + 0.5 * np.eye(5))
-    np.testing.assert_allclose(np.linalg.solve(loose.matrix, loose.right_side), np.arange(5.0), atol=1e-9)
-    assert loose.sum_of_squares == pytest.approx(float(np.arange(5.0) @ loose.matrix @ np.arange(5.0)))
 
 
 @pytest.mark.study
