@@ -125,8 +125,9 @@ def _explain_together(frames: Frames, layout: FiducialLayout, film_mm: float) ->
     """Explain the misfits by film and marks alone, wrong given coordinates or the scanner, with the problem."""
     places = np.array([mark.xy_mm for mark in layout.marks])
     given_mm = np.array([min(max(mark.sigma_mm), MOST_GIVEN_SIGMA_MM) for mark in layout.marks])
-    if len(frames) == 1:
-        return explain(frames, places, given_mm, 0.0, film_mm), NO_REASON
+    by_given = explain(frames, places, given_mm, 0.0, film_mm)
+    if by_given.is_lone:
+        return by_given, NO_REASON
     by_places = explain_by_pattern(frames, places, given_mm, film_mm)
     is_clear, rest = (
         by_places.pattern.p_value >= FALSE_DOUBT,
@@ -143,7 +144,7 @@ def _explain_together(frames: Frames, layout: FiducialLayout, film_mm: float) ->
             return replace(by_scanner, frames=kept), _bent_scans(by_scanner)
         rest = "" if lead < -NAMED else " The scanner may do the same."
     if is_clear:
-        return explain(frames, places, given_mm, 0.0, film_mm), NO_REASON
+        return by_given, NO_REASON
     return by_places, _wrong_places(by_places, layout, rest)
 
 
@@ -173,7 +174,7 @@ def _add_findings(
     px_per_mm = frame.px_per_mm or 1.0
     code, cause = Code.OFF_FRAMES, Cause.OTHER_FRAMES
     has_it = "the camera's other frames have it, more than they scatter"
-    if len(shared.frames) == 1:
+    if shared.is_lone:
         code, cause = Code.OFF_GIVEN, Cause.GIVEN_PLACES
         has_it = "the other marks have it, more than film and given places explain"
     for mark, off in own.off_mm.items():
@@ -199,7 +200,7 @@ def _problem(own: FrameMisfit, shared: Explanation, names: Sequence[str], known_
     """Problem of an outlying frame, empty for any other. known_um: standard deviation that its marks are given."""
     if own.film_mm is None:
         return NO_REASON
-    alone = len(shared.frames) == 1
+    alone = shared.is_lone
     most_mm = float(shared.pattern.expected_marks(own, own.film_mm).distances_mm().max())
     than = "the given coordinates" if alone else "what the camera's frames have in common"
     p_value = f"p = {own.p_value:.1g} for film deformation alone"

@@ -166,6 +166,12 @@ class Explanation:
     film_is_more: bool
 
     @property
+    def is_lone(self) -> bool:
+        """Whether no other frame checks the misfit of any: at most one has more marks than an affine transformation
+        needs."""
+        return sum(each.marks.redundancy > 0 for each in self.frames.values()) < 2
+
+    @property
     def is_quiet(self) -> bool:
         """Whether there is no outlier."""
         return not (self.film_is_more or any(each.film_mm or each.off_mm for each in self.frames.values()))

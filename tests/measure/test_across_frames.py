@@ -164,6 +164,17 @@ def test_given_coordinates_that_all_frames_contradict(places: list[tuple[float, 
         assert set(result.film_sigma_mm) == {0.005}
 
 
+def test_a_frame_of_three_marks_checks_no_other_frame() -> None:
+    """A bent frame of four marks is alone then: nothing tells whether its film or the given coordinates are wrong."""
+    rng, layout = np.random.default_rng(8), make_layout(FOUR)
+    four, three = make_frames(layout, 2, rng)
+    frames = [shift_mark(four, 0, (30.0, 30.0)), replace(three, marks=three.marks[:3])]
+    result = check_frames(frames, layout, [(20.0, 20.0)] * 2)
+    assert "one frame does not tell which" in result.frames[0].problems[0]
+    assert result.film_sigma_mm[0] > 0.1
+    assert not result.frames[1].problems
+
+
 def test_what_is_alike_in_scan_axes_is_the_scanners() -> None:
     rng, layout = np.random.default_rng(9), make_layout(EIGHT)
     frames = make_frames(layout, 8, rng, poses=("0", "90", "180", "270m"), scanner_mm=0.06)
