@@ -169,8 +169,7 @@ def _parameters(camera: str, lens: Lens) -> tuple[Parameter, ...]:
 
 
 def _moved_covariance(covariance: Covariance, camera: str, source: Lens, lens: ConvertedLens) -> Covariance:
-    """Covariances of all parameters after the conversion of one camera, by propagation with the derivatives of its
-    lens."""
+    """Covariance of all parameters after the conversion of one camera, by the derivatives of its lens."""
     old, new = _parameters(camera, source), _parameters(camera, lens.lens)
     others = tuple(each for each in covariance.parameters if each not in old)
     by_old = np.zeros((len(new) + len(others), len(old) + len(others)))
@@ -246,8 +245,7 @@ def _converted_camera(path: Path, folder: Path, options: ConvertOptions) -> Conv
 
 
 def _sigmas(given: Array, source: Lens, found: ConvertedLens) -> Array:
-    """Standard deviations (3 + k,) from those of the source, taken as uncorrelated; parameters that depend on a free
-    one are free."""
+    """(3 + k,) standard deviations, from the uncorrelated ones of the source; what depends on a free one is free."""
     free, lens = np.isinf(given), found.lens
     sigmas = np.sqrt(np.maximum(np.diag(lens.covariance), 0.0))
     is_free = np.zeros(len(sigmas), dtype=bool)

@@ -100,8 +100,7 @@ def publish(folder: Path, files: Mapping[str, str | bytes], readme_text: str) ->
 
 
 def _check_names(block: Block) -> None:
-    """Raise InputError for images with equal file names in different folders: other programs know images by the name
-    only."""
+    """Raise InputError for equal file names in different folders: other programs know images by the name only."""
     images: dict[str, str] = {}
     for frame in block.frames:
         other = images.setdefault(frame.file_name, frame.image)

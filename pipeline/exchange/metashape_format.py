@@ -99,8 +99,7 @@ def _image(frame: OutFrame) -> dict[str, object]:
 
 
 def _calibration(lens: FittedLens, box: Canvas) -> str:
-    """Calibration of the exposed frame, with its width and height; cx and cy from its centre. Metashape's p1 is
-    OpenCV's p2."""
+    """Calibration of the exposed frame; cx and cy from its centre. Metashape's p1 is OpenCV's p2."""
     fx, fy, x0, y0 = lens.named(INTERIOR)
     k1, k2, p1, p2, k3 = lens.named(BROWN)
     middle = box.x_mm + box.width_px * box.pitch_mm / 2.0, box.y_mm - box.height_px * box.pitch_mm / 2.0
@@ -123,8 +122,7 @@ def import_metashape(paths: Sequence[Path], options: ImportOptions) -> Incoming:
 
 
 def _read_camera(path: Path, options: ImportOptions) -> CameraFile:
-    """Read one calibration. Raises InputError for other files, and for parameters that no distortion family here
-    has."""
+    """Read one calibration. Raises InputError for other files, and for parameters that no family here has."""
     root = read_xml(path)
     if root.tag != "calibration":
         raise InputError(f"{path}: its root is <{root.tag}>, not <calibration>. Save it as Agisoft XML.")

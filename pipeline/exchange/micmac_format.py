@@ -222,8 +222,7 @@ def _resampling(camera: str, box: Canvas) -> str:
 
 
 def _affine_misfit_px(frame: OutFrame, fiducials: Mapping[str, Array], box: Canvas) -> float:
-    """Largest difference at an image's fiducials between an affine transformation with equal weights and the adjusted
-    one, px of the frame."""
+    """Largest difference, px of the frame, at an image's fiducials between the unweighted and the adjusted affinity."""
     marks = tuple(mark for mark in frame.observed(fiducials=True) if mark.point in fiducials)
     if len(marks) < _FEWEST:
         return 0.0

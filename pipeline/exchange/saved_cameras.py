@@ -131,13 +131,7 @@ def _save(calibrations: Sequence[_Calibration], path: Path) -> SavedCamera:
 
 
 def _combine(calibrations: Sequence[_Calibration]) -> tuple[Array, Array, Mapping[Parameter, float]]:
-    """Weighted mean of several calibrations.
-
-    Returns
-    -------
-    Values and covariance of the first calibration's parameters; by free parameter, the standard deviation between
-    archives.
-    """
+    """Weighted mean: values and covariance of the first one's parameters; by free parameter, sigma between archives."""
     first = calibrations[0]
     if len(calibrations) == 1:
         return first.values, first.covariance, {}
@@ -159,12 +153,7 @@ def _combine(calibrations: Sequence[_Calibration]) -> tuple[Array, Array, Mappin
 
 
 def _archive_variances(values: Array, variances: Array) -> Array:
-    """Variances (n,) between archives, by the method of moments (DerSimonian and Laird).
-
-    Parameters
-    ----------
-    values, variances : (archives, n). The result is 0 where the variances explain the differences.
-    """
+    """(n,) variances between archives, by the method of moments (DerSimonian and Laird), from (archives, n)."""
     weights = 1.0 / variances
     total = weights.sum(axis=0)
     mean = (weights * values).sum(axis=0) / total
@@ -173,8 +162,7 @@ def _archive_variances(values: Array, variances: Array) -> Array:
 
 
 def _order(first: _Calibration, other: _Calibration) -> Array:
-    """Indices of the parameters of one calibration in another of the same camera. Raises InputError where they
-    differ."""
+    """Indices of one calibration's parameters in another of the same camera. Raises InputError where they differ."""
     name = first.camera.name
     ours, theirs = first.record.cameras[name].distortion, other.record.cameras[name].distortion
     where = {one: at for at, one in enumerate(other.parameters)}
@@ -230,8 +218,7 @@ def _fiducial(one: _Calibration, id: str, mark: FiducialRecord, changed: Changed
 
 
 def _adjusted_camera(one: _Calibration, record: CameraRecord, earlier: Path, path: Path, source: Source) -> CameraFile:
-    """The project's camera file with adjusted values. The calibration replaces the standard deviations of its
-    parameters."""
+    """The project's camera file with adjusted values; the calibration replaces their standard deviations."""
     camera, point = one.camera, record.principal_point_mm
     parameters = {
         name: Prior(record.distortion.parameters[name].value, prior.sigma)

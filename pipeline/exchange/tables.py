@@ -91,8 +91,7 @@ def _transformations(adjustment: AdjustmentRecord, block: Block) -> Iterable[Row
 
 
 def _covariances(block: Block) -> Iterable[Row]:
-    """Covariances of each image's exterior orientation and film transformation: lower triangle; mm, object units and
-    rad."""
+    """Covariances of each image's orientation and film: lower triangle; mm, object units and rad."""
     of_image: dict[str, list[Parameter]] = {}
     for each in block.covariance.parameters:
         if each.kind in ("exterior", "film"):

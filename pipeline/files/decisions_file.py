@@ -356,10 +356,7 @@ def _locked(path: Path, exclusive: bool = False) -> Iterator[None]:
 
 
 def _end_last_line(file: BinaryIO, path: Path) -> None:
-    """Complete the last line: add a missing line end, drop a line that was cut short.
-
-    Raises InputError for any other invalid line, since appended text would become part of it.
-    """
+    """Add a missing line end, or drop a line that was cut short. Raises InputError for any other invalid line."""
     size = file.seek(0, os.SEEK_END)
     file.seek(max(0, size - _LONGEST_LINE))
     data = file.read()

@@ -197,8 +197,7 @@ def _calibration(
 
 
 def _check_held(sigma: Table, earlier: EarlierCalibration, camera: Camera) -> None:
-    """Check that parameters held fixed by the earlier adjustment are fixed at the same values here: its other values
-    are conditional on them."""
+    """Check that parameters that the earlier adjustment held fixed are fixed at the same values here."""
     given: dict[tuple[str, str], Prior | None] = {  # by fiducial id and quantity
         ("", "c"): camera.principal_distance_mm,
         ("", "x0"): camera.x0_mm,

@@ -57,8 +57,7 @@ def read_points(path: Path) -> GivenPoints:
 
 
 def _coordinate(row: Row, axis: str) -> Prior | None:
-    """Prior of a coordinate. A sigma of 0 fixes it, a blank sigma frees it, a blank coordinate is unknown. Without a
-    sigma column the value is fixed."""
+    """Prior of a coordinate: fixed by sigma 0 or without that column, freed by a blank sigma, unknown if blank."""
     value, sigma = row.number(axis), row.sigma(f"s{axis}")
     if value is None:
         if sigma is not None:
@@ -200,8 +199,7 @@ def _window(row: Row) -> Window | None:
 def _join(
     path: Path, exterior: dict[str, Exterior | None], camera: Mapping[str, str], part_of: Mapping[str, str]
 ) -> None:
-    """Copy the orientation of a frame to all its parts. Raises InputError where parts contradict each other, or a frame
-    has only one part."""
+    """Copy the orientation of a frame to its parts. Raises InputError for contradictions, and for a single part."""
     for frame in sorted({frame for frame in part_of.values() if frame}):
         parts = [image for image in part_of if part_of[image] == frame]
         if len(parts) == 1:

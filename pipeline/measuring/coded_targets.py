@@ -105,8 +105,7 @@ class _CodedDots:
 
 
 def _coded_dots(scan: Scan, coded: CodedPoints, mirrored: bool = False) -> _CodedDots:
-    """Find the dots of coded points in the whole scan, and read their codes. mirrored: the film is seen from its other
-    side."""
+    """Find the dots in the whole scan, and read their codes. mirrored: the film is seen from its other side."""
     greatest = max(_GREATEST_SHARE * float(np.hypot(scan.width_px, scan.height_px)), _LEAST_DIAMETER_PX)
     search = DiskSearch((_LEAST_DIAMETER_PX, greatest), coded.settings.polarity, _LEAST_CONTRAST)
     found, code = disk_candidates(scan, search), coded.settings.code

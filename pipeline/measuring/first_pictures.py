@@ -141,8 +141,7 @@ def _recurrence(job: tuple[Window, list[Window], float]) -> Recurrence:
 
 
 def _view(task: ScanTask) -> tuple[Array, Mapping[str, Window]] | None:
-    """Approximate placement of the frame in one scan, and a window around every learned mark; None where the drawn
-    marks were not found or the scan cannot be read."""
+    """Approximate placement of the frame, and a window around every learned mark; None without drawn marks or scan."""
     camera = task.options.camera
     with suppress(MeasurementError), task.opened() as scan:
         placement = _drawn_placement(task.options, scan)

@@ -163,8 +163,7 @@ def _freed(camera: Camera, distortion: Distortion, values: Mapping[str, float], 
 
 
 def _image_points(adjustment: Adjustment, image: str) -> tuple[ImagePoints, Array, list[str]]:
-    """Observations of an image in the camera frame, the standard deviation (n,) of each, and the names of the
-    points."""
+    """Observations of an image in the camera frame, their standard deviations (n,), and the names of the points."""
     observations = adjustment.network.observations
     weights = adjustment.weights if len(adjustment.weights) else np.ones(len(observations))
     rows = [

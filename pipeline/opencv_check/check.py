@@ -154,8 +154,7 @@ def compare_corners(
 
 
 def _paired(image: ImagePoints, pictures: BoardPictures) -> tuple[ImagePoints, ImagePoints] | None:
-    """Corresponding points, each of OpenCV's with the name of the nearest measured one; None where there are too
-    few."""
+    """OpenCV's points with the names of the nearest measured ones; None where there are too few."""
     own_mm = pictures.points_mm(image.image)
     if len(own_mm) == 0 or len(image.xyz) < 2:
         return None
@@ -355,8 +354,7 @@ def _rows(
 
 
 def _agreement(rows: Sequence[Row], sigmas_tell: bool) -> tuple[Verdict, str]:
-    """Verdict from the parameters. sigmas_tell: whether the residuals are larger than OpenCV's rounding, so that sigmas
-    are meaningful."""
+    """Verdict from the parameters. sigmas_tell: whether the residuals are larger than OpenCV's rounding."""
     worst = max(rows, key=lambda row: row.difference_sigmas)
     loosest = max(rows, key=_sigma_ratio)
     found = f"{worst.name} differs most from OpenCV's, by {worst.difference_sigmas:.2f} sigma"

@@ -234,8 +234,7 @@ def calibrate_fisheye(images: Sequence[ImagePoints], freedom: Freedom, start: Ar
 
 
 def _fisheye_derivatives(xyz: Array, turn: Array, shift: Array, matrix: Array, lens: Array, alpha: float) -> Array:
-    """Derivatives (2 n, 9) with respect to the camera's parameters, projected orthogonally to those of the exterior
-    orientation."""
+    """(2 n, 9) derivatives by the camera's parameters, orthogonal to those by the exterior orientation."""
     _, jacobian = cv2.fisheye.projectPoints(xyz[None], turn, shift, matrix, lens, alpha=alpha)
     pose = np.linalg.qr(jacobian[:, 8:14])[0]
     by_camera = jacobian[:, [*range(8), 14]]
@@ -291,8 +290,7 @@ class _Pixels:
 
 
 def _sigmas(sigmas: Array, freedom: Freedom, start: Array, pixel_mm: float) -> Array:
-    """Standard deviations in the order of NAMES. If the ratio of the focal lengths is held, OpenCV returns only that of
-    fy."""
+    """Standard deviations in the order of NAMES. With a held ratio of focal lengths OpenCV returns only that of fy."""
     found = sigmas[: len(NAMES)] * np.where(np.arange(len(NAMES)) < 4, pixel_mm, 1.0)
     if "fy" not in freedom.names:
         found[0] = found[1] * start[0] / start[1]

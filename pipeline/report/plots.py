@@ -100,8 +100,7 @@ def calibrated_cameras(data: ReportData) -> Iterator[tuple[CameraPlots, CameraRe
 
 
 def _stored_map(record: CameraRecord, distance: float) -> tuple[Array, Array]:
-    """Stored map: places (r, c, 2) and standard deviations (r, c), mm. Raises AdjustmentError for a distance without
-    one."""
+    """Places (r, c, 2) and standard deviations (r, c), mm. Raises AdjustmentError for a distance without a map."""
     for known in record.projection:
         if known.distance == distance or (math.isnan(known.distance) and math.isinf(distance)):
             places = np.stack(np.meshgrid(known.x_mm, known.y_mm), axis=-1)
