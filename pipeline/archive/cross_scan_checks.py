@@ -4,7 +4,6 @@ import hashlib
 import json
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
 
@@ -17,7 +16,7 @@ from pipeline.archive.work import Work
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.measuring.camera_identification import add_plates
-from pipeline.measuring.roll import check_scans, name_roll, note_same_frames, reject_repeated_views
+from pipeline.measuring.roll import check_repeated_views, check_scans, name_roll, note_same_frames
 from pipeline.measuring.scan_task import ScanTask
 from pipeline.provenance import alike_groups, content_hash, fingerprint, shard_number
 from pipeline.results.measured_record import MeasuredScan
@@ -154,8 +153,7 @@ def _check_camera(
     """Second step of the measurement. Scans whose marks get other names by it are measured again."""
     scans = name_roll(tasks, [work.read(task.name) for task in tasks], camera.writing, work.measure)
     checked = check_scans(camera, scans, project.film)
-    has_board = project.targets is not None and project.targets.board is not None
-    return tuple(reject_repeated_views(checked)) if has_board else checked
+    return tuple(check_repeated_views(checked, project.targets is not None and project.targets.board is not None))
 
 
 def _writing_remarks(project: Project, tasks: Sequence[ScanTask], work: Work) -> Remarks:
@@ -177,9 +175,5 @@ def _checked_result(scan: MeasuredScan, work: Work) -> CheckedResult:
 def _copy(scan: MeasuredScan, original: str) -> MeasuredScan:
     """Scan with all observations rejected, since they count in the scan of which its file is a copy."""
     reason = Reason(f"its file is a copy of that of {original}, which counts", Code.COPY)
-    marks = [
-        replace(mark, status=Status.REJECTED, reason=reason) if mark.status.is_observation else mark
-        for mark in scan.frame.marks
-    ]
     sentence = f"its file is byte for byte that of {original}: its marks count once. Name one of both in `exclude`."
-    return scan.changed(marks, [Reason(sentence, Code.COPY)])
+    return scan.restated(None, Status.REJECTED, reason).changed(problems=[Reason(sentence, Code.COPY)])

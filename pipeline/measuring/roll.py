@@ -31,6 +31,7 @@ _WAYS = 2  # scan orientations searched by known lines: more would take as long 
 _LEAST = 6  # letters and digits that a known line needs
 _TURNS = ("0", "90", "180", "270")  # directions of text in the camera's frame
 _SAME_VIEW = 0.005  # fraction of an image's longer side; in sets of boards no two images are nearer than 0.04
+_SAME_SCAN_PX = 0.2  # px: film that is laid on a scanner again lies many pixels elsewhere
 _FEWEST_COMMON = 4  # points in both of two images
 _SAME = ("run", "frames", "date")  # fields that identify a frame together with its number
 
@@ -214,35 +215,47 @@ def check_scans(camera: CameraFile, measured: Sequence[MeasuredScan], film: Beli
     return tuple(by_image.get(scan.frame.image, scan) for scan in measured)
 
 
-def reject_repeated_views(scans: Sequence[MeasuredScan]) -> list[MeasuredScan]:
-    """Reject a board's points in images that show it where another image does.
+def check_repeated_views(scans: Sequence[MeasuredScan], is_board: bool) -> list[MeasuredScan]:
+    """Reject a board's points in images that show it where another image does, and name scans of film stored twice.
 
-    The errors of lens, board and picture's processing repeat in such an image, so that it adds nothing to the other.
+    The errors of lens, board and picture's processing repeat in such an image, so that it adds nothing to the other. A
+    scan stored again, in another format, size or orientation, has its fiducials at the same places of the picture.
     """
+    kind = "target" if is_board else "fiducial"
     points = {name: at for at, name in enumerate(dict.fromkeys(m.point for s in scans for m in s.frame.marks))}
-    places_px = np.full((len(scans), len(points), 2), np.nan)
+    sides_px = np.array([max(scan.width_px, scan.height_px, 1) for scan in scans])
+    places = np.full((len(scans), len(points), 2), np.nan)  # from the centre, in sides, along the camera's axes
     for row, scan in enumerate(scans):
+        up = up_from_camera(scan.frame.pose.name) if scan.frame.pose else np.eye(2)
         for mark in scan.frame.marks:
-            if mark.status.is_observation and mark.kind == "target":
-                places_px[row, points[mark.point]] = mark.center_px
-    is_known = np.isfinite(places_px[..., 0])
-    kept, repeated = list[int](), dict[int, tuple[int, float]]()
+            if mark.center_px is not None and mark.status.is_observation and mark.kind == kind:
+                centred = mark.center_px + 0.5 - np.array([scan.width_px, scan.height_px]) / 2
+                places[row, points[mark.point]] = centred * (1, -1) @ up / sides_px[row]
+    is_known = np.isfinite(places[..., 0])
+    kept, repeated = list[int](), dict[int, MeasuredScan]()
     for row in np.argsort(-is_known.sum(axis=1), kind="stable").tolist():
-        apart_px = np.nan_to_num(np.hypot(*np.moveaxis(places_px[kept] - places_px[row], 2, 0))).max(axis=1, initial=0)
+        apart = np.nan_to_num(np.hypot(*np.moveaxis(places[kept] - places[row], 2, 0))).max(axis=1, initial=0)
+        apart_px = apart * np.minimum(sides_px[kept], sides_px[row])
         is_comparable = (is_known[kept] & is_known[row]).sum(axis=1) >= _FEWEST_COMMON
         apart_px[~is_comparable] = np.inf
-        if apart_px.min(initial=np.inf) < _SAME_VIEW * max(scans[row].width_px, scans[row].height_px):
-            repeated[row] = kept[int(apart_px.argmin())], float(apart_px.min())
+        if apart_px.min(initial=np.inf) < (_SAME_VIEW * sides_px[row] if is_board else _SAME_SCAN_PX):
+            original, least_px = scans[kept[int(apart_px.argmin())]], max(float(apart_px.min()), 0.1)
+            repeated[row] = (_repeated_view if is_board else _stored_twice)(scans[row], original, least_px)
         else:
             kept.append(row)
-    return [
-        _repeated_view(scan, scans[repeated[row][0]].frame.image, repeated[row][1]) if row in repeated else scan
-        for row, scan in enumerate(scans)
-    ]
+    return [repeated.get(row, scan) for row, scan in enumerate(scans)]
 
 
-def _repeated_view(scan: MeasuredScan, original: str, apart_px: float) -> MeasuredScan:
-    what = f"it shows the board where {original} does to within {max(apart_px, 0.1):.1f} px"
+def _stored_twice(scan: MeasuredScan, original: MeasuredScan, apart_px: float) -> MeasuredScan:
+    sentence = (
+        f"its marks lie where those of {original.frame.image} do, to within {apart_px:.1f} px: both are the same scan "
+        "(or rectified to the same places), and its marks count twice. Name one of both in `exclude`."
+    )
+    return scan.changed(problems=[Reason(sentence, Code.COPY)])
+
+
+def _repeated_view(scan: MeasuredScan, original: MeasuredScan, apart_px: float) -> MeasuredScan:
+    what = f"it shows the board where {original.frame.image} does to within {apart_px:.1f} px"
     remedy = "its points count once. Move the board or the camera from picture to picture."
     rejected = scan.restated("target", Status.REJECTED, Reason(f"{what}, which counts", Code.COPY))
     return rejected.changed(problems=[Reason(f"{what}: {remedy}", Code.COPY)])

@@ -96,12 +96,12 @@ class MeasuredScan:
         frame = replace(frame, marks=marks, problems=(*frame.problems, *problems))
         return replace(self, frame=frame, notes=(*self.notes, *notes))
 
-    def restated(self, kind: Kind, status: Status, reason: Reason) -> "MeasuredScan":
-        """Copy in which the observed marks of a kind have another status."""
+    def restated(self, kind: Kind | None, status: Status, reason: Reason) -> "MeasuredScan":
+        """Copy in which the observed marks of a kind, or all, have another status."""
         return self.changed(
             [
                 replace(mark, status=status, reason=reason)
-                if mark.kind == kind and mark.status.is_observation
+                if kind in (mark.kind, None) and mark.status.is_observation
                 else mark
                 for mark in self.frame.marks
             ]

@@ -46,7 +46,7 @@ from pipeline.calibration.pictures import find_pictures
 from pipeline.calibration.project_files import board_options
 from pipeline.cli import run
 from pipeline.files.target_table import read_targets
-from pipeline.measuring.roll import reject_repeated_views
+from pipeline.measuring.roll import check_repeated_views
 from pipeline.opencv_check.check import BoardPictures, compare_corners, detector_name, find_points
 from pipeline.opencv_check.opencv_calibration import NAMES, Freedom, ImagePoints, OpenCvCalibration, calibrate
 from pipeline.results.measured_record import MeasuredScan
@@ -426,10 +426,35 @@ def test_a_board_at_the_same_place_counts_once() -> None:
 
     shifts_px = {"few": 1.0, "first": 0.0, "again": 10.0, "next": 18.0}
     scans = [scan(name, shift_px, 7 if name == "few" else 8) for name, shift_px in shifts_px.items()]
-    checked = {each.frame.image: each for each in reject_repeated_views(scans)}  # 0.5 % of a side is 25 px
+    checked = {each.frame.image: each for each in check_repeated_views(scans, True)}  # 0.5 % of a side is 25 px
     kept = {name for name, each in checked.items() if any(mark.status.is_observation for mark in each.frame.marks)}
     assert kept == {"first", "next"}
     assert "it shows the board where first does to within 14.1 px" in checked["again"].frame.problems[0]
+
+
+def test_a_scan_that_is_stored_twice_is_named() -> None:
+    """In another format, and at twice the size and turned by a quarter; the next frame lies half a pixel elsewhere."""
+
+    def scan(name: str, **changes: Any) -> MeasuredScan:
+        made = made_record(1)
+        marks = (replace(mark, center_px=np.asarray(mark.center_px)) for mark in made.frame.marks)
+        return replace(made, frame=replace(made.frame, image=name, marks=tuple(marks), **changes))
+
+    def moved(scan: MeasuredScan, matrix: Any, shift: Any, **changes: Any) -> MeasuredScan:
+        marks = (replace(each, center_px=matrix @ each.center_px + shift) for each in scan.frame.marks)
+        return replace(scan, frame=replace(scan.frame, marks=tuple(marks)), **changes)
+
+    first, again, turned, other = map(scan, ("first", "again", "turned", "other"))
+    assert first.frame.pose is not None
+    assert first.frame.pose.name == "90m"
+    quarter = replace(first.frame.pose, name="180m")  # (column, row) becomes (row, width - 1 - column)
+    turned = replace(turned, frame=replace(turned.frame, pose=quarter), width_px=8000, height_px=10000)
+    matrix = 2 * np.array([[0.0, 1.0], [-1.0, 0.0]])
+    turned = moved(turned, matrix, (0.5, 2 * first.width_px - 1.5))
+    scans = [first, moved(again, np.eye(2), 0.05), turned, moved(other, np.eye(2), (0.5, 0.0))]
+    problems = {each.frame.image: each.frame.problems for each in check_repeated_views(scans, False)}
+    assert {name: len(each) for name, each in problems.items()} == {"first": 0, "again": 1, "turned": 1, "other": 0}
+    assert "its marks lie where those of first do" in problems["turned"][0]
 
 
 def test_boards_as_project_files_have_them() -> None:
