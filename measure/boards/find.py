@@ -156,7 +156,7 @@ def _shorter_steps(grid: Array) -> Array:
 
 
 def find_chessboard(picture: Bytes, spec: ChessboardSpec, is_quick: bool = False) -> FoundBoard:
-    """Find the inner corners of a chessboard, and other boards that look the same.
+    """Find the inner corners of a chessboard.
 
     A board of a different count is refused, with its count, since its corners would get wrong names. A part of a board
     is refused if its position on the board is ambiguous. is_quick: use only the fastest detector, for a whole board.
@@ -171,7 +171,7 @@ def find_chessboard(picture: Bytes, spec: ChessboardSpec, is_quick: bool = False
             steps = np.stack([np.gradient(grid, axis=1), np.gradient(grid, axis=0)], axis=-1)
             places = np.ndindex(*grid.shape[:2])
             corners = {f"r{row}c{column}": FoundCorner(grid[row, column], steps[row, column]) for row, column in places}
-            return FoundBoard(corners, others_px=_other_chessboards(picture, grid, spec))
+            return FoundBoard(corners)
         other_size = pattern
     if other_size is not None and not is_quick:
         return _part_of_chessboard(picture, other_size, spec)
@@ -207,7 +207,7 @@ def _part_of_chessboard(picture: Bytes, pattern: WholePattern, spec: ChessboardS
         for place in np.ndindex(naming.shape[0], naming.shape[1])
         if shown[place]
     }
-    return FoundBoard(corners, others_px=_other_chessboards(picture, grid, spec))
+    return FoundBoard(corners)
 
 
 def _namings(picture: Bytes, grid: Array, borders: tuple[bool, ...], spec: ChessboardSpec) -> Iterator[Integers]:
@@ -323,26 +323,26 @@ def _drawn_chessboard_grid(picture: Bytes, spec: ChessboardSpec, flags: int, dra
     return None
 
 
-def _other_chessboards(picture: Bytes, grid: Array, spec: ChessboardSpec) -> tuple[Array, ...]:
-    """Centres of further chessboards; each is painted over before the next one is searched."""
-    picture, background = picture.copy(), int(np.median(picture[::4, ::4]))
-    others: list[Array] = []
+def _other_chessboards(scan: Scan, found: FoundBoard, spec: ChessboardSpec, factor: int) -> tuple[Array, ...]:
+    """Centres of further chessboards in the scan reduced by a factor, in which a smaller one shows; each is painted
+    over before the next one is searched."""
+    picture, offset = _searchable(scan, factor)[0].copy(), (factor - 1) / 2
+    background = int(np.median(picture[::4, ::4]))
+    corners = np.array([corner.center_px for corner in found.corners.values()])
+    steps = np.array([corner.steps_px for corner in found.corners.values()])
+    centers, steps, others = (corners - offset) / factor, steps / factor, list[Array]()
     while True:
-        cv2.fillConvexPoly(picture, np.round(_outline(grid)).astype(np.int32), background)
+        around = centers[:, None] + np.einsum("nij,kj->nki", steps, [(-1, -1), (1, -1), (1, 1), (-1, 1)])
+        hull = cv2.convexHull(around.reshape(-1, 2).astype(np.float32))
+        cv2.fillConvexPoly(picture, np.round(hull).astype(np.int32), background)
         if not cv2.checkChessboard(picture, (spec.columns, spec.rows)):  # searching in vain takes long
             return tuple(others)
-        other = _drawn_chessboard_grid(picture, spec, _THOROUGHLY, _DRAWINGS)
-        if other is None:
+        grid = _drawn_chessboard_grid(picture, spec, _THOROUGHLY, _DRAWINGS)
+        if grid is None:
             return tuple(others)
-        grid = other
-        others.append(grid.mean(axis=(0, 1)))
-
-
-def _outline(grid: Array) -> Array:
-    """(n, 2) convex hull of a chessboard's squares, one step beyond its inner corners."""
-    columns = np.concatenate([2 * grid[:, :1] - grid[:, 1:2], grid, 2 * grid[:, -1:] - grid[:, -2:-1]], axis=1)
-    squares = np.concatenate([2 * columns[:1] - columns[1:2], columns, 2 * columns[-1:] - columns[-2:-1]])
-    return np.asarray(cv2.convexHull(squares.reshape(-1, 2).astype(np.float32)), float).reshape(-1, 2)
+        others.append(grid.mean(axis=(0, 1)) * factor + offset)
+        centers = grid.reshape(-1, 2)
+        steps = np.stack([np.gradient(grid, axis=1), np.gradient(grid, axis=0)], axis=-1).reshape(-1, 2, 2)
 
 
 def _right_handed(grid: Array) -> Array:
@@ -360,11 +360,13 @@ def find_board(scan: Scan, spec: ChessboardSpec | ArucoSpec | CharucoSpec | Squa
     if isinstance(spec, ChessboardSpec) and quick > max(sizes):
         found = _find_reduced(scan, spec, quick, is_quick=True)
         if found.corners:
-            return found
+            return replace(found, others_px=_other_chessboards(scan, found, spec, max(sizes)))
     for factor in sorted(set(sizes), reverse=True):
         found = _find_reduced(scan, spec, factor)
         if found.corners or found.reason.code == Code.CONTRAST:
             break
+    if found.corners and isinstance(spec, ChessboardSpec):
+        found = replace(found, others_px=_other_chessboards(scan, found, spec, factor))
     return found
 
 

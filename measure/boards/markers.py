@@ -29,6 +29,7 @@ Changes = dict[str, Any]
 Layout = TypeVar("Layout", ArucoSpec, CharucoSpec)
 _OFF_SQUARES = 0.25  # in squares, largest distance of a corner from the place given by the adjacent markers
 _COMMON_DICTIONARIES = ("4X4_250", "5X5_250", "6X6_250", "7X7_250", "ARUCO_ORIGINAL", "APRILTAG_36h11")
+_FEWEST_TWICE = 2  # markers read at several places, from which on these are another board, no false readings
 _FEWEST_CORNERS = 4  # points needed for a homography
 
 
@@ -97,7 +98,11 @@ def placed_markers(read: MarkerReadings, board: Markers) -> ReadMarkers:
     readings = {number: places for number, places in read.outlines_px.items() if number in board}
     view = _view(readings, board, read.size_px, read.border / 2)
     corners: dict[int, Array] = {}
+    several = {number: len(places) for number, places in readings.items() if len(places) > 1}
     refused: dict[int, Reason] = {}
+    if len(several) >= _FEWEST_TWICE:
+        message = "marker {} was read at {} places, of which one lies on the board: there may be another such board"
+        refused = {number: Reason(message.format(number, count), Code.AMBIGUOUS) for number, count in several.items()}
     agreeing = 0
     for number, places in readings.items():
         off = [_off(view, board[number], place) for place in places]

@@ -304,6 +304,19 @@ def test_of_boards_that_are_alike_none_is_observed(kind: str) -> None:
     assert {mark.reason for mark in three.marks} == {three.ambiguous}
 
 
+def test_a_board_of_less_than_half_the_size_is_another_one() -> None:
+    """The larger one is found in a picture of 640 px, in which the squares of the other are 8 px large."""
+    squares, rng = np.indices((7, 10)).sum(axis=0) % 2, np.random.default_rng(4)
+    picture = np.full((700, 1300), 120.0)
+    for side, left, top in ((70, 60, 40), (16, 960, 300)):
+        dark = np.pad(np.kron(squares, np.ones((side, side))), side, constant_values=1)
+        picture[top : top + dark.shape[0], left : left + dark.shape[1]] = 25 + 200 * dark
+    blurred = np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.8), float) + rng.normal(0, 2, picture.shape)
+    board = measure_board(scan_of(blurred, 255), ChessboardSpec(9, 6, 30.0))
+    assert "2 boards of 9 x 6 inner corners" in board.ambiguous
+    assert {mark.status for mark in board.marks} == {Status.REJECTED}
+
+
 def test_a_circle_grid_is_no_part_of_a_larger_one() -> None:
     spec, larger = CircleGridSpec(6, 5, 28.0, 13.0), CircleGridSpec(7, 5, 28.0, 13.0)
     board = measure_board(scan_of(tile_boards(larger, circles_dark(larger), (1.0,))), spec)

@@ -221,6 +221,9 @@ def test_a_marker_read_twice_is_the_one_where_its_board_has_it(name: str) -> Non
     two = picture.copy()
     picture[60:120, width + 100 : width + 160] = cv2.aruco.generateImageMarker(dictionary, 3, 60)
     two[20 : 20 + height, width + 40 : 2 * width + 40] = drawing
+    half = np.full_like(picture, 255.0)
+    half[20 : 20 + height, 20 : 20 + width] = drawing
+    half[20 : 20 + height, width + 40 + width // 2 : 2 * width + 40] = drawing[:, width // 2 :]
 
     def measure_picture(grey: Array) -> BoardMeasurement:
         noise = np.random.default_rng(2).normal(0, 300, grey.shape)
@@ -232,6 +235,9 @@ def test_a_marker_read_twice_is_the_one_where_its_board_has_it(name: str) -> Non
     neither = measure_picture(two)
     assert "was read at 2 places" in neither.reason
     assert all(mark.status is Status.ABSENT for mark in neither.marks)
+    beside = measure_picture(half)
+    assert all(mark.status is Status.MEASURED for mark in beside.marks)
+    assert "of which one lies on the board: there may be another such board" in beside.refused[0]
 
 
 @pytest.mark.parametrize("gap", [60.0, 130.0])
