@@ -4,14 +4,40 @@ import numpy as np
 import pytest
 from drawn import drawn, transformed, whitened
 from numpy.typing import NDArray
+from scipy.special import ndtr
+from scipy.stats import multivariate_normal
 from studies import parametrize_with_studies
 
 from measure import ScanWindow
-from measure.boards.corner_surfaces import crossing, quarter
+from measure.array_types import Single
+from measure.boards.corner_surfaces import Surface, crossing, quarter
 from measure.boards.corners import Corner, CornerStart, fit_corners
 
 Array = NDArray[np.float64]
 SIZE, NOISE, CONTRAST = 25, 4.0, 100.0
+
+
+@pytest.mark.parametrize("correlation", [-0.7, 0.0, 0.4])
+@pytest.mark.parametrize("surface", [crossing, quarter])
+def test_the_closed_form_and_its_derivatives(correlation: float, surface: Surface) -> None:
+    rng = np.random.default_rng(1)
+    u, v = rng.normal(0, 2, (2, 6))
+    both = [multivariate_normal([0, 0], [[1, correlation], [correlation, 1]]).cdf(place) for place in np.c_[u, v]]
+    truth = 4 * np.array(both) - 2 * ndtr(u) - 2 * ndtr(v) + 1 if surface is crossing else 2 * np.array(both) - 1
+    value, *slopes = surface(*singles(u, v, correlation))
+    np.testing.assert_allclose(value[0], truth, atol=2e-6)
+    e = 0.02
+    steps = ((e, 0, 0), (0, e, 0), (0, 0, e))
+    for slope, (du, dv, dc) in zip(slopes, steps, strict=True):
+        ahead, behind = (
+            surface(*singles(u + way * du, v + way * dv, correlation + way * dc))[0] for way in (1.0, -1.0)
+        )
+        np.testing.assert_allclose(slope, (ahead - behind) / (2 * e), atol=5e-4)
+
+
+def singles(u: Array, v: Array, correlation: float) -> tuple[Single, Single, Single]:
+    """Of one corner, in single precision."""
+    return u[None].astype(np.float32), v[None].astype(np.float32), np.array([[correlation]], np.float32)
 
 
 def board_steps(rng: np.random.Generator) -> Array:

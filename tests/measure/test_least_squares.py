@@ -116,6 +116,14 @@ def test_least_distances_leave_false_places_aside() -> None:
     np.testing.assert_allclose(both[1], 2.0 * MAP, atol=0.04)
 
 
+def test_least_distances_hold_to_what_a_map_usually_is() -> None:
+    design, there = _mapped([])
+    usual = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    held = least_distances(design, there, 5.0, 6, 1e9 * np.diag([0.0, 1.0, 1.0]), usual)
+    np.testing.assert_allclose(held[1:], np.eye(2), atol=1e-4)
+    np.testing.assert_allclose(least_distances(design, there, 5.0, 6, 1e-9 * np.diag([0.0, 1.0, 1.0]), usual), MAP)
+
+
 MAP = np.array([[7.0, -4.0], [1.02, 0.1], [-0.1, 0.97]])
 FALSE = [2, 7]
 

@@ -150,6 +150,15 @@ def test_what_touches_one_side_of_a_dot_widens_its_variance_and_chance_hardly_do
     assert np.mean([each.variance_px2 for each in chance]) < 0.05 * known_px**2
 
 
+def test_how_likely_a_touched_dot_is_far_off_is_what_drawing_at_random_finds() -> None:
+    rng, radius_px, sigma = np.random.default_rng(4), 5.3, 0.022
+    changes = rng.normal(0.0, 0.00125 * 36.0**2 / radius_px**2, 400_000)
+    alike = np.abs(changes + rng.normal(0.0, sigma, len(changes)) + 0.054) < 0.002  # of those that look so small
+    one = touch(np.exp(-0.054), sigma, radius_px)
+    expected = float(np.mean(np.abs(2 * radius_px * changes[alike]) > 0.5))
+    assert one.exceedance(0.5) / one.probability == pytest.approx(expected, abs=0.02)
+
+
 def touch(ratio: float, sigma: float, radius_px: float, px_per_mm: float = 36.0) -> Touch:
     shape = SharedShape(np.log([ratio]), np.array([sigma]), differs=False)
     return touch_of_round(shape, radius_px, px_per_mm, is_damaged=False)
