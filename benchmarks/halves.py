@@ -1,14 +1,16 @@
 """Validity of the standard deviations of board calibrations: differences between two random halves of the images.
 
 Each set is split 40 times into two halves, which are calibrated separately: by this program with an unmodelled error
-and the larger of the standard deviations of the model and by leaving out images, and by `cv2.calibrateCameraExtended`
-with the same corners. A difference over the root of the sum of both claimed variances should have standard deviation 1:
-the figures are 1.48 times the median of its absolute value. All splits of a set share its images: `range` is the 90 %
-interval of the figure for correct variances, by simulation with as many images. --corners FOLDER keeps the measured
-corners.
+and the larger of the standard deviations of the model and by leaving out images, by `cv2.calibrateCameraExtended`
+and by mrcal (Debian's package) with the same corners. A difference over the root of the sum of both claimed variances
+should have standard deviation 1: the figures are 1.48 times the median of its absolute value. All splits of a set share
+its images: `range` is the 90 % interval of the figure for correct variances, by simulation with as many images.
+--corners FOLDER keeps the measured corners.
 """
 
+import json
 import pickle
+import subprocess
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
@@ -26,6 +28,7 @@ from adjust.problem.observations import Observations
 from adjust.solution.adjustment import adjust
 from adjust.solution.unmodelled_error import adjust_unmodelled
 from benchmarks.harness import DATA, Row
+from benchmarks.peers import SYSTEM_PYTHON
 from measure.boards.corners import one_definition
 from measure.boards.measure import measure_board
 from measure.boards.specs import ChessboardSpec
@@ -37,12 +40,41 @@ from pipeline.results.comparator_file import read_comparator
 Array = NDArray[np.float64]
 QUANTITIES = ("fx", "fy", "cx", "cy", "k1")
 COLUMNS = {"set": "s", "pictures": "d", "lens": "s", "range": "s", "all": ".2f"} | dict.fromkeys(QUANTITIES, ".2f")
-COLUMNS |= {"model": ".2f", "opencv": ".2f"}
+CLAIMS = ("ours", "model", "opencv", "mrcal")
+COLUMNS |= dict.fromkeys(CLAIMS[1:], ".2f")
 SPLITS, SIMULATIONS = 40, 2000
 PIXEL_MM = 0.005
 SEED = 1
 GIVEN_PX = 0.02  # px, assumed standard deviation of published corners
 ROBUST = 1.4826
+
+
+MRCAL = """
+import json, sys, numpy as np, mrcal
+task, found = json.load(sys.stdin), []
+for each in task["tasks"]:
+    observed = np.array(each["observed"])
+    count = len(observed)
+    inputs = dict(
+        intrinsics=np.array([each["lens"]]), extrinsics_rt_fromref=np.zeros((0, 6)), points=None,
+        frames_rt_toref=np.array(each["poses"]), observations_board=observed,
+        indices_frame_camintrinsics_camextrinsics=np.array([(k, 0, -1) for k in range(count)], np.int32),
+        observations_point=None, indices_point_camintrinsics_camextrinsics=None,
+        lensmodel="LENSMODEL_" + task["model"], imagersizes=np.array([task["size"]], np.int32),
+        calibration_object_spacing=each["spacing"], do_optimize_intrinsics_core=True,
+        do_optimize_intrinsics_distortions=True, do_optimize_extrinsics=False, do_optimize_frames=True,
+        do_optimize_calobject_warp=False, do_apply_regularization=True, do_apply_outlier_rejection=True, verbose=False)
+    for _ in range(3):
+        mrcal.optimize(**inputs)
+    _, residuals, by_state, _ = mrcal.optimizer_callback(**inputs)
+    by_state, unit = by_state.toarray(), np.ones(by_state.shape[1])
+    mrcal.unpack_state(unit, **inputs)
+    used = 2 * int((observed[..., 2] > 0).sum())
+    variance = (residuals**2).sum() / (used - len(unit))
+    sigmas = unit * np.sqrt(variance * np.diag(np.linalg.inv(by_state.T @ by_state)))
+    found.append((inputs["intrinsics"][0][:5].tolist(), sigmas[:5].tolist()))
+print(json.dumps(found))
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,17 +163,17 @@ def case(set: str, seed: int, corners: str | None = None) -> dict[str, Any]:
     chosen = SETS[set]
     pictures = kept_corners(set, None if corners is None else Path(corners))
     rng = np.random.default_rng(seed)
-    claims = ("ours", "model", "opencv")
-    scores: dict[str, list[Array]] = {claim: [] for claim in claims}
-    for _ in range(SPLITS):
-        order = rng.permutation(len(pictures))
-        half = len(pictures) // 2
-        halves = [[pictures[each] for each in part] for part in (order[:half], order[half:])]
-        both = [calibrated(chosen, part) for part in halves]
-        if None in both:
+    scores: dict[str, list[Array]] = {claim: [] for claim in CLAIMS}
+    orders, half = [rng.permutation(len(pictures)) for _ in range(SPLITS)], len(pictures) // 2
+    halves = [[pictures[each] for each in part] for order in orders for part in (order[:half], order[half:])]
+    by_mrcal = calibrate_mrcal(chosen, halves)
+    found = [calibrated(chosen, part) for part in halves]
+    for k in range(0, len(halves), 2):
+        if found[k] is None or found[k + 1] is None:
             continue
-        for claim in claims:
-            (a, a_sigma), (b, b_sigma) = (each[claim] for each in both if each is not None)
+        both = [{**(found[each] or {}), "mrcal": by_mrcal[each]} for each in (k, k + 1)]
+        for claim in CLAIMS:
+            (a, a_sigma), (b, b_sigma) = (each[claim] for each in both)
             scores[claim].append((a - b) / np.hypot(a_sigma, b_sigma))
     sizes = {claim: np.abs(np.array(each)) for claim, each in scores.items()}
     low, high = honest_range(len(pictures))
@@ -151,15 +183,14 @@ def case(set: str, seed: int, corners: str | None = None) -> dict[str, Any]:
         "range": f"{low:.2f} to {high:.2f}",
         "all": ROBUST * float(np.median(sizes["ours"])),
         **{name: ROBUST * float(np.median(sizes["ours"][:, place])) for place, name in enumerate(QUANTITIES)},
-        "model": ROBUST * float(np.median(sizes["model"])),
-        "opencv": ROBUST * float(np.median(sizes["opencv"])),
+        **{claim: ROBUST * float(np.median(sizes[claim])) for claim in CLAIMS[1:]},
         "splits": len(sizes["ours"]),
         "sizes": {claim: each.tolist() for claim, each in sizes.items()},
     }
 
 
 def report(rows: Sequence[Row]) -> Iterator[str]:
-    for claim in ("ours", "model", "opencv"):
+    for claim in CLAIMS:
         sizes = np.concatenate([np.array(row["sizes"][claim]) for row in rows])
         each = ", ".join(f"{name} {ROBUST * np.median(sizes[:, place]):.2f}" for place, name in enumerate(QUANTITIES))
         yield f"pooled, {claim}: {ROBUST * np.median(sizes):.2f} ({each})"
@@ -217,15 +248,43 @@ def board_network(chosen: BoardSet, pictures: Sequence[Corners]) -> Network:
     )
 
 
-def calibrate_opencv(chosen: BoardSet, pictures: Sequence[Corners]) -> tuple[Array, Array]:
+def run_opencv(chosen: BoardSet, pictures: Sequence[Corners]) -> Any:
     flags = cv2.CALIB_FIX_K3 if chosen.lens == "opencv4" else 0
     points, places = ([np.asarray(part, np.float32) for part in each] for each in zip(
         *((each.points * [1, 1, 0], each.places_px) for each in pictures), strict=True
     ))  # fmt: skip
-    found = cv2.calibrateCameraExtended(points, places, chosen.size_px, np.eye(3), np.zeros(5), flags=flags)
+    return cv2.calibrateCameraExtended(points, places, chosen.size_px, np.eye(3), np.zeros(5), flags=flags)
+
+
+def calibrate_opencv(chosen: BoardSet, pictures: Sequence[Corners]) -> tuple[Array, Array]:
+    found = run_opencv(chosen, pictures)
     matrix, distortion, deviations = found[1], np.ravel(found[2]), np.ravel(found[5]).astype(np.float64)
     values = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], distortion[0]])
     return values, deviations[:5]
+
+
+def calibrate_mrcal(chosen: BoardSet, halves: Sequence[Sequence[Corners]]) -> list[tuple[Array, Array]]:
+    """Calibrate each half by mrcal from OpenCV's solution, in the system's interpreter; NaN where it has no mrcal."""
+    tasks = []
+    for pictures in halves:
+        found = run_opencv(chosen, pictures)
+        xy = [np.unique(np.concatenate([each.points[:, axis] for each in pictures])) for axis in (0, 1)]
+        observed, poses = np.full((len(pictures), len(xy[1]), len(xy[0]), 3), -1.0), []
+        for grid, each, turn, shift in zip(observed, pictures, found[3], found[4], strict=True):
+            row, column = (np.searchsorted(xy[axis], each.points[:, axis]) for axis in (1, 0))
+            grid[row, column] = np.column_stack([each.places_px, np.ones(len(row))])
+            poses.append(
+                [*turn[:, 0], *(shift[:, 0] + cv2.Rodrigues(turn)[0] @ [float(xy[0][0]), float(xy[1][0]), 0.0])]
+            )
+        lens = [*found[1][[0, 1, 0, 1], [0, 1, 2, 2]], *np.ravel(found[2])[: int(chosen.lens[-1])]]
+        tasks.append(
+            {"observed": observed.tolist(), "poses": poses, "lens": lens, "spacing": float(xy[0][1] - xy[0][0])}
+        )
+    task = json.dumps({"size": chosen.size_px, "model": chosen.lens.upper(), "tasks": tasks})
+    done = subprocess.run([SYSTEM_PYTHON, "-c", MRCAL], input=task, capture_output=True, text=True, check=False)
+    if "ModuleNotFoundError" in done.stderr:
+        return [(np.full(5, np.nan), np.full(5, np.nan))] * len(halves)
+    return [(np.array(values), np.array(sigmas)) for values, sigmas in json.loads(done.stdout)]
 
 
 @cache
