@@ -334,9 +334,9 @@ def is_cross(mark: MarkShape) -> bool:
 def measure_arms(window: ScanWindow, mark: MarkShape, pixel_from_mark: Array, fit: MarkFit) -> tuple[Array, Array]:
     """Estimate the lengths of the arms of a cross, relative to the drawn ones, by linear least squares.
 
-    Gain, offset and slopes are further unknowns. The derivative with respect to a length is the difference of images
-    with a longer and a shorter arm, which is uniform along the end of the arm: the estimate is proportional to the
-    missing part, regardless of the blur. Pixels masked as damage are used, since a missing arm is masked, too.
+    Gain, offset and slopes are further unknowns. The derivative with respect to a length is the image of a line about
+    the end of the arm, uniform along it: the estimate is proportional to the missing part, regardless of the blur.
+    Pixels masked as damage are used, since a missing arm is masked, too.
 
     Parameters
     ----------
@@ -351,11 +351,7 @@ def measure_arms(window: ScanWindow, mark: MarkShape, pixel_from_mark: Array, fi
     place = pixel_from_mark - np.column_stack([np.zeros((2, 2)), window.origin_px])
     height, width = window.grey.shape
     drawn = picture(mark, place, width, height, fit.blur_px)
-    changes = [
-        (picture(more, place, width, height, fit.blur_px) - picture(less, place, width, height, fit.blur_px))
-        / (2 * _CHANGE)
-        for more, less in _arm_variants(mark)
-    ]
+    changes = [picture(tip, place, width, height, fit.blur_px) / (2 * _CHANGE) for tip in _arm_tips(mark)]
     used = window.usable & (window.sides == 0)
     design = np.stack([*changes, drawn, *background_planes(height, width)])[:, used]
     grey = window.grey[used]
@@ -371,18 +367,13 @@ def measure_arms(window: ScanWindow, mark: MarkShape, pixel_from_mark: Array, fi
     return 1 + solution[: len(changes)] / gain, sigmas
 
 
-def _arm_variants(mark: MarkShape) -> list[tuple[MarkShape, MarkShape]]:
-    """For each arm: the mark with that arm longer, and with it shorter."""
-    pairs = list[tuple[MarkShape, MarkShape]]()
-    for index, bar in enumerate(mark.parts):
+def _arm_tips(mark: MarkShape) -> list[MarkShape]:
+    """For each arm: what it has more if it is longer than if it is shorter, the line about its end."""
+    tips = list[MarkShape]()
+    for bar in mark.parts:
         assert isinstance(bar, Bar)
         for tip, other in ((bar.from_mm, bar.to_mm), (bar.to_mm, bar.from_mm)):
             if np.dot(tip, np.subtract(tip, other)) > 0:  # the start of an arm near the centre is no tip
-                ends = ((tip[0] * share, tip[1] * share) for share in (1 + _CHANGE, 1 - _CHANGE))
-                longer, shorter = (_with_part(mark, index, Bar(other, end, bar.line_mm)) for end in ends)
-                pairs.append((longer, shorter))
-    return pairs
-
-
-def _with_part(mark: MarkShape, index: int, part: Bar) -> MarkShape:
-    return replace(mark, parts=(*mark.parts[:index], part, *mark.parts[index + 1 :]))
+                inner, outer = ((tip[0] * share, tip[1] * share) for share in (1 - _CHANGE, 1 + _CHANGE))
+                tips.append(replace(mark, parts=(Bar(inner, outer, bar.line_mm),)))
+    return tips

@@ -245,7 +245,12 @@ class PictureModel:
 
     def take_steadiness(self, steadiness: Array) -> None:
         """Set the steadiness (height, width), the noise of an ordinary pixel over that of each pixel."""
-        self.steadiness, self._linearised = steadiness, None
+        if self._linearised is not None:
+            before, residuals = self._linearised
+            ratio = steadiness / self.steadiness
+            self.design *= ratio
+            self._linearised = None if self.is_clipped else (before, residuals * ratio)
+        self.steadiness = steadiness
 
     def step(self, step: Array) -> float:
         """Apply a step, shortened to the range of the linearisation. Returns its length in px."""

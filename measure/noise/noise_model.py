@@ -167,12 +167,12 @@ def may_be_noise(off: Array, covariance: Array) -> bool:
 
 
 def correlated(columns: Array, noise: NoiseModel, power: float = 1.0) -> Array:
-    """Product of the noise's covariance matrix and images (n, height, width), by FFT; powers other than 1 ignore the
-    image border."""
+    """Product of the noise's covariance matrix and images (n, height, width), by FFT in single precision; powers other
+    than 1 ignore the image border."""
     spectrum, shape = _spectrum(noise, columns.shape[1:])
     if power != 1.0:
         spectrum = np.maximum(spectrum, WHITE * noise.variance_dn2) ** power
-    return np.asarray(_filtered(columns, spectrum, shape))
+    return np.asarray(_filtered(columns.astype(np.float32), spectrum.astype(np.float32), shape), float)
 
 
 def _spectrum(noise: NoiseModel, size: tuple[int, ...]) -> tuple[Array, list[int]]:

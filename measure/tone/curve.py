@@ -296,8 +296,10 @@ class Tone:
 
     def derivatives(self, light: NDArray[np.floating], full_scale: float) -> Array:
         """(k, ...) derivatives of light with respect to the departures, at the codes of this light."""
-        share = self.code(light, full_scale) / full_scale
-        return full_scale * np.stack([np.interp(share, _NODES, each) for each in self._departure_derivatives])
+        share = self.code(light, full_scale) * (_PIECES / full_scale)
+        whole = np.minimum(share.astype(np.intp), _PIECES - 1)
+        by_departure, steps = self._departure_derivatives, np.diff(self._departure_derivatives, axis=1)
+        return np.asarray(full_scale * (by_departure[:, whole] + steps[:, whole] * (share - whole)))
 
     def equivalent_power(self, low: float, high: float) -> tuple[float, float]:
         """Power (gamma) fitted to the curve between two codes, fractions of full scale, and its standard deviation."""

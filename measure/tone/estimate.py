@@ -157,16 +157,13 @@ def tone_score(
     -------
     ToneScore
     """
-    columns, wanted = design.swapaxes(-1, -2), changes.swapaxes(-1, -2)
-    if priors is not None:  # a row each
-        columns = np.concatenate([columns, np.diag(np.sqrt(priors))])
-        wanted = np.concatenate([wanted, np.zeros((len(priors), wanted.shape[-1]))])
-    # Normalise the columns; otherwise a strong prior would make all others numerically zero.
-    size = np.maximum(np.linalg.norm(columns, axis=-2, keepdims=True), 1e-300)
-    columns = columns / size
-    across = columns.swapaxes(-1, -2)
-    inverse = np.linalg.pinv(across @ columns, rcond=_SINGULAR, hermitian=True)
-    by_unknown = inverse @ (across @ wanted) / size.swapaxes(-1, -2)
+    normal, wanted = design @ design.swapaxes(-1, -2), design @ changes.swapaxes(-1, -2)
+    if priors is not None:
+        normal = normal + np.diag(priors)
+    # Normalise the unknowns; otherwise a strong prior would make all others numerically zero.
+    size = np.sqrt(np.maximum(np.einsum("...ii->...i", normal), 1e-300))[..., None]
+    inverse = np.linalg.pinv(normal / size / size.swapaxes(-1, -2), rcond=_SINGULAR, hermitian=True)
+    by_unknown = inverse @ (wanted / size) / size
     left = changes - by_unknown.swapaxes(-1, -2) @ design
     value = -(left @ residuals[..., None])[..., 0]
     if priors is not None and departures is not None:
