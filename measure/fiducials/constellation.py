@@ -326,8 +326,9 @@ class _Constellation:
             scale = (of_second[None, :] - of_first[:, None]) / base
             size = np.abs(scale)
             allowed = (np.abs(size - 1) < self.bounds.scale_tolerance) & (scale.real > upright * size)
-            scales.append(scale[allowed])
-            offsets.append(of_first[np.nonzero(allowed)[0]] - scales[-1] * self.camera[first])
+            at = np.flatnonzero(allowed)
+            scales.append(scale.ravel()[at])
+            offsets.append(of_first[at // len(of_second)] - scales[-1] * self.camera[first])
         return np.concatenate(scales), np.concatenate(offsets)
 
     def _pairs(self) -> list[tuple[int, int]]:

@@ -33,9 +33,8 @@ from measure.tone.declared import tone_of_tags
 Array = NDArray[np.float32]
 _HEADERS_BYTES = 1 << 18  # head of a JPEG or PNG file: profiles and Exif blocks are smaller
 _END_BYTES = 1 << 16  # end of a complete JPEG or PNG file, which holds the end marker
-_BAND_PX = 1 << 18  # pixels of a window read at a time
+_BAND_PX = 1 << 18  # approximate number of pixels read at a time
 _FULL_SCALE_DN = 65535.0  # of a thumbnail of 16 bits
-_GREY_BAND_PX = 1 << 20  # approximate number of pixels held in grey at a time
 
 
 def open_scan(path: str | Path, max_pixels: int | None = None) -> Scan:
@@ -226,7 +225,7 @@ def _reduced(scan: Scan, factor: int) -> NDArray[np.uint16]:
     """Grey values with 16 bits, averaged by an integer factor, band by band to limit memory."""
     unit = np.float32(_FULL_SCALE_DN / scan.full_scale_dn)
     grey = np.empty((scan.height_px // factor, scan.width_px // factor), np.uint16)
-    rows = max(_GREY_BAND_PX // scan.width_px // factor, 1)
+    rows = max(_BAND_PX // scan.width_px // factor, 1)
 
     def fill(row: int) -> None:
         band = grey[row : row + rows]
