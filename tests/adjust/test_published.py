@@ -122,7 +122,7 @@ def table(file: Path) -> list[list[str]]:
 
 
 @needs("coded", "camcal", "camcaldemo")
-@pytest.mark.study  # tests/pipeline/test_published_numbers.py finds the same from files
+@pytest.mark.study
 def test_the_published_result_is_found_from_nothing(network: Network) -> None:
     """By elements: each parameter to a tenth of its sigma, each sigma to half a percent, sigma0 to its last digit."""
     adjustment = adjust(network, approximate(network), Options(method="elements"))

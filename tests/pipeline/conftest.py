@@ -2,7 +2,7 @@
 processes."""
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from importlib import resources
 from pathlib import Path
@@ -11,11 +11,11 @@ import cv2
 import made_up_calibration
 import pytest
 from browser import started_browser
-from demonstration import FEWER_TARGETS, FRAMES
 from in_process import Here, pools
 from playwright.sync_api import Browser
+from projects import FEWER_TARGETS, FRAMES
 
-from pipeline.cli import run
+from pipeline.cli import WRONG_INPUT, run
 from pipeline.rendered.scene_file import render_project
 from pipeline.report import ReportData
 from pipeline.workers import worker_pool
@@ -75,6 +75,18 @@ def project(finished: tuple[Path, int], tmp_path: Path) -> Path:
     folder = tmp_path / "project"
     shutil.copytree(finished[0], folder)
     return folder
+
+
+@pytest.fixture
+def refusal(capsys: pytest.CaptureFixture[str]) -> Callable[[list[str]], str]:
+    """The message with which a command refuses its input, in one line."""
+
+    def message(arguments: list[str]) -> str:
+        capsys.readouterr()
+        assert run(arguments) == WRONG_INPUT
+        return " ".join(capsys.readouterr().err.split())
+
+    return message
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from adjust.least_squares.iteration import Iteration
 from adjust.problem.estimates import NullDirection, VarianceFactor
 from adjust.problem.tested import Probabilities
 from adjust.quality.run import Group, Residuals
-from measure.flags import Cause, Status
+from measure.flags import Cause, Reason, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from pipeline import read_adjustment, write_adjustment
 from pipeline.report import ReportData, Thumbnail
@@ -200,6 +200,21 @@ def set_mark(data: ReportData, row: int, status: Status, reason: str) -> ReportD
     rows = list(data.comparator)
     rows[row] = replace(rows[row], status=status, reason=reason)
     return replace(data, comparator=rows)
+
+
+def set_weak(data: ReportData, image: str, points: Sequence[str], reason: Reason) -> ReportData:
+    """With weak fiducials in an image's record."""
+
+    def change(frame: FrameMeasurement) -> FrameMeasurement:
+        marks = tuple(
+            replace(mark, status=Status.WEAK, reason=reason)
+            if frame.image == image and mark.kind == "fiducial" and mark.point in points
+            else mark
+            for mark in frame.marks
+        )
+        return replace(frame, marks=marks)
+
+    return set_frames(data, change)
 
 
 @cache

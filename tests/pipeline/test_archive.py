@@ -6,35 +6,26 @@ import re
 import shutil
 import sqlite3
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
 from contextlib import closing
-from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import tifffile
-from drawn import PITCH_UM, layout_of
-from projects import CAMERA, change_camera, change_project, replace_text, write_project
+from drawn import layout_of
+from projects import CAMERA, Capture, change_camera, change_project, replace_text, write_project, write_tables
 from studies import parametrize_with_studies
 
 from measure import MarkShape, Pose, polygon
 from pipeline import read_project
-from pipeline.archive.measurement import picture_sizes_mm
 from pipeline.archive.schema import MEASUREMENTS, Schema, add_digests, opened
 from pipeline.archive.status import archive_status
 from pipeline.archive.verdicts import NEXT_STEP, Verdict
 from pipeline.cli import run
-from pipeline.files.camera_file import CameraFile
-from pipeline.measuring.roll import check_scans
 from pipeline.measuring.scan_measurement import MeasuredFile, measure_file
 from pipeline.measuring.scan_task import Measure, ScanTask
-from pipeline.results.comparator_file import read_measurement_hash
-from pipeline.results.measured_record import FailureCode, MeasuredScan, pose_record
-
-SAID = pytest.CaptureFixture[str]
+from pipeline.results.measured_record import FailureCode, pose_record
 
 measured: list[str] = []  # the images that were measured, in their order
 
@@ -74,15 +65,6 @@ def folder(done: Path, tmp_path: Path) -> Path:
 
 def measure(folder: Path, *options: str) -> int:
     return run(["measure", str(folder / "project.toml"), *options])
-
-
-@pytest.mark.study
-def test_the_size_of_a_picture_is_that_of_its_scan(done: Path) -> None:
-    digest = read_measurement_hash(done / "comparator.csv")
-    height, width = tifffile.imread(done / "a.tif").shape[:2]
-    size = pytest.approx((width * PITCH_UM / 1000.0, height * PITCH_UM / 1000.0))
-    assert picture_sizes_mm(done / "out" / "measurement.db", digest) == {"a": size, "b": size, "c": size}
-    assert picture_sizes_mm(done / "out" / "measurement.db", "") == {}
 
 
 def marks(folder: Path) -> bytes:
@@ -164,9 +146,7 @@ def test_a_project_that_is_moved_as_a_whole_keeps_its_results(folder: Path, tmp_
     assert marks(tmp_path / "elsewhere") == before
 
 
-def test_moved_and_touched_files_are_known_by_their_content_where_that_is_requested(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_moved_files_are_known_by_content_where_requested(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def asks_first(tasks: Sequence[ScanTask], measure: Measure, _: Any) -> Any:
         """A step that has scans measured before all others, as that which reads a roll's first frames."""
         return tasks, {scan.frame.image: scan for scan in measure(tasks)}
@@ -196,7 +176,7 @@ def spoil(folder: Path) -> None:
     tifffile.imwrite(folder / "black.tif", black)
 
 
-def test_bad_scans_have_a_verdict_and_the_others_are_measured(folder: Path, capsys: SAID) -> None:
+def test_bad_scans_have_a_verdict_and_the_others_are_measured(folder: Path, capsys: Capture) -> None:
     good = [line for line in marks(folder).decode().splitlines() if line.startswith("a,")]
     spoil(folder)
     assert measure(folder) == 1
@@ -232,48 +212,7 @@ def test_copies_count_once(folder: Path) -> None:
     assert verdicts(folder)["z"] in ("look", "poor")
 
 
-class Interrupts:
-    """An executor that is interrupted after so many tasks."""
-
-    def __init__(self, after: int) -> None:
-        self.left = after
-
-    def __enter__(self) -> "Interrupts":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        self.left -= 1
-        if self.left < 0:
-            raise KeyboardInterrupt
-        future.set_result(fn(*args))
-        return future
-
-
-def test_an_interrupt_keeps_what_is_done(
-    three: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: SAID
-) -> None:
-    shutil.copytree(three, tmp_path / "p")
-    monkeypatch.setattr("pipeline.archive.work.TASKS_A_CORE", 1)
-    monkeypatch.setattr("pipeline.archive.work.os.cpu_count", lambda: 1)
-    with monkeypatch.context() as patched:
-        patched.setattr("pipeline.archive.measure_archive.worker_pool", lambda *_: Interrupts(2))
-        assert measure(tmp_path / "p") == 130
-    assert "scans that were measured are kept" in capsys.readouterr().err
-    assert not (tmp_path / "p" / "comparator.csv").exists()
-    assert sorted(verdicts(tmp_path / "p").values()) == ["good", "good", "waiting"]
-    measured.clear()
-    assert measure(tmp_path / "p") == 0
-    assert len(measured) == 1
-    assert "2 of 3 scans measured in an earlier run (1 to measure)" in capsys.readouterr().err
-
-
-def test_a_full_disk_is_reported_and_costs_nothing_that_was_measured(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: SAID
-) -> None:
+def test_a_full_disk_costs_no_result(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     before = marks(folder)
     one_more(folder)
 
@@ -294,7 +233,7 @@ def test_a_full_disk_is_reported_and_costs_nothing_that_was_measured(
     assert measured == ["d"]
 
 
-def test_shards_joined_are_the_same_as_one_machine(folder: Path, three: Path, tmp_path: Path, capsys: SAID) -> None:
+def test_shards_joined_are_the_same_as_one_machine(folder: Path, three: Path, tmp_path: Path, capsys: Capture) -> None:
     parts = tmp_path / "parts"
     shutil.copytree(three, parts)
     project = parts / "project.toml"
@@ -313,21 +252,12 @@ def test_shards_joined_are_the_same_as_one_machine(folder: Path, three: Path, tm
 
 
 @pytest.mark.parametrize("shard", ["3", "0/2", "3/2", "a/b", "1/2/3"])
-def test_a_shard_that_is_none_is_refused(folder: Path, shard: str, capsys: SAID) -> None:
+def test_a_shard_that_is_none_is_refused(folder: Path, shard: str, capsys: Capture) -> None:
     assert measure(folder, "--shard", shard) == 2
     assert "is not K/N" in capsys.readouterr().err
 
 
-@pytest.mark.study
-@pytest.mark.filterwarnings("ignore")
-def test_a_cluster_gives_the_same_marks(folder: Path, three: Path, tmp_path: Path) -> None:
-    shutil.copytree(three, tmp_path / "cluster")
-    assert measure(tmp_path / "cluster", "--cluster", "local", "--workers", "1") == 0
-    assert not measured
-    assert marks(tmp_path / "cluster") == marks(folder)
-
-
-def test_status_tells_what_changed_outside(folder: Path, capsys: SAID) -> None:
+def test_status_tells_what_changed_outside(folder: Path, capsys: Capture) -> None:
     project = str(folder / "project.toml")
     assert run(["status", project]) == 0
     one_more(folder)
@@ -369,47 +299,6 @@ def test_the_pages_of_results_and_scans_have_the_tables_of_verdicts_and_failures
     assert all(f"| `{code}` | {code.meaning} |" in scans for code in FailureCode)
 
 
-BOARD = '[targets]\nkind = "chessboard"\nrows = 5\ncolumns = 7\nsquare_mm = 20.0\n'
-
-
-def drop_targets(task: ScanTask) -> MeasuredFile:
-    """The board is sought in no scan: that takes longer than all the rest."""
-    return measure_file(replace(task, options=replace(task.options, targets=None)))
-
-
-@pytest.mark.study
-def test_of_many_scans_only_the_lot_of_a_new_one_is_tested_again(
-    folder: Path, three: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("pipeline.archive.work.measure_file", drop_targets)
-    replace_text(folder / "project.toml", "[measure]", f"{BOARD}[measure]")
-    measure(folder)
-    monkeypatch.setattr("pipeline.archive.cross_scan_checks._TOGETHER", 1)
-    neighbour = list[list[str]]()
-
-    def counted(camera: CameraFile, scans: Sequence[MeasuredScan], *more: Any) -> tuple[MeasuredScan, ...]:
-        neighbour.append([scan.frame.image for scan in scans])
-        return check_scans(camera, scans, *more)
-
-    monkeypatch.setattr("pipeline.archive.cross_scan_checks.check_scans", counted)
-    shutil.copy(three / "a.tif", folder / "other.tif")  # a copy is no frame of its own, and needs no checks
-    pixels = tifffile.imread(three / "a.tif")
-    for number, (name, lots) in enumerate({"d": [["d"]], "h": [["h"]], "e": [["a", "b", "c", "e"]]}.items()):
-        pixels[5, 5 + number] ^= 1
-        tifffile.imwrite(folder / f"{name}.tif", pixels)
-        if name == "h":
-            (folder / "d.tif").unlink()
-        measure(folder)
-        assert [sorted(lot) for lot in neighbour] == lots  # by the SHA-256 of their names a, b, c and e are of one lot
-        neighbour.clear()
-    anew = tmp_path / "anew"
-    shutil.copytree(folder, anew)
-    (anew / "out" / "measurement.db").unlink()
-    measure(anew)
-    assert sorted(chain.from_iterable(neighbour)) == ["a", "b", "c", "e", "h"]
-    assert marks(anew) == marks(folder)
-
-
 def test_other_programs_read_the_marks(folder: Path) -> None:
     with sqlite3.connect(folder / "out" / "measurement.db") as db:
         rows = db.execute("select image, point, x_mm, y_mm, status from mark_view").fetchall()
@@ -419,32 +308,11 @@ def test_other_programs_read_the_marks(folder: Path) -> None:
     ]
 
 
-LEARNED = (
-    CAMERA.replace('mark = "m"', 'mark = "l"').split("[mark.m]")[0] + '[mark.l]\nkind = "learned"\nsize_mm = 2.0\n'
-)
-
-
-@pytest.mark.study
-def test_learned_marks_stay_when_a_scan_comes(three: Path, tmp_path: Path) -> None:
-    shutil.copytree(three, tmp_path / "p")
-    (tmp_path / "p" / "c.tif").unlink()
-    (tmp_path / "p" / "camera.toml").write_text(LEARNED, encoding="utf-8")
-    assert measure(tmp_path / "p") in (0, 1)
-    measured.clear()
-    before = marks(tmp_path / "p")
-    assert measure(tmp_path / "p") in (0, 1)
-    assert not measured
-    assert marks(tmp_path / "p") == before
-    one_more(tmp_path / "p")
-    assert measure(tmp_path / "p") in (0, 1)
-    assert measured == ["d"]
-
-
 TIP_MM = ((0.0, 0.0), (0.8, -1.0), (0.8, 1.0))  # of a wedge, whose sides lean on the tone curve
 
 
 @pytest.mark.study
-def test_the_tone_of_a_scanner_stays_when_scans_come_and_go(tmp_path: Path, capsys: SAID) -> None:
+def test_the_tone_of_a_scanner_stays_when_scans_come_and_go(tmp_path: Path, capsys: Capture) -> None:
     folder = tmp_path / "p"
     write_project(folder, ["a", "b"], layout=layout_of([MarkShape(polygon(TIP_MM))] * 4))
     mark = f'[mark.m]\nkind = "polygon"\nvertices_mm = {[*map(list, TIP_MM)]}\n'
@@ -461,18 +329,15 @@ def test_the_tone_of_a_scanner_stays_when_scans_come_and_go(tmp_path: Path, caps
     assert measured == ["d"]
 
 
-def test_scans_that_fail_alike_are_reported_once_and_all_scans_are_counted(tmp_path: Path, capsys: SAID) -> None:
+def test_scans_that_fail_alike_are_reported_once_and_all_scans_are_counted(tmp_path: Path, capsys: Capture) -> None:
     """No pitch in project and files: one sentence with the number and the names, not one a scan."""
-    (tmp_path / "camera.toml").write_text('name = "c"\nprincipal_distance_mm = 10.0\n', encoding="utf-8")
-    (tmp_path / "points.csv").write_text("point,X,Y,Z\n1,0,0,0\n2,9,0,0\n3,0,9,0\n4,9,9,1\n", encoding="utf-8")
     for number in range(6):
         pixels = np.full((40, 40), 90 + number, np.uint8)
         tifffile.imwrite(tmp_path / f"s{number}.tif", pixels, metadata=None)
-    (tmp_path / "project.toml").write_text(
-        'camera = "camera.toml"\nscans = ["*.tif"]\n[object]\npoints = "points.csv"\n'
-        '[targets]\nkind = "disk"\ndiameter_mm = 1.0\n[adjust]\ntransformation = "none"\n',
-        encoding="utf-8",
-    )
+    disks = '[targets]\nkind = "disk"\ndiameter_mm = 1.0\n[adjust]\ntransformation = "none"'
+    project = f'camera = "camera.toml"\nscans = ["*.tif"]\n[object]\npoints = "points.csv"\n{disks}'
+    points = ["point,X,Y,Z", "1,0,0,0", "2,9,0,0", "3,0,9,0", "4,9,9,1"]
+    write_tables(tmp_path, project, camera='name = "c"\nprincipal_distance_mm = 10.0', points=points)
     assert run(["measure", str(tmp_path / "project.toml")]) == 2
     message = capsys.readouterr().err
     (last,) = [line for line in message.splitlines() if line.startswith("reseau: ")]

@@ -10,15 +10,13 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from networks import lens_network
-from projects import write_network_project
+from projects import Capture, Refusal, result_file, write_network_project
 
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Lens
 from adjust.problem.parameter import Parameter
 from pipeline import read_adjustment, read_camera
-from pipeline.adjusting.compare_stage import _labels
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
-from pipeline.exchange.certificate import fit, read_certificate
 from pipeline.exchange.saved_cameras import save_cameras
 from pipeline.files.project_file import read_project
 from pipeline.provenance import hash_file
@@ -47,7 +45,7 @@ a2 = "free"
 """
 
 
-def test_a_camera_file_becomes_opencvs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_camera_file_becomes_opencvs(tmp_path: Path, capsys: Capture) -> None:
     (tmp_path / "camera.toml").write_text(CAMERA, encoding="utf-8")
     assert run(["convert", str(tmp_path / "camera.toml"), "opencv", str(tmp_path / "out")]) == DONE
     assert "aicon and opencv mean the same here" in capsys.readouterr().out
@@ -86,7 +84,7 @@ def test_an_adjustment_keeps_its_covariance(tmp_path: Path) -> None:
     assert not (tmp_path / "mixed").exists()
 
 
-def test_the_larger_covariance_is_converted_saved_and_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_larger_covariance_is_converted_saved_and_used(tmp_path: Path, capsys: Capture) -> None:
     """Images of unlike distortion: by leaving them out the camera is less precise than by the model."""
     network = lens_network("australis", np.random.default_rng(7))
     xy_mm, images = network.observations.xy_mm, [int(image[1:]) for image in network.observations.image]
@@ -118,19 +116,7 @@ def test_the_larger_covariance_is_converted_saved_and_used(tmp_path: Path, capsy
         assert np.sqrt(np.diag(calibration.covariance))[rows] == pytest.approx(sigmas, rel=1e-6)
 
 
-@pytest.mark.study
-def test_a_converted_calibration_is_taken_in(tmp_path: Path) -> None:
-    project = write_network_project(lens_network("australis", np.random.default_rng(7)), tmp_path)
-    run(["adjust", str(project)])
-    assert run(["convert", str(tmp_path / "out" / "adjustment.json"), "brown", str(tmp_path / "brown")]) == DONE
-    text = (tmp_path / "camera.toml").read_text(encoding="utf-8").replace('"australis"', '"brown"')
-    text = text.replace("r0_mm = 13.0\n", "").replace("[sigma]\n", '[sigma]\ncalibration = "brown/adjustment.json"\n')
-    (tmp_path / "camera.toml").write_text(text, encoding="utf-8")
-    assert run(["adjust", str(project)]) in (DONE, LOOK)
-    assert len(read_adjustment(tmp_path / "out" / "adjustment.json").calibrations) == 9
-
-
-def test_what_does_not_fit_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_does_not_fit_is_reported(tmp_path: Path, capsys: Capture, refusal: Refusal) -> None:
     camera = tmp_path / "camera.toml"
     camera.write_text(CAMERA, encoding="utf-8")
     assert run(["convert", str(camera), "brown", str(tmp_path / "out"), "--json"]) == LOOK
@@ -145,8 +131,7 @@ def test_what_does_not_fit_is_reported(tmp_path: Path, capsys: pytest.CaptureFix
         assert run(["convert", str(camera), arguments[0], str(tmp_path / arguments[1]), *arguments[2:]]) == WRONG_INPUT
         assert words in capsys.readouterr().err.lower().replace("\n", " ")
     camera.write_text(CAMERA.replace("frame_mm = [36.0, 24.0]\n", ""), encoding="utf-8")
-    assert run(["convert", str(camera), "opencv", str(tmp_path / "out")]) == WRONG_INPUT
-    assert "has no frame_mm" in capsys.readouterr().err
+    assert "has no frame_mm" in refusal(["convert", str(camera), "opencv", str(tmp_path / "out")])
 
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -156,7 +141,7 @@ def shift_parameter(project: Path, name: str, change_mm: float) -> Path:
     """A copy of the project's calibration whose principal distance is another."""
     copy = project.parent / name / "adjustment.json"
     copy.parent.mkdir()
-    content = json.loads((project / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    content = result_file(project)
     (camera,) = content["cameras"].values()
     camera["principal_distance_mm"]["value"] += change_mm
     copy.write_text(json.dumps(content), encoding="utf-8")
@@ -168,7 +153,7 @@ def shift_parameter(project: Path, name: str, change_mm: float) -> Path:
     return copy
 
 
-def test_an_unchanged_camera_and_a_changed_one(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unchanged_camera_and_a_changed_one(project: Path, capsys: Capture) -> None:
     first = project / "out" / "adjustment.json"
     assert run(["compare", str(first), str(shift_parameter(project, "same", 0.0))]) == 0
     output = " ".join(capsys.readouterr().out.split())
@@ -192,7 +177,7 @@ def test_an_unchanged_camera_and_a_changed_one(project: Path, capsys: pytest.Cap
     assert np.hypot(*corner) == pytest.approx(np.hypot(25.0, 25.0) * 0.5 / 60.3 * 1e3, rel=0.1)
 
 
-def test_a_series_has_a_trend(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_series_has_a_trend(project: Path, capsys: Capture) -> None:
     paths = [str(shift_parameter(project, f"y{year}", 0.02 * (year - 1950))) for year in (1952, 1958, 1961, 1970)]
     assert run(["compare", *paths, "--times", "1952,1958,1961,1970", "--json"]) == 1
     content = json.loads(capsys.readouterr().out)
@@ -213,28 +198,12 @@ def test_a_series_has_a_trend(project: Path, capsys: pytest.CaptureFixture[str])
         ("out", [], "is named twice"),
     ],
 )
-def test_what_it_refuses(
-    other: str, arguments: list[str], words: str, project: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_it_refuses(other: str, arguments: list[str], words: str, project: Path, refusal: Refusal) -> None:
     first = project / "out" / "adjustment.json"
     second = first if other == "out" else shift_parameter(project, other, 0.1 if other == "mixed" else 0.0)
     if other == "mixed":
         second.with_suffix(".npz").write_bytes(first.with_suffix(".npz").read_bytes())
-    assert run(["compare", str(first), str(second), *arguments]) == 2
-    assert words in capsys.readouterr().err.replace("\n", " ")
-
-
-@pytest.mark.parametrize(
-    ("files", "labels"),
-    [
-        (("a/out/adjustment.json", "b/out/adjustment.json"), ["a", "b"]),
-        (("1952/adjustment.json", "1959/adjustment.json"), ["1952", "1959"]),
-        (("a/x/adjustment.json", "b/x/adjustment.json", "b/y/adjustment.json"), ["a/x", "b/x", "b/y"]),
-        (("out/1952.json", "out/1959.json"), ["1952", "1959"]),
-    ],
-)
-def test_calibrations_are_named_by_what_differs_in_their_paths(files: tuple[str, ...], labels: list[str]) -> None:
-    assert list(_labels([Path(file) for file in files]).values()) == labels
+    assert words in refusal(["compare", str(first), str(second), *arguments])
 
 
 C, K3, K5 = 153.02, 2.0e-8, -1.5e-12
@@ -272,7 +241,7 @@ def balanced(lens: tuple[float, float, float]) -> float:
     return (low + high) / 2.0
 
 
-def test_the_table_is_that_of_the_lens() -> None:
+def test_the_printed_table_is_that_of_the_lens_with_its_standard_deviations() -> None:
     view = certificate(LENS, REACH_MM)
     calibrated = balanced((C, K3, K5))
     assert view.calibrated[0] == pytest.approx(calibrated, abs=2e-5)
@@ -282,12 +251,8 @@ def test_the_table_is_that_of_the_lens() -> None:
     for row in view.rows:
         there = distortion_um(calibrated, row.angle_deg)
         assert row.radial[0] == pytest.approx(there, abs=0.01)
-
-
-def test_its_standard_deviations_are_those_of_lenses_drawn_at_random() -> None:
     rng = np.random.default_rng(2)
     drawn = [rng.normal((C, K3, K5), list(SIGMAS.values())) for _ in range(300)]
-    view = certificate(LENS, REACH_MM)
     distances = [balanced((float(c), float(k3), float(k5))) for c, k3, k5 in drawn]
     assert view.calibrated[1] == pytest.approx(np.std(distances), rel=0.15)
     for row in view.rows[1:]:
@@ -297,37 +262,7 @@ def test_its_standard_deviations_are_those_of_lenses_drawn_at_random() -> None:
             for own, (c, k3, k5) in zip(distances, drawn, strict=True)
         ]
         assert row.radial[1] == pytest.approx(np.std(values), rel=0.2)
-
-
-@pytest.mark.parametrize(
-    ("c", "k3", "k5", "reach_mm"), [(C, K3, K5, REACH_MM), (60.3344, -5.991e-6, 1.995e-9, 33.0), (210.4, K3, K5, 155.0)]
-)
-def test_the_printed_table_gives_the_lens_back(tmp_path: Path, c: float, k3: float, k5: float, reach_mm: float) -> None:
-    """Typed as a certificate, the camera comes out again, to the tenths of a micrometre that are printed."""
-    powers = np.array([{"k3": k3, "k5": k5}.get(name, 0.0) for name in NAMES])
-    lens = replace(LENS, interior=np.array([c, 0.0, 0.0]), parameters=powers, covariance=1e-4 * LENS.covariance)
-    view = certificate(lens, reach_mm)
-    (tmp_path / "c.toml").write_text(
-        f"calibrated_principal_distance_mm = {view.calibrated[0]:.4f}\n"
-        f"angle_deg = {[row.angle_deg for row in view.rows]}\n"
-        f"radial_um = {[round(row.radial[0], 1) for row in view.rows]}\n",
-        encoding="utf-8",
-    )
-    fitted = fit(read_certificate(tmp_path / "c.toml"))
-    assert fitted.equivalent_mm == pytest.approx(c, abs=0.002)
-    at = np.linspace(0.2, 1.0, 5) * reach_mm
-    gone = (fitted.equivalent_mm - c) * at / c + (fitted.coefficients[0] - k3) * at**3
-    gone += (fitted.coefficients[1] - k5) * at**5 + fitted.coefficients[2] * at**7
-    assert np.abs(gone).max() < 0.001
-
-
-def test_a_narrow_camera_has_angles_of_its_own() -> None:
     view = certificate(replace(LENS, interior=np.array([600.0, 0.0, 0.0])), 140.0)
     angles = [row.angle_deg for row in view.rows]
     assert len(angles) == 6
     assert angles[-1] == pytest.approx(np.degrees(np.arctan(140.0 / 600.0)), abs=0.1)
-
-
-def test_the_report_shows_it(finished: tuple[Path, int]) -> None:
-    text = (finished[0] / "out" / "report.html").read_text(encoding="utf-8")
-    assert "The calibrated principal distance" in text

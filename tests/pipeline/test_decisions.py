@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from projects import write_project
+from projects import Capture, write_project
 
 from measure.fiducials.options import Click, FiducialOptions
 from measure.flags import Cause, Code, Reason, Status
@@ -58,7 +58,7 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "decisions.jsonl"
 
 
-def test_what_is_appended_is_read_again(path: Path) -> None:
+def test_what_is_appended_is_read_again_but_for_a_line_cut_short(path: Path) -> None:
     result = [
         Decision("box/a", Choice.ACCEPT, "1", "fiducial", note="é <b>", who="ann", when="2026-01-01T10:00:00+00:00"),
         place("2", 1.5, fingerprint="f", window=(1.0, 2.0, 81.0, 81.0)),
@@ -82,9 +82,7 @@ def test_a_line_cut_short_does_not_count_and_the_next_one_stands_by_itself(path:
     assert [one.decision for one in read_decisions(path)] == [Choice.ACCEPT, Choice.REJECT]
 
 
-def test_lines_that_a_full_disk_stops_are_all_taken_back(
-    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_takes_all_lines_back(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a roll, decided at once: none of its lines counts, and the message says so."""
     append_decisions(path, [mark_decision(Choice.ACCEPT)])
     before = path.read_bytes()
@@ -148,7 +146,7 @@ def test_a_typing_error_in_the_last_line_is_named(line: str, path: Path) -> None
 
 
 @pytest.mark.study
-def test_lines_that_do_not_apply_are_named_and_do_not_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_lines_that_do_not_apply_are_named_and_do_not_count(tmp_path: Path, capsys: Capture) -> None:
     project = write_project(tmp_path / "p", ["a", "b"])
     path = project.with_name("decisions.jsonl")
     unknown = [
@@ -174,7 +172,7 @@ def test_lines_that_do_not_apply_are_named_and_do_not_count(tmp_path: Path, caps
         assert "Decisions stand behind" not in output
 
 
-def test_status_is_stale_until_a_decision_is_taken_in(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_status_is_stale_until_a_decision_is_taken_in(tmp_path: Path, capsys: Capture) -> None:
     project = write_project(tmp_path / "p", ["a", "b"])
     assert run(["measure", str(project)]) == 0
     append_decisions(project.with_name("decisions.jsonl"), [mark_decision(Choice.REJECT)])
@@ -203,9 +201,7 @@ def test_a_million_lines_are_read_in_little_more_than_their_json_takes(path: Pat
     assert reading_s < 2.5 * (time.process_time() - began)
 
 
-def test_lines_of_all_forms_are_read_in_their_order_and_a_wrong_one_is_named(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_lines_of_all_forms_are_read_in_their_order(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Lines are checked many at a time, those of one form together."""
     monkeypatch.setattr(decisions_file, "_BYTES_AT_A_TIME", 500)
     forms: Sequence[dict[str, Any]] = [
@@ -238,21 +234,14 @@ def test_lines_of_all_forms_are_read_in_their_order_and_a_wrong_one_is_named(
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        (
-            '{"image": "a", "decision": "accept", "piont": "1"}',
-            "line 2, piont: there is no such key. Did you mean 'point'",
-        ),
         ('{"image": "a", "decision": "acept", "point": "1"}', "line 2, decision.*Did you mean 'accept'"),
         ('{"image": "a", "decision": "accept"}', "line 2, point: is missing"),
-        ('{"decision": "accept", "point": "1"}', "line 2, image: is missing"),
         ('{"image": "a", "decision": "place", "point": "1", "col_px": 1}', "row_px: must be a number of pixels"),
         ('{"image": "a", "decision": "place", "point": "1", "col_px": true, "row_px": 1}', "col_px: must be a number"),
         ('{"image": "a", "decision": "pose", "pose": "91"}', "pose: must be one of"),
         ('{"image": "a", "decision": "pose", "pose": "90", "point": "1"}', "a pose is of the whole scan"),
         ('{"image": "a", "decision": "accept", "point": "1", "when": "now"}', "when: must be a time"),
-        ('{"image": "a", "decision": "accept", "point": "1", "kind": "fid"}', "kind: must be one of"),
         ('["a"]', "line 2: must be a JSON object"),
-        ("{", "line 2: is no JSON"),
     ],
 )
 def test_a_wrong_line_is_named(line: str, words: str, path: Path) -> None:
@@ -261,23 +250,17 @@ def test_a_wrong_line_is_named(line: str, words: str, path: Path) -> None:
         read_decisions(path)
 
 
-def test_the_last_line_counts_and_undo_takes_back_the_one_before() -> None:
+def test_decisions_count_in_their_order_and_of_their_own_result() -> None:
     accept, reject, undo = (mark_decision(choice) for choice in (Choice.ACCEPT, Choice.REJECT, Choice.UNDO))
     about = accept.subject
     assert standing([accept, reject])[about] is reject
     assert standing([accept, reject, undo])[about] is accept
     assert standing([accept, undo, undo, reject])[about] is reject
     assert standing([accept, undo]) == {}
-
-
-def test_decisions_of_another_result_do_not_count() -> None:
     old = mark_decision(Choice.ACCEPT, fingerprint="another file")
     own = mark_decision(Choice.REJECT, "2", fingerprint=task_key(TASK))
     assert list(apply_decisions(TASK, [old, own], task_key, result_pose)[1].values()) == [own]
-
-
-def test_decisions_count_for_what_follows_from_those_before_them() -> None:
-    """Accepted, then another mark placed, then, on what was measured from that, one more rejected."""
+    # Accepted, then another mark placed, then, on what was measured from that, one more rejected.
     accept = mark_decision(Choice.ACCEPT, "1", fingerprint=task_key(TASK))
     placed = place("2", 7.0, fingerprint=task_key(TASK))
     now, _ = apply_decisions(TASK, [accept, placed], task_key, result_pose)
@@ -290,7 +273,7 @@ def test_decisions_count_for_what_follows_from_those_before_them() -> None:
     }
 
 
-def test_what_was_settled_about_marks_does_not_count_in_another_pose() -> None:
+def test_decisions_about_marks_count_in_the_pose_in_which_they_were_found() -> None:
     placed = place("2", 7.0, fingerprint=task_key(TASK))
     pose = Decision("a", Choice.POSE, pose="90", fingerprint=task_key(TASK))
     late = mark_decision(Choice.ACCEPT, "3", fingerprint=task_key(TASK))  # on a page that was not measured anew yet
@@ -301,12 +284,8 @@ def test_what_was_settled_about_marks_does_not_count_in_another_pose() -> None:
     assert apply_decisions(TASK, [pose, other], task_key, result_pose)[0].options.fiducials.pose == "180"
     undone = Decision("a", Choice.UNDO, fingerprint="whatever is shown")
     assert apply_decisions(TASK, [placed, pose, undone], task_key, result_pose)[0].options.fiducials.pose == "auto"
-
-
-def test_what_was_settled_about_marks_counts_on_in_the_pose_in_which_they_were_found() -> None:
-    """Decided on one page, the pose first or last, before it is measured anew."""
+    # Decided on one page, the pose first or last, before it is measured anew.
     early, late = (mark_decision(Choice.ACCEPT, point, fingerprint=task_key(TASK)) for point in "13")
-    pose = Decision("a", Choice.POSE, pose="90", fingerprint=task_key(TASK))
     found = {task_key(TASK): "90"}
     now, counting = apply_decisions(TASK, [early, pose, late], task_key, found.get)
     assert now.options.fiducials.pose == "90"
@@ -341,52 +320,18 @@ def test_a_mark_becomes_what_was_settled_and_says_by_whom() -> None:
     assert after.frame.marks[2].center_px is None
     assert after.decided_by == {"ann": 3}
     assert after_checks(scan, {}) == scan
-
-
-def test_a_mark_that_was_not_measured_cannot_be_accepted() -> None:
     bare = MarkMeasurement(
         "1", "fiducial", np.array([5.0, 6.0]), None, Status.PREDICTED, Reason("not seen", Code.NOT_FOUND)
     )
     one = mark_decision(Choice.ACCEPT)
     assert after_checks(make_scan(bare), {one.subject: one}).frame.marks[0].status is Status.PREDICTED
-
-
-def test_a_target_that_is_placed_counts_as_well_as_one_points() -> None:
     one = Decision("a", Choice.PLACE, "1", "target", col_px=50.0, row_px=60.0)
     (mark,) = after_checks(make_scan(weak("1", "target")), {one.subject: one}).frame.marks
     assert mark.status is Status.WEAK
-    assert mark.center_px is not None
-    np.testing.assert_array_equal(mark.center_px, (50.0, 60.0))
+    np.testing.assert_array_equal(np.asarray(mark.center_px), (50.0, 60.0))
 
 
-@pytest.mark.study
-def test_decisions_that_were_not_taken_in_are_reported_until_measure_takes_them(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    project = write_project(tmp_path / "p", ["a", "b"])
-    assert run(["measure", str(project)]) == 0
-    before = project.with_name("comparator.csv").read_text(encoding="utf-8")
-    append_decisions(project.with_name("decisions.jsonl"), [mark_decision(Choice.REJECT, who="ann")])
-    capsys.readouterr()
-    assert run(["report", str(project)]) == 1
-    assert "Decisions were made" in capsys.readouterr().out
-    run(["measure", str(project)])
-    captured = capsys.readouterr()
-    assert (
-        "2 of 2 scans measured in an earlier run\n" in captured.err
-    )  # a mark that is no mark is judged, and not measured, anew
-    assert "Decisions were made" not in captured.out
-    assert "Decisions stand behind these marks: 1 of ann" in " ".join(captured.out.split())
-    assert "rejected by ann" in project.with_name("comparator.csv").read_text(encoding="utf-8")
-    append_decisions(project.with_name("decisions.jsonl"), [mark_decision(Choice.UNDO)])
-    assert run(["measure", str(project)]) == 0
-    rows = [line for line in project.with_name("comparator.csv").read_text().splitlines() if line[0] != "#"]
-    assert rows == [line for line in before.splitlines() if line[0] != "#"]
-
-
-def test_what_is_settled_is_not_open_and_every_command_says_who_settled(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_settled_is_not_open_and_every_command_says_who_settled(tmp_path: Path, capsys: Capture) -> None:
     """A mark that no scan shows needs a look, until a person says that it is not there."""
     project = write_project(tmp_path / "p", ["a"])
     with project.with_name("camera.toml").open("a") as camera:

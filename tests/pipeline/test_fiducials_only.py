@@ -3,7 +3,6 @@
 import json
 import re
 from collections.abc import Iterable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 from networks import field_points, film_network, given_marks, simulated
 from numpy.typing import NDArray
+from projects import Capture, fiducial_tables, result_file, write_tables
 from projects import write_network_project as write_network
 from reference_cases import CASES
 from scipy.stats import chi2
@@ -20,7 +20,6 @@ from test_adjust_stage import write_project
 from adjust import Adjustment, Camera, Parameter, adjust, approximate
 from adjust.problem.estimates import adjusted_image
 from adjust.problem.network import Transformation
-from pipeline import InputError, read_project
 from pipeline.cli import run
 from pipeline.report.fiducials import Figure, figure_of_films
 from pipeline.results.adjustment_record import FiducialRecord, GivenQuantity, Quantity
@@ -42,25 +41,15 @@ def write_fiducials_project(
     folder: Path, marks: dict[str, int], camera: str = "", extra: tuple[str, ...] = (), sigma_mm: float = 0.0
 ) -> Path:
     """Frames by name with so many fiducials each, of which the camera knows that much, and further marks' lines."""
-    lines = ['name = "K"', camera]
-    for id_, (x, y) in GIVEN.items():
-        lines += ["[[fiducial]]", f'id = "{id_}"', f"xy_mm = [{x}, {y}]", f"sigma_mm = {sigma_mm}"]
-    (folder / "camera.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    text = f'name = "K"\n{camera}\n' + fiducial_tables(GIVEN, f"sigma_mm = {sigma_mm}\n")
     rows = ["image,point,kind,x_mm,y_mm,sx_mm,sy_mm", *extra]
     for seed, (image, count) in enumerate(marks.items()):
         for id_, (x, y) in zip(GIVEN, comparator_mm(seed, count).tolist(), strict=False):
             rows.append(f"{image},{id_},fiducial,{x!r},{y!r},{SIGMA_MM},{SIGMA_MM}")
-    (folder / "comparator.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
-    (folder / "project.toml").write_text('camera = "camera.toml"\n', encoding="utf-8")
-    return folder / "project.toml"
+    return write_tables(folder, 'camera = "camera.toml"', camera=text, comparator=rows)
 
 
-def read_result(project: Path) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads((project.parent / "out" / "adjustment.json").read_text(encoding="utf-8"))
-    return content
-
-
-def test_film_transformations_without_an_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_film_transformations_without_an_object(tmp_path: Path, capsys: Capture) -> None:
     """Against the linear least-squares fit, values and standard deviations; no orientation, no calibration."""
     project = write_fiducials_project(tmp_path, {"a": 5, "b": 5, "c": 3})
     assert run(["run", str(project)]) == 0
@@ -70,11 +59,9 @@ def test_film_transformations_without_an_object(tmp_path: Path, capsys: pytest.C
     assert report.count("No exterior orientation") == 3
     assert "Exterior orientation</caption>" not in report
     assert "Film report</p>" in report
-    assert not any(
-        word in report for word in ("OpenCV</h2>", "Calibration report", "Distortion</h2>", "Parameters</h2>")
-    )
+    assert "Calibration report" not in report
     assert run(["report", str(project)]) == 0  # and it may be written over
-    result = read_result(project)
+    result = result_file(tmp_path)
     assert result["converged"]
     assert (result["unknowns"], result["redundancy"]) == (18, 8)
     for seed, image in enumerate(("a", "b")):
@@ -102,7 +89,7 @@ def test_a_frame_without_enough_targets_keeps_its_film_transformation(tmp_path: 
     (tmp_path / "points.csv").write_text("point,X,Y,Z\nt1,0,0,0\n", encoding="utf-8")
     project.write_text('camera = "camera.toml"\n[object]\npoints = "points.csv"\n', encoding="utf-8")
     assert run(["adjust", str(project)]) == 1
-    result = read_result(project)
+    result = result_file(tmp_path)
     assert list(result["images"]) == ["a"]
     assert {row["kind"] for row in result["residuals"]} == {"fiducial"}
     warnings = " ".join(result["warnings"])
@@ -112,21 +99,19 @@ def test_a_frame_without_enough_targets_keeps_its_film_transformation(tmp_path: 
     assert result["cameras"]["K"]["principal_distance_mm"]["sigma"] is None
 
 
-def test_too_few_fiducials_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_too_few_fiducials_are_reported(tmp_path: Path, capsys: Capture) -> None:
     assert run(["adjust", str(write_fiducials_project(tmp_path, {"a": 2}))]) == 2
     message = " ".join(capsys.readouterr().err.split())
     assert "'a' shows the most fiducials, 2, and its affine transformation needs 3" in message
 
 
-def test_the_film_transformation_can_be_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_film_transformation_can_be_chosen(tmp_path: Path, capsys: Capture) -> None:
     """No lens to choose, but the kind of film: these marks have two scales that differ by 0.2 %."""
     assert run(["choose", str(write_fiducials_project(tmp_path, {"a": 5, "b": 5}))]) == 0
     assert "The data ask for affine, no distortion" in " ".join(capsys.readouterr().out.split())
 
 
-def test_the_form_of_the_fiducials_is_reported_where_they_are_estimated(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_form_of_the_fiducials_is_reported_where_they_are_estimated(tmp_path: Path, capsys: Capture) -> None:
     """Marks with a datum of 1 mm: no figure of mm is left in the form, and the dashes are gone."""
     project = write_fiducials_project(tmp_path, {f"f{i}": 5 for i in range(60)}, sigma_mm=1.0)
     assert run(["run", str(project)]) == 0
@@ -142,33 +127,13 @@ def test_the_form_of_the_fiducials_is_reported_where_they_are_estimated(
     assert "Distances" not in form
 
 
-@pytest.mark.parametrize(
-    ("source", "given_by"),
-    [
-        ("", "the certificate"),
-        ('[source]\ntext = "reports"\nreports = 3\n', "the library's typical coordinates"),
-        ('[source]\ntext = "adjusted"\nframes = 3\n', "the camera file"),
-    ],
-)
-def test_corrections_are_to_what_the_camera_file_rests_on(
-    source: str, given_by: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    project = write_fiducials_project(tmp_path, {"a": 5, "b": 5}, sigma_mm=0.01)
-    with (tmp_path / "camera.toml").open("a", encoding="utf-8") as camera:
-        camera.write(source)
-    run(["run", str(project)])
-    assert f"Corrections to {given_by}, after a common" in " ".join(capsys.readouterr().out.split())
-
-
-def test_a_single_frame_with_a_mere_datum_has_a_priori_sigmas(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_single_frame_with_a_mere_datum_has_a_priori_sigmas(tmp_path: Path, capsys: Capture) -> None:
     """sigma0 was 0.003 here, and multiplied the datum's 1 mm: now the shift is known to 1 mm over the root of 5."""
     project = write_fiducials_project(tmp_path, {"a": 5}, sigma_mm=1.0)
     run(["adjust", str(project)])
     printed = " ".join(capsys.readouterr().out.split())
     assert "standard deviations a priori" in printed
-    result = read_result(project)
+    result = result_file(tmp_path)
     assert result["sigma0_from"] == {"redundancy": 0.0, "a_priori": True, "left_out": []}
     design = np.column_stack([np.ones(5), comparator_mm(0)])
     sigma = np.sqrt(np.linalg.inv(design.T @ design)[0, 0] * (1.0 + SIGMA_MM**2))
@@ -291,7 +256,7 @@ def spoilt_project(folder: Path, adjust: str) -> Path:
 def test_a_gross_error_is_named_in_file_and_report(adjust: str, removed: bool, tmp_path: Path) -> None:
     project = spoilt_project(tmp_path, adjust)
     assert run(["adjust", str(project)]) == 1
-    result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    result = result_file(tmp_path)
     (suspect,) = result["suspects"]
     name = f"target {POINT} in image {suspect['owner']}"
     assert (suspect["name"], suspect["removed"]) == (name, removed)
@@ -312,68 +277,6 @@ def test_a_gross_error_is_named_in_file_and_report(adjust: str, removed: bool, t
         assert "Variance components: factors of the variances" in report
 
 
-@pytest.mark.study
-@pytest.mark.parametrize("adjust", ["", "snooping = true\n"])
-def test_a_control_point_with_exchanged_coordinates_is_named(adjust: str, tmp_path: Path) -> None:
-    rng = np.random.default_rng(1)
-    network, _ = simulated(rng, points=field_points(rng, 15), fiducial_sigma=0.01, point_sigma=0.05)
-    project = write_network(network, tmp_path)
-    project.write_text(project.read_text(encoding="utf-8") + adjust, encoding="utf-8")
-    file = tmp_path / "points.csv"
-    lines = file.read_text(encoding="utf-8").splitlines()
-    name, x, y, *rest = lines[1].split(",")
-    file.write_text("\n".join([lines[0], ",".join([name, y, x, *rest]), *lines[2:]]) + "\n", encoding="utf-8")
-    assert run(["adjust", str(project)]) == 1
-    result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
-    left_out = {suspect["name"] for suspect in result["suspects"] if suspect["removed"]}
-    if adjust:
-        assert left_out == {f"control point {name} X", f"control point {name} Y"}
-        assert result["sigma0"] < 1.2
-    else:
-        assert left_out == set()
-        assert result["warnings"][0].startswith(f"Control point {name} is not where it is given")
-        assert "X and Y look exchanged." in result["warnings"][0]
-
-
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        ('robust = "tukey"', "possible are"),
-        ('variance_components = ["targets"]', "names 'targets'; possible are target, tie, fiducial"),
-        ("robust = true\nsnooping = true", "Set one of the two to false"),
-    ],
-)
-def test_wrong_keys_are_reported(line: str, words: str, tmp_path: Path) -> None:
-    project = spoilt_project(tmp_path, line)
-    with pytest.raises(InputError, match=words):
-        read_project(project)
-
-
-@pytest.mark.study
-def test_an_image_without_orientation_is_left_out_and_named(tmp_path: Path) -> None:
-    """The targets of one of four frames have one another's numbers: the other three are adjusted."""
-    network, _ = simulated(np.random.default_rng(1), points=field_points(np.random.default_rng(2), 15))
-    observed = network.observations
-    rows = [
-        i
-        for i, (image, kind) in enumerate(zip(observed.image, observed.kind, strict=True))
-        if (image, kind) == ("f2", "target")
-    ]
-    points = list(observed.point)
-    for row, other in zip(rows, np.random.default_rng(4).permutation(rows).tolist(), strict=True):
-        points[row] = observed.point[other]
-    project = write_network(replace(network, observations=replace(observed, point=tuple(points))), tmp_path)
-    assert run(["adjust", str(project)]) == 1
-    result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
-    assert result["converged"]
-    assert sorted(result["images"]) == ["f0", "f1", "f3"]
-    assert result["left_out"]["f2"].startswith("image f2 sees 15 known points, but no orientation")
-    assert any(warning.startswith("Left out of the adjustment: image f2") for warning in result["warnings"])
-    assert run(["check", str(project)]) in (0, 1)
-    assert run(["report", str(project)]) == 1
-    assert "Left out of the adjustment: image f2" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-
-
 @parametrize_with_studies(("frame_mm", "level"), [(228.0, 0), (600.0, 1)])
 def test_a_lens_known_in_the_middle_alone_needs_attention(frame_mm: float, level: int, tmp_path: Path) -> None:
     """Targets within some 110 mm of the principal point: most of a picture of 228 mm, a quarter of one of 600 mm."""
@@ -383,7 +286,7 @@ def test_a_lens_known_in_the_middle_alone_needs_attention(frame_mm: float, level
     camera = tmp_path / "camera.toml"
     camera.write_text(camera.read_text(encoding="utf-8").replace("228.0", str(frame_mm)), encoding="utf-8")
     assert run(["adjust", str(project)]) == level
-    known = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))["cameras"]["K"]["lens_known"]
+    known = result_file(tmp_path)["cameras"]["K"]["lens_known"]
     assert (known["share"] < 0.5) is bool(level)
     assert known["corner_sigma_um"] > known["sigma_um"] > 0.0
     # By dr = k3 r³ + k5 r⁵ and the covariance that stands in adjustment.npz.
@@ -403,12 +306,12 @@ def test_points_that_no_image_shows_are_a_note_and_an_unknown_one_in_one_image_i
     points, marks = tmp_path / "points.csv", tmp_path / "comparator.csv"
     points.write_text(points.read_text(encoding="utf-8") + "u1,5,5,0,0,0,0\nu2,6,6,0,0,0,0\n", encoding="utf-8")
     assert run(["adjust", str(project)]) == 0
-    result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    result = result_file(tmp_path)
     assert [note for note in result["notes"] if "measured in no image: 2 points, u1, u2" in note]
     points.write_text(points.read_text(encoding="utf-8") + "single,,,,,,\n", encoding="utf-8")
     marks.write_text(marks.read_text(encoding="utf-8") + "f2,single,target,10,10,0.005,0.005\n", encoding="utf-8")
     assert run(["adjust", str(project)]) == 1
-    result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    result = result_file(tmp_path)
     (warning,) = [warning for warning in result["warnings"] if "single" in warning]
     assert "measured in one image only, and so left out: single (f2). Two images are needed" in warning
     assert not any("single" in note for note in result["notes"])

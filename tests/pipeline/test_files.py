@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-from projects import keep_scans
+from projects import keep_scans, write_tables
 
 from measure.fiducials.options import SCATTER_MM, BelievedFilm
 from measure.flags import Cause, Code, Reason, Status
@@ -76,11 +76,14 @@ def refused(read: Callable[[Path], object], path: Path, words: Sequence[str] = (
     return message
 
 
-def bare_project(folder: Path, text: str) -> Project:
-    """Of a camera without fiducials and marks that are given."""
-    written(folder, "camera.toml", 'name = "c"\nframe_mm = [24.0, 36.0]\nprincipal_distance_mm = 50.0\n')
-    written(folder, "comparator.csv", "image,point,kind,x_mm,y_mm\n")
-    return read_project(written(folder, "project.toml", f'camera = "camera.toml"\n{text}\n'))
+def bare_project(folder: Path, text: str, *files: str) -> Project:
+    """Of a camera without fiducials, marks that are given, and empty files."""
+    for file in files:
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).touch()
+    camera = 'name = "c"\nframe_mm = [24.0, 36.0]\nprincipal_distance_mm = 50.0'
+    text, comparator = f'camera = "camera.toml"\n{text}', "image,point,kind,x_mm,y_mm"
+    return read_project(write_tables(folder, text, camera=camera, comparator=comparator))
 
 
 @pytest.mark.parametrize(("folder", "title"), [("roll_7", "roll_7"), ("roll_7/out", "roll_7/out")])
@@ -102,15 +105,16 @@ def test_a_project_whose_camera_is_unknown_yet_is_drawn_and_else_refused_with_wh
     assert read_undrawn(path).missing_camera == "camera.toml"
 
 
-def test_an_astrograph_of_10_m_with_small_plates_is_a_camera(tmp_path: Path) -> None:
+def test_what_is_unusual_is_no_mistake(tmp_path: Path) -> None:
     for frame, distance in (("160.0, 160.0", 3437.0), ("40.0, 60.0", 10000.0)):
         path = written(
             tmp_path, "camera.toml", f'name = "c"\nframe_mm = [{frame}]\nprincipal_distance_mm = {distance}\n'
         )
         assert read_camera(path).principal_distance_mm == distance
+    assert read_camera(written(tmp_path, "camera.toml", f"\ufeff{CAMERA}")).name == "C"
 
 
-def test_camera_file_gives_priors_and_marks(tmp_path: Path) -> None:
+def test_camera_file_gives_priors_and_marks_turned_with_their_place(tmp_path: Path) -> None:
     file = read_camera(written(tmp_path, "camera.toml", CAMERA))
     camera = file.camera()
     priors = (camera.principal_distance_mm, camera.x0_mm, camera.y0_mm)
@@ -121,6 +125,14 @@ def test_camera_file_gives_priors_and_marks(tmp_path: Path) -> None:
     mark = file.layout().marks[0].mark
     assert isinstance(mark, MarkShape)
     assert len(mark.parts) == 4
+    text = CAMERA.replace('kind = "cross"\narm_mm = 1.0\nline_mm = 0.1\ngap_mm = 0.5', 'kind = "polygon"\n'
+                          "vertices_mm = [[0.0, -1.0], [2.0, 0.0], [0.0, 1.0]]")  # fmt: skip
+    mark = read_camera(written(tmp_path, "camera.toml", text)).layout().marks[0].mark
+    assert isinstance(mark, MarkShape)
+    # The tip points away from the centre of the frame: here up.
+    (part,) = mark.parts
+    assert isinstance(part, Polygon)
+    assert any(np.allclose(vertex, (0.0, 2.0)) for vertex in part.vertices_mm)
 
 
 def test_self_calibration_sets_count_in_halves_of_the_frame(tmp_path: Path) -> None:
@@ -137,7 +149,7 @@ def test_self_calibration_sets_count_in_halves_of_the_frame(tmp_path: Path) -> N
     assert read_camera(written(tmp_path, "again.toml", again)).distortion == camera.distortion
 
 
-def test_a_template_that_is_turned_stays_so_in_a_written_camera(tmp_path: Path) -> None:
+def test_marks_are_turned_with_their_place_and_written_so(tmp_path: Path) -> None:
     chip = 'kind = "template"\nimage = "chip.tif"\npitch_um = 20.0\norigin_px = [3, 4]'
     grey = np.arange(80, dtype=np.uint16).reshape(10, 8)
     tifffile.imwrite(tmp_path / "chip.tif", grey)
@@ -148,9 +160,6 @@ def test_a_template_that_is_turned_stays_so_in_a_written_camera(tmp_path: Path) 
         assert isinstance(mark, MarkTemplate)
         assert (mark.turn_deg, mark.origin_px) == (90.0, (3.0, 4.0))
         np.testing.assert_allclose(np.ptp(mark.image) * grey / 79, mark.image - mark.image.min(), atol=1.0)
-
-
-def test_where_a_drawing_is_true_is_turned_with_it_and_written_with_it(tmp_path: Path) -> None:
     about = DRAWN + "\ntrue_mm = [[-0.5, -1.0], [2.0, 1.0]]"
     camera = read_camera(written(tmp_path, "camera.toml", CAMERA.replace(DRAWN, about)))
     again = read_camera(written(tmp_path, "again.toml", camera_text(camera, picture_writer(tmp_path))))
@@ -165,27 +174,13 @@ def test_where_a_drawing_is_true_is_turned_with_it_and_written_with_it(tmp_path:
     np.testing.assert_allclose(np.ptp(askew.true_mm, axis=0), np.array([2.0, 2.5]) * 2.0 / (2.0 * 3**0.5 / 2 + 1.25))
 
 
-def test_radial_mark_is_turned_with_its_place(tmp_path: Path) -> None:
-    text = CAMERA.replace('kind = "cross"\narm_mm = 1.0\nline_mm = 0.1\ngap_mm = 0.5', 'kind = "polygon"\n'
-                          "vertices_mm = [[0.0, -1.0], [2.0, 0.0], [0.0, 1.0]]")  # fmt: skip
-    mark = read_camera(written(tmp_path, "camera.toml", text)).layout().marks[0].mark
-    assert isinstance(mark, MarkShape)
-    # The tip points away from the centre of the frame: here up.
-    (part,) = mark.parts
-    assert isinstance(part, Polygon)
-    assert any(np.allclose(vertex, (0.0, 2.0)) for vertex in part.vertices_mm)
-
-
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
         ('family = "torlegard"', 'famly = "torlegard"', ["line 9", "famly", "family"]),
         ('family = "torlegard"', 'family = "torlegaard"', ["line 9", "Did you mean 'torlegard'"]),
         ('family = "torlegard"', 'family = "legendre(1)"', ["line 9", "the order of legendre must be 2 to 9, not 1"]),
-        ('family = "torlegard"', 'family = "ebner"\nhalf_mm = 0', ["line 10", "half_mm", "must be positive"]),
         ("frame_mm = [228.0, 228.0]", "frame_mm = 228.0", ["frame_mm", "[x, y]"]),
-        ("frame_mm = [228.0, 228.0]", "frame_mm = [228.0, 228.0", ["not valid TOML", "line"]),
-        ("principal_distance_mm = 153.0", 'principal_distance_mm = "153,0"', ["must be a number"]),
         ("principal_distance_mm = 153.0", "principal_distance_mm = -153.0", ["greater than 0"]),
         ("principal_distance_mm = 153.0", "principal_distance_mm = 0.153", ["line 4", "impossible", "Give both in mm"]),
         ("xy_mm = [0.0, 106.0]", "xy_mm = [0.0, 106000.0]", ["line 14", "far outside of the frame"]),
@@ -197,77 +192,38 @@ def test_radial_mark_is_turned_with_its_place(tmp_path: Path) -> None:
         ('mark = "side"', 'mark = "sid"', ["Did you mean 'side'"]),
         ("arm_mm = 1.0", "arm_m = 1.0", ["arm_mm", "'arm_m'"]),
         ("gap_mm = 0.5", "gap_mm = 1.5", ["smaller than arm_mm"]),
-        ('k3 = "free"', 'k3 = "fre"', ["k3", '"free"']),
         ('k3 = "free"', 'k9 = "free"', ["k9", "Known here"]),
         ("[[fiducial]]", '[[fiducial]]\nid = "1"\nxy_mm = [0.0, 1.0]\n[[fiducial]]', ["'1' is given twice"]),
     ],
 )
-def test_camera_file_with_a_mistake_gets_a_message_that_helps(
-    tmp_path: Path, old: str, new: str, words: list[str]
-) -> None:
+def test_a_mistake_in_a_camera_file_is_named(tmp_path: Path, old: str, new: str, words: list[str]) -> None:
     assert old in CAMERA
     path = written(tmp_path, "camera.toml", CAMERA.replace(old, new, 1))
     refused(read_camera, path, [str(path), *words])
 
 
-def test_a_self_calibration_set_without_a_frame_is_reported_what_it_needs(tmp_path: Path) -> None:
+def test_what_is_missing_for_a_camera_or_a_project_is_told(tmp_path: Path) -> None:
     text = CAMERA.replace("frame_mm = [228.0, 228.0]\n", "").replace('"torlegard"', '"ebner"')
     message = refused(read_camera, written(tmp_path, "camera.toml", text))
     assert "line 8: [distortion] family: ebner counts in halves of the frame" in message
     assert "Give the camera's frame_mm, or half_mm in this table." in message
-
-
-def test_a_byte_order_mark_is_no_mistake(tmp_path: Path) -> None:
-    assert read_camera(written(tmp_path, "camera.toml", f"\ufeff{CAMERA}")).name == "C"
-
-
-def test_a_chip_that_shows_nothing_is_no_mark(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "chip.tif", np.full((20, 20), 90, np.uint8))
     chip = 'kind = "template"\nimage = "chip.tif"\npitch_um = 20\norigin_px = [10, 10]'
     message = refused(read_camera, written(tmp_path, "camera.toml", CAMERA.replace(DRAWN, chip)))
     assert "all its pixels are alike" in message
-
-
-def test_a_camera_file_in_place_of_a_project_is_named(tmp_path: Path) -> None:
     (tmp_path / "camera.toml").write_text('name = "K"\nprincipal_distance_mm = 60.0\n', encoding="utf-8")
     with pytest.raises(InputError, match=r'is a camera file\. Give the project file, which names it: camera = "camera'):
         read_project(tmp_path / "camera.toml")
-
-
-def test_missing_file_is_named_with_the_place_inspected_for(tmp_path: Path) -> None:
     path = tmp_path / "no.toml"
     assert str(path.resolve()) in refused(read_toml, path)
     assert str(path.resolve()) in refused(read_points, path)
 
 
-def test_points_file_fixed_free_and_unknown(tmp_path: Path) -> None:
+def test_points_and_orientations_fixed_free_and_unknown(tmp_path: Path) -> None:
     text = "point,X,Y,Z,sX,sY,sZ\n# a comment\n1,1,2,3,0,0.5,\n2,,,7,,,0.02\n"
     points = {point.id: point for point in read_points(written(tmp_path, "points.csv", text)).points}
     sigmas = {id: [axis and axis.sigma for axis in (point.X, point.Y, point.Z)] for id, point in points.items()}
     assert sigmas == {"1": [0.0, 0.5, math.inf], "2": [None, None, 0.02]}
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("point,X,Y,Z\n1,1,2,3\n1,4,5,6\n", ["line 3", "'1'", "line 2"]),
-        ("point,X,Y\n1,1,2\n", ["'Z'", "lacks"]),
-        ("point,X,Y,Z,sx\n1,1,2,3,0\n", ["'sx'", "Did you mean 'sX'"]),
-        ("point,X,Y,Z\n1,1,2,3a\n", ["line 2", "column Z", "'3a'"]),
-        ("point,X,Y,Z\n1,1,5,2,0,3,0\n", ["line 2", "7 values", "4 columns", "commas"]),
-        ("point,X,Y,Z,sX,sY,sZ\n1,1,2,3,-1,0,0\n", ["negative"]),
-        ("point,X,Y,Z,sX,sY,sZ\n1,,2,3,1,0,0\n", ["X", "blank"]),
-        ("point,X,Y,Z\n1,1,2,3\n2,4,5", ["line 3", "cut short", "3 of the 4 values"]),
-        ("point;X;Y;Z\n1;1;2;3\n", ["line 1", "semicolons", "commas are needed"]),
-        ("point,X,Y,Z\n", ["no point"]),
-        ("", ["is empty"]),
-    ],
-)
-def test_points_file_with_a_mistake(tmp_path: Path, text: str, words: list[str]) -> None:
-    refused(read_points, written(tmp_path, "points.csv", text), words)
-
-
-def test_images_file_in_degrees_with_or_without_ending(tmp_path: Path) -> None:
     text = "image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg,sX0\na.tif,1,2,3,10,20,90,0.1\nb.2,,,,,,,\n"
     images = read_images(written(tmp_path, "images.csv", text))
     exterior = images.exterior["a"]
@@ -288,10 +244,8 @@ def test_comparator_coordinates_have_y_up_and_survive_writing(tmp_path: Path) ->
     write_comparator(path, mark_rows([FrameMeasurement("#1", marks)]), {"#1": (20.0, 10.0)})
     first, second = read_comparator(path)
     assert first.image == "#1"  # a line that begins with # would be a comment
-    assert first.xy_mm is not None
-    assert first.sigma_mm is not None
-    np.testing.assert_allclose(first.xy_mm, [2.005, -2.005], atol=1e-9)
-    np.testing.assert_allclose(first.sigma_mm, [0.02 * 0.02, 0.01 * 0.03], rtol=1e-3)
+    np.testing.assert_allclose(np.asarray(first.xy_mm), [2.005, -2.005], atol=1e-9)
+    np.testing.assert_allclose(np.asarray(first.sigma_mm), [0.02 * 0.02, 0.01 * 0.03], rtol=1e-3)
     assert first.rho == pytest.approx(-0.0001 / (0.02 * 0.03), abs=1e-4)  # y is turned round
     assert second.xy_mm is None
     assert second.status is Status.ABSENT
@@ -321,26 +275,14 @@ def test_the_projects_film_is_what_measuring_believes_of_it(tmp_path: Path) -> N
     assert film == [BelievedFilm(0.012, is_stated=True), BelievedFilm(SCATTER_MM)]
 
 
-@pytest.mark.parametrize(
-    ("row", "words"),
-    [
-        ("f,1,fiducial,1,2\nf,1,fiducial,3,4", ["line 3", "line 2", "fiducial '1'"]),
-        ("f,1,fidu,1,2", ["'fidu'", "possible are"]),
-        ("f,1,target,,2", ["x_mm", "blank"]),
-    ],
-)
-def test_comparator_file_with_a_mistake(tmp_path: Path, row: str, words: list[str]) -> None:
-    refused(read_comparator, written(tmp_path, "comparator.csv", f"image,point,kind,x_mm,y_mm\n{row}\n"), words)
-
-
 def test_a_list_of_pixels_is_read_with_y_up_by_the_pitch(tmp_path: Path) -> None:
     text = "image,point,col_px,row_px,scol_px,srow_px,rho\nf.png,1,100.5,200,0.1,0.2,0.3\n"
     path = written(tmp_path, "comparator.csv", text)
     (mark,) = read_comparator(path, (20.0, 10.0))
     assert (mark.kind, mark.status) == ("target", Status.MEASURED)
-    assert mark.xy_mm is not None
-    assert mark.sigma_mm is not None
-    np.testing.assert_allclose([*mark.xy_mm, *mark.sigma_mm, mark.rho], [2.01, -2.0, 0.002, 0.002, -0.3])
+    np.testing.assert_allclose(
+        [*np.asarray(mark.xy_mm), *np.asarray(mark.sigma_mm), mark.rho], [2.01, -2.0, 0.002, 0.002, -0.3]
+    )
     assert "Set pitch_um in project.toml" in refused(read_comparator, path)
     nothing = written(tmp_path, "nothing.csv", "image,point,col_px\nf,1,2\n")
     assert "lacks the columns x_mm, y_mm or col_px, row_px" in refused(read_comparator, nothing)
@@ -349,7 +291,7 @@ def test_a_list_of_pixels_is_read_with_y_up_by_the_pitch(tmp_path: Path) -> None
         read_comparator(blank, (20.0, 10.0))
 
 
-def test_failed_write_leaves_the_earlier_file_and_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_writing_is_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = written(tmp_path, "out.json", "earlier")
 
     def full(_: object) -> None:
@@ -381,19 +323,6 @@ def test_trying_whether_a_folder_takes_results_touches_no_file_of_it(tmp_path: P
         check_writable(tmp_path / "trial")
 
 
-def test_an_image_is_called_as_its_file_without_what_no_table_keeps() -> None:
-    assert image_name("roll 7/ frame 1 .TIF") == "roll 7/frame 1"
-    assert image_name("frame.2") == "frame.2"
-
-
-def make_project(folder: Path, scans: str, *files: str) -> Project:
-    for file in files:
-        (folder / file).parent.mkdir(parents=True, exist_ok=True)
-        (folder / file).touch()
-    written(folder, "camera.toml", 'name = "c"\nframe_mm = [24.0, 36.0]\nprincipal_distance_mm = 50.0\n')
-    return read_project(written(folder, "project.toml", f'camera = "camera.toml"\n{scans}\n'))
-
-
 @pytest.mark.parametrize(
     ("said", "names"),
     [
@@ -408,21 +337,23 @@ def make_project(folder: Path, scans: str, *files: str) -> Project:
         ),
     ],
 )
-def test_images_are_called_by_their_path_below_the_folder_that_all_share(
-    tmp_path: Path, said: str, names: list[str]
-) -> None:
+def test_images_are_called_by_their_path(tmp_path: Path, said: str, names: list[str]) -> None:
     files = ("box/1952/0001.tif", "box/1952/deep/0001.tif", "box/1958/0001.tif", "box/0000.tif", "box/notes.txt")
-    assert set(make_project(tmp_path, said, *files).scans) == set(names)
+    assert set(bare_project(tmp_path, said, *files).scans) == set(names)
 
 
-def test_an_image_that_is_left_out_may_stand_in_images_csv(tmp_path: Path) -> None:
+def test_images_that_are_left_out_or_called_alike(tmp_path: Path) -> None:
     """One that is neither found nor left out has no scan, and is told so."""
     written(tmp_path, "images.csv", "image\na\nb\nc\n")
     text = 'scans = ["scans/*.tif"]\nexclude = ["scans/b.tif"]\n[object]\nimages = "images.csv"\n[ties]'
-    project = make_project(tmp_path, text, "scans/a.tif", "scans/b.tif")
+    project = bare_project(tmp_path, text, "scans/a.tif", "scans/b.tif")
     assert project.left_out == {"b"}
     assert set(project.scans) == {"a"}
     assert check_measurable(project) == ("a", "c")
+    with pytest.raises(InputError, match="have the same name 'a/1'"):
+        bare_project(tmp_path, 'scans = ["**/*.*g"]', "a/1.jpg", "a/1.png", "b/1.png")
+    with pytest.raises(InputError, match=r"exclude.*leaves no scan of those that scans names"):
+        bare_project(tmp_path, 'scans = ["a/*"]\nexclude = ["a/*"]')
 
 
 @pytest.mark.parametrize(
@@ -434,19 +365,10 @@ def test_an_image_that_is_left_out_may_stand_in_images_csv(tmp_path: Path) -> No
         ("image,camera", 'writing = "all"', "all"),
     ],
 )
-def test_a_column_for_what_is_written_asks_for_it_on_all_scans(
-    tmp_path: Path, columns: str, said: str, reads: str
-) -> None:
+def test_columns_tell_what_is_read_on_all_scans(tmp_path: Path, columns: str, said: str, reads: str) -> None:
     written(tmp_path, "images.csv", f"{columns}\na{',' * columns.count(',')}\n")
     project = f'scans = ["a.tif"]\n[object]\nimages = "images.csv"\n[measure]\n{said}'
-    assert make_project(tmp_path, project, "a.tif").reads == reads
-
-
-def test_two_files_of_one_name_in_a_folder_are_refused_and_so_is_leaving_all_out(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="have the same name 'a/1'"):
-        make_project(tmp_path, 'scans = ["**/*.*g"]', "a/1.jpg", "a/1.png", "b/1.png")
-    with pytest.raises(InputError, match=r"exclude.*leaves no scan of those that scans names"):
-        make_project(tmp_path, 'scans = ["a/*"]\nexclude = ["a/*"]')
+    assert bare_project(tmp_path, project, "a.tif").reads == reads
 
 
 @pytest.mark.parametrize(
@@ -456,33 +378,42 @@ def test_the_tone_curve_of_a_project(tmp_path: Path, said: str, tone: float | st
     assert bare_project(tmp_path, f"[measure]\n{said}").tone == tone
 
 
-@pytest.mark.parametrize(
-    ("said", "words"),
-    [('"2.2"', ["tone", "linear", "A number above 0, without quotes"]), ("-1.0", ["tone", "greater than 0"])],
-)
-def test_a_tone_curve_that_is_none(tmp_path: Path, said: str, words: list[str]) -> None:
-    refused(read_project, written(tmp_path, "p.toml", f'camera = "camera.toml"\n[measure]\ntone = {said}\n'), words)
-
-
-def test_rows_go_down_and_y_goes_up() -> None:
+def test_rows_go_down_y_goes_up_and_images_are_called_as_their_files() -> None:
     np.testing.assert_allclose(comparator_from_pixel(np.array([[3.0, 5.0]]), (20.0, 10.0)), [[0.06, -0.05]])
     np.testing.assert_allclose(pixel_from_comparator(np.array([0.06, -0.05]), (20.0, 10.0)), [3.0, 5.0])
     np.testing.assert_array_equal(comparator_from_pixel(np.zeros(2), (20.0, 20.0)), np.zeros(2))  # a pixel's middle
+    assert image_name("roll 7/ frame 1 .TIF") == "roll 7/frame 1"
+    assert image_name("frame.2") == "frame.2"
+
+
+COMPARATOR = "image,point,kind,x_mm,y_mm\n"
+TONE = 'camera = "camera.toml"\n[measure]\ntone = '
 
 
 @pytest.mark.parametrize(
-    ("line", "remedy"),
+    ("read", "text", "words"),
     [
-        ("k3 = free", 'Text stands in quotes: k3 = "free".'),
-        ("kind = ring-cross  # of the RC8", 'Text stands in quotes: kind = "ring-cross".'),
-        ("pitch_um = 5 um", "A number stands without its unit, which the key names: pitch_um = 5."),
-        ("frame_mm = [228.0, 228.0", "Mend that line."),
+        (read_points, "point,X,Y,Z\n1,1,2,3\n1,4,5,6\n", ["line 3", "'1'", "line 2"]),
+        (read_points, "point,X,Y\n1,1,2\n", ["'Z'", "lacks"]),
+        (read_points, "point,X,Y,Z,sx\n1,1,2,3,0\n", ["'sx'", "Did you mean 'sX'"]),
+        (read_points, "point,X,Y,Z\n1,1,2,3a\n", ["line 2", "column Z", "'3a'"]),
+        (read_points, "point,X,Y,Z\n1,1,5,2,0,3,0\n", ["line 2", "7 values", "4 columns", "commas"]),
+        (read_points, "point,X,Y,Z,sX,sY,sZ\n1,1,2,3,-1,0,0\n", ["negative"]),
+        (read_points, "point,X,Y,Z,sX,sY,sZ\n1,,2,3,1,0,0\n", ["X", "blank"]),
+        (read_points, "point,X,Y,Z\n1,1,2,3\n2,4,5", ["line 3", "cut short", "3 of the 4 values"]),
+        (read_points, "point;X;Y;Z\n1;1;2;3\n", ["line 1", "semicolons", "commas are needed"]),
+        (read_points, "point,X,Y,Z\n", ["no point"]),
+        (read_points, "", ["is empty"]),
+        (read_comparator, f"{COMPARATOR}f,1,fiducial,1,2\nf,1,fiducial,3,4", ["line 3", "line 2", "fiducial '1'"]),
+        (read_comparator, f"{COMPARATOR}f,1,fidu,1,2", ["'fidu'", "possible are"]),
+        (read_comparator, f"{COMPARATOR}f,1,target,,2", ["x_mm", "blank"]),
+        (read_project, f'{TONE}"2.2"', ["tone", "linear", "A number above 0, without quotes"]),
+        (read_project, f"{TONE}-1.0", ["tone", "greater than 0"]),
+        (read_toml, "k3 = free", ['Text stands in quotes: k3 = "free".']),
+        (read_toml, "kind = ring-cross  # of the RC8", ['Text stands in quotes: kind = "ring-cross".']),
+        (read_toml, "pitch_um = 5 um", ["A number stands without its unit, which the key names: pitch_um = 5."]),
+        (read_toml, "frame_mm = [228.0, 228.0", ["Mend that line."]),
     ],
 )
-def test_a_value_without_quotes_or_with_a_unit_is_reported_as_it_should_be(
-    tmp_path: Path, line: str, remedy: str
-) -> None:
-    (tmp_path / "camera.toml").write_text(f'name = "K"\n{line}\n', encoding="utf-8")
-    with pytest.raises(InputError) as refused:
-        read_toml(tmp_path / "camera.toml")
-    assert str(refused.value).endswith(remedy)
+def test_a_wrong_table_is_named(read: Callable[[Path], object], text: str, words: list[str], tmp_path: Path) -> None:
+    refused(read, written(tmp_path, "table", text), words)

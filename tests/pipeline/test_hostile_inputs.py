@@ -176,20 +176,12 @@ def decisions_trial(rng: random.Random, folder: Path) -> str:
     choices = (Choice.ACCEPT, Choice.REJECT, Choice.ABSENT, Choice.UNDO)
     lines = [Decision(rng.choice("abz"), rng.choice(choices), rng.choice("129"), "fiducial") for _ in range(8)]
     append_decisions(path, lines)
-    data = bytearray(path.read_bytes())
-    kind = rng.randrange(4)
-    if kind == 0:
-        at = rng.randrange(len(data))
-        data[at] = rng.randrange(256)
-    elif kind == 1:
-        del data[rng.randrange(len(data)) :]
-    elif kind == 2:
-        data += rng.choice([b"{}", b"[]", b"NaN", b"\x00", b'{"image": "a", "decision": "pose", "pose": NaN}'])
-    path.write_bytes(data)
+    if is_spoilt := rng.random() < 0.7:
+        change_bytes(rng, path)
 
     def trial() -> str:
         read = read_decisions(path)
-        if kind == 3 and read != tuple(lines):
+        if not is_spoilt and read != tuple(lines):
             return WRONG
         bad = Decision("a", Choice.PLACE, "1", "fiducial", col_px=rng.choice([float("nan"), 1e300]), row_px=1.0)
         before = path.read_bytes()
@@ -214,6 +206,13 @@ def xml(text: str) -> str:
     return "".join(f"&#{ord(letter)};" if letter in '<>&"' else letter for letter in text)
 
 
+def writing(write: Callable[[Path], object], out: Path, around: Path) -> str:
+    """How writing into a folder ended, and whether a file came to be elsewhere around it."""
+    before = files(around)
+    ended = outcome(lambda: (write(out), GOOD)[1])
+    return OUTSIDE if any(not path.is_relative_to(out) for path in files(around) - before) else ended
+
+
 def imports_trial(rng: random.Random, folder: Path) -> str:
     folder.mkdir(parents=True)
     place = rng.choice(["1 2", "nan 1", "1e999 0", "x", "1"])
@@ -225,15 +224,8 @@ def imports_trial(rng: random.Random, folder: Path) -> str:
     source = folder / rng.choice(["MeasuresIm-a.xml", "MeasuresCamera.xml", "MesIm-a.xml", "a.xml"])
     source.write_bytes(text)
     format = rng.choice(["micmac", "mmvii", "metashape", "opencv", "certificate", "bingo"])
-    before = files(folder.parent)
-
-    def trial() -> str:
-        run_import(format, [source], folder / "out", ImportOptions(pitch_um=10.0, sigma_px=0.1))
-        return GOOD
-
-    own_outcome = outcome(trial)
-    new = files(folder.parent) - before
-    return OUTSIDE if any(not path.is_relative_to(folder / "out") for path in new) else own_outcome
+    options = ImportOptions(pitch_um=10.0, sigma_px=0.1)
+    return writing(lambda out: run_import(format, [source], out, options), folder / "out", folder.parent)
 
 
 def names_trial(rng: random.Random, adjusted_folder: Path, folder: Path) -> str:
@@ -249,15 +241,10 @@ def names_trial(rng: random.Random, adjusted_folder: Path, folder: Path) -> str:
     (folder / "comparator.csv").write_text(
         "\n".join(cell + line[2:] if line.startswith("f1,") else line for line in lines)
     )
-    before = files(folder.parent)
-
-    def trial() -> str:
-        run_export(read_project(project), rng.choice(["csv", "mmvii", "micmac"]), folder / "o" / "out", ExportOptions())
-        return GOOD
-
-    own_outcome = outcome(trial)
-    new = files(folder.parent) - before
-    return OUTSIDE if any(not path.is_relative_to(folder / "o" / "out") for path in new) else own_outcome
+    format = rng.choice(["csv", "mmvii", "micmac"])
+    return writing(
+        lambda out: run_export(read_project(project), format, out, ExportOptions()), folder / "o" / "out", folder.parent
+    )
 
 
 def files(folder: Path) -> set[Path]:
@@ -318,9 +305,7 @@ def study(kind: str, count: int, seed: int, measured_folder: Path, adjusted_fold
     return counts
 
 
-def test_a_digest_changed_in_its_row_or_in_its_index_is_never_taken_for_no_judging(
-    measured_folder: Path, tmp_path: Path
-) -> None:
+def test_a_changed_digest_is_never_taken_for_no_judging(measured_folder: Path, tmp_path: Path) -> None:
     right, place = readings(measured_folder), tmp_path / "p"
     shutil.copytree(measured_folder, place)
     path = place / "out" / "measurement.db"
@@ -336,9 +321,7 @@ def test_a_digest_changed_in_its_row_or_in_its_index_is_never_taken_for_no_judgi
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_hostile_inputs_end_in_the_right_result_or_in_a_message(
-    kind: str, measured_folder: Path, adjusted_folder: Path, tmp_path: Path
-) -> None:
+def test_hostile_inputs(kind: str, measured_folder: Path, adjusted_folder: Path, tmp_path: Path) -> None:
     assert study(kind, 4, 1, measured_folder, adjusted_folder, tmp_path) == {GOOD: 4}
 
 

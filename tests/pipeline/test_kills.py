@@ -11,25 +11,20 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import pytest
-from projects import replace_text, scan_content
+from projects import Capture, replace_text, scan_content
 
 from pipeline.cli import run
 
 END_S = 5.0  # within which every process is to be gone
 LONGEST_S = 300.0
-Whom = Literal["parent", "worker"]
 State = dict[str, bytes]
 
 
 @dataclass(frozen=True)
 class Ended:
-    """One trial: what stands in the folder, and what was left running END_S after the command's own end.
-
-    in_time: whether a parent that was asked to end did so within END_S.
-    """
+    """What stands in the folder, what runs END_S after the command's end, and whether it ended within END_S."""
 
     state: State
     processes: tuple[int, ...]
@@ -67,23 +62,17 @@ def time_command(source: Path, folder: Path, command: str) -> tuple[float, State
     return seconds, results
 
 
-def trial(source: Path, folder: Path, command: str, sign: signal.Signals, whom: Whom, after_s: float) -> Ended:
-    """A copy of a project in which the command is begun, and one of its processes ended after so many seconds (of a
-    worker: after the first is there)."""
+def kill(source: Path, folder: Path, command: str, sign: signal.Signals, after_s: float) -> Ended:
+    """A copy of a project in which the command is begun, and ended after so many seconds."""
     shutil.copytree(source, folder)
     parent = started(folder, command)
-    if whom == "worker":
-        _wait(lambda: bool(_workers(parent.pid)) or parent.poll() is not None, LONGEST_S)
     _wait(lambda: parent.poll() is not None, after_s)
     before = parent.poll() is not None
-    requests = time.monotonic()
-    targets = [parent.pid] if whom == "parent" else _workers(parent.pid)
-    if targets and not before:
-        os.kill(random.Random(after_s).choice(targets), sign)
-    else:
-        before = True
+    begun = time.monotonic()
+    if not before:
+        parent.send_signal(sign)
     parent.wait(LONGEST_S)
-    in_time = whom == "worker" or before or time.monotonic() - requests < END_S
+    in_time = before or time.monotonic() - begun < END_S
     _wait(lambda: not _session(parent.pid), END_S)
     left = _session(parent.pid)
     for pid in left:
@@ -97,41 +86,23 @@ def _wait(holds: Callable[[], bool], most_s: float) -> None:
         time.sleep(0.02)
 
 
-def _workers(parent: int) -> list[int]:
-    """The processes that measure, of a command."""
-    return [
-        pid
-        for pid, fields in _processes()
-        if fields[1] == parent and b"spawn_main" in (Path(f"/proc/{pid}/cmdline").read_bytes() if _is(pid) else b"")
-    ]
-
-
 def _session(leader: int) -> list[int]:
-    return [pid for pid, fields in _processes() if fields[3] == leader]
-
-
-def _is(pid: int) -> bool:
-    return Path(f"/proc/{pid}/cmdline").exists()
-
-
-def _processes() -> list[tuple[int, list[int]]]:
-    """Every process that is no zombie, with what follows its name in /proc: state, parent, group, session."""
+    """The processes of a session that are no zombies."""
     found = []
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            try:
-                text = (entry / "stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
-            except OSError:
-                continue
-            if text[0] != "Z":
-                found.append((int(entry.name), [0, *map(int, text[1:4])]))
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            text = (entry / "stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
+        except OSError:
+            continue
+        if text[0] != "Z" and int(text[3]) == leader:
+            found.append(int(entry.name))
     return found
 
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 
 
-def counted(old: Path, folder: Path, command: str, trials: int, whoms: tuple[Whom, ...], seed: int) -> Counter[str]:
+def counted(old: Path, folder: Path, command: str, trials: int, seed: int) -> Counter[str]:
     """How so many trials ended. old: a project whose results are of other input than it has now."""
     rng = random.Random(seed)
     earlier = state(old)
@@ -140,11 +111,10 @@ def counted(old: Path, folder: Path, command: str, trials: int, whoms: tuple[Who
     assert all(complete[name] != earlier[name] for name in ("out/adjustment.json", "out/adjustment.npz"))
     found: Counter[str] = Counter()
     for number in range(trials):
-        whom, sign = whoms[number % len(whoms)], SIGNALS[number // len(whoms) % len(SIGNALS)]
-        after_s = rng.uniform(0.0, 1.1 * seconds if whom == "parent" else 0.5 * seconds)
-        ended = trial(old, folder / "trial", command, sign, whom, after_s)
+        sign, after_s = SIGNALS[number % len(SIGNALS)], rng.uniform(0.0, 1.1 * seconds)
+        ended = kill(old, folder / "trial", command, sign, after_s)
         left = "earlier" if ended.state == earlier else "complete" if ended.state == complete else "mixed"
-        kind = "ended before" if ended.before else f"{sign.name} to the {whom}"
+        kind = "ended before" if ended.before else sign.name
         found[f"{kind}: {left}"] += 1
         if ended.processes:
             found[f"WRONG, processes left: {kind} after {after_s:.1f} s"] += 1
@@ -163,7 +133,7 @@ def changed(project: Path) -> None:
 
 
 @pytest.mark.study
-def test_two_hundred_kills(rendered_demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_hundred_kills(rendered_demo: Path, tmp_path: Path, capsys: Capture) -> None:
     old = tmp_path / "old"
     shutil.copytree(rendered_demo, old)
     project = old / "project.toml"
@@ -171,7 +141,7 @@ def test_two_hundred_kills(rendered_demo: Path, tmp_path: Path, capsys: pytest.C
     assert run(["run", str(project)]) in (0, 1)
     changed(project)
     project.write_text(f"pitch_um = 45.001\n{project.read_text(encoding='utf-8')}", encoding="utf-8")  # other places
-    found = counted(old, tmp_path, "run", 200, ("parent", "worker"), 2)
+    found = counted(old, tmp_path, "run", 200, 2)
     with capsys.disabled():
         print("\n" + "\n".join(f"{number:4d}  {what}" for what, number in sorted(found.items())))
     assert not [what for what in found if "WRONG" in what]

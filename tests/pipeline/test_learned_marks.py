@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from shutil import copy, copytree
@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import tifffile
 from numpy.typing import NDArray
-from projects import measure_scan
+from projects import fiducial_tables, measure_scan, write_tables
 from rich.console import Console
 
-from measure import FrameMeasurement, MarkTemplate, Status
+from measure import FrameMeasurement, MarkTemplate
 from pipeline import InputError, read_camera
 from pipeline.files.project_file import Project, read_project
 from pipeline.measuring import learn_stage
@@ -67,14 +67,9 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def make_project(folder: Path, camera: str, scans: str = '"scans/*.tif"', pose: str = "0") -> Project:
-    given = "".join(
-        f'[[fiducial]]\nid = "{id}"\nxy_mm = [{x + 0.2}, {y - 0.3}]\nmark = "m"\n' for id, (x, y) in CORNERS.items()
-    )
-    (folder / "camera.toml").write_text(camera + given)
-    (folder / "project.toml").write_text(
-        f'camera = "camera.toml"\nscans = [{scans}]\npitch_um = 50.0\n[measure]\npose = "{pose}"\n'
-    )
-    return read_project(folder / "project.toml")
+    given = fiducial_tables({id: (x + 0.2, y - 0.3) for id, (x, y) in CORNERS.items()}, 'mark = "m"\n')
+    text = f'camera = "camera.toml"\nscans = [{scans}]\npitch_um = 50.0\n[measure]\npose = "{pose}"'
+    return read_project(write_tables(folder, text, camera=camera + given))
 
 
 def truth(folder: Path) -> dict[str, Array]:
@@ -85,10 +80,14 @@ def truth(folder: Path) -> dict[str, Array]:
     }
 
 
+def clicked(places: Iterable[Sequence[float]], scan: str = "f1.tif") -> str:
+    """The camera file's table of clicks at these places."""
+    lines = "".join(f"{id} = [{col:.0f}, {row:.0f}]\n" for id, (col, row) in zip(CORNERS, places, strict=True))
+    return f'[clicks]\nscan = "{scan}"\n[clicks.px]\n{lines}'
+
+
 def clicks(folder: Path) -> str:
-    px = truth(folder)["f1"] + (1.7, -2.2)
-    lines = "".join(f"{id} = [{col:.0f}, {row:.0f}]\n" for id, (col, row) in zip(CORNERS, px.tolist(), strict=True))
-    return f'[clicks]\nscan = "f1.tif"\n[clicks.px]\n{lines}'
+    return clicked((truth(folder)["f1"] + (1.7, -2.2)).tolist())
 
 
 class Forgetful:
@@ -148,15 +147,13 @@ def assert_off_alike(frames: list[FrameMeasurement], true: dict[str, Array]) -> 
 
 
 @pytest.mark.study
-def test_marks_learned_from_clicks_lie_off_the_true_ones_alike_in_all_frames(
-    rendered: Path, clicked_projects: tuple[Project, Project]
-) -> None:
+def test_marks_learned_from_clicks_lie_off_alike(rendered: Path, clicked_projects: tuple[Project, Project]) -> None:
     """In the scan that was clicked in, and in another one."""
     assert_off_alike([measure_scan(clicked_projects[1], name).frame for name in ("f0", "f1")], truth(rendered))
 
 
 @pytest.mark.study
-def test_marks_that_recur_lie_off_the_true_ones_alike_in_all_frames(rendered: Path) -> None:
+def test_marks_that_recur_lie_off_alike(rendered: Path) -> None:
     project = make_project(rendered, LEARNED)
     frames = measure_picture(project, "f0", "f2")
     assert_off_alike(frames, truth(rendered))
@@ -164,9 +161,7 @@ def test_marks_that_recur_lie_off_the_true_ones_alike_in_all_frames(rendered: Pa
 
 
 @pytest.mark.study
-def test_a_scan_that_lies_otherwise_than_the_one_clicked_in_is_known_by_its_pictures(
-    rendered: Path, tmp_path: Path
-) -> None:
+def test_a_scan_that_lies_otherwise_is_known_by_its_pictures(rendered: Path, tmp_path: Path) -> None:
     """Turned by a quarter: the arrows point elsewhere."""
     for folder in ("scans", "turned"):
         (tmp_path / folder).mkdir()
@@ -181,8 +176,7 @@ def test_a_scan_that_lies_otherwise_than_the_one_clicked_in_is_known_by_its_pict
     assert turned.pose is not None
     assert (turned.pose.name, turned.pose.decided) == ("90", True), turned.pose.evidence
     for mark, (col, row) in zip(turned.marks, truth(rendered)["f2"].tolist(), strict=True):
-        assert mark.center_px is not None
-        np.testing.assert_allclose(mark.center_px, (row, upright.shape[1] - 1 - col), atol=5.0)
+        np.testing.assert_allclose(np.asarray(mark.center_px), (row, upright.shape[1] - 1 - col), atol=5.0)
     assert_measured_alike(project, turned)
 
 
@@ -197,9 +191,7 @@ def test_one_scan_must_be_clicked_and_says_what_it_can_tell(rendered: Path) -> N
     assert all(0 < np.trace(np.asarray(mark.covariance_px2)) < 0.01 for mark in frame.marks)
 
 
-def test_cameras_whose_files_are_named_alike_are_stored_apart(
-    rendered: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cameras_named_alike_are_stored_apart(rendered: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The second in another folder, beside a third that has the name which the second would get. What is stored of each
     is its first pictures: it has no second scan to seek them in."""
     monkeypatch.setattr(learn_stage, "_chips", lambda *_: ({}, set()))
@@ -207,10 +199,8 @@ def test_cameras_whose_files_are_named_alike_are_stored_apart(
     make_project(tmp_path, LEARNED, f'"{rendered}/scans/*.tif"')
     given = (tmp_path / "camera.toml").read_text()
     for name, places in truth(rendered).items():
-        px = "".join(f"{id} = [{col:.0f}, {row:.0f}]\n" for id, (col, row) in zip(CORNERS, places, strict=True))
         (tmp_path / files[name]).parent.mkdir(exist_ok=True)
-        own = given.replace("small", name)
-        (tmp_path / files[name]).write_text(f'{own}[clicks]\nscan = "{name}.tif"\n[clicks.px]\n{px}')
+        (tmp_path / files[name]).write_text(given.replace("small", name) + clicked(places.tolist(), f"{name}.tif"))
     rows = "".join(f"{image},{file}\n" for image, file in files.items())
     (tmp_path / "images.csv").write_text(f"image,camera\n{rows}")
     text = (tmp_path / "project.toml").read_text()
@@ -231,24 +221,7 @@ def read_shares(project: Project) -> set[frozenset[str]]:
     return {frozenset(mark.shares) for mark in marks if isinstance(mark, MarkTemplate)}
 
 
-@pytest.mark.study
-def test_scans_of_several_folders_that_are_called_alike_have_a_share_each(
-    clicked_projects: tuple[Project, Project], rendered: Path, tmp_path: Path
-) -> None:
-    for number in range(3):
-        (tmp_path / f"box{number}").mkdir()
-        copy(rendered / "scans" / f"f{number}.tif", tmp_path / f"box{number}" / "0001.tif")
-    clicked = clicks(rendered).replace("f1.tif", "box1/0001.tif")
-    project = make_project(tmp_path, LEARNED + clicked, '"box*/0001.tif"')
-    known = learned(project)
-    assert read_shares(known) == {frozenset({"box0/0001", "box1/0001", "box2/0001"})}
-    for of_folder, of_name in ((0, "box0/0001"), (2, "box2/0001")):
-        frame, same = measure_scan(known, of_name).frame, measure_scan(clicked_projects[1], f"f{of_folder}").frame
-        for mark, other in zip(frame.marks, same.marks, strict=True):
-            np.testing.assert_allclose(np.array(mark.covariance_px2), np.array(other.covariance_px2), rtol=0.05)
-
-
-def test_marks_learned_in_one_project_hold_nothing_of_the_scans_of_another(
+def test_marks_of_one_project_hold_nothing_of_another(
     clicked_projects: tuple[Project, Project], rendered: Path, tmp_path: Path
 ) -> None:
     """There f1 is another scan than the one that they were clicked in."""
@@ -306,40 +279,25 @@ def test_clicks_that_cannot_be_are_refused(rendered: Path) -> None:
         learned(replace(project, cameras={"camera.toml": outside}))
 
 
-@pytest.mark.parametrize("pose", ["0", "auto"])
-def test_clicks_that_contradict_the_set_orientation_are_questioned(pose: str, rendered: Path, tmp_path: Path) -> None:
-    """As a viewer shows it that obeys the file's orientation tag: turned by 180 degrees, other marks lie there."""
-    picture = tifffile.imread(rendered / "scans" / "f1.tif")
-    (tmp_path / "scans").mkdir()
-    tifffile.imwrite(tmp_path / "scans" / "f1.tif", picture, extratags=[(274, 3, 1, 3, True)])
-    turned_px = np.array(picture.shape[1::-1]) - 1 - truth(rendered)["f1"]
-    lines = "".join(
-        f"{id} = [{col:.0f}, {row:.0f}]\n" for id, (col, row) in zip(CORNERS, turned_px.tolist(), strict=True)
-    )
-    project = make_project(tmp_path, f'{LEARNED}[clicks]\nscan = "f1.tif"\n[clicks.px]\n{lines}', pose=pose)
-    with pytest.raises(InputError) as raised:
-        learned(project)
-    does = "sets 0" if pose == "0" else "sets none"
-    assert f"show the frame in the scan orientation 180, and the project {does}" in str(raised.value)
-    assert "orientation tag (3) asks viewers to turn the picture" in str(raised.value)
-    if pose == "0":
-        learned(make_project(tmp_path, LEARNED + clicks(rendered)))
-
-
 @pytest.mark.parametrize(
-    ("tag", "shown"),
+    ("tag", "pose", "shown"),
     [
-        (2, lambda col, row, last_col, last_row: (last_col - col, row)),
-        (3, lambda col, row, last_col, last_row: (last_col - col, last_row - row)),
-        (4, lambda col, row, last_col, last_row: (col, last_row - row)),
-        (5, lambda col, row, last_col, last_row: (row, col)),
-        (6, lambda col, row, last_col, last_row: (last_row - row, col)),
-        (7, lambda col, row, last_col, last_row: (last_row - row, last_col - col)),
-        (8, lambda col, row, last_col, last_row: (row, last_col - col)),
+        (2, "0", lambda col, row, last_col, last_row: (last_col - col, row)),
+        (3, "0", lambda col, row, last_col, last_row: (last_col - col, last_row - row)),
+        (3, "auto", lambda col, row, last_col, last_row: (last_col - col, last_row - row)),
+        (4, "0", lambda col, row, last_col, last_row: (col, last_row - row)),
+        (5, "0", lambda col, row, last_col, last_row: (row, col)),
+        (6, "0", lambda col, row, last_col, last_row: (last_row - row, col)),
+        (7, "0", lambda col, row, last_col, last_row: (last_row - row, last_col - col)),
+        (8, "0", lambda col, row, last_col, last_row: (row, last_col - col)),
     ],
 )
 def test_clicks_in_a_picture_turned_by_any_orientation_tag_are_questioned(
-    tag: int, shown: Callable[[float, float, float, float], tuple[float, float]], rendered: Path, tmp_path: Path
+    tag: int,
+    pose: str,
+    shown: Callable[[float, float, float, float], tuple[float, float]],
+    rendered: Path,
+    tmp_path: Path,
 ) -> None:
     """The tag's own definition (TIFF 6.0, page 36) says where a viewer shows a pixel."""
     picture = tifffile.imread(rendered / "scans" / "f1.tif")
@@ -347,52 +305,7 @@ def test_clicks_in_a_picture_turned_by_any_orientation_tag_are_questioned(
     tifffile.imwrite(tmp_path / "scans" / "f1.tif", picture, extratags=[(274, 3, 1, tag, True)])
     last_row, last_col = (size - 1 for size in picture.shape[:2])
     places = [shown(col, row, last_col, last_row) for col, row in truth(rendered)["f1"].tolist()]
-    lines = "".join(f"{id} = [{col:.0f}, {row:.0f}]\n" for id, (col, row) in zip(CORNERS, places, strict=True))
-    with pytest.raises(InputError, match=f"in the scan orientation {SHOWN[tag]}, .*orientation tag .{tag}. asks"):
-        learned(make_project(tmp_path, f'{LEARNED}[clicks]\nscan = "f1.tif"\n[clicks.px]\n{lines}', pose="0"))
-
-
-@pytest.mark.study
-def test_symmetric_marks_in_frames_that_lie_in_different_ways_are_measured(tmp_path: Path) -> None:
-    """Crosses clicked beside their middles in one frame: no pose is decided, and all frames repeat them."""
-    poses = ("0", "90", "180m")
-    images = tuple(
-        scene.SceneImage(f"f{k}", (40.0 * k, 10.0 * k, 100.0, 0.0, 0.0, 0.5 * k), pose=pose, turn_rad=0.004 * k)
-        for k, pose in enumerate(poses)
-    )
-    crossed = (areas.bar((-0.9, 0.0), (0.9, 0.0), 0.15), areas.bar((0.0, -0.9), (0.0, 0.9), 0.15))
-    camera = scene.SceneCamera(
-        "small",
-        (16.0, 16.0),
-        30.0,
-        fiducials=tuple(scene.SceneFiducial(id, place, scene.DrawnMark(crossed)) for id, place in CORNERS.items()),
-    )
-    scanner = scene.Scanner((50.0, 50.0), margin_mm=1.0, noise=0.004)
-    field = scene.DiskField((), 1.0)
-    render_scene(scene.Scene("turned", 5, camera, field, images, scanner, background="terrain", pad_mm=1.6), tmp_path)
-    true = truth(tmp_path)
-    rng = np.random.default_rng(6)
-    px = true["f1"] + rng.uniform(-2.5, 2.5, (4, 2))
-    lines = "".join(f"{id} = [{col:.0f}, {row:.0f}]\n" for id, (col, row) in zip(CORNERS, px.tolist(), strict=True))
-    project = make_project(tmp_path, f'{LEARNED}[clicks]\nscan = "f1.tif"\n[clicks.px]\n{lines}', pose="auto")
-    known = learned(project)
-    frames = [measure_scan(known, f"f{k}").frame for k in range(len(poses))]
-    outward, across = [], []
-    for frame in frames:
-        assert frame.pose is not None
-        assert not frame.pose.decided or frame.image == "f1"
-        places = true[frame.image]
-        for mark in frame.marks:
-            assert mark.status is Status.MEASURED, mark.reason
-            off = np.asarray(mark.center_px) - places
-            nearest = int(np.hypot(*off.T).argmin())
-            radial = (places[nearest] - places.mean(axis=0)) / np.hypot(*(places[nearest] - places.mean(axis=0)))
-            outward.append(float(off[nearest] @ radial))
-            across.append(float(off[nearest] @ (-radial[1], radial[0])))
-    # Every pose takes origins that lie outward of their marks to one another: nothing tells them from the middles.
-    np.testing.assert_allclose(outward, np.mean(outward), atol=0.02)
-    np.testing.assert_allclose(across, 0.0, atol=0.02)
-    template = known.default_camera.fiducials[0].mark
-    assert isinstance(template, MarkTemplate)
-    assert len(template.shares) == len(poses)
-    assert_measured_alike(project, frames[0])
+    does = "sets 0" if pose == "0" else "sets none"
+    words = f"in the scan orientation {SHOWN[tag]}, and the project {does}.*orientation tag .{tag}. asks viewers"
+    with pytest.raises(InputError, match=words):
+        learned(make_project(tmp_path, LEARNED + clicked(places), pose=pose))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from projects import keep_scans, write_project
+from projects import fiducial_tables, keep_scans, write_project, write_tables
 
 from measure import open_scan
 from measure.flags import Cause, Code, Reason, Status
@@ -21,7 +21,7 @@ from pipeline import read_project
 from pipeline.archive.checked_statuses import remember_written
 from pipeline.archive.measurement import read_fingerprints, read_measurement
 from pipeline.archive.results_database import Store
-from pipeline.archive.thumbnails import Thumbnails, ThumbnailStore, thumbnails_path
+from pipeline.archive.thumbnails import Thumbnails, ThumbnailStore
 from pipeline.cli import run
 from pipeline.report import ReportData, Thumbnail, judge, render_report
 from pipeline.report.frame_views import MOST_CARDS
@@ -80,12 +80,18 @@ def page(many: ReportData) -> str:
     return render_report(many)
 
 
-def test_a_report_on_thousands_of_frames_is_small(page: str) -> None:
+def test_a_report_on_thousands_of_frames_is_small_and_escaped(page: str, many: ReportData) -> None:
     assert len(page.encode()) < 2_000_000
     assert page.count('<details class="frame"') == MOST_FRAMES
+    assert "box&lt;b&gt;" in page
+    assert "<b>0/" not in page
+    grey = np.random.default_rng(1).normal(2e4, 3e3, (81, 81))  # noise, which no format makes small
+    page = render_report(replace(many, thumbnail=lambda *_: Thumbnail(grey, (0.0, 0.0))))
+    assert page.count("data:image/png") == MOST_FRAMES * MARKS + MOST_CARDS + 1  # with the first problem's
+    assert len(page.encode()) < 10_000_000
 
 
-def test_its_counts_are_those_of_the_frames(many: ReportData) -> None:
+def test_counts_are_those_of_all_frames_and_the_worst_are_shown(many: ReportData, page: str) -> None:
     assert many.totals is not None
     good = FRAMES - len(BAD) - len(FAILED)
     counts = sum(map(Counter, many.totals.verdicts.values()), Counter[str]())
@@ -95,9 +101,6 @@ def test_its_counts_are_those_of_the_frames(many: ReportData) -> None:
     assert {kind for _, kind in many.totals.verdicts} == {"tif", "jpg"}
     observed = FRAMES * MARKS - len(BAD) - MARKS * len(FAILED)
     assert judge(many).sentence.startswith(f"Measured: {observed} marks in {FRAMES} frames, but ")
-
-
-def test_the_worst_frames_are_shown_and_alike_problems_stated_once(many: ReportData, page: str) -> None:
     shown = set(many.measurement or {})
     assert {image(number) for number in FAILED} <= shown
     assert shown <= {image(number) for number in (*BAD, *FAILED)}
@@ -105,30 +108,6 @@ def test_the_worst_frames_are_shown_and_alike_problems_stated_once(many: ReportD
     assert len(finding) == 2
     assert f"and {len(BAD) - 8} more: 1 fiducial mark not measured, 7 measured" in finding[0]
     assert f"and {len(FAILED) - 8} more (numbers of {image(min(FAILED))}): scan 5 is damaged" in finding[1]
-
-
-def test_what_users_named_is_escaped(page: str) -> None:
-    assert "box&lt;b&gt;" in page
-    assert "<b>0/" not in page
-
-
-def test_only_what_is_shown_is_kept(many: ReportData) -> None:
-    assert len(many.measurement or {}) == MOST_FRAMES
-    assert len(many.comparator) == MOST_FRAMES * MARKS
-
-
-def test_pictures_of_all_that_is_shown_leave_it_small(many: ReportData) -> None:
-    grey = np.random.default_rng(1).normal(2e4, 3e3, (81, 81))  # noise, which no format makes small
-    page = render_report(replace(many, thumbnail=lambda *_: Thumbnail(grey, (0.0, 0.0))))
-    assert page.count("data:image/png") == MOST_FRAMES * MARKS + MOST_CARDS + 1  # with the first problem's
-    assert len(page.encode()) < 10_000_000
-
-
-def test_good_frames_alone_need_no_attention() -> None:
-    scans = [scan(number) for number in range(1, 400) if number not in BAD and number not in FAILED]
-    data = reduced(ReportData("Good", list(rows(scans))), iter(scans), lambda _: "k")
-    assert judge(data).level == "good"
-    assert "No frame needs a look." in render_report(data)
 
 
 def test_the_page_of_a_frame_has_all_its_marks() -> None:
@@ -140,49 +119,23 @@ def test_the_page_of_a_frame_has_all_its_marks() -> None:
     assert set(re.findall(r"<b>([mt]\d+)</b>", html)) == {mark.point for mark in frame.marks}
     assert 'href="../../report.html"' in html
     assert "<b>0/" not in html
+    scans = [scan(number) for number in range(1, 400) if number not in BAD and number not in FAILED]
+    data = reduced(ReportData("Good", list(rows(scans))), iter(scans), lambda _: "k")
+    assert judge(data).level == "good"
+    assert "No frame needs a look." in render_report(data)
 
 
 def write_images(folder: Path, images: int) -> Path:
     """A project of coordinates that somebody has measured."""
     marks = {"1": (-100, -100), "2": (100, -100), "3": (100, 100), "4": (-100, 100)}
-    fiducials = [f'[[fiducial]]\nid = "{id}"\nxy_mm = [{x}, {y}]\nsigma_mm = 0' for id, (x, y) in marks.items()]
-    (folder / "camera.toml").write_text("\n".join(['name = "K"', *fiducials]), encoding="utf-8")
-    (folder / "project.toml").write_text('camera = "camera.toml"\n', encoding="utf-8")
+    camera = 'name = "K"\n' + fiducial_tables(marks, "sigma_mm = 0\n")
     lines = ["image,point,kind,x_mm,y_mm,sx_mm,sy_mm"]
     rng = np.random.default_rng(3)
     for number in range(images):
         for id, xy in marks.items():
             x, y = xy + rng.normal(0, 0.003, 2)
             lines.append(f"roll/{number:03d},{id},fiducial,{x:.5f},{y:.5f},0.003,0.003")
-    (folder / "comparator.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return folder / "project.toml"
-
-
-@pytest.mark.study
-def test_pages_are_made_when_requested(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    project = write_images(tmp_path, MOST_FRAMES + 5)
-    assert run(["adjust", str(project)]) in (0, 1)
-    for _ in range(2):  # what was written may be written over
-        assert run(["report", str(project)]) in (0, 1)
-        assert run(["report", str(project), "--frames", "roll/007", "roll/008"]) == 0
-    assert sorted(file.name for file in (tmp_path / "out" / "frames" / "roll").iterdir()) == ["007.html", "008.html"]
-    page = (tmp_path / "out" / "frames" / "roll" / "007.html").read_text(encoding="utf-8")
-    assert set(re.findall(r"<b>(\d)</b> fiducial", page)) == {"1", "2", "3", "4"}
-    report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    assert f"{MOST_FRAMES + 5} of {MOST_FRAMES + 5} scans measured (" in report
-    capsys.readouterr()
-    assert run(["report", str(project), "--frames", "roll/7"]) == 2
-    assert "has no image 'roll/7'" in capsys.readouterr().err
-    assert run(["report", str(project), "roll/007"]) == 2
-
-
-def test_few_frames_are_shown_one_by_one(tmp_path: Path) -> None:
-    project = write_images(tmp_path, 3)
-    assert run(["adjust", str(project)]) in (0, 1)
-    assert run(["report", str(project)]) in (0, 1)
-    report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    assert "3 of 3 scans measured (3 good)." in report
-    assert report.count('<details class="frame"') == 3
+    return write_tables(folder, 'camera = "camera.toml"', camera=camera, comparator=lines)
 
 
 def stored(folder: Path) -> tuple[Path, list[MeasuredScan]]:
@@ -223,29 +176,6 @@ def as_written(folder: Path) -> None:
         remember_written(store, read_measurement_hash(folder / "comparator.csv"), folder / "comparator.csv")
 
 
-@pytest.mark.study
-@pytest.mark.parametrize("is_written", [False, True])
-def test_scans_come_from_the_store_one_after_the_other(tmp_path: Path, is_written: bool) -> None:
-    project, scans = stored(tmp_path)
-    if is_written:
-        as_written(tmp_path)
-    assert run(["report", str(project), "--frames", "0001", "0010"]) == 0
-    assert "12000 × 12000 px" in (tmp_path / "out" / "frames" / "0010.html").read_text(encoding="utf-8")
-    assert run(["report", str(project), "--frames", "1"]) == 2
-    assert run(["report", str(project)]) == 1
-    report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    bad, lost, blind = (sum(map(n, range(len(scans)))) for n in (BAD.__contains__, FAILED.__contains__, is_blind))
-    counts = f"({len(scans) - bad - lost} good, {bad} to look at, {lost} failed)"
-    assert f"{len(scans) - lost} of {len(scans)} scans measured {counts}." in report
-    assert f"The {bad + lost + blind} that need a look most are shown below" in report
-    assert report.count('<details class="frame"') == bad + lost + blind
-    assert "scan 5 is damaged" in report
-
-
-def is_blind(number: int) -> bool:
-    return number % 10 == 3 and number not in BAD and number not in FAILED
-
-
 def test_frames_that_need_no_attention_are_counted_as_if_each_were_read(tmp_path: Path, monkeypatch: Any) -> None:
     project = read_project(stored(tmp_path)[0])
     every = report_data(project, lambda path: path)
@@ -263,19 +193,6 @@ def test_frames_that_need_no_attention_are_counted_as_if_each_were_read(tmp_path
     for axis in ("column", "row"):
         np.testing.assert_array_equal(few.totals.places_px[axis], every.totals.places_px[axis])
     assert set(few.measurement or {}) == set(every.measurement or {})
-
-
-@pytest.mark.study
-def test_marks_that_somebody_has_changed_are_read_from_the_file(tmp_path: Path) -> None:
-    project = stored(tmp_path)[0]
-    as_written(tmp_path)
-    file = tmp_path / "comparator.csv"
-    lines = file.read_text(encoding="utf-8").splitlines()
-    place = next(number for number, line in enumerate(lines) if line.startswith("0001,m0,"))
-    lines[place] = lines[place].replace(",measured,", ",rejected,it is a hair")
-    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    assert run(["report", str(project)]) == 1
-    assert "it is a hair" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")
@@ -302,7 +219,7 @@ def grey(pixels: np.ndarray) -> np.ndarray:
     return np.asarray((values - values.mean()) / values.std())
 
 
-def test_every_mark_has_the_picture_that_its_scan_shows(folder: Path) -> None:
+def test_every_mark_and_the_whole_scan_have_their_pictures(folder: Path) -> None:
     found = keys(folder)
     assert set(found) == {"a", "b", "c"}
     with ThumbnailStore(folder / "out" / "measurement.db") as store:
@@ -319,9 +236,6 @@ def test_every_mark_has_the_picture_that_its_scan_shows(folder: Path) -> None:
                         own.pixels.shape,
                     )
                     assert grey(kept.pixels) @ grey(own.pixels) / own.pixels.size > 0.98
-
-
-def test_the_whole_scan_is_kept_where_measuring_saw_it(folder: Path) -> None:
     with ThumbnailStore(folder / "out" / "measurement.db") as store:
         stored = store.get(keys(folder)["a"])
     assert stored is not None
@@ -348,7 +262,7 @@ def test_a_report_and_a_frames_page_open_no_scan(folder: Path) -> None:
     assert (folder / "out" / "report.html").read_text(encoding="utf-8").count("data:image/png") == 12
 
 
-def test_without_the_file_pictures_come_from_the_scans_again(folder: Path) -> None:
+def test_pictures_come_from_their_file_or_else_from_the_scans(folder: Path) -> None:
     (folder / "out" / "thumbnails.db").unlink()
     assert run(["report", str(folder / "project.toml"), "--frames", "a"]) == 0
     assert (folder / "out" / "frames" / "a.html").read_text(encoding="utf-8").count("data:image/png") == 4
@@ -377,24 +291,3 @@ def test_pictures_follow_results_that_are_moved_or_merged(folder: Path) -> None:
     with ThumbnailStore(folder / "out" / "measurement.db") as thumbnails:
         assert thumbnails.get(now.pop(), "1", "fiducial") is not None
         assert thumbnails.get(before["a"], "1", "fiducial") is None
-
-
-@pytest.mark.study
-def test_stores_of_shards_bring_their_pictures(measured_folder: Path, tmp_path: Path) -> None:
-    parts = tmp_path / "parts"
-    shutil.copytree(measured_folder, parts, ignore=lambda *_: ["out", "comparator.csv"])
-    project = str(parts / "project.toml")
-    for k in (1, 2):
-        run(["measure", project, "--shard", f"{k}/5", "--workers", "1"])
-    run(["merge", project, *(str(parts / "out" / f"measurement.{k}-of-5.db") for k in (1, 2))])
-    assert thumbnails_path(parts / "out" / "measurement.1-of-5.db").exists()
-    with ThumbnailStore(parts / "out" / "measurement.db") as thumbnails:
-        assert all(thumbnails.get(key, "1", "fiducial") for key in keys(parts).values())
-    assert len(keys(parts)) == 3
-
-
-def test_a_file_of_another_kind_in_its_place_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shutil.copy(folder / "out" / "measurement.db", folder / "out" / "thumbnails.db")
-    (folder / "b.tif").unlink()
-    assert run(["measure", str(folder / "project.toml"), "--workers", "1"]) == 2
-    assert "thumbnails" in capsys.readouterr().err

@@ -5,8 +5,7 @@ import os
 import pickle
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Executor, Future
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import Executor
 from dataclasses import MISSING, fields, is_dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -14,8 +13,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from in_process import Here, Loses
 from loaded_script import script
-from projects import CAMERA, PROJECT, measure_scan, write_project
+from projects import CAMERA, PROJECT, Refusal, write_project
 
 from measure.annotations.fields import Line, Reading
 from measure.flags import Cause, Code, Reason, Status
@@ -23,8 +23,7 @@ from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from measure.tone.curve import Tone, ToneInformation, power, sampled_curve, srgb
 from measure.tone.estimate import FrameTone
 from measure.tone.sharpening import Sharpening
-from pipeline import read_comparator, read_measurement, read_project
-from pipeline.cli import run
+from pipeline import read_project
 from pipeline.measuring import scan_measurement
 from pipeline.measuring.scan_measurement import ended_scan, measured_scan
 from pipeline.measuring.scan_task import ScanTask, sample_names, scan_tasks
@@ -41,7 +40,6 @@ from pipeline.results.measured_record import (
 from pipeline.workers import iterate_results
 
 Changed = Callable[[str, str], tuple[str, str]]  # of project.toml and camera.toml
-SAID = pytest.CaptureFixture[str]
 
 BOARD = '[targets]\nkind = "chessboard"\ncolumns = 5\nrows = 4\nsquare_mm = 10.0\n'
 TARGETS = '[targets]\nkind = "disk"\ndiameter_mm = 30.0\n[object]\npoints = "points.csv"\nimages = "images.csv"\n'
@@ -69,13 +67,18 @@ def make_tasks(folder: Path, project: str = PROJECT, camera: str = CAMERA) -> tu
     return scan_tasks(read_project(folder / "project.toml"), ["a", "b"])
 
 
-def test_scans_that_have_all_in_common_have_equal_options(tmp_path: Path) -> None:
+def test_scans_have_equal_options_unless_targets_are_sought(tmp_path: Path) -> None:
     a, b = make_tasks(tmp_path / "here")
     there, _ = make_tasks(tmp_path / "there")
     assert a.options.json == b.options.json == there.options.json
     assert pickle.loads(pickle.dumps(a)).options.json == a.options.json
     assert json.loads(a.options.json)
     assert (a.name, Path(a.scan).name) == ("a", "a.tif")
+    a, b = make_tasks(tmp_path, PROJECT + TARGETS)
+    longer, _ = make_tasks(tmp_path, PROJECT + TARGETS, CAMERA.replace("distance_mm = 30.0", "distance_mm = 31.0"))
+    larger, _ = make_tasks(tmp_path, PROJECT + TARGETS.replace("30.0", "31.0"))
+    assert len({task.options.json for task in (a, b, longer, larger)}) == 4
+    assert b"points.csv" not in pickle.dumps(a)  # the project does not travel with it
 
 
 @pytest.mark.parametrize(
@@ -97,29 +100,6 @@ def test_scans_that_have_all_in_common_have_equal_options(tmp_path: Path) -> Non
 def test_what_may_change_the_result_changes_the_options(changed: Changed, tmp_path: Path) -> None:
     before, after = make_tasks(tmp_path), make_tasks(tmp_path, *changed(PROJECT, CAMERA))
     assert before[0].options.json != after[0].options.json
-
-
-@pytest.mark.parametrize(
-    "changed",
-    [
-        lambda project, camera: (project, camera.replace('name = "K"', 'name = "L"')),
-        lambda project, camera: (project, 'number = "13182"\n' + camera),
-        lambda project, camera: (project, camera.replace("distance_mm = 30.0", "distance_mm = 31.0")),
-        lambda project, camera: (project + "[adjust]\nrobust = true\n", camera),
-        lambda project, camera: (project.replace("scans", 'output = "elsewhere"\nscans'), camera),
-    ],
-)
-def test_what_changes_no_scan_leaves_its_options(changed: Changed, tmp_path: Path) -> None:
-    before, after = make_tasks(tmp_path), make_tasks(tmp_path, *changed(PROJECT, CAMERA))
-    assert before[0].options.json == after[0].options.json
-
-
-def test_where_targets_are_sought_the_lens_and_the_orientation_of_the_scan_count(tmp_path: Path) -> None:
-    a, b = make_tasks(tmp_path, PROJECT + TARGETS)
-    longer, _ = make_tasks(tmp_path, PROJECT + TARGETS, CAMERA.replace("distance_mm = 30.0", "distance_mm = 31.0"))
-    larger, _ = make_tasks(tmp_path, PROJECT + TARGETS.replace("30.0", "31.0"))
-    assert len({task.options.json for task in (a, b, longer, larger)}) == 4
-    assert b"points.csv" not in pickle.dumps(a)  # the project does not travel with it
 
 
 def test_the_marks_of_another_camera_do_not_count(tmp_path: Path) -> None:
@@ -146,30 +126,7 @@ def test_few_of_many_scans_are_the_same_when_another_one_comes() -> None:
     assert sample_names(names[:3], 4) == names[:3]
 
 
-class Watched(Executor):
-    """An executor that holds some tasks: then, and when it has got its last, it does the one that waits longest. A
-    broken task's process ends."""
-
-    def __init__(self, total: int, holds: int = 1, broken: str = "") -> None:
-        self.left, self.holds, self.broken, self.most = total, holds, broken, 0
-        self.waiting: list[tuple[Future[Any], Callable[..., Any], Any]] = []
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> "Future[Any]":
-        future: Future[Any] = Future()
-        self.waiting.append((future, fn, pickle.loads(pickle.dumps(args))))
-        self.most, self.left = max(self.most, len(self.waiting)), self.left - 1
-        while self.waiting and (len(self.waiting) >= self.holds or not self.left):
-            oldest, work, given = self.waiting.pop(0)
-            if given[0].name == self.broken:
-                oldest.set_exception(BrokenProcessPool("ended abruptly"))
-            else:
-                oldest.set_result(work(*given))
-            if self.left:
-                break
-        return future
-
-
-def measured(tasks: Iterable[ScanTask], executor: Watched, in_flight: int = 4) -> Iterator[MeasuredScan]:
+def measured(tasks: Iterable[ScanTask], executor: Executor, in_flight: int = 4) -> Iterator[MeasuredScan]:
     for task, result in iterate_results(measured_scan, tasks, executor, in_flight):
         yield ended_scan(task, result) if isinstance(result, Exception) else result
 
@@ -184,23 +141,19 @@ def test_results_come_one_by_one_and_few_tasks_are_handed_out_at_a_time(two: Pat
             requests.append(number)
             yield replace(lost, name=str(number))
 
-    watched = Watched(20, holds=3)
-    results = measured(tasks(), watched, in_flight=3)
+    results = measured(tasks(), Here(), in_flight=3)
     first = next(results)
     assert first.failure is not None
     assert len(requests) == 3
-    second = next(results)
-    assert len(requests) == 4
-    assert {first.frame.image, second.frame.image, *(scan.frame.image for scan in results)} == {
-        str(number) for number in range(20)
-    }
-    assert watched.most == 3
+    four = [first, *(next(results) for _ in range(3))]
+    assert len(requests) == 6
+    assert {scan.frame.image for scan in (*four, *results)} == {str(number) for number in range(20)}
 
 
 def test_a_scan_whose_process_ends_is_a_result(two: Path) -> None:
     project = read_project(two)
     tasks = scan_tasks(project, ["a", "b"])
-    results = {scan.frame.image: scan for scan in measured(tasks, Watched(2, broken="b"))}
+    results = {scan.frame.image: scan for scan in measured(tasks, Loses(lambda _, given: given[0].name == "b"))}
     assert results["a"].failure is None
     assert results["b"].failure is not None
     assert results["b"].failure.code is FailureCode.ENDED
@@ -219,7 +172,7 @@ def a_fault(*_: object) -> None:
     ("raises", "code", "words"),
     [(memory_full, "memory", "the memory was full"), (a_fault, "fault", "ZeroDivisionError: by nothing")],
 )
-def test_whatever_happens_in_a_scan_is_a_result(
+def test_failures_are_results(
     two: Path, monkeypatch: pytest.MonkeyPatch, raises: Callable[..., None], code: str, words: str
 ) -> None:
     monkeypatch.setattr(scan_measurement, "measure_fiducials", raises)
@@ -239,48 +192,10 @@ def test_a_failed_scan_has_a_row_for_each_target(tmp_path: Path) -> None:
     assert (kinds.count("fiducial"), kinds.count("target")) == (4, 20)
 
 
-@pytest.mark.study
-def test_damaged_and_missing_scans_cost_the_others_nothing(tmp_path: Path, capsys: SAID) -> None:
-    """Of six scans one is damaged, one a text and one a link that leads nowhere; images.csv names another."""
-    whole = write_project(tmp_path / "whole", ["a", "b", "c"])
-    assert run(["run", str(whole)]) == 0
-    listed = PROJECT + '[object]\nimages = "images.csv"\n'
-    four = write_project(tmp_path / "four", ["a", "b", "c", "d"], listed)
-    (four.parent / "images.csv").write_text("image\n" + "\n".join("abcde") + "\n", encoding="utf-8")
-    data = (four.parent / "d.tif").read_bytes()
-    (four.parent / "d.tif").write_bytes(data[: len(data) // 2])
-    (four.parent / "f.tif").write_text("This is no picture.\n" * 50, encoding="utf-8")
-    (four.parent / "g.tif").symlink_to("moved away.tif")
-    capsys.readouterr()
-    assert run(["run", str(four), "--json"]) == 1
-    output = json.loads(capsys.readouterr().out)
-    assert output["adjustment"]["converged"]
-    whats = [problem["what"] for problem in output["problems"]]
-    assert [what for what in whats if what.startswith("d: ") and "d.tif" in what]
-    assert [what for what in whats if what.startswith("e: images.csv names it, and the project has no scan of")]
-    assert [what for what in whats if what.startswith("g: there is no scan") and "g.tif" in what]
-    assert len(whats) == 4
-    rows = read_comparator(four.parent / "comparator.csv")
-    lines = [
-        line for line in (four.parent / "comparator.csv").read_text().splitlines() if line[:2] in ("a,", "b,", "c,")
-    ]
-    assert lines == [line for line in (whole.parent / "comparator.csv").read_text().splitlines() if line[1:2] == ","]
-    assert {(row.image, row.status) for row in rows if row.image in "de"} == {
-        ("d", Status.ABSENT),
-        ("e", Status.ABSENT),
-    }
-    assert (four.parent / "out" / "report.html").exists()
-    scans = {scan.frame.image: scan for scan in read_measurement(four.parent / "out" / "measurement.db")}
-    assert {name: scan.failure and str(scan.failure.code) for name, scan in scans.items()} == {
-        "a": None, "b": None, "c": None, "d": "unreadable", "e": "missing", "f": "unreadable", "g": "missing",
-    }  # fmt: skip
-
-
-def test_a_scan_refused_for_its_size_says_how_to_allow_it(tmp_path: Path, capsys: SAID) -> None:
+def test_a_scan_refused_for_its_size_says_how_to_allow_it(tmp_path: Path, refusal: Refusal) -> None:
     project = write_project(tmp_path, ["a", "b"])
     shutil.copy(tmp_path / "a.tif", tmp_path / "c.tif")
-    assert run(["measure", str(project), "--max-pixels", "1000"]) == 2
-    assert "--max-pixels" in capsys.readouterr().err
+    assert "--max-pixels" in refusal(["measure", str(project), "--max-pixels", "1000"])
     (task,) = scan_tasks(replace(read_project(project), max_pixels=1000), ["a"])
     failed: MeasuredScan = measured_scan(task)
     assert failed.failure is not None
@@ -398,28 +313,11 @@ def test_every_field_comes_back() -> None:
     assert not left_out(RICH)
     relative = replace(RICH, scan="/out/../scans/roll 7/a.tif")
     same(relative, again(RICH))
-
-
-def test_what_was_measured_in_drawn_frames_comes_back(tmp_path: Path) -> None:
-    project = read_project(write_project(tmp_path, ["a"], PROJECT.replace('pose = "0"', 'pose = "auto"')))
-    scan = measure_scan(project, "a")
-    assert scan.frame.tone is not None
-    assert any(mark.covariance for mark in scan.frame.marks)
-    same(scan, replace(again(scan), scan=scan.scan))
-    assert len(json.dumps(scan_detail(scan, ""))) + sum(len(str(mark_row(mark))) for mark in scan.frame.marks) < 12000
+    empty = MeasuredScan("/scans/a.tif", 1, 1, (1.0, 2.0), FrameMeasurement("a", ()))
+    same(empty, replace(again(empty), scan=empty.scan))
 
 
 @pytest.mark.parametrize("base", [power(1.0), power(1.6), power(1 / 2.2), srgb(), CURVE])
 def test_a_curve_comes_back_by_its_name_or_its_numbers(base: np.ndarray) -> None:
     frame = replace(RICH.frame, tone=FrameTone(Tone(base)))
     same(frame.tone, again(replace(RICH, frame=frame)).frame.tone)
-
-
-@pytest.mark.parametrize("scan", ["s3://prints/1952/0001.tif", "https://example.org/a.tif", ""])
-def test_addresses_stay_as_they_are(scan: str) -> None:
-    assert scan_location(scan, Path("/out")) == scan
-
-
-def test_what_has_nothing_of_it_comes_back_too() -> None:
-    empty = MeasuredScan("/scans/a.tif", 1, 1, (1.0, 2.0), FrameMeasurement("a", ()))
-    same(empty, replace(again(empty), scan=empty.scan))

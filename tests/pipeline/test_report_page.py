@@ -9,7 +9,7 @@ from typing import Any
 
 import made_up_calibration
 import pytest
-from made_up_calibration import set_adjustment, set_frames, set_mark
+from made_up_calibration import set_adjustment, set_frames, set_mark, set_weak
 from studies import parametrize_with_studies
 
 from measure import Code, FrameMeasurement, Reason, Status
@@ -66,7 +66,7 @@ def good_page() -> str:
     return render_report(made_up_calibration.adjusted_report())
 
 
-def test_a_good_calibration_says_so_first() -> None:
+def test_a_good_calibration_says_so_first_and_has_one_value_to_be_cited(adjusted_data: ReportData) -> None:
     html = good_page()
     document = Document(html)
     assert "✓ Good" in document.text
@@ -75,6 +75,20 @@ def test_a_good_calibration_says_so_first() -> None:
     assert [id for id in document.ids if not id.startswith("frame-")] == [
         "verdict", "camera", "problems", "frames", "marks", "coverage", "fiducials", "reliability", "check", "notes",
     ]  # fmt: skip
+    # And the certificate's other reference is closed, and says that it is another.
+    (row,) = re.findall(r'<tr class="cite">.*?</tr>', html, re.DOTALL)
+    assert Document(row).text.split() == ["c", "principal", "distance", "153.6640", "0.0041", "mm", "cite"]
+    before = html[: html.index("as calibration certificates print it")]
+    assert before.rindex("<details>") > before.rindex("</details>")
+    assert "not to cite with c above" in html
+    text = Document(good_page()).text
+    for status, meaning in ((each, each.meaning) for each in Status):
+        assert status in text
+        assert meaning in text
+    assert re.search(
+        r"control given object coordinates; rms in millionths of their unit no check 0\.00 0\.00 0\.0: no check",
+        Document(good_page()).text,
+    )
 
 
 def test_no_section_and_no_column_is_empty(adjusted_data: ReportData) -> None:
@@ -87,16 +101,6 @@ def test_no_section_and_no_column_is_empty(adjusted_data: ReportData) -> None:
             rows = re.findall(r"<tr.*?</tr>", re.sub(r"<thead.*?</thead>", "", table, flags=re.DOTALL), re.DOTALL)
             cells = [re.findall(r"<td[^>]*>(.*?)</td>", row, re.DOTALL) for row in rows]
             assert all(any(cell.strip(" –") for cell in column) for column in zip(*cells, strict=False)), table
-
-
-def test_one_value_is_to_be_cited(adjusted_data: ReportData) -> None:
-    """And the certificate's other reference is closed, and says that it is another."""
-    html = good_page()
-    (row,) = re.findall(r'<tr class="cite">.*?</tr>', html, re.DOTALL)
-    assert Document(row).text.split() == ["c", "principal", "distance", "153.6640", "0.0041", "mm", "cite"]
-    before = html[: html.index("as calibration certificates print it")]
-    assert before.rindex("<details>") > before.rindex("</details>")
-    assert "not to cite with c above" in html
 
 
 @cache
@@ -152,16 +156,26 @@ def test_marks_that_fit_badly_are_shown_and_all_others_closed(adjusted_data: Rep
     assert '<div class="card"' not in good_page().split('<details id="marks">')[0]
 
 
-def test_a_problem_has_cause_remedy_link_and_thumbnail(adjusted_data: ReportData) -> None:
+def test_a_problem_has_reason_remedy_link_and_thumbnail(adjusted_data: ReportData) -> None:
     html = render_report(set_mark(adjusted_data, 2, Status.REJECTED, "4.2 px off"))
     (problem,) = re.findall(r"<li>.*?</li>", html[: html.index("<h2>Frames")], re.DOTALL)
     assert "<b>f1: 1 fiducial mark not measured" in problem
     assert 'class="step">Settle them with' in problem
     assert '<a href="#frame-1">f1</a>' in problem
     assert problem.count("data:image/png") == 1
+    reason = "4.2 px off the other marks' places."
+    lost = adjusted_data.comparator[2]
+    assert adjusted_data.adjustment is not None
+    rows = adjusted_data.adjustment.residuals
+    kept = tuple(row for row in rows if (row.image, row.kind, row.point) != (lost.image, lost.kind, lost.point))
+    text = rendered(set_adjustment(set_mark(adjusted_data, 2, Status.REJECTED, reason), residuals=kept)).text
+    assert "! Needs a look" in text
+    assert "1 thing needs a look" in text
+    assert f"f1: 1 fiducial mark not measured, 7 measured. Reasons: 3 rejected: {reason}" in text
+    assert "7 of 8 (1 rejected)" in text
 
 
-def test_nothing_is_loaded_from_anywhere_and_every_link_finds_its_place() -> None:
+def test_nothing_is_loaded_from_anywhere_and_every_drawing_has_words() -> None:
     html = good_page()
     document = Document(html)
     inside, pictures = (
@@ -172,26 +186,8 @@ def test_nothing_is_loaded_from_anywhere_and_every_link_finds_its_place() -> Non
     assert {address[1:] for address in inside} <= set(document.ids)
     assert len(document.ids) == len(set(document.ids))
     assert not re.search(r"http|url\(|@import", html)
-
-
-def test_every_drawing_has_words_for_those_who_cannot_see_it() -> None:
-    html = good_page()
     for opening in re.findall(r"<svg[^>]*>", html):
         assert re.search(r'aria-label="[^"]{10,}', opening), opening
-
-
-def test_the_statuses_are_those_of_the_table() -> None:
-    text = Document(good_page()).text
-    for status, meaning in ((each, each.meaning) for each in Status):
-        assert status in text
-        assert meaning in text
-
-
-def test_no_check_stands_where_the_redundancy_is_zero() -> None:
-    assert re.search(
-        r"control given object coordinates; rms in millionths of their unit no check 0\.00 0\.00 0\.0: no check",
-        Document(good_page()).text,
-    )
 
 
 @pytest.mark.parametrize(
@@ -205,7 +201,7 @@ def test_no_check_stands_where_the_redundancy_is_zero() -> None:
         (0, 0.0, "! Needs a look", 1),
     ],
 )
-def test_the_redundancy_is_that_which_sigma0_comes_from(
+def test_redundancy_is_that_of_sigma0(
     adjusted_data: ReportData, redundancy: int, of_sigma0: float, words: str, count: int
 ) -> None:
     """Given coordinates that only place the datum have redundancy, but none that tells sigma0."""
@@ -221,24 +217,12 @@ def test_only_measured(measured_data: ReportData) -> None:
     assert "✓ Good" in text
     assert "Measured: 160 marks in 5 frames." in text
     assert "These marks are not adjusted yet: run <code>reseau run</code>." in page
-
-
-def test_commands_in_problems_are_code(measured_data: ReportData) -> None:
+    assert "<dt>of which</dt>" in page
+    assert re.search(r">noise 0\.041</span>, <span [^>]*>tone 0\.020</span> px", page)
     problem = Problem("It is <stale>. So says `reseau status`.", "Run `reseau measure`.")
     page = render_report(replace(measured_data, problems=(problem,)))
     for words in ("It is &lt;stale&gt;.", "So says <code>reseau status</code>.", "Run <code>reseau measure</code>."):
         assert words in page
-
-
-def test_a_frame_that_was_not_found_says_so_once(measured_data: ReportData) -> None:
-    reason = "no fiducial was measured: the constellation does not fit"
-    absent = [replace(point, status=Status.ABSENT, reason=reason) for point in measured_data.comparator]
-    problem = (Reason(f"{reason}.", Code.NO_FRAME),)
-    data = set_frames(measured_data, lambda frame: FrameMeasurement(frame.image, (), problems=problem))
-    text = rendered(replace(data, comparator=absent)).text
-    assert text.count(f"{reason}.") == 1
-    assert "fiducial marks not measured" not in text
-    assert "not adjusted yet" not in text
 
 
 def test_tie_points_are_not_called_targets(measured_data: ReportData) -> None:
@@ -261,20 +245,15 @@ def test_tie_points_are_not_called_targets(measured_data: ReportData) -> None:
         ({"covariance": None}, "The camera has no distortion parameters, or their covariance is missing."),
     ],
 )
-def test_what_is_not_there_has_a_word_in_its_place(
-    adjusted_data: ReportData, change: dict[str, Any], words: str
-) -> None:
+def test_what_is_missing_is_told(adjusted_data: ReportData, change: dict[str, Any], words: str) -> None:
     assert words in rendered(replace(adjusted_data, **change)).text
 
 
-def test_nothing_at_all() -> None:
+def test_without_a_result_the_report_says_why() -> None:
     text = rendered(ReportData("Empty")).text
     assert "✕ No result" in text
     assert "No mark was measured." in text
     assert "No frame has been measured yet" in text
-
-
-def test_a_singular_network_names_cause_and_remedy() -> None:
     text = rendered(made_up_calibration.singular()).text
     for words in (
         "✕ No result",
@@ -302,48 +281,32 @@ def test_what_the_user_named_is_escaped(adjusted_data: ReportData) -> None:
     assert "&lt;script&gt;alert" in html
 
 
-def test_a_rejected_fiducial_is_a_problem_with_its_reason(adjusted_data: ReportData) -> None:
-    reason = "4.2 px off the other marks' places."
-    lost = adjusted_data.comparator[2]
-    assert adjusted_data.adjustment is not None
-    rows = adjusted_data.adjustment.residuals
-    kept = tuple(row for row in rows if (row.image, row.kind, row.point) != (lost.image, lost.kind, lost.point))
-    text = rendered(set_adjustment(set_mark(adjusted_data, 2, Status.REJECTED, reason), residuals=kept)).text
-    assert "! Needs a look" in text
-    assert "1 thing needs a look" in text
-    assert f"f1: 1 fiducial mark not measured, 7 measured. Reasons: 3 rejected: {reason}" in text
-    assert "7 of 8 (1 rejected)" in text
-
-
 @pytest.mark.parametrize("code", [Code.OFF_GIVEN, Code.OFF_FRAMES])
 def test_a_weak_fiducial_that_the_others_contradict_is_a_problem(measured_data: ReportData, code: Code) -> None:
     """Without it the clearer case, one mark of eight 0.1 mm off, passed as good where bent film did not."""
     sentence, row = "it lies 0.100 mm from where the other marks have it", measured_data.comparator[2]
     data = set_mark(measured_data, 2, Status.WEAK, sentence)
-    assert data.measurement is not None
-    scan = data.measurement[row.image]
-    texts = []
-    for codes in ((code,), (code, Code.DECIDED)):
-        reason = Reason(sentence, *codes)
-        marks = tuple(
-            replace(mark, status=Status.WEAK, reason=reason)
-            if (mark.kind, mark.point) == (row.kind, row.point)
-            else mark
-            for mark in scan.frame.marks
-        )
-        known = {**data.measurement, row.image: replace(scan, frame=replace(scan.frame, marks=marks))}
-        texts.append(rendered(replace(data, measurement=known)).text)
+    reasons = (Reason(sentence, code), Reason(sentence, code, Code.DECIDED))
+    texts = [rendered(set_weak(data, row.image, [row.point], reason)).text for reason in reasons]
     assert f"f1: 1 weak fiducial mark. Reasons: {row.point} weak: {sentence}." in texts[0]
     assert "! Needs a look" in texts[0]
     assert "weak fiducial mark" not in texts[1]
 
 
-def test_reasons_that_differ_by_their_numbers_are_reported_once(measured_data: ReportData) -> None:
+def test_reasons_are_told_once(measured_data: ReportData) -> None:
     data = set_mark(measured_data, 2, Status.REJECTED, "4.2 px off the other marks' places")
     data = set_mark(data, 4, Status.REJECTED, "3.1 px off the other marks' places")
     first, second = (data.comparator[row].point for row in (2, 4))
     reasons = f"{first}, {second} rejected, such as {first}: 4.2 px off the other marks' places."
     assert f"6 measured. Reasons: {reasons}" in rendered(data).text
+    reason = "no fiducial was measured: the constellation does not fit"
+    absent = [replace(point, status=Status.ABSENT, reason=reason) for point in measured_data.comparator]
+    problem = (Reason(f"{reason}.", Code.NO_FRAME),)
+    data = set_frames(measured_data, lambda frame: FrameMeasurement(frame.image, (), problems=problem))
+    text = rendered(replace(data, comparator=absent)).text
+    assert text.count(f"{reason}.") == 1
+    assert "fiducial marks not measured" not in text
+    assert "not adjusted yet" not in text
 
 
 def test_of_many_targets_the_worst_are_shown_and_all_fiducials(adjusted_data: ReportData) -> None:
@@ -376,29 +339,10 @@ def test_the_verdict_of_the_check_stands_with_its_reason(adjusted_data: ReportDa
     assert ("! Needs a look" in text) == (verdict == "differs")
 
 
-def test_a_marks_sigma_is_known_by_its_causes(measured_data: ReportData) -> None:
-    page = render_report(measured_data)
-    assert "<dt>of which</dt>" in page
-    assert re.search(r">noise 0\.041</span>, <span [^>]*>tone 0\.020</span> px", page)
-
-
 def test_marks_can_be_chosen_by_the_code_of_their_reason(measured_data: ReportData) -> None:
-    assert measured_data.measurement is not None
-    image, scan = next(iter(measured_data.measurement.items()))
-    gone = Reason("half of it is gone", Code.COVERED, Code.SIZE)
-    changed = [mark.point for mark in scan.frame.marks if mark.kind == "fiducial"][:2]
-    marks = tuple(
-        replace(mark, status=Status.WEAK, reason=gone) if mark.kind == "fiducial" and mark.point in changed else mark
-        for mark in scan.frame.marks
-    )
-    rows = tuple(
-        replace(row, status=Status.WEAK, reason="a hair" if row.point == changed[1] else str(gone))
-        if row.image == image and row.kind == "fiducial" and row.point in changed
-        else row
-        for row in measured_data.comparator
-    )
-    scans = {**measured_data.measurement, image: replace(scan, frame=replace(scan.frame, marks=marks))}
-    html = render_report(replace(measured_data, comparator=rows, measurement=scans))
+    gone, (first, second) = Reason("half of it is gone", Code.COVERED, Code.SIZE), measured_data.comparator[:2]
+    data = set_mark(set_mark(measured_data, 0, Status.WEAK, str(gone)), 1, Status.WEAK, "a hair")
+    html = render_report(set_weak(data, first.image, [first.point, second.point], gone))
     assert html.count('data-codes="covered size"') == 2  # with its frame, and above; what a person wrote has no code
     assert '<option value="covered">covered (1)</option>' in html
     text = Document(html).text

@@ -22,14 +22,11 @@ from pipeline.results.assessment_record import SuspectRecord
 from pipeline.results.stage_files import Check
 
 
-def test_the_bounds_of_sigma0_are_those_of_the_chi_square_table() -> None:
+def test_bounds_are_those_of_published_tables() -> None:
     """Chi-square with 10 degrees of freedom: 2.156 and 25.188 (any table, 0.005 and 0.995)."""
     low, high = sigma0_bounds(10)
     assert (low, high) == pytest.approx((np.sqrt(0.2156), np.sqrt(2.5188)), abs=1e-4)
-
-
-def test_the_critical_w_grows_with_the_number_of_tests() -> None:
-    """One test: 2.576; a hundred: 0.01 / 100 two-sided, 3.891 (normal table)."""
+    # One test: 2.576; a hundred: 0.01 / 100 two-sided, 3.891 (normal table).
     assert critical_w(1) == pytest.approx(2.576, abs=1e-3)
     assert critical_w(100) == pytest.approx(3.891, abs=1e-3)
 
@@ -51,16 +48,13 @@ def test_good(adjusted_data: ReportData) -> None:
     assert (verdict.level, verdict.exit_code, verdict.problems) == ("good", 0, ())
     alone = judge(replace(adjusted_data, comparator=(), measurement=None))
     assert (alone.level, alone.sentence[:40]) == ("good", "Calibrated from 160 marks in 5 frames: R")
-
-
-def test_marks_and_frames_left_out_of_the_adjustment_do_not_count(adjusted_data: ReportData) -> None:
     assert adjusted_data.adjustment is not None
     rows = adjusted_data.adjustment.residuals
     some = changed(adjusted_data, residuals=tuple(row for row in rows if row.image != rows[0].image))
     assert judge(some).sentence.startswith("Calibrated from 128 marks in 4 frames: ")
 
 
-def test_sigma0_above_and_below_its_bounds(adjusted_data: ReportData) -> None:
+def test_sigma0_beyond_its_bounds_is_told_with_what_explains_it(adjusted_data: ReportData) -> None:
     assert "σ₀ = 1.60 is above 1.11" in describe(changed(adjusted_data, sigma0=1.6))
     assert "film_sigma_um" in describe(changed(adjusted_data, sigma0=1.6))
     assert "(target 1.02, fiducial 0.97)" in describe(changed(adjusted_data, sigma0=1.6)), "no group without a check"
@@ -68,9 +62,6 @@ def test_sigma0_above_and_below_its_bounds(adjusted_data: ReportData) -> None:
         verdict = judge(changed(adjusted_data, sigma0=sigma0))
         assert verdict.exit_code == 0, "better than promised is no harm"
         assert words in " ".join(verdict.notes)
-
-
-def test_what_explains_a_large_sigma0_stands_in_place_of_advice_on_gross_errors(adjusted_data: ReportData) -> None:
     found = (Explanation("pixels", "The pixels are not square.", "Give b1.", 1e-9, (1.6, 1.0)),)
     text = describe(changed(adjusted_data, sigma0=1.6, explanations=found))
     assert "larger than the standard deviations given. The pixels are not square. Give b1." in text
@@ -99,23 +90,18 @@ def suspect(**values: Any) -> tuple[SuspectRecord]:
         ({"name": "given c (camera RC 20)", "group": "interior"}, ["Correct the given value in the camera's file"]),
     ],
 )
-def test_a_gross_error_is_named_with_what_to_do(
-    adjusted_data: ReportData, values: dict[str, Any], words: list[str]
-) -> None:
+def test_gross_errors_are_named(adjusted_data: ReportData, values: dict[str, Any], words: list[str]) -> None:
     text = describe(changed(adjusted_data, suspects=suspect(**values)))
     for word in words:
         assert word in text
     assert ("Look at the picture" in text) == (values.get("group") != "interior")
 
 
-def test_a_given_value_and_a_mark_that_are_suspect_each_have_their_advice(adjusted_data: ReportData) -> None:
+def test_suspects_have_the_advice_of_their_kind(adjusted_data: ReportData) -> None:
     given = suspect(name="given c (camera RC 20)", group="interior")
     text = describe(changed(adjusted_data, suspects=(*given, *suspect())))
     assert "Look at the picture" in text
     assert "Correct the given value in the camera's file" in text
-
-
-def test_suspects_of_one_image_ask_for_its_numbers(adjusted_data: ReportData) -> None:
     of_one = tuple(suspect(name=f"target {k} in image f2")[0] for k in range(8))
     assert "marks of f2: look for wrong point numbers" in describe(changed(adjusted_data, suspects=of_one))
     of_two = tuple(replace(each, owner=f"f{k % 2}") for k, each in enumerate(of_one))
@@ -129,32 +115,17 @@ def test_pictures_without_fiducial_marks_are_no_film(adjusted_data: ReportData) 
     assert not set_cameras(uncalibrated, fiducials={}).is_film_alone
 
 
-def test_no_convergence_is_no_result(adjusted_data: ReportData) -> None:
-    assert "c is carried by its prior." in describe(changed(adjusted_data, warnings=("c is carried by its prior.",)))
-    stopped = changed(
-        adjusted_data, converged=False, termination="iteration limit", iterations=50, warnings=("Not final.",)
-    )
-    verdict = judge(stopped)
-    assert verdict.level == "failed"
-    assert "There is no calibration: the iteration did not come to rest." in verdict.sentence
-    assert "iteration limit, 50 iterations" in verdict.problems[0].what
-    assert verdict.problems[1].what == "Not final."
-
-
 def posed(data: ReportData) -> ReportData:
     """Of its scans' poses nothing is decided."""
     pose = Pose("0", False, ("The marks are symmetric to 3 µm.",))
     return set_frames(data, lambda frame: replace(frame, pose=pose))
 
 
-def test_an_assumed_pose_needs_attention_once_for_all_frames(measured_data: ReportData) -> None:
+def test_an_assumed_pose_needs_attention_once(measured_data: ReportData, adjusted_data: ReportData) -> None:
     data = posed(measured_data)
     assert len(judge(data).problems) == 1
     assert "f1, f2, f3, f4, f5: pose assumed (0). The marks are symmetric to 3 µm." in describe(data)
     assert 'pose = "90"' in describe(data)
-
-
-def test_a_pose_assumed_needs_attention_where_fiducials_are_all_there_is_too(adjusted_data: ReportData) -> None:
     bare = set_cameras(adjusted_data, principal_distance_mm=Quantity(153.0, np.nan))
     check = Check(verdict="not possible", reason="No camera is calibrated.", cameras={})
     verdict = judge(replace(posed(bare), check=check))
@@ -177,15 +148,12 @@ def test_the_table_of_exit_code_1_is_that_of_the_code() -> None:
     assert [line.split(" | ")[0].removeprefix("| ") for line in table.splitlines()] == list(NEEDS_A_LOOK)
 
 
-def test_problems_of_a_frame_and_of_the_caller_are_passed_on(measured_data: ReportData) -> None:
+def test_problems_and_notes_of_a_frame_and_of_the_caller_are_passed_on(measured_data: ReportData) -> None:
     dark = (Reason("nearly black.", Code.NO_FRAME),)
     data = set_frames(measured_data, lambda frame: replace(frame, problems=dark) if frame.image == "f4" else frame)
     data = replace(data, problems=(Problem("points.csv: 99 was not measured."),))
     assert "f4: nearly black." in describe(data)
     assert "99 was not measured" in describe(data)
-
-
-def test_what_a_scans_file_does_unusually_is_noted_once(measured_data: ReportData) -> None:
     assert measured_data.measurement is not None
     note = "The file's orientation tag (6) is not applied."
     scans = {name: replace(scan, notes=(note,)) for name, scan in measured_data.measurement.items()}
@@ -229,11 +197,20 @@ def test_weights_that_the_adjustment_changed_are_noted(adjusted_data: ReportData
     assert "OpenCV cannot check this calibration. One flat frame." in judge(cannot).notes
 
 
-def test_nothing_measured_is_no_result() -> None:
+def test_without_a_solution_there_is_no_result(adjusted_data: ReportData) -> None:
     assert judge(ReportData("none")).level == "failed"
+    assert "c is carried by its prior." in describe(changed(adjusted_data, warnings=("c is carried by its prior.",)))
+    stopped = changed(
+        adjusted_data, converged=False, termination="iteration limit", iterations=50, warnings=("Not final.",)
+    )
+    verdict = judge(stopped)
+    assert verdict.level == "failed"
+    assert "There is no calibration: the iteration did not come to rest." in verdict.sentence
+    assert "iteration limit, 50 iterations" in verdict.problems[0].what
+    assert verdict.problems[1].what == "Not final."
 
 
-def test_even_fractions_pass_and_locked_ones_do_not() -> None:
+def test_positions_that_prefer_parts_of_a_pixel_are_told_from_even_ones() -> None:
     rng = np.random.default_rng(2)
     even = rng.uniform(0.0, 2000.0, 800)
     assert not fraction_test(even).is_locked
@@ -241,20 +218,15 @@ def test_even_fractions_pass_and_locked_ones_do_not() -> None:
     assert fraction_test(pulled).is_locked
     assert fraction_test(even[:20]).probability is None
     assert fraction_test(even).counts.sum() == 800
-
-
-def test_the_bias_of_locked_positions_is_measured() -> None:
-    """0.03 px towards the pixel's centre, as interpolating methods have it."""
+    # 0.03 px towards the pixel's centre, as interpolating methods have it.
     rng = np.random.default_rng(4)
     true = rng.uniform(0.0, 4000.0, 20000)
     test = fraction_test(true - 0.03 * np.sin(2.0 * np.pi * true))
     assert test.is_locked
     assert test.bias_px == pytest.approx(0.03, abs=0.003)
-
-
-def test_a_bias_that_harms_nobody_is_left_alone_however_many_marks_show_it() -> None:
-    true = (np.arange(400000) + 0.5) / 1000.0
-    test = fraction_test(true - 0.005 * np.sin(2.0 * np.pi * true))
+    # However many marks show it, a bias that harms nobody is left alone.
+    many = (np.arange(400000) + 0.5) / 1000.0
+    test = fraction_test(many - 0.005 * np.sin(2.0 * np.pi * many))
     assert test.probability is not None
     assert test.probability < 1e-9
     assert not test.is_locked
@@ -266,17 +238,14 @@ def near_a_column(mark: MarkMeasurement, off_px: float) -> MarkMeasurement:
     return replace(mark, center_px=np.array([round(mark.center_px[0]) + off_px, mark.center_px[1]]))
 
 
-def test_locked_positions_need_attention(measured_data: ReportData) -> None:
+def test_locked_positions_need_attention_and_recurring_ones_do_not(measured_data: ReportData) -> None:
     def locked(frame: FrameMeasurement) -> FrameMeasurement:
         return replace(frame, marks=tuple(near_a_column(mark, 0.02) for mark in frame.marks))
 
     text = describe(set_frames(measured_data, locked))
     assert "The column positions of the marks prefer parts of a pixel" in text
     assert "The row positions" not in text
-
-
-def test_marks_that_recur_in_one_place_are_no_pixel_locking(measured_data: ReportData) -> None:
-    """A frame that lies in the same place of every scan: 4 marks, 38 times within 0.01 px of the same places."""
+    # A frame that lies in the same place of every scan: 4 marks, 38 times within 0.01 px of the same places.
     rng = np.random.default_rng(6)
     (name, scan), *_ = (measured_data.measurement or {}).items()
     marks = [tuple(near_a_column(mark, rng.normal(0.0, 0.01)) for mark in scan.frame.marks[:4]) for _ in range(38)]
@@ -286,16 +255,12 @@ def test_marks_that_recur_in_one_place_are_no_pixel_locking(measured_data: Repor
     assert sum(mark.status.is_observation for frame in shots for mark in frame.marks) == 4 * 38
     assert all(len(positions) <= 4 for positions in places_px(shots).values())
     assert judge(recurring).level == "good"
-
-
-def test_a_lattice_that_lies_along_the_pixels_is_no_pixel_locking(measured_data: ReportData) -> None:
-    """A reseau of 20 x 20 crosses, 120.04 px apart: 20 columns and 20 rows, each measured 20 times."""
-    (name, scan), *_ = (measured_data.measurement or {}).items()
+    # A reseau of 20 x 20 crosses, 120.04 px apart: 20 columns and 20 rows, each measured 20 times.
     places = np.stack(np.meshgrid(*[100.7 + 120.04 * np.arange(20)] * 2), axis=-1).reshape(-1, 2)
     places += np.random.default_rng(8).normal(0.0, 0.01, places.shape)
     mark = scan.frame.marks[0]
-    marks = tuple(replace(mark, point=str(index), center_px=place) for index, place in enumerate(places))
-    scans = {name: replace(scan, frame=replace(scan.frame, marks=marks))}
+    crosses = tuple(replace(mark, point=str(index), center_px=place) for index, place in enumerate(places))
+    scans = {name: replace(scan, frame=replace(scan.frame, marks=crosses))}
     lattice = replace(measured_data, comparator=(), measurement=scans)
     assert len(frames(lattice)[0].marks) == 400
     assert judge(lattice).level == "good"

@@ -11,13 +11,11 @@ import numpy as np
 import pytest
 import tifffile
 from numpy.typing import NDArray
-from studies import parametrize_with_studies
 
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.transformation import Film
 from measure import MeasurementError, open_scan
-from pipeline.cli import run
 from pipeline.resampling.canvas import FrameChain, outline_canvas, scan_places
 from pipeline.resampling.interpolation import open_source
 from pipeline.resampling.resample_stage import BEST, FAST, FrameScan, ResampleTask, resampled
@@ -93,9 +91,7 @@ def find_place(description: dict[str, float], shape: tuple[int, ...]) -> Array:
 
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("turn_deg", [0.4, 90.4, 180.3, 269.7])
-def test_marks_measured_in_the_frame_lie_where_the_transformation_puts_them(
-    turn_deg: float, mirrored: bool, tmp_path: Path
-) -> None:
+def test_marks_lie_where_the_transformation_puts_them(turn_deg: float, mirrored: bool, tmp_path: Path) -> None:
     """Gaussian marks, by least squares with their own form as the transformation turns it: within 0.002 px rms."""
     middles, picture = marked()
     tifffile.imwrite(tmp_path / "scan.tif", np.rint(picture).astype(np.uint16))
@@ -160,32 +156,6 @@ def test_marks_of_both_scans_of_a_frame_lie_where_their_transformations_put_them
         assert np.sqrt(np.mean(np.square(off))) < 0.002
 
 
-@pytest.mark.parametrize("mirrored", [False, True])
-@parametrize_with_studies("turn_deg", [0.4, 90.4, 180.3, 269.7], quick=(1,))
-def test_every_pose_shows_the_formula_where_it_should(
-    turn_deg: float, mirrored: bool, scan: Path, tmp_path: Path
-) -> None:
-    """Each pixel against the formula at the place that the test computes itself; the scan's outline is all there."""
-    transformation, matrix, shift = film(turn_deg, mirrored)
-    done = resampled(task(scan, tmp_path, FrameChain(PITCH_UM, transformation)))
-    assert done.problem == ""
-    with tifffile.TiffFile(tmp_path / "a.tif") as file:
-        pixels, mask = file.pages[0].asarray(), file.pages[1].asarray().astype(bool)
-        description = json.loads(file.pages.first.description)
-        assert pixels.dtype == np.uint16
-        assert len(file.pages.first.pages or ()) >= 1
-    comparator = (find_place(description, pixels.shape) - shift) @ np.linalg.inv(matrix).T
-    col, row = comparator[..., 0] * 1000 / PITCH_UM[0], -comparator[..., 1] * 1000 / PITCH_UM[1]
-    inside = (col >= -0.5) & (col <= WIDTH - 0.5) & (row >= -0.5) & (row <= HEIGHT - 0.5)
-    unsure = (np.abs(col + 0.5) < 1e-6) | (np.abs(row + 0.5) < 1e-6)
-    assert (mask == inside)[~unsure].all()
-    assert inside.sum() == pytest.approx(WIDTH * HEIGHT * PITCH_UM[0] * PITCH_UM[1] / 400.0, rel=0.01)
-    assert not pixels[~mask].any()
-    off = pixels[inside] - light(col[inside], row[inside])
-    steepest = 20000.0 / BLUR_PX * np.exp(-0.5)  # grey values a pixel
-    assert np.abs(off).max() < 0.002 * steepest
-
-
 def test_fast_is_less_true_and_linear_would_not_do(scan: Path, tmp_path: Path) -> None:
     transformation, matrix, shift = film(0.4, False)
     off = {}
@@ -244,30 +214,24 @@ def test_a_fisheyes_ideal_picture_ends_where_it_would_be_stretched_without_end()
     np.testing.assert_allclose(np.stack([columns, rows], axis=2).reshape(-1, 2), expected.reshape(-1, 2), atol=1e-4)
 
 
-def test_a_frame_is_kept_until_something_changes(scan: Path, tmp_path: Path) -> None:
+def test_a_frame_is_kept_until_something_changes_and_is_no_scan(scan: Path, tmp_path: Path) -> None:
     chain = FrameChain(PITCH_UM, film(0.4, False)[0])
     assert not resampled(task(scan, tmp_path, chain)).kept
     assert resampled(task(scan, tmp_path, chain)).kept
     assert not resampled(task(scan, tmp_path, chain, FAST)).kept
     moved = replace(chain, film=replace(chain.film, parameters=1.000000001 * chain.film.parameters))
     assert not resampled(task(scan, tmp_path, moved, FAST)).kept
-
-
-def test_what_is_resampled_is_not_measured(scan: Path, tmp_path: Path) -> None:
     resampled(task(scan, tmp_path, FrameChain(PITCH_UM, film(0.4, False)[0])))
     with pytest.raises(MeasurementError, match="has resampled, and no scan"):
         open_scan(tmp_path / "a.tif")
 
 
-def test_a_scan_in_strips_that_lies_across_is_decoded_once(scan: Path, tmp_path: Path) -> None:
+def test_a_scan_in_strips_that_lies_across_is_decoded_once_and_its_losses_are_known(scan: Path, tmp_path: Path) -> None:
     with open_scan(scan) as opened, open_source(opened, 10**9, tmp_path) as decoded:
         for place in ((-20, -30, 100, 90), (WIDTH - 50, 100, 90, 60), (100, HEIGHT - 5, 40, 30), (300, 200, 50, 40)):
             assert (decoded.window(*place) == opened.samples(*place)).all()
     assert not list(tmp_path.iterdir())
-
-
-def test_what_a_decoded_scan_has_lost_is_known(scan: Path, tmp_path: Path) -> None:
-    """A strip that is damaged is decoded once, and is no part of any tile."""
+    # A strip that is damaged is decoded once, and is no part of any tile.
     content = bytearray(scan.read_bytes())
     with tifffile.TiffFile(scan) as file:
         page = file.pages.first
@@ -287,25 +251,3 @@ def test_a_scan_that_is_gone_is_a_result(tmp_path: Path) -> None:
     assert done.path is None
     assert "gone.tif" in done.problem
     assert not list(tmp_path.glob("*.tif"))
-
-
-@pytest.mark.study
-def test_a_project_through_the_command(project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The fiducials of the demonstration, each in all frames at the pixel that its camera coordinates say."""
-    out = tmp_path / "frames"
-    assert run(["resample", str(project / "project.toml"), str(out), "--json"]) == 0
-    results = json.loads(capsys.readouterr().out)
-    assert [result["image"] for result in results] == ["frame1", "frame2", "frame3"]
-    truth = json.loads((project / "truth.json").read_text(encoding="utf-8"))
-    (camera,) = truth["cameras"].values()
-    for result in results:
-        with tifffile.TiffFile(result["path"]) as file:
-            pixels, description = file.pages[0].asarray(), json.loads(file.pages.first.description)
-        for mark in camera["fiducials"].values():
-            col = (mark["x_mm"]["value"] - description["x_mm"]) / description["pitch_mm"]
-            row = (description["y_mm"] - mark["y_mm"]["value"]) / description["pitch_mm"]
-            near = pixels[round(row) - 4 : round(row) + 5, round(col) - 4 : round(col) + 5].astype(float)
-            far = pixels[round(row) - 12 : round(row) + 13, round(col) - 12 : round(col) + 13].astype(float)
-            assert abs(near.mean() - np.median(far)) > 0.02 * far.max()  # a mark is there
-    assert run(["resample", str(project / "project.toml"), str(out)]) == 0
-    assert capsys.readouterr().out.count("as it was") == 3

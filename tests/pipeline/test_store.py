@@ -1,7 +1,6 @@
 """The store gives back what was kept, takes it whole or not at all, and other programs can read it."""
 
 import os
-import shutil
 import signal
 import sqlite3
 import subprocess
@@ -11,10 +10,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
-import tifffile
-from projects import FOLDER, changed, content, dump, failed, kept_result, made_record, stored
+from projects import FOLDER, changed, content, failed, kept_result, made_record, stored
 
 from measure import Code, Reason, Status
 from pipeline import InputError
@@ -53,7 +50,7 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "out" / "measurement.db"
 
 
-def test_a_record_comes_back_without_loss(path: Path) -> None:
+def test_a_record_comes_back_without_loss_and_once(path: Path) -> None:
     with Store(path) as store:
         row = store.keep(kept_result(3), "box/3")
         other = store.keep(kept_result(4))
@@ -62,34 +59,8 @@ def test_a_record_comes_back_without_loss(path: Path) -> None:
         assert stored(store, other, "4") == content(made_record(4))
         assert store.fingerprints() == {kept_result(3).fingerprint: row, kept_result(4).fingerprint: other}
         assert store.identities() == {"scans/3.tif": kept_result(3).identity, "scans/4.tif": kept_result(4).identity}
-
-
-def test_a_result_that_is_there_is_not_kept_twice(path: Path) -> None:
-    with Store(path) as store:
-        assert store.keep(kept_result(3)) == store.keep(kept_result(3))
-        assert store.keep(kept_result(3, options='{"pose": "90"}')) != store.keep(kept_result(3))
-        assert len(store.fingerprints()) == 2
-
-
-def test_the_view_has_the_columns_and_numbers_of_comparator_csv(path: Path) -> None:
-    with Store(path) as store:
-        row = store.keep(kept_result(3), "box/3")
-        judge(store, {}, "input", [CheckedResult(row, made_record(3, image="box/3"))])
-    with sqlite3.connect(path) as db:
-        view = db.execute("select * from mark_view")
-        names = [column[0] for column in view.description]
-        rows = view.fetchall()
-    assert names == ["image", "point", "kind", "x_mm", "y_mm", "sx_mm", "sy_mm", "rho", "col_px", "row_px", "status",
-                     "reason"]  # fmt: skip
-    mark = made_record(3).frame.marks[0]
-    assert mark.center_px is not None
-    assert mark.covariance_px2 is not None
-    (variance_x, covariance), (_, variance_y) = mark.covariance_px2.tolist()
-    assert rows[0][:3] == ("box/3", "1", "fiducial")
-    assert rows[0][3:5] == pytest.approx(mark.center_px * (0.020, -0.0205), rel=1e-12)
-    assert rows[0][5:7] == pytest.approx((variance_x**0.5 * 0.020, variance_y**0.5 * 0.0205), rel=1e-12)
-    assert rows[0][7] == pytest.approx(-covariance / (variance_x * variance_y) ** 0.5, rel=1e-12)
-    assert len(rows) == 8
+        assert store.keep(kept_result(3)) == row != store.keep(kept_result(3, options='{"pose": "90"}'))
+        assert len(store.fingerprints()) == 3
 
 
 def test_a_judging_changes_what_is_visible_and_not_what_was_measured(path: Path) -> None:
@@ -238,7 +209,7 @@ def test_a_step_to_a_later_version_is_made_whole_or_not_at_all(path: Path, monke
         assert stored(store, row) == content(made_record())
 
 
-def test_a_file_of_another_kind_or_of_a_later_version_is_refused(path: Path) -> None:
+def test_what_is_no_store_is_refused(path: Path, tmp_path: Path) -> None:
     path.parent.mkdir()
     path.write_text("measured: nothing", encoding="utf-8")
     with pytest.raises(InputError, match="cannot be used as a database of measurements"):
@@ -254,6 +225,11 @@ def test_a_file_of_another_kind_or_of_a_later_version_is_refused(path: Path) -> 
         db.execute(f"pragma user_version = {VERSION + 1}")
     with pytest.raises(InputError, match="a later reseau"):
         Store(path)
+    with Store(tmp_path / "a.db") as store:
+        with pytest.raises(InputError, match="there is no such results database"):
+            merge(store, [tmp_path / "b.db"])
+        with pytest.raises(InputError, match="joined into"):
+            merge(store, [tmp_path / "a.db"])
 
 
 WRITER = """
@@ -298,35 +274,6 @@ def test_failed_scans_are_tried_again_only_when_requested(path: Path) -> None:
         assert store.forget_failed() == 0
 
 
-def test_stores_of_shards_become_one(tmp_path: Path) -> None:
-    whole, joined, shards = tmp_path / "whole.db", tmp_path / "joined.db", [tmp_path / f"{k}.db" for k in (1, 2)]
-    for seed in range(20):
-        for place in (whole, shards[shard_number(str(seed), 2) - 1]):
-            with Store(place) as store:
-                store.keep(kept_result(seed, options=f"[{seed % 3}]"), str(seed))
-    with Store(joined) as store:
-        first, second = merge(store, shards)
-        assert first.new + second.new == first.results + second.results == 20
-        assert [again.new for again in merge(store, shards)] == [0, 0]
-    assert dump(joined) == dump(whole)
-    assert min(first.new, second.new) > 3
-
-
-def test_merging_names_what_is_no_store(tmp_path: Path) -> None:
-    with Store(tmp_path / "a.db") as store:
-        with pytest.raises(InputError, match="there is no such results database"):
-            merge(store, [tmp_path / "b.db"])
-        with pytest.raises(InputError, match="joined into"):
-            merge(store, [tmp_path / "a.db"])
-
-
-def test_shards_are_the_same_everywhere() -> None:
-    """By SHA-256 of the name: another Python, or another start of it, gives the same."""
-    assert [shard_number(name, 8) for name in ("0001", "box1/0001", "Übersicht")] == [4, 7, 2]  # sha256sum's 8th byte
-    counts = [sum(shard_number(str(n), 4) == k for n in range(4000)) for k in (1, 2, 3, 4)]
-    assert min(counts) > 900
-
-
 def test_verdicts_of_scans() -> None:
     good, counts = made_record(), {"ann": 1}
     answered = changed(good, [0], Status.REJECTED, Reason("rejected by ann", Code.DECIDED))
@@ -356,31 +303,17 @@ def test_verdicts_of_scans() -> None:
         assert any(single_frame_problems(frame)) is verdict.needs_look, verdict
 
 
-def test_the_key_depends_on_all_that_it_names() -> None:
+def test_keys_and_shards_depend_on_all_that_they_name() -> None:
     base = kept_result(1)
     others = [kept_result(1, options="[1]"), kept_result(1, mtime_ns=2), kept_result(2)]
     keys = {base.fingerprint, *(other.fingerprint for other in others)}
     keys.add(result_key(base.identity, hash_text("{}"), revision=-1))
     assert len(keys) == 5
     assert base.fingerprint == kept_result(1, scan=failed()).fingerprint
-
-
-def test_parts_tell_scans_apart_that_share_head_and_tables(rendered_demo: Path, tmp_path: Path) -> None:
-    scan = tmp_path / "scan.tif"
-    shutil.copyfile(rendered_demo / "scans" / "frame1.tif", scan)
-    first = parts_hash(scan), content_hash(scan)
-    copy = tmp_path / "copy.tif"
-    shutil.copyfile(scan, copy)
-    assert (parts_hash(copy), content_hash(copy)) == first
-    pixels = tifffile.imread(scan)
-    for place, name in (((pixels.shape[0] // 2, pixels.shape[1] // 2), "middle"), ((0, 0), "corner")):
-        changed = pixels.copy()
-        changed[place] ^= 1
-        tifffile.imwrite(tmp_path / f"{name}.tif", changed)
-    tifffile.imwrite(tmp_path / "same.tif", np.asarray(pixels))
-    hashes = {name: parts_hash(tmp_path / f"{name}.tif") for name in ("same", "middle")}
-    assert hashes["same"] != hashes["middle"]
-    assert content_hash(tmp_path / "corner.tif") != content_hash(tmp_path / "same.tif")
+    # By SHA-256 of the name: another Python, or another start of it, gives the same.
+    assert [shard_number(name, 8) for name in ("0001", "box1/0001", "Übersicht")] == [4, 7, 2]  # sha256sum's 8th byte
+    counts = [sum(shard_number(str(n), 4) == k for n in range(4000)) for k in (1, 2, 3, 4)]
+    assert min(counts) > 900
 
 
 def test_the_identity_of_what_is_no_scan(tmp_path: Path) -> None:

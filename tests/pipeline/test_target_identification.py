@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import tifffile
 from numpy.typing import NDArray
-from projects import measure_scan
+from projects import Refusal, measure_scan, write_tables
+from real_data import DATA, needs
 from studies import parametrize_with_studies
 
 from adjust.functional_model.families import parameter_names
@@ -19,21 +20,20 @@ from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.transformation import Film
-from measure import Status
+from measure import Status, open_scan
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement
+from measure.targets.disk_detection import DiskSearch, disk_candidates
+from measure.targets.ring_codes import RingCode, read_code
+from measure.targets.sheets import Dots, Naming, name_dots
 from pipeline import InputError
 from pipeline.files.project_file import Project, read_project
-from pipeline.files.target_table import read_targets
 from pipeline.measuring.coded_targets import check_sheet
 from pipeline.measuring.scan_task import scan_tasks
 from pipeline.measuring.target_field import across, disk_images, disk_normals, eccentricity_mm, plane_normal
 from pipeline.measuring.target_identification import assign, log10_of_chance, recognise
-from pipeline.rendered.scene_file import read_scene, render_project
+from pipeline.rendered.scene_file import render_project
 from pipeline.results.comparator_file import pixel_from_comparator
 from pipeline.results.measured_record import MeasuredScan
-from pipeline.text.tables import read_toml
-from synthetic_images.frame import frame_truth
-from synthetic_images.truth import Truth, truth_json
 
 Array = NDArray[np.float64]
 
@@ -56,6 +56,9 @@ def test_pattern_is_named_right_with_targets_missing_and_marks_that_are_none() -
         pairs = assign(placement[0], found[order], 40.0)
         right = sum(order[j] < len(kept) and kept[order[j]] == i for i, j in pairs)
         assert right >= 0.8 * len(kept)
+    predicted = np.array([[0.0, 0.0], [1.0, 0.0], [100.0, 0.0]])
+    found = np.array([[0.9, 0.0], [50.0, 0.0]])
+    assert assign(predicted, found, 5.0) == [(1, 0)]
 
 
 @parametrize_with_studies(("targets", "strays"), [(4, 0), (8, 16), (25, 0), (25, 50)], quick=(1,))
@@ -73,12 +76,6 @@ def test_agreement_by_chance_is_distinguished_from_a_pattern(targets: int, stray
         placement = recognise(places, other, 1500.0)
         for gate_px in (6.0, 30.0, 90.0):
             assert placement is None or (log10_of_chance(placement[0], other, gate_px, placement[1]) > -1.0)
-
-
-def test_assignment_is_one_to_one_and_gated() -> None:
-    predicted = np.array([[0.0, 0.0], [1.0, 0.0], [100.0, 0.0]])
-    found = np.array([[0.9, 0.0], [50.0, 0.0]])
-    assert assign(predicted, found, 5.0) == [(1, 0)]
 
 
 def test_eccentricity_and_place_of_a_disk_are_those_of_the_rendered_one(rendered_demo: Path) -> None:
@@ -102,46 +99,6 @@ def test_eccentricity_and_place_of_a_disk_are_those_of_the_rendered_one(rendered
         np.testing.assert_allclose(off_px, ellipse_px - true_px, atol=2e-5)
         largest = max(largest, float(np.abs(off_px).max()))
     assert largest > 0.005  # or there was nothing to see
-
-
-CLOSE = """[camera]
-name = "c"
-frame_mm = [24.0, 16.0]
-principal_distance_mm = 20.0
-[camera.distortion]
-family = "brown"
-[camera.distortion.value]
-k1 = -2.0e-4
-p1 = 2.0e-5
-[field]
-diameter_mm = 120.0
-[[field.grid]]
-first = 1
-columns = 5
-rows = 4
-right = [0.36, 0.0, 0.0]
-up = [0.0, 0.33, 0.0]
-relief = 0.15
-[scan]
-pitch_um = 12.0
-[[image]]
-name = "a"
-position = [0.9, -0.4, 1.6]
-angles_deg = [12.0, 28.0, 10.0]
-"""
-
-
-def test_large_disks_at_close_range_under_strong_distortion(tmp_path: Path) -> None:
-    """125 px wide and up to 1.2 px off, 0.1 px of which comes from the lens, of 2 % in the corner."""
-    (tmp_path / "scene.toml").write_text(CLOSE, encoding="utf-8")
-    scene = read_scene(tmp_path / "scene.toml").scene
-    document = json.loads(truth_json(Truth(scene, (frame_truth(scene, 0),))))
-    (camera,), (frame,) = document["cameras"].values(), document["images"].values()
-    centers, normals, true_px, ellipse_px = shown_disks(document, frame)
-    off_mm = eccentricity_mm(true_model(camera, frame), centers, normals, 0.06)
-    off_px = pixel_from_comparator(off_mm, tuple(frame["pitch_um"]))
-    assert np.abs(ellipse_px - true_px).max() > 0.9
-    np.testing.assert_allclose(off_px, ellipse_px - true_px, atol=2e-3)
 
 
 def shown_disks(truth: dict[str, Any], frame: dict[str, Any]) -> tuple[Array, Array, Array, Array]:
@@ -187,15 +144,6 @@ def test_normals_of_a_flat_field_are_its_planes_and_face_the_camera() -> None:
     assert plane_normal(rng.uniform(-1.0, 1.0, (6, 3))) is None
 
 
-def test_vectors_across_are_at_right_angles() -> None:
-    normals = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.6, 0.0, 0.8]])
-    first, second = across(normals)
-    for one, other in ((first, normals), (second, normals), (first, second)):
-        np.testing.assert_allclose(np.sum(one * other, axis=1), 0.0, atol=1e-15)
-    np.testing.assert_allclose(np.linalg.norm(first, axis=1), 1.0)
-    np.testing.assert_allclose(np.linalg.norm(second, axis=1), 1.0)
-
-
 PINHOLE = ImageModel(
     Lens(Distortion("none", {}), np.array([100.0, 0.0, 0.0]), np.empty(0)),
     np.eye(3),
@@ -204,7 +152,7 @@ PINHOLE = ImageModel(
 )
 
 
-def test_the_ellipse_of_a_near_disk_is_that_of_its_outline() -> None:
+def test_eccentricities_are_those_of_the_outline_also_at_seven_digits() -> None:
     """Through a pinhole, of a disk a third as far off as it is wide: the centre of gravity of 4000 points' polygon."""
     radius, c = 0.9, PINHOLE.lens.interior[0]
     centers, normals = np.array([[0.8, -0.5, -3.0], [-1.0, 0.6, -2.7]]), np.array([[0.6, 0.0, 0.8], [0.36, -0.48, 0.8]])
@@ -221,10 +169,7 @@ def test_the_ellipse_of_a_near_disk_is_that_of_its_outline() -> None:
         middle = np.array([((x + np.roll(x, -1)) * cross).sum(), ((y + np.roll(y, -1)) * cross).sum()])
         middle /= 3.0 * cross.sum()
         np.testing.assert_allclose(off, middle + c * center[:2] / center[2], atol=1e-3)
-
-
-def test_the_eccentricity_of_disks_at_seven_digits_is_that_at_the_origin() -> None:
-    """To a picometre and less: what coordinates of seven digits lose by rounding would be 10 pm here."""
+    # To a picometre and less: what coordinates of seven digits lose by rounding would be 10 pm here.
     centers = np.array([[0.75, -0.5, -3.0], [-1.0, 0.625, -2.75]])
     normals = np.array([[0.6, 0.0, 0.8], [0.0, -0.6, 0.8]])
     far = np.array([500_000.0, 5_400_000.0, 300.0])
@@ -286,8 +231,7 @@ def errors(scan: MeasuredScan, places: dict[str, Array]) -> dict[str, Array]:
 
 
 def error(mark: MarkMeasurement, place: Array) -> Array:
-    assert mark.center_px is not None
-    return mark.center_px - place
+    return np.asarray(mark.center_px) - place
 
 
 @pytest.mark.study
@@ -350,15 +294,28 @@ def test_a_ring_read_twice_is_the_one_at_its_place(scenes: dict[str, Path], tmp_
     assert marks[second].reason == f"the ring at its place reads as {first}"
 
 
+CODED = 'kind = "coded-ring"\ndiameter_mm = 200.0\n[targets.codes]\nt8 = 23\nt12 = 347\n'
+
+
 @pytest.mark.parametrize(
     ("targets", "message"),
-    [('kind = "cross"\narm_mm = 5.0\nline_mm = 6.0', "a line of 6 mm is no line for arms of 5 mm"),
-     ('kind = "cross"\nline_mm = 6.0', "arm_mm")],
-)  # fmt: skip
-def test_what_a_cross_cannot_be(tmp_path: Path, targets: str, message: str) -> None:
-    (tmp_path / "t.toml").write_text(targets, encoding="utf-8")
-    with pytest.raises(InputError, match=message):
-        read_targets(read_toml(tmp_path / "t.toml"))
+    [
+        ('kind = "cross"\narm_mm = 5.0\nline_mm = 6.0', "a line of 6 mm is no line for arms of 5 mm"),
+        ('kind = "cross"\nline_mm = 6.0', "arm_mm"),
+        (f"{CODED}u3 = 5", "points.csv has no coordinates of such a point"),
+        (f"{CODED}t3 = 4095", "is no number of 12 bits"),
+        (f"{CODED}t3 = 46", "is, turned, the code of t8 too"),
+        (f"{CODED}[targets.more]", "is no key of this table"),
+    ],
+)
+def test_what_targets_cannot_be(targets: str, message: str, tmp_path: Path, refusal: Refusal) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((60, 80), np.uint8))
+    rows = [f"t{i},{i % 7},{i // 7},0" for i in range(49)]
+    scans = 'camera = "camera.toml"\nscans = ["*.png"]\npitch_um = 40.0'
+    project = f'{scans}\n[targets]\n{targets}\n[object]\npoints = "points.csv"'
+    camera = 'name = "c"\nframe_mm = [36.0, 27.2]'
+    write_tables(tmp_path, project, camera=camera, points=["point,X,Y,Z", *rows])
+    assert message in refusal(["measure", str(tmp_path / "project.toml")])
 
 
 def test_coordinates_in_another_unit_than_the_project_says(scenes: dict[str, Path], tmp_path: Path) -> None:
@@ -381,15 +338,10 @@ BUCKLED, MISPRINTED = "r2c3", "r5c6"
 
 
 def board(folder: Path) -> Project:
-    (folder / "camera.toml").write_text('name = "c"\nframe_mm = [11.0, 8.5]\n', encoding="utf-8")
-    (folder / "comparator.csv").touch()
-    (folder / "points.csv").write_text("point,X,Y,Z\nr0c0,,,\n", encoding="utf-8")  # a board has places without any
-    (folder / "project.toml").write_text(
-        f'camera = "camera.toml"\n[targets]\nkind = "chessboard"\ncolumns = {COLUMNS}\nrows = {ROWS}\n'
-        'square_mm = 20.0\n[object]\npoints = "points.csv"\n',
-        encoding="utf-8",
-    )
-    return read_project(folder / "project.toml")
+    sheet = f'[targets]\nkind = "chessboard"\ncolumns = {COLUMNS}\nrows = {ROWS}\nsquare_mm = 20.0'
+    project = f'camera = "camera.toml"\n{sheet}\n[object]\npoints = "points.csv"'
+    camera, points = 'name = "c"\nframe_mm = [11.0, 8.5]', "point,X,Y,Z\nr0c0,,,"  # a board has places without any
+    return read_project(write_tables(folder, project, camera=camera, points=points, comparator=""))
 
 
 def rotation(axis: int, angle: float) -> Array:
@@ -452,12 +404,9 @@ def test_a_scan_of_two_like_boards_says_so(tmp_path: Path, drawn_before: int) ->
     """And none of their points is an observation. OpenCV's detector draws random numbers: going on from these, it
     misses the second board."""
     cv2.setRNGSeed(drawn_before)
-    (tmp_path / "camera.toml").write_text('name = "c"\nframe_mm = [4.2, 1.8]\n', encoding="utf-8")
-    (tmp_path / "project.toml").write_text(
-        'camera = "camera.toml"\nscans = ["two.png"]\npitch_um = 10.0\n'
-        '[targets]\nkind = "chessboard"\ncolumns = 4\nrows = 3\nsquare_mm = 25.0\n',
-        encoding="utf-8",
-    )
+    table = '[targets]\nkind = "chessboard"\ncolumns = 4\nrows = 3\nsquare_mm = 25.0'
+    project = f'camera = "camera.toml"\nscans = ["two.png"]\npitch_um = 10.0\n{table}'
+    write_tables(tmp_path, project, camera='name = "c"\nframe_mm = [4.2, 1.8]')
     board = np.kron(np.indices((4, 5)).sum(axis=0) % 2, np.ones((32, 32)))
     sheet = np.pad(255 * board, 24, constant_values=255)
     two = cv2.GaussianBlur(np.hstack([sheet, sheet]), (0, 0), 0.8)
@@ -466,3 +415,54 @@ def test_a_scan_of_two_like_boards_says_so(tmp_path: Path, drawn_before: int) ->
     assert {mark.status for mark in frame.marks} == {Status.REJECTED}
     words = "No point of the board is used: the scan shows 2 boards of 4 x 3 inner corners"
     assert frame.problems[-1].startswith(words)
+
+
+CAMCAL = DATA / "coded" / "camcal"
+REAL_ROWS = """
+90 92 94 95 97 96 93 91 89 88
+81 1003 83 84 85 87 86 82 1004 80
+71 73 75 77 78 79 76 74 72 70
+61 62 64 65 67 69 68 66 63 60
+50 51 54 55 56 59 58 57 53 52
+42 45 40 41 43 49 47 44 46 48
+30 31 32 33 34 36 37 35 38 39
+25 23 21 20 22 24 26 27 28 29
+17 1001 14 12 13 15 16 18 1002 19
+8 6 4 2 3 5 7 9 10 11
+"""  # the real sheet by the names in its list of marks, rows from the bottom, 1/7 m apart
+
+
+@needs("coded", "camcal", "images")
+@pytest.mark.parametrize(("picture", "count"), [(21, 100), (26, 93)])
+def test_a_real_sheet(picture: int, count: int) -> None:
+    """Every mark that was given for the picture gets its name, and its place to what a search without a fit can do."""
+    lines = (CAMCAL / "camcaldemo" / "measurements" / "markpts.txt").read_text(encoding="utf-8").splitlines()
+    cells = [line.split(",") for line in lines if line.strip() and not line.startswith("#")]
+    own = [row for row in cells if int(row[0]) == picture - 20]
+    given = {int(row[1]): np.array([float(row[2]), float(row[3])]) - 0.5 for row in own}
+    assert len(given) == count
+    sheet = np.array(list(real_sheet().values()))
+    numbers = {31: 1001, 51: 1002, 37: 1003, 85: 1004}
+    row = {point: i for i, point in enumerate(real_sheet())}
+    with open_scan(CAMCAL / "images" / f"P82500{picture}.JPG") as scan:
+        found = disk_candidates(scan, DiskSearch((16.0, 60.0), "dark", 0.2))
+        read = {i: read_code(scan, dot, RingCode(8, (2.6, 4.1))) for i, dot in enumerate(found)}
+        coded = {i: row[numbers[number]] for i, number in read.items() if number in numbers}
+        dots = Dots(
+            np.array([dot.center_px for dot in found]), np.array([dot.pixel_from_disk for dot in found]), coded
+        )  # fmt: skip
+        naming = name_dots(sheet, dots, (scan.width_px, scan.height_px))
+    assert isinstance(naming, Naming), naming
+    named = {point: naming.named[row[point]] for point in given if row[point] in naming.named}
+    off = {point: dots.centers_px[dot] - given[point] for point, dot in named.items()}
+    assert len(off) >= len(given) - 2
+    assert max(np.hypot(*step) for step in off.values()) < 2.5
+
+
+def real_sheet() -> dict[int, Array]:
+    rows = [line.split() for line in REAL_ROWS.strip().splitlines()]
+    return {
+        int(name): np.array([column - 1.0, row - 1.0]) / 7.0
+        for row, names in enumerate(rows)
+        for column, name in enumerate(names)
+    }

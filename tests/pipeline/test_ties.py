@@ -2,26 +2,23 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import tifffile
-from in_process import Loses
 from networks import FIDUCIALS, affine, rotation
 from numpy.typing import NDArray
-from projects import IMAGES, PITCH_MM, POINTS, TRUTH, camera_mm, ideal_mm, scan_px
+from projects import IMAGES, PITCH_MM, POINTS, TRUTH, camera_mm, ideal_mm, scan_px, write_tables
 from scipy.spatial.distance import pdist
 
 from adjust import ObjectPoint
 from adjust.functional_model.lens import Distortion as OtherDistortion
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.transformation import Film as OtherFilm
-from measure import Code, Status
+from measure import Status
 from measure.tie_points.features import TieFrame
 from measure.tie_points.find_points import TieOptions, measure_ties
-from measure.tie_points.tracks import TieCandidate
 from pipeline import InputError, build_network, read_images, read_project
 from pipeline.blocks.block_stage import A_CELL, CELLS, feature_precision, oriented_by_control, tie_marks, written_block
 from pipeline.blocks.mapping import (
@@ -83,8 +80,7 @@ def test_natural_points_are_where_the_scene_says(tmp_path: Path) -> None:
             start = next(i for i in marks if name in marks[i] and marks[i][name].quality.get("reference"))
             place = marks[start][name].center_px
             assert place is not None
-            assert mark.center_px is not None
-            errors.append(mark.center_px - transferred(place[None], geometry[start], geometry[image])[0])
+            errors.append(np.asarray(mark.center_px) - transferred(place[None], geometry[start], geometry[image])[0])
             claimed.append(mark.quality["sigma_to_reference_px"])
     assert len(errors) > 41
     assert np.sqrt(np.mean(np.square(errors))) < 0.1
@@ -95,39 +91,6 @@ def test_natural_points_are_where_the_scene_says(tmp_path: Path) -> None:
     for own in marks.values():
         observed = [mark.center_px for mark in own.values() if mark.status in (Status.MEASURED, Status.WEAK)]
         assert pdist(np.array(observed)).min() > 26.0, "patches of 31 px overlap"
-
-
-@pytest.mark.study
-def test_a_worker_that_is_ended_costs_its_scan_or_its_point_and_none_else(tmp_path: Path) -> None:
-    """One process is ended over scan d, another one over a point; and scan e is gone."""
-    images = (*SCENE.images, replace(SCENE.images[0], name="d"), replace(SCENE.images[0], name="e"))
-    truth = render_scene(replace(SCENE, images=images), tmp_path)
-    frames = [tie_frame(frame.geometry, tmp_path) for frame in truth.frames]
-    frames[4].scan.unlink()
-    points = list[TieCandidate]()
-
-    def is_deadly(_: object, args: tuple[Any, ...]) -> bool:
-        """Of a scan and of a point that begins a chunk."""
-        item = args[1][0]
-        if isinstance(item, TieFrame):
-            return item.image == "d"
-        if isinstance(item, tuple) and isinstance(item[0], TieCandidate):
-            points.append(item[0])
-            return np.array_equal(item[0].maps[item[0].reference], points[0].maps[points[0].reference])
-        return False
-
-    ties = measure_ties(frames, TieOptions(wanted=6), workers=Loses(is_deadly))
-    assert {image: [reason.code for reason in own] for image, own in ties.problems.items()} == {
-        "d": [Code.UNREACHABLE],
-        "e": [Code.UNREACHABLE],
-    }
-    assert "its process was ended" in str(ties.problems["d"][0])
-    assert "e.tif" in str(ties.problems["e"][0])
-    marks = [mark for image in "abc" for mark in ties.marks[image]]
-    lost = [mark for mark in marks if Code.UNREACHABLE in mark.reason.codes]
-    assert len(lost) == 3
-    assert {mark.status for mark in lost} == {Status.REJECTED}
-    assert sum(mark.status is Status.MEASURED for mark in marks) >= 15
 
 
 PROJECT = """camera = "camera.toml"
@@ -145,37 +108,16 @@ ROWS = "image,point,kind,x_mm,y_mm\n" + "".join(
 
 
 def written(folder: Path, project: str = PROJECT) -> Path:
-    (folder / "camera.toml").write_text(CAMERA)
-    (folder / "points.csv").write_text("point,X,Y,Z,sX,sY,sZ\n7,1.0,2.0,3.0,,,0.01\n8,5.0,2.0,3.0,,,0.01\n")
-    (folder / "comparator.csv").write_text(ROWS)
-    (folder / "project.toml").write_text(project)
-    return folder / "project.toml"
+    points = ["point,X,Y,Z,sX,sY,sZ", "7,1.0,2.0,3.0,,,0.01", "8,5.0,2.0,3.0,,,0.01"]
+    return write_tables(folder, project, camera=CAMERA, points=points, comparator=ROWS)
 
 
-def test_of_natural_points_the_height_of_the_ground_is_known(tmp_path: Path) -> None:
+def test_natural_points_have_the_ground_s_height_and_names_of_their_own(tmp_path: Path) -> None:
     project = read_project(written(tmp_path))
     network, _ = build_network(project, read_comparator(project.comparator))
     assert Prior(42.0, 0.05) == network.point_by_id["tie0001"].Z
     assert network.point_by_id["tie0001"].X is None
     assert Prior(3.0, 0.01) == network.point_by_id["7"].Z
-
-
-@pytest.mark.parametrize(
-    ("ties", "words"),
-    [
-        ("images = 2", "two prove nothing"),
-        ("wanted = 0", "at least 1"),
-        ("height = 3.0", "height_sigma"),
-        ("hight = 3.0", "hight"),
-    ],
-)
-def test_a_wrong_table_is_refused(tmp_path: Path, ties: str, words: str) -> None:
-    path = written(tmp_path, f'camera = "camera.toml"\n[ties]\n{ties}\n')
-    with pytest.raises(InputError, match=words):
-        read_project(path)
-
-
-def test_given_points_do_not_take_the_names_of_natural_points(tmp_path: Path) -> None:
     path = written(tmp_path)
     (tmp_path / "points.csv").write_text("point,X,Y,Z\ntie7,1,2,3\n")
     with pytest.raises(InputError, match="'tie7'"):
@@ -234,17 +176,27 @@ def disagree(block: Mapped, off_px: float) -> Mapped:
 
 
 def place_mm(point: ComparatorPoint) -> NDArray[np.float64]:
-    assert point.xy_mm is not None
-    return point.xy_mm
+    return np.asarray(point.xy_mm)
 
 
-def test_tracks_come_back_into_turned_and_mirrored_scans() -> None:
+def test_tracks_come_back_into_turned_mirrored_and_cut_scans() -> None:
     marks = tie_marks(disagree(mapped(), 0.4), PICTURES)
     assert {mark.image for mark in marks} == {"f0", "f1", "f2", "f3"}
     for mark in marks:
         col, row = scan_px(int(mark.image[1:]), camera_mm(int(mark.image[1:])))[int(mark.point.removeprefix("tie-"))]
         np.testing.assert_allclose(place_mm(mark), [col * PITCH_MM, -row * PITCH_MM], atol=1e-9)
         assert mark.kind == "tie"
+    block = disagree(mapped(), 0.4)
+    marks = tie_marks(block, [half_picture(i) for i in IMAGES])
+    whole = {(mark.image, mark.point): mark for mark in tie_marks(block, PICTURES)}
+    assert len(marks) == len(whole)
+    assert {mark.image for mark in marks} == {f"f{i}{half}" for i in IMAGES for half in "lr"}
+    for mark in marks:
+        place = place_mm(whole[mark.image[:2], mark.point])
+        begin_mm = RIGHT_PX * PITCH_MM if mark.image.endswith("r") else 0.0
+        np.testing.assert_allclose(place_mm(mark), place - np.array([begin_mm, 0.0]), atol=1e-9)
+        col = place[0] / PITCH_MM
+        assert col < LEFT_PX if mark.image.endswith("l") else col > RIGHT_PX
 
 
 LEFT_PX, RIGHT_PX = 1500, 1000  # the left scan of a frame ends at the one column, the right one begins at the other
@@ -258,20 +210,6 @@ def half_picture(i: int) -> BlockPicture:
     right = FrameChain(PITCH_UM, OtherFilm("affine", moved, np.array(TRUTH.middle_mm) - (begin_mm, 0.0)))
     scans = (BlockScan(f"f{i}l", chain(i), LEFT_PX, 2500), BlockScan(f"f{i}r", right, 2500 - RIGHT_PX, 2500))
     return replace(PICTURES[i], scans=scans)
-
-
-def test_tracks_of_a_frame_that_was_scanned_in_parts_come_back_into_the_scan_that_shows_them() -> None:
-    block = disagree(mapped(), 0.4)
-    marks = tie_marks(block, [half_picture(i) for i in IMAGES])
-    whole = {(mark.image, mark.point): mark for mark in tie_marks(block, PICTURES)}
-    assert len(marks) == len(whole)
-    assert {mark.image for mark in marks} == {f"f{i}{half}" for i in IMAGES for half in "lr"}
-    for mark in marks:
-        place = place_mm(whole[mark.image[:2], mark.point])
-        begin_mm = RIGHT_PX * PITCH_MM if mark.image.endswith("r") else 0.0
-        np.testing.assert_allclose(place_mm(mark), place - np.array([begin_mm, 0.0]), atol=1e-9)
-        col = place[0] / PITCH_MM
-        assert col < LEFT_PX if mark.image.endswith("l") else col > RIGHT_PX
 
 
 def test_their_standard_deviation_is_that_of_features_of_their_size() -> None:
@@ -396,11 +334,3 @@ def test_the_camera_that_colmap_is_given_counts_from_the_corner() -> None:
     assert fx == fy == pytest.approx(TRUTH.c / PITCH_MM)
     assert (cx, cy) == pytest.approx(lattice_px(np.array([TRUTH.x0, TRUTH.y0])) + 0.5)
     assert rest == [0.0] * 4
-
-
-def test_marks_are_written_as_they_were_read(tmp_path: Path) -> None:
-    marks, _ = control(2)
-    (tmp_path / "c.csv").write_text(points_text(marks, {"f0": PITCH_UM}), encoding="utf-8")
-    for mark, again in zip(marks, read_comparator(tmp_path / "c.csv"), strict=True):
-        assert (mark.image, mark.point, mark.kind) == (again.image, again.point, again.kind)
-        np.testing.assert_allclose(place_mm(again), place_mm(mark), atol=1e-7)

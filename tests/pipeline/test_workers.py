@@ -11,9 +11,7 @@ from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from range_server import range_server
 
 from pipeline import InputError, workers
 from pipeline.workers import LocalPool, SubmittedAgain, WorkerKilled, cluster_executor, worker_pool
@@ -29,14 +27,6 @@ def count_up(told: Path) -> None:
         number += 1
 
 
-def factorise(told: Path) -> None:
-    """What is almost always in a library."""
-    told.write_text(str(os.getpid()), encoding="utf-8")
-    matrix = np.random.default_rng(1).normal(size=(1500, 1500))
-    while True:
-        np.linalg.svd(matrix)
-
-
 def wait_for_a_pipe(told: Path) -> None:
     """What waits for the operating system."""
     os.mkfifo(pipe := told.with_suffix(".pipe"))
@@ -44,12 +34,7 @@ def wait_for_a_pipe(told: Path) -> None:
     pipe.open("rb").read()
 
 
-def rest(told: Path) -> None:
-    """A process without work."""
-    told.write_text(str(os.getpid()), encoding="utf-8")
-
-
-KINDS = {work.__name__: work for work in (count_up, factorise, wait_for_a_pipe, rest)}
+KINDS = {work.__name__: work for work in (count_up, wait_for_a_pipe)}
 
 
 def begin(kind: str, told: Path) -> None:
@@ -114,6 +99,16 @@ def test_a_killed_process_is_replaced_and_its_task_begun_again(tmp_path: Path) -
         assert list(pool.map(square, range(4))) == [0, 1, 4, 9]
 
 
+def test_a_process_killed_without_a_task_is_replaced_and_what_a_task_raises_is_its_own() -> None:
+    with worker_pool(1, workers=1) as pool:
+        with pytest.raises(ValueError, match="invalid literal"):
+            pool.submit(int, "a").result(60)
+        first = pool.submit(process).result(60)
+        os.kill(first, signal.SIGKILL)
+        time.sleep(0.2)
+        assert pool.submit(process).result(60) != first
+
+
 def test_a_script_without_a_guard_starts_the_workers_once(tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(
@@ -137,14 +132,6 @@ def test_a_task_that_kills_its_process_twice_is_given_up_and_none_else(tmp_path:
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_a_process_killed_without_a_task_is_replaced() -> None:
-    with worker_pool(1, workers=1) as pool:
-        first = pool.submit(process).result(60)
-        os.kill(first, signal.SIGKILL)
-        time.sleep(0.2)
-        assert pool.submit(process).result(60) != first
-
-
 def test_a_process_killed_on_its_way_says_nothing_of_the_task(tmp_path: Path) -> None:
     with worker_pool(1, workers=1) as pool:
         killed = {pool.submit(process).result(60)}
@@ -165,13 +152,6 @@ def test_where_no_process_stands_tasks_are_given_up(monkeypatch: pytest.MonkeyPa
         for task in [pool.submit(square, number) for number in range(2)]:
             with pytest.raises(WorkerKilled):
                 task.result(60)
-
-
-def test_what_a_task_raises_is_its_own() -> None:
-    with worker_pool(1, workers=1) as pool:
-        with pytest.raises(ValueError, match="invalid literal"):
-            pool.submit(int, "a").result(60)
-        assert pool.submit(square, 3).result(60) == 9
 
 
 def test_a_process_that_is_begun_while_the_pool_ends_is_ended_too(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -219,16 +199,12 @@ def test_a_killed_worker_loses_nothing_and_is_replaced(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(InputError, match=r"reseau\[cluster\]"), cluster_executor("local", []):
-        pass
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_a_scheduler_that_does_not_answer_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cluster_that_cannot_be_had_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workers, "_ANSWER_S", 0.5)
     with pytest.raises(InputError, match="no scheduler answers there"), cluster_executor("tcp://127.0.0.1:9", []):
+        pass
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"reseau\[cluster\]"), cluster_executor("local", []):
         pass
 
 
@@ -263,31 +239,6 @@ def test_workers_are_requested_their_versions_and_their_way_to_the_scans() -> No
     for words, answer in cases.items():
         with pytest.raises(InputError, match=words):
             workers._check_workers(Answers({"a": good, "b": answer}), "x", [])
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_one_scan_a_folder_is_inspected_for(tmp_path: Path) -> None:
-    for folder in ("a", "b"):
-        (tmp_path / folder).mkdir()
-        for name in "12":
-            (tmp_path / folder / name).write_bytes(b"1")
-    scans = [str(tmp_path / place) for place in ("a/0", "a/1", "a/2", "b/1", "c/1")]
-    assert workers._one_a_folder([*scans, ""]) == [str(tmp_path / "a/1"), str(tmp_path / "b/1")]
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_addresses_are_inspected_for_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("measure.scans.remote._WAITS_S", (0.01,))
-    for name in ("a/1.tif", "a/2.tif", "closed/1.tif", "closed/2.tif"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_bytes(b"1")
-    with range_server(tmp_path) as server:
-        scans = [f"{server.url}/{name}" for name in ("closed/1.tif", "a/1.tif", "closed/2.tif", "a/2.tif")]
-        assert workers._one_a_folder(scans) == [f"{server.url}/a/1.tif"]
-        _, missing = workers._versions_and_unreachable(scans[:2])
-        ((scan, why),) = missing
-    assert scan == scans[0]
-    assert "forbids to read it (403)" in why
 
 
 class Loses(Executor):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from projects import keep_scans
+from projects import fiducial_tables, keep_scans
 from rich.console import Console
 
 from measure.annotations import text as networks_module
@@ -73,7 +73,7 @@ def test_empty_columns_of_images_csv_are_filled_and_nothing_else_is_touched(tmp_
     assert dict(read_images(path).camera) == {"a": "c.toml", "b": ""}
 
 
-def test_two_scans_that_say_the_same_frame_are_reported() -> None:
+def test_two_scans_that_say_the_same_frame_are_reported_unless_they_are_parts() -> None:
     lines = [line(text) for text in TITLES]
     first, second, other = note_same_frames(
         [scan("a", lines), scan("b", lines), scan("c", lines[:-2])], lambda image: ""
@@ -82,10 +82,6 @@ def test_two_scans_that_say_the_same_frame_are_reported() -> None:
     assert "that of b" in first.frame.problems[0]
     assert "that of a" in second.frame.problems[0]
     assert other.frame.problems == ()
-
-
-def test_scans_of_parts_of_one_frame_are_meant_to_say_the_same() -> None:
-    lines = [line(text) for text in TITLES]
     halves = note_same_frames([scan("a", lines), scan("b", lines)], lambda image: "8617")
     assert all(half.frame.problems == () for half in halves)
 
@@ -164,16 +160,10 @@ def test_what_single_frames_do_not_tell_they_tell_together() -> None:
     }
     doubted = replace(scans[1], frame=replace(scans[1].frame, problems=(Reason("not told.", Code.CHANCE),)))
     assert not poses_of_roll([scans[0], doubted], WILD)["b"].decided
-
-
-def test_one_stamp_on_many_frames_tells_no_more_than_one() -> None:
     stamp: Written = ("LIBRARY OF FILMS", "270", "right")
     scans = [posed(name, "0", (f"LIBRARY COPY {name}", *stamp[1:])) for name in "1234"]
     poses = poses_of_roll(scans, WILD)
     assert not any(pose.decided for pose in poses.values())
-
-
-def test_a_frame_that_is_settled_tells_the_others_how_they_lie() -> None:
     known = posed("a", "90", TITLE, places=())
     known = replace(known, frame=replace(known.frame, pose=replace(known.frame.pose, decided=True)))  # type: ignore[type-var]
     poses = poses_of_roll([known, posed("b", "180", TITLE, name="90", places=())], ())
@@ -234,15 +224,6 @@ def test_a_few_frames_of_a_roll_are_read_and_the_others_know_by_what() -> None:
         assert add_known_lines(none, measure, Reporter(Console(quiet=True))) == (tuple(none), {})
 
 
-def test_the_frames_that_are_read_hardly_change_with_one_scan_more() -> None:
-    def first(*more: str) -> set[str]:
-        silent = Reporter(Console(quiet=True))
-        tasks = roll_tasks([*(f"{number:04d}" for number in range(200)), *more])
-        return set(add_known_lines(tasks, lambda own: (scan(task.name, ()) for task in own), silent)[1])
-
-    assert max(len(first() - first(f"more{number}")) for number in range(20)) <= 1
-
-
 RC10 = parse_camera(
     Table({**CAMERA, "name": "Wild RC10, 153 mm", "principal_distance_mm": 153.0}, Path("camera.toml"), "")
 )
@@ -260,9 +241,6 @@ def test_a_plate_is_held_against_the_cameras_file() -> None:
     other = add_plates(RC10, [scan("a", [line("Nr 1234 305.12")])], {})[0]
     assert "not of Wild RC10, 153 mm: it gives a principal distance of 305.12 mm" in other.frame.problems[0]
     assert other.notes == ()
-
-
-def test_plates_of_two_cameras_under_one_file_are_reported() -> None:
     first, second, mute = add_plates(
         RC10, [scan("a", [line("Nr 13043")]), scan("b", [line("Nr 13022")]), scan("c", [])], {}
     )
@@ -324,26 +302,6 @@ ring_mm = 0.5
 ring_line_mm = 0.1
 arm_mm = 0.8
 line_mm = 0.1
-[[camera.fiducial]]
-id = "1"
-xy_mm = [-10.0, -10.0]
-sigma_mm = 0.005
-mark = "m"
-[[camera.fiducial]]
-id = "2"
-xy_mm = [10.0, 10.0]
-sigma_mm = 0.005
-mark = "m"
-[[camera.fiducial]]
-id = "3"
-xy_mm = [-10.0, 10.0]
-sigma_mm = 0.005
-mark = "m"
-[[camera.fiducial]]
-id = "4"
-xy_mm = [10.0, -10.0]
-sigma_mm = 0.005
-mark = "m"
 [field]
 kind = "natural"
 [picture]
@@ -362,7 +320,11 @@ name = "a"
 position = [0.0, 0.0, 100.0]
 angles_deg = [0.0, 0.0, 0.0]
 pose = "90m"
-"""
+""" + fiducial_tables(
+    {"1": (-10, -10), "2": (10, 10), "3": (-10, 10), "4": (10, -10)},
+    'sigma_mm = 0.005\nmark = "m"\n',
+    "camera.fiducial",
+)
 
 
 @pytest.mark.study
