@@ -16,8 +16,6 @@ from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Decentering, Distortion, Lens, Prior
 from adjust.functional_model.projection import EARTH_RADIUS_M, sight_vectors
 from adjust.functional_model.rotation import (
-    angles_from_rotation,
-    rotation_from_angles,
     rotation_from_vector,
 )
 from adjust.problem.condition_equations import compute, computed_observations, derivatives
@@ -74,13 +72,6 @@ def test_image_equations_by_complex_steps(family: str, decentering: Decentering)
 def test_a_rotation_vector_is_the_rotation_of_other_programs(length: float) -> None:
     vector = length * np.array([2.0, -3.0, 6.0]) / 7.0
     np.testing.assert_allclose(rotation_from_vector(vector), Rotation.from_rotvec(vector).as_matrix(), atol=1e-14)
-
-
-def test_angles_of_any_rotation() -> None:
-    for matrix in Rotation.random(50, rng=np.random.default_rng(8)).as_matrix():
-        np.testing.assert_allclose(rotation_from_angles(angles_from_rotation(matrix)), matrix, atol=1e-12)
-    locked = rotation_from_angles(np.array([0.4, np.pi / 2, 0.3]))
-    np.testing.assert_allclose(rotation_from_angles(angles_from_rotation(locked)), locked, atol=1e-12)
 
 
 @pytest.mark.parametrize("by_elements", [False, True])

@@ -336,19 +336,6 @@ def test_what_is_there_is_significant_and_what_is_not_is_not() -> None:
     assert min(p["p1"], p["p2"], p["decentering"], p["x0"], p["y0"]) > 0.01
 
 
-@pytest.mark.study
-def test_superfluous_parameters_have_evenly_spread_p() -> None:
-    """p of p1, of the pair and of the priors' departures are uniform where these are true (Kolmogorov-Smirnov)."""
-    truth = Truth(distortion={})
-    points = field_points(np.random.default_rng(1), 6)
-    found = []
-    for seed in range(40):
-        network, start = simulated(np.random.default_rng(seed), truth, points=points)
-        found.append(p_values(adjust(free_all(network, "p1", "p2"), start)))
-    for name in ("p1", "decentering", "x0", "c"):
-        assert stats.kstest([p[name] for p in found], "uniform").pvalue > 0.01, name
-
-
 def test_what_is_fixed_or_without_a_solution_is_not_tested() -> None:
     network, start = simulated(np.random.default_rng(2))
     result = adjust(network, start)

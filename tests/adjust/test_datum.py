@@ -263,17 +263,6 @@ def test_no_attitude_is_singular() -> None:
     assert result.value("EO.f0.phi") == pytest.approx(half, abs=1e-6)
 
 
-def test_cofactors_of_each_are_parts_of_the_whole_matrix() -> None:
-    """Of points and of images, in a free network and in one with fixed coordinates."""
-    network, start = simulated(np.random.default_rng(5), point_sigma=np.inf, free={"k3": np.inf})
-    for result in (adjust(network, start, Options(datum="minimal")), adjust(network, start, Options(datum="free"))):
-        for prefix, count in (("PT.", 3), ("EO.", 6)):
-            groups = np.flatnonzero(np.char.startswith(result.names, prefix)).reshape(-1, count)
-            expected = [result.cofactor.part(at) for at in groups]
-            found = result.cofactor.parts(groups)
-            np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
-
-
 @pytest.mark.parametrize("datum", ["minimal", "free"])
 def test_a_datum_that_is_given_is_left_alone(datum: Datum) -> None:
     """Known points, and points with standard deviations: nothing is free, and nothing more is fixed."""

@@ -232,19 +232,6 @@ def test_what_was_measured_does_not_matter() -> None:
         assert other.sigma(name) == pytest.approx(one.sigma(name), rel=1e-12)
 
 
-def test_twice_as_large_errors_give_twice_as_large_sigmas() -> None:
-    """Of what observations alone determine: no prior has a say."""
-    network, values = simulated(np.random.default_rng(5), noise=False, fiducial_sigma=0.0)
-    network = give_values(network, NO_INTERIOR)
-    rows = network.observations
-    coarse = replace(network, observations=replace(rows, covariance_mm2=4.0 * rows.covariance_mm2))
-    fine, doubled, factor = plan(network, values), plan(coarse, values), plan(network, values, sigma0=2.0)
-    for name in fine.adjustment.names:
-        assert doubled.sigma(name) == pytest.approx(2.0 * fine.sigma(name), rel=1e-9)
-        assert factor.sigma(name) == pytest.approx(2.0 * fine.sigma(name), rel=1e-9)
-    assert factor.adjustment.sigma0 == pytest.approx(2.0)
-
-
 def test_a_singular_network_still_determines_the_rest() -> None:
     """Juhl's field of known heights: not c, x0', y0', but all nine deformations as if these were known."""
     case = load("ii_juhl_3photos")

@@ -47,18 +47,6 @@ def test_parameters_of_a_lens_without_distortion_are_zero(name: str) -> None:
     assert not found.lens.values[1:].any()
 
 
-def test_frasers_terms_are_browns_with_the_other_sign() -> None:
-    given = {"k1": 1e-4, "k2": -1e-7, "p1": 5e-6, "p2": -8e-6, "b1": 1e-4, "b2": -2e-4}
-    found = convert_lens(
-        Lens(Distortion("brown"), INTERIOR, values("brown", **given)), Distortion("australis"), CORNERS_MM
-    )
-    assert found.is_same
-    np.testing.assert_allclose(found.lens.parameters, -values("brown", **given), rtol=1e-8)
-    back = convert_lens(found.lens, Distortion("brown"), CORNERS_MM)
-    used = [0, 1, 2, 3, 4, 6, 7, 8, 9]  # k3 is 0 and certain: nothing takes its place
-    np.testing.assert_allclose((back.by_source @ found.by_source)[np.ix_(used, used)], np.eye(9), atol=1e-6)
-
-
 def test_what_is_0_and_uncertain_has_its_counterpart() -> None:
     """A lens that is yet to be found: k3 and p1 free at 0 are k1 and p1, and nothing else."""
     lens = Lens(Distortion("torlegard"), INTERIOR, np.zeros(7))

@@ -8,7 +8,7 @@ from networks import EIGHT_MARKS_MM, HALF_MM, Truth, bent_films, field_points, s
 from numpy.typing import NDArray
 
 from adjust import Distortion, Options, Prior, adjust, approximate
-from adjust.model_selection.candidates import Candidate, Model, f_test, lenses, nested_tests, simplest_sufficient
+from adjust.model_selection.candidates import Candidate, Model, f_test, lenses, simplest_sufficient
 from adjust.model_selection.cross_validation import CrossValidation, cross_validate, folds
 from adjust.model_selection.model_choice import Choice, choose, weighted_network
 from adjust.problem.network import Network, ObjectPoint, Transformation
@@ -156,15 +156,6 @@ def test_what_has_no_solution_is_not_chosen() -> None:
     good = candidate("k3", 300.0, 1.0)
     assert simplest_sufficient([broken, good]) is good
     assert simplest_sufficient([broken]) is None
-
-
-def test_neighbours_alone_are_tested() -> None:
-    ladder = [candidate(names, vpv, 1.0) for names, vpv in (("", 900.0), ("k3", 400.0), ("k3 k5", 300.0))]
-    tests = nested_tests(ladder)
-    assert [(test.simpler.name, test.richer.name) for test in tests] == [
-        ("affine, no distortion", "affine, torlegard k3"),
-        ("affine, torlegard k3", "affine, torlegard k3 k5"),
-    ]
 
 
 def test_akaikes_criteria_in_closed_form() -> None:

@@ -153,15 +153,6 @@ def test_an_undetected_error_of_an_earlier_calibration_moves_the_camera_as_state
         assert wrong.value(name) - clean.value(name) == pytest.approx(result[name].effect, rel=0.01)
 
 
-def test_the_redundancies_of_everything_add_up() -> None:
-    network, start = exact_network()
-    result = adjust(network, start)
-    tests = assess_reliability(result)
-    assert tests.redundancy.sum() == pytest.approx(result.redundancy)
-    assert sum(group.redundancy for group in result.groups.values()) == pytest.approx(result.redundancy)
-    np.testing.assert_allclose(tests.redundancy[: len(network.observations)], result.residuals.redundancy)
-
-
 def test_w_of_an_observation_does_not_depend_on_the_weight_that_it_was_left() -> None:
     """Nearly without weight it is predicted by the others; the test is that of the observation as it was given."""
     network, start = simulated(np.random.default_rng(5), fiducial_sigma=0.01)

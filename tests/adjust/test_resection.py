@@ -145,16 +145,6 @@ def test_relative_orientation_is_among_the_poses(relief: float, tilt_rad: float,
         assert all(np.linalg.det(found.rotation) == pytest.approx(1.0) for found in poses)
 
 
-def test_relative_orientation_from_exact_rays_is_exact_and_first() -> None:
-    rng = np.random.default_rng(2)
-    pose, first, _ = pair(0.3, 0.3, 12, rng)
-    points = first / -first[:, 2:] * rng.uniform(2.0, 4.0, (12, 1))
-    exact = (points - pose.center) @ pose.rotation.T
-    found = relative_poses(points, exact, np.random.default_rng(0))[0]
-    np.testing.assert_allclose(found.rotation, pose.rotation, atol=1e-6)
-    np.testing.assert_allclose(found.center, pose.center, atol=1e-6)
-
-
 def model_in_space(rng: np.random.Generator) -> tuple[Array, Array, Array, Array]:
     """Model points and stations, and the same in the object space, the cameras above."""
     points = rng.uniform(-1.0, 1.0, (12, 3)) * [900.0, 900.0, 200.0] + [5e4, 2e4, 300.0]

@@ -118,16 +118,6 @@ def test_all_disks_of_a_frame_and_nothing_else() -> None:
     assert len(hit) >= 31
 
 
-def test_a_disk_on_the_border_of_two_blocks_is_found_once() -> None:
-    rng = np.random.default_rng(4)
-    picture = GROUND + rng.normal(0, NOISE, (1700, 120))
-    center = np.array([60.2, 1535.9])
-    picture[1500:1570] += CONTRAST * drawn(ellipse(center - (0, 1500), np.eye(2) * 7), 120, 70, 0.9)
-    found = fitted_disks(scan_of(picture), DiskSearch((8.0, 24.0)))
-    assert len(found) == 1
-    assert np.abs(found[0].center_px - center).max() < 0.03
-
-
 @pytest.mark.parametrize(("snr", "blur_px"), [(10.0, 0.7), (50.0, 1.5)])
 def test_disks_of_all_sizes_are_found_nearly_where_they_are(snr: float, blur_px: float) -> None:
     """From every reduction of the scan, also beside its edge; 0.15 px, or three times the best there is."""

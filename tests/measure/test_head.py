@@ -53,14 +53,6 @@ def test_the_head_says_what_the_opened_scan_does(
     assert head.file_format == {".tif": "TIFF", ".jpg": "JPEG", ".png": "PNG"}[path.suffix]
 
 
-def test_the_resolution_of_jpeg_and_png_files_is_read(tmp_path: Path) -> None:
-    path = written(tmp_path / "a.jpg", GREY)
-    data = bytearray(path.read_bytes())
-    data[13:18] = bytes([1, 1270 >> 8, 1270 & 255, 1270 >> 8, 1270 & 255])  # JFIF: dots an inch
-    path.write_bytes(data)
-    assert read_head(path).pitch.um == pytest.approx((20.0, 20.0))
-
-
 def test_no_picture_is_decoded_for_its_head(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise AssertionError("decoded")

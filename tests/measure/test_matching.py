@@ -118,14 +118,6 @@ def test_clean_marks_are_unbiased_at_every_phase(name: str, blur_px: float) -> N
         assert fit.contrast_dn == pytest.approx(CONTRAST, rel=0.03)
 
 
-def test_the_windows_origin_counts() -> None:
-    shown, place = draw_mark("cross", 1.0)[0]
-    here = match(ScanWindow(shown * CONTRAST), MARKS["cross"], placed(SCALE, tuple(place[:, 2])))
-    moved = placed(SCALE, tuple(place[:, 2] + (1000, 2000)))
-    there = match(ScanWindow(shown * CONTRAST, (1000, 2000)), MARKS["cross"], moved)
-    np.testing.assert_allclose(there.center_px - here.center_px, [1000, 2000], atol=1e-6)
-
-
 @parametrize_with_studies("disturbance", ["dark mark", "gradient", "8 bit"])
 def test_disturbances_that_cost_nothing(disturbance: str) -> None:
     rng = np.random.default_rng(11)

@@ -11,7 +11,7 @@ from measure import FiducialOptions, MarkFit, MatchOptions, match
 from measure.detection.localisation import MarkPrediction
 from measure.fiducials.mark_fit import detect_mark
 from measure.matching.covariance import second_order
-from measure.matching.window import Coding, clipped_sides, noise_scale, read_window
+from measure.matching.window import clipped_sides, noise_scale, read_window
 from measure.noise.grain import _KERNELS, GRAIN_PX, PATCH_PX, PLANE, grain_model
 from measure.noise.noise_model import influence_covariances, noise_model, steadiness
 from measure.targets.disks import fit_disk
@@ -152,15 +152,6 @@ def test_disks_in_whole_grey_values_are_as_far_off_as_they_say() -> None:
         covariances.append(disk.covariance_px2)
     assert np.sqrt(np.mean(np.square(errors))) < 0.0025
     assert 0.7 < whitened_rms(errors, covariances) < 1.3
-
-
-def test_the_step_is_that_of_all_grey_values() -> None:
-    for grey, step in (([60.0, 61, 64, 60], 1.0), ([514.0, 257, 1028], 257.0)):
-        steps = Coding(np.array(grey)).steps_dn(np.ones(len(grey), bool))
-        assert steps is not None
-        assert np.all(steps == step)
-    for grey in ([0.3, 1.0, 1.1, 1.5], [60.0] * 4):
-        assert Coding(np.array(grey)).steps_dn(np.ones(4, bool)) is None
 
 
 @pytest.mark.parametrize("noise_dn", [1.0, 10.0])

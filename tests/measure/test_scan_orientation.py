@@ -28,7 +28,7 @@ from studies import parametrize_with_studies
 
 from measure import FrameMeasurement, MatchOptions, Scan, ScanWindow, Status, match, measure_fiducials
 from measure.annotations.fields import KnownLine, Line, Reading, read_from_one_face
-from measure.annotations.orientation_from_text import main_pose, side_in_camera, writing_likelihoods
+from measure.annotations.orientation_from_text import side_in_camera, writing_likelihoods
 from measure.detection.localisation import localise
 from measure.fiducials import mark_fit
 from measure.fiducials.constellation import Placement
@@ -36,7 +36,7 @@ from measure.fiducials.measure_frame import measure_frame, rename_frame
 from measure.fiducials.options import FiducialOptions, Reads
 from measure.fiducials.orientation_pictures import Drawings, MarkSite, PosedMark
 from measure.fiducials.search import FrameSearch, pitch_hypotheses
-from measure.geometry import POSES, pose_in_camera, up_from_camera
+from measure.geometry import POSES, pose_in_camera
 from measure.marks.shapes import (
     FiducialLayout,
     LayoutMark,
@@ -124,19 +124,6 @@ def test_without_a_known_place_only_the_mirror_is_reported() -> None:
 def test_what_reads_the_same_in_all_ways_says_nothing() -> None:
     assert writing_likelihoods([line("808808808808", "0", "top", share=1.0)], (), POSES) == pytest.approx([0.0] * 8)
     assert writing_likelihoods([], WILD, POSES) == pytest.approx([0.0] * 8)
-
-
-def test_sides_follow_the_poses_own_definition() -> None:
-    towards: dict[Side, tuple[int, int]] = {"left": (-1, 0), "right": (1, 0), "top": (0, 1), "bottom": (0, -1)}
-    for pose in POSES:
-        for side, direction in towards.items():
-            assert np.allclose(up_from_camera(pose) @ towards[side_in_camera(side, pose)], direction)
-
-
-def test_most_of_the_writing_lies_one_way_or_there_is_none() -> None:
-    assert main_pose([line("DEVELOPMENT", "90", "left"), line("5804", "0", "top")]) == "90"
-    assert main_pose([line("ABCDE", "90", "left"), line("5804", "0", "top")]) == ""
-    assert main_pose([]) == ""
 
 
 def test_lines_are_read_from_the_face_that_most_reads_from() -> None:

@@ -36,13 +36,6 @@ def test_reduced_is_the_mean_of_its_pixels(tmp_path: Path, factor: int, tile: tu
         np.testing.assert_allclose(scan.reduced(factor), blocks.mean(axis=(1, 3)), rtol=2e-6)
 
 
-def test_a_window_of_the_reduced_scan_is_that_part_of_it(tmp_path: Path) -> None:
-    tifffile.imwrite(tmp_path / "s.tif", picture(np.uint8, 3), tile=(64, 64), photometric="rgb")
-    with open_scan(tmp_path / "s.tif") as scan:
-        whole = scan.reduced(3)
-        np.testing.assert_allclose(scan.reduced_window(3, 20, 11, 31, 27), whole[11:38, 20:51], rtol=1e-5)
-
-
 def recorded_reads(scan: Scan, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
     """The segments, by row and column, that are decoded from now on."""
     reads, original = list[tuple[int, int]](), scan._segments.read

@@ -212,12 +212,6 @@ def test_hills_are_no_outliers() -> None:
     assert alarms <= 4, "of 12,000 points 1.2 may be"
 
 
-def test_too_few_points_tell_nothing() -> None:
-    first, second = seen_twice(np.random.default_rng(4), relief=0.0, count=20)
-    second[7] += [0.0, 400.0]
-    assert not neighbour_outliers(first, second).any()
-
-
 SIDE, ROWS, FEW_ROWS = 700, 320, 200  # px: of the picture, and of its upper part that is scanned
 
 
