@@ -87,6 +87,16 @@ def test_errors_are_as_large_as_their_sigmas_say(blur_px: float, alone: bool) ->
     assert np.abs(np.mean(errors, axis=0)).max() < 0.4  # 2.8 standard deviations
 
 
+@pytest.mark.parametrize("blur_px", [0.5, 1.5])
+def test_the_junction_lies_where_the_squares_meet(blur_px: float) -> None:
+    rng = np.random.default_rng(7)
+    for _ in range(8):
+        center, steps = SIZE // 2 + rng.uniform(-0.5, 0.5, 2), board_steps(rng)
+        corner = fit_mark(square_picture(center, steps, blur_px, False), center, steps, False)
+        assert corner.junction_px is not None
+        assert np.abs(corner.junction_px - center).max() < 0.03
+
+
 def test_trap_pixel_locking() -> None:
     """Without noise the error stays below 0.004 px wherever the corner lies in its pixel: no grid of any kind."""
     rng = np.random.default_rng(3)
