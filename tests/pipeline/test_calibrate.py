@@ -244,9 +244,7 @@ def test_a_folder_of_pictures_gives_intrinsics_in_pixels(result: dict[str, Any],
     assert re.search(r"fx = 520\.\d+ ± 0\.\d+ px", (out / "out" / "report.html").read_text(encoding="utf-8"))
 
 
-def test_the_lens_that_was_chosen_is_printed_with_its_choice(
-    result: dict[str, Any], calibrations: list[Calibration]
-) -> None:
+def test_the_chosen_lens_is_printed(result: dict[str, Any], calibrations: list[Calibration]) -> None:
     (camera,) = calibrations[0].cameras
     scores: dict[LensModel, float | None] = {"opencv4": 0.1624, "opencv5": 0.158, "fisheye": None}
     text = io.StringIO()
@@ -454,9 +452,7 @@ def test_a_fisheye_is_tried_where_the_field_is_wide(monkeypatch: pytest.MonkeyPa
         ({4: 3.0, 5: 3.0, 8: 3.0, "fisheye": 1.0}, "fisheye"),
     ],
 )
-def test_of_lenses_that_predict_as_well_the_one_with_fewer_parameters_is_taken(
-    errors: dict[int | str, float], wanted: LensModel
-) -> None:
+def test_of_lenses_as_good_the_simplest_is_taken(errors: dict[int | str, float], wanted: LensModel) -> None:
     network = board_network(np.random.default_rng(4), 6, ERROR_PX * PIXEL_MM)
     scatter = np.random.default_rng(1).uniform(0.9, 1.1, (9, len(network.images)))
 

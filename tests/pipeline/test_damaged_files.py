@@ -174,9 +174,7 @@ def damaged_covariance(how: str, data: bytes) -> bytes:
         ("twice", "'IO.K.x0' is named twice"),
     ],
 )
-def test_files_that_contradict_each_other_are_refused(
-    sound: Path, tmp_path: Path, refusal: Refusal, how: str, words: str
-) -> None:
+def test_contradicting_files_are_refused(sound: Path, tmp_path: Path, refusal: Refusal, how: str, words: str) -> None:
     project = copied(sound, tmp_path / "project")
     file = project.parent / "earlier" / "adjustment.npz"
     file.write_bytes(damaged_covariance(how, file.read_bytes()))

@@ -268,9 +268,7 @@ def drawn_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_a_folder_is_measured_by_one_command(
-    drawn_library: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_is_measured(drawn_library: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     """Beside a film scan of a known camera: a photograph, a scan of no camera, and a broken file. What follows the
     measuring is left out here."""
     monkeypatch.setattr(stages, "run_all", stages.run_measure)
@@ -296,9 +294,7 @@ def test_a_folder_is_measured_by_one_command(
     assert "1 of 1 scan measured in an earlier run" in again.err
 
 
-def test_photographs_alone_and_out_without_a_folder_are_refused(
-    tmp_path: Path, capsys: Capture, refusal: Refusal
-) -> None:
+def test_photographs_alone_are_refused(tmp_path: Path, capsys: Capture, refusal: Refusal) -> None:
     photograph(tmp_path / "p" / "IMG_1.jpg", board=(7, 5))
     assert run(["run", str(tmp_path / "p"), "--out", str(tmp_path / "o")]) == 2
     message = capsys.readouterr().err

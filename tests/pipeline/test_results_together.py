@@ -225,9 +225,7 @@ def test_an_end_after_measuring_leaves_all_as_it_was(project: Path, monkeypatch:
 
 
 @pytest.mark.study
-def test_a_process_ended_on_the_second_pass_costs_no_other(
-    project: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_ended_second_pass_costs_no_other(project: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     """The visits are shared among processes as the first ones are: one of them is ended over frame2."""
 
     def is_deadly(_: object, args: tuple[Any, ...]) -> bool:
