@@ -15,6 +15,7 @@ from adjust.problem.network import Image, Network
 from adjust.problem.parameter import Parameter, description
 
 TARGETS_NEEDED = 3
+LARGEST_SIGMA = 0.02  # standard deviation of most marks, relative to half the extent of an image's marks
 DEFINITE = 1e-13  # smallest eigenvalue of an earlier calibration's correlation matrix
 
 Faults = Iterator[str]  # sentences; the first one is raised
@@ -37,6 +38,7 @@ def validate_plan(network: Network) -> None:
         _fiducial_distance_faults,
         _calibration_faults,
         _value_faults,
+        _sigma_faults,
         _part_faults,
         _image_faults,
     ):
@@ -259,6 +261,18 @@ def _place_faults(network: Network) -> Faults:
                 f"image {observations.image[order[start]]}: all its {count} {kind} are at one place, ({x:g}, {y:g}) "
                 "mm. Correct them, or leave the image out."
             )
+
+
+def _sigma_faults(network: Network) -> Faults:
+    """Standard deviations of most marks that are a large part of the images: another unit."""
+    sigma_mm = np.sqrt(np.trace(network.observations.covariance_mm2, axis1=1, axis2=2) / 2.0)
+    half_mm = np.array([network.extent_by_image[name].half_mm for name in network.observations.image])
+    if np.median(sigma_mm / half_mm) > LARGEST_SIGMA:
+        yield (
+            f"The standard deviations of the marks, {np.median(sigma_mm):.3g} mm in the middle, are "
+            f"{100.0 * np.median(sigma_mm / half_mm):.2g} % of half the extent of the marks in an image: they are in "
+            "another unit, or of another picture. Give them in mm (sx_mm, sy_mm) or µm (sigma_target_um)."
+        )
 
 
 def _part_faults(network: Network) -> Faults:

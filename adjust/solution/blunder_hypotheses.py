@@ -18,17 +18,19 @@ from adjust.functional_model.lens import Prior
 from adjust.problem.camera import Camera
 from adjust.problem.estimates import adjusted_image, adjusted_places
 from adjust.problem.network import Network, ObjectPoint
-from adjust.problem.parameter import Parameter
-from adjust.solution.left_out_images import leave_out
+from adjust.problem.parameter import Parameter, shortened
 from adjust.solution.result import Adjustment
 
 TOLERATED = 2.0  # factor on the given standard deviations up to which residuals need no explanation
 CHECKED = 10  # smallest redundancy for an explanation
-FEWEST_IMAGES = 3  # images needed to identify a mirrored one
-MOST_MIRRORED = 6  # images left out in turn, largest residuals first
+FEWEST_LINEAR = 8  # points of an image that tell by a linear transformation whether it is mirrored
+FLAT_FIELD = 0.05  # relative thickness of a field below which that is not told
+NAMED = 5  # images named in a message
 MOST_PAIRS = 15  # pairs of frames tried as exchanged, largest residuals first
+HEIGHTS = 10.0  # sigma0 that heights in another unit leave at least
 UNITS = (1000.0, 100.0, 10.0, 0.3048)  # ratios of length units: m, dm, cm, mm, feet
 FACTORS = (*UNITS, *(1.0 / each for each in UNITS))
+HEIGHT_FACTORS = (0.3048, 1.0 / 0.3048)  # of heights in feet beside m, or the reverse
 
 AXES = {  # blunders that mirror the points, and the matrices that correct them
     **{f"the sign of {'XYZ'[i]} of all points is wrong": np.diag(1.0 - 2.0 * np.eye(3)[i]) for i in range(3)},
@@ -88,7 +90,14 @@ def network_hypotheses(
         by = factor * np.eye(3)
         remedy = "Give both in the unit that [object] unit names."
         yield [NetworkHypothesis(unit_words(factor), _move_points(network, by), remedy, by)]
-    alone = _exchanged_frames(network, given), _mirrored_images(network, given, trials), _distances(network)
+    has_relief = len({place[2] for place in network.known_places.values()}) > 1
+    for factor in (
+        HEIGHT_FACTORS if has_relief and (given is None or not given.converged or given.sigma0 > HEIGHTS) else ()
+    ):
+        by, how = np.diag([1.0, 1.0, factor]), "large" if factor < 1.0 else "small"
+        words = f"Z of all points is {max(factor, 1.0 / factor):.4g} times too {how} for X and Y: another unit"
+        yield [NetworkHypothesis(words, _move_points(network, by), moved=by)]
+    alone = _exchanged_frames(network, given), _mirrored_images(network), _distances(network)
     yield from ([each] for each in chain(*alone))
 
 
@@ -141,38 +150,53 @@ def reversed_y(network: Network, keeps_given: bool = False) -> Network:
     return replace(network, cameras=tuple(cameras), observations=replace(network.observations, xy_mm=xy_mm))
 
 
-def _mirrored_images(network: Network, given: Adjustment | None, trials: Trials) -> Iterator[NetworkHypothesis]:
-    """Hypothesis: one image of a digital camera is mirrored, if all others agree without it; worst images first."""
-    worst = list(_worst_images(network, given, films=False))
-    for name in worst[:MOST_MIRRORED] if len(worst) >= FEWEST_IMAGES else ():
-        others = leave_out(network, [network.image_by_name[name].frame])
-        rest = None if others is None else trials.adjust(others)
-        if rest is not None and trials.explains(rest):
-            remedy = "Mirror its picture and measure it again, or its coordinates in comparator.csv."
-            yield NetworkHypothesis(f"image {name} is mirrored", _mirrored_image(network, name, rest), remedy)
-            return
+def _mirrored_images(network: Network) -> Iterator[NetworkHypothesis]:
+    """Hypothesis: those digital images are mirrored that a linear transformation of the given points shows so."""
+    rows = ~network.observations.is_fiducial
+    names = []
+    for number, image in enumerate(network.images):
+        own = np.flatnonzero(rows & (network.image_numbers == number))
+        known = [row for row in own if network.observations.point[row] in network.known_places]
+        places = np.array([network.known_places[network.observations.point[row]] for row in known]).reshape(-1, 3)
+        if image.transformation == "none" and _is_mirrored(places, network.observations.xy_mm[known]):
+            names.append(image.name)
+    if 0 < len(names) < len(network.images):
+        who = f"image {names[0]} is" if len(names) == 1 else f"the images {shortened(names, NAMED)} are"
+        remedy = "Mirror these pictures and measure them again, or their coordinates in comparator.csv."
+        turned = mirrored_images(network, names)
+        # Where the image centre is unknown, mirrored images get a principal point of their own.
+        other = {
+            each.name: each if each.frame_mm[0] else replace(each, name=f"{each.name}~") for each in turned.cameras
+        }
+        images = tuple(
+            replace(image, camera=other[image.camera].name) if image.name in names else image for image in turned.images
+        )
+        cameras = (*turned.cameras, *(each for name, each in other.items() if each.name != name))
+        yield NetworkHypothesis(f"{who} mirrored", replace(turned, images=images, cameras=cameras), remedy)
 
 
-def _mirrored_image(network: Network, name: str, rest: Adjustment) -> Network:
-    """Mirror one image of a network."""
-    # Where the image centre is unknown, the image gets its own principal point, with the lens of the other images.
-    turned = mirrored_images(network, [name])
-    camera = network.camera_by_name[network.image_by_name[name].camera]
-    if camera.frame_mm[0]:
-        return turned
-    known = {
-        each: Prior(rest.value(Parameter.interior(camera.name, each))) for each in ("c", *camera.distortion.parameters)
-    }
-    own = replace(
-        camera,
-        name=f"{camera.name} ({name})",
-        principal_distance_mm=known.pop("c"),
-        x0_mm=None,
-        y0_mm=None,
-        distortion=replace(camera.distortion, parameters=known),
-    )
-    images = tuple(replace(image, camera=own.name) if image.name == name else image for image in turned.images)
-    return replace(turned, images=images, cameras=(*turned.cameras, own))
+def _is_mirrored(xyz: Array, xy_mm: Array) -> bool:
+    """Whether the direct linear transformation of points (n, 3) to an image (n, 2) is that of a mirrored one.
+
+    Mirror images of flat fields are images.
+    """
+    if len(xyz) < FEWEST_LINEAR:
+        return False
+    (xyz, extents), (xy, _) = (_normalised(each) for each in (xyz, xy_mm))
+    if extents[-1] < FLAT_FIELD * extents[0]:
+        return False
+    at, none = np.column_stack([xyz, np.ones(len(xyz))]), np.zeros((len(xyz), 4))
+    rows = [np.hstack([at, none, -xy[:, :1] * at]), np.hstack([none, at, -xy[:, 1:] * at])]
+    projection = np.linalg.svd(np.vstack(rows), full_matrices=False)[2][-1].reshape(3, 4)
+    depths = at @ projection[2]
+    return bool(np.linalg.det(projection[:, :3]) * np.median(depths) > 0.0)
+
+
+def _normalised(places: Array) -> tuple[Array, Array]:
+    """Places about their centroid, of size 1, and their singular values."""
+    centred = places - places.mean(axis=0)
+    extents = np.linalg.svd(centred, compute_uv=False)
+    return centred / max(extents[0], 1e-300), extents
 
 
 def mirrored_images(network: Network, names: Sequence[str]) -> Network:

@@ -60,7 +60,8 @@ def model_hypotheses(run: Run) -> Iterator[ModelHypothesis]:
     used = run.problem.unknowns.camera.keys() - network.idle_cameras
     cameras = [camera for camera in network.cameras if camera.name in used]
     is_grouped = any(each.name.endswith(OTHERS) for each in network.cameras)
-    for hypotheses in (_lens_terms,) if is_grouped else (_lens_terms, _second_interior_orientation):
+    always = _lens_terms, _wrong_interior_orientation
+    for hypotheses in always if is_grouped else (*always, _second_interior_orientation):
         for camera in cameras:
             yield from hypotheses(run, camera)
     yield from _scanner_pixels(run)
@@ -195,12 +196,24 @@ def _wrong_point(run: Run) -> Iterator[ModelHypothesis]:
     if network.boards or len(given) < FEWEST_GIVEN:
         return
     name = names[max(given, key=lambda k: squares[k])]
-    problem = _continued(run, network)
-    sigma, added = problem.unknowns.sigma.copy(), problem.unknowns.point[name]
-    sigma[added] = np.inf
-    freed = replace(problem, unknowns=replace(problem.unknowns, sigma=sigma))
+    added = unknowns.point[name]
     choices, contrasts = float(np.log(len(given))), len(added) * (len(given) - 1)
-    yield ModelHypothesis("point", partial(_point_words, name), freed, added, choices, contrasts)
+    yield ModelHypothesis("point", partial(_point_words, name), _freed(run, added), added, choices, contrasts)
+
+
+def _wrong_interior_orientation(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
+    """Wrong values of c, x0 and y0 that are given as exact."""
+    positions = run.problem.unknowns.camera[camera.name][: len(INTERIOR_NAMES)]
+    added = positions[run.problem.unknowns.sigma[positions] == 0.0]
+    if len(added):
+        yield ModelHypothesis("interior", partial(_interior_words, camera.name), _freed(run, added), added)
+
+
+def _freed(run: Run, positions: Indices) -> Problem:
+    problem = _continued(run, run.problem.network)
+    sigma = problem.unknowns.sigma.copy()
+    sigma[positions] = np.inf
+    return replace(problem, unknowns=replace(problem.unknowns, sigma=sigma))
 
 
 def _free_terms(camera: Camera) -> set[str]:
@@ -376,6 +389,19 @@ def _point_words(name: str, run: Run, added: Indices, _: float) -> tuple[str, st
     )
 
 
+def _interior_words(camera: str, run: Run, added: Indices, _: float) -> tuple[str, str]:
+    value, covariance = _estimate(run, added)
+    names, given = [run.problem.unknowns.parameters[i].quantity for i in added], run.problem.unknowns.given[added]
+    found = ", ".join(
+        f"{name} = {v:.5g} ± {s:.1g} in place of {g:.5g} mm"
+        for name, v, s, g in zip(names, value, np.sqrt(np.diag(covariance)), given, strict=True)
+    )
+    return (
+        f"The interior orientation given for camera {camera} as exact is not that of the images: {found}",
+        "Correct it, or give its standard deviations.",
+    )
+
+
 def _group_words(camera: str, groups: ImageGroups, run: Run, added: Indices, _: float) -> tuple[str, str]:
     """Describe two groups of images by the simplest differences of interior orientation that fit."""
     values, covariance = _estimate(run, np.concatenate([added, run.problem.unknowns.camera[camera][:3]]))
@@ -394,13 +420,19 @@ def _group_words(camera: str, groups: ImageGroups, run: Run, added: Indices, _: 
         (
             np.eye(3)[:, 1:],
             f"{who} have another principal point than the others, by ({difference[1]:+.4g}, {difference[2]:+.4g}) ± "
-            f"({sigma[1]:.1g}, {sigma[2]:.1g}) mm: images of different sizes in one camera (cropped)",
+            f"({sigma[1]:.1g}, {sigma[2]:.1g}) mm: images of different sizes in one camera (cropped), or turned or "
+            "mirrored pictures",
         ),
         (
             base[:, None] / np.linalg.norm(base),
             f"{who} are {scale:.5g} times as large as the others: images of different sizes in one camera (scaled)",
         ),
-        (np.eye(3), f"{who} have another interior orientation than the others"),
+        (
+            np.eye(3),
+            f"{who} have another interior orientation than the others: c is {1.0 + difference[0] / base[0]:.4g} times "
+            f"as long, the principal point ({difference[1]:+.4g}, {difference[2]:+.4g}) mm off (another camera, or "
+            "pictures cropped and enlarged)",
+        ),
     )
     costs = [_misfit(difference, spread, along) + 2.0 * along.shape[1] for along, _cause in readings]
     fitting = [each for each, cost in zip(readings, costs, strict=True) if cost < min(costs) + ALIKE]

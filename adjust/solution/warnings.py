@@ -35,6 +35,7 @@ def run_warnings(run: Run, cofactor: Cofactor, residuals: Residuals) -> list[str
         *_points_without_image(problem),
         *_films_by_targets(problem),
         *_swapped_numbers(run, residuals),
+        *_repeated_images(observations),
         *unchecked,
     ]
 
@@ -143,6 +144,22 @@ def _unchecked_orientations(observations: Observations, residuals: Residuals) ->
                 f"and an error of one of them would not show. Measure more targets in it."
             )
     return found
+
+
+def _repeated_images(observations: Observations) -> list[str]:
+    """Warn of images with the same coordinates of all marks: the same picture under two names."""
+    first, pairs = dict[bytes, str](), []
+    for name, rows in _rows_by_image(observations).items():
+        ordered = rows[np.argsort(np.array(observations.point)[rows], kind="stable")]
+        other = first.setdefault(observations.xy_mm[ordered].tobytes(), name)
+        if other != name:
+            pairs.append(f"{name} as {other}")
+    if not pairs:
+        return []
+    return [
+        f"All marks have the same coordinates in {shortened(pairs, NAMED)}: a picture under two names counts twice, "
+        "and standard deviations are too small. Leave one of them out."
+    ]
 
 
 def _rows_by_image(observations: Observations) -> dict[str, Indices]:

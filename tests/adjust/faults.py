@@ -545,6 +545,7 @@ class Effects:
     pitch: float = 1.0
     object_unit: float = 1.0
     mirrored: bool = False
+    group_mirrored: bool = False
     y_down: bool = False
 
 
@@ -569,6 +570,7 @@ class Misfit:
     frame_given: bool = False
     disk_radius: float = 0.0
     sigma: float = 1.0
+    point_held: bool = False
 
 
 def scene(seed: int, flat: bool) -> Scene:
@@ -608,7 +610,8 @@ def misfit_network(made: Scene, effects: Effects, kind: Misfit, rng: np.random.G
     middle = effects.pitch * MIDDLE_MM * [1.0, -1.0 if effects.y_down else 1.0]
     c = Prior(C_MM, 0.005) if kind.c_given else None
     frame = (float(2.0 * HALF_MM[0]), float(2.0 * HALF_MM[1])) if kind.frame_given else (0.0, 0.0)
-    camera = Camera("cam", c, None, None, Distortion("opencv", given), {}, (float(middle[0]), float(middle[1])), frame)
+    x0, y0 = (Prior(float(value) + 0.3, 0.0) if kind.point_held else None for value in middle)
+    camera = Camera("cam", c, x0, y0, Distortion("opencv", given), {}, (float(middle[0]), float(middle[1])), frame)
     exterior = _exteriors(made) if kind.stations_given else {}
     rows = [(*name, xy) for name, xy in zip(names, xy_mm, strict=True)]
     points = {f"p{k}": effects.object_unit * xyz for k, xyz in enumerate(made.points)}
@@ -649,7 +652,7 @@ def _projected(made: Scene, effects: Effects, kind: Misfit, image: int, rotation
         at += np.sign(effects.disk) * (center_of_gravity(imaged(points[:, None] + circle)) - imaged(points))
     at[:, 0] += own * effects.crop
     at[:, 1] += 0.7 * own * effects.crop
-    if effects.mirrored and image == int(np.argmax(made.groups)):
+    if (effects.mirrored and image == int(np.argmax(made.groups))) or (effects.group_mirrored and own):
         at[:, 0] = 2.0 * MIDDLE_MM[0] - at[:, 0]
     return np.asarray(at * (1.0 + own * effects.scale))
 
@@ -680,6 +683,19 @@ MISFITS = {
     "sizes: scaled": Misfit(lambda e: Effects(scale=0.01 * e), ("images of different sizes in one camera (scaled)",)),
     "sizes: cropped": Misfit(
         lambda e: Effects(crop=0.05 * e), ("images of different sizes in one camera (cropped)",), size=2
+    ),
+    "sizes: cropped and enlarged": Misfit(
+        lambda e: Effects(crop=-0.8, scale=0.3), ("pictures cropped and enlarged",), sized=False
+    ),
+    "principal point held wrong": Misfit(
+        lambda e: Effects(), ("camera cam as exact is not that of the images",), sized=False, point_held=True
+    ),
+    "a group of images mirrored, frame_mm": Misfit(
+        lambda e: Effects(group_mirrored=True), ("are mirrored",), sized=False, frame_given=True
+    ),
+    "Z in feet": Misfit(
+        lambda e: Effects(height=1.0 / 3.2808 - 1.0), ("Z of all points is 3.281 times", "along Z than"),
+        sized=False, boards=False,
     ),
     "lens: no radial term": Misfit(
         lambda e: Effects(radial=0.01 * e), ("have a radial pattern",), free=(), lens={}, size=2

@@ -38,6 +38,9 @@ QUICK = (
     "board stretched",
     "object stretched",
     "disks of another diameter",
+    "principal point held wrong",
+    "sizes: cropped and enlarged",
+    "Z in feet",
     "a point is elsewhere",
     "mm for m, stations in m",
     "noise too small",
@@ -138,6 +141,31 @@ def test_a_diameter_taken_as_exact_is_noted_where_c_depends_on_it() -> None:
     assert change_mm == pytest.approx(shifts_mm[1] - shifts_mm[0], rel=0.05)
     small = replace(kind, disk_radius=0.5)
     assert adjust(misfit_network(made, Effects(), small, None)).notes == ()
+
+
+def test_a_group_of_mirrored_images_is_named() -> None:
+    kind, made = MISFITS["a group of images mirrored, frame_mm"], scene(5, flat=False)
+    some = [f"im{i:02d}" for i in np.flatnonzero(made.groups)]
+    given = misfit_network(made, Effects(group_mirrored=True), kind, np.random.default_rng(1))
+    with pytest.raises(AdjustmentError, match=f"The images {', '.join(some)} are mirrored. Without this all"):
+        adjust(given)
+
+
+def test_one_picture_under_two_names_is_named() -> None:
+    given = misfit_network(scene(6, flat=True), Effects(), SOUND, np.random.default_rng(1))
+    rows, seen = np.array([name == "im02" for name in given.observations.image]), given.observations
+    twice = seen.only(np.append(np.arange(len(seen)), np.flatnonzero(rows)))
+    names = (*seen.image, *["copy"] * int(rows.sum()))
+    images = (*given.images, replace(given.image_by_name["im02"], name="copy"))
+    result = adjust(replace(given, observations=replace(twice, image=names), images=images))
+    assert ["copy as im02" in each for each in result.warnings] == [True]
+
+
+def test_standard_deviations_in_another_unit_are_refused() -> None:
+    given = misfit_network(scene(6, flat=True), Effects(), SOUND, None)
+    in_um = replace(given.observations, covariance_mm2=1e6 * given.observations.covariance_mm2)
+    with pytest.raises(AdjustmentError, match="another unit"):
+        adjust(replace(given, observations=in_um))
 
 
 def sound(frame_mm: tuple[float, float] = (12.8, 9.6), seed: int = 6) -> Network:
