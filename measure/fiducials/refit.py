@@ -117,7 +117,8 @@ def _refit_with_tone(frame: Frame) -> Frame:
     is_open = best.tone.disagreement > _AGREED and _depends_on_tone(best)
     for power in _OTHER_STARTS if is_open else ():
         other = _refit_from_curve(best, prior, prior.shift_to_power(power))
-        best = other if other.tone.disagreement < best.tone.disagreement else best
+        is_better = not other.tone.is_doubted and other.tone.disagreement < best.tone.disagreement
+        best = other if is_better else best
     return best
 
 
@@ -131,6 +132,9 @@ def _refit_from_curve(frame: Frame, prior: Tone, start: Tone) -> Frame:
             dict.fromkeys(_mark_tones(frame), frame.options.match),
         )
         pending = set()
+        estimate = FrameTone.from_marks(prior, _mark_tones(frame), start)
+        if estimate.is_doubted:
+            return replace(frame, tone=estimate)
     for _ in range(_TONE_ROUNDS):
         estimate = FrameTone.from_marks(prior, _mark_tones(frame), frame.scan.tone)
         moved = _moved_by_tone(frame, estimate)

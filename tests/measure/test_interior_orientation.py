@@ -85,6 +85,7 @@ def outlying(camera: Array, up: Array) -> list[int]:
 
 
 GRID = np.array([(10.0 * i, 10.0 * j) for i in range(-2, 3) for j in range(-2, 3)])
+LARGE = np.array([(5.0 * i, 5.0 * j) for i in range(-4, 5) for j in range(-4, 5)])
 
 
 @pytest.mark.parametrize(
@@ -94,6 +95,7 @@ GRID = np.array([(10.0 * i, 10.0 * j) for i in range(-2, 3) for j in range(-2, 3
         (EIGHT, {2: (0.9, -0.4), 5: (0.0, 0.6)}),
         (GRID, {7: (0.1, 0.0)}),  # well inside of the gate, far outside of the others' scatter
         (GRID[:20], {3: (0.28, 0.0), 16: (-0.25, 0.05)}),  # neither hides the other
+        (LARGE, {k: (0.08 * (-1) ** k, 0.1) for k in range(5, 75, 10)}),  # of many marks some are removed at once
     ],
 )
 def test_gross_errors_are_found_and_no_others(camera: Array, off_mm: dict[int, tuple[float, float]]) -> None:
