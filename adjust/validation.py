@@ -25,6 +25,7 @@ def validate(network: Network) -> None:
     """Raise AdjustmentError where a network is empty, contradictory or lacks what an image needs."""
     validate_plan(network)
     _raise_first(_place_faults(network))
+    _raise_first(_sigma_faults(network))
 
 
 def validate_plan(network: Network) -> None:
@@ -38,7 +39,6 @@ def validate_plan(network: Network) -> None:
         _fiducial_distance_faults,
         _calibration_faults,
         _value_faults,
-        _sigma_faults,
         _part_faults,
         _image_faults,
     ):
