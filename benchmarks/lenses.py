@@ -1,13 +1,10 @@
-"""Lens families and bent boards: claimed against realised standard deviations, and comparison with mrcal.
+"""Lens families and bent boards: claimed against realised standard deviations.
 
-RMS errors over standard deviations by parameter, and chi-square per degree of freedom with its two-sided 1 % limits;
-with --lens mrcal, one bent board compared with mrcal 2.2 (Debian's package).
+RMS errors over standard deviations by parameter, and chi-square per degree of freedom with its two-sided 1 % limits.
 Image coordinates are computed by the renderer, which has its own formulas, or by OpenCV; boards bend as in mrcal.
 """
 
-import json
-import subprocess
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import cast
 
@@ -24,7 +21,7 @@ from adjust.problem.camera import Camera
 from adjust.problem.network import Board, Image, Network, ObjectPoint
 from adjust.problem.observations import ObservationKind, Observations
 from adjust.solution.adjustment import adjust
-from benchmarks.harness import Row, table
+from benchmarks.harness import Row
 from synthetic_images.projection import camera_from_object
 from synthetic_images.scene import Distortion as SceneDistortion
 from synthetic_images.scene import Family, SceneCamera
@@ -46,27 +43,9 @@ ATTITUDES = [(0.0, 0.0, 0.1), (0.5, 0.1, 1.6), (-0.5, 0.2, 3.1), (0.1, 0.5, -1.5
 ACROSS, DOWN, SPACING_MM = 10, 7, 30.0
 BENDS_MM = (0.9, -0.5)
 TURNS = [(0.0, 0.0, 0.0), (0.5, 0.0, 0.3), (-0.5, 0.1, 1.2), (0.1, 0.55, -0.7), (0.0, -0.5, 2.0), (0.4, -0.4, -2.1)]
-MRCAL = """
-import json, sys, numpy as np, mrcal
-task = json.load(sys.stdin)
-xy = np.array(task["pixels"])
-views, rows, columns = xy.shape[:3]
-observations = np.concatenate([xy, np.ones((views, rows, columns, 1))], axis=-1)
-indices = np.stack([np.arange(views), np.zeros(views), -np.ones(views)], axis=1).astype(np.int32)
-inputs = dict(
-    intrinsics=np.array([task["start"]]), extrinsics_rt_fromref=np.zeros((0, 6)),
-    frames_rt_toref=np.array(task["frames"]),
-    points=None, observations_board=observations, indices_frame_camintrinsics_camextrinsics=indices,
-    observations_point=None, indices_point_camintrinsics_camextrinsics=None,
-    lensmodel="LENSMODEL_OPENCV4", imagersizes=np.array([[4000, 3000]], dtype=np.int32),
-    calobject_warp=np.zeros(2), calibration_object_spacing=task["spacing"], do_optimize_intrinsics_core=True,
-    do_optimize_intrinsics_distortions=True, do_optimize_extrinsics=False, do_optimize_frames=True,
-    do_optimize_calobject_warp=True, do_apply_regularization=False, do_apply_outlier_rejection=False, verbose=False)
-for _ in range(3):
-    stats = mrcal.optimize(**inputs)
-print(json.dumps({"warp": inputs["calobject_warp"].tolist(), "intrinsics": inputs["intrinsics"][0].tolist(),
-                  "rms": stats["rms_reproj_error__pixels"]}))
-"""
+
+
+COLUMNS = {"lens": "", "parameters": "d", **dict.fromkeys(("least", "largest", "chi-square", "from", "to"), ".3f")}
 
 
 def cells() -> Iterator[Row]:
@@ -75,22 +54,13 @@ def cells() -> Iterator[Row]:
 
 def case(lens: str, seed: int, sets: int = 200) -> Row:
     """Adjust `sets` of random errors from one start. sets: about a minute for 40."""
-    if lens == "mrcal":
-        return {"compared": list(compare_mrcal(seed))}
     if lens == "bent board":
         true = dict(zip(("BD.board.bend_x", "BD.board.bend_y"), BENDS_MM, strict=True)) | {"IO.C.k1": -0.08}
-        return simulate(lambda rng: board_network(rng)[0], true | {"IO.C.c": 20.0}, sets, seed)
+        return simulate(board_network, true | {"IO.C.c": 20.0}, sets, seed)
     family = cast(Family, lens)
     c, values = LENSES[family]
     true = {f"IO.C.{name}": value for name, value in {**values, "x0": POINT_MM[0], "y0": POINT_MM[1], "c": c}.items()}
     return simulate(partial(lens_network, family), true, sets, seed)
-
-
-def report(rows: Sequence[Row]) -> Iterator[str]:
-    figures = dict.fromkeys(("least", "largest", "chi-square", "from", "to"), ".3f")
-    yield from table({"lens": "", "parameters": "d"} | figures, [row for row in rows if "least" in row])
-    columns = {"": "", "mrcal": ".8g", "here": ".8g", "sigma": ".2g", "differs by, sigmas": ".1e"}
-    yield from table(columns, (line for row in rows for line in row.get("compared", ())))
 
 
 def simulate(drawn: Drawn, true: dict[str, float], sets: int, seed: int) -> Row:
@@ -127,14 +97,13 @@ def lens_network(name: Family, rng: np.random.Generator | None) -> Network:
     )
 
 
-def board_network(rng: np.random.Generator | None) -> tuple[Network, Array, Array]:
-    """Six views of a bent board by OpenCV: network, poses of the board in mrcal's form (v, 6), and places (v, n, 2)."""
+def board_network(rng: np.random.Generator | None) -> Network:
+    """Six views of a bent board by OpenCV."""
     t, u = np.meshgrid(np.linspace(0.0, 1.0, ACROSS), np.linspace(0.0, 1.0, DOWN))
     flat = np.stack([t.ravel() * (ACROSS - 1), u.ravel() * (DOWN - 1), 0.0 * t.ravel()], axis=1) * SPACING_MM
     real = flat.copy()
     real[:, 2] = (4.0 * (t - t**2) * BENDS_MM[0] + 4.0 * (u - u**2) * BENDS_MM[1]).ravel()
     rows: list[tuple[int, int, Array]] = []
-    poses = []
     for i, angles in enumerate(TURNS):
         rotation = Rotation.from_euler("xyz", angles)
         shift = np.array([0.0, 0.0, 420.0]) - rotation.as_matrix() @ flat.mean(axis=0)
@@ -144,11 +113,9 @@ def board_network(rng: np.random.Generator | None) -> tuple[Network, Array, Arra
         )
         projected, _ = cv2.projectPoints(real, rotation.as_rotvec(), shift, matrix, lens)
         rows += [(i, k, place) for k, place in enumerate(np.reshape(projected, (-1, 2)) * [1.0, -1.0])]
-        poses.append(np.concatenate([rotation.as_rotvec(), shift]))
     camera = Camera("C", None, None, None, Distortion("opencv", {"k1": Prior(0.0, np.inf)}))
     board = Board("board", {f"t{k}": place for k, place in enumerate(flat)})
-    network = make_network(camera, flat, rows, rng, (board,))
-    return network, np.array(poses), network.observations.xy_mm.reshape(len(TURNS), -1, 2)
+    return make_network(camera, flat, rows, rng, (board,))
 
 
 def make_network(
@@ -174,39 +141,3 @@ def make_network(
         ),
         boards=boards,
     )
-
-
-def compare_mrcal(seed: int) -> Iterator[Row]:
-    """Calibrate the same noisy views by both programs, with fx, fy, cx, cy, k1, k2, p1, p2 and the bends as
-    unknowns."""
-    pixel_mm = 0.005
-    network, poses, places = board_network(np.random.default_rng(seed))
-    free = dict.fromkeys(("k1", "k2", "p1", "p2", "b1"), Prior(0.0, np.inf))
-    network = Network(
-        (Camera("C", None, None, None, Distortion("opencv", free)),),
-        network.images,
-        network.points,
-        network.observations,
-        boards=network.boards,
-    )
-    found = adjust(network, approximate(network))
-    middle = np.array([2000.0, 1500.0])
-    pixels = places * [1.0, -1.0] / pixel_mm + middle
-    start = [20.0 / pixel_mm, 20.0 / pixel_mm, *middle, -0.08, 0.0, 0.0, 0.0]
-    task = {"pixels": pixels.reshape(len(TURNS), DOWN, ACROSS, 2).tolist(), "start": start, "frames": poses.tolist()}
-    text = json.dumps(task | {"spacing": SPACING_MM})
-    done = subprocess.run(["/usr/bin/python3", "-c", MRCAL], input=text, capture_output=True, text=True, check=True)
-    output = json.loads(done.stdout)
-    fx, fy, cx, cy, *lens = output["intrinsics"]
-    theirs = {
-        "BD.board.bend_x": output["warp"][0],
-        "BD.board.bend_y": output["warp"][1],
-        "IO.C.c": fy * pixel_mm,
-        "IO.C.b1": fx / fy - 1.0,
-        "IO.C.x0": (cx - middle[0]) * pixel_mm,
-        "IO.C.y0": (middle[1] - cy) * pixel_mm,
-        **dict(zip((f"IO.C.{name}" for name in ("k1", "k2", "p1", "p2")), lens, strict=True)),
-    }
-    for name, value in theirs.items():
-        here, sigma = found.value(name), found.sigma(name)
-        yield {"": name, "mrcal": value, "here": here, "sigma": sigma, "differs by, sigmas": (value - here) / sigma}
