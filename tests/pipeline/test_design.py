@@ -163,6 +163,7 @@ def test_points_and_cameras_of_other_files_can_be_varied_and_natural_points_not(
     [
         ("design.sigma_heigth", "Did you mean 'sigma_height'?"),
         ("exterior.tow.X0", "there is no image 'tow'. Did you mean 'two'? There are one, two."),
+        ("exterior.two.kapa_deg", "Did you mean 'kappa_deg'?"),
         ("image.two.position.4", "has no '4'"),
         ("field.points", "counts things"),
     ],
