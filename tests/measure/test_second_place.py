@@ -27,7 +27,7 @@ from measure.marks.shapes import (
     ring_cross,
     turned,
 )
-from measure.matching.covariance import LinearFit
+from measure.matching.covariance import LinearFit, across_edges
 from measure.noise.noise_model import NoiseModel, combined, correlated, products, weighted
 from measure.results import MarkFit, SecondPlace
 from measure.targets.disks import UNIT_DISK, fit_disk
@@ -103,6 +103,20 @@ def coarse(fine: NDArray[np.float64], col: int, row: int) -> NDArray[np.float64]
     rows = len(fine) // FOLD - 1
     part = fine[row : row + rows * FOLD, col : col + rows * FOLD]
     return np.asarray(part.reshape(rows, FOLD, rows, FOLD).mean(axis=(1, 3)))
+
+
+def test_the_sums_are_of_second_derivatives_across_the_edges() -> None:
+    """Of a picture with the same second derivatives everywhere, n'Hn summed over the edges' pixels is known."""
+    rng = np.random.default_rng(8)
+    slopes = np.zeros((2, SIZE, SIZE))
+    slopes[:, 15:-15, 15:-15] = rng.normal(size=(2, SIZE - 30, SIZE - 30))
+    weights = across_edges(slopes, 1.6)
+    row, col = np.mgrid[:SIZE, :SIZE] - SIZE / 2
+    for hessian in (np.diag([1.0, 0.0]), np.array([[0.0, 1.0], [1.0, 0.0]]), np.array([[0.4, -0.7], [-0.7, 1.1]])):
+        picture = (hessian[0, 0] * col**2 + 2 * hessian[0, 1] * col * row + hessian[1, 1] * row**2) / 2
+        across = np.einsum("irc,ij,jrc->rc", slopes, hessian, slopes) / np.maximum((slopes**2).sum(axis=0), 1e-300)
+        expected = (slopes * across).sum(axis=(1, 2))
+        np.testing.assert_allclose((weights * picture).sum(axis=(1, 2)), expected, rtol=0.01, atol=0.02)
 
 
 @pytest.mark.parametrize("is_grain", [False, True])
