@@ -168,6 +168,7 @@ class _Field:
             float(np.average(image[patch], weights=lit)) for image in (self.room_dn, self.ground_dn, self.texture_dn)
         )
         pairs = texture[:, 1:] & texture[:, :-1]
+        neighbours = np.stack([self.detail[:, 1:][pairs], self.detail[:, :-1][pairs]])
         contrast_dn = self.polarity * amplitude * room_dn
         fit = MarkFit(
             converged=True,
@@ -181,7 +182,9 @@ class _Field:
             blur_px=self.blur_px,
             damaged_fraction=max(1 - float(shown.sum() / drawn.sum()), 0.0),
             redundancy=int((lit > 0).sum()) - 3,
-            neighbour_correlation=float(np.corrcoef(self.detail[:, 1:][pairs], self.detail[:, :-1][pairs])[0, 1]),
+            neighbour_correlation=float(np.asarray(np.corrcoef(neighbours))[0, 1])
+            if neighbours.std(axis=1).all()
+            else 0.0,
             likeness=min(height / float(np.linalg.norm(self.detail[patch][lit > _LINE / 5 * lit.max()])), 1.0),
             significance=height / scatter,
         )

@@ -33,6 +33,7 @@ _WEIGHTED_STEPS = 4  # steps with the grain's weights; the place is nearly final
 _CLOSE_PX, _SETTLED_PX = 0.002, 0.02  # px: step that ends the iteration; longest last step accepted as converged
 _OUTLINE_BLUR_PX, _SHOWN = 0.3, 0.02  # blur (px) and fraction of the contrast that delimit the mark itself
 _GROUND = 0.1  # fraction of the mark's contrast: pixels that show less are background
+_OWN = 0.3  # fraction of the mark's contrast: pixels that show more are the mark
 
 
 class Model(Protocol):
@@ -220,8 +221,18 @@ class PictureFit:
         noise_dn = max(robust_scale(model.residuals[self.telling]), _DRAWN * self.contrast_dn, 1e-9)
         clipping_dn = model.noise_dn if model.is_clipped else 0.0  # noise assumed for clipped grey values
         self.variance_dn2 = max(noise_dn**2, clipping_dn**2)
-        self.scale_dn = max(noise_dn, _SCALE_FLOOR * self.contrast_dn) if robust else np.inf
+        self.scale_dn = max(noise_dn, self._misfit_dn(), _SCALE_FLOOR * self.contrast_dn) if robust else np.inf
         self.reason = gauss_newton(self, tolerance_px, _ITERATIONS, _HALVINGS).reason
+
+    def _misfit_dn(self) -> float:
+        """Robust scale of the residuals where the mark shows; 0 for few pixels.
+
+        Lines thinner than a pixel, or sharpened, deviate from their drawing by far more than the background's noise:
+        by that scale most of the mark would be taken for damage.
+        """
+        shown = np.abs(self.model.design[-GREY])
+        own = self.telling & (shown > _OWN * shown[self.area].max(initial=0.0))
+        return robust_scale(self.model.residuals[own]) if own.sum() >= _LEAST_AREA_PX else 0.0
 
     def _take_steadiness(self) -> None:
         """Estimate from the current residuals how the noise grows with light, and set the steadiness."""

@@ -315,7 +315,7 @@ def _likeness(fit: PictureFit) -> float:
     if fit.used.sum() <= len(background):
         return 0.0
     without = grey - combined(factors(background, grey), background)
-    unexplained = np.sum(fit.model.residuals[fit.used] ** 2) / max(np.sum(without**2), 1e-12)
+    unexplained = np.sum(fit.model.misfit[fit.used] ** 2) / max(np.sum(without**2), 1e-12)
     return float(np.sqrt(max(1 - unexplained, 0.0)))
 
 

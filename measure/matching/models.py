@@ -338,6 +338,13 @@ class PictureModel:
         return self.light - (self.uncensored if self.is_clipped else self.residuals) / self.steadiness
 
     @property
+    def misfit(self) -> Array:
+        """(height, width) residuals; those of clipped grey values are 0 where the model lies beyond the range, too."""
+        if not self.is_clipped:
+            return self.residuals
+        return np.where(self.clipped * self.uncensored < 0, 0.0, self.uncensored)
+
+    @property
     def scores(self) -> Array:
         """(height, width) scores, residuals times slopes: each pixel's contribution to the normal equations. Their mean
         is 0, their variance proportional to the information."""

@@ -5,12 +5,14 @@ from functools import cache
 
 import numpy as np
 import pytest
-from drawn import Array, brute_picture, placed
+from drawn import Array, brute_picture, placed, scan_of
 from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 
 from measure import MarkFit, MatchOptions, ScanWindow, match
 from measure.marks.shapes import Mark, MarkShape, MarkTemplate, cross, dot, polygon, ring_cross, ring_dot
+from measure.matching.window import read_window
+from measure.tone.curve import Tone
 
 SIZE, SCALE, CONTRAST, GROUND = 41, 10.0, 500.0, 1000.0
 MARKS = {
@@ -155,6 +157,32 @@ def test_dust_is_cut_out() -> None:
     assert np.sqrt(np.mean(np.square(dusty))) < 1.6 * np.sqrt(np.mean(np.square(clean)))
     assert 0.8 < np.sqrt(np.mean(np.square(ratios))) < 1.35
     assert 0.02 < np.mean(fractions) < 0.25
+
+
+def test_lines_that_a_scanner_sharpened_are_no_damage() -> None:
+    """Thinner than a pixel and than drawn, on ground with hardly any noise: they differ from the drawing throughout."""
+    rng, drawing = np.random.default_rng(29), MarkShape(ring_cross(1.0, 0.08, 1.6, 0.08, angle_deg=45.0))
+    film = MarkShape(ring_cross(1.0, 0.05, 1.6, 0.05, angle_deg=45.0))
+    for _ in range(6):
+        place = placed(SCALE, tuple((SIZE - 1) / 2 + rng.uniform(-0.5, 0.5, 2)), rng.uniform(0.02, 0.05))
+        shown = brute_picture(film, place, SIZE, SIZE, 0.3)
+        shown += 3.5 * (shown - gaussian_filter(shown, 1.0))
+        grey = GROUND + CONTRAST * shown + rng.normal(0, CONTRAST / 500, shown.shape)
+        fit = measure_picture(grey, drawing, place, rng)
+        assert fit.damaged_fraction < 0.02
+        assert np.hypot(*(fit.center_px - place[:, 2])) < 0.02
+
+
+def test_clipped_grey_values_are_like_a_drawing_beyond_the_range() -> None:
+    """A light mark whose lines are cut off, and half of its ground, under an unknown tone curve."""
+    rng = np.random.default_rng(31)
+    for shown, place in draw_mark("ring-cross", 1.0):
+        grey = 100 + 150 * shown + rng.normal(0, 10, shown.shape)
+        scan = scan_of((grey - 100) * 255 / 60, full_scale=255).replace_tone(Tone.unknown())
+        start = placed(SCALE, tuple(place[:, 2] + rng.uniform(-0.5, 0.5, 2)))
+        fit = match(read_window(scan, (0, 0, SIZE, SIZE)), MARKS["ring-cross"], start)
+        assert fit.likeness > 0.2
+        assert np.hypot(*(fit.center_px - place[:, 2])) < 0.1
 
 
 def test_a_large_speck_costs_what_it_covers() -> None:
