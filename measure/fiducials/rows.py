@@ -54,6 +54,8 @@ def absent_frame(
         "check whether the camera is that of the scan, the pitch right, and the film laid within "
         f"{rotation_deg:g} degrees of upright or of a quarter turn"
     )
+    if all(mark.mark.polarity != "auto" for mark in layout.marks):
+        remedy += ', and the scan no negative of what the camera file draws (polarity = "auto" takes both)'
     if Code.NO_FIT in reason.codes:
         remedy = "compare the drawings of these marks with the scan, or set tone under [measure] in the project"
     coarse = _too_coarse(layout, max(pitch_um)) if pitch_um else NO_REASON

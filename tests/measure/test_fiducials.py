@@ -170,6 +170,9 @@ def test_marks_places_decide_where_they_are_not_symmetric(tmp_path: Path) -> Non
 def test_dark_marks_and_an_unknown_pitch(tmp_path: Path) -> None:
     matrix = pixel_from_camera("0")
     negative = 20000 - frame_picture(NUMBERED, matrix)
+    light = [replace(mark, mark=replace(mark.mark, polarity="light")) for mark in NUMBERED.marks]
+    lost = measured(negative, replace(NUMBERED, marks=tuple(light)), tmp_path, pitch=False)
+    assert 'no negative of what the camera file draws (polarity = "auto" takes both)' in lost.problems[0]
     result = measured(negative, NUMBERED, tmp_path, pitch=False)
     assert result.pose is not None
     assert result.pose.name == "0"
