@@ -105,7 +105,8 @@ class Attempt:
         """Whether the earlier results make it unnecessary."""
         frame = found.frame if found.is_taken else None
         if self.is_repeated:
-            return found.is_taken or found.frame is None or not found.frame.failed_fits
+            # Another curve may cure fits that failed, and marks in their places that are unlike their drawings.
+            return found.is_taken or found.frame is None or not (found.frame.failed_fits or found.frame.agrees)
         if self.kind == "faint":
             return found.is_taken
         if self.kind == "given":
