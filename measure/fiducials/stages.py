@@ -156,7 +156,7 @@ def find_frame(
 
 
 def list_attempts(wide: FrameSearch, hypotheses: Sequence[Hypotheses], is_given: bool) -> list[Attempt]:
-    """List the attempts in order; where fits fail, that of the whole scan is repeated from other tone curves."""
+    """List the attempts in order. That of the whole scan may be repeated from other tone curves."""
     given, *others = hypotheses
     near, nearly = slightly_longer(given[0], _STRETCH) if is_given else ([], given)
     in_windows = is_given and not wide.options.part and is_searched_by_windows(wide.scan, wide.layout, given[0].mm)

@@ -202,8 +202,7 @@ def test_ordinary_frames_have_no_problem() -> None:
 @pytest.mark.parametrize("places", [FOUR, EIGHT])
 @pytest.mark.parametrize("count", [1, 4])
 def test_no_problem_names_a_mark_as_wrong_that_is_measured(places: list[tuple[float, float]], count: int) -> None:
-    """Over frames of bent film, with wrong marks and on wrong coordinates: what a problem says of single marks is
-    their status, and a measured mark is blamed by none."""
+    """Over frames of bent film, with wrong marks and on wrong coordinates."""
     rng, problems = np.random.default_rng(12), 0
     for off_px, film_mm, camera_mm in [(4.0, 0.005, 0.0), (0.0, 0.08, 0.0), (0.0, 0.005, 0.3), (30.0, 0.02, 0.0)]:
         layout = make_layout(places)
