@@ -31,6 +31,7 @@ _WAYS = 2  # scan orientations searched by known lines: more would take as long 
 _LEAST = 6  # letters and digits that a known line needs
 _TURNS = ("0", "90", "180", "270")  # directions of text in the camera's frame
 _SAME_VIEW = 0.005  # fraction of an image's longer side; in sets of boards no two images are nearer than 0.04
+_TARGET_WEIGHT = 0.1  # of distances of targets: in rectified scans of different frames they alone lie elsewhere
 _SAME_SCAN_PX = 0.2  # px: film that is laid on a scanner again lies many pixels elsewhere
 _FEWEST_COMMON = 4  # points in both of two images
 _SAME = ("run", "frames", "date")  # fields that identify a frame together with its number
@@ -216,25 +217,29 @@ def check_scans(camera: CameraFile, measured: Sequence[MeasuredScan], film: Beli
 
 
 def check_repeated_views(scans: Sequence[MeasuredScan], is_board: bool) -> list[MeasuredScan]:
-    """Reject a board's points in images that show it where another image does, and name scans of film stored twice.
+    """Reject a board's points in images that show it where another image does, and all marks of scans stored twice.
 
     The errors of lens, board and picture's processing repeat in such an image, so that it adds nothing to the other. A
-    scan stored again, in another format, size or orientation, has its fiducials at the same places of the picture.
+    scan stored again, in another format, size or orientation, has all marks at the same places of the picture.
     """
-    kind = "target" if is_board else "fiducial"
-    points = {name: at for at, name in enumerate(dict.fromkeys(m.point for s in scans for m in s.frame.marks))}
+    weights = {"target": 1.0} if is_board else {"fiducial": 1.0, "target": _TARGET_WEIGHT}
+    marks = dict.fromkeys((mark.kind, mark.point) for scan in scans for mark in scan.frame.marks)
+    points, weight = (
+        {mark: at for at, mark in enumerate(marks)},
+        np.array([weights.get(kind, 0.0) for kind, _ in marks]),
+    )
     sides_px = np.array([max(scan.width_px, scan.height_px, 1) for scan in scans])
     places = np.full((len(scans), len(points), 2), np.nan)  # from the centre, in sides, along the camera's axes
     for row, scan in enumerate(scans):
         up = up_from_camera(scan.frame.pose.name) if scan.frame.pose else np.eye(2)
         for mark in scan.frame.marks:
-            if mark.center_px is not None and mark.status.is_observation and mark.kind == kind:
+            if mark.center_px is not None and mark.status.is_observation and mark.kind in weights:
                 centred = mark.center_px + 0.5 - np.array([scan.width_px, scan.height_px]) / 2
-                places[row, points[mark.point]] = centred * (1, -1) @ up / sides_px[row]
+                places[row, points[mark.kind, mark.point]] = centred * (1, -1) @ up / sides_px[row]
     is_known = np.isfinite(places[..., 0])
     kept, repeated = list[int](), dict[int, MeasuredScan]()
     for row in np.argsort(-is_known.sum(axis=1), kind="stable").tolist():
-        apart = np.nan_to_num(np.hypot(*np.moveaxis(places[kept] - places[row], 2, 0))).max(axis=1, initial=0)
+        apart = np.nan_to_num(weight * np.linalg.norm(places[kept] - places[row], axis=2)).max(axis=1, initial=0)
         apart_px = apart * np.minimum(sides_px[kept], sides_px[row])
         is_comparable = (is_known[kept] & is_known[row]).sum(axis=1) >= _FEWEST_COMMON
         apart_px[~is_comparable] = np.inf
@@ -247,11 +252,14 @@ def check_repeated_views(scans: Sequence[MeasuredScan], is_board: bool) -> list[
 
 
 def _stored_twice(scan: MeasuredScan, original: MeasuredScan, apart_px: float) -> MeasuredScan:
+    first = original.frame.image
+    what = f"its marks lie where those of {first} do, to within {apart_px:.1f} px: both are the same scan"
     sentence = (
-        f"its marks lie where those of {original.frame.image} do, to within {apart_px:.1f} px: both are the same scan "
-        "(or rectified to the same places), and its marks count twice. Name one of both in `exclude`."
+        f"{what}, and its marks count once. To use this one, name {first} in `exclude`; where both are scans of "
+        "different frames, rectified to the same places, give the camera without fiducials."
     )
-    return scan.changed(problems=[Reason(sentence, Code.COPY)])
+    rejected = scan.restated(None, Status.REJECTED, Reason(f"{what}, which counts", Code.COPY))
+    return rejected.changed(problems=[Reason(sentence, Code.COPY)])
 
 
 def _repeated_view(scan: MeasuredScan, original: MeasuredScan, apart_px: float) -> MeasuredScan:

@@ -355,7 +355,7 @@ def test_a_board_at_the_same_place_counts_once() -> None:
     assert "it shows the board where first does to within 14.1 px" in checked["again"].frame.problems[0]
 
 
-def test_a_scan_that_is_stored_twice_is_named() -> None:
+def test_a_scan_that_is_stored_twice_counts_once() -> None:
     """In another format, and at twice the size and turned by a quarter; the next frame lies half a pixel elsewhere."""
 
     def scan(name: str, **changes: Any) -> MeasuredScan:
@@ -375,9 +375,17 @@ def test_a_scan_that_is_stored_twice_is_named() -> None:
     matrix = 2 * np.array([[0.0, 1.0], [-1.0, 0.0]])
     turned = moved(turned, matrix, (0.5, 2 * first.width_px - 1.5))
     scans = [first, moved(again, np.eye(2), 0.05), turned, moved(other, np.eye(2), (0.5, 0.0))]
-    problems = {each.frame.image: each.frame.problems for each in check_repeated_views(scans, False)}
-    assert {name: len(each) for name, each in problems.items()} == {"first": 0, "again": 1, "turned": 1, "other": 0}
-    assert "its marks lie where those of first do" in problems["turned"][0]
+    checked = {each.frame.image: each.frame for each in check_repeated_views(scans, False)}
+    left_out = {name for name, each in checked.items() if not any(mark.status.is_observation for mark in each.marks)}
+    assert left_out == {"again", "turned"} == {name for name, each in checked.items() if each.problems}
+    assert "its marks lie where those of first do" in checked["turned"].problems[0]
+    assert "name first in `exclude`" in checked["turned"].problems[0]
+    target = replace(first.frame.marks[0], kind="target")
+    rectified = [
+        replace(each, frame=replace(each.frame, marks=(*each.frame.marks, replace(target, center_px=np.array(at)))))
+        for each, at in ((first, (50.0, 80.0)), (again, (90.0, 80.0)))
+    ]
+    assert not any(each.frame.problems for each in check_repeated_views(rectified, False))
 
 
 def test_boards_as_project_files_have_them() -> None:
