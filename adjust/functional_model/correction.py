@@ -6,12 +6,15 @@ side, `ideal_point_family`), and distortion of the dimensionless ray (`ray_famil
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
 from adjust.array_types import Array
 from adjust.linear_algebra.small_matrices import applied
+
+STEP = 1e-30
 
 
 class Settings(Protocol):
@@ -31,13 +34,17 @@ class Settings(Protocol):
 class Correction:
     """Correction d (n, 2) in mm, subtracted from the observed point, and its derivatives.
 
-    xy_jacobian, by_principal_point (n, 2, 2); parameter_jacobian (n, 2, k).
+    xy_jacobian, by_principal_point (n, 2, 2); by_parameters: returns those (n, 2, k) by the parameters, on demand.
     """
 
     value: Array
     xy_jacobian: Array
     by_principal_point: Array
-    parameter_jacobian: Array
+    by_parameters: Callable[[], Array]
+
+    @cached_property
+    def parameter_jacobian(self) -> Array:
+        return self.by_parameters()
 
 
 @dataclass(frozen=True)
@@ -69,11 +76,15 @@ Correct = Callable[
 Image = Callable[[Settings, float, Array, Array], Imaged]  # arguments: settings, c, rays, parameters
 
 
+def complex_steps(function: Callable[[Array], Array], at: Array) -> Array:
+    """Derivatives (..., k) of a function by k numbers (..., k) or (k,), by complex steps: exact, but slower."""
+    return np.stack([function(at + 1j * STEP * unit).imag / STEP for unit in np.eye(at.shape[-1])], axis=-1)
+
+
 def no_correction(_: Settings, xy: Array, __: Array, parameters: Array) -> Correction:
     """Zero correction, of the object-side families and of `none`."""
-    count = len(xy)
-    nothing = [np.broadcast_to(0.0, (count, *shape)) for shape in ((2,), (2, 2), (2, 2), (2, len(parameters)))]
-    return Correction(*nothing)
+    zero = np.broadcast_to(0.0, (len(xy), 2, 2))
+    return Correction(zero[..., 0], zero, zero, lambda: np.broadcast_to(0.0, (len(xy), 2, len(parameters))))
 
 
 def straight(ray: Array) -> DistortedRay:

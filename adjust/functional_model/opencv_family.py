@@ -7,7 +7,7 @@ axes are x right and y DOWN, those of the camera here have y up. The parameters 
 import numpy as np
 
 from adjust.array_types import Array
-from adjust.functional_model.correction import DistortedRay, straight
+from adjust.functional_model.correction import DistortedRay, complex_steps, straight
 from adjust.linear_algebra.small_matrices import applied, matrices, product, vectors
 
 OPENCV_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y", "b1", "b2")
@@ -34,14 +34,14 @@ def opencv(ray: Array, parameters: Array) -> DistortedRay:
     tau_x, tau_y, the tilt of the sensor, in rad. b1 scales x and b2 shears it, as the camera matrix does: OpenCV's fx
     is c (1 + b1), its fy is c, the skew of Zhang's matrix is c b2, all over the pitch.
     """
-    tau_x, tau_y, b1, b2 = parameters[12:]
+    angles, (b1, b2) = parameters[12:14], parameters[14:]
     straight_lens = _lens(ray * DOWN, parameters[:12])
-    is_tilted = tau_x != 0.0 or tau_y != 0.0
-    tilted = _tilt(straight_lens.value, tau_x, tau_y) if is_tilted else straight(straight_lens.value)
+    is_tilted = bool(angles.any())
+    tilted = _tilt(straight_lens.value, angles) if is_tilted else straight(straight_lens.value)
 
     def parameter_derivative(k: int) -> Array:
         if OPENCV_NAMES[k] in ("tau_x", "tau_y"):
-            return _tilt(straight_lens.value, tau_x, tau_y).parameter_derivative(k - OPENCV_NAMES.index("tau_x"))
+            return _tilt(straight_lens.value, angles).parameter_derivative(k - OPENCV_NAMES.index("tau_x"))
         column = straight_lens.parameter_derivative(k)
         return applied(tilted.ray_jacobian, column) if is_tilted else column
 
@@ -156,38 +156,18 @@ def _lens(ray: Array, parameters: Array) -> DistortedRay:
     return DistortedRay(vectors(xd, yd), ray_jacobian, parameter_derivative)
 
 
-def _tilt(point: Array, tau_x: float, tau_y: float) -> DistortedRay:
-    """Project points onto a sensor that is tilted around its axes: R33 (r1 p / r3 p, r2 p / r3 p) - (R13, R23)."""
+def _tilt(point: Array, angles: Array) -> DistortedRay:
+    """Project points onto a sensor tilted by tau_x, tau_y: R33 (r1 p / r3 p, r2 p / r3 p) - (R13, R23)."""
     # r1, r2, r3 are the rows of R = Ry(tau_y) Rx(tau_x), p = (x, y, 1).
-    (rx, rx_by_angle), (ry, ry_by_angle) = _turn(tau_x, 0), _turn(tau_y, 1)
-    rotation, by_angles = ry @ rx, (ry @ rx_by_angle, ry_by_angle @ rx)
-    *over, depth = _turned(rotation, point)
-    over, size = [each / depth for each in over], rotation[2, 2] / depth
-    by_point = [
-        [size * (row[i] - at * rotation[2, i]) for i in (0, 1)] for row, at in zip(rotation, over, strict=False)
-    ]
+
+    def projected(point: Array, angles: Array) -> Array:
+        (cx, cy), (sx, sy), zero = np.cos(angles), np.sin(angles), 0.0
+        rotation = np.array([[cy, sy * sx, -sy * cx], [zero, cx, sx], [sy, -cy * sx, cy * cx]])
+        along = point @ rotation[:, :2].T + rotation[:, 2]
+        return np.asarray(rotation[2, 2] * along[:, :2] / along[:, 2:] - rotation[:2, 2])
 
     def angle_derivative(k: int) -> Array:
-        change = by_angles[k]
-        *shift, deeper = _turned(change, point)
-        return vectors(
-            *(size * (shift[i] - at * deeper) + change[2, 2] * at - change[i, 2] for i, at in enumerate(over))
-        )
+        return complex_steps(lambda moved: projected(point, moved), angles)[..., k]
 
-    value = [rotation[2, 2] * at - rotation[axis, 2] for axis, at in enumerate(over)]
-    return DistortedRay(vectors(*value), matrices(*by_point), angle_derivative)
-
-
-def _turned(matrix: Array, point: Array) -> list[Array]:
-    """Three coordinates (n,) of a matrix (3, 3) times (x, y, 1)."""
-    x, y = point.T
-    return [row[0] * x + row[1] * y + row[2] for row in matrix]
-
-
-def _turn(angle: float, axis: int) -> tuple[Array, Array]:
-    """OpenCV's rotation (3, 3) around x (0) or y (1), and its derivative."""
-    c, s, i = np.cos(angle), np.sin(angle), np.arange(axis + 1, axis + 3) % 3
-    turn, derivative = np.zeros((2, 3, 3), dtype=np.result_type(c))
-    turn[axis, axis] = 1.0
-    turn[np.ix_(i, i)], derivative[np.ix_(i, i)] = [[c, s], [-s, c]], [[-s, c], [-c, -s]]
-    return turn, derivative
+    by_point = complex_steps(lambda moved: projected(moved, angles), point)
+    return DistortedRay(projected(point, angles), by_point, angle_derivative)

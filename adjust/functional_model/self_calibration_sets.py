@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from adjust.array_types import Array
 from adjust.functional_model.correction import Correction, Settings
+from adjust.functional_model.polynomial_terms import PolynomialTerms, combined
 
 STRETCH, SHEAR, TILT_X, TILT_Y = "stretch", "shear", "tilt x", "tilt y"
 Term = str | tuple[int, int, int]  # one of the four combinations, or (0 for dx or 1 for dy, m, n)
@@ -105,43 +106,32 @@ def correct(of: PolynomialSet, settings: Settings, xy: Array, principal_point: A
 
 def summed(of: PolynomialSet, half: Array, xy: Array, center: Array, parameters: Array) -> Correction:
     """Sum the terms of a set times their parameters (k,) at places (n, 2); center, half (2,) of the extent."""
-    coefficients = _coefficients(of, float(half[1] / half[0]))
-    scaled = (xy - center) / half
-    (x, x_slope), (y, y_slope) = (_polynomials(of, scaled[:, axis]) for axis in (0, 1))
-    count = len(of.polynomials) ** 2
-    products = (x[:, :, None] * y[:, None, :]).reshape(len(xy), count)
-    parameter_jacobian = (products @ coefficients.reshape(-1, count).T).reshape(len(xy), 2, len(of.terms))
-    products_of = np.einsum("akij,k->aij", coefficients, parameters)
-    by_scaled = [np.einsum("aij,ni,nj->na", products_of, *pair) for pair in ((x_slope, y), (x, y_slope))]
-    xy_jacobian = np.stack(by_scaled, axis=2) / half
-    return Correction(parameter_jacobian @ parameters, xy_jacobian, -xy_jacobian, parameter_jacobian)
+    return _polynomial_terms(of, float(half[1] / half[0])).correction(xy, center, parameters, half)
 
 
 @lru_cache
-def _coefficients(of: PolynomialSet, ratio: float) -> Array:
-    """(2, k, degree + 1, degree + 1) coefficients of the products in dx and dy for each parameter. ratio: by / bx."""
-    size = len(of.polynomials)
+def _polynomial_terms(of: PolynomialSet, ratio: float) -> PolynomialTerms:
+    """Terms of a set; ratio: by / bx."""
     q = np.sqrt(ratio)
     combinations = {
-        STRETCH: (((0, 1, 0), q), ((1, 0, 1), -1 / q)),
-        SHEAR: (((0, 0, 1), 1 / q), ((1, 1, 0), q)),
-        TILT_X: (((0, 2, 0), -of.tilt * q), ((1, 1, 1), 1 / q)),
-        TILT_Y: (((0, 1, 1), q), ((1, 0, 2), -of.tilt / q)),
+        STRETCH: ((q, (0, 1, 0)), (-1 / q, (1, 0, 1))),
+        SHEAR: ((1 / q, (0, 0, 1)), (q, (1, 1, 0))),
+        TILT_X: ((-of.tilt * q, (0, 2, 0)), (1 / q, (1, 1, 1))),
+        TILT_Y: ((q, (0, 1, 1)), (-of.tilt / q, (1, 0, 2))),
     }
-    coefficients = np.zeros((2, len(of.terms), size, size))
-    for number, term in enumerate(of.terms):
-        for (axis, m, n), factor in combinations[term] if isinstance(term, str) else ((term, 1.0),):
-            coefficients[axis, number, m, n] = factor
-    return coefficients
-
-
-def _polynomials(of: PolynomialSet, t: Array) -> tuple[Array, Array]:
-    """Values and derivatives of all polynomials at t (n,), both (n, degree + 1)."""
-    size = len(of.polynomials)
-    matrix = np.array([[*each, *[0.0] * (size - len(each))] for each in of.polynomials]).T
-    powers = t[:, None] ** np.arange(size)
-    slopes = np.arange(1, size) * powers[:, :-1]
-    return powers @ matrix, slopes @ matrix[1:]
+    in_x, in_y = (
+        [{exponents(i): c for i, c in enumerate(p)} for p in of.polynomials]
+        for exponents in (lambda i: (i, 0), lambda i: (0, i))
+    )
+    terms = []
+    for term in of.terms:
+        products = combinations[term] if isinstance(term, str) else ((1.0, term),)
+        dx, dy = (
+            combined(*((factor, (in_x[m], in_y[n])) for factor, (own, m, n) in products if own == axis))
+            for axis in (0, 1)
+        )
+        terms.append((dx, dy))
+    return PolynomialTerms.from_terms(terms)
 
 
 def fourier_names(order: int) -> tuple[str, ...]:
@@ -167,8 +157,8 @@ def fourier(order: int, settings: Settings, xy: Array, principal_point: Array, p
     pair = parameters.reshape(2, -1)
     xy_jacobian = np.einsum("ak,nkj->naj", pair, slope)
     zero = np.zeros_like(basis)
-    parameter_jacobian = np.stack([np.hstack([basis, zero]), np.hstack([zero, basis])], axis=1)
-    return Correction(basis @ pair.T, xy_jacobian, -xy_jacobian, parameter_jacobian)
+    by_parameters = np.stack([np.hstack([basis, zero]), np.hstack([zero, basis])], axis=1)
+    return Correction(basis @ pair.T, xy_jacobian, -xy_jacobian, lambda: by_parameters)
 
 
 def _frequencies(order: int) -> NDArray[np.int_]:
