@@ -2,20 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
-from scipy.spatial.distance import cdist
 
 from adjust.functional_model.lens import Lens
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.transformation import Film
-from adjust.initial_values.resection import MAX_TRIPLES
 from adjust.target_identification.naming import name_marks
-from adjust.target_identification.unnamed_marks import chance_of_a_mark, log10_of_agreement, mark_density
 from measure.targets.block_search import Candidate
 from measure.targets.identification import TargetPrediction
 from pipeline.files.camera_file import CameraFile
@@ -28,10 +23,10 @@ ComplexArray = NDArray[np.complex128]  # places in the plane: x + iy
 
 _SCALE, _TURN_RAD = 0.15, 0.15  # tolerances of a predicted pattern: relative change of scale, rotation
 _DISTORTION = 0.03  # residuals after these, due to tilt and relief, as a fraction of the pattern's size
+_AS_GOOD = 0.95  # of the most targets: of such placements of a regular grid, the nearest to the prediction is taken
+_NEAREST = 0.35  # fraction of them that an affine transformation leaves
 _PAIRS = 60  # distant pairs of targets that generate hypotheses on the placement
 _TESTED, _REFINED = 400, 8  # hypotheses that are tested on all targets, and that are refined
-_OF_POSE = 3  # targets that always fit three marks, in P3P,
-_POSES = 4  # by up to four exterior orientations
 _SIGMA_PX = 0.5  # px, of a candidate, including locally varying effects of eccentricity and lens
 _FOUND_WITHIN_PX = 2.0  # px, largest shift of the fit from the candidate
 _STRAYS = 1.5  # candidates per target, the strongest: dust and texture are weaker than painted targets
@@ -42,28 +37,36 @@ _SIZES = 4.0  # largest ratio of a target's size to that in an image filled by t
 _IN_THE_PICTURE = 0.4  # of the scan's size: largest offset of the principal point from its centre, if not cropped
 
 
-def recognise(predicted_px: Array, found_px: Array, shift_px: float) -> tuple[Array, int] | None:
+def recognise(predicted_px: Array, found_px: Array, shift_px: float) -> dict[int, int]:
     """Lay a predicted pattern (n, 2) on candidates (m, 2), most places on candidates, false alarm or not.
 
     Similarities that map distant pairs of targets onto pairs of candidates are refined to affine transformations.
-    shift_px: largest shift of the pattern.
 
     Returns
     -------
-    Places (n, 2) of the targets, and the number of placements that they were chosen from; None where there are fewer
-    than three of either, or no placement is within the tolerances.
+    Target (index) by candidate (index); empty where there are fewer than three of either, or no placement is within the
+    tolerances. shift_px: largest shift of the pattern.
     """
     if min(len(predicted_px), len(found_px)) < 3:
-        return None
+        return {}
     scales, shifts = _similarities(_complex(predicted_px), _complex(found_px), shift_px)
     if not len(scales):
-        return None
+        return {}
     tree, gate_px = cKDTree(found_px), _DISTORTION * float(np.linalg.norm(np.ptp(predicted_px, axis=0)))
     placements = _plane(scales[:, None] * _complex(predicted_px) + shifts[:, None])
     counts = np.array([_hits(places, tree, gate_px)[0].sum() for places in placements])
-    best = placements[np.argsort(-counts, kind="stable")[:_REFINED]]
-    refined = [_tightened(places, predicted_px, found_px, tree, gate_px) for places in best]
-    return max(refined, key=lambda places: _score(places, tree, gate_px)), len(scales)
+    order = np.lexsort((_off_px(placements, predicted_px), -np.minimum(counts, _AS_GOOD * counts.max())))
+    refined = [_tightened(places, predicted_px, found_px, tree, gate_px) for places in placements[order[:_REFINED]]]
+    scores = np.array([_score(places, tree, gate_px) for places in refined])
+    as_good = np.array(refined)[scores >= _AS_GOOD * scores.max()]
+    chosen = as_good[_off_px(as_good, predicted_px).argmin()]
+    hit, _, nearest = _hits(chosen, tree, _NEAREST * gate_px)
+    return dict(zip(nearest[hit].tolist(), np.flatnonzero(hit).tolist(), strict=True))
+
+
+def _off_px(placements: Array, predicted_px: Array) -> Array:
+    """(k,) median distances of placements (k, n, 2) from the predicted places."""
+    return np.asarray(np.median(np.linalg.norm(placements - predicted_px, axis=2), axis=1))
 
 
 def _similarities(predicted: ComplexArray, found: ComplexArray, shift_px: float) -> tuple[ComplexArray, ComplexArray]:
@@ -122,7 +125,7 @@ def _hits(places: Array, tree: cKDTree, gate_px: float) -> tuple[Mask, Array, In
 def _tightened(places: Array, predicted: Array, found: Array, tree: cKDTree, gate_px: float) -> Array:
     """Places after affine fits with a decreasing gate."""
     design = np.column_stack([predicted, np.ones(len(predicted))])
-    for share in (1.0, 0.7, 0.5, 0.35, 0.35):
+    for share in (1.0, 0.7, 0.5, _NEAREST, _NEAREST):
         hit, _, nearest = _hits(places, tree, share * gate_px)
         if hit.sum() < 4:
             break
@@ -134,35 +137,6 @@ def _score(places: Array, tree: cKDTree, gate_px: float) -> float:
     """Number of targets explained, with weights that decrease with distance."""
     hit, distances, _ = _hits(places, tree, gate_px)
     return float(np.sum(1.0 - (distances[hit] / gate_px) ** 2))
-
-
-def log10_of_chance(places_px: Array, found_px: Array, gate_px: float, tried: int) -> float:
-    """Log10 of the expected number of false orientations with as many agreements.
-
-    Null hypothesis: candidates (m, 2) are random, with their density around the places (n, 2), px. An agreement is a
-    candidate within gate_px of a place.
-
-    Parameters
-    ----------
-    tried : number of placements; each could be oriented by any three of its targets.
-    """
-    n = len(places_px)
-    if n <= _OF_POSE or not len(found_px):
-        return 0.0
-    chance = chance_of_a_mark(mark_density(cKDTree(found_px), places_px), gate_px).mean()
-    agreeing = len(assign(places_px, found_px, gate_px))
-    tests = tried * _POSES * min(comb(agreeing, _OF_POSE), MAX_TRIPLES)
-    return log10_of_agreement(agreeing - _OF_POSE, n - _OF_POSE, float(chance)) + float(np.log10(max(tests, 1)))
-
-
-def assign(predicted_px: Array, found_px: Array, gate_px: float) -> list[tuple[int, int]]:
-    """Pairs (target, candidate), one to one, with the least total distance; none farther apart than gate_px."""
-    if not len(predicted_px) or not len(found_px):
-        return []
-    distances = cdist(predicted_px, found_px)
-    capped = np.minimum(distances, 2.0 * gate_px)
-    rows, columns = linear_sum_assignment(capped)
-    return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if distances[i, j] <= gate_px]
 
 
 def likely_diameters_px(field: Field, measured: MeasuredScan) -> tuple[float, float]:
@@ -218,7 +192,8 @@ def name_field(
     ----------
     model : camera and film of the image. Its exterior orientation is not used, nor its principal distance where the
         camera file gives none.
-    codes : point, by index, of some candidates, by index, from their codes.
+    codes : point, by index, of some candidates, by index, from their codes or an approximate orientation; some may be
+        wrong.
 
     Returns
     -------

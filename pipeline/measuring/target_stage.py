@@ -7,7 +7,6 @@ import numpy as np
 
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
-from adjust.initial_values.resection import resect
 from measure.boards.measure import measure_board
 from measure.flags import Code, Reason
 from measure.results import ON_FILM, MarkMeasurement
@@ -30,16 +29,12 @@ from pipeline.measuring.target_field import (
 )
 from pipeline.measuring.target_identification import (
     NamedField,
-    assign,
     camera_model,
     likely_diameters_px,
-    log10_of_chance,
     name_field,
     recognise,
 )
-from pipeline.results.comparator_file import comparator_from_pixel
 from pipeline.results.measured_record import MeasuredScan
-from pipeline.types import Array
 
 _MIRRORED = (
     "The board is mirrored: in a mirror, from its back, or the picture is flipped. Its points are named as on the "
@@ -47,10 +42,6 @@ _MIRRORED = (
 )
 LEAST_PAIRS = 4  # pairs of points and marks needed to identify an image's targets
 
-_GATE_SHARE = 0.01  # fraction of the scan's diagonal: residuals of an affine placement due to tilt and relief
-_SLACK_PX = 3.0  # a mark within this plus _SLACK_SIGMAS of the resection is the target predicted there
-_SLACK_SIGMAS = 6.0
-_MOST_LOG10_CHANCE = -1.0  # log10 of the expected false alarms; lenient, since the pattern is known to be in the scan
 _STRONGEST = 3  # candidates per target, by contrast: dust and texture are weaker than painted targets
 _NEAR = 0.65  # of the scan's size, from its centre: targets predicted closer may be in the scan
 _SIZE_SLACK = 1.5  # largest factor of the error of a target's size due to the approximate distance
@@ -164,10 +155,10 @@ def _oriented_by_targets(
     notes: tuple[str, ...] = ()
     if exterior is not None and camera.principal_distance_mm is not None:
         approximate = replace(model, rotation=rotation_from_angles(exterior.values[3:]), station=exterior.center)
-        oriented = _oriented(approximate, field, scan, measured, settings)
-        if not isinstance(oriented, str):
-            return (oriented.model, oriented.predictions(field, measured)), ()
-        notes = (f"Its orientation in images.csv was not used to name the targets: {oriented}.",)
+        named = _named_by_orientation(approximate, options, sought, scan, measured)
+        if isinstance(named, NamedField):
+            return (named.model, named.predictions(field, measured)), ()
+        notes = (f"Its orientation in images.csv was not used to name the targets: {named}.",)
     diameters = likely_diameters_px(field, measured)
     if diameters[1] < LEAST_DIAMETER_PX:
         return _too_small(sought, diameters[1]), notes
@@ -196,56 +187,22 @@ def _diameters_px(predictions: Sequence[TargetPrediction], measured: MeasuredSca
     return 2.0 * float(axes.min()) / _SIZE_SLACK, 2.0 * float(axes.max()) * _SIZE_SLACK
 
 
-def _oriented(
-    model: ImageModel, field: Field, scan: Scan, measured: MeasuredScan, settings: TargetSettings
+def _named_by_orientation(
+    approximate: ImageModel, options: ScanOptions, sought: SoughtTargets, scan: Scan, measured: MeasuredScan
 ) -> NamedField | str:
-    """Orient the image by matching the detected disks with the predicted pattern; or the reason of the failure."""
-    # Targets that an unknown lens distortion displaces by far more than a pixel are identified, too.
-    size = float(np.hypot(measured.width_px, measured.height_px))
-    predictions = field.predictions(model, measured, _SLACK_PX)
-    predicted = np.array([prediction.center_px for prediction in predictions]).reshape(-1, 2)
+    """Identify the targets by the pattern that an approximate orientation predicts; or the reason of the failure."""
+    field = sought.field
+    predictions = field.predictions(approximate, measured, search_px=1.0)
     diameters = _diameters_px(predictions, measured)
     if diameters is None:
         return f"the approximate orientation puts no target of {LEAST_DIAMETER_PX} px or more into the scan"
-    strongest = target_candidates(scan, settings, diameters)[: _STRONGEST * len(predicted)]
-    found = np.array([patch.center_px for patch in strongest]).reshape(-1, 2)
-    placement = recognise(predicted, found, size / 2.0)
-    unlike = f"the {len(found)} marks found do not make the pattern of the {len(predicted)} targets predicted"
-    if placement is None:
-        return unlike
-    (places, tried), gate_px = placement, _GATE_SHARE * size
-    for _ in range(2):
-        pairs = assign(places, found, gate_px)
-        resection = _resected(model, field, [(predictions[i].point, found[j]) for i, j in pairs], measured)
-        if resection is None:
-            return unlike
-        model, gate_px = resection
-        predictions = field.predictions(model, measured, gate_px)
-        places = np.array([p.center_px for p in predictions])
-    shown = ((places >= 0.0) & (places <= (measured.width_px - 1, measured.height_px - 1))).all(axis=1)
-    if log10_of_chance(places[shown], found, gate_px, tried) > _MOST_LOG10_CHANCE:
-        return f"{unlike}, except for possible false alarms"
-    named = {
-        predictions[i].point: replace(strongest[j], pixel_from_disk=predictions[i].pixel_from_disk)
-        for i, j in assign(places, found, gate_px)
-    }
-    return NamedField(model, named, _SLACK_PX)
-
-
-def _resected(
-    model: ImageModel, field: Field, named: Sequence[tuple[str, Array]], measured: MeasuredScan
-) -> tuple[ImageModel, float] | None:
-    """Space resection from identified marks. Returns the model and the gate for further marks in px, or None."""
-    if len(named) < LEAST_PAIRS:
-        return None
+    strongest = target_candidates(scan, sought.settings, diameters)[: _STRONGEST * len(predictions)]
+    predicted, found = (np.array([one.center_px for one in some]).reshape(-1, 2) for some in (predictions, strongest))
     row = {id: i for i, id in enumerate(field.ids)}
-    xyz = field.xyz[[row[id] for id, _ in named]]
-    comparator = comparator_from_pixel(np.array([place for _, place in named]), measured.pitch_um)
-    ideal, _ = model.lens.ideal_from_observed(model.camera_from_comparator(comparator))
-    c = float(model.lens.interior[0])
-    resection = resect(xyz, ideal - model.lens.interior[1:], c)
-    if resection is None or resection.inliers.sum() < LEAST_PAIRS:
-        return None
-    sigma_px = 1000.0 * resection.sigma_mm / min(measured.pitch_um)
-    pose = resection.pose
-    return replace(model, rotation=pose.rotation, station=pose.center), _SLACK_PX + _SLACK_SIGMAS * sigma_px
+    pattern = recognise(predicted, found, float(np.hypot(measured.width_px, measured.height_px)) / 2.0)
+    codes = {candidate: row[predictions[target].point] for candidate, target in pattern.items()}
+    named = name_field(field, approximate, options.camera, measured, strongest, codes) if codes else ""
+    if isinstance(named, NamedField):
+        return named
+    chance = ", except for possible false alarms" if named else ""
+    return f"the {len(found)} marks found do not make the pattern of the {len(predicted)} targets predicted{chance}"

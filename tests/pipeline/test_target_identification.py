@@ -13,7 +13,6 @@ import tifffile
 from numpy.typing import NDArray
 from projects import Refusal, measure_scan, write_tables
 from real_data import DATA, needs
-from studies import parametrize_with_studies
 
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Lens
@@ -30,7 +29,7 @@ from pipeline.files.project_file import Project, read_project
 from pipeline.measuring.coded_targets import check_sheet
 from pipeline.measuring.scan_task import scan_tasks
 from pipeline.measuring.target_field import across, disk_images, disk_normals, eccentricity_mm, plane_normal
-from pipeline.measuring.target_identification import assign, log10_of_chance, recognise
+from pipeline.measuring.target_identification import recognise
 from pipeline.rendered.scene_file import render_project
 from pipeline.results.comparator_file import pixel_from_comparator
 from pipeline.results.measured_record import MeasuredScan
@@ -51,31 +50,19 @@ def test_pattern_is_named_right_with_targets_missing_and_marks_that_are_none() -
         kept = np.flatnonzero(rng.random(n) > 0.2)
         found = np.concatenate([true[kept], rng.uniform(0.0, size, (int(0.3 * n), 2))])
         order = rng.permutation(len(found))
-        placement = recognise(predicted, found[order], 1500.0)
-        assert placement is not None
-        pairs = assign(placement[0], found[order], 40.0)
-        right = sum(order[j] < len(kept) and kept[order[j]] == i for i, j in pairs)
+        named = recognise(predicted, found[order], 1500.0)
+        right = sum(order[mark] < len(kept) and kept[order[mark]] == target for mark, target in named.items())
         assert right >= 0.8 * len(kept)
-    predicted = np.array([[0.0, 0.0], [1.0, 0.0], [100.0, 0.0]])
-    found = np.array([[0.9, 0.0], [50.0, 0.0]])
-    assert assign(predicted, found, 5.0) == [(1, 0)]
 
 
-@parametrize_with_studies(("targets", "strays"), [(4, 0), (8, 16), (25, 0), (25, 50)], quick=(1,))
-def test_agreement_by_chance_is_distinguished_from_a_pattern(targets: int, strays: int) -> None:
-    """A fifth of the pattern's marks missing; the other marks are placed as well as chance allows."""
-    rng = np.random.default_rng([2, targets, strays])
-    for _ in range(2):
-        places = rng.uniform(0.0, 3000.0, (targets, 2))
-        view = places[: max(round(0.8 * targets), 4)] + rng.normal(0.0, 1.0, (max(round(0.8 * targets), 4), 2))
-        marks = np.concatenate([view, rng.uniform(0.0, 3000.0, (strays, 2))])
-        placement = recognise(places, marks, 1500.0)
-        assert placement is not None
-        assert log10_of_chance(places, marks, 6.0, placement[1]) < -1.0
-        other = rng.uniform(0.0, 3000.0, marks.shape)
-        placement = recognise(places, other, 1500.0)
-        for gate_px in (6.0, 30.0, 90.0):
-            assert placement is None or (log10_of_chance(placement[0], other, gate_px, placement[1]) > -1.0)
+def test_a_regular_grid_is_laid_next_to_its_prediction() -> None:
+    """Moved on by a step, as many of its targets would lie on candidates."""
+    grid = 100.0 * np.stack(np.meshgrid(np.arange(12.0), np.arange(12.0)), axis=-1).reshape(-1, 2)
+    predicted = grid[(grid >= 300.0).all(axis=1) & (grid <= 800.0).all(axis=1)] + (30.0, -20.0)
+    named = recognise(predicted, grid, 600.0)
+    assert len(named) == len(predicted)
+    for mark, target in named.items():
+        np.testing.assert_allclose(predicted[target] - grid[mark], (30.0, -20.0))
 
 
 def test_eccentricity_and_place_of_a_disk_are_those_of_the_rendered_one(rendered_demo: Path) -> None:
