@@ -2,7 +2,7 @@
 
 Bend of a nearly flat board: two parabolas, as in mrcal (`ref_calibration_object`, calobject_warp). With ξ and η from -1
 to 1 over the board's points, a point lies bend_x (1 - ξ²) + bend_y (1 - η²) off the plane. The corners do not move; in
-the middle the two bends add up.
+the middle the two bends add up. A twist by ξη makes it a saddle.
 
 Strain of any object: stretches along its axes relative to the last one, and shears. A change of scale is one of the
 stations.
@@ -33,20 +33,24 @@ _UPRIGHT = 0.9  # |X| of the normal above which the board's first axis is taken 
 class BoardForm:
     """Shape of the bend of a board.
 
-    normal (3,): unit normal, positive in its largest component. axes (2, 3): unit vectors along the sides. places
-    (n, 2): of the points along them, from their mean. shapes (n, 2): offsets of the points for a bend of 1 along each
-    axis.
+    normal (3,): unit normal, positive in its largest component. axes (2, 3): unit vectors along the sides. relative
+    (n, 2): places of the points along them, from -1 to 1.
     """
 
     normal: Array
     axes: Array
-    places: Array
-    shapes: Array
+    relative: Array
 
     @property
     def bend_directions(self) -> Array:
         """(n, 2, 3) displacements of the points by a bend of 1 along each axis."""
-        return np.asarray(self.shapes[:, :, None] * self.normal)
+        return np.asarray((1.0 - self.relative**2)[:, :, None] * self.normal)
+
+    @property
+    def twist_directions(self) -> Array:
+        """(n, 1, 3) displacements of the points by a twist that lifts two opposite corners by 1 and lowers the
+        others."""
+        return np.asarray(self.relative.prod(axis=1)[:, None, None] * self.normal)
 
 
 def strain_directions(xyz: Array, axes: Array) -> Array:
@@ -91,7 +95,7 @@ def board_form(xyz: Array) -> BoardForm:
     axes = plane @ _to_sides(centred @ plane)
     places = centred @ axes
     low, high = places.min(axis=0), places.max(axis=0)
-    return BoardForm(normal, axes.T, places, 1.0 - ((2.0 * places - low - high) / (high - low)) ** 2)
+    return BoardForm(normal, axes.T, (2.0 * places - low - high) / (high - low))
 
 
 def _to_sides(places: Array) -> Array:

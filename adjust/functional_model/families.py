@@ -1,13 +1,4 @@
-"""Table of the distortion families: parameters and formulas; and additional terms that a family may lack.
-
-With (ξ, η) the observed point relative to the principal point, in units of half the frame, and s = ξ² + η², the
-correction is
-
-    radial           r3, r5, ...:   (ξ, η) s^m
-    decentering      p1, p2, ...:   (s + 2ξ², 2ξη) s^q, (2ξη, s + 2η²) s^q
-    affinity         b1, b2:        (ξ, 0), (η, 0)
-
-All parameters are in mm at the edge of the frame. The name of a family with these terms ends in +: "opencv+".
+"""Table of the distortion families: parameters and formulas.
 
 The name of a family with an order includes the order: "legendre(3)". All code that handles distortion uses this table.
 A new family needs a formula with derivatives and an entry here.
@@ -21,59 +12,15 @@ from functools import lru_cache, partial
 import numpy as np
 
 from adjust.array_types import Array
-from adjust.functional_model import opencv_family, physical, polynomial_terms, self_calibration_sets
+from adjust.functional_model import opencv_family, physical, self_calibration_sets
 from adjust.functional_model.correction import (
     Correct,
-    Correction,
     Image,
-    Imaged,
-    Settings,
     ideal_point_family,
     no_correction,
     ray_family,
     undistorted,
 )
-
-RADIAL_DEGREES = (3, 5, 7, 9, 11, 13)
-RADIAL = tuple(f"+r{degree}" for degree in RADIAL_DEGREES)
-DECENTERING = (("+p1", "+p2"), ("+p3", "+p4"))  # lowest degree, next degree
-AFFINITY = ("+b1", "+b2")
-ADDED_NAMES = (*RADIAL, *DECENTERING[0], *DECENTERING[1], *AFFINITY)
-_RADIAL_TERMS = (polynomial_terms.radial((degree - 1) // 2) for degree in RADIAL_DEGREES)
-_ADDED = polynomial_terms.PolynomialTerms.from_terms(
-    [*_RADIAL_TERMS, *polynomial_terms.decentering(0), *polynomial_terms.decentering(1), *polynomial_terms.AFFINITY]
-)
-
-
-def correction_with_terms(correct: Correct, count: int) -> Correct:
-    """Add the terms to the correction of a family with count parameters."""
-
-    def corrected(settings: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:
-        own = correct(settings, xy, principal_point, parameters[:count])
-        added = _ADDED.correction(xy, principal_point, parameters[count:], settings.half_mm[0])
-        return Correction(
-            own.value + added.value,
-            own.xy_jacobian + added.xy_jacobian,
-            own.by_principal_point + added.by_principal_point,
-            lambda: np.concatenate([own.parameter_jacobian, added.parameter_jacobian], axis=2),
-        )
-
-    return corrected
-
-
-def image_without_terms(image: Image, count: int) -> Image:
-    """Pass only the first count parameters to a family's image of a ray: the added terms do not affect it."""
-
-    def imaged(settings: Settings, c: float, ray: Array, parameters: Array) -> Imaged:
-        own = image(settings, c, ray, parameters[:count])
-
-        def parameter_derivative(k: int) -> Array:
-            return own.parameter_derivative(k) if k < count else np.broadcast_to(0.0, own.value.shape)
-
-        return Imaged(own.value, own.ray_jacobian, own.by_distance, parameter_derivative)
-
-    return imaged
-
 
 LEGENDRE_ORDERS = range(2, 10)  # from 2, the degree of the omitted tilts, to 9, so that an index has one digit
 FOURIER_ORDERS = range(1, 10)
@@ -169,23 +116,7 @@ _WITH_ORDER: dict[str, tuple[range, Callable[[int], Family]]] = {
     "legendre": (LEGENDRE_ORDERS, lambda order: _polynomials(self_calibration_sets.legendre(order))),
     "fourier": (FOURIER_ORDERS, _fourier),
 }
-EXTENDED = "+"  # suffix of a family with the added terms, which test whether the family lacks any
 FAMILY_NAMES = (*_FAMILIES, *(f"{name}(n)" for name in _WITH_ORDER))
-
-
-def _extended(of: Family) -> Family:
-    """Append the added terms to a family's parameters."""
-    count = len(of.parameters)
-    units = of.units or ("mm",) * count
-    return replace(
-        of,
-        parameters=(*of.parameters, *ADDED_NAMES),
-        units=(*units, *("mm",) * len(ADDED_NAMES)),
-        image=image_without_terms(of.image, count),
-        correct=correction_with_terms(of.correct, count),
-        needs="half_mm" if not of.needs else of.needs,
-        apart=lambda parameters: np.concatenate([of.apart(parameters[:count]), parameters[count:]]),
-    )
 
 
 @lru_cache
@@ -193,8 +124,6 @@ def family(name: str) -> Family:
     """Return a family by name. Raises ValueError for an unknown name or order."""
     if name in _FAMILIES:
         return _FAMILIES[name]
-    if name.endswith(EXTENDED):
-        return _extended(family(name.removesuffix(EXTENDED)))
     spelled = re.fullmatch(r"(\w+)\((\d+)\)", name)
     if spelled is None or spelled[1] not in _WITH_ORDER:
         raise ValueError(f"a distortion family must be one of {', '.join(FAMILY_NAMES)}, not {name}")

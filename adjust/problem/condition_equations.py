@@ -125,8 +125,13 @@ def _lens(problem: Problem, state: State, camera: str) -> Lens:
 
 def observed_in_camera(problem: Problem, state: State) -> Array:
     """Transform the observations to camera coordinates (n, 2)."""
-    camera_xy = np.empty_like(problem.network.observations.xy_mm)
-    straight_mm = _straight(problem, state, problem.network.observations.xy_mm)
+    return in_camera(problem, state, problem.network.observations.xy_mm)
+
+
+def in_camera(problem: Problem, state: State, xy_mm: Array) -> Array:
+    """Transform comparator coordinates (n, 2) of the observations to camera coordinates (n, 2)."""
+    camera_xy = np.empty_like(xy_mm)
+    straight_mm = _straight(problem, state, xy_mm)
     for films in problem.films:
         parameters = state.values[films.positions][films.of]
         camera_xy[films.rows] = films.kind.apply(parameters, straight_mm[films.rows])
@@ -139,6 +144,23 @@ def _straight(problem: Problem, state: State, xy_mm: Array) -> Array:
     for scans in problem.scans:
         straight_mm[scans.rows] = scans.bend.apply(state.values[scans.positions], xy_mm[scans.rows])
     return straight_mm
+
+
+def object_displacements(problem: Problem, state: State, camera_xy: Array, image_mm: Array) -> Array:
+    """(n, k, 3) displacements of the targets' points, parallel to the image, that displace their images at (n, 2) by
+    (n, k, 2) mm in the camera frame, but for what free parameters of the camera displace."""
+    found = np.zeros((*image_mm.shape[:2], 3))
+    for name, rows in problem.targets_by_camera.items():
+        shown = _image_targets(problem, state, name, rows)
+        at = _lens(problem, state, name).equations_with_image(camera_xy[rows], shown.imaged)
+        misclosure = at.xy_jacobian @ image_mm[rows].swapaxes(1, 2)
+        is_free = problem.unknowns.sigma[problem.unknowns.camera[name]] > 0.0
+        free = np.stack([at.quantity_derivative(int(k)) for k in np.flatnonzero(is_free)], axis=-1)
+        flat, by_free = misclosure.reshape(-1, misclosure.shape[2]), free.reshape(-1, free.shape[2])
+        rest = (flat - by_free @ np.linalg.lstsq(by_free, flat)[0]).reshape(misclosure.shape)
+        in_plane = (np.linalg.solve(at.ray_jacobian, rest) * shown.in_camera[:, 2, None, None]).swapaxes(1, 2)
+        found[rows] = in_plane @ state.rotations[problem.image_numbers[rows], :2]
+    return found
 
 
 def _computed_in_comparator(problem: Problem, state: State, camera_xy: Array) -> tuple[Array, Mask]:

@@ -6,12 +6,11 @@ Units: image mm, object units chosen by the user, angles rad.
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 
 from adjust.array_types import Array, Indices
-from adjust.functional_model.board import BOARD_NAMES, BoardForm, board_form, strain_directions
+from adjust.functional_model.board import BOARD_NAMES, BoardForm, board_form
 from adjust.functional_model.lens import Lens, Prior
 from adjust.functional_model.projection import STRAIGHT as STRAIGHT
 from adjust.functional_model.projection import LineOfSight as LineOfSight
@@ -152,22 +151,20 @@ class ObjectPoint:
 
 @dataclass(frozen=True, eq=False)
 class Board:
-    """Flat board with a bend, which displaces its points from the plane, or another deformation of an object.
+    """Flat board with a bend, which displaces its points from the plane, or any other displacement of points.
 
     places: undeformed coordinates (3,) of all its points by id, including those in no image. bends: priors of the
-    deformation's parameters (see `functional_model.board`). deformation: bend_x and bend_y in object units; or strain
-    along `axes`, for any object; or the squared radius of disks on a flat board. by_observation (n, k, 3): their
-    displacements by each parameter of 1.
+    parameters, bend_x and bend_y in object units. by_observation (n, k, 3): displacements of the point of each target
+    by parameters of 1 that take the place of the bend.
     """
 
     name: str
     places: Mapping[str, Array]
     bends: tuple[Prior, ...] = (Prior(0.0, np.inf), Prior(0.0, np.inf))
-    deformation: Literal["bend", "strain", "disks"] = "bend"
     by_observation: Array | None = None
 
     def __post_init__(self) -> None:
-        if self.deformation != "strain":
+        if self.by_observation is None:
             _ = self.form  # raises ValueError for points that are not a board
 
     @cached_property
@@ -177,28 +174,12 @@ class Board:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters."""
-        return (
-            BOARD_NAMES
-            if self.deformation == "bend"
-            else tuple(f"{self.deformation}_{k}" for k, _ in enumerate(self.bends))
-        )
-
-    @cached_property
-    def axes(self) -> Array:
-        """(m, 3) sides of a flat board, or X, Y and Z."""
-        try:
-            return self.form.axes
-        except ValueError:
-            return np.eye(3)
+        return BOARD_NAMES if self.by_observation is None else tuple(f"by_{k}" for k, _ in enumerate(self.bends))
 
     @cached_property
     def lift_directions(self) -> dict[str, Array]:
-        """(k, 3) displacement of a point by each parameter of 1, by id."""
-        if self.deformation == "strain":
-            directions = strain_directions(np.array(list(self.places.values())), self.axes)
-        else:
-            directions = self.form.bend_directions
-        return dict(zip(self.places, directions, strict=True))
+        """(2, 3) displacement of a point by each bend of 1, by id."""
+        return dict(zip(self.places, self.form.bend_directions, strict=True))
 
 
 @dataclass(frozen=True)
@@ -214,7 +195,7 @@ class Network:
     """All input of an adjustment. Names are unique; order does not matter.
 
     transparent: whether flat boards of given points can be seen from both sides. disk_radius: of the targets, for whose
-    perspective the observations are corrected; 0 if they are no disks.
+    perspective the observations are corrected; 0 if they are no disks, None where nothing says what they are.
     """
 
     cameras: tuple[Camera, ...]
@@ -227,7 +208,7 @@ class Network:
     scanners: tuple[Scanner, ...] = ()
     boards: tuple[Board, ...] = ()
     transparent: bool = False
-    disk_radius: float = 0.0
+    disk_radius: float | None = None
 
     @cached_property
     def scanner_by_name(self) -> dict[str, Scanner]:

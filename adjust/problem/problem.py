@@ -260,7 +260,12 @@ class Problem:
         names, of_name = self.network.observations.numbered_points
         none = np.empty(0, dtype=np.intp)
         of_boards = [
-            [self.unknowns.board[each.name] for each in self.network.boards if name in each.places] for name in names
+            [
+                self.unknowns.board[each.name]
+                for each in self.network.boards
+                if each.by_observation is not None or name in each.places
+            ]
+            for name in names
         ]
         positions = side_by_side([np.concatenate([none, *own]) for own in of_boards])[of_name]
         positions[self.is_fiducial] = ABSENT

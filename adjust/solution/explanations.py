@@ -42,6 +42,7 @@ from adjust.solution.model_hypotheses import ModelHypothesis, model_hypotheses, 
 from adjust.solution.reweighting import again
 
 LEVEL = 0.001  # probability of reporting anything where the model is correct
+SUSPECTED = 0.05  # p-value of v'Pv below which wrong points are sought
 CHECKED = 10  # smallest redundancy for an explanation
 ROUNDS = 3  # rounds of explanations, each in addition to those before
 MOST_ADJUSTED = 4  # hypotheses adjusted per round
@@ -57,7 +58,7 @@ class Explanation:
 
     Attributes
     ----------
-    kind : "radial", "decentering", "pixels", "groups", "board", "point" or "noise".
+    kind : that of the hypothesis (see `ModelHypothesis`), or "noise".
     cause : cause in words with figures.
     remedy : what to do.
     p : p-value.
@@ -99,7 +100,7 @@ def explain(
         noisy = replace(last, run=with_noise)
         found.append(_explanation("noise", words, float(chdtrc(last.redundancy, last.vpv)), last, noisy))
         last = noisy
-    explains = not last.exceeds(probabilities.family) or last.variance - 1.0 < LEFT * (first.variance - 1.0)
+    explains = not last.exceeds(LEVEL) or last.variance - 1.0 < LEFT * (first.variance - 1.0)
     return (tuple(found), last.run) if found and explains else ((), run)
 
 
@@ -183,7 +184,12 @@ class _Model:
 
     def extended(self, hypothesis: ModelHypothesis) -> "_Model | None":
         """Add a hypothesis to the model; None without a solution."""
-        if (run := self.adjusted(hypothesis.problem)) is None:
+        run, (low, high) = self.adjusted(hypothesis.problem), hypothesis.limits
+        if (
+            run is None
+            or not ((values := run.end.state.values[hypothesis.added]) >= low).all()
+            or (values > high).any()
+        ):
             return None
         p = self.probability(hypothesis, self.vpv - run.end.vpv)
         left, has_suspects = self.redundancy - len(hypothesis.added), bool(self.gross_errors)
@@ -193,7 +199,8 @@ class _Model:
 def _best(model: _Model) -> tuple[list[_Model], bool]:
     """Models with the best significant hypotheses, several where these are not distinguished."""
     # Also returns whether gross errors of single observations explain the residuals as well.
-    falls = [(_first_order_fall(model.run, each.problem), each) for each in model_hypotheses(model.run)]
+    is_thorough = model.is_noise_fitted or model.exceeds(SUSPECTED) or bool(model.gross_errors)
+    falls = [(_first_order_fall(model.run, each.problem), each) for each in model_hypotheses(model.run, is_thorough)]
     level = LEVEL / max(len(falls), 1)
     worth = WORTH * max((fall for fall, _ in falls), default=0.0)
     likely = [(fall, each) for fall, each in falls if fall > worth and model.is_significant(each, fall, level)]

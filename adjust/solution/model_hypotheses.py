@@ -11,30 +11,37 @@ from functools import partial
 from itertools import combinations, product
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from adjust.array_types import Array, Indices
-from adjust.functional_model.board import disk_directions
-from adjust.functional_model.families import DECENTERING, EXTENDED, RADIAL, family
+from adjust.functional_model.board import BoardForm, board_form, disk_directions, strain_directions
+from adjust.functional_model.families import family
 from adjust.functional_model.lens import INTERIOR_NAMES, Prior
+from adjust.functional_model.polynomial_terms import AFFINITY, PolynomialTerms, Term, decentering, radial
 from adjust.functional_model.scanner import is_left
 from adjust.least_squares.iteration import linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.problem.camera import Camera
-from adjust.problem.condition_equations import computed_observations
+from adjust.problem.condition_equations import computed_observations, in_camera, object_displacements
 from adjust.problem.network import Approximations, Board, Network, Scanner
 from adjust.problem.parameter import shortened
 from adjust.problem.problem import Problem, State, number
 from adjust.quality.cofactor import free_cofactor
 from adjust.quality.run import Run
+from adjust.solution.displaced_points import PointGroup, displaced_points
 from adjust.solution.image_groups import ImageGroups, two_groups
 
 FREE = Prior(0.0, np.inf)
+RADIAL_DEGREES = (3, 5, 7, 9, 11, 13)
 TERMS_TOGETHER = 2  # radial terms tested jointly
+FEWEST_DRIFTING = 4  # images that tell a drift from their scatter
+LEAST_CHANGE = 0.05  # of the distance
 OTHERS = " (other images)"  # suffix of a camera's name for the images with a different interior orientation
 FEWEST_GIVEN, FEWEST_IMAGES = 5, 2  # given points, and images of one, that tell a wrong one
 MISMEASURED = 0.1  # relative error of the given diameter of disks whose effect is reported
 CLEAR = 3.0  # standard deviations above which one of two changes of a board is told
-NAMED = 5  # images named in a message
+NAMED = 5  # images named in a message, and points with their errors
+MOST_NAMED = 10  # points named in a message
 ALIKE = 7.0  # difference of chi-square plus twice the unknowns below which two readings are not distinguished
 
 # Arguments: adjustment with the added unknowns, their positions, rms of the residuals that they explain (µm).
@@ -45,70 +52,127 @@ Words = Callable[[Run, Indices, float], tuple[str, str]]
 class ModelHypothesis:
     """Model with additional unknowns."""
 
-    kind: str  # "radial", "decentering", "pixels", "groups", "board" or "point"
+    kind: str  # "radial", "decentering", "pixels", "groups", "drift", "interior", "board", "disks" or "point"
     words: Words  # returns cause (with figures) and remedy
     problem: Problem  # problem that starts where the simpler model ended
     added: Indices  # (k,) positions of the additional unknowns
+    name: str = ""  # of the displacement that is added
+    limits: tuple[float, float] = (-np.inf, np.inf)  # possible values of the unknowns
     choices: float = 0.0  # natural logarithm of the number of models it was selected from
     contrasts: int = 0  # number of unknowns that all of these models would have together
     p_scatter: Callable[[], float] = float  # of groups of images, see `ImageGroups`; 0 for other hypotheses
 
 
-def model_hypotheses(run: Run) -> Iterator[ModelHypothesis]:
-    """Generate all hypotheses on what the model of an adjustment may lack."""
+def model_hypotheses(run: Run, is_thorough: bool) -> Iterator[ModelHypothesis]:
+    """Generate all hypotheses on what the model of an adjustment may lack; is_thorough: also which points are wrong."""
     network = run.problem.network
     used = run.problem.unknowns.camera.keys() - network.idle_cameras
     cameras = [camera for camera in network.cameras if camera.name in used]
     is_grouped = any(each.name.endswith(OTHERS) for each in network.cameras)
-    always = _lens_terms, _wrong_interior_orientation
+    always = _lens_terms, _drift, _wrong_interior_orientation
+    tested = {board.name for board in network.boards}
     for hypotheses in always if is_grouped else (*always, _second_interior_orientation):
         for camera in cameras:
-            yield from hypotheses(run, camera)
+            yield from (each for each in hypotheses(run, camera) if each.name not in tested)
     yield from _scanner_pixels(run)
-    given = {each.deformation for each in network.boards}
-    yield from (each for each in _deformations(run) if each.problem.network.boards[-1].deformation not in given)
-    yield from _wrong_point(run)
+    yield from (each for each in _deformations(run) if each.name not in tested)
+    if is_thorough:
+        yield from (each for each in _wrong_points(run) if each.name not in tested)
 
 
 def diameter_notes(run: Run) -> Iterator[str]:
-    """Note where a wrong diameter of the disks, taken as exact, changes c by more than its standard deviation."""
-    for each in _deformations(run) if run.problem.network.disk_radius > 0.0 and run.converged else ():
-        if each.kind != "disks":
-            continue
+    """Note where a wrong diameter of the disks, or one that is not given, changes c by more than its deviation."""
+    for each in _disks(run) if run.converged else ():
         unknowns, (radius_squared,) = each.problem.unknowns, each.added
         weighted, covariance = run.weighting.applied(each.problem)
         numbering = Numbering(weighted)
         if (at := linearise(numbering, covariance, weighted.start())) is None:
             return
         cofactor = free_cofactor(numbering, at.state, at.factor)
+        given = run.problem.network.disk_radius
         for camera, (c, *_) in unknowns.camera.items():
             (own, common), (_, square) = cofactor.part(np.array([c, radius_squared]))
-            change = ((1.0 + MISMEASURED) ** 2 - 1.0) * run.problem.network.disk_radius**2 * common / square
-            if abs(change) > np.sqrt(own - common**2 / square):
+            squared = _possible_radius(run) ** 2 if given is None else ((1.0 + MISMEASURED) ** 2 - 1.0) * given**2
+            change = squared * common / square
+            if abs(change) <= np.sqrt(own - common**2 / square):
+                continue
+            if given is not None:
                 yield (
                     f"The diameter of the disks is taken as exact: if it is {100.0 * MISMEASURED:.0f} % larger, c of "
                     f"camera {camera} changes by {change:+.2g} mm."
                 )
+            elif squared - at.factor.solution[numbering.numbers[radius_squared]] < CLEAR * np.sqrt(square):
+                yield (
+                    "Nothing says whether the points are corners or the centres of dots: if they are dots of a "
+                    f"diameter of {2.0 * np.sqrt(squared):.2g} (points' unit), whose perspective is not corrected, c "
+                    f"of camera {camera} changes by {change:+.2g} mm. Give their diameter_mm under [targets], kind = "
+                    '"disk".'
+                )
 
 
 def _lens_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
-    """The lowest radial terms that a camera lacks, its next decentering terms, and non-square pixels."""
+    """The lowest radial terms that a camera lacks, its next decentering terms, and non-square pixels.
+
+    Polynomials of the observed point in units of half the frame, so that their parameters are in mm at its edge.
+    """
     free, own = _free_terms(camera), partial(_own_terms, camera)
-    freed = {degree for names in (own("radial"), RADIAL) for degree, name in enumerate(names) if name in free}
-    lacking = [term for degree, term in enumerate(RADIAL) if degree not in freed]
-    radial = (lacking or RADIAL[-TERMS_TOGETHER:])[:TERMS_TOGETHER]
-    pattern = f"a radial pattern, of the degrees {', '.join(name.removeprefix('+r') for name in radial)} in r"
-    yield _extended_lens(run, camera, radial, "radial", partial(_lens_words, camera, "radial", pattern))
-    lower, higher = DECENTERING
-    if not free.intersection(higher):
-        terms = higher if free.intersection((*own("decentering"), *lower)) else lower
+    half_mm = _lens_half_mm(run.problem.network, camera)
+    places = _from_principal_point(run, camera)
+
+    def lacking(name: str, words: Words, terms: Sequence[Term]) -> ModelHypothesis:
+        fields = PolynomialTerms.from_terms(terms).correction(places, np.zeros(2), np.zeros(len(terms)), half_mm)
+        return _displaced_images(run, name, camera, words, fields.parameter_jacobian.swapaxes(1, 2))
+
+    freed = {3 + 2 * k for k, name in enumerate(own("radial")) if name in free}
+    degrees = [degree for degree in RADIAL_DEGREES if degree not in freed] or RADIAL_DEGREES[-TERMS_TOGETHER:]
+    degrees = degrees[:TERMS_TOGETHER]
+    pattern = f"a radial pattern, of the degrees {', '.join(map(str, degrees))} in r"
+    words = partial(_lens_words, camera, "radial", pattern)
+    yield lacking("radial", words, [radial((degree - 1) // 2) for degree in degrees])
+    if not free.intersection(own("decentering")[2:]):
         words = partial(_lens_words, camera, "decentering", "a tangential pattern (decentering)")
-        yield _extended_lens(run, camera, terms, "decentering", words)
+        yield lacking("decentering", words, decentering(int(bool(free.intersection(own("decentering"))))))
     images = run.problem.network.images
     digital = all(image.transformation == "none" for image in images if image.camera == camera.name)
-    if digital and not free.intersection((*own("affinity")[:1], "+b1")):
-        half_mm = _lens_half_mm(run.problem.network, camera)[0]
-        yield _extended_lens(run, camera, ("+b1",), "pixels", partial(_pixel_words, camera.name, 1.0 / half_mm))
+    if digital and not free.intersection(own("affinity")[:1]):
+        yield lacking("pixels", partial(_pixel_words, camera.name, 1.0 / half_mm), AFFINITY[:1])
+
+
+def _drift(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
+    """A principal distance that changes with the number of the image, or with the distance of the object."""
+    problem, state = run.problem, run.end.state
+    rows = problem.targets_by_camera[camera.name]
+    shown, of_row, counts = np.unique(problem.image_numbers[rows], return_inverse=True, return_counts=True)
+    if len(shown) < FEWEST_DRIFTING:
+        return
+    outward = _from_principal_point(run, camera) / state.values[problem.unknowns.camera[camera.name][0]]
+    points = state.values[problem.places[rows]]
+    middle = np.stack([np.bincount(of_row, points[:, k]) for k in range(3)], axis=1) / counts[:, None]
+    nearness = 1.0 / np.linalg.norm(middle - state.values[problem.exterior[shown, :3]], axis=1)
+    for name, by in (("order", np.arange(len(shown), dtype=float)), ("nearness", nearness)):
+        if np.ptp(by) > LEAST_CHANGE * by.max():
+            share = np.zeros(len(outward))
+            share[rows] = ((by - by.mean()) / np.ptp(by))[of_row]
+            words = partial(_drift_words, camera.name, name)
+            yield _displaced_images(run, name, camera, words, (outward * share[:, None])[:, None], "drift")
+
+
+def _from_principal_point(run: Run, camera: Camera) -> Array:
+    """(n, 2) mm, adjusted image points of a camera relative to its principal point; 0 for other marks."""
+    problem, xy_mm = run.problem, np.zeros_like(run.end.v_mm)
+    rows = problem.targets_by_camera[camera.name]
+    principal_point = run.end.state.values[problem.unknowns.camera[camera.name][1:3]]
+    xy_mm[rows] = in_camera(problem, run.end.state, run.end.computed_mm)[rows] - principal_point
+    return xy_mm
+
+
+def _displaced_images(
+    run: Run, name: str, camera: Camera, words: Words, fields_mm: Array, kind: str = ""
+) -> ModelHypothesis:
+    """Add displacements (n, k, 2) of the camera's images in mm as unknowns."""
+    camera_xy = in_camera(run.problem, run.end.state, run.end.computed_mm)  # observed places have the residuals' errors
+    directions = object_displacements(run.problem, run.end.state, camera_xy, fields_mm)
+    return _displaced(run, f"{name} of {camera.name}", kind or name, words, directions)
 
 
 def _scanner_pixels(run: Run) -> Iterator[ModelHypothesis]:
@@ -138,67 +202,116 @@ def _second_interior_orientation(run: Run, camera: Camera) -> Iterator[ModelHypo
     problem = _continued(run, apart, {others.name: camera.name})
     added = problem.unknowns.camera[others.name][: len(INTERIOR_NAMES)]
     words, contrasts = partial(_group_words, camera.name, groups), len(INTERIOR_NAMES) * (groups.count - 1)
-    yield ModelHypothesis("groups", words, problem, added, groups.choices, contrasts, groups.p_scatter)
+    own = ModelHypothesis("groups", words, problem, added)
+    yield replace(own, choices=groups.choices, contrasts=contrasts, p_scatter=groups.p_scatter)
 
 
 def _deformations(run: Run) -> Iterator[ModelHypothesis]:
-    """A bend, a strain, or another diameter of the disks, of the object of all given points."""
+    """A strain of the object of all given points; a bend or a twist of a flat one, or another diameter of its disks."""
     network = run.problem.network
-    places = network.known_places
-    if len(places) < max(FEWEST_GIVEN, len(network.observed_points)):
+    if not _is_given(network):
         return
-    strain = Board("strain", places, (), "strain")
-    count = len(strain.axes)
-    strain = replace(strain, bends=(FREE,) * (count - 1 + count * (count - 1) // 2))
-    yield _deformed(run, "board", partial(_strain_words, count), strain)
-    if count == 2:
-        yield _deformed(run, "board", _bend_words, Board("bend", places))
-        if network.disk_radius > 0.0 and (disks := _disks(run, places)) is not None:
-            yield _deformed(run, "disks", _disk_words, disks)
+    xyz = np.array(list(network.known_places.values()))
+    form = _flat_form(network)
+    axes = np.eye(3) if form is None else form.axes
+    fields: list[tuple[str, Words, Array]] = [
+        ("strain", partial(_strain_words, len(axes)), strain_directions(xyz, axes))
+    ]
+    if form is not None:
+        is_bent = any(board.by_observation is None for board in network.boards)
+        fields += [] if is_bent else [("bend", _bend_words, form.bend_directions)]
+        fields += [("twist", _twist_words, form.twist_directions)]
+    for name, words, directions in fields:
+        by_point = dict(zip(network.known_places, directions, strict=True))
+        yield _displaced(run, name, "board", words, _of_targets(run, by_point))
+    yield from _disks(run)
 
 
-def _disks(run: Run, places: Mapping[str, Array]) -> Board | None:
-    """Board of disks whose squared radius differs from the given one; None where some have no image."""
-    problem, state, radius = run.problem, run.end.state, run.problem.network.disk_radius
-    board = Board("disks", places, (FREE,), "disks")
-    points = np.array([at for id_, at in problem.unknowns.point.items() if id_ in places])
-    shown, at = problem.network.observations.has_kind("target"), dict[tuple[int, int], Array]()
+def _is_given(network: Network) -> bool:
+    """Whether all points of an object are given, and enough to test its shape."""
+    return len(network.known_places) >= max(FEWEST_GIVEN, len(network.observed_points))
+
+
+def _flat_form(network: Network) -> BoardForm | None:
+    try:
+        return board_form(np.array(list(network.known_places.values())))
+    except ValueError:
+        return None
+
+
+def _of_targets(run: Run, by_point: Mapping[str, Array]) -> Array:
+    """(n, k, 3) displacements of the points of all targets, of those (k, 3) by name; 0 for others."""
+    observations, width = run.problem.network.observations, len(next(iter(by_point.values())))
+    none = np.zeros((width, 3))
+    return np.array([by_point.get(name, none) for name in observations.point])
+
+
+def _possible_radius(run: Run) -> float:
+    """Radius of disks: as given, or where it is not a quarter of the distance of neighbours."""
+    network = run.problem.network
+    if network.disk_radius is not None:
+        return network.disk_radius
+    xyz = np.array(list(network.known_places.values()))
+    nearest, _ = KDTree(xyz).query(xyz, 2)
+    return float(np.median(np.asarray(nearest)[:, 1])) / 4.0
+
+
+def _disks(run: Run) -> Iterator[ModelHypothesis]:
+    """Another squared radius of disks on a board than given, or one where nothing says that the points are disks."""
+    problem, state, network = run.problem, run.end.state, run.problem.network
+    form = _flat_form(network) if _is_given(network) and network.disk_radius != 0.0 else None
+    if form is None:
+        return
+    radius, at = _possible_radius(run), dict[tuple[int, int], Array]()
+    points = np.array([at for id_, at in problem.unknowns.point.items() if id_ in network.known_places])
+    shown = network.observations.has_kind("target")
     for i, j in product((-1, 0, 1), repeat=2):
         values = state.values.copy()
-        values[points] += radius * (np.array([i, j]) @ board.form.axes)
+        values[points] += radius * (np.array([i, j]) @ form.axes)
         if (computed := computed_observations(problem, State(values, state.rotations))) is None:
-            return None
+            return
         at[i, j] = computed[shown]
     directions = np.zeros((len(shown), 1, 3))
-    directions[shown] = disk_directions(at, board.form.axes, radius)
-    return replace(board, by_observation=directions)
+    directions[shown] = disk_directions(at, form.axes, radius)
+    limits = (-np.inf, np.inf) if network.disk_radius is not None else (0.0, (2.0 * radius) ** 2)
+    yield replace(_displaced(run, "disks", "disks", _disk_words, directions), limits=limits)
 
 
-def _deformed(run: Run, kind: str, words: Words, board: Board) -> ModelHypothesis:
+def _displaced(run: Run, name: str, kind: str, words: Words, directions: Array) -> ModelHypothesis:
+    """Add displacements (n, k, 3) of the targets' points as unknowns."""
     network = run.problem.network
+    board = Board(name, {}, (FREE,) * directions.shape[1], directions)
     problem = _continued(run, replace(network, boards=(*network.boards, board)))
-    return ModelHypothesis(kind, words, problem, problem.unknowns.board[board.name])
+    return ModelHypothesis(kind, words, problem, problem.unknowns.board[name], name=name)
 
 
-def _wrong_point(run: Run) -> Iterator[ModelHypothesis]:
-    """Wrong coordinates of the fixed point whose residuals are largest, where at least two images show it.
+def _wrong_points(run: Run) -> Iterator[ModelHypothesis]:
+    """Wrong coordinates of fixed points, each by itself, or of a line or a side of a regular field by one shift.
 
     Coordinates that are given with a standard deviation are observations, tested by data snooping.
     """
     network, unknowns = run.problem.network, run.problem.unknowns
-    names, of_row = network.observations.numbered_points
-    rows = np.flatnonzero(~run.problem.is_fiducial)
-    variances = np.diagonal(network.observations.covariance_mm2[rows], axis1=1, axis2=2)
-    squares = np.bincount(of_row[rows], (run.end.v_mm[rows] ** 2 / variances).sum(axis=1), len(names))
-    images = np.bincount(of_row[rows], minlength=len(names))
-    fixed = {name for name, at in unknowns.point.items() if not unknowns.sigma[at].any()}
-    given = [k for k, name in enumerate(names) if name in fixed and images[k] >= FEWEST_IMAGES]
-    if network.boards or len(given) < FEWEST_GIVEN:
+    of_image = dict[str, set[str]]()
+    for name, image in zip(network.observations.point, network.observations.image, strict=True):
+        of_image.setdefault(name, set()).add(image)
+    names = tuple(
+        name
+        for name, at in unknowns.point.items()
+        if not unknowns.sigma[at].any() and len(of_image[name]) >= FEWEST_IMAGES and name in network.known_places
+    )
+    if len(names) < FEWEST_GIVEN:
         return
-    name = names[max(given, key=lambda k: squares[k])]
-    added = unknowns.point[name]
-    choices, contrasts = float(np.log(len(given))), len(added) * (len(given) - 1)
-    yield ModelHypothesis("point", partial(_point_words, name), _freed(run, added), added, choices, contrasts)
+    form, positions = _flat_form(network), np.concatenate([unknowns.point[name] for name in names])
+    axes = np.eye(3) if form is None else form.axes
+    for group in displaced_points(run, axes, _freed(run, positions), names):
+        if group.words:
+            moved = _of_targets(run, dict.fromkeys(group.names, np.eye(3)))
+            found = _displaced(run, "group", "point", partial(_moved_words, group), moved)
+        else:
+            added = np.concatenate([unknowns.point[name] for name in group.names])
+            words = partial(_point_words, group.names)
+            found = ModelHypothesis("point", words, _freed(run, added), added)
+        yield replace(found, choices=group.choices, contrasts=group.contrasts)
 
 
 def _wrong_interior_orientation(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
@@ -220,33 +333,15 @@ def _free_terms(camera: Camera) -> set[str]:
     return {name for name, prior in camera.distortion.parameters.items() if prior.sigma > 0.0}
 
 
-def _own_family(camera: Camera) -> str:
-    return camera.distortion.family.removesuffix(EXTENDED)
-
-
 def _own_terms(camera: Camera, group: str) -> tuple[str, ...]:
     """Terms of a group in the camera's own family."""
-    return tuple(dict(family(_own_family(camera)).groups).get(group, ()))
+    return tuple(dict(family(camera.distortion.family).groups).get(group, ()))
 
 
-def _lens_half_mm(network: Network, camera: Camera) -> tuple[float, float]:
+def _lens_half_mm(network: Network, camera: Camera) -> float:
     """Half the frame in mm; from the extent of the camera's marks where it is not given."""
-    if min(camera.distortion.half_mm) > 0.0:
-        return camera.distortion.half_mm
     own = [image for image in network.images if image.camera == camera.name]
-    return (max(network.extent_by_image[image.name].half_mm for image in own),) * 2
-
-
-def _extended_lens(run: Run, camera: Camera, terms: Sequence[str], kind: str, words: Words) -> ModelHypothesis:
-    network, extended = run.problem.network, _own_family(camera) + EXTENDED
-    parameters = dict(camera.distortion.parameters) | dict.fromkeys(terms, FREE)
-    half_mm = _lens_half_mm(network, camera)
-    lens = replace(camera.distortion, family=extended, parameters=parameters, half_mm=half_mm)
-    cameras = tuple(replace(each, distortion=lens) if each is camera else each for each in network.cameras)
-    problem = _continued(run, replace(network, cameras=cameras))
-    names = family(extended).parameters
-    added = problem.unknowns.camera[camera.name][[3 + names.index(term) for term in terms]]
-    return ModelHypothesis(kind, words, problem, added)
+    return camera.distortion.half_mm[0] or max(network.extent_by_image[image.name].half_mm for image in own)
 
 
 def separate_lenses(run: Run) -> Problem | None:
@@ -298,10 +393,10 @@ def _continued(run: Run, network: Network, like: Mapping[str, str] | None = None
 
 def _lens_words(camera: Camera, group: str, what: str, run: Run, added: Indices, rms_um: float) -> tuple[str, str]:
     cause = f"The lens model of camera {camera.name} is too simple: the residuals have {what}, {rms_um:.2g} µm rms"
-    if _own_family(camera) == "none":
+    if camera.distortion.family == "none":
         names = "k1 and k2" if group == "radial" else "p1 and p2"
         return cause, f'Give the camera a [distortion] of the family "brown", say, with {names} free.'
-    denominator = family(_own_family(camera)).alike_at_zero  # asked for by nobody at first
+    denominator = family(camera.distortion.family).alike_at_zero  # asked for by nobody at first
     known = {*denominator, *_free_terms(camera)}
     if fixed := [name for name in _own_terms(camera, group) if name not in known]:
         return cause, f'Free {", ".join(fixed)} under [distortion.sigma] of the camera ("free").'
@@ -366,26 +461,75 @@ def _strain_words(count: int, run: Run, added: Indices, _: float) -> tuple[str, 
     )
 
 
+def _twist_words(run: Run, added: Indices, _: float) -> tuple[str, str]:
+    value, covariance = _estimate(run, added)
+    return (
+        f"The board of the given points is twisted: two opposite corners stand {abs(value[0]):.3g} ± "
+        f"{np.sqrt(covariance[0, 0]):.1g} above its plane, the others as much below it (points' unit; ± for "
+        "independent errors, on real boards up to 5 times as much)",
+        "Put it on a flat plate.",
+    )
+
+
 def _disk_words(run: Run, added: Indices, _: float) -> tuple[str, str]:
     value, covariance = _estimate(run, added)
     given = run.problem.network.disk_radius
-    square, sigma = given**2 + float(value[0]), float(np.sqrt(covariance[0, 0]))
+    square, sigma = (given or 0.0) ** 2 + float(value[0]), float(np.sqrt(covariance[0, 0]))
     diameter = 2.0 * np.sqrt(max(square, 0.0))
+    found = f"{diameter:.3g} ± {2.0 * sigma / max(diameter, np.sqrt(sigma)):.1g} (points' unit)"
+    if given is None:
+        return (
+            f"The points are centres of dots, whose perspective is not corrected: their diameter is found as {found}",
+            'Give their diameter_mm under [targets], kind = "disk".',
+        )
     return (
         f"The disks do not have the diameter of {2.0 * given:.4g} that is given, or the points another spacing: by the "
-        f"coordinates it is found as {diameter:.3g} ± {2.0 * sigma / max(diameter, np.sqrt(sigma)):.1g} (points' unit)",
+        f"coordinates it is found as {found}",
         "Measure a disk, and from one to the next; correct diameter_mm or the coordinates and their unit.",
     )
 
 
-def _point_words(name: str, run: Run, added: Indices, _: float) -> tuple[str, str]:
+def _point_words(names: Sequence[str], run: Run, added: Indices, _: float) -> tuple[str, str]:
     value, covariance = _estimate(run, added)
-    off, sigma = run.problem.unknowns.given[added] - value, np.sqrt(np.diag(covariance))
-    digits = [max(0, -int(np.floor(np.log10(s)))) for s in sigma]
-    by = ", ".join(f"{axis} by {d:+.{n}f} ± {s:.1g}" for axis, d, s, n in zip("XYZ", off, sigma, digits, strict=True))
+    offs = (run.problem.unknowns.given[added] - value).reshape(-1, 3)
+    sigmas = np.sqrt(np.diag(covariance)).reshape(-1, 3)
+    by = [_shift_words(off, sigma) for off, sigma in zip(offs, sigmas, strict=True)]
+    if len(names) == 1:
+        return (
+            f"Point {names[0]} is not where it is given: its coordinates are off, {by[0]} (points' unit)",
+            "Correct the coordinates of this point, or its number among the marks.",
+        )
+    worst = np.argsort(-np.linalg.norm(offs, axis=1), kind="stable")[:NAMED]
+    told = "; ".join(f"{names[k]}: {by[k]}" for k in worst)
     return (
-        f"Point {name} is not where it is given: its coordinates are off, {by} (points' unit)",
-        "Correct the coordinates of this point, or its number among the marks.",
+        f"{len(names)} points are not where they are given: {shortened(names, MOST_NAMED)}; the coordinates of the "
+        f"worst are off, {told} (points' unit)",
+        "Correct the coordinates of these points, or their numbers among the marks.",
+    )
+
+
+def _moved_words(group: PointGroup, run: Run, added: Indices, _: float) -> tuple[str, str]:
+    value, covariance = _estimate(run, added)
+    return (
+        f"The points {shortened(group.names, MOST_NAMED)} ({group.words}) are not where they are given: all their "
+        f"coordinates are off, {_shift_words(-value, np.sqrt(np.diag(covariance)))} (points' unit)",
+        "Correct the coordinates of these points, or their numbers among the marks.",
+    )
+
+
+def _shift_words(off: Array, sigma: Array) -> str:
+    digits = [max(0, -int(np.floor(np.log10(max(s, 1e-12))))) for s in sigma]
+    return ", ".join(f"{axis} by {d:+.{n}f} ± {s:.1g}" for axis, d, s, n in zip("XYZ", off, sigma, digits, strict=True))
+
+
+def _drift_words(camera: str, by: str, run: Run, added: Indices, _: float) -> tuple[str, str]:
+    value, covariance = _estimate(run, added)
+    change, sigma = float(value[0]), float(np.sqrt(covariance[0, 0]))
+    along = "from the first image to the last" if by == "order" else "from the farthest image to the nearest"
+    return (
+        f"The principal distance of camera {camera} changes {along}, by {change:+.3g} ± {sigma:.1g} mm: the focus "
+        "drifts",
+        "Fix focus and zoom, switch autofocus and stabilisation off, and take the pictures again.",
     )
 
 

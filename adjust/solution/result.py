@@ -257,7 +257,9 @@ class Adjustment(Estimates, PlottedResult):
     @cached_property
     def notes(self) -> tuple[str, ...]:
         """Notes that need no action."""
-        return (*self.unused, *(sentence for _, sentence in self._inseparable.values()), *diameter_notes(self.run))
+        is_told = any(each.kind == "disks" for each in self.explanations)
+        of_disks = () if is_told else diameter_notes(self.run)
+        return (*self.unused, *(sentence for _, sentence in self._inseparable.values()), *of_disks)
 
     def inseparable(self, camera: str) -> list[str]:
         """Distortion parameters of a camera that the observations do not separate."""

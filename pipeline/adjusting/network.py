@@ -103,7 +103,7 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
         # Digital cameras that photographed the film, with their lens; none for film that was scanned.
         scanners=tuple(Scanner(name, lens=project.lens.lens) for name in scanners) if project.lens else (),
         boards=_boards(project),
-        disk_radius=project.disk_radius,
+        disk_radius=project.disk_radius or (0.0 if project.targets and not project.targets.code else None),
         transparent=project.transparent or (project.targets is not None and project.targets.transparent),
         calibrations=calibrations,
         line_of_sight=LineOfSight(

@@ -540,6 +540,12 @@ class Effects:
     shear: float = 0.0
     height: float = 0.0
     disk: float = 0.0
+    twist: float = 0.0
+    drift: float = 0.0
+    breathing: float = 0.0
+    row: float = 0.0
+    side: float = 0.0
+    third: float = 0.0
     point: float = 0.0
     noise: float = 1.0
     pitch: float = 1.0
@@ -568,7 +574,7 @@ class Misfit:
     c_given: bool = False
     stations_given: bool = False
     frame_given: bool = False
-    disk_radius: float = 0.0
+    disk_radius: float | None = 0.0
     sigma: float = 1.0
     point_held: bool = False
 
@@ -634,7 +640,12 @@ def _projected(made: Scene, effects: Effects, kind: Misfit, image: int, rotation
     points = made.points.copy()
     low, high = points.min(axis=0), points.max(axis=0)
     relative = (2.0 * points - low - high)[:, :2] / (high - low)[:2]
-    points[:, 2] += effects.bend * (1.0 - relative[:, 0] ** 2)
+    points[:, 2] += effects.bend * (1.0 - relative[:, 0] ** 2) + effects.twist * relative[:, 0] * relative[:, 1]
+    lines = np.unique(made.points[:, 1])
+    points[made.points[:, 1] == lines[1 % len(lines)], 0] -= effects.row
+    points[made.points[:, 1] > lines[len(lines) // 2], 1] -= effects.side
+    off = np.random.default_rng(len(points)).normal(size=points.shape) * [1.0, 1.0, 0.3]
+    points[::4] += effects.third * off[::4]
     points[:, 1] *= 1.0 + effects.stretch
     points[:, 2] *= 1.0 + effects.height
     points[:, 0] += effects.shear * points[:, 1]
@@ -642,9 +653,13 @@ def _projected(made: Scene, effects: Effects, kind: Misfit, image: int, rotation
 
     def imaged(places: Array) -> Array:
         u, v, w = np.moveaxis((places - station) @ rotation.T, -1, 0)
-        return _through_lens(effects, kind, -u / w, v / w, C_MM + own * effects.zoom)
+        return _through_lens(effects, kind, -u / w, v / w, C_MM + zoom_mm)
 
     own = float(made.groups[image])
+    order = image / (len(made.stations) - 1) - 0.5
+    nearness = 1.0 / np.linalg.norm(made.stations - made.points.mean(axis=0), axis=1)
+    near = float((nearness[image] - nearness.mean()) / np.ptp(nearness))
+    zoom_mm = own * effects.zoom + order * effects.drift + near * effects.breathing
     at = imaged(points) + made.point_mm
     if effects.disk:
         angles = np.linspace(0.0, 2.0 * np.pi, 40, endpoint=False)
@@ -727,6 +742,24 @@ MISFITS = {
     ),
     "disks of another diameter": Misfit(
         lambda e: Effects(disk=50.0 * e), ("disks do not have the diameter",), fields=False, disk_radius=11.0, sigma=0.1
+    ),
+    "dots of a diameter that nobody gave": Misfit(
+        lambda e: Effects(disk=50.0 * abs(e)), ("points are centres of dots",), fields=False, disk_radius=None,
+        sigma=0.1
+    ),
+    "board twisted": Misfit(lambda e: Effects(twist=0.5 * e), ("board of the given points is twisted",), fields=False),
+    "focus drifts": Misfit(lambda e: Effects(drift=0.05 * e), ("from the first image to the last",)),
+    "focus breathes with the distance": Misfit(
+        lambda e: Effects(breathing=0.05 * e), ("from the farthest image to the nearest",)
+    ),
+    "a row of points shifted": Misfit(
+        lambda e: Effects(row=0.1 * e), ("(a row) are not where they are given",), size=3, fields=False
+    ),
+    "half the board shifted": Misfit(
+        lambda e: Effects(side=0.1 * e), ("all on one side of a line",), size=3, fields=False
+    ),
+    "a quarter of the points elsewhere": Misfit(
+        lambda e: Effects(third=2.0), ("points are not where they are given",), sized=False
     ),
     "a point is elsewhere": Misfit(
         lambda e: Effects(point=0.1 * e), (f"Point p{WRONG_POINT} is not where it is given",), size=3

@@ -126,11 +126,12 @@ def test_the_centre_of_gravity_of_an_imaged_disk() -> None:
 def test_the_form_is_1_in_the_middle_and_0_at_the_corners() -> None:
     form = board_form(flat_board())
     assert form.normal == pytest.approx([0.0, 0.0, 1.0])
-    assert form.shapes[0] == pytest.approx([0.0, 0.0])
-    assert form.shapes[3 * COLUMNS + 4] == pytest.approx([1.0 - (1.0 / 9.0) ** 2, 1.0])
+    lifts = form.bend_directions[..., 2]
+    assert lifts[0] == pytest.approx([0.0, 0.0])
+    assert lifts[3 * COLUMNS + 4] == pytest.approx([1.0 - (1.0 / 9.0) ** 2, 1.0])
     facing_x = board_form(flat_board()[:, [2, 0, 1]])
     assert facing_x.normal == pytest.approx([1.0, 0.0, 0.0])
-    np.testing.assert_allclose(facing_x.shapes, form.shapes, atol=1e-12)
+    np.testing.assert_allclose(facing_x.bend_directions[..., 0], lifts, atol=1e-12)
 
 
 def test_what_is_no_board_is_refused() -> None:

@@ -38,6 +38,12 @@ QUICK = (
     "board stretched",
     "object stretched",
     "disks of another diameter",
+    "dots of a diameter that nobody gave",
+    "board twisted",
+    "focus drifts",
+    "focus breathes with the distance",
+    "a row of points shifted",
+    "half the board shifted",
     "principal point held wrong",
     "sizes: cropped and enlarged",
     "Z in feet",
@@ -136,11 +142,25 @@ def test_a_diameter_taken_as_exact_is_noted_where_c_depends_on_it() -> None:
     kind, made = MISFITS["disks of another diameter"], scene(6, flat=True)
     (note,) = adjust(misfit_network(made, Effects(), kind, None)).notes
     change_mm = float(note.split(" changes by ")[1].split(" ")[0])
-    tenth = Effects(disk=-(1.1**2 - 1.0) * kind.disk_radius**2)
+    tenth = Effects(disk=-(1.1**2 - 1.0) * (kind.disk_radius or 0.0) ** 2)
     shifts_mm = [adjust(misfit_network(made, each, kind, None)).value("IO.cam.c") - C_MM for each in (Effects(), tenth)]
     assert change_mm == pytest.approx(shifts_mm[1] - shifts_mm[0], rel=0.05)
     small = replace(kind, disk_radius=0.5)
     assert adjust(misfit_network(made, Effects(), small, None)).notes == ()
+
+
+def test_dots_are_noted_where_they_would_change_c_and_the_images_leave_them_open() -> None:
+    kind, made = replace(MISFITS["dots of a diameter that nobody gave"], sigma=0.2), scene(6, flat=True)
+    dots = Effects(disk=12.5**2 / 4.0)
+    (note,) = adjust(misfit_network(made, dots, kind, np.random.default_rng(3))).notes
+    assert "if they are dots of a diameter of 12 (points' unit)" in note
+    change_mm = float(note.split(" changes by ")[1].split(" ")[0])
+    c_mm = [adjust(misfit_network(made, each, kind, None)).value("IO.cam.c") for each in (dots, Effects())]
+    assert change_mm == pytest.approx(c_mm[1] - c_mm[0], rel=0.1)
+    corners = misfit_network(made, Effects(), replace(kind, disk_radius=0.0), np.random.default_rng(3))
+    assert adjust(corners).notes == ()
+    precise = replace(kind, sigma=0.05)
+    assert adjust(misfit_network(made, Effects(), precise, np.random.default_rng(3))).notes == ()
 
 
 def test_a_group_of_mirrored_images_is_named() -> None:
