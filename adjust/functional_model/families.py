@@ -12,7 +12,7 @@ from functools import lru_cache, partial
 import numpy as np
 
 from adjust.array_types import Array
-from adjust.functional_model import opencv_family, physical, self_calibration_sets
+from adjust.functional_model import distortion_models, opencv_family
 from adjust.functional_model.correction import (
     Correct,
     Image,
@@ -47,40 +47,40 @@ class Family:
         return self.units[self.parameters.index(parameter)] if self.units else "mm"
 
 
-def _polynomials(terms: self_calibration_sets.PolynomialSet) -> Family:
-    groups = self_calibration_sets.degree_groups(terms)
-    return Family(terms.names, correct=partial(self_calibration_sets.correct, terms), needs="half_mm", groups=groups)
+def _polynomials(terms: distortion_models.PolynomialSet) -> Family:
+    groups = distortion_models.degree_groups(terms)
+    return Family(terms.names, correct=partial(distortion_models.correct, terms), needs="half_mm", groups=groups)
 
 
 def _fourier(order: int) -> Family:
-    names, groups = self_calibration_sets.fourier_names(order), self_calibration_sets.order_groups(order)
-    return Family(names, correct=partial(self_calibration_sets.fourier, order), needs="half_mm", groups=groups)
+    names, groups = distortion_models.fourier_names(order), distortion_models.order_groups(order)
+    return Family(names, correct=partial(distortion_models.fourier, order), needs="half_mm", groups=groups)
 
 
 _BROWN_LADDER = ("k1", "k1 k2", "k1 p1 p2", "k1 k2 p1 p2", "k1 k2 k3 p1 p2")
 _BROWN = Family(
-    physical.BROWN_NAMES,
-    correct=physical.brown,
-    units=physical.BROWN_UNITS,
-    groups=physical.BROWN_GROUPS,
+    distortion_models.BROWN_NAMES,
+    correct=distortion_models.brown,
+    units=distortion_models.BROWN_UNITS,
+    groups=distortion_models.BROWN_GROUPS,
     ladder=_BROWN_LADDER,
 )
 _FAMILIES = {
     "none": Family(),
     "torlegard": Family(
-        physical.TORLEGARD_NAMES,
-        correct=physical.torlegard,
-        units=physical.TORLEGARD_UNITS,
-        groups=physical.TORLEGARD_GROUPS,
+        distortion_models.TORLEGARD_NAMES,
+        correct=distortion_models.torlegard,
+        units=distortion_models.TORLEGARD_UNITS,
+        groups=distortion_models.TORLEGARD_GROUPS,
         ladder=("k3", "k3 k5", "k3 p1 p2", "k3 k5 p1 p2", "k3 k5 k7 p1 p2"),
     ),
     "brown": _BROWN,
-    "australis": replace(_BROWN, correct=physical.australis),
+    "australis": replace(_BROWN, correct=distortion_models.australis),
     "aicon": Family(
-        physical.AICON_NAMES,
-        image=ideal_point_family(physical.aicon),
-        units=physical.BROWN_UNITS,
-        groups=physical.AICON_GROUPS,
+        distortion_models.AICON_NAMES,
+        image=ideal_point_family(distortion_models.aicon),
+        units=distortion_models.BROWN_UNITS,
+        groups=distortion_models.AICON_GROUPS,
         ladder=("a1", "a1 a2", "a1 b1 b2", "a1 a2 b1 b2", "a1 a2 a3 b1 b2"),
     ),
     "opencv": Family(
@@ -103,17 +103,17 @@ _FAMILIES = {
         is_pinhole_at_zero=False,
     ),
     "juhl": Family(
-        physical.JUHL_NAMES,
-        correct=physical.juhl,
-        units=physical.JUHL_UNITS,
+        distortion_models.JUHL_NAMES,
+        correct=distortion_models.juhl,
+        units=distortion_models.JUHL_UNITS,
         needs="r0_mm",
-        groups=physical.JUHL_GROUPS,
+        groups=distortion_models.JUHL_GROUPS,
     ),
-    "ebner": _polynomials(self_calibration_sets.EBNER),
-    "gruen": _polynomials(self_calibration_sets.GRUEN),
+    "ebner": _polynomials(distortion_models.EBNER),
+    "gruen": _polynomials(distortion_models.GRUEN),
 }
 _WITH_ORDER: dict[str, tuple[range, Callable[[int], Family]]] = {
-    "legendre": (LEGENDRE_ORDERS, lambda order: _polynomials(self_calibration_sets.legendre(order))),
+    "legendre": (LEGENDRE_ORDERS, lambda order: _polynomials(distortion_models.legendre(order))),
     "fourier": (FOURIER_ORDERS, _fourier),
 }
 FAMILY_NAMES = (*_FAMILIES, *(f"{name}(n)" for name in _WITH_ORDER))

@@ -22,8 +22,7 @@ import numpy as np
 
 from adjust.array_types import Array, Mask
 from adjust.functional_model.correction import Correction, no_correction
-from adjust.functional_model.lens import Distortion, Lens
-from adjust.functional_model.self_calibration_sets import (
+from adjust.functional_model.distortion_models import (
     SHEAR,
     STRETCH,
     TILT_X,
@@ -33,6 +32,7 @@ from adjust.functional_model.self_calibration_sets import (
     legendre_terms,
     summed,
 )
+from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.transformation import polynomial_order
 from adjust.linear_algebra.small_matrices import newton, product
 

@@ -11,8 +11,8 @@ from networks import FIDUCIALS
 from projects import PITCH_MM, TRUTH, Capture, Refusal, adjusted_project, result_file
 from studies import parametrize_with_studies
 
+from adjust.functional_model.distortion_models import TORLEGARD_NAMES
 from adjust.functional_model.lens import Lens, Prior
-from adjust.functional_model.physical import TORLEGARD_NAMES
 from adjust.problem.camera import FiducialDistance
 from pipeline import InputError, read_images
 from pipeline.cli import DONE, WRONG_INPUT, run
