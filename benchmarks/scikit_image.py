@@ -23,7 +23,7 @@ from test_disks import field
 from true_marks import KIND, TrueMark, some_mark
 
 from adjust.functional_model.transformation import film_kind
-from adjust.initial_values.fiducial_fit import fit_transformation
+from adjust.initial_values.frames import fit_transformation
 from benchmarks.harness import Row, rms
 from benchmarks.measured_marks import CONTRAST, GROUND, draw_mark, measure_mark, start_off
 from measure.boards.corners import junctions

@@ -13,7 +13,7 @@ from adjust.problem.estimates import adjusted_image, lifted
 from adjust.problem.network import Approximations, Network
 from adjust.problem.parameter import Kind, object_coordinate
 from adjust.problem.problem import number
-from adjust.problem.reduction import Reduction
+from adjust.problem.unknowns import Reduction
 from adjust.solution.adjustment import Options, settle_datum
 from adjust.solution.result import Adjustment
 from adjust.solution.reweighting import run

@@ -12,7 +12,7 @@ import numpy as np
 
 from adjust.array_types import Array
 from adjust.functional_model.transformation import Film, film_kind, film_parameter_names
-from adjust.initial_values.fiducial_fit import fit_transformation
+from adjust.initial_values.frames import fit_transformation
 
 KEEPS_DISTANCES = ("none", "congruent")
 STEPS = 10  # Gauss-Newton steps at most; models that are linear in their parameters need one

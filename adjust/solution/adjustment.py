@@ -12,7 +12,7 @@ from adjust.initial_values.approximations import initial_values
 from adjust.least_squares.malloc_tuning import keep_freed_memory, pause_cycle_search
 from adjust.problem.network import STRAIGHT, Approximations, Network
 from adjust.problem.problem import Problem, number
-from adjust.problem.reduction import Reduction
+from adjust.problem.unknowns import Reduction
 from adjust.quality.run import Run
 from adjust.rank_defect.datum import (
     CENTERINGS,

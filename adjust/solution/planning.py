@@ -17,7 +17,7 @@ from adjust.problem.further_observations import error_free
 from adjust.problem.network import Approximations, Network
 from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem, number
-from adjust.problem.reduction import Reduction
+from adjust.problem.unknowns import Reduction
 from adjust.quality.cofactor import free_cofactor
 from adjust.rank_defect.null_space import null_vectors
 from adjust.solution.adjustment import Options, adjust_problem, settle_datum

@@ -15,7 +15,7 @@ from studies import parametrize_with_studies
 
 from adjust import Adjustment, Camera, Distortion, Prior
 from adjust.problem.network import Approximations, Exterior, LineOfSight, Network, ObjectPoint, Transformation
-from adjust.problem.reduction import Reduction
+from adjust.problem.unknowns import Reduction
 from adjust.solution.adjustment import Datum, Options, adjust
 
 CASES = (

@@ -12,7 +12,7 @@ from adjust.functional_model.transformation import (
     Film,
     film_kind,
 )
-from adjust.initial_values.fiducial_fit import fit_transformation
+from adjust.initial_values.frames import fit_transformation
 from adjust.problem.network import Image, Network, Transformation
 
 Array = NDArray[np.float64]

@@ -14,8 +14,13 @@ from adjust import AdjustmentError, Camera, Distortion, Network, Options, Prior,
 from adjust.initial_values.intersection import intersect
 from adjust.initial_values.model_formation import absolute_orientation, relative_poses
 from adjust.initial_values.pose import KnownField, Pose, image_distances
-from adjust.initial_values.principal_distance import find_principal_distance
-from adjust.initial_values.resection import resect, resect_images, resections, three_point_poses
+from adjust.initial_values.resection import (
+    find_principal_distance,
+    resect,
+    resect_images,
+    resections,
+    three_point_poses,
+)
 
 Array = NDArray[np.float64]
 
