@@ -30,7 +30,7 @@ from adjust.model_selection.cross_validation import adjusted_values, cross_valid
 from adjust.model_selection.scanner_choice import choose_bends
 from adjust.problem.network import Network
 from adjust.problem.parameter import description
-from adjust.quality.weighting import NO_WEIGHT
+from adjust.quality.tested import NO_WEIGHT
 from adjust.rank_defect.datum import held_as_known
 from adjust.solution.adjustment import Options, adjust
 from adjust.solution.result import Adjustment

@@ -1,18 +1,26 @@
-"""Inner and outer reliability (Baarda): redundancy numbers, test statistics, smallest detectable errors, their effect.
+"""Inner and outer reliability (Baarda), and data snooping: detection of gross errors in observations and given values.
 
-The tests are those of a run in unit weight, see `adjust.quality.run`.
+Redundancy numbers, test statistics, smallest detectable errors and their effect. The tests are those of a run in unit
+weight, see `adjust.quality.run`.
+
+Gross errors are found one after the other, the largest first, each tested without those found before; all of these are
+then tested again without the later ones, so that two errors neither mask each other nor make good observations suspect
+(Baarda's data snooping with forward and backward steps). The linear model of one adjustment suffices: its residuals T v
+and cofactor matrix V = I - T B C_xx B' T', in unit weight, give the residuals without any subset of observations.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from scipy import special
 
 from adjust.array_types import Array, Indices, Mask
 from adjust.linear_algebra.small_matrices import applied, eigen, product
 from adjust.problem.parameter import Parameter
-from adjust.problem.tested import Probabilities, Tested
-from adjust.quality.run import UNCHECKED, Run
+from adjust.quality.run import UNCHECKED, GrossError, Run
+from adjust.quality.tested import Probabilities, Tested, robust_scale
 
 Effects = tuple[Array, Callable[[int], str]]  # effects (k, c) of errors on the cameras' parameters, and their names
 
@@ -173,3 +181,239 @@ def _further_effects(run: Run, by_shared: Array, shift: float) -> Iterator[Effec
         errors = np.where(controlled, _over(shift, variance, controlled), 0.0)
         names = [f"{each.group} {label}" for label in each.labels]
         yield errors[:, None] * (inward.T @ (through @ by_shared[block.shared[0]])), names.__getitem__
+
+
+TOLD_APART = 7.0  # difference of two statistics that decides between explanations: odds of 30 to 1
+ALIKE_SHOWN = 3
+AT_ONCE = 20  # columns of V computed in one pass
+MOST_SUSPECT = 0.25  # largest fraction of gross errors; beyond it, right and wrong cannot be distinguished
+MOST_AT_ONCE = 60  # gross errors in one adjustment; the next one continues
+MANY = 500  # image points whose median is robust against some gross errors
+RAISED = 1.02  # least ratio of a scale that counts as larger
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A suspected gross error in an observation or given quantity, tested without the other suspects.
+
+    Attributes
+    ----------
+    size : number of coordinates tested together.
+    statistic : chi-square with `size` degrees of freedom.
+    critical : critical value at the family-wise level `Probabilities.family`.
+    w, tau, critical_tau : of its worst coordinate in the adjustment as it stands.
+    error : estimated gross error by coordinate, in mm, object units or rad.
+    alike : units that could be wrong in its place.
+    removed : whether the adjustment rejects it.
+    """
+
+    tested: Tested
+    size: int
+    statistic: float
+    critical: float
+    w: float
+    tau: float
+    critical_tau: float
+    error: tuple[float, ...]
+    alike: tuple[str, ...]
+    removed: bool
+
+
+class Snooping:
+    """Search for gross errors in one adjustment.
+
+    Columns of V are computed on demand, many at a time, since each pass goes over all blocks.
+    """
+
+    def __init__(self, run: Run, probabilities: Probabilities) -> None:
+        self.run, self.probabilities = run, probabilities
+        self._columns: dict[int, Array] = {}
+
+    @cached_property
+    def critical(self) -> Array:
+        """(N,) critical values of the statistics; inf for untested units."""
+        tests = self.run.statistics
+        is_tested = tests.sizes > 0
+        critical = self.probabilities.critical(tests.sizes, int(is_tested.sum()))
+        return np.where(is_tested & ~self._impossible, critical, np.inf)
+
+    @property
+    def _impossible(self) -> Mask:
+        """(N,) mask of units whose estimated gross error is impossible: a principal distance wrong by more than itself.
+
+        Over flat ground v'Pv hardly depends on the principal distance. Its small slope may come from elsewhere, such as
+        errors of given heights, and looks like a gross error of metres in the linear model.
+        """
+        run, observed = self.run, len(self.run.end.v_mm)
+        positions = run.units.positions[:, 0]
+        is_distance = np.isin(positions, [some[0] for some in run.problem.unknowns.camera.values()])
+        errors = np.abs(run.statistics.error[observed:, 0])
+        impossible = is_distance & (errors > np.abs(run.end.state.values[positions]))
+        return np.concatenate([np.zeros(observed, dtype=bool), impossible])
+
+    @property
+    def limits(self) -> Array:
+        """(N,) limits of the statistics in an adjustment without the gross errors."""
+        return np.asarray(self._significant_scale([]) ** 2 * self.critical)
+
+    @cached_property
+    def contradictions(self) -> list[GrossError]:
+        """Gross errors in the order in which they were found.
+
+        Where all observations are less precise than given, the limits are raised by their scale. The scale is estimated
+        without the gross errors, since in a small network one of them affects all residuals.
+        """
+        most = min(int(MOST_SUSPECT * len(self.critical)), MOST_AT_ONCE)
+        scale = self._median_scale([]) if len(self.run.end.v_mm) > MANY else 1.0
+        while True:
+            limits = scale**2 * self.critical
+            chosen = self._chosen(limits, most)
+            # If there may be more gross errors, the sum of squares would include them: use the median.
+            learnt = self._significant_scale(chosen) if len(chosen) < most else self._median_scale(chosen)
+            if learnt <= RAISED * scale:
+                return [self._contradiction(chosen, unit, limits) for unit in chosen]
+            scale = learnt
+
+    def rest(self, units: Sequence[int]) -> tuple[float, float]:
+        """v'Pv and redundancy of the adjustment without some units."""
+        found = self.run.misfits
+        residual, hat = found.residual, found.hat[self.run.weighting.used]
+        vpv = float((residual**2).sum())
+        redundancy = 2.0 * len(hat) - float(np.trace(hat, axis1=1, axis2=2).sum())
+        if not units:
+            return vpv, redundancy
+        joint = self._joint_cofactor(units)
+        explained = residual[units].ravel() @ _inverse(joint) @ residual[units].ravel()
+        rank = int(np.linalg.matrix_rank(joint, tol=UNCHECKED, hermitian=True))
+        return max(vpv - float(explained), 0.0), redundancy - rank
+
+    def suspects(self, result: Reliability, redundancy: int) -> tuple[Suspect, ...]:
+        """Gross errors and down-weighted units, with names, the worst first."""
+        tests, weighting = self.run.statistics, self.run.weighting
+        entries = {each.unit: each for each in self.contradictions}
+        alike = {each.unit: each.alike for each in self.run.removed}
+        limits = self.limits
+        for unit in map(int, np.flatnonzero((weighting.weights < 1.0) & (tests.statistic > limits))):
+            figures = float(tests.statistic[unit]), float(limits[unit]), tests.error[unit]
+            entries[unit] = GrossError(unit, *figures, alike.get(unit, ()))
+        critical_tau = self.probabilities.critical_tau(redundancy, int((tests.sizes > 0).sum()))
+        worst_first = sorted(entries.values(), key=lambda each: -each.statistic / each.limit)
+        return tuple(self._suspect(entry, result, critical_tau) for entry in worst_first)
+
+    def _suspect(self, entry: GrossError, result: Reliability, critical_tau: float) -> Suspect:
+        unit, tested = entry.unit, result.tested[entry.unit]
+        worst = int(np.abs(result.w[unit]).argmax())
+        return Suspect(
+            tested=tested,
+            size=int(result.sizes[unit]),
+            statistic=entry.statistic,
+            critical=entry.limit,
+            w=float(result.w[unit, worst]),
+            tau=float(result.tau[unit, worst]),
+            critical_tau=critical_tau,
+            error=tuple(float(value) for value in entry.error[: len(tested.coordinates)]),
+            alike=tuple(result.tested[other].name for other in entry.alike[:ALIKE_SHOWN]),
+            removed=not bool(self.run.weighting.used[unit]),
+        )
+
+    def _significant_scale(self, units: Sequence[int]) -> float:
+        """Root of v'Pv over redundancy without some units if it is significantly above 1, else 1."""
+        vpv, redundancy = self.rest(units)
+        chance = redundancy < 1.0 or special.chdtrc(redundancy, vpv) > self.probabilities.family
+        return 1.0 if chance else float(np.sqrt(vpv / redundancy))
+
+    def _median_scale(self, units: Sequence[int]) -> float:
+        """Robust scale from the median of the other image points' statistics, at least 1."""
+        points = np.setdiff1d(np.arange(len(self.run.end.v_mm)), units)
+        sizes = np.where(np.isfinite(self.critical[points]), 2, 0)
+        return max(1.0, robust_scale(self._reduced_statistics(units)[points], sizes))
+
+    def _chosen(self, limits: Array, most: int) -> list[int]:
+        chosen: list[int] = []
+        for _ in range(2 * most):
+            statistic = self._reduced_statistics(chosen)
+            worst = int(np.argmax(statistic / limits))
+            if statistic[worst] <= limits[worst] or len(chosen) == most:
+                break
+            chosen.append(worst)
+            confirmed = self._joint_errors(chosen)[1] > limits[chosen]
+            chosen = [unit for unit, still in zip(chosen, confirmed, strict=True) if still or unit == worst]
+        return chosen
+
+    def _contradiction(self, chosen: Sequence[int], unit: int, limits: Array) -> GrossError:
+        errors, joint = self._joint_errors(chosen)
+        at = chosen.index(unit)
+        others = self._reduced_statistics([each for each in chosen if each != unit])
+        near = np.flatnonzero((others > limits) & (others > joint[at] - TOLD_APART))
+        alike = sorted((int(other) for other in near if other != unit), key=lambda other: -others[other])
+        error = self.run.misfits.back[unit] @ errors[at]
+        return GrossError(unit, float(joint[at]), float(limits[unit]), error, tuple(alike))
+
+    def _reduced_statistics(self, left_out: Sequence[int]) -> Array:
+        """(N,) statistics without some units; 0 for these."""
+        residual, cofactor = self.run.misfits.residual, np.eye(2) - self.run.misfits.hat
+        if left_out:
+            columns = self._cofactor_columns(left_out)
+            through = columns @ _inverse(columns[left_out].reshape(2 * len(left_out), -1))
+            residual = residual - through @ residual[left_out].ravel()
+            cofactor = cofactor - through @ columns.transpose(0, 2, 1)
+        variance, axes = eigen(cofactor)
+        statistic = _square_sums(variance, applied(axes.transpose(0, 2, 1), residual))
+        statistic[left_out] = 0.0
+        return statistic
+
+    def _joint_errors(self, chosen: Sequence[int]) -> tuple[Array, Array]:
+        """Joint estimate of the gross errors (k, 2) of all chosen units, in unit weight, and their statistics (k,)."""
+        inverse = _inverse(self._joint_cofactor(chosen))
+        errors = -(inverse @ self.run.misfits.residual[chosen].ravel()).reshape(-1, 2)
+        own = inverse.reshape(len(chosen), 2, len(chosen), 2)
+        variance, axes = np.linalg.eigh(np.einsum("kikj->kij", own))
+        return errors, _square_sums(variance, (axes.transpose(0, 2, 1) @ errors[..., None])[..., 0])
+
+    def _joint_cofactor(self, units: Sequence[int]) -> Array:
+        """(2 k, 2 k) block of V of some units."""
+        return self._cofactor_columns(units)[units].reshape(2 * len(units), -1)
+
+    def _cofactor_columns(self, units: Sequence[int]) -> Array:
+        """(N, 2, 2 k) columns of V of some units."""
+        missing = [unit for unit in units if unit not in self._columns]
+        if missing:
+            worst = np.argsort(-self.run.statistics.statistic / self.critical)[:AT_ONCE]  # likely to be needed next
+            self._prepare([*missing, *(int(unit) for unit in worst if unit not in missing)])
+        nothing = np.zeros((len(self.critical), 2, 0))
+        return np.concatenate([nothing, *(self._columns[unit] for unit in units)], axis=2)
+
+    def _prepare(self, units: list[int]) -> None:
+        """Compute the columns (N, 2, 2) of some units in one pass."""
+        units = [unit for unit in units if unit not in self._columns]
+        # By unit: number of the rows and of the block that hold it, its own rows, its covariances with the shared.
+        homes: dict[int, tuple[int, int, Array, Array]] = {}
+        triangle = self.run.factor.triangle
+        for part, rows in enumerate(self.run.unit_rows()):
+            for block, place in np.argwhere(np.isin(rows.units, units)):
+                through = np.zeros((len(triangle), 2))
+                np.add.at(through, rows.shared[block], rows.through[block, place].T)
+                by_shared = triangle.cofactor_times(through)
+                homes[int(rows.units[block, place])] = (part, int(block), rows.own[block, place], by_shared)
+        columns = {unit: np.zeros((len(self.critical) + 1, 2, 2)) for unit in units}  # the last entry is ABSENT
+        for part, rows in enumerate(self.run.unit_rows()):
+            for unit, (home, block, own, by_shared) in homes.items():
+                columns[unit][rows.units] = -(rows.through @ by_shared[rows.shared][:, None])
+                if part == home:
+                    columns[unit][rows.units[block]] -= rows.own[block] @ own.T
+        for unit in units:
+            self._columns[unit] = columns[unit][:-1]
+            self._columns[unit][unit] = np.eye(2) - self.run.misfits.hat[unit]
+
+
+def _square_sums(variance: Array, along: Array) -> Array:
+    """(n,) sums of squares over variances (n, 2), without unchecked components."""
+    visible = variance > UNCHECKED
+    return np.asarray(np.where(visible, along**2 / np.where(visible, variance, 1.0), 0.0).sum(axis=1))
+
+
+def _inverse(cofactor: Array) -> Array:
+    """Pseudo-inverse without unchecked components."""
+    variance, axes = np.linalg.eigh(cofactor)
+    visible = variance > UNCHECKED
+    return np.asarray((axes[:, visible] / variance[visible]) @ axes[:, visible].T)

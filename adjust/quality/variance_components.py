@@ -21,7 +21,7 @@ from adjust.linear_algebra.sparse_rows import spread_squares
 from adjust.problem.estimates import GivenGroup, VarianceFactor
 from adjust.problem.problem import ABSENT, Problem
 from adjust.quality.run import Run
-from adjust.quality.weighting import Weighting
+from adjust.quality.tested import Weighting
 
 UNCHECKED = 0.01  # redundancy below which given values only place something
 LEAST_REDUNDANCY = 1.0  # of the observations that determine sigma0

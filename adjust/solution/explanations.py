@@ -33,9 +33,9 @@ from adjust.array_types import Array, Indices, Mask
 from adjust.least_squares.iteration import linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.problem.problem import Problem
-from adjust.problem.tested import Probabilities
+from adjust.quality.reliability import TOLD_APART, Snooping
 from adjust.quality.run import UM_PER_MM, GrossError, Run, residuals
-from adjust.quality.snooping import TOLD_APART, Snooping
+from adjust.quality.tested import Probabilities
 from adjust.quality.variance_components import added_variance
 from adjust.rank_defect.diagnosis import singular_directions
 from adjust.solution.model_hypotheses import ModelHypothesis, model_hypotheses, separate_lenses

@@ -3,8 +3,7 @@
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
-from adjust.problem.tested import PRIOR_GROUPS, Probabilities
-from adjust.quality.weighting import WeightFunction
+from adjust.quality.tested import PRIOR_GROUPS, Probabilities, WeightFunction
 
 Datum = Literal["control", "minimal", "free"]
 Method = Literal["combined", "elements"]
@@ -25,7 +24,7 @@ class Options:
     datum_points : points with the inner constraints of "free"; default: all.
     robust : robust estimation. "huber" (or True) reduces the weights of outliers; "igg3" finally gives them no weight;
         see `robust_weights`.
-    snooping : remove outliers by data snooping; see `adjust.quality.snooping`.
+    snooping : remove outliers by data snooping; see `adjust.quality.reliability`.
     variance_components : estimate variance factors of groups. True: targets, tie points, fiducials and joins in the
         images; or names of groups (see `Group`).
     iteration_limit : largest number of iterations.

@@ -17,9 +17,7 @@ from adjust.problem.camera import Camera
 from adjust.problem.estimates import Cofactor, Estimates, NullDirection, VarianceFactor
 from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem
-from adjust.problem.tested import Probabilities
 from adjust.quality.cofactor import NoCofactor, free_cofactor, inner_cofactor
-from adjust.quality.correlation import Correlation, correlations
 from adjust.quality.image_clusters import (
     MOST_SHARED,
     cluster_covariance,
@@ -29,10 +27,17 @@ from adjust.quality.image_clusters import (
 )
 from adjust.quality.lens_reach import LensReach, lens_reach
 from adjust.quality.projection_uncertainty import ProjectionUncertainty, only_camera, projection_uncertainty
-from adjust.quality.reliability import Reliability, reliability
+from adjust.quality.reliability import Reliability, Snooping, Suspect, reliability
 from adjust.quality.run import FurtherResidual, Group, Residuals, Run, further_residuals, groups, residuals
-from adjust.quality.significance import CalibrationTest, SignificanceTest, calibration_tests, significance_tests
-from adjust.quality.snooping import Snooping, Suspect
+from adjust.quality.significance import (
+    CalibrationTest,
+    Correlation,
+    SignificanceTest,
+    calibration_tests,
+    correlations,
+    significance_tests,
+)
+from adjust.quality.tested import Probabilities
 from adjust.quality.variance_components import factor_sigmas, variance_factor
 from adjust.rank_defect.flat_valleys import held_directions, inseparable
 from adjust.solution.explanations import Explanation, explain

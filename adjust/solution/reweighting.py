@@ -12,12 +12,11 @@ from adjust.least_squares.numbering import Numbering
 from adjust.problem.condition_equations import blind_marks
 from adjust.problem.estimates import NullDirection, Termination
 from adjust.problem.problem import Problem, State
-from adjust.problem.tested import TestedUnits
 from adjust.quality.cofactor import free_cofactor
+from adjust.quality.reliability import Snooping
 from adjust.quality.run import GrossError, Run
-from adjust.quality.snooping import Snooping
+from adjust.quality.tested import NO_WEIGHT, TestedUnits, WeightFunction, Weighting, robust_weights
 from adjust.quality.variance_components import refined_factors
-from adjust.quality.weighting import NO_WEIGHT, WeightFunction, Weighting, robust_weights
 from adjust.rank_defect.diagnosis import singular_directions
 from adjust.rank_defect.flat_valleys import REACHES, edge_motions, is_contradicted, unresolved
 from adjust.solution.options import Options

@@ -15,12 +15,11 @@ from adjust.problem.camera import Camera
 from adjust.problem.estimates import adjusted_image
 from adjust.problem.network import EXTERIOR_NAMES, Image, Network, ObjectPoint
 from adjust.problem.parameter import Kind, Parameter
-from adjust.problem.tested import Tested
 from adjust.quality.projection_uncertainty import projection_uncertainty
-from adjust.quality.reliability import Reliability
+from adjust.quality.reliability import Reliability, Suspect
 from adjust.quality.run import FurtherResidual
 from adjust.quality.significance import CalibrationTest, SignificanceTest
-from adjust.quality.snooping import Suspect
+from adjust.quality.tested import Tested
 from adjust.solution.result import Adjustment
 from pipeline.results.adjustment_record import (
     AdjustmentRecord,

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
 from adjust import Adjustment, AdjustmentError, Distortion, Network, ObjectPoint, Options, Prior, adjust, approximate
-from adjust.problem.tested import Probabilities
+from adjust.quality.tested import Probabilities
 from adjust.solution.explanations import explain
 from adjust.solution.unmodelled_error import adjust_unmodelled
 

@@ -12,7 +12,7 @@ from adjust.model_selection.candidates import Candidate, Model, f_test, lenses, 
 from adjust.model_selection.cross_validation import CrossValidation, cross_validate, folds
 from adjust.model_selection.model_choice import Choice, choose, weighted_network
 from adjust.problem.network import Network, ObjectPoint, Transformation
-from adjust.quality.weighting import WeightFunction
+from adjust.quality.tested import WeightFunction
 
 Array = NDArray[np.float64]
 

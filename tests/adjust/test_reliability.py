@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from adjust import Adjustment, Calibration, Fiducial, Options, Parameter, Prior, adjust
 from adjust.problem.network import Approximations, Exterior, Network
-from adjust.problem.tested import Probabilities
 from adjust.quality.reliability import Reliability
-from adjust.quality.weighting import WeightFunction
+from adjust.quality.tested import Probabilities, WeightFunction
 
 Array = NDArray[np.float64]
 

@@ -31,7 +31,7 @@ from adjust.problem.estimates import GivenGroup, adjusted_image
 from adjust.problem.network import Approximations, Exterior, Network
 from adjust.problem.problem import State, number
 from adjust.quality.fiducial_corrections import common_transformation, corrections_to_given
-from adjust.quality.weighting import robust_weights
+from adjust.quality.tested import robust_weights
 
 Array = NDArray[np.float64]
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from adjust import Adjustment, Camera, Distortion, Exterior, Image, Network, ObjectPoint, Parameter, Prior
 from adjust.least_squares.iteration import Iteration
 from adjust.problem.estimates import NullDirection, VarianceFactor
-from adjust.problem.tested import Probabilities
 from adjust.quality.run import Group, Residuals
+from adjust.quality.tested import Probabilities
 from measure.flags import Cause, Reason, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from pipeline import read_adjustment, write_adjustment
