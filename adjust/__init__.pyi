@@ -15,7 +15,7 @@ from .problem.observations import Calibration as Calibration
 from .problem.observations import Distance as Distance
 from .problem.observations import Observations as Observations
 from .problem.parameter import Parameter as Parameter
-from .quality.projection_uncertainty import ProjectionUncertainty as ProjectionUncertainty
+from .quality.lens_uncertainty import ProjectionUncertainty as ProjectionUncertainty
 from .solution.adjustment import adjust as adjust
 from .solution.options import Options as Options
 from .solution.result import Adjustment as Adjustment

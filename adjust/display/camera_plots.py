@@ -13,7 +13,7 @@ from adjust.functional_model.lens import Lens
 from adjust.problem.camera import Camera
 from adjust.problem.estimates import Estimates, adjusted_lens, observed_places
 from adjust.problem.parameter import Parameter
-from adjust.quality.lens_reach import distortion_curves, is_defined_over_frame
+from adjust.quality.lens_uncertainty import distortion_curves, is_defined_over_frame
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from adjust.array_types import Array, Mask
 from adjust.functional_model.rotation import rotation_from_vector
-from adjust.initial_values.intersection import intersect
-from adjust.initial_values.pose import KnownField, Pose, Sight, image_distances
+from adjust.initial_values.pose import KnownField, Pose, Sight, image_distances, intersect
 from adjust.initial_values.resection import resect_images
 
 SAMPLES = 150

@@ -8,7 +8,7 @@ import numpy as np
 from adjust.array_types import Array, Indices, Mask
 from adjust.errors import AdjustmentError
 from adjust.functional_model.projection import ImageModel
-from adjust.initial_values.intersection import intersect
+from adjust.initial_values.pose import intersect
 from adjust.problem.estimates import adjusted_image, lifted
 from adjust.problem.network import Approximations, Network
 from adjust.problem.parameter import Kind, object_coordinate

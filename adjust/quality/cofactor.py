@@ -1,4 +1,7 @@
-"""Cofactor matrix of a result (covariance at sigma0 = 1), computed on demand from the factor."""
+"""Cofactor matrix of a result (covariance at sigma0 = 1), computed on demand, and a covariance by clusters.
+
+In the cluster-robust covariance of the cameras, residuals within an image may be correlated; images are the clusters.
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,6 +11,7 @@ from scipy.sparse import csr_array
 
 from adjust.array_types import Array, Indices
 from adjust.functional_model.rotation import vector_by_angles
+from adjust.least_squares.iteration import Linearised
 from adjust.least_squares.numbering import Numbering
 from adjust.linear_algebra.factor import Factor
 from adjust.problem.problem import Problem, State
@@ -145,3 +149,130 @@ def _reported(problem: Problem, state: State) -> csr_array:
     matrix = csr_array((np.concatenate(values), entries), shape=(count, count))
     matrix.eliminate_zeros()
     return matrix
+
+
+FEWEST_IMAGES = 5  # needed to estimate standard deviations, then to about a third
+MOST_SHARED = 300  # shared quantities: with many unknown points the dense matrix would be too large
+LARGEST_SHARE = 0.999  # of one image in the information on some combination of unknowns; above, it rests on that image
+RANK = 1e-12  # eigenvalue of a scaled covariance, below which a direction is fixed
+
+
+def shared_positions(numbering: Numbering) -> Indices:
+    """Positions of the free quantities shared by images."""
+    unknowns = numbering.problem.unknowns
+    return np.flatnonzero(unknowns.sigma[: unknowns.shared_count] > 0.0)
+
+
+def cluster_covariance(numbering: Numbering, end: Linearised, cofactor: Array) -> Array | None:
+    """Covariance (k, k) of the quantities at `shared_positions` by a delete-one-image jackknife.
+
+    Each image is left out of the normal equations in turn. With N the normal matrix of the shared unknowns, N_i the
+    part of image i, its own unknowns eliminated, and g_i its share of the right side, the shared unknowns change by
+    d_i = -(N - N_i)^-1 g_i. The covariance is (m - 1) / m times the sum of (d_i - d)(d_i - d)' (Efron 1982; MacKinnon
+    and White 1985, with images as clusters). It holds for any correlation of errors within an image, such as unmodelled
+    distortion causes.
+
+    Parameters
+    ----------
+    numbering, end : the unknowns, and the rows at the solution
+    cofactor : (k, k) of the shared quantities, at sigma0 = 1
+
+    Returns
+    -------
+    None with fewer than FEWEST_IMAGES images, or where some quantity rests on one image.
+    """
+    shares = _shares(numbering, end, cofactor)
+    if len(shares) < FEWEST_IMAGES:
+        return None
+    moves = [_move(share.by_shared, share.right) for share in shares]
+    if any(move is None for move in moves):
+        return None
+    spread = np.array(moves) @ np.linalg.cholesky(cofactor).T
+    spread -= spread.mean(axis=0)
+    return np.asarray((len(shares) - 1) / len(shares) * spread.T @ spread)
+
+
+def larger_covariance(model: Array, clusters: Array) -> Array:
+    """Covariance (k, k) of the adjustment, enlarged in each direction in which the jackknife's is larger."""
+    total = model + clusters
+    scale = np.sqrt(np.where(np.diagonal(total) > 0.0, np.diagonal(total), 1.0))
+    variances, axes = np.linalg.eigh(total / np.outer(scale, scale))
+    known = variances > RANK
+    root = axes[:, known] * np.sqrt(variances[known])
+    inverse = root.T / variances[known, None] / scale
+    shares, directions = np.linalg.eigh(inverse @ model @ inverse.T)  # of the model in the total
+    spread = scale[:, None] * root @ directions * np.sqrt(np.maximum(shares, 1.0 - shares))
+    return np.asarray(spread @ spread.T)
+
+
+def prediction_errors(numbering: Numbering, end: Linearised, cofactor: Array, folds: int) -> Array | None:
+    """Cross-validation over images: mean square (m,) of the normalised lengths of each image's residuals.
+
+    One fold of images at a time is left out and oriented by the camera from the others. Without them the shared
+    unknowns change by d, as in `cluster_covariance`, and their residuals r become r - B d (PRESS: Allen 1974, with
+    images in place of observations).
+
+    Parameters
+    ----------
+    numbering, end, cofactor : as for `cluster_covariance`
+    folds : number of folds
+
+    Returns
+    -------
+    None where some quantity rests on the images of one fold.
+    """
+    shares = _shares(numbering, end, cofactor)
+    errors = np.zeros(len(shares))
+    for fold in (range(first, len(shares), folds) for first in range(min(folds, len(shares)))):
+        equations = (shares[image].by_shared for image in fold), (shares[image].right for image in fold)
+        move = _move(*map(np.concatenate, map(list, equations)))
+        if move is None:
+            return None
+        for image in fold:
+            errors[image] = 2.0 * float(np.mean((shares[image].right - shares[image].by_shared @ move) ** 2))
+    return errors
+
+
+@dataclass(frozen=True, eq=False)
+class _Share:
+    """Reduced equations of an image: derivatives (n, k) by the shared unknowns, in units of the root of their cofactor
+    matrix, in which N is the unit matrix; right sides (n,)."""
+
+    by_shared: Array
+    right: Array
+
+
+def _shares(numbering: Numbering, end: Linearised, cofactor: Array) -> list[_Share]:
+    """Reduced equations of each image with marks, in the network's order."""
+    problem = numbering.problem
+    images, shared = problem.network.frame_numbers[problem.image_numbers], shared_positions(numbering)
+    root = np.asarray(np.linalg.cholesky(cofactor), dtype=np.float64)
+    free = np.append(numbering.problem.unknowns.sigma > 0.0, False)  # the last entry is ABSENT
+    shares = []
+    for image in np.unique(images):
+        rows = images == image
+        columns, matrix, right = problem.columns[rows], end.rows.matrix[rows], end.rows.right[rows].ravel()
+        own = np.setdiff1d(np.unique(columns[free[columns]]), shared)
+        by_shared, by_own = (_by_unknowns(columns, matrix, each, len(free)) for each in (shared, own))
+        basis = np.linalg.qr(by_own)[0]
+        by_shared, right = by_shared - basis @ (basis.T @ by_shared), right - basis @ (basis.T @ right)
+        shares.append(_Share(by_shared @ root, right))
+    return shares
+
+
+def _move(by_shared: Array, right: Array) -> Array | None:
+    """Change of the shared unknowns without the equations of some images, in units of the root; None if
+    undetermined."""
+    parts, axes = np.linalg.eigh(by_shared.T @ by_shared)
+    if parts.max(initial=0.0) > LARGEST_SHARE:
+        return None
+    return np.asarray(-axes @ (axes.T @ (by_shared.T @ right) / (1.0 - parts)))
+
+
+def _by_unknowns(columns: Indices, matrix: Array, positions: Indices, count: int) -> Array:
+    """Scatter derivatives (n, 2, j) at columns (n, j) to a matrix (2 n, k) of the quantities at some positions."""
+    place = np.full(count, len(positions), dtype=np.intp)
+    place[positions] = np.arange(len(positions))
+    dense = np.zeros((len(columns), len(positions) + 1, 2))
+    np.add.at(dense, (np.arange(len(columns))[:, None], place[columns]), matrix.transpose(0, 2, 1))
+    return np.asarray(dense[:, :-1].transpose(0, 2, 1).reshape(2 * len(columns), -1))

@@ -11,8 +11,7 @@ import numpy as np
 from adjust.array_types import Array
 from adjust.functional_model.lens import Lens, Prior
 from adjust.initial_values.frames import camera_frames
-from adjust.initial_values.intersection import intersect
-from adjust.initial_values.pose import Pose, Sight, image_distances
+from adjust.initial_values.pose import Pose, Sight, image_distances, intersect
 from adjust.problem.network import Approximations, Network, ObjectPoint
 from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem

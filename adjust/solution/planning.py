@@ -19,7 +19,7 @@ from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem, number
 from adjust.problem.unknowns import Reduction
 from adjust.quality.cofactor import free_cofactor
-from adjust.rank_defect.null_space import null_vectors
+from adjust.rank_defect.diagnosis import null_vectors
 from adjust.solution.adjustment import Options, adjust_problem, settle_datum
 from adjust.solution.result import Adjustment
 from adjust.validation import validate_plan

@@ -17,16 +17,23 @@ from adjust.problem.camera import Camera
 from adjust.problem.estimates import Cofactor, Estimates, NullDirection, VarianceFactor
 from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem
-from adjust.quality.cofactor import NoCofactor, free_cofactor, inner_cofactor
-from adjust.quality.image_clusters import (
+from adjust.quality.cofactor import (
     MOST_SHARED,
+    NoCofactor,
     cluster_covariance,
+    free_cofactor,
+    inner_cofactor,
     larger_covariance,
     prediction_errors,
     shared_positions,
 )
-from adjust.quality.lens_reach import LensReach, lens_reach
-from adjust.quality.projection_uncertainty import ProjectionUncertainty, only_camera, projection_uncertainty
+from adjust.quality.lens_uncertainty import (
+    LensReach,
+    ProjectionUncertainty,
+    lens_reach,
+    only_camera,
+    projection_uncertainty,
+)
 from adjust.quality.reliability import Reliability, Snooping, Suspect, reliability
 from adjust.quality.run import FurtherResidual, Group, Residuals, Run, further_residuals, groups, residuals
 from adjust.quality.significance import (
@@ -133,7 +140,7 @@ class Adjustment(Estimates, PlottedResult):
         """Estimate the covariance (k, k) of quantities of cameras or boards by leaving out one image at a time.
 
         It remains valid where errors within an image are correlated. Fixed quantities have zeros. None without a
-        solution or with too few images (`adjust.quality.image_clusters`).
+        solution or with too few images (`adjust.quality.cofactor`).
         """
         run, at = self.scaled, shared_positions(self.scaled.numbering)
         if not self.converged or len(at) > MOST_SHARED:
@@ -158,7 +165,7 @@ class Adjustment(Estimates, PlottedResult):
         """Cross-validate the images in `folds` groups.
 
         Returns the (m,) mean squared standardised length of each image's residuals, each group of images predicted from
-        the others (`adjust.quality.image_clusters`); None without a solution.
+        the others (`adjust.quality.cofactor`); None without a solution.
         """
         run, at = self.scaled, shared_positions(self.scaled.numbering)
         if not self.converged or len(at) > MOST_SHARED:

@@ -15,8 +15,8 @@ import numpy as np
 from scipy.optimize import nnls
 
 from adjust.functional_model.rotation import angles_from_rotation
-from adjust.initial_values.intersection import intersect
 from adjust.initial_values.model_formation import absolute_orientation
+from adjust.initial_values.pose import intersect
 from adjust.problem.network import Exterior, ObjectPoint
 from measure.flags import Status
 from pipeline.blocks.mapping import (

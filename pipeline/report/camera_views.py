@@ -9,7 +9,7 @@ from markupsafe import Markup
 
 from adjust.functional_model.families import parameter_names
 from adjust.problem.parameter import Parameter, parameter_from_text
-from adjust.quality.lens_reach import Curves, distortion_curves, is_defined_over_frame
+from adjust.quality.lens_uncertainty import Curves, distortion_curves, is_defined_over_frame
 from pipeline.drawing import svg
 from pipeline.report import fiducials, lens, vectors
 from pipeline.report.data import ReportData

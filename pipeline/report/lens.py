@@ -9,7 +9,7 @@ from markupsafe import Markup
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Lens
 from adjust.problem.parameter import Parameter
-from adjust.quality.lens_reach import (
+from adjust.quality.lens_uncertainty import (
     Curves,
     directions,
     displacement_cofactor,

@@ -15,7 +15,7 @@ from adjust.problem.camera import Camera
 from adjust.problem.estimates import adjusted_image
 from adjust.problem.network import EXTERIOR_NAMES, Image, Network, ObjectPoint
 from adjust.problem.parameter import Kind, Parameter
-from adjust.quality.projection_uncertainty import projection_uncertainty
+from adjust.quality.lens_uncertainty import projection_uncertainty
 from adjust.quality.reliability import Reliability, Suspect
 from adjust.quality.run import FurtherResidual
 from adjust.quality.significance import CalibrationTest, SignificanceTest

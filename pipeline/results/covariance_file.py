@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.problem.parameter import Parameter, as_parameter, parameters_from_texts
-from adjust.quality.image_clusters import larger_covariance
+from adjust.quality.cofactor import larger_covariance
 from adjust.solution.result import Adjustment
 from pipeline.errors import InputError
 from pipeline.provenance import hash_file

@@ -15,7 +15,7 @@ from adjust.linear_algebra.factor import BlockFactors, DenseBlocks, Factor
 from adjust.linear_algebra.fronts import Fronts
 from adjust.linear_algebra.sparse_factor import Triangle
 from adjust.problem.network import Approximations, Exterior, Network, Transformation
-from adjust.rank_defect import null_space
+from adjust.rank_defect import diagnosis
 from adjust.solution.adjustment import Datum, Options, adjust
 
 GIVEN: dict[str, list[tuple[str, Callable[[Network], Network]]]] = {
@@ -176,17 +176,17 @@ def factorise(shared: Array, *blocks: BlockFactors) -> Factor:
     return Factor(DenseBlocks(blocks), dense, np.zeros(len(shared)), np.ones(count))
 
 
-@pytest.mark.parametrize("below", [null_space.SINGULAR, 1e-4])
+@pytest.mark.parametrize("below", [diagnosis.SINGULAR, 1e-4])
 @pytest.mark.parametrize(
     "small", [(), (1e-16,) * 9, (1e-17, 1e-16, 1e-6, 3e-5, 9e-5), tuple(np.geomspace(1e-6, 1e-3, 60))]
 )
 def test_small_singular_values_are_found_one_and_all(small: tuple[float, ...], below: float) -> None:
     """Also more of them than are iterated at first, and next to others that are hardly larger."""
     rng = np.random.default_rng(1)
-    count = 2 * null_space.DENSE
+    count = 2 * diagnosis.DENSE
     singular = np.array([*small, *np.geomspace(2e-3, 1.0, count - len(small))])
     shared = triangle(rng, singular)
-    vectors, view = null_space.null_space(factorise(shared), [], below)
+    vectors, view = diagnosis.null_space(factorise(shared), [], below)
     expected = np.sort(singular[singular <= below])
     assert len(view) == len(expected)
     np.testing.assert_allclose(np.sort(view), expected, rtol=0.02, atol=1e-14)
@@ -200,7 +200,7 @@ def test_a_block_without_its_own_determination_lends_its_rows_to_the_shared() ->
     own = np.array([[1.0, 0.0], [0.0, 0.0]])
     border = np.array([[0.0, 0.5], [0.7, 0.0]])
     block = BlockFactors(np.array([[2, 3]]), np.array([[0, 1]]), own[None], border[None], np.zeros((1, 2)))
-    found = null_space.null_vectors(factorise(shared, block))
+    found = diagnosis.null_vectors(factorise(shared, block))
     np.testing.assert_allclose(np.abs(found), [[0.0], [0.0], [0.0], [1.0]], atol=1e-12)
 
 

@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 from studies import parametrize_with_studies
 
 from adjust import AdjustmentError, Camera, Distortion, Network, Options, Prior, adjust, approximate
-from adjust.initial_values.intersection import intersect
 from adjust.initial_values.model_formation import absolute_orientation, relative_poses
-from adjust.initial_values.pose import KnownField, Pose, image_distances
+from adjust.initial_values.pose import KnownField, Pose, image_distances, intersect
 from adjust.initial_values.resection import (
     find_principal_distance,
     resect,

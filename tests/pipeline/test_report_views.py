@@ -15,8 +15,8 @@ from projects import Refusal, write_network_project
 
 from adjust import Parameter, adjust, approximate
 from adjust.functional_model.lens import Lens
-from adjust.quality.image_clusters import larger_covariance
-from adjust.quality.lens_reach import distortion_curves
+from adjust.quality.cofactor import larger_covariance
+from adjust.quality.lens_uncertainty import distortion_curves
 from measure.flags import NO_REASON, Status
 from pipeline import build_network, read_comparator, read_project
 from pipeline.cli import run
