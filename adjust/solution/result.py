@@ -9,8 +9,14 @@ from typing import Any, Literal
 import numpy as np
 
 from adjust.array_types import Array, Indices, Mask
-from adjust.display.camera_plots import CameraPlots, PlottedResult, adjusted_camera_plots
-from adjust.display.tables import data_frame, parameter_columns, residual_columns
+from adjust.display import (
+    CameraPlots,
+    PlottedResult,
+    adjusted_camera_plots,
+    data_frame,
+    parameter_columns,
+    residual_columns,
+)
 from adjust.least_squares.iteration import Iteration, factorise
 from adjust.least_squares.numbering import Numbering
 from adjust.problem.camera import Camera

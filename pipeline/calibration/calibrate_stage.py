@@ -13,8 +13,7 @@ from typing import Any, get_args
 import numpy as np
 from rich.console import Console
 
-from adjust.display.camera_plots import CameraPlots, PlottedResult
-from adjust.display.tables import data_frame
+from adjust.display import CameraPlots, PlottedResult, data_frame
 from adjust.errors import AdjustmentError
 from adjust.problem.network import Network
 from adjust.solution.adjustment import adjust

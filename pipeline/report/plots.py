@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from adjust.display.camera_plots import CameraPlots
+from adjust.display import CameraPlots
 from adjust.errors import AdjustmentError
 from pipeline.errors import InputError, missing_extra
 from pipeline.report.data import ReportData

@@ -12,7 +12,7 @@ from matplotlib.quiver import Quiver
 from networks import HALF_MM, Truth, board_network, field_points, simulated
 
 from adjust import Adjustment, AdjustmentError, Parameter, adjust
-from adjust.display.camera_plots import contour_levels, distance_text
+from adjust.display import contour_levels, distance_text
 
 PIXEL_MM = 0.005
 

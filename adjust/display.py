@@ -1,4 +1,4 @@
-"""Matplotlib plots of a calibrated camera: residuals, distortion, uncertainty of projected points, coverage."""
+"""Display of results: plots of a camera, which need Matplotlib, and tables for pandas, where it is installed."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -12,8 +12,10 @@ from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Lens
 from adjust.problem.camera import Camera
 from adjust.problem.estimates import Estimates, adjusted_lens, observed_places
+from adjust.problem.observations import Observations
 from adjust.problem.parameter import Parameter
 from adjust.quality.lens_uncertainty import distortion_curves, is_defined_over_frame
+from adjust.quality.run import Residuals
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -308,3 +310,33 @@ def _log_norm(levels: list[float]) -> "LogNorm | None":
     from matplotlib.colors import LogNorm
 
     return LogNorm(levels[0], levels[-1]) if len(levels) > 1 and levels[-1] > 3.0 * levels[0] else None
+
+
+def data_frame(columns: dict[str, Any]) -> Any:
+    """Make a pandas.DataFrame. Raises ImportError without pandas."""
+    try:
+        import pandas as pd
+    except ImportError:
+        raise ImportError("Tables need pandas, which this installation lacks. Install: pip install pandas.") from None
+    return pd.DataFrame(columns)
+
+
+def parameter_columns(estimates: Estimates) -> dict[str, Any]:
+    """Columns of a table with one row per quantity."""
+    keys = estimates.parameters
+    return {
+        "kind": [key.kind for key in keys],
+        "owner": [key.owner for key in keys],
+        "id": [key.id for key in keys],
+        "quantity": [key.quantity for key in keys],
+        "value": estimates.values,
+        "sigma": estimates.sigma0 * np.sqrt(estimates.cofactor.variances),
+    }
+
+
+def residual_columns(observations: Observations, residuals: Residuals) -> dict[str, Any]:
+    """Columns of a table with one row per observation."""
+    columns: dict[str, Any] = {"image": observations.image, "point": observations.point, "kind": observations.kind}
+    pairs = {"{}_mm": observations.xy_mm, "v{}_um": 1e3 * residuals.v_mm, "redundancy_{}": residuals.redundancy}
+    pairs["w_{}"] = residuals.w
+    return columns | {name.format(axis): pair[:, k] for name, pair in pairs.items() for k, axis in enumerate("xy")}

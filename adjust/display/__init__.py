@@ -1,1 +1,0 @@
-"""Plots (Matplotlib) and tables (pandas) of results, where these packages are installed."""
