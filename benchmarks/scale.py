@@ -25,8 +25,8 @@ from scipy.sparse.linalg import splu
 
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.rotation import rotation_from_angles
+from adjust.least_squares.equations import Numbering
 from adjust.least_squares.iteration import linearise
-from adjust.least_squares.numbering import Numbering
 from adjust.problem.network import Exterior
 from adjust.problem.problem import ABSENT, number
 from adjust.solution.adjustment import Options, adjust

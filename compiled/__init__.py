@@ -70,7 +70,7 @@ class Kernels(Protocol):
         weight, prior : (b, o) root weights and right sides of the own unknowns' priors.
         fronts, after : as in `square_rows`.
         triangle, reduced, orthonormal, parts, alone : (b, o, o), (b, o), (o, 2, m), (m, o, w), (b, o, t), filled; as in
-            `adjust.linear_algebra.schur_complement.SparseBlocks`.
+            `adjust.linear_algebra.elimination.SparseBlocks`.
         squares, right sides : as in `square_rows`, reduced in place.
         """
         ...

@@ -13,9 +13,9 @@ from reference_cases import CASES, case_approximations, case_network, load
 import compiled
 from adjust.functional_model.projection import LineOfSight
 from adjust.linear_algebra import elimination, fronts
+from adjust.linear_algebra.elimination import SparseBlocks, eliminated
 from adjust.linear_algebra.factor import Blocks
 from adjust.linear_algebra.fronts import Fronts
-from adjust.linear_algebra.schur_complement import SparseBlocks, eliminated
 from adjust.linear_algebra.sparse_factor import Triangle
 from adjust.linear_algebra.sparse_rows import Pattern, SharedEquations, SparseRows
 from adjust.solution.adjustment import adjust

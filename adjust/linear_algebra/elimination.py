@@ -7,24 +7,283 @@ number is that of the design matrix, not its square as with normal equations (Go
 section 5.3; Triggs et al., Bundle adjustment: a modern synthesis). Blocks of equal shape are factorised together.
 
 Observations that no single block contains form blocks without own unknowns: all their unknowns must be shared.
+
+For many small blocks, for example points, whose rows involve few of the shared unknowns, the own unknowns of all blocks
+are eliminated at once (Schur complement): their columns are orthonormalised by the Gram-Schmidt method, twice, which is
+as accurate as Householder reflections (Giraud, Langou and Rozloznik 2005, The loss of orthogonality in the Gram-Schmidt
+orthogonalization process). No dense blocks are formed. The reduced normal equations of the shared unknowns are
+N = A'A - B'B, with the rows A and the borders B: products of block-sparse matrices.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from scipy.sparse import bsr_array, coo_array, csr_array
 
-from adjust.array_types import Array
+import compiled
+from adjust.array_types import Array, Indices
 from adjust.linear_algebra.factor import BlockFactors, Blocks, DenseBlocks, Factor, column_values
 from adjust.linear_algebra.fronts import Fronts
-from adjust.linear_algebra.schur_complement import eliminated
 from adjust.linear_algebra.sparse_factor import (
     TEN_DIGITS,
+    Triangle,
     factorise_normal_equations,
     qr_triangle,
     reflected,
     reflections_cost,
 )
-from adjust.linear_algebra.sparse_rows import SharedEquations, SparseRows
+from adjust.linear_algebra.sparse_rows import Pattern, SharedEquations, SparseRows, batches, take_columns
+
+COMPILED_OWN = 3  # largest number of own unknowns per block in kernels.c
+
+
+@dataclass(frozen=True)
+class Border:
+    """Border of r rows in the shared unknowns: block-sparse in the groups, and dense (r, t) in the single ones."""
+
+    pattern: Pattern
+    parts: bsr_array
+    alone: Array
+
+    def times(self, shared: Array) -> Array:
+        """Product (r,) with shared unknowns (s,)."""
+        of_groups = np.append(shared, 0.0)[self.pattern.members.ravel()]
+        return np.asarray(self.parts @ of_groups + self.alone @ shared[self.pattern.singles])
+
+    def transposed_times(self, rows: Array) -> Array:
+        """Product (s,) of the transpose with a vector (r,)."""
+        result = np.zeros(self.pattern.count + 1)
+        np.add.at(result, self.pattern.members.ravel(), self.parts.T @ rows)
+        result[self.pattern.singles] += self.alone.T @ rows
+        return result[:-1]
+
+    def square(self) -> csr_array:
+        """B'B (s, s)."""
+        groups, singles, transposed = self.pattern.members.ravel(), self.pattern.singles, self.parts.T
+        within = bsr_array(transposed @ self.parts).tocoo()
+        across = coo_array(transposed @ self.alone)
+        alone = coo_array(self.alone.T @ self.alone)
+        rows = np.concatenate([groups[within.row], groups[across.row], singles[across.col], singles[alone.row]])
+        columns = np.concatenate([groups[within.col], singles[across.col], groups[across.row], singles[alone.col]])
+        data = np.concatenate([within.data, across.data, across.data, alone.data])
+        there = (rows >= 0) & (columns >= 0)
+        shape = self.pattern.count, self.pattern.count
+        return csr_array(coo_array((data[there], (rows[there], columns[there])), shape=shape))
+
+
+def eliminated(
+    rows: SparseRows, root_weight: Array, prior_right: Array, scale: Array, equations: SharedEquations
+) -> "SparseBlocks":
+    """Eliminate all own unknowns.
+
+    Parameters
+    ----------
+    root_weight, prior_right : (n,) priors of the scaled unknowns: root_weight times unknown = prior_right.
+    scale : (n,) as in `Factor`.
+    equations : normal equations of the shared unknowns, reduced in place by B'B of the borders B.
+    """
+    pattern, own, fronts = rows.pattern, rows.pattern.own[:-1], equations.fronts
+    blocks = SparseBlocks(
+        rows,
+        triangle=np.empty((*own.shape, own.shape[1])),
+        parts=np.empty((len(pattern.order), own.shape[1], pattern.members.shape[1])),
+        alone=np.empty((*own.shape, len(pattern.singles))),
+        right=np.empty(own.shape),
+        orthonormal=np.empty((own.shape[1], 2, len(pattern.order))),
+        scale=scale,
+    )
+    weight = np.where(own >= 0, (root_weight * scale)[own], 1.0)
+    prior = np.where(own >= 0, prior_right[own], 0.0)
+    if compiled.kernels is not None and own.shape[1] <= COMPILED_OWN:
+        home = fronts.home(pattern.left_over[0][:-1, None])
+        given = (
+            rows.right, pattern.order, pattern.first, np.argsort(home, kind="stable"), home, *pattern.columns, own,
+            pattern.groups, pattern.members, pattern.single, pattern.singles, weight, prior,
+            fronts.table, fronts.later_unknowns,
+        )  # fmt: skip
+        found = blocks.triangle, blocks.right, blocks.orthonormal, blocks.parts, blocks.alone
+        arrays = *map(np.ascontiguousarray, given), *found
+        compiled.kernels.eliminate_blocks(rows.matrix, *arrays, equations.values, equations.right)
+        return blocks
+    _eliminate(blocks, weight, prior)
+    border = blocks.border.square()
+    for front, square in zip(fronts, equations.squares, strict=True):
+        of_own = csr_array(border[front.own, front.first :]).tocoo()
+        square[front.places(of_own.col.astype(np.intp) + front.first), of_own.row] -= of_own.data
+    equations.right[...] -= blocks.border.transposed_times(blocks.right.ravel())
+    return blocks
+
+
+def _eliminate(blocks: "SparseBlocks", weight: Array, prior: Array) -> None:
+    """Fill the blocks; weight, prior (b, o): coefficients and right sides of the own unknowns' priors."""
+    rows, pattern, own = blocks.rows, blocks.rows.pattern, blocks.own
+    alone = np.empty((*own.shape, len(pattern.singles) + 1))
+    for members in batches(pattern.first):
+        some = slice(pattern.first[members.start], pattern.first[members.stop])
+        order, of = pattern.order[some], pattern.block_numbers[some] - members.start
+        by_block = csr_array(
+            (np.ones(len(of)), np.arange(len(of)), pattern.first[members.start : members.stop + 1] - some.start),
+            shape=(members.stop - members.start, len(of)),
+        )
+        by_own, by_group, by_single = (take_columns(rows.matrix, columns, order) for columns in pattern.columns)
+        by_own.swapaxes(1, 2)[(own[members][of] < 0).T] = 0.0
+        by_prior = weight[members].T[..., None] * np.eye(own.shape[1])[:, None, :]
+        first = _orthonormal(by_block, of, by_own, by_prior)
+        blocks.triangle[members] = _orthonormal(by_block, of, by_own, by_prior) @ first
+        x, y = rows.right[order].T
+        reduced = by_block @ (by_own[:, 0] * x + by_own[:, 1] * y).T
+        blocks.right[members] = reduced + (by_prior * prior[members]).sum(axis=2).T
+        by_group, by_single = (
+            by_own[:, None, 0] * by[:, 0] + by_own[:, None, 1] * by[:, 1] for by in (by_group, by_single)
+        )
+        blocks.parts[some] = by_group.transpose(2, 0, 1)
+        place = pattern.place_in_border[..., some] - members.start * alone[0].size
+        of_alone = np.bincount(place.ravel(), by_single.ravel(), alone[members].size)
+        alone[members] = of_alone.reshape(alone[members].shape)
+        blocks.orthonormal[..., some] = by_own
+    blocks.alone[...] = alone[..., :-1]
+
+
+def _orthonormal(by_block: csr_array, of: Indices, columns: Array, by_prior: Array) -> Array:
+    """Orthonormalise columns (o, 2, m), with rows (o, b, o) of priors below, in place by modified Gram-Schmidt."""
+    # by_block (b, m): sums over the blocks; of (m,): block of each pair. Returns the triangles (b, o, o).
+    count = len(columns)
+    triangle = np.zeros((by_prior.shape[1], count, count))
+    for i in range(count):
+        along = by_block @ (columns[i, 0] * columns[i:, 0] + columns[i, 1] * columns[i:, 1]).T
+        along += (by_prior[i] * by_prior[i:]).sum(axis=2).T
+        length = np.sqrt(along[:, 0])
+        over = 1.0 / np.where(length > 0.0, length, np.inf)
+        columns[i] *= over[of]
+        by_prior[i] *= over[:, None]
+        triangle[:, i, i:] = along * over[:, None]
+        rest = triangle[:, i, i + 1 :].T
+        columns[i + 1 :] -= rest.take(of, axis=1)[:, None] * columns[i]
+        by_prior[i + 1 :] -= rest[..., None] * by_prior[i]
+    return triangle
+
+
+@dataclass(frozen=True)
+class SparseBlocks:
+    """Blocks after elimination: triangle own + border shared = right, for the unscaled unknowns."""
+
+    rows: SparseRows
+    triangle: Array  # (b, o, o)
+    parts: Array  # (m, o, w) border in the groups, for the pairs of rows `Pattern.order`
+    alone: Array  # (b, o, t) border in the single unknowns
+    right: Array  # (b, o)
+    orthonormal: Array  # (o, 2, m) orthonormalised columns of the own unknowns
+    scale: Array  # (n,) as in `Factor`
+
+    @property
+    def own(self) -> Indices:
+        """(b, o) numbers of the own unknowns, -1 for none."""
+        return self.rows.pattern.own[:-1]
+
+    @cached_property
+    def border(self) -> "Border":
+        pattern = self.rows.pattern
+        shape = self.right.size, pattern.members.size
+        sparse = bsr_array((self.parts, pattern.groups, pattern.first), shape=shape)
+        return Border(pattern, sparse, self.alone.reshape(self.right.size, len(pattern.singles)))
+
+    def substitute(self, solution: Array) -> None:
+        """Compute the own unknowns by back substitution in a scaled solution (n,) with the shared ones solved."""
+        count, diagonal = self.rows.pattern.count, np.einsum("bii->bi", self.triangle)
+        if not diagonal.all():
+            raise np.linalg.LinAlgError("a block is singular")
+        rest = self.right - self.border.times(solution[:count] / self.scale[:count]).reshape(self.right.shape)
+        own = np.zeros_like(rest)
+        for i in reversed(range(rest.shape[1])):
+            own[:, i] = (rest[:, i] - np.einsum("bk,bk->b", self.triangle[:, i], own)) / diagonal[:, i]
+        there = self.own >= 0
+        solution[self.own[there]] = own[there] * self.scale[self.own[there]]
+
+    def square_sum(self) -> float:
+        """Sum of the squared right sides."""
+        return float((self.right**2).sum())
+
+    @cached_property
+    def _inverse(self) -> Array:
+        """Inverses (b, o, o) of the scaled triangles."""
+        scaled = self.triangle / np.where(self.own >= 0, self.scale[self.own], 1.0)[:, None, :]
+        inverse = np.zeros_like(scaled)
+        for i in reversed(range(scaled.shape[1])):
+            inverse[:, i, i] = 1.0
+            inverse[:, i] -= np.einsum("bk,bkj->bj", scaled[:, i, i + 1 :], inverse[:, i + 1 :])
+            inverse[:, i] /= scaled[:, i, i, None]
+        return inverse
+
+    def norm_of_inverse(self) -> float:
+        """Largest Frobenius norm of the scaled triangles' inverses; inf if one is singular."""
+        if not np.einsum("bii->bi", self.triangle).all():
+            return np.inf
+        return float(np.sqrt((self._inverse**2).sum(axis=(1, 2)).max(initial=0.0)))
+
+    def own_cofactors(self, triangle: Triangle) -> Iterator[tuple[Indices, Array]]:
+        if compiled.kernels is None or self.own.shape[1] > COMPILED_OWN or not triangle.is_safely_squared:
+            yield from self._own_cofactors_by_shape(triangle)
+            return
+        pattern, fronts, inner = self.rows.pattern, triangle.fronts, np.empty_like(self.triangle)
+        over = 1.0 / self.scale[: pattern.count]
+        squares = (
+            square * over[front.columns] * over[front.columns, None]
+            for front, square in zip(fronts, triangle.squares, strict=True)
+        )
+        home = fronts.home(pattern.left_over[0][:-1, None])
+        given = (
+            pattern.first, np.argsort(home, kind="stable"), home, pattern.groups, pattern.members, pattern.singles,
+            self.parts, self.alone, fronts.table, fronts.later_unknowns,
+            np.concatenate([square.ravel() for square in squares]),
+        )  # fmt: skip
+        compiled.kernels.border_cofactors(*map(np.ascontiguousarray, given), inner)
+        inner += np.eye(self.own.shape[1])
+        yield self.own, self._inverse @ inner @ self._inverse.swapaxes(1, 2)
+
+    def _own_cofactors_by_shape(self, triangle: Triangle) -> Iterator[tuple[Indices, Array]]:
+        """Own cofactors without kernels, for blocks of equal shape together; by roots where the condition requires."""
+        pattern = self.rows.pattern
+        counts, group, count = np.diff(pattern.first), pattern.groups, pattern.count
+        shared_scale, inverse = np.append(self.scale[:count], 1.0), self._inverse
+        for each in np.unique(counts):
+            some = np.flatnonzero(counts == each)
+            at = pattern.first[some][:, None] + np.arange(each)
+            border = self.parts[at].swapaxes(1, 2).reshape(*self.right[some].shape, -1)
+            border = np.concatenate([border, self.alone[some]], axis=2)
+            members = pattern.members[group[at]].reshape(len(some), -1)
+            unknowns = np.concatenate(
+                [members, np.broadcast_to(pattern.singles, (len(some), len(pattern.singles)))], axis=1
+            )
+            border *= np.where(unknowns >= 0, 1.0 / shared_scale[unknowns], 0.0)[:, None]
+            some_of_each = np.where(unknowns >= 0, unknowns, unknowns.max(axis=1, keepdims=True))
+            inner = triangle.through(border, some_of_each) + np.eye(self.right.shape[1])
+            yield self.own[some], inverse[some] @ inner @ inverse[some].swapaxes(1, 2)
+
+    @cached_property
+    def blocks(self) -> tuple[BlockFactors, ...]:
+        """The eliminated blocks in dense form, scaled, grouped by shape."""
+        pattern = self.rows.pattern
+        place = np.zeros(len(pattern.block), dtype=np.intp)
+        place[pattern.order] = np.arange(len(pattern.order))
+        block_of = np.zeros(len(self.scale), dtype=np.intp)
+        some, _ = there = np.nonzero(self.own >= 0)
+        block_of[self.own[there]] = some
+        present = np.argsort(self.own < 0, axis=1, kind="stable")
+        found = []
+        for rows, block in self.rows.arranged():
+            count = block.own.shape[1]
+            at = block_of[block.own.min(axis=1, initial=len(block_of) - 1)]
+            columns = present[at, :count]
+            turned = self.orthonormal[columns[..., None, None], np.arange(2), place[rows][:, None, :, None]]
+            shared = block.matrix[..., count:] / self.scale[block.shared][:, None, :]
+            border = turned.reshape(len(at), count, shared.shape[1]) @ shared
+            triangle = self.triangle[at[:, None, None], columns[..., None], columns[:, None]]
+            triangle = triangle / self.scale[block.own][:, None, :]
+            found.append(BlockFactors(block.own, block.shared, triangle, border, self.right[at[:, None], columns]))
+        return tuple(found)
+
 
 CHEAP = 1e7  # rows times columns squared of the shared unknowns, up to which Householder QR is always used
 REFLECTED = 1e9  # the same, up to which it is used where normal equations would lose digits

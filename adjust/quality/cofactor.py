@@ -11,8 +11,8 @@ from scipy.sparse import csr_array
 
 from adjust.array_types import Array, Indices
 from adjust.functional_model.rotation import vector_by_angles
+from adjust.least_squares.equations import Numbering
 from adjust.least_squares.iteration import Linearised
-from adjust.least_squares.numbering import Numbering
 from adjust.linear_algebra.factor import Factor
 from adjust.problem.problem import Problem, State
 from adjust.rank_defect.datum import free_motion

@@ -13,9 +13,8 @@ from functools import cached_property
 import numpy as np
 
 from adjust.array_types import Array, Indices, Mask
+from adjust.least_squares.equations import Numbering, prior_differences
 from adjust.least_squares.iteration import Linearised, Solution
-from adjust.least_squares.numbering import Numbering
-from adjust.least_squares.rows import prior_differences
 from adjust.linear_algebra.factor import Blocks, Factor
 from adjust.linear_algebra.small_matrices import applied, eigen, inverse, laid_out, product
 from adjust.problem.estimates import NullDirection

@@ -15,7 +15,7 @@ from scipy.sparse import csr_array
 from scipy.special import fdtr
 
 from adjust.array_types import Array, Indices, Mask
-from adjust.least_squares.rows import prior_differences
+from adjust.least_squares.equations import prior_differences
 from adjust.linear_algebra.factor import Factor
 from adjust.linear_algebra.sparse_rows import spread_squares
 from adjust.problem.estimates import GivenGroup, VarianceFactor

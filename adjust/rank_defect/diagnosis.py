@@ -7,7 +7,7 @@ from itertools import chain
 import numpy as np
 
 from adjust.array_types import Array, Indices, Mask
-from adjust.least_squares.numbering import Numbering
+from adjust.least_squares.equations import Numbering
 from adjust.linear_algebra.factor import Factor
 from adjust.linear_algebra.sparse_factor import Triangle, append_rows
 from adjust.problem.estimates import NullDirection

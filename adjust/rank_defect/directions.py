@@ -11,7 +11,7 @@ from adjust.functional_model.families import family
 from adjust.functional_model.lens import INTERIOR_NAMES
 from adjust.functional_model.scanner import is_left, term_degree
 from adjust.functional_model.transformation import follows_tilts
-from adjust.least_squares.numbering import Numbering
+from adjust.least_squares.equations import Numbering
 from adjust.linear_algebra.factor import Factor
 from adjust.problem.estimates import Cofactor
 from adjust.problem.parameter import Kind, Parameter, enumeration, shortened

@@ -13,8 +13,8 @@ from scipy.sparse import csr_array
 from scipy.special import chdtri, gammaln
 
 from adjust.array_types import Array, Mask
+from adjust.least_squares.equations import Numbering
 from adjust.least_squares.iteration import linearise
-from adjust.least_squares.numbering import Numbering
 from adjust.problem.problem import Problem
 from adjust.quality.run import Run
 

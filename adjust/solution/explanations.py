@@ -30,8 +30,8 @@ from scipy.spatial import KDTree
 from scipy.special import chdtr, chdtrc, fdtrc, ndtr
 
 from adjust.array_types import Array, Indices, Mask
+from adjust.least_squares.equations import Numbering
 from adjust.least_squares.iteration import linearise
-from adjust.least_squares.numbering import Numbering
 from adjust.problem.problem import Problem
 from adjust.quality.reliability import TOLD_APART, Snooping
 from adjust.quality.run import UM_PER_MM, GrossError, Run, residuals

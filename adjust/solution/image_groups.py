@@ -12,8 +12,8 @@ from functools import partial
 import numpy as np
 
 from adjust.array_types import Array, Mask
+from adjust.least_squares.equations import Numbering
 from adjust.least_squares.iteration import linearise
-from adjust.least_squares.numbering import Numbering
 from adjust.quality.run import Run
 
 MOST_TURNS = 20  # iterations of two-means

@@ -15,12 +15,12 @@ from scipy.spatial import KDTree
 
 from adjust.array_types import Array, Indices
 from adjust.functional_model.board import BoardForm, board_form, disk_directions, strain_directions
+from adjust.functional_model.correction import AFFINITY_TERMS, PolynomialTerms, Term, decentering, radial
 from adjust.functional_model.families import family
 from adjust.functional_model.lens import INTERIOR_NAMES, Prior
-from adjust.functional_model.polynomial_terms import AFFINITY, PolynomialTerms, Term, decentering, radial
 from adjust.functional_model.scanner import is_left
+from adjust.least_squares.equations import Numbering
 from adjust.least_squares.iteration import linearise
-from adjust.least_squares.numbering import Numbering
 from adjust.problem.camera import Camera
 from adjust.problem.condition_equations import computed_observations, in_camera, object_displacements
 from adjust.problem.network import Approximations, Board, Network, Scanner
@@ -135,7 +135,7 @@ def _lens_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
     images = run.problem.network.images
     digital = all(image.transformation == "none" for image in images if image.camera == camera.name)
     if digital and not free.intersection(own("affinity")[:1]):
-        yield lacking("pixels", partial(_pixel_words, camera.name, 1.0 / half_mm), AFFINITY[:1])
+        yield lacking("pixels", partial(_pixel_words, camera.name, 1.0 / half_mm), AFFINITY_TERMS[:1])
 
 
 def _drift(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:

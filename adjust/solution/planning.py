@@ -8,8 +8,8 @@ from scipy.linalg import qr
 
 from adjust.array_types import Array
 from adjust.errors import AdjustmentError
+from adjust.least_squares.equations import Numbering
 from adjust.least_squares.iteration import factorise, linearise
-from adjust.least_squares.numbering import Numbering
 from adjust.linear_algebra.factor import Factor
 from adjust.problem.condition_equations import blind_marks, computed_observations
 from adjust.problem.estimates import NullDirection

@@ -17,8 +17,8 @@ from adjust.display import (
     parameter_columns,
     residual_columns,
 )
+from adjust.least_squares.equations import Numbering
 from adjust.least_squares.iteration import Iteration, factorise
-from adjust.least_squares.numbering import Numbering
 from adjust.problem.camera import Camera
 from adjust.problem.estimates import Cofactor, Estimates, NullDirection, VarianceFactor
 from adjust.problem.parameter import Parameter

@@ -7,8 +7,8 @@ import numpy as np
 
 from adjust.errors import NoImageError
 from adjust.functional_model.families import family
+from adjust.least_squares.equations import Numbering
 from adjust.least_squares.iteration import Linearised, iterate, linearise
-from adjust.least_squares.numbering import Numbering
 from adjust.problem.condition_equations import blind_marks
 from adjust.problem.estimates import NullDirection, Termination
 from adjust.problem.problem import Problem, State

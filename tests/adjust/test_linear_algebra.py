@@ -13,9 +13,8 @@ from scipy.sparse import csc_array, csr_array, eye_array, vstack
 from scipy.sparse.linalg import splu
 
 from adjust import Approximations, Fiducial, Network, ObjectPoint, Prior, adjust
+from adjust.least_squares.equations import Numbering, WhitenedRows, prior_root_weights
 from adjust.least_squares.iteration import Linearised, factorise, linearise
-from adjust.least_squares.numbering import Numbering
-from adjust.least_squares.rows import WhitenedRows, prior_root_weights
 from adjust.linear_algebra import elimination, fronts, sparse_factor
 from adjust.linear_algebra.elimination import eliminate
 from adjust.linear_algebra.factor import Blocks, Factor

@@ -23,9 +23,8 @@ from studies import parametrize_with_studies
 from adjust import Adjustment, Camera, Fiducial, Options, Prior, adjust
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.transformation import Film, film_parameter_names
+from adjust.least_squares.equations import Numbering, prior_root_weights
 from adjust.least_squares.iteration import linearise
-from adjust.least_squares.numbering import Numbering
-from adjust.least_squares.rows import prior_root_weights
 from adjust.problem.condition_equations import compute, derivatives
 from adjust.problem.estimates import GivenGroup, adjusted_image
 from adjust.problem.network import Approximations, Exterior, Network
