@@ -27,6 +27,7 @@ from adjust.rank_defect.datum import (
 from adjust.solution.blunder_hypotheses import Trials, blunder_sentence, stations_elsewhere
 from adjust.solution.coordinate_blunders import Slip, coordinate_slips, far_points, few_points, free_points
 from adjust.solution.left_out_images import adopt_lens, contradicting_image, fitting, leave_out
+from adjust.solution.misnumbered_images import misnumbered_images
 from adjust.solution.options import Datum, Method, Options
 from adjust.solution.plausibility import check_plausibility
 from adjust.solution.result import Adjustment, is_fixed, run_result
@@ -114,8 +115,19 @@ class _Solver:
         """Leave out the images for which no orientation is found.
 
         Returns the remaining network, its own approximations and the reasons by frame. Returns the whole network
-        without approximations where too little would remain or something else is wrong.
+        without approximations where too little would remain or something else is wrong. Images whose point numbers are
+        off are left out beforehand.
         """
+        if not (misnumbered := misnumbered_images(network)):
+            return self._orientable(network)
+        if (part := leave_out(network, misnumbered)) is None:
+            raise AdjustmentError(
+                " ".join(f"{each[0].upper()}{each[1:]}" for each in dict.fromkeys(misnumbered.values()))
+            )
+        rest, start, reasons = self._orientable(part)
+        return rest, start, misnumbered | reasons
+
+    def _orientable(self, network: Network) -> tuple[Network, Approximations | None, dict[str, str]]:
         try:
             return network, self.initial_values(network), {}
         except UnorientedError as error:

@@ -19,12 +19,11 @@ from adjust.problem.camera import Camera
 from adjust.problem.estimates import adjusted_image, adjusted_places
 from adjust.problem.network import Network, ObjectPoint
 from adjust.problem.parameter import Parameter, shortened
+from adjust.solution.misnumbered_images import FEWEST, linear_transformation
 from adjust.solution.result import Adjustment
 
 TOLERATED = 2.0  # factor on the given standard deviations up to which residuals need no explanation
 CHECKED = 10  # smallest redundancy for an explanation
-FEWEST_LINEAR = 8  # points of an image that tell by a linear transformation whether it is mirrored
-FLAT_FIELD = 0.05  # relative thickness of a field below which that is not told
 NAMED = 5  # images named in a message
 MOST_PAIRS = 15  # pairs of frames tried as exchanged, largest residuals first
 HEIGHTS = 10.0  # sigma0 that heights in another unit leave at least
@@ -158,8 +157,9 @@ def _mirrored_images(network: Network) -> Iterator[NetworkHypothesis]:
         own = np.flatnonzero(rows & (network.image_numbers == number))
         known = [row for row in own if network.observations.point[row] in network.known_places]
         places = np.array([network.known_places[network.observations.point[row]] for row in known]).reshape(-1, 3)
-        if image.transformation == "none" and _is_mirrored(places, network.observations.xy_mm[known]):
-            names.append(image.name)
+        if image.transformation == "none" and len(known) >= FEWEST:
+            handedness, _ = linear_transformation(places, network.observations.xy_mm[known])
+            names += [image.name] if handedness > 0.0 else []
     if 0 < len(names) < len(network.images):
         who = f"image {names[0]} is" if len(names) == 1 else f"the images {shortened(names, NAMED)} are"
         remedy = "Mirror these pictures and measure them again, or their coordinates in comparator.csv."
@@ -173,30 +173,6 @@ def _mirrored_images(network: Network) -> Iterator[NetworkHypothesis]:
         )
         cameras = (*turned.cameras, *(each for name, each in other.items() if each.name != name))
         yield NetworkHypothesis(f"{who} mirrored", replace(turned, images=images, cameras=cameras), remedy)
-
-
-def _is_mirrored(xyz: Array, xy_mm: Array) -> bool:
-    """Whether the direct linear transformation of points (n, 3) to an image (n, 2) is that of a mirrored one.
-
-    Mirror images of flat fields are images.
-    """
-    if len(xyz) < FEWEST_LINEAR:
-        return False
-    (xyz, extents), (xy, _) = (_normalised(each) for each in (xyz, xy_mm))
-    if extents[-1] < FLAT_FIELD * extents[0]:
-        return False
-    at, none = np.column_stack([xyz, np.ones(len(xyz))]), np.zeros((len(xyz), 4))
-    rows = [np.hstack([at, none, -xy[:, :1] * at]), np.hstack([none, at, -xy[:, 1:] * at])]
-    projection = np.linalg.svd(np.vstack(rows), full_matrices=False)[2][-1].reshape(3, 4)
-    depths = at @ projection[2]
-    return bool(np.linalg.det(projection[:, :3]) * np.median(depths) > 0.0)
-
-
-def _normalised(places: Array) -> tuple[Array, Array]:
-    """Places about their centroid, of size 1, and their singular values."""
-    centred = places - places.mean(axis=0)
-    extents = np.linalg.svd(centred, compute_uv=False)
-    return centred / max(extents[0], 1e-300), extents
 
 
 def mirrored_images(network: Network, names: Sequence[str]) -> Network:

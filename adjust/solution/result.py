@@ -268,7 +268,7 @@ class Adjustment(Estimates, PlottedResult):
 
         Where coordinate blunders prevent a solution, the warnings on the run are dropped as consequences of these.
         """
-        left_out = (f"Left out of the adjustment: {reason}" for reason in self.left_out.values())
+        left_out = (f"Left out of the adjustment: {reason}" for reason in dict.fromkeys(self.left_out.values()))
         own = () if self.slips and not self.converged else run_warnings(self.scaled, self.cofactor, self.residuals)
         return (*self.misread, *self.slips, *left_out, *self.remarks, *own)
 

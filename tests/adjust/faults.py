@@ -546,6 +546,7 @@ class Effects:
     row: float = 0.0
     side: float = 0.0
     third: float = 0.0
+    numbers_off: int = 0
     point: float = 0.0
     noise: float = 1.0
     pitch: float = 1.0
@@ -606,7 +607,8 @@ def misfit_network(made: Scene, effects: Effects, kind: Misfit, rng: np.random.G
     for i, (rotation, station) in enumerate(zip(made.rotations, made.stations, strict=True)):
         projected = _projected(made, effects, kind, i, rotation, station)
         inside = np.flatnonzero((np.abs(projected - MIDDLE_MM) < HALF_MM).all(axis=1))
-        names += [(f"im{i:02d}", f"p{k}") for k in inside]
+        off = effects.numbers_off if made.groups[i] else 0
+        names += [(f"im{i:02d}", f"p{(k + off) % len(made.points)}") for k in inside]
         places.append(projected[inside])
     xy_mm = np.concatenate(places)
     if rng is not None:
@@ -760,6 +762,9 @@ MISFITS = {
     ),
     "a quarter of the points elsewhere": Misfit(
         lambda e: Effects(third=2.0), ("points are not where they are given",), sized=False
+    ),
+    "numbers of a third of the images one off": Misfit(
+        lambda e: Effects(numbers_off=1), ("their numbers are 1 too high",), sized=False
     ),
     "a point is elsewhere": Misfit(
         lambda e: Effects(point=0.1 * e), (f"Point p{WRONG_POINT} is not where it is given",), size=3

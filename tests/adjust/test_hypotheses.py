@@ -44,6 +44,7 @@ QUICK = (
     "focus breathes with the distance",
     "a row of points shifted",
     "half the board shifted",
+    "numbers of a third of the images one off",
     "principal point held wrong",
     "sizes: cropped and enlarged",
     "Z in feet",
@@ -161,6 +162,20 @@ def test_dots_are_noted_where_they_would_change_c_and_the_images_leave_them_open
     assert adjust(corners).notes == ()
     precise = replace(kind, sigma=0.05)
     assert adjust(misfit_network(made, Effects(), precise, np.random.default_rng(3))).notes == ()
+
+
+@pytest.mark.parametrize("flat", [True, False], ids=["board", "deep field"])
+def test_images_with_numbers_one_off_are_left_out_or_all_is_refused(flat: bool) -> None:
+    made, rng = scene(4, flat), np.random.default_rng(1)
+    some = {f"im{i:02d}" for i in np.flatnonzero(made.groups)}
+    result = adjust(misfit_network(made, Effects(numbers_off=-2), SOUND, rng))
+    assert result.left_out.keys() == some
+    (sentence,) = set(result.left_out.values())
+    assert sentence.endswith("their numbers are 2 too low. Correct them.")
+    assert abs(result.value("IO.cam.c") - C_MM) < 4.0 * result.sigma("IO.cam.c")
+    everywhere = replace(made, groups=np.ones(len(made.groups)))
+    with pytest.raises(AdjustmentError, match="their numbers are 2 too low"):
+        adjust(misfit_network(everywhere, Effects(numbers_off=-2), SOUND, rng))
 
 
 def test_a_group_of_mirrored_images_is_named() -> None:
