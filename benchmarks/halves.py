@@ -25,7 +25,6 @@ from adjust.functional_model.lens import Prior
 from adjust.problem.camera import Camera
 from adjust.problem.network import Image, Network, ObjectPoint
 from adjust.problem.observations import Observations
-from adjust.solution.adjustment import adjust
 from adjust.solution.unmodelled_error import adjust_unmodelled
 from benchmarks.harness import DATA, Row
 from benchmarks.peers import SYSTEM_PYTHON
@@ -209,7 +208,7 @@ def kept_corners(name: str, folder: Path | None) -> Sequence[Corners]:
 def calibrated(chosen: BoardSet, pictures: Sequence[Corners]) -> Mapping[str, tuple[Array, Array]] | None:
     """Values and standard deviations of QUANTITIES by each method; None without a solution."""
     network = board_network(chosen, pictures)
-    result = adjust_unmodelled(network, adjust)
+    result = adjust_unmodelled(network)
     if not result.converged:
         return None
     images = CameraPictures("camera", *chosen.size_px, None, tuple(image.name for image in network.images))

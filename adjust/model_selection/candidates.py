@@ -69,18 +69,15 @@ class Model:
         same = same and all(set(terms) <= set(bends.get(scanner, ())) for scanner, terms in other.bends)
         return other != self and other.transformation in films and same
 
-    def build_network(
-        self, network: Network, values: Mapping[Parameter, float], half_mm: Mapping[str, tuple[float, float]]
-    ) -> Network:
-        """Build the network with this model, its parameters free. values: initial values."""
+    def build_network(self, network: Network, half_mm: Mapping[str, tuple[float, float]]) -> Network:
+        """Build the network with this model, its parameters free."""
         cameras = []
         for camera in network.cameras:
             given = camera.distortion
-            start = {name: values.get(Parameter.interior(camera.name, name), 0.0) for name in self.parameters}
             distortion = replace(
                 given,
                 family=self.family,
-                parameters={name: Prior(value, np.inf) for name, value in start.items()},
+                parameters={name: Prior(0.0, np.inf) for name in self.parameters},
                 half_mm=given.half_mm if all(given.half_mm) else half_mm.get(camera.name, given.half_mm),
             )
             cameras.append(replace(camera, distortion=distortion))

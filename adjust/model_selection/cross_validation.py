@@ -10,8 +10,8 @@ from adjust.errors import AdjustmentError
 from adjust.functional_model.projection import ImageModel
 from adjust.initial_values.pose import intersect
 from adjust.problem.estimates import adjusted_image, lifted
-from adjust.problem.network import Approximations, Network
-from adjust.problem.parameter import Kind, object_coordinate
+from adjust.problem.network import Network
+from adjust.problem.parameter import object_coordinate
 from adjust.problem.problem import number
 from adjust.problem.unknowns import Reduction
 from adjust.solution.adjustment import Options, settle_datum
@@ -75,22 +75,6 @@ def cross_validate(
     return CrossValidation(rms_um, float(np.sqrt(normalised.mean() / 2)), len(rows))
 
 
-def adjusted_values(adjustment: Adjustment) -> Approximations:
-    """Convert the values of an adjustment to approximations."""
-    network, collected = adjustment.network, dict[tuple[Kind, str, str], list[float]]()
-    for each, value in zip(adjustment.parameters, adjustment.values.tolist(), strict=True):
-        collected.setdefault((each.kind, each.owner, each.id), []).append(value)
-    values = {owner: np.array(each) for owner, each in collected.items()}
-    return Approximations(
-        interior={camera: each[:3] for (kind, camera, _), each in values.items() if kind == "interior"},
-        exterior={image.name: values["exterior", image.frame, ""] for image in network.images},
-        transformation={image.name: values.get(("film", image.name, ""), np.empty(0)) for image in network.images},
-        points={id: each for (kind, _, id), each in values.items() if kind == "point"},
-        mirrored=adjustment.mirrored,
-        joins={(frame, point): values["join", frame, point] for frame, point in network.joins},
-    )
-
-
 def _refitted_models(
     adjustment: Adjustment, points: frozenset[str], options: Options
 ) -> Mapping[str, ImageModel] | None:
@@ -106,7 +90,7 @@ def _refitted_models(
     if reduced.unoriented - network.unoriented:
         return None
     reduction = Reduction.to_centroid(reduced)
-    start = reduction.approximations(adjusted_values(adjustment))
+    start = reduction.approximations(adjustment.approximations)
     try:
         validate(reduced)
         problem = number(reduction.network(reduced), start, options.method == "elements")

@@ -26,9 +26,9 @@ from adjust.model_selection.candidates import (
     transformations,
     verdict,
 )
-from adjust.model_selection.cross_validation import adjusted_values, cross_validate, folds
+from adjust.model_selection.cross_validation import cross_validate, folds
 from adjust.model_selection.scanner_choice import choose_bends
-from adjust.problem.network import Network
+from adjust.problem.network import Approximations, Network
 from adjust.problem.parameter import description
 from adjust.quality.tested import NO_WEIGHT
 from adjust.rank_defect.datum import held_as_known
@@ -153,11 +153,11 @@ class _Fits:
     def needed_bends(self, model: Model) -> tuple[Bends, tuple[str, ...]]:
         """Select significant scanner terms for a model without any; also return remarks on terms not estimable."""
         near = self.starts[model.transformation]
-        network = self._network(model, near)
+        network = model.build_network(self.network, self.half_mm)
         if not any(image.scanner for image in network.images):
             return (), ()
         try:
-            choice = choose_bends(network, lambda bent: adjust(bent, adjusted_values(near), self.options))
+            choice = choose_bends(network, lambda bent: adjust(bent, _start(model, near), self.options))
         except AdjustmentError as error:
             return (), (f"No bend of the scanner was estimated: {error}",)
         return given_model(choice.network).bends, choice.remarks
@@ -189,21 +189,21 @@ class _Fits:
 
     def _from(self, model: Model, near: Adjustment | None) -> Adjustment:
         """Adjust from the values of a similar model, or where that fails from the network's own approximations."""
+        network = model.build_network(self.network, self.half_mm)
         if near is not None:
             try:
-                result = adjust(self._network(model, near), adjusted_values(near), self.options)
+                result = adjust(network, _start(model, near), self.options)
             except AdjustmentError:
                 result = None
             if result is not None and (result.converged or result.singular):
                 return result
-        network = self._network(model, None)
         return adjust(network, approximate(held_as_known(network, self.options.datum_coordinates)), self.options)
 
-    def _network(self, model: Model, near: Adjustment | None) -> Network:
-        """Network with a model; parameters in common with the similar one start at its values."""
-        same = near is not None and near.network.cameras[0].distortion.family == model.family
-        values = dict(zip(near.parameters, near.values.tolist(), strict=True)) if near is not None and same else {}
-        return model.build_network(self.network, values, self.half_mm)
+
+def _start(model: Model, near: Adjustment) -> Approximations:
+    """Values of a similar model, with its distortion if that is of the same family."""
+    same = near.network.cameras[0].distortion.family == model.family
+    return near.approximations if same else replace(near.approximations, distortion={})
 
 
 def _correlated(result: Adjustment) -> tuple[tuple[str, str, float], ...]:

@@ -14,7 +14,7 @@ from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.scanner import NO_BEND
 from adjust.functional_model.transformation import Film, film_parameter_names
-from adjust.problem.network import EXTERIOR_NAMES, Network
+from adjust.problem.network import EXTERIOR_NAMES, Approximations, Network
 from adjust.problem.parameter import Kind, Parameter, as_parameter
 
 Termination = Literal["converged", "singular", "iteration limit", "diverged"]
@@ -132,6 +132,24 @@ class Estimates:
     def sigma(self, parameter: Parameter | str) -> float:
         """A-posteriori standard deviation of a quantity."""
         return self.sigma0 * float(np.sqrt(self.cofactor.variances[self.index(parameter)]))
+
+    @property
+    def approximations(self) -> Approximations:
+        """The values as initial values of another adjustment."""
+        network, collected = self.network, dict[tuple[Kind, str, str], dict[str, float]]()
+        for each, value in zip(self.parameters, self.values.tolist(), strict=True):
+            collected.setdefault((each.kind, each.owner, each.id), {})[each.quantity] = value
+        values = {owner: np.array([*each.values()]) for owner, each in collected.items()}
+        cameras = {camera: each for (kind, camera, _), each in collected.items() if kind == "interior"}
+        return Approximations(
+            interior={camera: values["interior", camera, ""][: len(INTERIOR_NAMES)] for camera in cameras},
+            exterior={image.name: values["exterior", image.frame, ""] for image in network.images},
+            transformation={image.name: values.get(("film", image.name, ""), np.empty(0)) for image in network.images},
+            points={id: each for (kind, _, id), each in values.items() if kind == "point"},
+            mirrored=self.mirrored,
+            joins={(frame, point): values["join", frame, point] for frame, point in network.joins},
+            distortion=cameras,
+        )
 
 
 def adjusted_image(estimates: Estimates, name: str) -> ImageModel:

@@ -367,6 +367,7 @@ class Approximations:
     mirrored : images whose scan is mirrored (the determinant of their transformation is negative); congruent,
         similarity and conformal transformations need this.
     joins : (2,) places in the camera frame, by frame and point.
+    distortion : values by parameter, by camera; default the given ones.
     """
 
     interior: Mapping[str, Array]
@@ -375,6 +376,7 @@ class Approximations:
     points: Mapping[str, Array]
     mirrored: frozenset[str] = frozenset()
     joins: Mapping[tuple[str, str], Array] = field(default_factory=dict)
+    distortion: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"Approximations({len(self.exterior)} orientations, {len(self.points)} points)"

@@ -211,7 +211,8 @@ def _camera_quantities(camera: Camera, approximations: Approximations) -> list[Q
             f"camera {camera.name}: the distortion family {camera.distortion.family} has no parameter "
             f"{', '.join(unknown)}; it has {', '.join(names) or 'none at all'}."
         )
-    return quantities + [(name, given.get(name, Prior(0.0, 0.0)), None) for name in names]
+    distortion = approximations.distortion.get(camera.name, {})
+    return quantities + [(name, given.get(name, Prior(0.0, 0.0)), distortion.get(name)) for name in names]
 
 
 def _exterior_quantities(image: Image, approximations: Approximations) -> list[Quantity]:

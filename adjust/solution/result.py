@@ -21,6 +21,7 @@ from adjust.least_squares.equations import Numbering
 from adjust.least_squares.iteration import Iteration, factorise
 from adjust.problem.camera import Camera
 from adjust.problem.estimates import Cofactor, Estimates, NullDirection, VarianceFactor
+from adjust.problem.network import Approximations
 from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem
 from adjust.quality.cofactor import (
@@ -141,6 +142,11 @@ class Adjustment(Estimates, PlottedResult):
     def significance(self) -> Mapping[tuple[str, str], tuple[SignificanceTest, ...]]:
         """Significance tests by kind ("interior", "scanner", "board") and owner: single parameters, then groups."""
         return significance_tests(self)
+
+    @property
+    def start(self) -> Approximations | None:
+        """Initial values of a similar adjustment of all images; None without a solution or with images left out."""
+        return self.approximations if self.converged and not self.left_out else None
 
     def cluster_covariance_of(self, parameters: Sequence[Parameter]) -> Array | None:
         """Estimate the covariance (k, k) of quantities of cameras or boards by leaving out one image at a time.

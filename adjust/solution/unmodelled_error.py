@@ -1,6 +1,6 @@
 """Variance component of unmodelled errors: one standard deviation per camera, added to those of its marks."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 from adjust.problem.network import Network
 from adjust.quality.variance_components import added_variance
+from adjust.solution.adjustment import adjust
+from adjust.solution.options import Options
 from adjust.solution.result import Adjustment
 
 ROUNDS = 6  # two or three suffice: nearly equal weights hardly change the residuals
@@ -16,7 +18,7 @@ PLAUSIBLE = 3e-4  # fraction of the frame's diagonal that lens, board and proces
 SETTLED = 0.01  # relative change of a standard deviation that means convergence
 
 
-def adjust_unmodelled(network: Network, adjusted: Callable[[Network], Adjustment]) -> Adjustment:
+def adjust_unmodelled(network: Network, options: Options | None = None) -> Adjustment:
     """Adjust with a standard deviation of unmodelled errors, estimated for each camera.
 
     It is added in quadrature to those of the camera's targets and tie points, such that their v'Pv equals their
@@ -28,7 +30,7 @@ def adjust_unmodelled(network: Network, adjusted: Callable[[Network], Adjustment
     Parameters
     ----------
     network : marks with their standard deviations from image measurement
-    adjusted : adjusts a network
+    options : of each adjustment
 
     Returns
     -------
@@ -38,18 +40,18 @@ def adjust_unmodelled(network: Network, adjusted: Callable[[Network], Adjustment
     Raises
     ------
     AdjustmentError
-        As `adjusted` does.
+        As `adjust` does.
     """
     diagonal_mm = {each.name: float(np.hypot(*each.frame_mm)) for each in network.cameras}
     sigma_mm = {each: FIRST * diagonal_mm[each] for each in diagonal_mm}
-    result = adjusted(add_unmodelled(network, sigma_mm))
+    result = adjust(add_unmodelled(network, sigma_mm), options=options)
     for _ in range(ROUNDS):
         if not result.converged:
             break
         before, sigma_mm = sigma_mm, _components_mm(result, sigma_mm)
         if all(abs(sigma_mm[each] - before[each]) <= SETTLED * sigma_mm[each] for each in sigma_mm):
             break
-        result = adjusted(add_unmodelled(network, sigma_mm))
+        result = adjust(add_unmodelled(network, sigma_mm), result.start, options)
     large = [each for each in sigma_mm if sigma_mm[each] > PLAUSIBLE * diagonal_mm[each] > 0.0]
     warnings = (
         f"Camera {each}: errors of {1000.0 * sigma_mm[each]:.3g} µm are not modelled, one part in "

@@ -114,7 +114,7 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
     options = adjustment_options(project.adjust)
     adjusted = partial(adjust, options=options)
     network, untold = add_scanner_bends(project, network, adjusted)
-    first = adjust_unmodelled(network, adjusted) if project.adjust.unmodelled == "estimate" else adjusted(network)
+    first = adjust_unmodelled(network, options) if project.adjust.unmodelled == "estimate" else adjusted(network)
     adjustment, network = first, first.network  # without images that were left out
     uncorrected = np.zeros_like(network.observations.xy_mm)
     if project.disk_radius > 0.0:

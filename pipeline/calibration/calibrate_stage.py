@@ -15,12 +15,9 @@ from rich.console import Console
 
 from adjust.display import CameraPlots, PlottedResult, data_frame
 from adjust.errors import AdjustmentError
-from adjust.problem.network import Network
 from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
-from adjust.solution.unmodelled_error import adjust_unmodelled
 from pipeline.adjusting.adjust_stage import adjust_marks, adjustment_options
-from pipeline.adjusting.network import build_network
 from pipeline.calibration.intrinsics import (
     CameraIntrinsics,
     LensChoice,
@@ -171,9 +168,15 @@ def _calibrated(
                     cameras = (*pictures.cameras[:done], camera, *pictures.cameras[done + 1 :])
                     pictures = replace(pictures, cameras=cameras)
                     project = write_project(out, pictures, options, lenses)
-                choices[camera.name] = choice = _chosen_lens(project, own, camera, options, left_out)
-                lenses[camera.name] = choice.model if choice else first
-                adjustments[camera.name] = _adjust(write_project(out, pictures, options, lenses), own)
+                _check_count(camera, left_out)
+                adjustment, choice = adjust_marks(project, own), None
+                if options.lens == "auto":
+                    choice = _chosen_lens(project, adjustment, camera, options)
+                    if choice.model != first:
+                        lenses[camera.name] = choice.model
+                        adjustment = adjust_marks(write_project(out, pictures, options, lenses), own)
+                _check_solution(adjustment)
+                adjustments[camera.name], choices[camera.name] = adjustment, choice
             except (AdjustmentError, InputError) as error:
                 not_calibrated[camera.name] = str(error)
     if not adjustments:
@@ -216,14 +219,8 @@ def _left_out(pictures: BoardPictureFiles, marks: Sequence[ComparatorPoint]) -> 
     }
 
 
-def _chosen_lens(
-    project: Project,
-    marks: Sequence[ComparatorPoint],
-    camera: CameraPictures,
-    options: CalibrationOptions,
-    left_out: Mapping[str, str],
-) -> LensChoice | None:
-    """Lens model by cross-validation; None where it is given. Raises InputError where too few images show the board."""
+def _check_count(camera: CameraPictures, left_out: Mapping[str, str]) -> None:
+    """Raise InputError where too few images show the board."""
     used = set(camera.images) - left_out.keys()
     if len(used) < FEWEST_PICTURES:
         others = _most_common(left_out[name] for name in camera.images if name in left_out)
@@ -232,34 +229,30 @@ def _chosen_lens(
             f"{FEWEST_PICTURES} or more with different tilts are needed{others and f' (others: {others})'}. Pictures "
             "that were cut are taken for another camera's: give them as they were taken."
         )
-    if options.lens != "auto":
-        return None
-    network, _ = build_network(project, marks)
-    adjusted = partial(adjust, options=adjustment_options(project.adjust))
-    unmodelled_mm = adjust_unmodelled(network, adjusted).unmodelled_mm[camera.name]
-    alike = _alike(network, unmodelled_mm)
-    return choose_lens(alike, options.square_pixels, options.pixel_mm, adjusted)
 
 
-def _alike(network: Network, unmodelled_mm: float) -> Network:
-    """The network with one standard deviation for all marks, large enough for lens models with systematic residuals."""
-    observations = network.observations
+def _chosen_lens(
+    project: Project, first: Adjustment, camera: CameraPictures, options: CalibrationOptions
+) -> LensChoice:
+    """Select the lens model by cross-validation. All marks get one standard deviation, large enough for models with
+    larger misfit than the first."""
+    observations = first.network.observations
     variance = float(np.median(np.trace(observations.covariance_mm2, axis1=1, axis2=2)) / 2.0)
-    variance += (GENEROUS * unmodelled_mm) ** 2
+    variance += (GENEROUS**2 - 1.0) * first.unmodelled_mm[camera.name] ** 2
     covariance = np.broadcast_to(variance * np.eye(2), observations.covariance_mm2.shape).copy()
-    return replace(network, observations=replace(observations, covariance_mm2=covariance))
+    alike = replace(first.network, observations=replace(observations, covariance_mm2=covariance))
+    adjusted = partial(adjust, options=adjustment_options(project.adjust))
+    return choose_lens(alike, options.square_pixels, options.pixel_mm, adjusted, first.start)
 
 
-def _adjust(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustment:
-    """Adjust one camera. Raises InputError or AdjustmentError where there is no solution."""
-    adjustment = adjust_marks(project, marks)
+def _check_solution(adjustment: Adjustment) -> None:
+    """Raise InputError where an adjustment has no solution."""
     if not adjustment.converged:
         why = " ".join(adjustment.warnings[:1])
         raise InputError(
             f"the adjustment has no solution ({adjustment.termination}). {why} Take pictures with the board tilted by "
             "20 degrees and more in different directions, all over the picture."
         )
-    return adjustment
 
 
 def _nothing(pictures: BoardPictureFiles, left_out: Mapping[str, str], not_calibrated: Mapping[str, str]) -> str:

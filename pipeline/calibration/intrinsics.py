@@ -11,7 +11,7 @@ from rich.table import Column, Table
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Distortion, Prior
-from adjust.problem.network import Network
+from adjust.problem.network import Approximations, Network
 from adjust.problem.parameter import Parameter
 from adjust.solution.result import Adjustment
 from pipeline.calibration.pictures import CameraPictures
@@ -22,7 +22,7 @@ from pipeline.types import Array
 
 LensModel = Literal["opencv4", "opencv5", "opencv8", "fisheye"]
 LensSetting = LensModel | Literal["auto"]
-Adjust = Callable[[Network], Adjustment]
+Adjust = Callable[[Network, Approximations | None], Adjustment]
 
 PARAMETERS: dict[LensModel, tuple[str, ...]] = {
     "opencv4": ("k1", "k2", "p1", "p2"),
@@ -52,7 +52,9 @@ def free_lens(model: LensModel, square_pixels: bool) -> Distortion:
     return Distortion(family, {name: Prior(0.0, np.inf) for name in names})
 
 
-def choose_lens(network: Network, square_pixels: bool, pixel_mm: float, adjusted: Adjust) -> LensChoice:
+def choose_lens(
+    network: Network, square_pixels: bool, pixel_mm: float, adjusted: Adjust, start: Approximations | None = None
+) -> LensChoice:
     """Select the lens model of a camera by cross-validation over its images.
 
     One fifth of the images is left out in turn. Their points are predicted with the camera of the others, after a space
@@ -64,7 +66,8 @@ def choose_lens(network: Network, square_pixels: bool, pixel_mm: float, adjusted
     network : of one camera and its images, with equal standard deviations of all marks
     square_pixels : whether fx and fy are equal
     pixel_mm : side of a pixel
-    adjusted : adjusts a network
+    adjusted : adjusts a network, from initial values if given
+    start : values of an adjustment with the first model
     """
     if len(network.images) < FEWEST_PICTURES:
         return LensChoice("opencv4", {})
@@ -75,8 +78,14 @@ def choose_lens(network: Network, square_pixels: bool, pixel_mm: float, adjusted
         if model == "fisheye" and not is_wide:
             continue
         free = replace(camera, distortion=free_lens(model, square_pixels))
-        fitted = _try_adjustment(replace(network, cameras=(free,)), adjusted)
+        try:
+            fitted = adjusted(replace(network, cameras=(free,)), None if model == "fisheye" else start)
+        except AdjustmentError:
+            fitted = None
+        if fitted is not None and not fitted.converged:
+            fitted = None
         squares[model] = None if fitted is None else fitted.prediction_errors(FOLDS)
+        start = start if fitted is None else fitted.start
         if model == "opencv4":
             c_mm = 0.0 if fitted is None else fitted.value(Parameter.interior(camera.name, "c"))
             is_wide = float(np.hypot(*camera.frame_mm)) / 2.0 > WIDE * c_mm
@@ -94,15 +103,6 @@ def _is_better(squares: Array | None, than: Array | None) -> bool:
         return squares is not None
     gain = than - squares
     return bool(gain.mean() > gain.std(ddof=1) / np.sqrt(len(gain)))
-
-
-def _try_adjustment(network: Network, adjusted: Adjust) -> Adjustment | None:
-    """Adjust a network; None without a solution."""
-    try:
-        result = adjusted(network)
-    except AdjustmentError:
-        return None
-    return result if result.converged else None
 
 
 HIGHLY_CORRELATED = 0.9

@@ -90,7 +90,7 @@ def test_standard_deviations_of_figures_grow_with_the_noise_that_is_left() -> No
 def test_an_estimated_noise_does_not_hide_two_cameras_in_one(seed: int) -> None:
     made = scene(seed, flat=True)
     given = misfit_network(made, Effects(crop=0.5, zoom=0.2), SOUND, np.random.default_rng(seed))
-    result = adjust_unmodelled(given, adjust)
+    result = adjust_unmodelled(given)
     assert result.unmodelled_mm["cam"] > SIGMA_MM
     assert [each.kind for each in result.explanations] == ["groups"]
     some = [f"im{i:02d}" for i in np.flatnonzero(made.groups)]
@@ -104,7 +104,7 @@ def test_an_estimated_noise_does_not_hide_two_cameras_in_one(seed: int) -> None:
 def test_errors_of_each_image_are_no_two_groups(seed: int) -> None:
     made, rng = scene(seed, flat=True), np.random.default_rng(seed)
     each_its_own = replace(made, groups=rng.normal(size=len(made.groups)))
-    result = adjust_unmodelled(misfit_network(each_its_own, Effects(zoom=0.3), SOUND, rng), adjust)
+    result = adjust_unmodelled(misfit_network(each_its_own, Effects(zoom=0.3), SOUND, rng))
     assert result.unmodelled_mm["cam"] > SIGMA_MM
     assert result.explanations == ()
 
@@ -113,7 +113,7 @@ def test_a_small_effect_is_no_fault_of_the_model_where_errors_of_an_image_are_co
     """Significant if errors were independent: 3 % of v'Pv, p = 1e-6."""
     kind = MISFITS["lens: k1 alone"]
     effects = replace(kind.effect(1.5), noise=4.0)
-    result = adjust_unmodelled(misfit_network(scene(4, flat=True), effects, kind, np.random.default_rng(4)), adjust)
+    result = adjust_unmodelled(misfit_network(scene(4, flat=True), effects, kind, np.random.default_rng(4)))
     assert result.explanations == ()
 
 
@@ -125,7 +125,7 @@ def test_two_cameras_are_named_more_often_than_a_scatter_of_images_is_taken_for_
         for are_groups in named:
             shown = made if are_groups else replace(made, groups=rng.normal(size=len(made.groups)))
             effects = Effects(crop=0.5, zoom=0.2) if are_groups else Effects(zoom=0.3)
-            result = adjust_unmodelled(misfit_network(shown, effects, SOUND, rng), adjust)
+            result = adjust_unmodelled(misfit_network(shown, effects, SOUND, rng))
             named[are_groups] += any(each.kind == "groups" for each in result.explanations)
     assert named[False] == 0
     assert named[True] >= 20

@@ -242,7 +242,7 @@ def test_predictions_of_known_points_err_by_noise_and_by_what_predicts() -> None
     """Of 40 points in 5 folds the camera and stations add little to the noise of 4 um that the images have."""
     network = make_network(4, "k3", "none")
     model = Model("none", "torlegard", ("k3",))
-    fitted = model.build_network(network, {}, {})
+    fitted = model.build_network(network, {})
     result = adjust(fitted, approximate(fitted))
     found = cross_validate(result, folds(fitted, Options()), Options())
     assert found is not None

@@ -23,7 +23,7 @@ from projects import Refusal, made_record
 from rich.console import Console
 from scipy.spatial.distance import cdist
 
-from adjust import Network, adjust
+from adjust import Approximations, Network, adjust
 from measure import Scan, open_scan
 from measure.boards.specs import (
     ArucoSpec,
@@ -464,11 +464,11 @@ def test_of_lenses_as_good_the_simplest_is_taken(errors: dict[int | str, float],
     network = board_network(np.random.default_rng(4), 6, ERROR_PX * PIXEL_MM)
     scatter = np.random.default_rng(1).uniform(0.9, 1.1, (9, len(network.images)))
 
-    def adjusted(network: Network) -> Any:
+    def adjusted(network: Network, _: Approximations | None) -> Any:
         distortion = network.cameras[0].distortion
         count = len(distortion.parameters)
         squares = errors["fisheye" if "fisheye" in distortion.family else count] * scatter[count]
-        return SimpleNamespace(converged=True, value=lambda _: 1.0, prediction_errors=lambda _: squares)
+        return SimpleNamespace(converged=True, start=None, value=lambda _: 1.0, prediction_errors=lambda _: squares)
 
     assert choose_lens(network, True, PIXEL_MM, adjusted).model == wanted
 
