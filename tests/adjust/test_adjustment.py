@@ -61,19 +61,12 @@ def test_reference_case(name: str) -> None:
         posterior = [row["std_aposteriori"] for row in reference["parameters"].values()]
         np.testing.assert_allclose([result.sigma(own_name(n)) for n in reference["parameters"]], posterior, rtol=1e-9)
     assert result.vpv == pytest.approx(reference["vpv"], rel=1e-8, abs=1e-15)
+    assert result.history[-1][0] == pytest.approx(result.vpv)
     v = np.array(reference["residuals_obs"] + reference["residuals_fobs"])
     np.testing.assert_allclose(result.residuals.v_mm, v, rtol=0, atol=1e-11)
     redundancy = reference["redundancy_numbers"][: v.size]
     np.testing.assert_allclose(result.residuals.redundancy.ravel(), redundancy, rtol=0, atol=1e-9)
     assert sum(group.redundancy for group in result.groups.values()) == pytest.approx(result.redundancy)
-
-
-def test_juhls_table_of_standard_deviations() -> None:
-    """The paper's own figures, to the digits that it prints; its simulated points are others than the case's."""
-    case = load("ii_juhl_3photos")
-    result = adjust_network(case)
-    for name, printed_um in case["paper_table_rmse_um"].items():
-        assert result.sigma(f"IO.{CAMERA}.{name}") == pytest.approx(printed_um, rel=0.2)
 
 
 @pytest.mark.parametrize("name", ["i_five_images_affine_reduced", "iii_selfcal_mixed"])
@@ -95,27 +88,6 @@ def test_the_order_of_inputs_does_not_matter(name: str) -> None:
     np.testing.assert_allclose(other.residuals.w, plain.residuals.w[order], atol=1e-8)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_poor_approximations_lead_to_the_same_result(seed: int) -> None:
-    """Stations wrong by a tenth of the flying height, attitudes by 10 degrees, film by millimetres."""
-    case = load("i_five_images_affine_reduced")
-    rng = np.random.default_rng(seed)
-    start = {}
-    for name, value in case["input"]["initial_approximations"].items():
-        owner, quantity = name.split(".")
-        if owner.startswith("EO"):
-            size = 150.0 if quantity in ("X0", "Y0", "Z0") else 0.17
-        elif owner.startswith("T"):
-            size = 3.0 if quantity in ("a1", "b1") else 0.02
-        else:
-            size = 0.0
-        start[name] = value + rng.uniform(-size, size)
-    result = adjust(case_network(case), case_approximations(case, start))
-    assert result.converged
-    assert np.abs(differences(case, result)).max() < 1e-7
-    assert result.iterations < 20
-
-
 def test_elements_are_the_combined_model_when_axes_are_parallel_and_distortion_small() -> None:
     """Torlegård's special case, A near I, as good as true of this case's 0.1 mm of distortion and 5 um of noise."""
     case = load("i_five_images_affine_reduced")
@@ -124,14 +96,6 @@ def test_elements_are_the_combined_model_when_axes_are_parallel_and_distortion_s
     assert result.converged
     assert np.abs(differences(case, result)).max() < 0.05
     assert result.vpv == pytest.approx(case["result"]["vpv"], rel=0.01)
-
-
-def test_history_ends_at_the_result() -> None:
-    case = load("i_five_images_affine_reduced")
-    result = adjust_network(case)
-    assert len(result.history) == result.iterations
-    assert result.history[-1][0] == pytest.approx(result.vpv)
-    assert result.history[-1][1] < 1e-6
 
 
 def test_an_iteration_limit_is_reported() -> None:

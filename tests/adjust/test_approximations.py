@@ -117,22 +117,6 @@ def true_exterior(truth: Projected, image: str) -> Array:
     return np.concatenate([truth.centers[image], angles])
 
 
-@pytest.mark.study
-def test_the_order_of_things_does_not_matter() -> None:
-    truth = project_field(relief_field(30.0), CONVERGENT_STATIONS[:3], outliers=0.05)
-    network = drop_interior(truth.network)
-    rng = np.random.default_rng(0)
-    shuffled = replace(
-        network,
-        images=network.images[::-1],
-        points=network.points[::-1],
-        observations=subset(network.observations, rng.permutation(len(network.observations)).tolist()),
-    )
-    first, second = approximate(network), approximate(shuffled)
-    for image in truth.centers:
-        np.testing.assert_allclose(first.exterior[image], second.exterior[image], rtol=1e-12)
-
-
 def test_too_few_known_points_are_named() -> None:
     truth = project_field(relief_field(300.0), CONVERGENT_STATIONS[:1])
     network = free_points(truth.network, {f"t{k}" for k in range(2, 40)})
@@ -199,17 +183,6 @@ def test_heights_alone_and_two_points_orient_vertical_frames() -> None:
     truth = project_field(relief_field(20.0, n=60), VERTICAL_STATIONS)
     found = approximate(heights_only(truth.network, planimetry={"t3", "t7"}))
     assert_near(found, truth, meters=120.0, radians=0.08)
-
-
-def test_heights_alone_orient_vertical_frames_to_a_scale() -> None:
-    truth = project_field(relief_field(0.0, n=60), VERTICAL_STATIONS)
-    found = approximate(heights_only(truth.network, planimetry=set()))
-    stations = np.array([found.exterior[image][:3] for image in truth.centers])
-    expected = np.array(list(truth.centers.values()))
-    scale = stations[:, 2].mean() / expected[:, 2].mean()
-    bases, expected_bases = (np.linalg.norm(each[1:] - each[0], axis=1) for each in (stations, expected))
-    np.testing.assert_allclose(bases / scale, expected_bases, atol=120.0)
-    np.testing.assert_allclose(stations[:, 2] / scale, expected[:, 2], atol=120.0)
 
 
 def heights_only(network: Network, planimetry: set[str]) -> Network:
@@ -311,24 +284,6 @@ def exchanged(network: Network, image: str, first: str, second: str) -> Network:
     return replace(network, observations=replace(observations, point=points))
 
 
-@pytest.mark.study
-@pytest.mark.parametrize(("seed", "known"), [(8, POINTS), (7, 7)])
-def test_exchanged_numbers_are_named_whether_the_adjustment_ends_or_not(seed: int, known: int) -> None:
-    rng = np.random.default_rng(seed)
-    network, _ = simulated(rng, points=field_points(rng, POINTS), free={"k3": np.inf})
-    points = tuple(
-        point if int(point.id) < known else ObjectPoint(point.id, None, None, None) for point in network.points
-    )
-    image, pair = f"f{rng.integers(4)}", sorted(map(str, rng.choice(POINTS, 2, replace=False)))
-    network = exchanged(replace(network, points=points), image, *pair)
-    result = adjust(network, approximate(network))
-    named = [warning for warning in result.warnings if "swapped" in warning]
-    assert named == [
-        f"The points {pair[0]} and {pair[1]} of image {image} each lie where the other is expected: their numbers may "
-        f"be swapped."
-    ]
-
-
 def test_points_exchanged_in_all_images_are_named_once() -> None:
     rng = np.random.default_rng(8)
     network, start = simulated(rng, points=field_points(rng, POINTS), free={"k3": np.inf})
@@ -337,16 +292,6 @@ def test_points_exchanged_in_all_images_are_named_once() -> None:
     (named,) = (warning for warning in adjust(network, start).warnings if "swapped" in warning)
     assert named.startswith("The points 3 and 7 of the images f0, f1, f2, f3 each lie where the other is expected: ")
     assert named.endswith("their numbers, or the coordinates given to them, may be swapped.")
-
-
-@pytest.mark.study
-def test_an_image_that_starts_upside_down_has_no_swapped_numbers() -> None:
-    rng = np.random.default_rng(1)
-    network, start = simulated(rng, points=field_points(rng, POINTS))
-    exterior = {name: elements.copy() for name, elements in start.exterior.items()}
-    exterior["f1"][5] += np.pi
-    result = adjust(network, replace(start, exterior=exterior))
-    assert not [warning for warning in result.warnings if "swapped" in warning]
 
 
 ANGLE = np.deg2rad(30.0)
@@ -386,21 +331,6 @@ def only_heights() -> tuple[Network, Approximations]:
         ObjectPoint(each.id, *(None, None), Prior(each.Z.value, 0.05)) for each in network.points if each.Z is not None
     )
     return replace(network, points=points), start
-
-
-@pytest.mark.study
-def test_a_curved_valley_is_followed() -> None:
-    """Nine of ten starts reach the minimum; before steps were bent along the valley, one of six did."""
-    network, start = only_heights()
-    options = Options(datum="minimal")
-    right = adjust(network, start, options)
-    assert right.converged
-    reached = 0
-    for seed in range(4):
-        result = adjust(network, spoilt(start, 1500.0, np.random.default_rng(seed)), options)
-        reached += result.converged and result.vpv == pytest.approx(right.vpv, rel=1e-6)
-        assert result.converged or result.warnings
-    assert reached >= 3
 
 
 def test_the_history_tells_what_was_done() -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from adjust import Adjustment, AdjustmentError, Camera, Distortion, Parameter, Prior, adjust, approximate
-from adjust.functional_model.board import board_form, disk_directions
+from adjust.functional_model.board import disk_directions
 from adjust.model_selection.model_choice import choose
 from adjust.problem.condition_equations import compute, computed_observations, derivatives
 from adjust.problem.estimates import adjusted_places
@@ -123,17 +123,6 @@ def test_the_centre_of_gravity_of_an_imaged_disk() -> None:
     np.testing.assert_allclose(moved - at[0, 0], gravity - at[0, 0], atol=0.01 * np.abs(gravity - at[0, 0]).max())
 
 
-def test_the_form_is_1_in_the_middle_and_0_at_the_corners() -> None:
-    form = board_form(flat_board())
-    assert form.normal == pytest.approx([0.0, 0.0, 1.0])
-    lifts = form.bend_directions[..., 2]
-    assert lifts[0] == pytest.approx([0.0, 0.0])
-    assert lifts[3 * COLUMNS + 4] == pytest.approx([1.0 - (1.0 / 9.0) ** 2, 1.0])
-    facing_x = board_form(flat_board()[:, [2, 0, 1]])
-    assert facing_x.normal == pytest.approx([1.0, 0.0, 0.0])
-    np.testing.assert_allclose(facing_x.bend_directions[..., 0], lifts, atol=1e-12)
-
-
 def test_what_is_no_board_is_refused() -> None:
     line = {str(k): np.array([float(k), 0.0, 0.0]) for k in range(5)}
     with pytest.raises(ValueError, match="at least four points about in a plane"):
@@ -145,14 +134,6 @@ def test_what_is_no_board_is_refused() -> None:
     twice = replace(network, boards=(*network.boards, Board("other", dict(network.boards[0].places))))
     with pytest.raises(AdjustmentError, match="is on the boards board and other"):
         adjust(twice, approximate(network))
-
-
-def test_bends_that_heights_can_take_are_named() -> None:
-    """Where every height is free to 100 m, the bends are the heights' own."""
-    network = make_network(None)
-    vague = tuple(replace(point, Z=Prior(0.0, 1e5)) for point in network.points)
-    found = adjust(replace(network, points=vague), approximate(network))
-    assert found.singular or found.sigma("BD.board.bend_x") / found.sigma0 > 10.0
 
 
 @pytest.mark.study

@@ -152,19 +152,6 @@ def test_claimed_standard_deviations_hold(count: int) -> None:
     assert np.mean(sigma0) == pytest.approx(1.0, abs=chance)
 
 
-def test_given_coordinates_and_distances_weigh_together() -> None:
-    """Coordinates to 1 mm place the marks, distances to 4 um give their form."""
-    rng = np.random.default_rng(6)
-    drawn = observe_distances(draw_frames("affine", 3, 4, 1.0, 0.3, rng), rng, sigma_mm=1.0)
-    result = adjust(drawn.network, drawn.start)
-    values, _ = places(result, 4)
-    for i, j in combinations(range(4), 2):
-        true_mm = np.linalg.norm(drawn.places_mm[j] - drawn.places_mm[i])
-        assert np.linalg.norm(values[j] - values[i]) == pytest.approx(true_mm, abs=4.0 * SIGMA_MM)
-    moved = values - NOMINAL_MM[:4]
-    assert np.linalg.norm(moved.mean(axis=0)) < 1e-3  # of the datum nothing but the given coordinates speaks
-
-
 def test_a_plan_expects_the_form_of_the_distances_and_the_datum_of_the_coordinates() -> None:
     rng = np.random.default_rng(10)
     drawn = observe_distances(draw_frames("affine", 3, 4, 1.0, 0.0, rng, 0.0), rng, 0.0, sigma_mm=1.0)

@@ -23,11 +23,11 @@ from faults import (
     misfit_sentences,
     scene,
 )
-from networks import Truth, field_points, simulated, with_errors
+from networks import Truth, field_points, simulated
 from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
-from adjust import Adjustment, AdjustmentError, Distortion, Network, ObjectPoint, Options, Prior, adjust, approximate
+from adjust import Adjustment, AdjustmentError, Network, ObjectPoint, Options, Prior, adjust, approximate
 from adjust.quality.tested import Probabilities
 from adjust.solution.explanations import explain
 from adjust.solution.unmodelled_error import adjust_unmodelled
@@ -76,16 +76,6 @@ def test_figures_are_those_that_were_planted() -> None:
     assert found.p < 1e-6
 
 
-def test_standard_deviations_of_figures_grow_with_the_noise_that_is_left() -> None:
-    made, kind = scene(6, flat=True), MISFITS["pixels not square"]
-    sigmas = []
-    for noise in (1.0, 2.0):
-        result = adjust(misfit_network(made, Effects(b1=5e-3, noise=noise), kind, np.random.default_rng(1)))
-        found = result.explanations[0]
-        sigmas.append(float(found.cause.split(" ± ")[1].split(" ")[0]))
-    assert sigmas[1] / sigmas[0] == pytest.approx(2.0, rel=0.1)
-
-
 @pytest.mark.parametrize("seed", [4, 5, 6, 7])
 def test_an_estimated_noise_does_not_hide_two_cameras_in_one(seed: int) -> None:
     made = scene(seed, flat=True)
@@ -115,28 +105,6 @@ def test_a_small_effect_is_no_fault_of_the_model_where_errors_of_an_image_are_co
     effects = replace(kind.effect(1.5), noise=4.0)
     result = adjust_unmodelled(misfit_network(scene(4, flat=True), effects, kind, np.random.default_rng(4)))
     assert result.explanations == ()
-
-
-@pytest.mark.study
-def test_two_cameras_are_named_more_often_than_a_scatter_of_images_is_taken_for_them() -> None:
-    named = {True: 0, False: 0}
-    for seed in range(40):
-        made, rng = scene(seed, flat=True), np.random.default_rng([5, seed])
-        for are_groups in named:
-            shown = made if are_groups else replace(made, groups=rng.normal(size=len(made.groups)))
-            effects = Effects(crop=0.5, zoom=0.2) if are_groups else Effects(zoom=0.3)
-            result = adjust_unmodelled(misfit_network(shown, effects, SOUND, rng))
-            named[are_groups] += any(each.kind == "groups" for each in result.explanations)
-    assert named[False] == 0
-    assert named[True] >= 20
-
-
-@pytest.mark.study
-def test_gross_errors_of_single_marks_are_no_fault_of_the_model() -> None:
-    given = misfit_network(scene(6, flat=True), Effects(), SOUND, np.random.default_rng(1))
-    result = adjust(with_errors(given, dict.fromkeys((3, 40, 90), np.array([0.05, -0.04]))))
-    assert result.explanations == ()
-    assert len(result.suspects) == 3
 
 
 def test_a_diameter_taken_as_exact_is_noted_where_c_depends_on_it() -> None:
@@ -178,14 +146,6 @@ def test_images_with_numbers_one_off_are_left_out_or_all_is_refused(flat: bool) 
         adjust(misfit_network(everywhere, Effects(numbers_off=-2), SOUND, rng))
 
 
-def test_a_group_of_mirrored_images_is_named() -> None:
-    kind, made = MISFITS["a group of images mirrored, frame_mm"], scene(5, flat=False)
-    some = [f"im{i:02d}" for i in np.flatnonzero(made.groups)]
-    given = misfit_network(made, Effects(group_mirrored=True), kind, np.random.default_rng(1))
-    with pytest.raises(AdjustmentError, match=f"The images {', '.join(some)} are mirrored. Without this all"):
-        adjust(given)
-
-
 def test_one_picture_under_two_names_is_named() -> None:
     given = misfit_network(scene(6, flat=True), Effects(), SOUND, np.random.default_rng(1))
     rows, seen = np.array([name == "im02" for name in given.observations.image]), given.observations
@@ -206,11 +166,6 @@ def test_standard_deviations_in_another_unit_are_refused() -> None:
 def sound(frame_mm: tuple[float, float] = (12.8, 9.6), seed: int = 6) -> Network:
     given = misfit_network(scene(seed, flat=True), Effects(), SOUND, np.random.default_rng(1))
     return replace(given, cameras=(replace(given.cameras[0], frame_mm=frame_mm),))
-
-
-@pytest.mark.study
-def test_a_sound_network_has_nothing_implausible() -> None:
-    assert misfit_sentences(sound())[0] == []
 
 
 def test_an_image_numbered_as_in_a_mirror_is_not_said_to_agree_with_its_picture_mirrored() -> None:
@@ -278,17 +233,6 @@ def test_images_that_point_straight_at_a_board_are_named() -> None:
     straight = replace(made, rotations=np.tile(np.eye(3), (count, 1, 1)), stations=stations)
     with pytest.raises(AdjustmentError, match="look straight at a flat field"):
         adjust(misfit_network(straight, Effects(), Misfit(lambda e: Effects(), ()), np.random.default_rng(1)))
-
-
-@pytest.mark.study
-def test_derivatives_of_cameras_with_different_families() -> None:
-    """What only one of them has, the other has no derivative by."""
-    given = misfit_network(scene(4, flat=True), Effects(), SOUND, np.random.default_rng(1))
-    free = {name: Prior(0.0, np.inf) for name in ("k1", "k2", "s1")}
-    first = replace(given.cameras[0], distortion=Distortion("opencv", free))
-    second = replace(given.cameras[0], name="other", distortion=Distortion("brown", {"k1": Prior(0.0, np.inf)}))
-    images = tuple(replace(image, camera="other") if i % 2 else image for i, image in enumerate(given.images))
-    assert adjust(replace(given, cameras=(first, second), images=images)).converged
 
 
 Array = NDArray[np.float64]

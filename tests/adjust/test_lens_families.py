@@ -33,42 +33,13 @@ NAMES = parameter_names("opencv")[:14]
 FLIP = np.diag([1.0, -1.0, -1.0])  # from the camera's axes, y up and z backward, to OpenCV's
 
 
-def opencv_pixels(angles: Array, station: Array, xyz: Array) -> Array:
-    """Pixels (n, 2) by OpenCV."""
-    rotation = FLIP @ rotation_from_angles(angles)
-    rvec, _ = cv2.Rodrigues(rotation)
-    pixels, _ = cv2.projectPoints(xyz, rvec, -rotation @ station, MATRIX, DISTORTION)
-    return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
-
-
 def mm(pixels: Array) -> Array:
     """Comparator coordinates: x right, y up, origin at the centre of the top-left pixel."""
     return np.asarray(pixels * np.array([PIXEL_MM, -PIXEL_MM]))
 
 
-def camera(free: bool) -> Camera:
-    """The camera; its denominator is fixed, from which a numerator in the same powers can hardly be told."""
-    sigma = np.inf if free else 0.0
-    values = [*DISTORTION, FX / FY - 1.0, 0.0]
-    parameters = {
-        name: Prior(value, 0.0 if name in ("k4", "k5", "k6") else sigma)
-        for name, value in zip(parameter_names("opencv"), values, strict=True)
-    }
-    return Camera("D", *given_interior(INTERIOR, sigma), Distortion("opencv", parameters))
-
-
 def numbered(xyz: Array) -> dict[str, Array]:
     return {str(j): each for j, each in enumerate(xyz)}
-
-
-def test_projection_is_opencvs() -> None:
-    angles, station = np.array([0.2, -0.3, 0.5]), np.array([300.0, -200.0, 1500.0])
-    xyz = np.random.default_rng(2).uniform(-400, 400, (50, 3))
-    lens = Lens(camera(False).distortion, INTERIOR, camera(False).distortion.values)
-    image = ImageModel(lens, rotation_from_angles(angles), station, NO_FILM)
-    projected, visible = image.comparator_from_object(xyz)
-    assert visible.all()
-    np.testing.assert_allclose(projected, mm(opencv_pixels(angles, station, xyz)), atol=1e-11)
 
 
 def skewed(rays: Array) -> Array:
@@ -101,18 +72,6 @@ def test_skew_and_fisheye_are_opencvs(
     ideal, found = model.ideal_from_observed(projected)
     assert found.all()
     np.testing.assert_allclose((ideal - INTERIOR[1:]) / INTERIOR[0], rays, atol=1e-12)
-
-
-def test_corrected_points_are_opencvs_undistorted_points() -> None:
-    rng = np.random.default_rng(4)
-    pixels = rng.uniform([0, 0], SIZE_PX, (40, 2))
-    values = np.array([*DISTORTION, FX / FY - 1.0, 0.0])
-    ideal, found = Lens(Distortion("opencv"), INTERIOR, values).ideal_from_observed(mm(pixels))
-    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 500, 1e-14)
-    normal = cv2.undistortPoints(pixels[:, None], MATRIX, DISTORTION, R=np.eye(3), P=np.eye(3), criteria=criteria)
-    expected = np.asarray(normal).reshape(-1, 2) * [1, -1] * INTERIOR[0] + INTERIOR[1:]
-    assert found.all()
-    np.testing.assert_allclose(ideal, expected, atol=1e-9)
 
 
 def test_torlegard_is_inverted() -> None:
@@ -185,18 +144,6 @@ def test_a_rational_distortion_begins_at_zero(seed: int) -> None:
     assert result.sigma0 == pytest.approx(1.0, abs=0.05)
     for name, true in zip(("c", "x0", "y0"), (WIDE_FX, CX, -CY), strict=True):
         assert abs(result.value(f"IO.D.{name}") - true * PIXEL_MM) < 4.0 * result.sigma(f"IO.D.{name}")
-
-
-def test_a_denominator_that_nothing_asks_for_is_a_note() -> None:
-    """A lens without distortion: numerator and denominator do the same exactly, and yet there is a solution."""
-    network = wide_network(0, 0.0 * WIDE)
-    result = adjust(network, approximate(network))
-    assert result.converged
-    assert not result.warnings
-    (note,) = result.notes
-    assert note.startswith("k1, k2, k3, k4, k5 and k6 of camera D cannot be separated")
-    c = WIDE_FX * PIXEL_MM
-    assert abs(result.value("IO.D.c") - c) < 4.0 * result.sigma("IO.D.c")
 
 
 @pytest.mark.parametrize(("family", "parameters"), [("torlegard", {"k3": 1e-4}), ("opencv", {"k1": -4.0})])

@@ -316,25 +316,6 @@ def test_a_strip_in_fronts_has_the_inverse_of_its_sparse_normal_equations(
         np.testing.assert_allclose(roots @ roots.swapaxes(1, 2), expected, atol=tolerance)
 
 
-def test_a_strip_is_adjusted_alike_in_many_fronts_and_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    network, start = strip(0.05)
-    results = []
-    for cost in (0.0, np.inf):
-        monkeypatch.setattr(fronts, "FRONT_COST", cost)
-        results.append(adjust(network, start))
-    many, one = results
-    assert many.converged
-    sigmas = np.sqrt(one.cofactor.variances)
-    assert (np.abs(many.values - one.values) <= 1e-7 * sigmas).all()
-    np.testing.assert_allclose(np.sqrt(many.cofactor.variances), sigmas, rtol=1e-9)
-    np.testing.assert_allclose(many.residuals.redundancy, one.residuals.redundancy, atol=1e-9)
-    assert many.reliability is not None
-    assert one.reliability is not None
-    for here, there in zip(many.reliability.outer, one.reliability.outer, strict=True):
-        assert here.cause == there.cause
-        assert here.in_sigmas == pytest.approx(there.in_sigmas, rel=1e-7)
-
-
 @pytest.mark.usefixtures("finely")
 def test_null_directions_of_a_strip_in_fronts_are_named() -> None:
     """No datum in object space, none for the fiducials, four points in one image each: all are told, one by one."""

@@ -53,17 +53,6 @@ def test_a_fifth_missing_and_a_fifth_false(points: int, depth: float) -> None:
 
 
 @pytest.mark.study
-def test_names_do_not_depend_on_the_order_of_the_marks() -> None:
-    rng = np.random.default_rng(3)
-    xyz = rng.uniform(-0.4, 0.4, (20, 3))
-    marks, _ = photographed(xyz, rng)
-    names, turned = named(xyz, marks), named(xyz, marks[::-1])
-    assert isinstance(names, Names)
-    assert isinstance(turned, Names)
-    assert turned.mark == {point: len(marks) - 1 - mark for point, mark in names.mark.items()}
-
-
-@pytest.mark.study
 def test_marks_of_nothing_known_get_no_names() -> None:
     rng = np.random.default_rng(4)
     xyz = rng.uniform(-0.5, 0.5, (14, 3))

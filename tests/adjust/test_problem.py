@@ -126,14 +126,6 @@ def test_a_missing_approximation() -> None:
         adjust(network, replace(start, transformation=dict(start.transformation) | {"f1": np.zeros(4)}))
 
 
-@pytest.mark.study
-def test_unknown_point_without_approximation() -> None:
-    network, start = simulated(np.random.default_rng(1))
-    points = (ObjectPoint("0", None, None, Prior(3.0, 0.1)), *network.points[1:])
-    with pytest.raises(AdjustmentError, match=r"X of point 0 has neither"):
-        adjust(replace(network, points=points), replace(start, points={}))
-
-
 def test_an_image_with_two_targets_and_a_known_orientation_is_adjusted() -> None:
     truth = Truth()
     network, start = simulated(np.random.default_rng(1), truth)

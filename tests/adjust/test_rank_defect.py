@@ -262,22 +262,6 @@ def test_a_datum_for_the_object_leaves_the_camera_directions(datum: Datum) -> No
     assert [CAUSES["IO.c"] in direction.cause for direction in result.singular] == [True]
 
 
-@pytest.mark.parametrize("count", [9, 40])
-def test_a_point_in_one_image_only_is_named(count: int) -> None:
-    """Whether images or points are eliminated first: four images have 48 unknowns, nine points 27, forty 120."""
-    rng = np.random.default_rng(6)
-    network, start = simulated(rng, points=field_points(rng, count), point_sigma=np.inf, noise=False)
-    rows = network.observations
-    lonely = [(image, "3", "target") for image in ("f0", "f1", "f2")]
-    keys = list(zip(rows.image, rows.point, rows.kind, strict=True))
-    result = adjust(
-        keep_points(network, [i for i, key in enumerate(keys) if key not in lonely]), start, Options(datum="minimal")
-    )
-    assert result.termination == "singular"
-    (direction,) = result.singular
-    assert {(each.kind, each.id) for each in direction.parameters} == {("point", "3")}
-
-
 def keep_points(network: Network, keep: list[int]) -> Network:
     """The network with some of its observations."""
     return replace(network, observations=network.observations.only(np.array(keep)))

@@ -8,7 +8,7 @@ import pytest
 from networks import Truth, field_points, row_of, simulated, with_errors, without_rows
 from numpy.typing import NDArray
 
-from adjust import Adjustment, Calibration, Fiducial, Options, Parameter, Prior, adjust
+from adjust import Adjustment, Calibration, Options, Parameter, Prior, adjust
 from adjust.problem.network import Approximations, Exterior, Network
 from adjust.quality.reliability import Reliability
 from adjust.quality.tested import Probabilities, WeightFunction
@@ -246,16 +246,7 @@ def test_suspects_are_named_without_being_removed() -> None:
 
 def test_wrong_given_values_are_named() -> None:
     network, start = checkable(2)
-    camera = network.cameras[0]
-    mark = camera.fiducials["3"]
-    wrong = Fiducial(mark.x_mm, Prior(mark.y_mm.value + 0.15, mark.y_mm.sigma))
-    points = tuple(
-        replace(point, Z=Prior(point.Z.value + 1.0, point.Z.sigma)) if point.id == "5" and point.Z else point
-        for point in network.points
-    )
-    spoilt = replace(
-        network, cameras=(replace(camera, fiducials=dict(camera.fiducials) | {"3": wrong}),), points=points
-    )
+    spoilt = spoil_fiducial(spoil_control(network, 1.0), 0.15)
     for options in (Options(), Options(snooping=True), Options(robust="igg3")):
         assert named(adjust(spoilt, start, options)) == ["control point 5 Z", "given fiducial 3 (camera K)"]
 

@@ -267,15 +267,6 @@ def test_frames_that_lie_alike_get_no_bend_and_a_sentence() -> None:
     assert odd.endswith("turned by 90 degrees.")
 
 
-def test_targets_tell_the_bend_of_frames_that_lie_alike() -> None:
-    """Known points and a lens without distortion, as a calibrated camera has it."""
-    truth = Truth(distortion={})
-    points = field_points(np.random.default_rng(5), 60)
-    network, _ = simulated(np.random.default_rng(4), truth, points=points)
-    bent = bend_in_scanner(network, {"a20": 0.05}, {})
-    assert len(chosen(bent)) > 0
-
-
 def test_two_photographs_are_enough_for_terms_that_they_tell() -> None:
     """Their trial has far more terms than they tell, which are held by no more than its prior."""
     truth = Truth(stations=STATIONS[:2], attitudes=((0.0, 0.0, 0.0), (-0.05, 0.36, 1.6)), middle_mm=SCAN_MIDDLE_MM)
