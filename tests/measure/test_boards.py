@@ -22,8 +22,6 @@ from drawn import (
 )
 from numpy.typing import NDArray
 from real_data import DATA, needs
-from scipy.io import loadmat
-from scipy.spatial import KDTree
 from studies import parametrize_with_studies
 
 from measure import Status, open_scan
@@ -411,20 +409,6 @@ def chessboards(numbers: Iterable[int]) -> tuple[list[Array], list[Array]]:
         [np.array([points[mark.point] for mark in marks], np.float32) for marks in measured_marks],
         [np.array([mark.center_px for mark in marks], np.float32) for marks in measured_marks],
     )
-
-
-@pytest.mark.study
-@needs("chessboards", "bouguet")
-def test_crossings_under_coma_are_where_a_published_calibration_has_them() -> None:
-    """Matched under a symmetric blur they lie elsewhere."""
-    corners = loadmat(DATA / "chessboards" / "bouguet" / "Calib_Results.mat")["x_9"].T
-    with open_scan(DATA / "chessboards" / "bouguet" / "Image9.tif") as scan:
-        marks = measure_board(scan, ChessboardSpec(13, 12, 30.0)).marks
-    matched, met = (
-        KDTree(corners).query(np.array([mark.center_px for mark in each if mark.status.is_observation]))[0]
-        for each in (marks, one_definition([marks])[0])
-    )
-    assert np.median(met) < 0.6 * np.median(matched)
 
 
 @pytest.mark.study

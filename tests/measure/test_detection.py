@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drawn import Array, brute_picture, layout_of, paint, placed, scan_of, written_scan
+from drawn import Array, brute_picture, placed, scan_of, written_scan
 from scipy import ndimage
 from scipy.ndimage import gaussian_filter
 from true_marks import KIND, some_mark
 
-from measure import FiducialOptions, MatchOptions, Scan, measure_fiducials
+from measure import FiducialOptions, MatchOptions, Scan
 from measure.detection.correlation import CLOSE, GRAINY, WIDE, Map, Surroundings, correlation
 from measure.detection.faint_marks import FaintMark, detect_faint
 from measure.detection.localisation import MarkPrediction, localise
@@ -117,14 +117,6 @@ def test_what_answers_at_the_edge_of_a_wide_search_is_placed_within_the_window(t
         for off_px in np.arange(38.0, 42.0, 0.5):
             predicted = np.column_stack([LINEAR, place + np.array([off_px, 0.3])])
             detect_faint(scan, MarkPrediction(wide, predicted, 38.2, -1), 0.0, 0.7)
-
-
-@pytest.mark.study
-def test_bare_texture_answers_as_often_as_chance_says(tmp_path: Path) -> None:
-    answers = [found for seed in range(2) for found in detect_marks(textured(seed + 50), places(seed), tmp_path)]
-    chances = np.array([found.false_alarms for found in answers if found is not None])
-    assert (chances < 1e-3).sum() <= 1  # of fifty places
-    assert 3 <= (chances < 0.1).sum() <= 22  # the strongest of those within three pixels, not one drawn blindly
 
 
 def test_where_the_ground_is_black_nothing_is_visible(tmp_path: Path) -> None:
@@ -243,26 +235,6 @@ def test_the_marks_own_ground_is_never_beyond_an_edge() -> None:
     for contrast in (30000.0, -30000.0):  # the mark itself is the strongest edge of its window
         grey = 30000.0 + contrast * mark + np.random.default_rng(2).normal(0.0, NOISE, mark.shape)
         assert not pixels_beyond_edge(grey, WING, place).any()
-
-
-def test_a_cross_that_dust_touches_is_visible_where_the_others_put_it() -> None:
-    mark, size, rng = MarkShape(cross(0.5, 0.1)), 440, np.random.default_rng(5)
-    corners = [(x, y) for x in (-4.4, 4.4) for y in (-4.4, 4.4)]
-    layout, matrix = layout_of([mark] * 4, corners, (11.0, 11.0)), placed(PX_PER_MM, (220.3, 220.3))
-    grey = np.full((size, size), BEYOND_EDGE_GROUND)
-    for corner in corners:
-        paint(grey, mark, corner, matrix, 6000.0, blur_px=1.0)
-    row, col = np.mgrid[:size, :size]
-    dusty = matrix @ (*corners[3], 1.0)
-    grey[np.hypot(col - dusty[0] + 13, row - dusty[1]) < 5] = EDGE
-    grey += rng.normal(0.0, 1200.0, grey.shape)
-    result = measure_fiducials(
-        scan_of(grey), layout, (1000 / PX_PER_MM,) * 2, FiducialOptions(pose="0", pitch_is_right=True)
-    )
-    for found, corner in zip(result.marks, corners, strict=True):
-        assert found.center_px is not None
-        assert found.status.is_observation, found
-        assert np.hypot(*(found.center_px - matrix @ (*corner, 1.0))) < 0.3
 
 
 ORIGIN = np.array([7, 3])

@@ -30,10 +30,8 @@ from measure.geometry import POSES
 from measure.marks.shapes import (
     Disk,
     FiducialLayout,
-    LayoutMark,
     MarkShape,
     Part,
-    cross,
     dot,
     finest_detail_mm,
     polygon,
@@ -259,30 +257,6 @@ def test_a_mark_off_the_constellation_is_no_observation(tmp_path: Path) -> None:
     assert result.marks[5].status is Status.PREDICTED
     assert "nothing within 6 px of its place" in result.marks[5].reason
     assert result.marks[5].center_px == pytest.approx(matrix @ (0.0, 7.0, 1.0), abs=0.1)
-
-
-@pytest.mark.study
-def test_a_lattice_that_shows_only_in_part_keeps_its_names(tmp_path: Path) -> None:
-    mark = MarkShape(cross(0.5, 0.1), "dark")
-    index = range(-2, 3)
-    lattice = FiducialLayout(
-        tuple(LayoutMark(f"{i},{j}", (3.5 * i, 3.5 * j), (0.005, 0.005), mark) for j in index for i in index),
-        (17.0, 17.0),
-    )
-    matrix = pixel_from_camera("0", turn_rad=0.004)
-    rng = np.random.default_rng(9)
-    grey = 12000 + 1200 * gaussian_filter(rng.normal(0, 1, (FRAME_PX, FRAME_PX)), 3.0) / 0.094
-    dark = {"-2,2", "0,1", "1,1", "2,-2"}
-    for given in lattice.marks:
-        if given.id not in dark:
-            paint(grey, mark, given.xy_mm, matrix, -6000.0)
-    result = measured(grey + rng.normal(0, NOISE_DN, grey.shape), lattice, tmp_path, FiducialOptions(pose="0"))
-    found = {mark.point for mark in result.marks if mark.status.is_observation}
-    assert found <= {given.id for given in lattice.marks} - dark
-    assert len(found) >= 18
-    for mark_found, given in zip(result.marks, lattice.marks, strict=True):
-        if mark_found.point in found and mark_found.center_px is not None:
-            assert np.abs(mark_found.center_px - matrix @ (*given.xy_mm, 1.0)).max() < 0.5
 
 
 @parametrize_with_studies(

@@ -9,21 +9,18 @@ import pytest
 from drawn import ALIKE, layout_of, paint, placed, scan_of
 from numpy.typing import NDArray
 
-from measure import FiducialOptions, Scan, measure_fiducials
-from measure.detection.correlation import CLOSE, WIDE, Surroundings
+from measure import FiducialOptions, measure_fiducials
 from measure.detection.responses import ByteCache, Responses
-from measure.fiducials import measure_frame, stages
-from measure.fiducials.constellation import NARROW, Bounds, Placement, PlacementSearch, same_picture
+from measure.fiducials import stages
+from measure.fiducials.constellation import Bounds, Placement, PlacementSearch, same_picture
 from measure.fiducials.frame import Frame
-from measure.fiducials.mark_fit import Detection
 from measure.fiducials.rows import pitch_problem
 from measure.fiducials.search import FrameSearch, PitchHypothesis
 from measure.fiducials.stages import Attempt, Found, Kind, find_frame
 from measure.flags import FRAMES_BY_CHANCE, NO_REASON, Reason, Status
 from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, dot, polygon, turned_part
-from measure.results import Covariance, FrameMeasurement, MarkFit, MarkMeasurement
-from measure.tone.curve import Tone
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement
 
 DOT = MarkShape(dot(0.3), "light")
 PLACES = ((100.0, -100.0), (-100.0, -100.0), (-100.0, 100.0), (100.0, 100.0), (0.0, -103.0), (0.0, 95.0))
@@ -89,14 +86,6 @@ def test_a_square_is_alike_in_all_poses_and_six_marks_do_not() -> None:
     assert all(same_picture(MARKS[:4], first, (pose, [0] * 4), NEAR_MM) for pose in POSES)
     others = [pose for pose in POSES if not same_picture(MARKS, ("0", [0] * 6), (pose, [0] * 6), NEAR_MM)]
     assert set(others) == set(POSES) - {"0", "0m"}
-
-
-def test_a_posed_placement_keeps_its_place() -> None:
-    placement = Placement("0", np.array([[2.0, 0.1, 50.0], [0.1, -2.0, 60.0]]), 1.0, 4, 1, 1, (0.5, 0.5))
-    turned = placement.posed("90m", np.array([mark.xy_mm for mark in MARKS[:4]]))
-    assert turned.same_place(placement)
-    center = turned.pixel_from_camera @ (10.0, 0.0, 1.0)
-    np.testing.assert_allclose(center, placement.pixel_from_camera @ (*(up_from_camera("90m") @ (10.0, 0.0)), 1.0))
 
 
 def test_a_posed_placement_is_moved_by_what_the_coordinates_differ() -> None:
@@ -193,32 +182,6 @@ def test_where_nothing_was_detected_the_reason_says_so(monkeypatch: pytest.Monke
     assert found.misfit == "no two of the camera's marks were found in the scan"
 
 
-def test_marks_are_fitted_from_other_tone_curves_only_where_their_fits_failed_and_some_fit_then(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    scan, options = SCAN.replace_tone(Tone.unknown()), FiducialOptions(pose="0")
-    place = Placement("0", np.eye(2, 3), 1.0, 4, 1, 1, GIVEN.mm)
-    monkeypatch.setattr(FrameSearch, "search_scan", lambda *_: [place])
-    monkeypatch.setattr(stages, "_likely_placements", lambda *_: [place])
-    monkeypatch.setattr(stages, "doubt_frame", lambda *_: NO_REASON)
-    cases = [([1], True, [1.6, 1.0, 0.5]), ([], True, [1.6, 1.6, 1.6]), ([1], False, [1.6, 1.6, 1.6])]
-    for failed, shows, expected in cases:
-        begun: list[float] = []
-
-        def measure(scan: Scan, *_: object, begun: list[float] = begun, failed: list[int] = failed) -> Any:
-            begun.append(round(scan.tone.equivalent_power(0.1, 0.9)[0], 1))
-            frame = Stand("right")
-            frame.failed_fits, frame.accepted, frame.measured_count = failed, begun[-1] < 0.7, 4
-            frame.is_sure = frame.is_complete = frame.accepted
-            return frame
-
-        monkeypatch.setattr(stages, "measure_frame", measure)
-        monkeypatch.setattr(stages, "shows_marks", lambda *_, shows=shows: shows)
-        found = find_frame(scan, ALIKE, [[GIVEN], [GIVEN]], True, options)
-        assert found.is_taken == bool(failed and shows)
-        assert begun[:3] == expected
-
-
 PX_PER_MM = 20.0
 HALF_MM = 5.5
 AT_MM = 4.4
@@ -254,26 +217,6 @@ def test_wings_are_found_next_to_an_edge_that_is_nine_times_as_strong(contrast: 
         assert found.status is Status.WEAK, found
         assert found.center_px is not None
         assert np.hypot(*(found.center_px - matrix @ (*given.xy_mm, 1.0))) < 0.5
-
-
-@pytest.mark.parametrize(
-    ("surroundings", "chance", "is_taken"), [(CLOSE, 5e-4, True), (CLOSE, 5e-3, False), (WIDE, 5e-4, False)]
-)
-def test_at_closer_matching_marks_are_taken_that_noise_seldom_makes_for_all_together_decide(
-    surroundings: Surroundings, chance: float, is_taken: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    faint = cast(MarkFit, SimpleNamespace(likeness=0.1, significance=3.0))
-    monkeypatch.setattr(
-        measure_frame,
-        "detect_mark",
-        lambda _, expected, __: Detection(expected.center_px, True, faint, false_alarms=chance),
-    )
-    matrix = placed(PX_PER_MM, (MIDDLE_PX, MIDDLE_PX))
-    layout = layout_of([wing(*place) for place in CLOSER_LOOK_PLACES], CLOSER_LOOK_PLACES, (2 * HALF_MM, 2 * HALF_MM))
-    placement = Placement("0", matrix, 1.0, 4, 1, 1, (1 / PX_PER_MM,) * 2, surroundings)
-    frame = Frame.from_placement(scan_of(np.zeros((300, 300))), layout, placement, FiducialOptions())
-    frame = measure_frame._detect(frame, range(4), frame.first_search_px(NARROW))
-    assert [detection.fit is faint for detection in frame.detections] == [is_taken] * 4
 
 
 def layout(sigma_mm: float) -> FiducialLayout:

@@ -370,18 +370,6 @@ def test_a_frame_that_chance_is_likelier_to_have_made_than_not_gives_no_observat
     assert result.pixel_from_camera is None
 
 
-@pytest.mark.study
-def test_specks_that_lie_as_all_marks_are_doubted_too() -> None:
-    as_marks = np.rint(centers_px(DOTS, "0")).astype(int)
-    elsewhere = np.random.default_rng(1).integers(10, 360, (300, 2))
-    free = np.hypot(*(elsewhere[:, None] - as_marks).T).min(axis=0) > 22
-    result = measurement.measure_fiducials(
-        scan_of(strewn(np.concatenate([elsewhere[free], as_marks]))), DOTS, (50.0, 50.0)
-    )
-    assert Status.MEASURED not in {mark.status for mark in result.marks}
-    assert result.pose is None or not result.pose.decided
-
-
 def test_one_mark_and_the_places_of_the_others_tell_the_pose() -> None:
     """Marks that differ by their identification dots are not found under one another's names."""
     ids = [tuple(Disk((0.9, 0.4 * k - 0.4), 0.12) for k in range(count)) for count in range(4)]

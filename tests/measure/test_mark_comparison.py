@@ -209,21 +209,6 @@ def make_frame(
     return measure_frame(scan, FiducialLayout(layout, (50.0, 50.0)), placement, FiducialOptions()), marks
 
 
-@pytest.mark.study
-def test_faint_marks_are_matched_with_the_others_blur() -> None:
-    frame, marks = make_frame(np.random.default_rng(3), 2.5, 0.25)
-    squares, to_bound = [], []
-    for index in FAINT:
-        fit, (mark, corner) = frame.detections[index].fit, marks[index]
-        assert fit is not None
-        assert frame.verdict(index)[0] is Status.WEAK
-        error = fit.center_px - corner - mark.place[:, 2]
-        squares.append(float(error @ np.linalg.solve(fit.covariance_px2, error)) / 2)
-        to_bound.append(float(np.sqrt(np.trace(fit.covariance_px2) / np.trace(mark.bound(4 * NOISE / CONTRAST)))))
-    assert np.sqrt(np.mean(squares)) < 1.7
-    assert np.mean(to_bound) < 1.15  # of what is only seen it is 1.3
-
-
 def test_a_faint_mark_in_plain_noise_is_measured_with_the_standard_deviation_that_it_has() -> None:
     """In white noise a claim of 0.2 px is one; on a landscape it knows of the noise in part."""
     frame, _ = make_frame(np.random.default_rng(3), 1.0, 1.0)

@@ -26,7 +26,6 @@ from measure.boards.measure import BoardMeasurement, measure_board
 from measure.boards.specs import AprilGridSpec, ArucoSpec, CharucoSpec, FoundCorner, aruco_dictionary
 
 Array = NDArray[np.float64]
-OLDER = CharucoSpec("4X4_50", 6, 6, 32.0, 24.0, legacy=True)
 APRIL_GRID = AprilGridSpec("APRILTAG_36h11", 3, 2, 66.0, 20.0, first_marker=5)
 
 
@@ -42,22 +41,6 @@ def test_trap_charuco_corners_shifted_by_half_a_pixel(turn_deg: float) -> None:
     assert len(errors) >= 16
     assert np.abs(errors).max() < 0.06
     assert np.abs(errors.mean(axis=0)).max() < 0.01
-
-
-@pytest.mark.study
-def test_trap_charuco_corners_of_the_older_layout_have_their_neighbours_names() -> None:
-    """The markers tell the layout; one that is set against them is refused."""
-    homography = board_from_pixel(5.0, 2e-4) * np.array([[1.2], [1.2], [1.0]])
-    picture = charuco_picture(OLDER, homography)
-    board = measure_board(scan_of(picture), replace(OLDER, legacy=None))
-    errors = errors_px(board, read_truth(OLDER, homography))
-    assert len(errors) >= 20
-    assert np.abs(errors).max() < 0.06
-    refused = measure_board(scan_of(picture), replace(OLDER, legacy=False))
-    assert "but as with legacy = true" in refused.reason
-    assert {mark.status for mark in refused.marks} == {Status.ABSENT}
-    present = charuco_picture(replace(OLDER, legacy=False), homography)
-    assert "but as with legacy = false" in measure_board(scan_of(present), OLDER).reason
 
 
 def generated(spec: CharucoSpec) -> NDArray[np.uint8]:

@@ -73,41 +73,6 @@ def test_sigmas_are_those_of_the_errors(name: str, blur_px: float, count: int) -
     assert np.abs(errors.mean(axis=0)).max() < 4 * sigmas.mean() / np.sqrt(len(errors))
 
 
-def test_errors_are_at_the_cramer_rao_bound() -> None:
-    name, blur_px, snr = "ring-cross", 1.0, 25.0
-    errors, sigmas = errors_and_sigmas(name, blur_px, snr, 60)
-    bound = bound_px(MARKS[name], draw_mark(name, blur_px)[0][1], blur_px, snr)
-    assert np.sqrt(np.mean(errors**2)) < 1.15 * bound  # 120 numbers: 6.5 % standard deviation
-    assert sigmas.mean() == pytest.approx(bound, rel=0.04)
-
-
-def bound_px(mark: MarkShape, place: Array, blur_px: float, snr: float) -> float:
-    """The Cramér-Rao bound of a coordinate, every nuisance unknown, by differences of brute-force pictures."""
-
-    def draw_shifted(
-        shift: tuple[float, float] = (0, 0), turn: float = 0.0, scale: float = 1.0, blur: float = 0.0
-    ) -> Array:
-        c, s = np.cos(turn), np.sin(turn)
-        linear = scale * np.array([[c, -s], [s, c]]) @ place[:, :2]
-        return brute_picture(mark, np.column_stack([linear, place[:, 2] + shift]), SIZE, SIZE, blur_px + blur)
-
-    step = 0.1
-    row, col = np.mgrid[:SIZE, :SIZE] / SIZE
-    columns = [
-        (draw_shifted((step, 0)) - draw_shifted((-step, 0))) / (2 * step),
-        (draw_shifted((0, step)) - draw_shifted((0, -step))) / (2 * step),
-        (draw_shifted(turn=0.01) - draw_shifted(turn=-0.01)) / 0.02,
-        (draw_shifted(scale=1.01) - draw_shifted(scale=0.99)) / 0.02,
-        (draw_shifted(blur=0.05) - draw_shifted(blur=-0.05)) / 0.1,
-        draw_shifted(),
-        np.ones_like(col),
-        col,
-        row,
-    ]
-    design = np.stack([column.ravel() for column in columns], axis=1) * snr
-    return float(np.sqrt(np.trace(np.linalg.inv(design.T @ design)[:2, :2]) / 2))
-
-
 @pytest.mark.parametrize("name", MARKS)
 @pytest.mark.parametrize("blur_px", [0.6, 1.2])
 def test_clean_marks_are_unbiased_at_every_phase(name: str, blur_px: float) -> None:
@@ -242,15 +207,6 @@ def test_an_ellipse_takes_five_parameters() -> None:
     assert np.abs(fit.center_px - stretched[:, 2]).max() < 0.01
     found, true = (m[:, :2] @ m[:, :2].T for m in (fit.pixel_from_mark, stretched))
     np.testing.assert_allclose(found, true, rtol=0.02, atol=0.7)
-
-
-def test_a_notch_is_matched_by_shift_alone() -> None:
-    mark = MarkShape(polygon([(-1.2, 0.0), (0.0, -1.0), (1.2, 0.0), (1.2, 1.2), (-1.2, 1.2)]))
-    place = placed(SCALE, (20.31, 19.62))
-    grey = GROUND + CONTRAST * brute_picture(mark, place, SIZE, SIZE, 0.8)
-    grey = grey + np.random.default_rng(29).normal(0, 10, grey.shape)
-    fit = match(ScanWindow(grey), mark, placed(SCALE, (20.0, 20.0)), MatchOptions(freedom="shift"))
-    assert np.abs(fit.center_px - place[:, 2]).max() < 4 * np.sqrt(fit.covariance_px2.max())
 
 
 def test_a_drawing_is_fitted_where_it_is_true() -> None:

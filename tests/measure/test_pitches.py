@@ -29,13 +29,10 @@ from scipy.ndimage import gaussian_filter
 from small_scene import hidden_field
 from studies import parametrize_with_studies
 
-from measure.fiducials.constellation import NARROW, Placement
-from measure.fiducials.measure_frame import best_weights, measure_frame, registered_channels
+from measure.fiducials.measure_frame import best_weights, registered_channels
 from measure.fiducials.measurement import measure_fiducials, second_frame
 from measure.fiducials.options import CLICK_SIGMA_PX, Click, FiducialOptions
 from measure.fiducials.rows import pitch_problem
-from measure.fiducials.search import PitchHypothesis, slightly_longer
-from measure.fiducials.stages import _pitch_to_try
 from measure.flags import Cause, Code, Reason, Status
 from measure.geometry import POSES
 from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape
@@ -128,30 +125,6 @@ def test_three_of_many_marks_that_lie_as_the_cameras_are_no_frame(tmp_path: Path
     assert not any(mark.status.is_observation for mark in result.marks)
     (problem,) = result.problems
     assert "under another pitch 3 of them fit, which may be a false alarm: try pitch_um = [" in problem
-
-
-def test_the_pitch_to_try_is_what_the_marks_say(tmp_path: Path) -> None:
-    matrix = pixel_from_camera("0", turn_rad=0.0)
-    matrix[:, :2] = np.diag([1.012, 0.988]) @ matrix[:, :2]
-    pair_mm = (PITCH_UM / 1012, PITCH_UM / 988)
-    with written_scan(frame_picture(ALIKE, matrix), tmp_path) as scan:
-        frame = measure_frame(scan, ALIKE, Placement("0", matrix, 1.0, 4, 1, 1, pair_mm), STIFF)
-    result = _pitch_to_try([frame])
-    assert result.startswith("; under another pitch 4 of them fit, which may be a false alarm: try pitch_um = [")
-    pair = [float(number) for number in result.split("[")[1].rstrip("]").split(", ")]
-    assert pair == pytest.approx([1000 * mm for mm in pair_mm], rel=1e-3)
-    assert _pitch_to_try([]) == ""
-
-
-def test_closer_matching_tries_pixels_slightly_longer_one_way_so_that_no_mark_lies_beyond_its_reach() -> None:
-    """Of an aerial camera, pixels longer by up to 1 % either way."""
-    layout, options = layout_of([MarkShape(RING_CROSS)] * 4, AERIAL, (228.0, 228.0)), FiducialOptions()
-    near, longer = slightly_longer(PitchHypothesis((0.127, 0.127), 0.04, (0.127, 0.127)), 0.015)
-    tried = np.array([each.mm for each in (*near, *longer)]) / 0.127
-    for stretch in np.linspace(-0.01, 0.01, 9):
-        true = np.array([1 + stretch / 2, 1 - stretch / 2])
-        off_mm = np.hypot(*((true / tried - 1) * AERIAL[0]).T).min()
-        assert off_mm < NARROW * options.search_mm(layout)
 
 
 FAR_TURN_RAD = 0.35  # twenty degrees: no search looks for a frame that is laid so

@@ -15,7 +15,6 @@ from drawn import (
     Array,
     frame_picture,
     layout_of,
-    measured,
     paint,
     pixel_from_camera,
     pose_of,
@@ -29,9 +28,6 @@ from studies import parametrize_with_studies
 from measure import FrameMeasurement, MatchOptions, Scan, ScanWindow, Status, match, measure_fiducials
 from measure.annotations.fields import KnownLine, Line, Reading, read_from_one_face
 from measure.annotations.orientation_from_text import side_in_camera, writing_likelihoods
-from measure.detection.localisation import localise
-from measure.fiducials import mark_fit
-from measure.fiducials.constellation import Placement
 from measure.fiducials.measure_frame import measure_frame, rename_frame
 from measure.fiducials.options import FiducialOptions, Reads
 from measure.fiducials.orientation_pictures import Drawings, MarkSite, PosedMark
@@ -323,37 +319,3 @@ def test_blocks_at_the_border_are_measured_alike_with_their_pose_open_and_set(po
     assert {*statuses} <= {Status.MEASURED, Status.WEAK}
     for mark, place in zip(frame.marks, truth, strict=True):
         assert mark.center_px == pytest.approx(place, abs=0.25)
-
-
-@pytest.mark.study
-def test_marks_that_were_found_are_renamed_and_not_sought_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """From the pose opposite, where the given coordinates are 0.3 mm off; only their settling may look about them."""
-    grey, matrix = block_picture("180")
-    scan = scan_of(grey)
-    start = Placement("180", matrix, 1.0, 4, -1, 4, (1 / PX_PER_MM,) * 2)
-    named_rightly = measure_frame(scan, BLOCKS, start, OPTIONS)
-    named_wrongly = measure_frame(scan, BLOCKS, start.posed("0", right_mm(BLOCKS)), OPTIONS)
-    assert int(named_wrongly.inliers.sum()) == 4
-    monkeypatch.setattr(mark_fit, "localise", lambda scan, mark: localise(scan, mark) if mark.search_px < 2 else None)
-    frame = rename_frame(scan, named_wrongly, "180")
-    assert frame.placement.pose == "180"
-    assert int(frame.inliers.sum()) == 4
-    for fit, true in zip(frame.fits, named_rightly.fits, strict=True):
-        assert fit is not None
-        assert true is not None
-        np.testing.assert_allclose(fit.center_px, true.center_px, atol=0.02)
-
-
-@pytest.mark.study
-def test_half_wedges_of_any_pose(tmp_path: Path) -> None:
-    for seed, pose in enumerate(("90", "180m")):
-        matrix = pixel_from_camera(pose)
-        grey = frame_picture(LEANING, matrix, seed)
-        auto = measured(grey, LEANING, tmp_path)
-        placed = measured(grey, LEANING, tmp_path, FiducialOptions(pose=pose))
-        view, right = (
-            sorted(mark.center_px.tolist() for mark in each.marks if mark.center_px is not None)
-            for each in (auto, placed)
-        )
-        np.testing.assert_allclose(view, right, atol=0.05)
-        assert all(mark.status.is_observation for mark in auto.marks)

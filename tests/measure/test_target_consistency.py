@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drawn import drawn, ellipse, scan_of, transformed, whitened
+from drawn import drawn, ellipse, scan_of, transformed
 from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
@@ -324,30 +324,6 @@ def test_a_speck_that_passes_for_the_disk_is_known_by_the_other_disks() -> None:
     assert [mark.point for mark in marks if mark.status is Status.WEAK] == ["7"]
     assert "not like the other targets" in marks[7].reason
     assert all(mark.status is Status.MEASURED for mark in marks if mark.point != "7")
-
-
-@pytest.mark.study
-def test_small_disks_whose_edges_are_as_soft_as_a_spots_are_measured_where_all_are_alike() -> None:
-    rng = np.random.default_rng(2)
-    picture = GROUND + rng.normal(0, 500, (60, 40 * 24))
-    predictions, places = [], []
-    for number in range(24):
-        place = np.array([20 + 40 * number, 30]) + rng.uniform(-0.5, 0.5, 2)
-        shape = 2.1 * np.diag([1.0, rng.uniform(0.8, 0.95)])
-        blurred = drawn(ellipse(place - (40 * number, 0), shape), 40, 60, 1.45)
-        picture[:, 40 * number : 40 * number + 40] += rng.normal(1.0, 0.04) * CONTRAST * blurred
-        predictions.append(TargetPrediction(str(number), place + 0.3, 1.05 * shape, 4.0))
-        places.append(place)
-    marks = measure_disks(scan_of(picture), predictions)
-    assert sum(mark.status is Status.MEASURED for mark in marks) >= 20
-    errors = [
-        whitened(np.asarray(mark.center_px) - place, np.asarray(mark.covariance_px2))
-        for mark, place in zip(marks, places, strict=True)
-        if mark.status is Status.MEASURED
-    ]
-    assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.3  # three standard deviations of 40 numbers
-    lone = measure_disks(scan_of(picture), predictions[:6])
-    assert all(mark.status is not Status.MEASURED for mark in lone)
 
 
 @pytest.mark.parametrize(("share", "doubted"), [(0.0, 0.04), (0.2, 0.15)])

@@ -169,25 +169,6 @@ def test_the_linearised_effect_of_a_curve_is_that_of_a_fit_at_another_one() -> N
         np.testing.assert_allclose((more - less) / 0.2, estimate.on_place[:, k], atol=0.03)
 
 
-@pytest.mark.study
-def test_marks_that_contradict_one_another_on_the_curve_are_known_no_better_than_that() -> None:
-    rng = np.random.default_rng(6)
-    marks = [some_mark(TIP, 1.0, rng) for _ in range(4)]
-    codes = [code_between_ends(mark, power, rng) for mark, power in zip(marks, (1.0, 2.2, 1.0, 2.2), strict=True)]
-    prior = Tone.unknown()
-    fits, found = settled(marks, codes, prior)
-    for mark, fit in zip(marks, fits, strict=True):
-        assert fit.tone is not None
-        error, covariance = fit.center_px - mark.place[:, 2], fit.covariance_px2 + found.covariance_px2(fit.tone)
-        assert np.sqrt(error @ np.linalg.solve(covariance, error)) < 4  # by the curve's covariance alone up to 12
-
-
-def code_between_ends(mark: TrueMark, power: float, rng: np.random.Generator) -> np.ndarray:
-    """The same ends whatever the curve between them, so that no single curve explains two of them."""
-    share = np.clip(mark.picture + rng.standard_normal(mark.picture.shape) / 80, 0.0, 1.0)
-    return FULL * (0.1 + 0.6 * (0.05 + 0.9 * share) ** (1 / power))
-
-
 def test_what_the_marks_contradict_one_another_by_is_in_the_covariance_of_each() -> None:
     result = {n: mark_tone(way * np.eye(5)[0]) for n, way in enumerate((1.0, -1.0, 1.0, -1.0))}
     agreed = {n: mark_tone(np.zeros(5)) for n in range(4)}
