@@ -207,6 +207,32 @@ def test_a_calibration_that_cannot_be_is_refused(
         assert word in str(error.value)
 
 
+def noisy(network: Network, rng: np.random.Generator, scale: float) -> Network:
+    """A network without errors to speak of, its observations drawn by covariances so many times as large."""
+    rows = network.observations
+    covariance = scale**2 * rows.covariance_mm2
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    return replace(
+        network, observations=replace(rows, xy_mm=rows.xy_mm + rng.normal(0.0, sigma), covariance_mm2=covariance)
+    )
+
+
+def contradicted(sigmas: float, draws: int, level: float = 0.05) -> float:
+    """The share of calibrations that are told to be contradicted, of cameras whose c has changed by so many sigmas."""
+    (a, start_a), (b, start_b), _ = two_networks("none", 1e-6)
+    rng = np.random.default_rng(4)
+    result = []
+    for _ in range(draws):
+        calibration = make_calibration(adjust(noisy(a, rng, 1e6), start_a), False)
+        c = calibration.parameters.index(Parameter.interior("K", "c"))
+        values = calibration.values.copy()
+        values[c] += sigmas * np.sqrt(2.0 * calibration.covariance[c, c])
+        network = set_calibration(noisy(b, rng, 1e6), replace(calibration, values=values))
+        (found,) = adjust(network, start_b).contradictions
+        result.append(found.probability < level)
+    return float(np.mean(result))
+
+
 def test_an_earlier_calibration_is_tested_as_a_whole() -> None:
     """Against the calibration of the new images alone: d' (C_old + C_new)^-1 d, their sigma0, and d itself."""
     (a, start_a), (b, start_b), _ = two_networks("none", 1.0)
