@@ -13,12 +13,9 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from measure.errors import MeasurementError, MissingError, UnreachableError
+from measure.errors import MissingError, UnreachableError
 from measure.results import MEASURE_REVISION
-from measure.scans.metadata import DECODING_ERRORS
-from measure.scans.opening import open_scan
-from measure.scans.remote import Address, tiff_file, whole_file
-from measure.scans.scan import Scan
+from measure.scans.remote import Address, whole_file
 from pipeline.text.files import read_bytes
 
 _PLAIN = {str, int, bool, type(None)}  # types of most values, tested first
@@ -26,8 +23,6 @@ NO_FINGERPRINT = {"fingerprint": False}  # metadata of a field that is not part 
 Item = TypeVar("Item")
 
 _PIECES, _PIECE = 8, 32768  # number and bytes of pieces of a file, spread evenly from its first byte to its last
-_HEAD_BYTES = 1 << 16
-_MIDDLE_PX = 256
 _PIECE_BYTES = 1 << 20
 
 
@@ -59,20 +54,6 @@ def hash_text(text: str) -> str:
 def hash_file(path: Path) -> str:
     """SHA-256 of a file."""
     return hash_content(read_bytes(path))
-
-
-def scan_fingerprint(path: Path) -> str:
-    """Hash of a file's size and of the SHA-256 of pieces of it; "" where it cannot be read."""
-    try:
-        size = path.stat().st_size
-        with path.open("rb") as file:
-            pieces = []
-            for number in range(_PIECES):
-                file.seek(max(size - _PIECE, 0) * number // (_PIECES - 1))
-                pieces.append(file.read(_PIECE))
-    except OSError:
-        return ""
-    return fingerprint([size, *map(hash_content, pieces)])
 
 
 def _json(value: Any) -> Any:
@@ -167,30 +148,24 @@ def file_state(path: Path, folder: Path) -> FileState:
     return FileStates(folder).get(path)
 
 
-def parts_hash(path: Path, max_pixels: int | None = None) -> str:
-    """SHA-256 (hexadecimal) of parts of a scan's file.
+def parts_hash(path: Path) -> str:
+    """SHA-256 (hexadecimal) of the size of a scan's file and of pieces spread over it; "" where it cannot be read.
 
-    The parts are the first 64 KiB, the tables of tile offsets and byte counts, the central 256 x 256 px, and pieces
-    spread over the file. Head and tables are not sufficient, since uncompressed scans of one scanner share them. For a
-    file that cannot be opened as a scan only its first bytes and the pieces count; "" where they cannot be read. For an
-    object the store's own hash of its content is used, and nothing is read.
+    Scans of one scanner share their heads, and uncompressed ones their tables. For an object the store's own hash of
+    its content is used, and nothing is read.
     """
     try:
+        size = path.stat().st_size
         if isinstance(path, Address) and path.etag:
-            return hashlib.sha256(f"{path.etag} {path.stat().st_size}".encode()).hexdigest()
-        part = str(path).removeprefix(whole_file(str(path)))  # two parts of one file are two scans
-        digest = hashlib.sha256(f"{scan_fingerprint(path)}{part}".encode())
+            return hash_text(f"{path.etag} {size}")
         with path.open("rb") as file:
-            digest.update(file.read(_HEAD_BYTES))
+            pieces = []
+            for number in range(_PIECES):
+                file.seek(max(size - _PIECE, 0) * number // (_PIECES - 1))
+                pieces.append(hash_content(file.read(_PIECE)))
     except (OSError, MissingError, UnreachableError):
         return ""
-    try:
-        with open_scan(path, max_pixels) as scan:
-            digest.update(_tables(path))
-            digest.update(_middle(scan))
-    except (MeasurementError, *DECODING_ERRORS):
-        digest.update(b"cannot be opened")
-    return digest.hexdigest()
+    return fingerprint([size, *pieces, str(path).removeprefix(whole_file(str(path)))])  # parts of a file are two scans
 
 
 def content_hash(path: Path) -> str:
@@ -219,21 +194,6 @@ def alike_groups(items: Iterable[Item], *values: Callable[[Item], object]) -> li
                 parts[number, value(item)].append(item)
         groups = [group for (_, known), group in parts.items() if known and len(group) > 1]
     return groups
-
-
-def _tables(path: Path) -> bytes:
-    """Offsets and byte counts of the tiles or strips of all pages of a TIFF file; empty for other files."""
-    with path.open("rb") as start:
-        if start.read(2) not in (b"II", b"MM"):
-            return b""
-    with tiff_file(path) as file:
-        pages = [page.aspage() for page in file.pages]
-        return b"".join(np.array([*page.dataoffsets, *page.databytecounts], "<u8").tobytes() for page in pages)
-
-
-def _middle(scan: Scan) -> bytes:
-    width, height = min(_MIDDLE_PX, scan.width_px), min(_MIDDLE_PX, scan.height_px)
-    return scan.samples((scan.width_px - width) // 2, (scan.height_px - height) // 2, width, height).tobytes()
 
 
 def result_key(identity: Identity, options_hash: str, revision: int = MEASURE_REVISION) -> str:

@@ -69,7 +69,7 @@ def find_moved(store: Store, project: Project, reporter: Reporter) -> dict[str, 
             path = project.scans[name]
             uri = free.pop(content_hash(path), "") if state.bytes in sizes else ""
             if uri and uri not in taken:  # nor has another file come to its place
-                keys |= store.move(uri, Identity(state, parts_hash(path, project.max_pixels)))
+                keys |= store.move(uri, Identity(state, parts_hash(path)))
                 taken.add(state.uri)
                 found += 1
     if unknown:

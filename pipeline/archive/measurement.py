@@ -229,7 +229,7 @@ def measured_from(project: Project) -> MadeFrom:
             for camera in project.cameras.values()
         },
         **{
-            f"{SCAN}{image}": hash_text(f"{_parts(path, project, known, files)} {project.image_camera(image).name}")
+            f"{SCAN}{image}": hash_text(f"{_parts(path, known, files)} {project.image_camera(image).name}")
             for image, path in project.scans.items()
         },
     }
@@ -251,12 +251,12 @@ def adjusted_from(project: Project, marks: Sequence[ComparatorPoint]) -> MadeFro
     }
 
 
-def _parts(path: Path, project: Project, known: Mapping[str, Identity], files: FileStates) -> tuple[int, str]:
+def _parts(path: Path, known: Mapping[str, Identity], files: FileStates) -> tuple[int, str]:
     """Size of a scan's file and hash of its parts, read only where its state differs from that in the store."""
     state = files.get(path)
     found = known.get(state.uri)
     is_known = found is not None and found.state == state
-    return state.bytes, found.parts_hash if found and is_known else parts_hash(path, project.max_pixels)
+    return state.bytes, found.parts_hash if found and is_known else parts_hash(path)
 
 
 def differing(made: Mapping[str, str], now: Mapping[str, str]) -> list[str]:

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -267,7 +266,7 @@ def catalogue(given: Sequence[Path], count: Count, max_pixels: int | None = None
             own, number = number, number + 1
             alike.append((own, head))
         members[path.parent if by_folder else Path(), own].append((path, head))
-    copies = dict(_copies([path for path in files if path not in unread], max_pixels)) if by_folder else {}
+    copies = dict(_copies([path for path in files if path not in unread])) if by_folder else {}
     groups = (
         ScanGroup(some[0][0].parent, some[0][1], tuple(path for path, _ in some if path not in copies))
         for _, some in sorted(members.items(), key=lambda item: item[0])
@@ -397,10 +396,9 @@ def _files_below(folder: Path) -> Iterator[Path]:
             yield from (folder / place / name for name in names)
 
 
-def _copies(files: Sequence[Path], max_pixels: int | None) -> Iterator[tuple[Path, Path]]:
+def _copies(files: Sequence[Path]) -> Iterator[tuple[Path, Path]]:
     """Yield (copy, original) for files with identical bytes; size and a hash of parts are compared first."""
     # The original has the shortest name, since copies are called `Copy of 0001` or `0001 (1)`.
     by_name = sorted(files, key=lambda path: len(path.name))
-    parts = partial(parts_hash, max_pixels=max_pixels)
-    for original, *others in alike_groups(by_name, lambda path: path.stat().st_size, parts, content_hash):
+    for original, *others in alike_groups(by_name, lambda path: path.stat().st_size, parts_hash, content_hash):
         yield from ((path, original) for path in others)

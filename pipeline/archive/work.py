@@ -183,7 +183,7 @@ class Work:
         decisions = self.decisions.get(task.name)
         if decisions is None:
             return task
-        identity = self._identity(task) or Identity(self.state(task), parts_hash(scan_path(task.scan), task.max_pixels))
+        identity = self._identity(task) or Identity(self.state(task), parts_hash(scan_path(task.scan)))
         task, self.counting[task.name] = apply_decisions(
             task,
             decisions,

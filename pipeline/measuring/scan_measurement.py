@@ -252,7 +252,7 @@ def measure_file(task: ScanTask) -> MeasuredFile:
     thumbnails = TakenThumbnails()
     scan = measured_scan(task, thumbnails.take)
     bytes_read = _bytes_read() - before if before >= 0 else -1
-    parts = parts_hash(scan_path(task.scan), task.max_pixels) if task.scan else ""
+    parts = parts_hash(scan_path(task.scan)) if task.scan else ""
     return MeasuredFile(scan, parts, bytes_read, tuple(thumbnails))
 
 

@@ -22,7 +22,7 @@ from pipeline import read_measurement, read_project, stages
 from pipeline.adjusting import second_visit
 from pipeline.archive.measurement import measured_from
 from pipeline.cli import run
-from pipeline.provenance import fingerprint, scan_fingerprint
+from pipeline.provenance import fingerprint, parts_hash
 from pipeline.report.load import adjusted_data
 from pipeline.results.comparator_file import mark_rows, write_comparator
 from pipeline.results.measured_record import MeasuredScan
@@ -338,12 +338,12 @@ def test_a_scan_counts_as_another_wherever_a_piece_of_it_changes(tmp_path: Path)
         file = tmp_path / "scan.tif"
         data = bytearray(np.random.default_rng(size).bytes(size))
         file.write_bytes(data)
-        found = {scan_fingerprint(file)}
+        found = {parts_hash(file)}
         places = range(0, size, max(size // 7, 1)) if size <= 200_000 else (0, 30_000, 2_130_000, size - 1)
         for at in list(places)[:8]:
             changed = data.copy()
             changed[at] ^= 1
             file.write_bytes(changed)
-            found.add(scan_fingerprint(file))
+            found.add(parts_hash(file))
         assert len(found) == 1 + len(list(places)[:8]), size
-    assert scan_fingerprint(tmp_path / "none.tif") == ""
+    assert parts_hash(tmp_path / "none.tif") == ""
