@@ -4,6 +4,7 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.files.project_tables import UNITS_MM, AdjustSettings
+from pipeline.files.target_table import TieSettings
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.text.wording import did_you_mean, listed
 from pipeline.types import Array
@@ -83,21 +85,22 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
             "The reasons of all stand in its last column."
         )
     check_fiducials(project, used)
-    _check_points(project, used)
-    used, unjoined = _joinable(project, _drop_single_joins(project, used))
-    used, lonely = _locatable(project, used)
-    used, left_out = _orientable(project, used)
-    names = dict.fromkeys(mark.image for mark in used)
-    of_frame = {name: rank for rank, name in enumerate(dict.fromkeys(project.image_frame(name) for name in names))}
-    names_by_frame = sorted(names, key=lambda name: of_frame[project.image_frame(name)])
-    images = tuple(_image(project, name) for name in names_by_frame)
+    comparator, given = project.comparator, project.object_points
+    _check_points(comparator, given, used)
+    by_name = {name: _image(project, name) for name in dict.fromkeys(mark.image for mark in used)}
+    used, unjoined = _joinable(comparator, by_name, used)
+    used, lonely = _locatable(given, by_name, used)
+    used, left_out = _orientable(comparator, by_name, used, _expects_targets(project))
+    in_order = [by_name[name] for name in dict.fromkeys(mark.image for mark in used)]
+    first = {image.frame: rank for rank, image in reversed(list(enumerate(in_order)))}
+    images = tuple(sorted(in_order, key=lambda image: first[image.frame]))
     distances, without_end = _distances(project, used)
     cameras, calibrations = _cameras(project, images, used)
     scanners = dict.fromkeys(image.scanner for image in images if image.scanner)
     network = Network(
         cameras=cameras,
         images=images,
-        points=_points(project, used),
+        points=_points(given, project.ties, used),
         observations=_observations(project.adjust, used),
         distances=distances,
         # Digital cameras that photographed the film, with their lens; none for film that was scanned.
@@ -130,26 +133,15 @@ def check_transformation(project: Project) -> None:
         _transformation(project, camera)
 
 
-def _drop_single_joins(project: Project, marks: Sequence[ComparatorPoint]) -> list[ComparatorPoint]:
-    """Drop joins that only one scan of their frame shows."""
-    shown = Counter((project.image_frame(mark.image), mark.point) for mark in marks if mark.kind == "join")
-    for mark in marks:
-        if mark.kind == "join" and not project.scanned_frame(mark.image):
-            raise InputError(
-                f"{project.comparator}, line {mark.line}: image {mark.image!r} shows the join {mark.point!r}, but is "
-                "no part of a frame. Name the frame in the column part_of of images.csv, for all of its scans."
-            )
-    return [mark for mark in marks if mark.kind != "join" or shown[project.image_frame(mark.image), mark.point] > 1]
-
-
-def _locatable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[ComparatorPoint], tuple[str, ...]]:
+def _locatable(
+    given: Mapping[str, ObjectPoint], images: Mapping[str, Image], marks: Sequence[ComparatorPoint]
+) -> tuple[list[ComparatorPoint], tuple[str, ...]]:
     """Drop marks of points that cannot be located: without coordinates, and in one image only."""
-    given = {id for id, point in project.object_points.items() if any((point.X, point.Y, point.Z))}
-    shown_points = {(mark.point, project.image_frame(mark.image)) for mark in marks if mark.kind not in ON_FILM}
-    images = Counter(point for point, _ in shown_points)
-    lonely = {point for point, count in images.items() if count < 2 and point not in given}
-    image_of = {point: image for point, image in shown_points if point in lonely}
-    named = [f"{point} ({image_of[point]})" for point in sorted(lonely)]
+    known = {id for id, point in given.items() if any(point.priors)}
+    image_of = {(mark.point, images[mark.image].frame): mark.image for mark in marks if mark.kind not in ON_FILM}
+    counts = Counter(point for point, _ in image_of)
+    lonely = {point: frame for point, frame in image_of if counts[point] < 2 and point not in known}
+    named = [f"{point} ({frame})" for point, frame in sorted(lonely.items())]
     sentence = (
         f"Without coordinates and measured in one image only, and so left out: {listed(named)}. Two images are needed "
         "to locate a point. Measure each in a second image, or give its coordinates."
@@ -158,28 +150,29 @@ def _locatable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list
     return kept, (sentence,) if lonely else ()
 
 
-def _orientable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[ComparatorPoint], tuple[str, ...]]:
+def _orientable(
+    comparator: Path, images: Mapping[str, Image], marks: Sequence[ComparatorPoint], expects_targets: bool
+) -> tuple[list[ComparatorPoint], tuple[str, ...]]:
     """Drop marks of images that cannot be oriented, with a sentence on each."""
     # Of an image with too few targets the fiducials remain if they suffice for its film deformation model. Marks in
     # several parts of a frame count once.
-    shown = {(project.image_frame(mark.image), mark.kind, mark.point) for mark in marks}
+    shown = {(images[mark.image].frame, mark.kind, mark.point) for mark in marks}
     targets = Counter(frame for frame, kind, _ in shown if kind not in ON_FILM)
     fiducials = Counter(frame for frame, kind, _ in shown if kind == "fiducial")
-    first = {project.image_frame(mark.image): mark.image for mark in reversed(marks)}
-    images = [replace(_image(project, image), name=frame) for frame, image in reversed(first.items())]
-    few = [image for image in images if targets[image.name] < FEWEST_TARGETS and not image.is_observed]
+    frames = dict.fromkeys(images[mark.image].frame for mark in marks)
+    first = {images[mark.image].frame: images[mark.image] for mark in reversed(marks)}
+    whole = [replace(first[frame], name=frame) for frame in frames]
+    few = [image for image in whole if targets[image.name] < FEWEST_TARGETS and not image.is_observed]
     lost = [image for image in few if not _has_film_transformation(image, fiducials[image.name])]
-    if len(lost) == len(images):
-        raise InputError(f"{project.comparator}: {_why_nothing(lost, targets, fiducials)}")
-    short = [
-        image for image in images if image not in few and fiducials[image.name] < fewest_marks(image.transformation)
-    ]
-    if len(lost) + len(short) == len(images):
+    if len(lost) == len(whole):
+        raise InputError(f"{comparator}: {_why_nothing(lost, targets, fiducials)}")
+    needed = {image.name: fewest_marks(image.transformation) for image in whole}
+    short = [image for image in whole if image not in few and fiducials[image.name] < needed[image.name]]
+    if len(lost) + len(short) == len(whole):
         short = []  # the adjustment says what is wrong with all
     sentences = [
         f"Image {image.name!r} has no part in the adjustment: it shows {fiducials[image.name]} fiducial marks, and its "
-        f"{image.transformation} transformation needs {fewest_marks(image.transformation)}. Look at the reasons of the "
-        "others."
+        f"{image.transformation} transformation needs {needed[image.name]}. Look at the reasons of the others."
         for image in short
     ]
     sentences += [
@@ -192,53 +185,55 @@ def _orientable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[lis
         f"Image {image.name!r} is not oriented: it shows {targets[image.name]} targets and needs {FEWEST_TARGETS}. Its "
         "film transformation is adjusted from its fiducials. Look at the reasons of its targets."
         for image in few
-        if image not in lost and _expects_targets(project)
+        if image not in lost and expects_targets
     ]
     dropped = {image.name for image in (*lost, *short)}
     bare = dropped | {image.name for image in few}
-    kept = [
-        mark for mark in marks if project.image_frame(mark.image) not in (dropped if mark.kind in ON_FILM else bare)
-    ]
+    kept = [mark for mark in marks if images[mark.image].frame not in (dropped if mark.kind in ON_FILM else bare)]
     return kept, tuple(sentences)
 
 
-def _joinable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[ComparatorPoint], tuple[str, ...]]:
-    """Drop marks of scans that are not connected with the other parts of their frames, with a sentence on each."""
-    shown_points: dict[str, dict[str, set[tuple[str, str]]]] = {}
+def _joinable(
+    comparator: Path, images: Mapping[str, Image], marks: Sequence[ComparatorPoint]
+) -> tuple[list[ComparatorPoint], tuple[str, ...]]:
+    """Drop joins that only one scan of their frame shows, and marks of scans and frames that lack joins or fiducials,
+    with a sentence on each."""
+    joins = [mark for mark in marks if mark.kind == "join"]
+    for mark in joins:
+        if not images[mark.image].part_of:
+            raise InputError(
+                f"{comparator}, line {mark.line}: image {mark.image!r} shows the join {mark.point!r}, but is no part "
+                "of a frame. Name the frame in the column part_of of images.csv, for all of its scans."
+            )
+    counts = Counter((images[mark.image].frame, mark.point) for mark in joins)
+    marks = [mark for mark in marks if mark.kind != "join" or counts[images[mark.image].frame, mark.point] > 1]
+    parts = defaultdict[str, defaultdict[str, set[tuple[str, str]]]](partial(defaultdict, set))
     for mark in marks:
-        if frame := project.scanned_frame(mark.image):
-            shown_points.setdefault(frame, {}).setdefault(mark.image, set()).add((mark.kind, mark.point))
-    lost = dict[str, str]()
-    for frame, parts in shown_points.items():
-        fiducials = {part: sum(kind == "fiducial" for kind, _ in points) for part, points in parts.items()}
-        kept = max(_pieces(parts), key=lambda piece: sum(map(fiducials.__getitem__, piece)))
-        lost |= {part: frame for part in parts if part not in kept}
+        if frame := images[mark.image].part_of:
+            parts[frame][mark.image].add((mark.kind, mark.point))
+    lost, bare = dict[str, str](), dict[str, str]()
+    for frame, points in parts.items():
+        fiducials = {part: {each for each in points[part] if each[0] == "fiducial"} for part in points}
+        kept = max(_pieces(points), key=lambda piece: sum(len(fiducials[part]) for part in piece))
+        lost |= {part: frame for part in points if part not in kept}
+        left = [part for part in points if part in kept]
+        transformation, count = images[left[0]].transformation, len({each for part in left for each in fiducials[part]})
+        if count < (needed := fewest_marks(transformation)):
+            bare[frame] = (
+                f"Frame {frame!r} has no part in the adjustment: {listed(left)} "
+                f"{'shows' if len(left) == 1 else 'show'} {count} fiducial marks, and the transformation "
+                f"{transformation} needs {needed}."
+            )
     sentences = tuple(
         f"Image {image!r} has no part in the adjustment: it has fewer than {FEWEST_COMMON} points in common with the "
         f"other scans of frame {frame!r}, so that nothing joins it to them. See the reasons of its marks."
         for image, frame in sorted(lost.items())
     )
-    bare = {frame: _few_fiducials(project, frame, parts, lost) for frame, parts in shown_points.items()}
-    sentences += tuple(sentence for sentence in bare.values() if sentence)
-    kept_marks = [mark for mark in marks if mark.image not in lost and not bare.get(project.scanned_frame(mark.image))]
+    sentences += tuple(bare.values())
+    kept_marks = [mark for mark in marks if mark.image not in lost and images[mark.image].part_of not in bare]
     if not kept_marks:
-        raise InputError(f"{project.comparator}: {' '.join(sentences)}")
+        raise InputError(f"{comparator}: {' '.join(sentences)}")
     return kept_marks, sentences
-
-
-def _few_fiducials(
-    project: Project, frame: str, parts: Mapping[str, set[tuple[str, str]]], lost: Mapping[str, str]
-) -> str:
-    """Why the connected scans of a frame cannot take part either; "" if they can."""
-    left = [part for part in parts if part not in lost]
-    transformation = _transformation(project, project.image_camera(left[0]))
-    shown = {point for part in left for kind, point in parts[part] if kind == "fiducial"}
-    if len(shown) >= fewest_marks(transformation):
-        return ""
-    return (
-        f"Frame {frame!r} has no part in the adjustment: {listed(left)} {'shows' if len(left) == 1 else 'show'} "
-        f"{len(shown)} fiducial marks, and the transformation {transformation} needs {fewest_marks(transformation)}."
-    )
 
 
 def _pieces(parts: Mapping[str, set[tuple[str, str]]]) -> list[set[str]]:
@@ -296,13 +291,12 @@ def _transformation(project: Project, camera: CameraFile) -> Transformation:
     return given
 
 
-def _check_points(project: Project, marks: Sequence[ComparatorPoint]) -> None:
+def _check_points(comparator: Path, given: Mapping[str, ObjectPoint], marks: Sequence[ComparatorPoint]) -> None:
     """Raise InputError for a target, not a tie point, that is not among the given points, if there are any."""
-    given = project.object_points
     for mark in marks:
         if mark.kind == "target" and given and mark.point not in given:
             raise InputError(
-                f"{project.comparator}, line {mark.line}: image {mark.image!r} shows the target {mark.point!r}, which "
+                f"{comparator}, line {mark.line}: image {mark.image!r} shows the target {mark.point!r}, which "
                 f"the given points do not hold.{did_you_mean(mark.point, given)} Add it to them (coordinates may be "
                 "blank), or make it a point of kind tie."
             )
@@ -326,19 +320,16 @@ def _cameras(
     return tuple(cameras), tuple(calibrations)
 
 
-def _points(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[ObjectPoint, ...]:
+def _points(
+    given: Mapping[str, ObjectPoint], ties: TieSettings | None, marks: Sequence[ComparatorPoint]
+) -> tuple[ObjectPoint, ...]:
     """Object points that are observed: as given, of the board, or unknown."""
-    given, points = project.object_points, dict[str, ObjectPoint]()
-    for mark in marks:
-        if mark.kind in ON_FILM or mark.point in points:
-            continue
-        if mark.point in given:
-            points[mark.point] = given[mark.point]
-        elif mark.kind == "tie" and project.ties is not None:  # the height of a natural point may be known
-            points[mark.point] = project.ties.point(mark.point)
-        else:
-            points[mark.point] = ObjectPoint(mark.point, None, None, None)
-    return tuple(points.values())
+    kinds = {mark.point: mark.kind for mark in reversed(marks) if mark.kind not in ON_FILM}
+    unknown = partial(ObjectPoint, X=None, Y=None, Z=None)
+    return tuple(
+        given.get(id) or (ties.point(id) if ties is not None and kinds[id] == "tie" else unknown(id))
+        for id in dict.fromkeys(mark.point for mark in marks if mark.point in kinds)
+    )
 
 
 def _boards(project: Project) -> tuple[Board, ...]:
