@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from measure.scans.remote import public_address
 from pipeline.errors import InputError, what_to_do_about_store
 from pipeline.results.measured_record import MARK_COLUMNS
 
@@ -109,16 +108,6 @@ def add_triggers(db: sqlite3.Connection) -> None:
             db.execute(f"create temp trigger seal_{name}_{table} after {event} on {table} {sealed}")
 
 
-def add_digests(db: sqlite3.Connection) -> None:
-    """Set the digests of all rows of a store from a version without digests."""
-    db.execute(f"update result set marks_digest = {measured_marks_digest()}")
-    db.execute(f"update judged_frame set marks_digest = {checked_marks_digest()}")
-    for table in ("scan", "result", "kept", "judged_frame"):
-        db.execute(_seal(table))
-    db.execute(f"update judging set frames_digest = {FRAMES_DIGEST}")
-    db.execute(_seal("judging"))
-
-
 class DamagedError(InputError):
     """Stored content does not match its digest."""
 
@@ -183,7 +172,9 @@ create table scan (
     width_px integer, height_px integer, bits integer, pitch_x_um real, pitch_y_um real, camera text,
     result integer,                          -- of the last time that it was measured as a scan of the project
     is_current integer not null default 0,   -- whether that is by today's file and options
-    duplicate_of integer references scan
+    duplicate_of integer references scan,
+    asked text,                              -- hash of the project's request when that was last determined
+    digest text                              -- here and below: BLAKE2b of the row
 );
 create table program (
     id integer primary key, version text not null, measure_revision integer not null, python text not null,
@@ -200,7 +191,8 @@ create table result (
     a real, b real, c real, d real, e real, f real,   -- pixel_from_camera: col = a x' + b y' + c, row = d x' + e y' + f
     pitch_x_um real, pitch_y_um real,
     verdict text not null, seconds real not null, bytes_read integer not null, finished text not null,
-    detail text not null                     -- JSON: all else that the scan gave
+    detail text not null,                    -- JSON: all else that the scan gave
+    marks_digest text, digest text
 );
 create index result_of_scan on result (scan);
 create table mark (
@@ -214,13 +206,17 @@ create table judging (
     id integer primary key,
     digest text not null unique,             -- of all that it says: comparator.csv names it
     made_from text not null,                 -- JSON: fingerprints of what it was made from
-    input text not null                      -- SHA-256 of the results that were judged, and by what
+    input text not null,                     -- SHA-256 of the results that were judged, and by what
+    frames_digest text, seal text            -- seal: of the row
 );
 create table judged_frame (
     judging integer not null references judging on delete cascade,
     scan integer not null references scan, result integer not null references result,
     name text not null, verdict text not null, own_marks integer not null,
     detail text,                             -- JSON: what of the result is another now; null: nothing
+    lot integer not null default 0,
+    decisions text,                          -- hash of the decisions about the image that were considered
+    marks_digest text, digest text,
     primary key (judging, scan)
 ) without rowid;
 create table judged (
@@ -231,30 +227,6 @@ create table judged (
     status text not null, reason_code text not null, reason text not null, quality text not null,
     primary key (judging, result, number)
 ) without rowid;
-create table kept (key text primary key, value text not null);   -- what scans of a project tell all others
-create view mark_view as
-with latest as (select max(id) as id from judging where digest not like 'unfinished%'),
-frame as (
-    select coalesce(judged_frame.name, scan.name) as image, result.id as result, own_marks, latest.id as judging,
-        result.pitch_x_um / 1000.0 as px_mm, result.pitch_y_um / 1000.0 as py_mm
-    from judged_frame join latest on judged_frame.judging = latest.id
-    join scan on scan.id = judged_frame.scan join result on result.id = judged_frame.result
-),
-seen as (
-    select image, px_mm, py_mm, number, point, kind, col_px, row_px, var_col, var_row, cov, status, reason
-    from frame join mark on mark.result = frame.result where not own_marks
-    union all
-    select image, px_mm, py_mm, number, point, kind, col_px, row_px, var_col, var_row, cov, status, reason
-    from frame join judged on judged.judging = frame.judging and judged.result = frame.result where own_marks
-)
-select image, point, kind, col_px * px_mm as x_mm, -row_px * py_mm as y_mm,
-    sqrt(var_col) * px_mm as sx_mm, sqrt(var_row) * py_mm as sy_mm,
-    case when var_col > 0 and var_row > 0 then -cov / sqrt(var_col) / sqrt(var_row) end as rho,
-    col_px, row_px, status, reason
-from seen order by image, number;
-"""
-
-_LOTS = """
 create table judged_lot (
     judging integer not null references judging on delete cascade, lot integer not null,
     input text not null,                     -- SHA-256 of all that judging these frames starts from
@@ -262,35 +234,14 @@ create table judged_lot (
     primary key (judging, lot)
 ) without rowid;
 create index judged_lot_by_input on judged_lot (input);
-alter table judged_frame add column lot integer not null default 0;
-"""
-
-# Hash of the project's request when it was last determined whether the scan's result is current.
-_ASKED = "alter table scan add column asked text"
-
-# BLAKE2b of rows, see `results_integrity`; decisions: hash of the decisions about the image that were considered.
-_DIGESTS = """
-alter table scan add column digest text;
-alter table result add column marks_digest text;
-alter table result add column digest text;
-alter table judging add column frames_digest text;
-alter table judging add column seal text;    -- of the row
-alter table judged_frame add column decisions text;
-alter table judged_frame add column marks_digest text;
-alter table judged_frame add column digest text;
-alter table kept add column digest text;
-"""
-
-# Marks of every judging after the checks: those of the raw result where the checks changed none.
-_CHECKED_MARKS = """
-create view checked_mark as
+create table kept (key text primary key, value text not null, digest text);   -- what scans of a project tell all others
+create view checked_mark as                  -- after the checks: of the raw result where these changed none
 select f.judging, f.name as image, f.scan, f.verdict, m.* from judged_frame f
 join mark m on m.result = f.result where not f.own_marks
 union all
 select f.judging, f.name, f.scan, f.verdict, m.result, m.number, m.point, m.kind, m.col_px, m.row_px, m.var_col,
     m.var_row, m.cov, m.causes, m.status, m.reason_code, m.reason, m.quality from judged_frame f
 join judged m on m.judging = f.judging and m.result = f.result where f.own_marks;
-drop view mark_view;
 create view mark_view as
 with pitch as (select id, pitch_x_um / 1000.0 as px_mm, pitch_y_um / 1000.0 as py_mm from result)
 select image, point, kind, col_px * px_mm as x_mm, -row_px * py_mm as y_mm,
@@ -301,8 +252,6 @@ from checked_mark join pitch on pitch.id = result
 where judging = (select max(id) from judging where digest not like 'unfinished%') order by image, number;
 """
 
-MIGRATIONS: tuple[str, ...] = (_FIRST, _LOTS, _ASKED, _DIGESTS, _CHECKED_MARKS)
-VERSION = len(MIGRATIONS)
 
 # Frames of every judging with their scan and raw result. marks_digest: of the marks that checked_mark shows.
 _CHECKED_FRAMES = f"""
@@ -318,15 +267,20 @@ left join result on result.id = f.result left join scan on scan.id = f.scan
 
 @dataclass(frozen=True)
 class Schema:
-    """Schema of a kind of file. application: SQLite's application id; migrations: scripts, one per version; what: its
-    content, for messages."""
+    """Schema of a kind of file. application: SQLite's application id; first: the first version that was released;
+    migrations: scripts, one for each version from the first; what: its content, for messages."""
 
     application: int
+    first: int
     migrations: tuple[str, ...]
     what: str
 
+    @property
+    def version(self) -> int:
+        return self.first + len(self.migrations) - 1
 
-MEASUREMENTS = Schema(APPLICATION, MIGRATIONS, "measurements")
+
+MEASUREMENTS = Schema(APPLICATION, 5, (_FIRST,), "measurements")
 
 
 class Database:
@@ -404,26 +358,15 @@ def _connection(path: Path) -> sqlite3.Connection:
 def migrate(connection: sqlite3.Connection, schema: Schema) -> None:
     """Migrate from any earlier version to this one, each step completely or not at all."""
     version = connection.execute("pragma user_version").fetchone()[0]
-    for number, script in enumerate(schema.migrations[version:], version + 1):
+    for number, script in enumerate(schema.migrations, schema.first):
         marks = f"pragma application_id = {schema.application}; pragma user_version = {number}"
         try:
-            connection.executescript(f"begin immediate; {script}; {marks};")
-            if script == _DIGESTS:
-                _forget_secrets(connection)
-                add_digests(connection)
-            connection.execute("commit")
+            if number > version:
+                connection.executescript(f"begin immediate; {script}; {marks}; commit;")
         except STORE_ERRORS:
             if connection.in_transaction:
                 connection.execute("rollback")
             raise
-
-
-def _forget_secrets(connection: sqlite3.Connection) -> None:
-    """Delete scans that an earlier version stored under addresses with passwords or signatures."""
-    rows = connection.execute("select id, uri from scan where uri like '%://%'").fetchall()
-    if secret := [row for row, uri in rows if public_address(uri) != uri]:
-        connection.execute("pragma secure_delete = on")
-        forget(connection, (), secret)
 
 
 def forget(connection: sqlite3.Connection, results: Collection[int], scans: Collection[int] = ()) -> int:
@@ -457,11 +400,14 @@ def _check(connection: sqlite3.Connection, path: Path, schema: Schema) -> None:
     tables = connection.execute("select count(*) from sqlite_master").fetchone()[0]
     if tables and application != schema.application:
         raise InputError(f"{path}: is an SQLite file that was not written by reseau for {schema.what}. {_MOVE}")
-    newest = len(schema.migrations)
-    if version > newest:
+    if version > schema.version:
         raise InputError(
-            f"{path}: is of version {version}, written by a later reseau than this one, which knows up to {newest}. "
-            "Install that, or move the file away."
+            f"{path}: is of version {version}, written by a later reseau than this one, which knows up to "
+            f"{schema.version}. Install that, or move the file away."
+        )
+    if 0 < version < schema.first:
+        raise InputError(
+            f"{path}: is of version {version}, from before the first release; this one measures anew. {_MOVE}"
         )
 
 

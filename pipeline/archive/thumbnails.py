@@ -27,10 +27,10 @@ create table thumbnail (
     col_px real not null, row_px real not null,   -- in the scan, of the centre of the picture's top-left pixel
     step_px real not null,                   -- pixels of the scan to one of the picture
     jpeg blob not null,
+    digest text,                             -- BLAKE2b of the thumbnail and its location
     primary key (fingerprint, point, kind)
 );
 """
-_DIGESTS = "alter table thumbnail add column digest text"  # BLAKE2b of the thumbnail and its location; null: unknown
 _DIGEST = "row_digest(point, kind, col_px, row_px, step_px, jpeg)"
 _COLUMNS = "point, kind, col_px, row_px, step_px, jpeg"
 _OFF_MIDDLE = 0.25  # fraction of a thumbnail's width: a mark farther off its middle was measured again since
@@ -39,7 +39,7 @@ _OFF_MIDDLE = 0.25  # fraction of a thumbnail's width: a mark farther off its mi
 class ThumbnailStore(Database):
     """Open store of thumbnails beside a results database; closed at the end of the `with` block."""
 
-    schema = Schema(0x52455354, (_FIRST, _DIGESTS), "thumbnails")  # "REST"
+    schema = Schema(0x52455354, 2, (_FIRST,), "thumbnails")  # "REST"
 
     def __init__(self, measurement: Path) -> None:
         """Open the thumbnails of a results database."""

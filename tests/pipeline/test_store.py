@@ -28,7 +28,7 @@ from pipeline.archive.checked_statuses import (
     latest,
 )
 from pipeline.archive.results_database import Store, merge
-from pipeline.archive.schema import MEASUREMENTS, MIGRATIONS, VERSION, opened
+from pipeline.archive.schema import MEASUREMENTS, opened
 from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_verdict
 from pipeline.provenance import content_hash, file_state, hash_text, parts_hash, result_key, shard_number
 from pipeline.report.data import ReportData, frames
@@ -137,75 +137,18 @@ def test_one_judging_takes_the_place_of_another(path: Path) -> None:
         assert found.digest == second
 
 
-@pytest.mark.parametrize("version", range(VERSION + 1))
-def test_a_store_of_an_earlier_version_is_brought_to_this_one(path: Path, version: int) -> None:
-    path.parent.mkdir()
-    db = sqlite3.connect(path)
-    for number, script in enumerate(MIGRATIONS[:version], 1):
-        db.executescript(f"{script}; pragma application_id = {0x52455345}; pragma user_version = {number};")
-    if version:
-        db.execute("insert into options (hash, json) values ('h', '{}')")
-        db.commit()
-    db.close()
-    with Store(path) as store:
-        assert store.connection.execute("pragma user_version").fetchone() == (VERSION,)
-        row = store.keep(kept_result(1), "1")
-        assert stored(store, row) == content(made_record())
-        assert store.connection.execute("select count(*) from options").fetchone() == (1 + bool(version),)
-
-
-@pytest.mark.parametrize("has_secret", [False, True])
-def test_results_of_an_earlier_version_get_their_digests(has_secret: bool, path: Path) -> None:
-    """Of a store whose rows had none: all is taken as it stands but for addresses with a secret; a later change
-    is noticed."""
-    with Store(path) as store:
-        row = store.keep(kept_result(1), "1")
-        digest = judge(store, {}, "a", [CheckedResult(row, LOOKED_AT)])
-    secret = "https://ann:hunter2@h.org/2.tif?sig=hunter2"
-    with Store(path) as store:
-        if has_secret:
-            store.keep(kept_result(2), "2")
-    with sqlite3.connect(path) as db:
-        db.execute("update scan set uri = ? where name = '2'", (secret,))
-        db.execute("drop view mark_view")
-        db.execute("drop view checked_mark")
-        for table, columns in (
-            ("scan", ["digest"]), ("result", ["digest", "marks_digest"]), ("kept", ["digest"]),
-            ("judging", ["frames_digest", "seal"]), ("judged_frame", ["decisions", "marks_digest", "digest"]),
-        ):  # fmt: skip
-            for column in columns:
-                db.execute(f"alter table {table} drop column {column}")
-        db.execute("create view mark_view as select 1")
-        db.execute("pragma user_version = 3")
-    with Store(path) as store:
-        assert stored(store, row) == content(made_record())
-        judging = find_judging(store, digest)
-        assert (judging is None) == has_secret  # it is made anew
-        if judging is not None:
-            (scan,) = checked_scans(store, judging, FOLDER)
-            assert scan.frame.problems == (LOOK,)
-        assert [uri for (uri,) in store.connection.execute("select uri from scan")] == ["scans/1.tif"]
-    with sqlite3.connect(path) as db:
-        db.execute("update mark set col_px = col_px + 5 where number = 0")
-    with Store(path) as store:
-        with pytest.raises(InputError, match=r"image '1' is not what was measured.*measure --retry"):
-            stored(store, row)
-        assert store.forget_damaged() == 1
-        assert store.fingerprints() == {}
-
-
 def test_a_step_to_a_later_version_is_made_whole_or_not_at_all(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with Store(path) as store:
         row = store.keep(kept_result(1), "1")
     step = "alter table scan add column box text; update scan set box = 'a'"
     broken = f"{step}; insert into nowhere values (1)"
-    monkeypatch.setattr(Store, "schema", replace(MEASUREMENTS, migrations=(*MIGRATIONS, broken)))
+    monkeypatch.setattr(Store, "schema", replace(MEASUREMENTS, migrations=(*MEASUREMENTS.migrations, broken)))
     with pytest.raises(InputError, match="nowhere"):
         Store(path)
-    monkeypatch.setattr(Store, "schema", replace(MEASUREMENTS, migrations=(*MIGRATIONS, step)))
+    monkeypatch.setattr(Store, "schema", replace(MEASUREMENTS, migrations=(*MEASUREMENTS.migrations, step)))
     with Store(path) as store:
         assert store.connection.execute("select name, box from scan").fetchall() == [("1", "a")]
-        assert store.connection.execute("pragma user_version").fetchone() == (VERSION + 1,)
+        assert store.connection.execute("pragma user_version").fetchone() == (MEASUREMENTS.version + 1,)
         assert stored(store, row) == content(made_record())
 
 
@@ -222,8 +165,12 @@ def test_what_is_no_store_is_refused(path: Path, tmp_path: Path) -> None:
     path.unlink()
     opened(path).close()
     with sqlite3.connect(path) as db:
-        db.execute(f"pragma user_version = {VERSION + 1}")
+        db.execute(f"pragma user_version = {MEASUREMENTS.version + 1}")
     with pytest.raises(InputError, match="a later reseau"):
+        Store(path)
+    with sqlite3.connect(path) as db:
+        db.execute(f"pragma user_version = {MEASUREMENTS.first - 1}")
+    with pytest.raises(InputError, match="before the first release"):
         Store(path)
     with Store(tmp_path / "a.db") as store:
         with pytest.raises(InputError, match="there is no such results database"):
