@@ -227,7 +227,12 @@ def _problem(own: FrameMisfit, shared: Explanation, names: Sequence[str], known_
             Code.OFF_GIVEN if alone else Code.OFF_FRAMES,
         )
     cause = "Its film is bent, or was moved while it was scanned."
-    if alone:
+    if own.jump_mm is not None:
+        cause = (
+            f"A jump of the scanner, or a seam of joined strips, of {own.jump_mm:.3f} mm explains it, or film that is "
+            "bent: look at the scan, or scan the film again."
+        )
+    elif alone:
         cause = (
             "Film or scanner bent it, or the coordinates are not those of this camera; one frame does not tell which."
         )

@@ -7,9 +7,10 @@ the film, normally distributed around those of the camera's other frames, or wit
 K c: a perspective, 0 unless the film was photographed obliquely. The film scatters each mark independently; measured
 and given places have their own covariances.
 
-The chi-square of the residuals tests the frame, a mean shift of mark k tests the mark (data snooping: Baarda 1968).
+The chi-square of the residuals tests the frame, a mean shift of mark k tests the mark (data snooping: Baarda 1968), a
+shift that all marks beyond a column or row of the scan share tests for a jump of the scanner or a seam.
 Hypotheses are compared by their evidence (marginal likelihood): the film is ordinary, bent, stretched by a wrong pitch,
-or photographed obliquely; under each of these either no mark or one mark k has a gross error.
+or photographed obliquely; under each of these nothing else is wrong, or one mark has a gross error, or the scan a jump.
 """
 
 from dataclasses import dataclass, field, replace
@@ -19,7 +20,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
-from scipy.special import chdtri, fdtrc, logsumexp
+from scipy.spatial.distance import pdist
+from scipy.special import chdtrc, chdtri, fdtrc, logsumexp
 
 from measure.array_types import Array, Mask
 from measure.fiducials.options import AFFINITY_SIGMA, MOST_BENT_MM, SCATTER_DEGREES, SCATTER_MM, film_terms, interleaved
@@ -31,6 +33,8 @@ _RANK = 1e-9  # fraction of the largest singular value, below which a direction 
 _LEAST_MM = 1e-6  # smallest standard deviation of a mark
 _KNOWN = 1e6  # degrees of freedom of a known variance
 _MOST_OFF_MM = 0.5  # largest standard deviation of a gross error: marks are not searched farther off than some 1 mm
+_APART = 1 / 3  # fraction of the least distance of two marks: a jump is sought between columns of marks at least so far
+_FEWEST_BEYOND = 2  # marks on either side of a jump: of one mark alone it is a gross error
 _FEWEST = 3  # marks needed for a frame
 _AT_ONCE = 20  # one in so many marks may be removed at once: each hardly shifts the others then
 _LEAST_GATE = 0.1  # fraction of the gate: film may displace a mark by this much, however well most of them agree
@@ -38,7 +42,7 @@ _TURNED = 0.2  # shear per stretch that a wrong pitch causes in a frame rotated 
 MOST_STRETCHED = 0.05  # largest stretch by a wrong pitch
 _MOST_PERSPECTIVE = 2e-4  # per mm: film photographed from 0.6 m, tilted by 7 degrees
 _PRIOR = np.log(FALSE_DOUBT)  # log prior probability of each deviation from an ordinary frame
-_QUANTILES = (np.arange(3) + 0.5) / 3  # at which an estimated variance is sampled, to average over it
+_AVERAGED = 300  # equally probable variances of film over which a p-value is averaged: it is decided at one in 200
 _WIDTHS = 10  # standard deviations, in equal logarithmic steps, of an effect of which only the range is known
 _TESTS = 2  # independent tests of a frame: misfit beyond an affine transformation (global or one mark), and affinity
 
@@ -59,9 +63,10 @@ class Scatter:
     sigma: float
     degrees: float = _KNOWN
 
-    def variances(self) -> Array:
-        """(3,) equally probable variances: quantiles of the scaled inverse chi-square distribution."""
-        return np.asarray(self.sigma**2 * self.degrees / chdtri(self.degrees, 1 - _QUANTILES))
+    def variances(self, count: int = 3) -> Array:
+        """(count,) equally probable variances: quantiles of the scaled inverse chi-square distribution."""
+        quantiles = (np.arange(count) + 0.5) / count
+        return np.asarray(self.sigma**2 * self.degrees / chdtri(self.degrees, 1 - quantiles))
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,12 +91,14 @@ class FrameMarks:
     given_mm : (n, 2) given places, relative to their centroid.
     off_mm : (n, 2) measured less given places, in the camera's axes, after a rotation and shift onto the given ones.
     covariance_mm2 : (2n, 2n) covariance without the scatter of the film.
+    scan_mm : (n, 2) measured places in the scan's axes.
     model : film deformation model of the project.
     """
 
     given_mm: Array
     off_mm: Array
     covariance_mm2: Array
+    scan_mm: Array
     model: str = "affine"
 
     @classmethod
@@ -99,7 +106,7 @@ class FrameMarks:
         cls, given_mm: Array, measured_mm: Array, covariances_mm2: Array, model: str = "affine"
     ) -> "FrameMarks":
         """Rotate and shift measured places (n, 2) onto given ones (n, 2), with a mirror if needed. The measured places
-        and their covariances (n, 2, 2) may be in any axes."""
+        and their covariances (n, 2, 2) are in the scan's axes."""
         centers = given_mm.mean(axis=0), measured_mm.mean(axis=0)
         left, _, right = np.linalg.svd((given_mm - centers[0]).T @ (measured_mm - centers[1]))
         turn = left @ right
@@ -107,7 +114,7 @@ class FrameMarks:
         covariance = np.zeros((n, 2, n, 2))
         covariance[np.arange(n), :, np.arange(n)] = turn @ covariances_mm2 @ turn.T + _LEAST_MM**2 * np.eye(2)
         off = (measured_mm - centers[1]) @ turn.T - (given_mm - centers[0])
-        return cls(given_mm - centers[0], off, covariance.reshape(2 * n, 2 * n), model)
+        return cls(given_mm - centers[0], off, covariance.reshape(2 * n, 2 * n), measured_mm, model)
 
     @property
     def radius_mm(self) -> float:
@@ -123,6 +130,22 @@ class FrameMarks:
     def perspective(self) -> Array:
         """(2n, 2) derivatives with respect to a perspective, per mm of displacement of the outermost mark."""
         return film_terms("projective", self.given_mm, self.given_mm + self.off_mm) / self.radius_mm**2
+
+    @cached_property
+    def beyond_jumps(self) -> Mask:
+        """(n, j) marks beyond each column or row of the scan at which a jump may lie."""
+        least_mm, sides = _APART * float(pdist(self.scan_mm).min()), list[Mask]()
+        for place in self.scan_mm.T:
+            steps = np.sort(place)
+            sides += [place > steps[k] for k in np.flatnonzero(np.diff(steps) > least_mm)]
+        kept = [each for each in sides if _FEWEST_BEYOND <= each.sum() <= len(each) - _FEWEST_BEYOND]
+        return np.array(kept, dtype=bool).reshape(-1, len(self.scan_mm)).T
+
+    def scatter_degrees(self, film: Scatter) -> float:
+        """Degrees of freedom of the variance of a residual, of which only the film's part is estimated (Welch and
+        Satterthwaite)."""
+        total_mm2 = 1 / np.mean(1 / (self._beyond_affine.variances + film.sigma**2))
+        return float(film.degrees * (total_mm2 / film.sigma**2) ** 2)
 
     @cached_property
     def _beyond_affine(self) -> "_Reduced":
@@ -208,7 +231,8 @@ class FrameMarks:
         """Keep the marks of the given indices."""
         both = (2 * index[:, None] + np.arange(2)).ravel()
         covariance = self.covariance_mm2[np.ix_(both, both)]
-        return replace(self, given_mm=self.given_mm[index], off_mm=self.off_mm[index], covariance_mm2=covariance)
+        given, off, scan = self.given_mm[index], self.off_mm[index], self.scan_mm[index]
+        return replace(self, given_mm=given, off_mm=off, covariance_mm2=covariance, scan_mm=scan)
 
     def rotate(self, turn: Array) -> "FrameMarks":
         """Transform to axes that are rotated, or mirrored, by turn (2, 2)."""
@@ -247,6 +271,11 @@ class _Reduced:
         basis = basis @ vectors
         return cls(basis, np.maximum(variances, _LEAST_MM**2), basis.T @ marks.off_mm.ravel())
 
+    def shifted(self, beyond: Mask) -> Array:
+        """(m, n + j, 2) derivatives of the residuals by a shift of each mark, and of those beyond each jump."""
+        basis = self.basis.reshape(len(beyond), 2, -1)
+        return np.concatenate([basis, np.einsum("naj,ng->gaj", basis, beyond)]).transpose(2, 0, 1)
+
     def weighted(self, film_mm: float) -> Array:
         """(2n, m) basis over the variances, for a film scatter of film_mm."""
         return np.asarray(self.basis / (self.variances + film_mm**2))
@@ -258,31 +287,47 @@ class FrameConsistency:
 
     Attributes
     ----------
-    log_evidence : (4, n + 1) log evidence of the hypotheses without a gross error (first column) and with one in each
-        mark, given that something is wrong.
-    off_mm : (n, 2) estimated gross error of each mark, if it is the only one.
+    log_evidence : (4, 1 + n + j) log evidence of the hypotheses with nothing else wrong (first column), with a gross
+        error in each mark, and with each jump, given that something is wrong.
+    off_mm : (n + j, 2) estimated gross error of each mark, and size of each jump, if it is the only one.
+    beyond_jumps : (n, j) marks beyond each jump.
     """
 
     log_evidence: Array
     off_mm: Array
+    beyond_jumps: Mask
 
     @property
     def log_odds(self) -> Array:
-        """(n,) log-odds of a gross error in each mark against all other explanations."""
-        whole = logsumexp(self.log_evidence, axis=0)
-        others = np.where(np.eye(len(whole))[1:], -np.inf, whole)
-        return np.asarray(whole[1:] - logsumexp(others, axis=1))
+        """(n + 1,) log-odds of a gross error in each mark, and of any jump, against all other explanations."""
+        whole, n = logsumexp(self.log_evidence, axis=0), len(self.beyond_jumps)
+        causes = np.append(whole[: n + 1], logsumexp(np.append(whole[n + 1 :], -np.inf)))
+        others = np.where(np.eye(n + 2)[1:], -np.inf, causes)
+        return np.asarray(causes[1:] - logsumexp(others, axis=1))
+
+    @property
+    def log_gain(self) -> Array:
+        """(n,) log-odds of a gross error in each mark against none, with or without a jump."""
+        whole, n = logsumexp(self.log_evidence, axis=0), len(self.beyond_jumps)
+        return np.asarray(whole[1 : n + 1] - logsumexp([whole[0], *whole[n + 1 :]]))
 
     @property
     def wrong_mark(self) -> int | None:
         """Mark whose gross error is accepted; None if there is none."""
-        odds = self.log_odds
-        return int(odds.argmax()) if odds.max() > NAMED else None
+        odds, best = self.log_odds, int(self.log_odds.argmax())
+        return best if odds[best] > NAMED and best < len(self.beyond_jumps) else None
 
     @property
-    def suspects(self) -> NDArray[np.bool_]:
+    def jump_mm(self) -> float | None:
+        """Size of the likeliest jump, if there is one; None otherwise. Its place may be ambiguous."""
+        n = len(self.beyond_jumps)
+        likeliest = int(logsumexp(self.log_evidence, axis=0)[n + 1 :].argmax()) if self.beyond_jumps.size else 0
+        return float(np.hypot(*self.off_mm[n + likeliest])) if self.log_odds[-1] > NAMED else None
+
+    @property
+    def suspects(self) -> Mask:
         """(n,) mask of the marks that may have a gross error."""
-        return self.log_odds > _SUSPECT
+        return self.log_odds[:-1] > _SUSPECT
 
     @property
     def best_hypothesis(self) -> Hypothesis:
@@ -297,12 +342,13 @@ def frame_p_value(marks: FrameMarks, film: Scatter = LONE_FILM, affinity: Affini
     """p-value of a frame, with film and affinity as they are known.
 
     The smallest p-value, corrected for the number of tests, of: the misfit beyond an affine transformation; the
-    affinity; and the largest misfit of a single mark.
+    affinity; and the largest misfit of a single mark, or of the marks beyond a jump.
     """
-    chi_square, degrees = marks.chi_square(film.sigma), marks.redundancy
+    chi_square, degrees, reduced = marks.chi_square(film.sigma), marks.redundancy, marks._beyond_affine
     p_values = [1.0]
     if degrees:
-        p_values.append(float(fdtrc(degrees, film.degrees, chi_square / degrees)))
+        spread = reduced.variances + film.variances(_AVERAGED)[:, None]
+        p_values.append(float(chdtrc(degrees, (reduced.residuals**2 / spread).sum(axis=1)).mean()))
     fitted, covariance = marks.affinity(film.sigma)
     if np.linalg.matrix_rank(covariance, tol=_RANK * np.trace(covariance)) == len(fitted):
         apart, spread = fitted - affinity.mean, covariance + affinity.scatter.sigma**2 * np.eye(3)
@@ -310,14 +356,16 @@ def frame_p_value(marks: FrameMarks, film: Scatter = LONE_FILM, affinity: Affini
         apart, spread, tested = apart[first:], spread[first:, first:], len(apart) - first
         p_values.append(float(fdtrc(tested, affinity.scatter.degrees, apart @ np.linalg.solve(spread, apart) / tested)))
     if degrees > 2:
-        n, reduced = len(marks.given_mm), marks._beyond_affine
-        weight = reduced.weighted(film.sigma)
-        pulls = (weight @ reduced.residuals).reshape(n, 2)
-        blocks = weight.reshape(n, 2, -1) @ reduced.basis.reshape(n, 2, -1).swapaxes(1, 2)
-        share = np.einsum("ki,kij,kj->k", pulls, np.linalg.pinv(blocks, hermitian=True), pulls).max()
-        known = film.degrees + degrees - 2
-        ratio = share / 2 * known / (film.degrees + max(chi_square - share, 0.0))
-        p_values.append(n * float(fdtrc(2, known, ratio)))
+        shifts, weight = reduced.shifted(marks.beyond_jumps), 1 / (reduced.variances + film.sigma**2)
+        pulls = np.einsum("m,mga->ga", weight * reduced.residuals, shifts)
+        blocks = np.einsum("m,mga,mgb->gab", weight, shifts, shifts, optimize=True)
+        known = np.linalg.eigvalsh(blocks)[:, 0] > _RANK * np.trace(blocks, axis1=1, axis2=2).max()
+        solved = np.linalg.solve(blocks[known], pulls[known][..., None])[..., 0]
+        share = float((pulls[known] * solved).sum(axis=1).max(initial=0.0))
+        scatter_degrees = marks.scatter_degrees(film)
+        others = scatter_degrees + degrees - 2
+        ratio = share / 2 * others / (scatter_degrees + max(chi_square - share, 0.0))
+        p_values.append(len(shifts[0]) * float(fdtrc(2, others, ratio)))
     return min(1.0, _TESTS * min(p_values))
 
 
@@ -335,7 +383,7 @@ def frame_consistency(
     Returns
     -------
     FrameConsistency
-        Evidence of each hypothesis, and gross error of each mark.
+        Evidence of each hypothesis, gross error of each mark, and size of each jump.
 
     Notes
     -----
@@ -345,10 +393,12 @@ def frame_consistency(
     matrix determinant lemma (Harville 1997, 18.1).
     """
     states = _states(marks, film, affinity)
-    reduced, n = marks._beyond_congruent, len(marks.given_mm)
+    reduced = marks._beyond_congruent
+    moved = reduced.shifted(marks.beyond_jumps)
+    groups = moved.shape[1]
     residual = marks.off_mm.ravel() - marks.affine @ affinity.mean
     effects = reduced.basis.T @ np.column_stack([marks.affine, marks.perspective])
-    shifts = np.column_stack([reduced.basis.T @ residual, reduced.basis.T])
+    shifts = np.column_stack([reduced.basis.T @ residual, moved.reshape(len(moved), -1)])
     spread = reduced.variances + states.film[:, None]
     known = states.log_prior - 0.5 * np.log(spread).sum(axis=1)
     width = np.sqrt(states.effects)
@@ -359,15 +409,16 @@ def frame_consistency(
     chi_square = (shifts[:, 0] ** 2 / spread).sum(axis=1) - (cross[:, :, 0] * taken[:, :, 0]).sum(axis=1)
     known = known - 0.5 * (np.linalg.slogdet(inner)[1] + chi_square)
     pulls = (shifts[:, 0] / spread) @ shifts[:, 1:] - np.einsum("sp,spj->sj", cross[:, :, 0], taken[:, :, 1:])
-    pulls = pulls.reshape(-1, n, 2)
+    pulls = pulls.reshape(-1, groups, 2)
     # Only the diagonal 2 x 2 blocks of the weight matrix are needed: the whole one of many marks would take minutes.
-    own, by_mark = shifts[:, 1:].reshape(-1, n, 2), (len(spread), 5, n, 2)
-    blocks = (1 / spread) @ (own[..., :, None] * own[..., None, :]).reshape(len(own), -1)
-    blocks = blocks.reshape(-1, n, 2, 2) - np.einsum(
+    by_mark = (len(spread), 5, groups, 2)
+    blocks = (1 / spread) @ (moved[..., :, None] * moved[..., None, :]).reshape(len(moved), -1)
+    blocks = blocks.reshape(-1, groups, 2, 2) - np.einsum(
         "spka,spkb->skab", cross[:, :, 1:].reshape(by_mark), taken[:, :, 1:].reshape(by_mark)
     )
-    # An error of variance s in mark k changes the evidence by |I + s B| and p' d, where d = (I / s + B)^-1 p is the
-    # estimated error. B: weight matrix of the mark; p: weighted misfit. All are written out for 2 x 2 matrices.
+    # An error of variance s in mark k, or in all marks beyond jump k, changes the evidence by |I + s B| and p' d, where
+    # d = (I / s + B)^-1 p is the estimated error. B: weight matrix of the mark; p: weighted misfit. All are written out
+    # for 2 x 2 matrices.
     (xx, xy), (_, yy) = np.moveaxis(blocks, (2, 3), (0, 1))
     x, y = np.moveaxis(pulls, 2, 0)
     off_mm2 = _widths(_MOST_OFF_MM)[:, None, None] ** 2
@@ -381,7 +432,7 @@ def frame_consistency(
     evidence[Hypothesis.SOUND, 0] = -np.inf
     weights = np.exp(every - logsumexp(every, axis=0))
     off_mm = np.stack([(weights[:, 1:] * off[-1]).sum(axis=0) for off in (off_x, off_y)], axis=1)
-    return FrameConsistency(evidence, off_mm)
+    return FrameConsistency(evidence, off_mm, marks.beyond_jumps)
 
 
 def gross_errors(marks: FrameMarks, film: Scatter, gate_mm: float) -> NDArray[np.bool_]:
@@ -398,8 +449,7 @@ def gross_errors(marks: FrameMarks, film: Scatter, gate_mm: float) -> NDArray[np
     """
     order, odds, kept = list[int](), [0.0], np.arange(len(marks.given_mm))
     while len(kept) > _FEWEST and frame_p_value(own := marks.select(kept), film) < FALSE_DOUBT:
-        whole = logsumexp(frame_consistency(own, film).log_evidence, axis=0)
-        gained = whole[1:] - whole[0]
+        gained = frame_consistency(own, film).log_gain
         worst = np.argsort(-gained, kind="stable")[: max(len(kept) // _AT_ONCE, 1)]
         worst = worst[gained[worst] >= min(NAMED, gained.max())]
         order += kept[worst].tolist()
@@ -415,7 +465,7 @@ def gross_errors(marks: FrameMarks, film: Scatter, gate_mm: float) -> NDArray[np
         out[mark] = own.distances_mm().max() > gate_mm
         if not out[mark]:
             found = frame_consistency(own, film)
-            is_far = float(np.hypot(*found.off_mm[-1])) > _LEAST_GATE * gate_mm
+            is_far = float(np.hypot(*found.off_mm[len(agreeing)])) > _LEAST_GATE * gate_mm
             out[mark] = is_far and found.wrong_mark == len(agreeing)
     return out
 

@@ -50,6 +50,7 @@ class FrameMisfit:
     film_mm : own scatter of its film; None for an ordinary frame.
     hypothesis : accepted hypothesis.
     off_mm : size of the gross errors, by mark.
+    jump_mm : size of a jump within the scan; None without one.
     suspect_mm2 : (n,) variances of marks that may have a gross error.
     weak : (n,) marks with the status weak.
     weak_mm2 : variance along an axis that the weak marks have in addition.
@@ -62,6 +63,7 @@ class FrameMisfit:
     film_mm: float | None = None
     hypothesis: Hypothesis = Hypothesis.SOUND
     off_mm: Mapping[int, float] = field(default_factory=dict)
+    jump_mm: float | None = None
     suspect_mm2: Array = field(default_factory=lambda: np.zeros(1))
     weak: Mask = field(default_factory=lambda: np.zeros(1, dtype=bool))
     weak_mm2: float = 0.0
@@ -220,7 +222,10 @@ def explain(frames: Frames, places_mm: Array, sigma_mm: Array, free_mm: float, b
             film, is_more = _film([expected[place] for place in ordinary], believed_mm)
             films_mm |= {place: _own_film_mm(expected[place], film) for place in ordinary}
         affinities = _affinities({place: (expected[place], frames[place].pose) for place in ordinary}, film.sigma)
-        tests = {place: (expected[place], film, affinities[place]) for place in ordinary}
+        tests = {
+            place: (_widen_weak(frames[place], expected[place], film, affinities[place]), film, affinities[place])
+            for place in ordinary
+        }
         p_values = {place: frame_p_value(*test) for place, test in tests.items()}
         least = min(p_values.values(), default=1.0)
         if least * len(frames) >= FALSE_DOUBT:
@@ -236,7 +241,7 @@ def explain(frames: Frames, places_mm: Array, sigma_mm: Array, free_mm: float, b
 
 
 def _explain_alone(frame: FrameMisfit, marks: FrameMarks, film: Scatter, affinity: Affinity) -> FrameMisfit:
-    """Explain an outlying frame by a gross error in one mark, or else by its film, its pitch or a perspective."""
+    """Explain an outlying frame by a gross error in one mark, or else by a jump, film, pitch or perspective."""
     found = frame_consistency(marks, film, affinity)
     off_mm, mark = np.hypot(*found.off_mm.T), found.wrong_mark
     if mark is not None and mark not in frame.off_mm:
@@ -245,8 +250,13 @@ def _explain_alone(frame: FrameMisfit, marks: FrameMarks, film: Scatter, affinit
     if hypothesis is Hypothesis.PITCH:
         return replace(frame, film_mm=film.sigma, hypothesis=hypothesis)
     film_mm = float(np.sqrt(film.sigma**2 + marks.film_variance_mm2()))
-    suspect = np.where(found.suspects, off_mm**2 / 2, 0.0)
-    return replace(frame, film_mm=film_mm, hypothesis=hypothesis, suspect_mm2=suspect)
+    suspect = np.where(found.suspects, off_mm[: len(found.suspects)] ** 2 / 2, 0.0)
+    return replace(frame, film_mm=film_mm, hypothesis=hypothesis, suspect_mm2=suspect, jump_mm=found.jump_mm)
+
+
+def _widen_weak(frame: FrameMisfit, marks: FrameMarks, film: Scatter, affinity: Affinity) -> FrameMarks:
+    """Marks of a frame with the variance that its weak ones have in addition: these are no evidence on the frame."""
+    return marks.widen(np.where(frame.weak, _weak_mm2(frame, marks, film.sigma, affinity), 0.0))
 
 
 def _weak_mm2(frame: FrameMisfit, marks: FrameMarks, film_mm: float, affinity: Affinity) -> float:

@@ -11,9 +11,9 @@ from studies import parametrize_with_studies
 
 from measure import FiducialLayout, LayoutMark, MarkShape, cross
 from measure.fiducials.across_frames import CheckedFrames, check_frames
-from measure.fiducials.consistency import FrameMarks
+from measure.fiducials.consistency import FrameMarks, frame_p_value
 from measure.fiducials.options import BelievedFilm
-from measure.flags import Cause, Code, Reason, Status
+from measure.flags import FALSE_DOUBT, Cause, Code, Reason, Status
 from measure.geometry import up_from_camera
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 
@@ -146,6 +146,48 @@ def test_a_bent_frame_is_a_problem_of_the_frame(count: int) -> None:
     assert [len(frame.problems) for frame in result.frames] == [1] + [0] * (count - 1)
     assert ("one frame does not tell" in result.frames[0].problems[0]) == (count == 1)
     assert 0.04 < result.film_sigma_mm[0] < 0.14
+
+
+@pytest.mark.parametrize("step_px", [(4.5, 0.0), (0.0, -4.5)])
+def test_a_jump_within_a_scan_is_a_problem_of_the_frame(step_px: tuple[float, float]) -> None:
+    """By 90 µm, which each mark shows by a part only: an affine transformation takes up most of it."""
+    layout, named = make_layout(EIGHT), 0
+    for seed in range(10):
+        (frame,) = make_frames(layout, 1, np.random.default_rng(seed), film_mm=0.005)
+        for mark in np.flatnonzero([place[0] > -50.0 for place in EIGHT]).tolist():
+            frame = shift_mark(frame, mark, step_px)
+        (checked,) = checked_together([frame], layout)
+        assert weak((checked,)) == set()
+        (problem,) = checked.problems
+        jump = re.search(r"jump of the scanner.*of (0.\d+) mm", problem)
+        named += jump is not None
+        if jump:
+            assert float(jump[1]) == pytest.approx(0.09, abs=0.03)
+    assert named >= 6
+
+
+@pytest.mark.parametrize(("off_px", "is_flagged"), [(0.0, False), (6.0, True)])
+def test_given_coordinates_that_are_known_make_a_frame_no_vaguer(off_px: float, is_flagged: bool) -> None:
+    """One of four wings is short by 120 µm: the misfit is three times what coordinates of 20 µm explain, not film."""
+    layout = make_layout([(106.0, 0.0), (-106.0, 0.0), (0.0, 106.0), (0.0, -106.0)], sigma_mm=0.02)
+    (frame,) = make_frames(layout, 1, np.random.default_rng(2), camera_mm=0.0)
+    (checked,) = checked_together([shift_mark(frame, 3, (0.0, 2 * off_px))], layout)
+    assert bool(checked.problems) == is_flagged
+    variances = [mark.covariance.px2.trace() / 2 for mark in checked.marks if mark.covariance]
+    assert all(np.sqrt(each) > off_px / 2 for each in variances)
+
+
+@pytest.mark.parametrize("sigma_mm", [0.001, 0.005, 0.02])
+def test_an_ordinary_frame_is_flagged_as_often_as_stated(sigma_mm: float) -> None:
+    """Film that scatters as its prior says, with four degrees of freedom."""
+    rng, given, frames = np.random.default_rng(11), np.array(EIGHT), 300
+    flagged = 0
+    for _ in range(frames):
+        film_mm = 0.005 * np.sqrt(4.0 / rng.chisquare(4.0))
+        places = given + rng.normal(0.0, np.hypot(film_mm, sigma_mm), given.shape)
+        marks = FrameMarks.from_places(given, places, np.tile(sigma_mm**2 * np.eye(2), (len(given), 1, 1)))
+        flagged += frame_p_value(marks) < FALSE_DOUBT
+    assert flagged < 3 * FALSE_DOUBT * frames
 
 
 @pytest.mark.parametrize(("places", "count"), [(FOUR, 1), (FOUR, 3), (EIGHT, 2), (EIGHT, 6)])
