@@ -18,7 +18,7 @@ from measure.fiducials.faint_marks import detect_faint_marks, faint_reach_px
 from measure.fiducials.frame import CLEAR_LIKENESS, MANY, Frame, orient_frame
 from measure.fiducials.mark_fit import Detection, detect_mark, not_found
 from measure.fiducials.options import FiducialOptions
-from measure.fiducials.refit import fit_line_widths, refit_frame, sharpen_frame
+from measure.fiducials.refit import fit_lines_and_sharpening, refit_frame
 from measure.flags import FAINT_MARK_BY_NOISE, TEXTURE_LIKE_A_FAINT_MARK
 from measure.marks.rendering import picture
 from measure.marks.shapes import FiducialLayout, Mark
@@ -36,20 +36,19 @@ _TRIALS = 6  # about this many marks are used to choose the channels, or to test
 _CHANNELS = "red", "green", "blue"
 _COINCIDING_PX, _FEWEST_SHIFTS = 0.5, 3  # px between two channels below which they coincide, by this many marks
 _SHRINK = 0.1  # shrinkage of the noise covariance towards a multiple of the unit matrix: few pixels determine it poorly
+_FEWEST_SHARPENED = 4  # clear marks for a first estimate of the sharpening: of three, one may be taken for halos
 _ROUNDS = 2  # of detecting faint marks: the first marks found improve the predictions of the others
 
 
 def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
-    """Measure a frame from its placement. If the scan proves to be sharpened, missing marks are detected again."""
-    frame = sharpen_frame(detect_frame(scan, layout, placement, options))
-    if frame.scan.tone.sharpening and not scan.tone.sharpening:
-        frame = sharpen_frame(detect_missing_marks(frame))
-    return refit_frame(fit_line_widths(frame))
+    """Measure a frame from its placement."""
+    return refit_frame(fit_lines_and_sharpening(detect_frame(scan, layout, placement, options)))
 
 
 def detect_frame(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
     """Detect the marks of a frame, clear and faint ones, without the refit."""
-    return detect_missing_marks(fit_line_widths(detect_clear_marks(scan, layout, placement, options)))
+    clear = detect_clear_marks(scan, layout, placement, options)
+    return detect_missing_marks(fit_lines_and_sharpening(clear, _FEWEST_SHARPENED))
 
 
 def detect_clear_marks(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:

@@ -2,7 +2,7 @@
 unlike the others."""
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import replace
 
 import numpy as np
@@ -33,14 +33,13 @@ from measure.noise.noise_model import may_be_noise
 from measure.results import MarkFit
 from measure.tone.curve import Tone
 from measure.tone.estimate import FrameTone, MarkTone
-from measure.tone.sharpening import estimate_sharpening
+from measure.tone.sharpening import Sharpening, estimate_sharpening
 
 _STRAINED = 1 / 3  # fraction of a mark's standard deviation: a larger strain error raises it by more than a twentieth
 _TONE_ROUNDS = 5  # largest number of refits with an improved tone curve
 _OTHER_STARTS, _AGREED = (2.2, 1.0), 0.1  # gammas of further initial curves; disagreement up to which none is tried
-_TELLING = 8  # most significant marks used to estimate the sharpening after the first round: more cost time
-_SHARPENING_ROUNDS = 6  # largest number of refits with an improved sharpening
-_WIDTH_ROUNDS = 3  # largest number of refits with another width of lines
+_TELLING = 8  # most significant marks, refitted until widths, sharpening and tone curve are settled: more cost time
+_SHARED_ROUNDS = 8  # largest number of refits with improved widths and sharpening
 _MOVED = 0.3  # fraction of a mark's standard deviation: smaller shifts by a better curve are ignored
 _UNCHECKED = 3  # marks, which an affine transformation fits without residuals
 _REFIT_PX = 1.5  # search range around a mark that was fitted already
@@ -58,95 +57,95 @@ def refit_frame(frame: Frame) -> Frame:
     return _compare_shapes(_add_lens_covariance(_add_tone_covariance(frame)))
 
 
-def fit_line_widths(frame: Frame) -> Frame:
-    """Draw the crosses with lines as wide as they show in this scan, and refit them.
+def fit_lines_and_sharpening(frame: Frame, fewest: int = 0) -> Frame:
+    """Estimate what all marks of the scan share, the width of their lines and its sharpening, and refit them with it.
 
-    Exposure widens or narrows the lines of all marks of a frame alike. Where a line is drawn too wide, the size of a
-    cross takes that up, and the ends of its arms are taken for damage.
+    fewest: marks without which the sharpening is left for later.
+
+    Exposure widens or narrows the lines of all crosses of a frame alike. Where a line is drawn too wide, the size of a
+    cross takes that up, and the ends of its arms are taken for damage, as are the halos of a sharpened scan.
     """
-    for _ in range(_WIDTH_ROUNDS):
-        groups: dict[Mark, dict[int, tuple[float, float] | None]] = defaultdict(dict)
-        for index, fit in frame.clear_fits.items():
-            groups[frame.layout.marks[index].mark][index] = fit.line_width
-        ratios = {mark: shared_line_width(list(widths.values())) for mark, widths in groups.items()}
-        changed: dict[Mark, Mark] = {
-            mark: widen_lines(mark, ratio)
-            for mark, ratio in ratios.items()
-            if isinstance(mark, MarkShape) and ratio != 1
-        }
-        if not changed:
-            break
-        marks = tuple(replace(each, mark=changed.get(each.mark, each.mark)) for each in frame.layout.marks)
-        frame = replace(frame, layout=replace(frame.layout, marks=marks))
-        options = replace(frame.options.match, tells_sharpening=True)
-        frame = _refit(frame, {index: options for mark in changed for index in groups[mark]})
-    return frame
-
-
-def sharpen_frame(frame: Frame) -> Frame:
-    """Estimate the sharpening of the scan from the clear marks, and refit them in the scan without it.
-
-    Returns the frame unchanged where no sharpening is found.
-    """
-    if not frame.agrees:
-        return frame
-    plainest, begun = sorted(frame.clear_fits.items(), key=lambda item: -item[1].significance), frame
-    telling = [index for index, fit in plainest if fit.sharpening is not None]
+    begun, plainest = frame, _by_significance(frame)
+    options, telling = replace(frame.options.match, tells_sharpening=True), plainest
     last = before = frame.scan.tone.sharpening
-    for _ in range(_SHARPENING_ROUNDS):
-        if before:
-            telling = telling[:_TELLING]
-        scores = [fit.sharpening for index in telling if (fit := frame.detections[index].fit) and fit.sharpening]
-        found = estimate_sharpening(before, scores, len(frame.scan.tone.mean))
-        if found is None or found.is_as(before):
+    for _ in range(_SHARED_ROUNDS):
+        drawn = _widen_drawings(frame, telling)
+        fits = (frame.detections[index].fit for index in telling)
+        scores = [fit.sharpening for fit in fits if fit and fit.sharpening and begun.agrees]
+        scores = scores if len(scores) >= fewest else []
+        found = estimate_sharpening(before, scores, len(frame.scan.tone.mean)) or Sharpening()
+        if drawn is frame and found.is_as(before):
             break
         last, before = before, found.damped(before, last) if last else found
-        frame = replace(frame, scan=frame.scan.replace_tone(frame.scan.tone.sharpened(before)))
         telling = telling[:_TELLING]
-        frame = _refit(frame, dict.fromkeys(telling, frame.options.match), orient=False)
-    if found is not None:
-        frame = replace(frame, scan=frame.scan.replace_tone(frame.scan.tone.sharpened(found)))
-    rest = {index for index, _ in plainest} - {*telling}
-    return begun if frame is begun else _refit(frame, dict.fromkeys(rest, frame.options.match))
+        frame = _refit(_sharpened(drawn, before), dict.fromkeys(telling, options), orient=False)
+    if frame is begun:
+        return frame
+    return _refit(_sharpened(frame, found), dict.fromkeys({*plainest} - {*telling}, options))
+
+
+def _widen_drawings(frame: Frame, among: Sequence[int]) -> Frame:
+    """Draw the lines of crosses as wide as those among the marks show them; the same frame if they are so already."""
+    groups: dict[Mark, list[tuple[float, float] | None]] = defaultdict(list)
+    for index in among:
+        fit = frame.detections[index].fit
+        groups[frame.layout.marks[index].mark].append(None if fit is None else fit.line_width)
+    ratios = {mark: shared_line_width(widths) for mark, widths in groups.items() if isinstance(mark, MarkShape)}
+    if all(ratio == 1 for ratio in ratios.values()):
+        return frame
+    wider: dict[Mark, Mark] = {mark: widen_lines(mark, ratio) for mark, ratio in ratios.items()}
+    marks = tuple(replace(each, mark=wider.get(each.mark, each.mark)) for each in frame.layout.marks)
+    return replace(frame, layout=replace(frame.layout, marks=marks))
+
+
+def _sharpened(frame: Frame, sharpening: Sharpening) -> Frame:
+    return replace(frame, scan=frame.scan.replace_tone(frame.scan.tone.sharpened(sharpening)))
 
 
 def _refit_with_tone(frame: Frame) -> Frame:
-    """Refit the marks with the tone curve estimated from them; if they disagree, from further initial curves."""
-    prior = frame.scan.tone.prior
-    best = _refit_from_curve(frame, prior, frame.scan.tone)
+    """Refit the marks with the tone curve estimated from the telling ones; if these disagree, from further curves."""
+    prior, begun = frame.scan.tone.prior, frame.scan.tone
+    pending = {index for index, fit in frame.clear_fits.items() if _needs_frame(frame, index, fit)}
+    telling = {*_by_significance(frame)[:_TELLING]}
+    best = _refit_from_curve(frame, prior, begun, telling, pending & telling)
     is_open = best.tone.disagreement > _AGREED and _depends_on_tone(best)
     for power in _OTHER_STARTS if is_open else ():
-        other = _refit_from_curve(best, prior, prior.shift_to_power(power))
+        other = _refit_from_curve(best, prior, prior.shift_to_power(power), telling)
         is_better = not other.tone.is_doubted and other.tone.disagreement < best.tone.disagreement
         best = other if is_better else best
-    return best
+    rest = pending if best.scan.tone is begun else pending | {*_mark_tones(best)}
+    if rest <= telling:
+        return best
+    best = _refit(best, dict.fromkeys(rest - telling, frame.options.match))
+    every = FrameTone.from_marks(prior, _mark_tones(best), best.scan.tone)
+    return best if best.tone.is_doubted else replace(best, tone=every)
 
 
-def _refit_from_curve(frame: Frame, prior: Tone, start: Tone) -> Frame:
-    """Refit the marks and estimate the tone curve in turn. prior: curve known before; start: initial curve."""
-    if start is frame.scan.tone:
-        pending = {index for index, fit in frame.clear_fits.items() if _needs_frame(frame, index, fit)}
-    else:
-        frame = _refit(
-            replace(frame, scan=frame.scan.replace_tone(start)),
-            dict.fromkeys(_mark_tones(frame), frame.options.match),
-        )
-        pending = set()
-        estimate = FrameTone.from_marks(prior, _mark_tones(frame), start)
+def _refit_from_curve(
+    frame: Frame, prior: Tone, start: Tone, telling: Set[int], pending: Set[int] = frozenset()
+) -> Frame:
+    """Refit marks and estimate the tone curve from them in turn.
+
+    prior: curve known before; start: initial curve; pending: telling marks to be refitted with any curve.
+    """
+    if start is not frame.scan.tone:
+        begun = replace(frame, scan=frame.scan.replace_tone(start))
+        frame = _refit(begun, dict.fromkeys(telling & _mark_tones(frame).keys(), frame.options.match))
+        estimate = FrameTone.from_marks(prior, _mark_tones(frame, telling), start)
         if estimate.is_doubted:
             return replace(frame, tone=estimate)
     for _ in range(_TONE_ROUNDS):
-        estimate = FrameTone.from_marks(prior, _mark_tones(frame), frame.scan.tone)
-        moved = _moved_by_tone(frame, estimate)
+        estimate = FrameTone.from_marks(prior, _mark_tones(frame, telling), frame.scan.tone)
+        moved = _moved_by_tone(frame, estimate, telling)
         if moved:
             frame = replace(frame, scan=frame.scan.replace_tone(estimate.next_curve(frame.scan.tone)))
         if not pending | moved:
             break
         frame = _refit(frame, dict.fromkeys(pending | moved, frame.options.match))
-        pending = set()
+        pending = frozenset()
         if estimate.is_doubted:  # by the prior curve again, the marks would only lead to the same estimate
             return replace(frame, tone=estimate)
-    return replace(frame, tone=FrameTone.from_marks(prior, _mark_tones(frame), frame.scan.tone))
+    return replace(frame, tone=FrameTone.from_marks(prior, _mark_tones(frame, telling), frame.scan.tone))
 
 
 def _needs_frame(frame: Frame, index: int, fit: MarkFit) -> bool:
@@ -158,11 +157,11 @@ def _needs_frame(frame: Frame, index: int, fit: MarkFit) -> bool:
     return is_held_by_frame(mark) or error_px > _STRAINED * fit.sigma_px
 
 
-def _moved_by_tone(frame: Frame, estimate: FrameTone) -> set[int]:
-    """Marks with information on the tone curve, if the estimated curve displaces any of them."""
-    fits, tones = frame.clear_fits, _mark_tones(frame)
+def _moved_by_tone(frame: Frame, estimate: FrameTone, telling: Set[int]) -> Set[int]:
+    """Telling marks with information on the tone curve, if the estimated curve displaces any of them."""
+    fits, tones = frame.clear_fits, _mark_tones(frame, telling)
     moves = (estimate.shift_px(tone, frame.scan.tone) > _MOVED * fits[index].sigma_px for index, tone in tones.items())
-    return set(tones) if any(moves) else set()
+    return tones.keys() if any(moves) else frozenset()
 
 
 def _depends_on_tone(frame: Frame) -> bool:
@@ -171,8 +170,15 @@ def _depends_on_tone(frame: Frame) -> bool:
     return any(tone.sensitivity_px > fits[index].sigma_px for index, tone in _mark_tones(frame).items())
 
 
-def _mark_tones(frame: Frame) -> dict[int, MarkTone]:
-    return {index: fit.tone for index, fit in frame.clear_fits.items() if fit.tone is not None}
+def _mark_tones(frame: Frame, among: Set[int] | None = None) -> dict[int, MarkTone]:
+    """Information of the clear marks, or of those among them, on the tone curve."""
+    fits = frame.clear_fits.items()
+    return {index: fit.tone for index, fit in fits if fit.tone is not None and (among is None or index in among)}
+
+
+def _by_significance(frame: Frame) -> list[int]:
+    """Indices of the clear marks, the most significant first."""
+    return sorted(frame.clear_fits, key=lambda index: -frame.clear_fits[index].significance)
 
 
 def _add_tone_covariance(frame: Frame) -> Frame:
