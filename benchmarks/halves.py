@@ -28,8 +28,7 @@ from adjust.problem.observations import Observations
 from adjust.solution.unmodelled_error import adjust_unmodelled
 from benchmarks.harness import DATA, Row
 from benchmarks.peers import SYSTEM_PYTHON
-from measure.boards.corners import one_definition
-from measure.boards.measure import measure_board
+from measure.boards.measure import measure_board, one_definition
 from measure.boards.specs import ChessboardSpec
 from measure.scans.opening import open_scan
 from pipeline.calibration.intrinsics import LensModel, camera_intrinsics, free_lens

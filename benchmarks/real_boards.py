@@ -17,8 +17,7 @@ from scipy.spatial import KDTree
 from benchmarks.drawn_boards import found_by_opencv
 from benchmarks.halves import BOUGUET
 from benchmarks.harness import DATA
-from measure.boards.corners import one_definition
-from measure.boards.measure import measure_board
+from measure.boards.measure import measure_board, one_definition
 from measure.boards.specs import BoardSpec, ChessboardSpec, CircleGridSpec
 from measure.scans.opening import open_scan
 from pipeline.opencv_check.check import CRITERIA, FLAGS, NEAREST

@@ -29,7 +29,7 @@ from benchmarks.measured_marks import CONTRAST, GROUND, draw_mark, measure_mark,
 from measure.boards.corners import junctions
 from measure.fiducials.consistency import FrameMarks, Scatter, gross_errors
 from measure.noise.robust_estimation import _opened, robust_scale
-from measure.targets.disk_detection import DiskSearch, disk_candidates
+from measure.targets.detection import DiskSearch, disk_candidates
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from benchmarks.harness import Row, table
 from benchmarks.lone_frames import lone_frame, make_fiducials, make_image, painted
 from benchmarks.search_frames import SIDES
 from benchmarks.writing_lines import ALIKE, line_text
-from measure.annotations.fields import Line, Reading, is_plate
+from measure.annotations.lines import Line, Reading, is_plate
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.geometry import POSES

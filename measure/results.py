@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.special import chdtrc
 
-from measure.annotations.fields import Line
+from measure.annotations.lines import Line
 from measure.array_types import Array
 from measure.flags import NO_REASON, Cause, Code, Reason, Status
 from measure.geometry import linear_scale

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.annotations.fields import Line, Reading, read_from_one_face
+from measure.annotations.lines import Line, Reading, read_from_one_face
 from measure.array_types import Array
 from measure.marks.shapes import Side
 from measure.scans.scan import Scan

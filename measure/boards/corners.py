@@ -15,23 +15,98 @@ junction differ by tenths of a pixel, increasing towards the image corners. In t
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from measure.array_types import Array, Single
-from measure.boards.corner_surfaces import Surface, crossing
 from measure.flags import NO_REASON, Code, Reason
 from measure.matching.gauss_newton import UNDETERMINED, UNSETTLED
 from measure.matching.models import PIXEL_VARIANCE_PX2
 from measure.matching.window import ScanWindow
 from measure.noise.noise_model import influence_covariances
 from measure.noise.robust_estimation import gauss_newton_step, robust_scale, tukey_weights
-from measure.results import Covariance, MarkMeasurement
+
+Surface = Callable[[Single, Single, Single], tuple[Single, Single, Single, Single]]
+
+_FAR = np.float32(9.0)  # standard deviations beyond which nothing changes; denormal numbers would be slow
+_NODES, _MOST_NODES = ((0.3, 2), (0.55, 3), (0.8, 5)), 10  # nodes of the quadrature by correlation, single precision
+_ERF_SCALE = 0.3275911
+_ERF_FACTORS = (1.061405429, -1.453152027, 1.421413741, -0.284496736, 0.254829592)
+
+
+def crossing(u: Single, v: Single, correlation: Single) -> tuple[Single, Single, Single, Single]:
+    """Mean of sign(u + z1) sign(v + z2) over standard normal z1, z2 of the given correlation, and its derivatives with
+    respect to u, v and the correlation. Exact to single precision.
+
+    Notes
+    -----
+    The derivative with respect to the correlation is four times the normal density (Plackett 1954). It is integrated
+    over the arc sine of the correlation by Gauss's rule (Genz 2004, Numerical computation of rectangular bivariate and
+    trivariate normal and t probabilities, Statistics and Computing 14).
+    """
+    u, v = np.clip(u, -_FAR, _FAR), np.clip(v, -_FAR, _FAR)
+    inverse_root = np.asarray(1 / np.sqrt(np.maximum(1 - correlation**2, np.float32(1e-6))), np.float32)
+    density_u, across_u = _density(u), np.clip((v - correlation * u) * inverse_root, -_FAR, _FAR)
+    density_v, across_v = _density(v), np.clip((u - correlation * v) * inverse_root, -_FAR, _FAR)
+    density_across_u = _density(across_u)
+    value = _erf(u, density_u) * _erf(v, density_v)
+    by_u = 2 * density_u * _erf(across_u, density_across_u)
+    by_v = 2 * density_v * _erf(across_v, _density(across_v))
+    by_correlation = (4 * inverse_root) * (density_u * density_across_u)
+    squares, product, angle = u * u + v * v, u * v, np.arcsin(np.clip(correlation, -1, 1))
+    largest = float(np.abs(correlation).max(initial=0.0))
+    nodes = next((count for limit, count in _NODES if largest < limit), _MOST_NODES)
+    for place, weight in _gauss_legendre(nodes):
+        sine = np.sin(angle * np.float32((1 + place) / 2))
+        inverse = 1 / (sine * sine - 1)
+        exponent = squares * (inverse / 2)
+        exponent -= product * (sine * inverse)
+        np.maximum(exponent, -_FAR * _FAR, out=exponent)
+        np.exp(exponent, out=exponent)
+        exponent *= angle * np.float32(weight / np.pi)
+        value += exponent
+    return value, by_u, by_v, by_correlation
+
+
+def quarter(u: Single, v: Single, correlation: Single) -> tuple[Single, Single, Single, Single]:
+    """Twice the probability that u + z1 and v + z2 are both positive, minus one, and its derivatives: the counterpart
+    of `crossing` for a single corner."""
+    value, by_u, by_v, by_correlation = crossing(u, v, correlation)
+    u, v = np.clip(u, -_FAR, _FAR), np.clip(v, -_FAR, _FAR)
+    density_u, density_v, half = _density(u), _density(v), np.float32(0.5)
+    value = half * (value - 1 + _erf(u, density_u) + _erf(v, density_v))
+    return value, half * by_u + density_u, half * by_v + density_v, half * by_correlation
+
+
+def _erf(place: Single, density: Single) -> Single:
+    """erf(place / sqrt(2)) to 2e-7 (Abramowitz and Stegun 1964, 7.1.26), with the normal density there."""
+    t = 1 / (1 + np.float32(_ERF_SCALE / np.sqrt(2)) * np.abs(place))
+    tail = np.zeros_like(t)
+    for factor in _ERF_FACTORS:
+        tail += np.float32(factor)
+        tail *= t
+    tail *= density
+    return np.asarray(np.copysign(1 - np.float32(np.sqrt(2 * np.pi)) * tail, place), np.float32)
+
+
+def _density(place: Single) -> Single:
+    density = place * place
+    density *= np.float32(-0.5)
+    np.exp(density, out=density)
+    density *= np.float32(1 / np.sqrt(2 * np.pi))
+    return density
+
+
+@cache
+def _gauss_legendre(nodes: int) -> list[tuple[float, float]]:
+    """Nodes and weights of Gauss-Legendre quadrature."""
+    return list(zip(*(each.tolist() for each in np.polynomial.legendre.leggauss(nodes)), strict=True))
+
 
 Indices = NDArray[np.intp]
 _SCALE_FLOOR = 0.05  # fraction of the contrast, floor of Tukey's scale: sharpening and tone curves are not damage
@@ -53,8 +128,6 @@ _SMOOTHING_PX = 1.0  # px, suppresses pixel noise while edges stay separate
 _BORDER_PX = 4  # px, reflected border of each window, the reach of the smoothing
 _SUBPIX_BORDER_PX = 5  # px that OpenCV requires in addition to twice the half window
 _SUBPIX_END = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-4)  # iterations, px of the last step
-_NEIGHBOURS = 4  # nearest crossings along the rows and columns
-_FEWEST_CROSSINGS = 30  # needed to distinguish coma from noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -338,57 +411,3 @@ def junctions(greys: NDArray[np.floating], starts_px: Array, reach_px: float) ->
     starts = (starts_px + offsets).astype(np.float32)
     found = cv2.cornerSubPix(smooth, starts[:, None].copy(), (half, half), (-1, -1), _SUBPIX_END)[:, 0]
     return np.where((found == starts).all(axis=1, keepdims=True), np.nan, found - offsets)
-
-
-def one_definition(pictures: Sequence[Sequence[MarkMeasurement]]) -> tuple[tuple[MarkMeasurement, ...], ...]:
-    """Use one definition of crossings for all images of a camera: the matched places, or the junctions under coma.
-
-    Parameters
-    ----------
-    pictures
-        The marks of each image of one camera.
-
-    Returns
-    -------
-    tuple of tuples
-        The same marks. If the lens has coma, those with a junction are moved there and get its covariance.
-
-    Notes
-    -----
-    If a symmetric blur describes the edges, match and junction differ by noise only, and the match has less of it. Coma
-    blurs edges to one side, increasingly with the distance from the axis. It separates match and junction by the same
-    amount in neighbouring crossings, so the mean product of neighbours' differences is its share of their mean square.
-    Above one half, coma exceeds the noise added by the junction. The junctions are then used, as in most published
-    calibrations. Their error comes from the lens, not from noise. All get the standard deviation of a place known to
-    within the rms distance of match and junction, divided by the root of three (JCGM 100:2008, Guide to the expression
-    of uncertainty in measurement, 4.3.7).
-    """
-    unmoved = tuple(tuple(marks) for marks in pictures)
-    apart, alike = [np.zeros((0, 2))], [np.zeros((0, 2))]
-    for marks in pictures:
-        crossings = [mark for mark in marks if _has_junction(mark)]
-        if len(crossings) > _NEIGHBOURS:
-            centers = np.array([mark.center_px for mark in crossings])
-            differences = np.array([_junction_px(mark) for mark in crossings]) - centers
-            near = np.asarray(KDTree(centers).query(centers, _NEIGHBOURS + 1)[1])[:, 1:]
-            apart.append(differences)
-            alike.append((differences[:, None, :] * differences[near]).mean(axis=1))
-    squares_px2 = np.concatenate(apart) ** 2
-    if len(squares_px2) < _FEWEST_CROSSINGS or np.concatenate(alike).mean() <= squares_px2.mean() / 2:
-        return unmoved
-    covariance = Covariance.from_noise(squares_px2.mean() / 3 * np.eye(2))
-    return tuple(
-        tuple(
-            replace(mark, center_px=_junction_px(mark), covariance=covariance) if _has_junction(mark) else mark
-            for mark in marks
-        )
-        for marks in pictures
-    )
-
-
-def _has_junction(mark: MarkMeasurement) -> bool:
-    return mark.status.is_observation and "junction_col_px" in mark.quality
-
-
-def _junction_px(mark: MarkMeasurement) -> Array:
-    return np.array([mark.quality["junction_col_px"], mark.quality["junction_row_px"]])

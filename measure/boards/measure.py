@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
-from measure.boards.corner_surfaces import Surface, crossing, quarter
-from measure.boards.corners import Corner, CornerStart, fit_corners
+from measure.boards.corners import Corner, CornerStart, Surface, crossing, fit_corners, quarter
 from measure.boards.find import find_board
 from measure.boards.lattice import Place, find_grid
 from measure.boards.specs import (
@@ -26,7 +26,7 @@ from measure.matching.window import ScanWindow
 from measure.results import Covariance, MarkMeasurement
 from measure.scans.scan import Scan
 from measure.targets.block_search import Candidate, Patches
-from measure.targets.disk_detection import DiskSearch, disk_candidates
+from measure.targets.detection import DiskSearch, disk_candidates
 from measure.targets.disks import FittedDisk, fit_plain_disks
 
 Array = NDArray[np.float64]
@@ -42,6 +42,8 @@ _LONGEST_REACH_PX = 10.0  # px, enough for 0.01 px...
 _LARGE_REACH, _LARGEST_REACH_PX = 0.1, 15.0  # ...but squares this large may be blurred by several pixels
 _HALF_SIDE, _FREE_GAP = 0.5, 0.8  # fractions of an isolated square's side, and of the gap around it
 _MARKER_REACH = 0.8  # fraction of a marker's black border, or of the gap around it
+_NEIGHBOURS = 4  # nearest crossings along the rows and columns
+_FEWEST_CROSSINGS = 30  # needed to distinguish coma from noise
 _WEAK_DAMAGE = 0.25  # fraction of the pixels around a corner: if more are rejected the corner is weak
 
 
@@ -277,3 +279,57 @@ def _corner_mark(name: str, corner: Corner | None, missing: Reason) -> MarkMeasu
     return MarkMeasurement(
         name, "target", corner.center_px, Covariance.from_noise(corner.covariance_px2), status, reason, quality
     )
+
+
+def one_definition(pictures: Sequence[Sequence[MarkMeasurement]]) -> tuple[tuple[MarkMeasurement, ...], ...]:
+    """Use one definition of crossings for all images of a camera: the matched places, or the junctions under coma.
+
+    Parameters
+    ----------
+    pictures
+        The marks of each image of one camera.
+
+    Returns
+    -------
+    tuple of tuples
+        The same marks. If the lens has coma, those with a junction are moved there and get its covariance.
+
+    Notes
+    -----
+    If a symmetric blur describes the edges, match and junction differ by noise only, and the match has less of it. Coma
+    blurs edges to one side, increasingly with the distance from the axis. It separates match and junction by the same
+    amount in neighbouring crossings, so the mean product of neighbours' differences is its share of their mean square.
+    Above one half, coma exceeds the noise added by the junction. The junctions are then used, as in most published
+    calibrations. Their error comes from the lens, not from noise. All get the standard deviation of a place known to
+    within the rms distance of match and junction, divided by the root of three (JCGM 100:2008, Guide to the expression
+    of uncertainty in measurement, 4.3.7).
+    """
+    unmoved = tuple(tuple(marks) for marks in pictures)
+    apart, alike = [np.zeros((0, 2))], [np.zeros((0, 2))]
+    for marks in pictures:
+        crossings = [mark for mark in marks if _has_junction(mark)]
+        if len(crossings) > _NEIGHBOURS:
+            centers = np.array([mark.center_px for mark in crossings])
+            differences = np.array([_junction_px(mark) for mark in crossings]) - centers
+            near = np.asarray(KDTree(centers).query(centers, _NEIGHBOURS + 1)[1])[:, 1:]
+            apart.append(differences)
+            alike.append((differences[:, None, :] * differences[near]).mean(axis=1))
+    squares_px2 = np.concatenate(apart) ** 2
+    if len(squares_px2) < _FEWEST_CROSSINGS or np.concatenate(alike).mean() <= squares_px2.mean() / 2:
+        return unmoved
+    covariance = Covariance.from_noise(squares_px2.mean() / 3 * np.eye(2))
+    return tuple(
+        tuple(
+            replace(mark, center_px=_junction_px(mark), covariance=covariance) if _has_junction(mark) else mark
+            for mark in marks
+        )
+        for marks in pictures
+    )
+
+
+def _has_junction(mark: MarkMeasurement) -> bool:
+    return mark.status.is_observation and "junction_col_px" in mark.quality
+
+
+def _junction_px(mark: MarkMeasurement) -> Array:
+    return np.array([mark.quality["junction_col_px"], mark.quality["junction_row_px"]])

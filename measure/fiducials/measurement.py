@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from measure.annotations.fields import KnownLine, Line
+from measure.annotations.lines import KnownLine, Line
 from measure.annotations.text import networks, read_writing
 from measure.array_types import Array
 from measure.fiducials.clicked_frame import clicked_frame, contradicted_pose, is_shown, place_clicked_marks

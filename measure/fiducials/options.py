@@ -5,7 +5,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from measure.annotations.fields import KnownLine
+from measure.annotations.lines import KnownLine
 from measure.array_types import Array
 from measure.geometry import POSES
 from measure.marks.shapes import FiducialLayout

@@ -11,8 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from measure.annotations.fields import Line
-from measure.annotations.orientation_from_text import line_score, main_pose, writing_likelihoods
+from measure.annotations.lines import Line, line_score, main_pose, writing_likelihoods
 from measure.array_types import Array
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import bdtrc
 
-from measure.annotations.fields import Line
+from measure.annotations.lines import Line
 from measure.array_types import Array
 from measure.detection.correlation import CLOSE, GRAINY
 from measure.detection.localisation import highest_peak

@@ -20,7 +20,7 @@ from measure.results import Covariance, MarkFit, SecondPlace
 from measure.scans.compression import covariance_of_compression
 from measure.scans.scan import Scan
 from measure.targets.block_search import Block, Candidate, Patches
-from measure.targets.disk_detection import LEAST_SNR
+from measure.targets.detection import LEAST_SNR
 from measure.targets.disk_fit_batch import (
     LEAST_MARGIN_PX,
     MARGIN,

@@ -24,13 +24,15 @@ from measure.scans.parallel import map_or_replace
 from measure.tie_points.features import Features, TieFrame, find_all_features, read_pieces, unreachable
 from measure.tie_points.multi_image import RADIUS_PX, Bending, Matched, Piece, bending_variance, match_pieces
 from measure.tie_points.tracks import (
+    FEWEST_PAIRS,
     Shared,
     TieCandidate,
     candidates_with_radius,
+    epipolar_outliers,
     find_candidates,
+    neighbour_outliers,
     verify_pairs,
 )
-from measure.tie_points.verification import FEWEST_PAIRS, epipolar_outliers, neighbour_outliers
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

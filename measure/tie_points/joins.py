@@ -28,7 +28,7 @@ from measure.tie_points.features import (
     shared_features,
 )
 from measure.tie_points.multi_image import RADIUS_PX, Matched, Piece, match_pieces
-from measure.tie_points.verification import neighbour_outliers
+from measure.tie_points.tracks import neighbour_outliers
 
 Array = NDArray[np.float64]
 

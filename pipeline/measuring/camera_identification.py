@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.padding import Padding
 
-from measure.annotations.fields import CAMERA, Line, find_fields
+from measure.annotations.lines import CAMERA, Line, find_fields
 from measure.flags import Code, Reason
 from measure.marks.rendering import known_picture
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Polygon

@@ -21,7 +21,7 @@ from measure.targets.consistency import (
     plane_coordinates,
     predict_sheet_points,
 )
-from measure.targets.disk_detection import DiskSearch, disk_candidates
+from measure.targets.detection import DiskSearch, disk_candidates
 from measure.targets.identification import TargetOptions, TargetPrediction, measure_disks
 from measure.targets.ring_codes import read_code
 from measure.targets.sheets import Dots, Naming, name_dots

@@ -7,9 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from measure.annotations.fields import KnownLine, Line, masked_text
-from measure.annotations.orientation_from_text import bounded, line_score
-from measure.boards.corners import one_definition
+from measure.annotations.lines import KnownLine, Line, bounded, line_score, masked_text
+from measure.boards.measure import one_definition
 from measure.fiducials.across_frames import check_frames
 from measure.fiducials.options import BelievedFilm
 from measure.fiducials.scan_orientation import DECIDED, TOLD

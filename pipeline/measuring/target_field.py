@@ -13,8 +13,7 @@ from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
 from measure.targets.block_search import Candidate
 from measure.targets.consistency import TargetPlaces, compare_targets
-from measure.targets.crosses import CrossSearch, cross_candidates
-from measure.targets.disk_detection import DiskSearch, disk_candidates
+from measure.targets.detection import CrossSearch, DiskSearch, cross_candidates, disk_candidates
 from measure.targets.identification import TargetOptions, TargetPrediction, measure_crosses, measure_disks
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project

@@ -10,7 +10,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from measure.annotations.fields import Line
+from measure.annotations.lines import Line
 from measure.flags import Status
 from measure.geometry import up_from_camera
 from measure.results import Covariance

@@ -12,7 +12,7 @@ from typing import Any, get_args
 import numpy as np
 from pydantic import TypeAdapter
 
-from measure.annotations.fields import Field, Line, find_fields
+from measure.annotations.lines import Field, Line, find_fields
 from measure.flags import Cause, MeaningfulWord, Reason, Status
 from measure.results import Covariance, FrameMeasurement, Kind, MarkMeasurement, Pose
 from measure.tone.curve import Tone, ToneInformation, power, srgb

@@ -25,9 +25,8 @@ from real_data import DATA, needs
 from studies import parametrize_with_studies
 
 from measure import Status, open_scan
-from measure.boards.corners import one_definition
 from measure.boards.find import is_even, whole_pattern
-from measure.boards.measure import measure_board
+from measure.boards.measure import measure_board, one_definition
 from measure.boards.specs import (
     AprilGridSpec,
     ArucoSpec,

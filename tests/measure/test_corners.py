@@ -10,8 +10,7 @@ from studies import parametrize_with_studies
 
 from measure import ScanWindow
 from measure.array_types import Single
-from measure.boards.corner_surfaces import Surface, crossing, quarter
-from measure.boards.corners import Corner, CornerStart, fit_corners
+from measure.boards.corners import Corner, CornerStart, Surface, crossing, fit_corners, quarter
 
 Array = NDArray[np.float64]
 SIZE, NOISE, CONTRAST = 25, 4.0, 100.0

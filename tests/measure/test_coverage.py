@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from drawn import Array, brute_picture, placed
 
-from measure.marks.coverage import CELLS, cell_coverage
-from measure.marks.rendering import picture, render
+from measure.marks.rendering import CELLS, cell_coverage, picture, render
 from measure.marks.shapes import MarkShape, MarkTemplate, cross, dot, polygon, ring_cross, ring_dot
 
 SHEARED = np.array([[8.1, 0.9, 20.3], [-0.4, -8.6, 19.7]])

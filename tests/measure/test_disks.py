@@ -11,7 +11,7 @@ from studies import parametrize_with_studies
 
 from measure import Scan
 from measure.targets.block_search import Candidate
-from measure.targets.disk_detection import DiskSearch, disk_candidates
+from measure.targets.detection import DiskSearch, disk_candidates
 from measure.targets.disks import FittedDisk, fit_disk, fit_plain_disks
 
 Array = NDArray[np.float64]

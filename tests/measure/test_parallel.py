@@ -14,7 +14,7 @@ from measure import Scan
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
 from measure.scans.parallel import map_in_threads, map_or_replace
-from measure.targets.disk_detection import DiskSearch, disk_candidates
+from measure.targets.detection import DiskSearch, disk_candidates
 
 
 @pytest.fixture(autouse=True)

@@ -26,8 +26,7 @@ from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 
 from measure import FrameMeasurement, MatchOptions, Scan, ScanWindow, Status, match, measure_fiducials
-from measure.annotations.fields import KnownLine, Line, Reading, read_from_one_face
-from measure.annotations.orientation_from_text import side_in_camera, writing_likelihoods
+from measure.annotations.lines import KnownLine, Line, Reading, read_from_one_face, side_in_camera, writing_likelihoods
 from measure.fiducials.measure_frame import measure_frame, rename_frame
 from measure.fiducials.options import FiducialOptions, Reads
 from measure.fiducials.orientation_pictures import Drawings, MarkSite, PosedMark

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
 from measure import MarkMeasurement, Scan, Status, TargetOptions, TargetPrediction, measure_crosses, measure_disks
-from measure.targets.crosses import CrossSearch, cross_candidates
+from measure.targets.detection import CrossSearch, cross_candidates
 
 Array = NDArray[np.float64]
 CONTRAST, NOISE, GROUND = 20000.0, 500.0, 12000.0

@@ -9,7 +9,7 @@ from drawn import Array, written_scan
 from studies import parametrize_with_studies
 
 from measure.annotations import text as networks_module
-from measure.annotations.fields import Line, Reading, find_fields, is_of_film, is_plate, signs
+from measure.annotations.lines import Line, Reading, find_fields, is_of_film, is_plate, signs
 from measure.annotations.text import Networks, networks, read_writing
 
 SIZE_PX = 640

@@ -13,8 +13,7 @@ from measure.flags import Cause, Status
 from measure.tie_points.features import Features, TieFrame
 from measure.tie_points.joins import Joins, measure_joins
 from measure.tie_points.multi_image import RADIUS_PX, SPARE_PX, Piece, match_pieces
-from measure.tie_points.tracks import find_candidates, tracks_of_pairs, verify_pairs
-from measure.tie_points.verification import neighbour_outliers
+from measure.tie_points.tracks import find_candidates, neighbour_outliers, tracks_of_pairs, verify_pairs
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from in_process import Here, Loses
 from loaded_script import script
 from projects import CAMERA, PROJECT, Refusal, write_project
 
-from measure.annotations.fields import Line, Reading
+from measure.annotations.lines import Line, Reading
 from measure.flags import Cause, Code, Reason, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from measure.tone.curve import Tone, ToneInformation, power, sampled_curve, srgb

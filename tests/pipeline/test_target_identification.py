@@ -21,7 +21,7 @@ from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.transformation import Film
 from measure import Status, open_scan
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement
-from measure.targets.disk_detection import DiskSearch, disk_candidates
+from measure.targets.detection import DiskSearch, disk_candidates
 from measure.targets.ring_codes import RingCode, read_code
 from measure.targets.sheets import Dots, Naming, name_dots
 from pipeline import InputError

@@ -10,8 +10,7 @@ from projects import fiducial_tables, keep_scans
 from rich.console import Console
 
 from measure.annotations import text as networks_module
-from measure.annotations.fields import Line, Reading
-from measure.annotations.orientation_from_text import side_in_camera, writing_likelihoods
+from measure.annotations.lines import Line, Reading, side_in_camera, writing_likelihoods
 from measure.fiducials.options import FiducialOptions, Reads
 from measure.flags import Cause, Code, Reason, Status
 from measure.geometry import POSES, pose_in_camera
