@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 
 from benchmarks.archive_stand_ins import USE, write_project
 from benchmarks.harness import ROOT, START, Row, table
-from pipeline.archive.checked_statuses import checked_scans, latest
+from pipeline.archive.checked_results import latest
 from pipeline.archive.results_database import Store
 from pipeline.results.measured_record import mark_row, scan_detail
 
@@ -97,7 +97,7 @@ def content(folder: Path) -> list[str]:
         judging = latest(store)
         assert judging is not None
         keys = sorted(store.fingerprints())
-        scans = checked_scans(store, judging, folder)
+        scans = judging.scans()
         return [*keys, *(f"{scan_detail(scan, '')} {list(map(mark_row, scan.frame.marks))}" for scan in scans)]
 
 

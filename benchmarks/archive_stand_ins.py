@@ -15,8 +15,8 @@ import numpy as np
 
 from measure.flags import Cause, Code, Reason, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
-from pipeline.archive.checked_statuses import CheckedResult, checked_marks, find_judging, judge, remember_written
-from pipeline.archive.measurement import measured_from, pitches, remember_place
+from pipeline.archive.checked_results import CheckedResult, judge
+from pipeline.archive.made_from import measured_from
 from pipeline.archive.results_database import Kept, Store
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_measurement import MeasuredFile
@@ -80,12 +80,10 @@ def keep_results(project: Project) -> None:
     """Store results as `reseau measure` would; every hundredth frame lacks a fiducial."""
     home = project.path.resolve().parent
     with Store(project.measurement_path) as store:
-        remember_place(store, home)
-        digest = judge(store, measured_from(project), "kept", _frames(project, store, home))
-        judging = find_judging(store, digest)
-        assert judging is not None
-        write_comparator(project.comparator, checked_marks(store, judging), pitches(store, digest), digest)
-        remember_written(store, digest, project.comparator)
+        store.set_project_folder(home)
+        judging = judge(store, measured_from(project), "kept", _frames(project, store, home))
+        write_comparator(project.comparator, judging.marks(), judging.pitches_um(), judging.digest)
+        judging.remember_written(project.comparator)
 
 
 def _frames(project: Project, store: Store, home: Path) -> Iterator[CheckedResult]:

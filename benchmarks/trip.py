@@ -64,7 +64,7 @@ def followed() -> Followed:
     from projects import write_project
 
     from pipeline.archive import measure_archive
-    from pipeline.archive.measurement import read_measurement
+    from pipeline.archive.checked_results import read_measurement
     from pipeline.archive.results_database import Store
     from pipeline.files.project_file import read_project
     from pipeline.progress import Reporter

@@ -1,5 +1,5 @@
 from .adjusting.network import build_network as build_network
-from .archive.measurement import read_measurement as read_measurement
+from .archive.checked_results import read_measurement as read_measurement
 from .calibration.calibrate_stage import calibrate as calibrate
 from .errors import InputError as InputError
 from .files.camera_file import read_camera as read_camera

@@ -5,7 +5,7 @@ adjustment.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -14,26 +14,8 @@ from typing import TYPE_CHECKING
 from adjust.solution.result import Adjustment
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.adjusting.network import anything_to_adjust, check_transformation, sensor_size_mm
-from pipeline.archive.checked_statuses import (
-    checked_marks,
-    drop_all_but,
-    find_judging,
-    marks_as_written,
-    rejudge,
-    remember_written,
-)
-from pipeline.archive.measurement import (
-    adjusted_from,
-    count_decisions,
-    differing,
-    measured_scans,
-    picture_sizes_mm,
-    pitches,
-    read_fingerprints,
-    read_measurement,
-    remember_place,
-    written_scans,
-)
+from pipeline.archive.checked_results import Judging, measured_scans, read_measurement, stored_judging
+from pipeline.archive.made_from import adjusted_from, differing
 from pipeline.archive.results_database import Merged, Store, merge
 from pipeline.archive.schema import DamagedError
 from pipeline.archive.status import archive_status
@@ -227,13 +209,13 @@ class _Run:
                 return self._measured_and_written(store)
 
     def _measured_and_written(self, store: Store) -> str:
-        remember_place(store, self.project.path.parent)
-        digest = self.measure_into(store)
-        if not marks_as_written(store, digest, self.project.comparator):
-            self._write_marks(store, digest)
-        return digest
+        judging = self.measure_into(store)
+        assert judging is not None  # it is no shard
+        if not judging.is_written(self.project.comparator):
+            self._write_marks(judging)
+        return judging.digest
 
-    def measure_into(self, store: Store) -> str:
+    def measure_into(self, store: Store) -> Judging | None:
         """Measure the missing scans of the project or of a shard."""
         from pipeline.archive.measure_archive import measure_archive
 
@@ -254,10 +236,9 @@ class _Run:
         again = measure_again(project, scans, adjustment, self.reporter, lambda: open_executor(project, self.work))
         if again is None:
             return adjustment
-        with Store(project.measurement_path) as store:
-            before = find_judging(store, read_measurement_hash(self.new.current_path(project.comparator)))
+        with self._judging() as before:
             assert before is not None
-            self._write_marks(store, rejudge(store, before, again))
+            self._write_marks(before.rejudge(again))
         return adjust_marks(project, self.marks())
 
     def marks(self) -> tuple[ComparatorPoint, ...]:
@@ -274,30 +255,33 @@ class _Run:
             )
         return path
 
-    def _write_marks(self, store: Store, digest: str) -> None:
-        project, new, judging = self.project, self.new, find_judging(store, digest)
-        assert judging is not None
-        decisions = count_decisions(store, digest)
+    def _judging(self) -> AbstractContextManager[Judging | None]:
+        """Judging that comparator.csv names; None where it is not from the results database."""
+        project = self.project
+        return stored_judging(
+            project.measurement_path, read_measurement_hash(self.new.current_path(project.comparator))
+        )
+
+    def _write_marks(self, judging: Judging) -> None:
+        project, new, decisions = self.project, self.new, judging.decisions()
         for camera in project.cameras.values():
             if camera.clicks is not None and camera.clicks.who:  # the clicks count as one more decision
                 who = camera.path.name, camera.clicks.who
                 decisions[who] = decisions.get(who, 0) + 1
-        marks = checked_marks(store, judging)
-        write_comparator(new.place(project.comparator), marks, pitches(store, digest), digest, decisions)
-        if not write_frames(new.place(project.frames_path), written_scans(store, digest)):
+        place = new.place(project.comparator)
+        write_comparator(place, judging.marks(), judging.pitches_um(), judging.digest, decisions)
+        if not write_frames(new.place(project.frames_path), judging.written_scans()):
             new.remove(project.frames_path)
 
     def publish(self) -> None:
         """Publish all results, then delete earlier judgings, which no file names any more."""
         self.new.publish()
-        project = self.project
-        if not (project.scans and project.measurement_path.exists() and project.comparator.exists()):
+        if not (self.project.scans and self.project.comparator.exists()):
             return
-        digest = read_measurement_hash(project.comparator)
-        with Store(project.measurement_path) as store:
-            if find_judging(store, digest) is not None:
-                drop_all_but(store, digest)
-                remember_written(store, digest, project.comparator)
+        with self._judging() as judging:
+            if judging is not None:
+                judging.drop_others()
+                judging.remember_written(self.project.comparator)
 
     def fill_images(self, scans: Iterable[MeasuredScan]) -> None:
         """Fill empty columns of the user's images.csv with the writing read on the film."""
@@ -311,9 +295,10 @@ class _Run:
     def _frames_mm(self) -> dict[str, tuple[float, float]]:
         """{camera: size of its frame, mm}; for a camera without fiducials and frame size, that of its largest image."""
         project = self.project
-        digest = read_measurement_hash(self.new.current_path(project.comparator))
         largest: dict[str, tuple[float, float]] = {}
-        for image, size in picture_sizes_mm(project.measurement_path, digest).items():
+        with self._judging() as judging:
+            sizes = judging.sizes_mm() if judging is not None else {}
+        for image, size in sizes.items():
             camera = project.image_camera(image)
             if not camera.fiducials:
                 largest[camera.name] = max(largest.get(camera.name, size), size)
@@ -356,5 +341,6 @@ class _Run:
     def thumbnails(self, data: ReportData) -> Thumbnails:
         """Thumbnails of the marks in the data."""
         scans, path = data.measurement or {}, self.project.measurement_path
-        keys = read_fingerprints(path, data.made_from.get(path.name, ""), scans)
+        with stored_judging(path, data.made_from.get(path.name, "")) as judging:
+            keys = judging.fingerprints(scans) if judging is not None else {}
         return Thumbnails(scans.values(), self.project.max_pixels, path, keys)

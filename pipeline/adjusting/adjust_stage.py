@@ -22,7 +22,7 @@ from adjust.solution.result import Adjustment
 from adjust.solution.unmodelled_error import adjust_unmodelled
 from measure.results import ON_FILM
 from pipeline.adjusting.network import build_network
-from pipeline.archive.measurement import adjusted_from
+from pipeline.archive.made_from import adjusted_from
 from pipeline.errors import InputError
 from pipeline.files.project_file import ASSUMED_PITCH_UM, Project
 from pipeline.files.project_tables import AdjustSettings

@@ -10,7 +10,7 @@ from importlib.metadata import version
 from measure.flags import Code, Reason, Status
 from measure.results import MEASURE_REVISION
 from measure.scans.remote import scan_path
-from pipeline.archive.checked_statuses import CheckedResult, Lot
+from pipeline.archive.checked_results import CheckedResult, Lot
 from pipeline.archive.results_database import Store
 from pipeline.archive.work import Work
 from pipeline.files.camera_file import CameraFile

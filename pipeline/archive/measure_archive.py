@@ -8,9 +8,9 @@ from pathlib import Path
 
 from measure.errors import MeasurementError
 from measure.scans.remote import fetch_location, scan_path
-from pipeline.archive.checked_statuses import judge_lots, latest
+from pipeline.archive.checked_results import Judging, judge_lots, latest
 from pipeline.archive.cross_scan_checks import check_lots, find_copies, hash_inputs
-from pipeline.archive.measurement import measured_from
+from pipeline.archive.made_from import measured_from
 from pipeline.archive.results_database import Store
 from pipeline.archive.review_decisions import tell_inapplicable
 from pipeline.archive.thumbnails import ThumbnailStore
@@ -97,12 +97,12 @@ def measure_archive(
     learned_folder: Path,
     reporter: Reporter,
     options: WorkOptions,
-) -> str:
+) -> Judging | None:
     """Measure the missing scans of a project and check all of them together, unless nothing has changed.
 
     Returns
     -------
-    Digest of the judging; "" for a shard, which has no cross-scan checks.
+    The judging; None for a shard, which has no cross-scan checks.
 
     Raises
     ------
@@ -112,6 +112,7 @@ def measure_archive(
         No scan could be measured; single failures are results.
     """
     names = check_measurable(project)
+    store.set_project_folder(project.path.parent)
     with open_executor(project, options) as executor, ThumbnailStore(store.path) as thumbnails:
         # After all checks that could prevent a new measurement.
         lost = store.forget_damaged() if options.retry or store.has_damaged_rows() else 0
@@ -129,7 +130,7 @@ def measure_archive(
         if options.shard is not None:
             part, parts = options.shard
             work.complete([task for task in tasks if shard_number(task.name, parts) == part], reporter)
-            return ""
+            return None
         work.complete(tasks, reporter)
         if options.moved:
             hash_contents(store, tasks, work, reporter)
@@ -140,13 +141,13 @@ def measure_archive(
         input_hash = hash_inputs(tasks, work, copies, made)
         before = latest(store)
         if before is not None and before.input == input_hash:
-            tell_inapplicable(learned, store, before.digest, work)
-            return before.digest
+            tell_inapplicable(learned, before, work)
+            return before
         share = partial(tie_scans, learned, reporter=reporter, executor=executor)
         lots = check_lots(learned, tasks, work, copies, share, input_hash)
-        digest = judge_lots(store, made, input_hash, lots)
-        tell_inapplicable(learned, store, digest, work)
-        return digest
+        judging = judge_lots(store, made, input_hash, lots)
+        tell_inapplicable(learned, judging, work)
+        return judging
 
 
 def open_executor(project: Project, options: WorkOptions) -> AbstractContextManager[Executor]:

@@ -5,6 +5,7 @@ every machine, so databases of shards can be merged.
 """
 
 import json
+import os
 import platform
 import sqlite3
 from collections.abc import Mapping, Sequence
@@ -45,6 +46,7 @@ _SCAN = [name for name in COLUMNS["scan"][2:] if name not in ("result", "is_curr
 _RESULT = COLUMNS["result"][5:-1]
 _MARK = f"number, {MARKS}"
 _SOUND = is_result_sound("r", "other.mark")
+_PLACE = "project folder"
 _LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "tifffile", "imagecodecs")
 
 
@@ -260,6 +262,17 @@ class Store(Database):
         """Store what scans of the project contribute to others."""
         with self.writing():
             self.connection.execute("insert or replace into kept (key, value) values (?, ?)", (key, json.dumps(value)))
+
+    @property
+    def project_folder(self) -> Path:
+        """Folder of the project, to which paths of scans are relative."""
+        return self.path.parent / str((self.recall(_PLACE) or {"path": ".."})["path"])
+
+    def set_project_folder(self, folder: Path) -> None:
+        """Store the project's folder relative to the store, so that a project can be moved as a whole."""
+        relative = os.path.relpath(folder.resolve(), self.path.resolve().parent)
+        if self.recall(_PLACE) != {"path": relative}:
+            self.remember(_PLACE, {"path": relative})
 
     def pose_name(self, result: int) -> str | None:
         """Name of the pose under which the marks of a result are named."""

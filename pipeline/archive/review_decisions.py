@@ -12,8 +12,7 @@ import numpy as np
 from measure.fiducials.options import CLICK_SIGMA_PX, Click
 from measure.flags import Cause, Code, Reason, Status
 from measure.results import MEASURE_REVISION, Covariance, MarkMeasurement
-from pipeline.archive.checked_statuses import find_judging
-from pipeline.archive.results_database import Store
+from pipeline.archive.checked_results import Judging
 from pipeline.archive.schema import row_digest
 from pipeline.files.decisions_file import LEARNED, About, Choice, Decision, push_decision, standing
 from pipeline.files.project_file import Project
@@ -165,18 +164,17 @@ def _apply_to_mark(mark: MarkMeasurement, decision: Decision | None) -> MarkMeas
     return mark
 
 
-def tell_inapplicable(project: Project, store: Store, digest: str, work: "Work") -> None:
+def tell_inapplicable(project: Project, judging: Judging, work: "Work") -> None:
     """Store messages about the decisions that a judging could not apply."""
-    lines = [*unknown_images(project), *_known_images(project, store, digest, work)]
-    store.remember(
-        _INAPPLICABLE, {"digest": digest, "lines": [f"line {number}: {why}" for number, why in sorted(lines)]}
-    )
+    lines = sorted([*unknown_images(project), *_known_images(project, judging, work)])
+    messages = [f"line {number}: {why}" for number, why in lines]
+    judging.store.remember(_INAPPLICABLE, {"digest": judging.digest, "lines": messages})
 
 
-def inapplicable(store: Store, digest: str) -> tuple[str, ...]:
+def inapplicable(judging: Judging | None) -> tuple[str, ...]:
     """Messages about the decisions that a judging could not apply, shortened."""
-    kept = store.recall(_INAPPLICABLE) or {}
-    return shortened(kept["lines"]) if kept.get("digest") == digest else ()
+    kept = (judging and judging.store.recall(_INAPPLICABLE)) or {}
+    return shortened(kept["lines"]) if judging and kept.get("digest") == judging.digest else ()
 
 
 def shortened(lines: Sequence[str]) -> tuple[str, ...]:
@@ -197,16 +195,16 @@ def unknown_images(project: Project) -> Iterator[tuple[int, str]]:
             yield one.line, f"the project has no image {one.image!r}.{hints.get(one.image, '')}"
 
 
-def _known_images(project: Project, store: Store, digest: str, work: "Work") -> Iterator[tuple[int, str]]:
+def _known_images(project: Project, judging: Judging, work: "Work") -> Iterator[tuple[int, str]]:
     """Yield (line, message) for decisions about images of the project that have no effect."""
     decisions = {image: own for image, own in work.decisions.items() if image in project.scans}
-    judging, marks = find_judging(store, digest), defaultdict[str, dict[tuple[str, str], bool]](dict)
-    assert judging is not None  # it was stored just before
+    marks = defaultdict[str, dict[tuple[str, str], bool]](dict)
     query = (
         "select image, point, kind, causes is not null from checked_mark "
         "where judging = ? and image in (select value from json_each(?))"
     )
-    for image, *mark, is_measured in store.connection.execute(query, (judging.row, json.dumps(list(decisions)))):
+    rows = judging.store.connection.execute(query, (judging.row, json.dumps(list(decisions))))
+    for image, *mark, is_measured in rows:
         marks[image][mark[0], mark[1]] = bool(is_measured)
     for image, own in decisions.items():
         yield from _idle_lines(own, work.counting[image], marks[image])

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from pipeline.archive.checked_statuses import checked_scans, latest
+from pipeline.archive.checked_results import Judging, latest
 from pipeline.archive.results_database import Store
 from pipeline.archive.review_decisions import (
     decisions_hash,
@@ -22,7 +22,7 @@ from pipeline.archive.review_decisions import (
     shortened,
     unknown_images,
 )
-from pipeline.archive.schema import check_judging, is_sound
+from pipeline.archive.schema import is_sound
 from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_counts
 from pipeline.files.project_file import Project
 from pipeline.files.scan_files import as_named
@@ -82,9 +82,9 @@ def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
     rows, idle = {}, tuple[str, ...]()
     if path.exists():
         with Store(path) as store:
-            rows = {row[0]: row for row in _status_rows(store)}
             judging = latest(store)
-            idle = inapplicable(store, judging.digest) if judging is not None else ()
+            rows = {row[0]: row for row in _status_rows(store, judging)}
+            idle = inapplicable(judging)
     files, scans = FileStates(project.path.resolve().parent), []
     request_hash, decisions = request_hasher(project), group_decisions(project.decisions)
     for name, file in as_named(project.scans).items():
@@ -104,16 +104,15 @@ def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
     return ArchiveStatus(tuple(sorted(scans)), tuple(dict.fromkeys((*unknown, *idle))))
 
 
-def _status_rows(store: Store) -> Iterator[Sequence[Any]]:
+def _status_rows(store: Store, judging: Judging | None) -> Iterator[Sequence[Any]]:
     """Rows of the query; a damaged row is reported as a failure."""
     # Marks are checked only in frames where the reason of one may be shown.
-    judging = latest(store)
     rows = store.connection.execute(_QUERY, (-1 if judging is None else judging.row,)).fetchall()
     damaged = set[str]()
     if judging is not None:
-        check_judging(store.connection, judging.row, store.path)
+        judging.check()
         names_to_check = {row[-2] for row in rows if row[6] and row[-2]}
-        scans = checked_scans(store, judging, store.path.parent, names_to_check) if names_to_check else ()
+        scans = judging.scans(names_to_check) if names_to_check else ()
         damaged = {scan.frame.image for scan in scans if scan.failure and scan.failure.code is FailureCode.DAMAGED}
     why = "what is stored of it is not what was measured: `reseau measure --retry` measures it again"
     for *row, name, is_whole in rows:

@@ -12,7 +12,7 @@ from adjust.functional_model.lens import Lens
 from adjust.functional_model.projection import ImageModel, LineOfSight
 from adjust.functional_model.rotation import rotation_from_angles
 from pipeline.adjusting.network import rotate_to_sensor
-from pipeline.archive.measurement import adjusted_from, differing
+from pipeline.archive.made_from import adjusted_from, differing
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project

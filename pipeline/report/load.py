@@ -11,20 +11,17 @@ from pathlib import Path
 import numpy as np
 
 from measure.flags import Status
-from pipeline.archive.measurement import (
+from pipeline.archive.checked_results import StoredMarks, measured_scans, stored_judging
+from pipeline.archive.made_from import (
     CAMERA,
     DECISIONS,
     PLACES,
     SCAN,
     SETTINGS,
-    StoredMarks,
     adjusted_from,
     differing,
     measured_from,
-    measured_scans,
-    read_inputs,
 )
-from pipeline.archive.results_database import Store
 from pipeline.archive.review_decisions import inapplicable
 from pipeline.archive.verdicts import Verdict, scan_counts
 from pipeline.errors import InputError
@@ -250,7 +247,8 @@ def measured_data(
     digest, path = read_measurement_hash(comparator), project.measurement_path
     if not path.exists():
         return data
-    made = read_inputs(path, digest)
+    with stored_judging(path, digest) as judging:
+        made, lines = None if judging is None else judging.made_from, inapplicable(judging)
     if made is None and not digest:
         return replace(data, notes=(*data.notes, f"{comparator.name} was given: {path.name} says nothing of it."))
     if made is None:
@@ -271,8 +269,6 @@ def measured_data(
         for scan in scans.values()
         if scan.failure is not None and scan.failure.code is FailureCode.DAMAGED
     ]
-    with Store(path) as store:
-        lines = inapplicable(store, digest)
     idle = [Problem(f"{project.decisions_path.name}, {line}", "It does not count.") for line in lines]
     return _add_problems(data, *damaged, *idle, *unlike)
 

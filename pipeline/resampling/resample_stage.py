@@ -18,7 +18,7 @@ from adjust.functional_model.lens import Lens
 from measure.errors import MeasurementError
 from measure.scans.opening import open_scan
 from measure.scans.remote import scan_path
-from pipeline.archive.measurement import read_measurement
+from pipeline.archive.checked_results import read_measurement
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter

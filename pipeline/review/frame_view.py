@@ -11,7 +11,7 @@ import numpy as np
 from measure.fiducials.options import Click
 from measure.marks.shapes import Bar, Disk, FrameCorner, LayoutMark, Mark, MarkShape, Part, Polygon, Ring
 from measure.results import MarkMeasurement
-from pipeline.archive.checked_statuses import Judging, checked_scans, latest
+from pipeline.archive.checked_results import Judging, latest
 from pipeline.archive.results_database import Store
 from pipeline.archive.schema import DamagedError
 from pipeline.errors import InputError
@@ -162,9 +162,9 @@ class LookedAt:
 class Looking:
     """Access to the latest checked results in a results database, which another process may be writing."""
 
-    def __init__(self, store: Path, folder: Path, camera_of: Any) -> None:
-        """folder: to which paths of scans are relative; camera_of: returns the camera of an image."""
-        self._store, self._folder, self._camera_of = store, folder, camera_of
+    def __init__(self, store: Path, camera_of: Any) -> None:
+        """camera_of: returns the camera of an image."""
+        self._store, self._camera_of = store, camera_of
 
     def judging(self) -> Judging | None:
         if not self._store.exists():
@@ -179,7 +179,7 @@ class Looking:
             row = store.connection.execute(_ONE, (image, -1 if judging is None else judging.row)).fetchone()
             if row is None or judging is None:
                 raise KeyError(image)
-            (scan,) = checked_scans(store, judging, self._folder, {image})
+            (scan,) = judging.scans({image})
         if scan.failure and scan.failure.code is FailureCode.DAMAGED:
             raise DamagedError(scan.failure.sentence)
         return LookedAt(scan, str(row[0]), str(row[1]), self._camera_of(image))

@@ -226,7 +226,7 @@ class Session:
         """Raises InputError if there are no checked results and no scans."""
         self.project, self.who = project, who
         self.folder = project.path.resolve().parent
-        self.looking = Looking(project.measurement_path, self.folder, lambda image: self.learned.image_camera(image))
+        self.looking = Looking(project.measurement_path, lambda image: self.learned.image_camera(image))
         self._lock = threading.RLock()
         self._judging: int | None = None
         self._file_state: FileState | None = None  # of the decisions when they were read

@@ -21,8 +21,7 @@ from adjust import Network, Prior
 from measure import FiducialLayout
 from measure.flags import Cause, Code, Reason, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
-from pipeline.archive.checked_statuses import CheckedResult, checked_scans, find_judging, judge
-from pipeline.archive.measurement import remember_place
+from pipeline.archive.checked_results import CheckedResult, find_judging, judge
 from pipeline.archive.results_database import Kept, Store
 from pipeline.cli import DONE, LOOK, run
 from pipeline.files.project_file import Project
@@ -377,13 +376,13 @@ def keep_scans(path: Path, scans: Sequence[MeasuredScan], made_from: Mapping[str
     """In the store at `path` of the project whose folder is above its own; the digest of their judging."""
     folder = path.parent.parent.resolve()
     with Store(path) as store:
-        remember_place(store, folder)
+        store.set_project_folder(folder)
         frames = []
         for scan in scans:
             identity = Identity(file_state(Path(scan.scan), folder), parts_hash(Path(scan.scan)))
             row = store.keep(Kept(identity, "{}", scan), scan.frame.image)
             frames.append(CheckedResult(row, scan))
-        return judge(store, made_from or {}, "kept", frames)
+        return judge(store, made_from or {}, "kept", frames).digest
 
 
 def scan_content(file: Path) -> bytes:
@@ -396,7 +395,7 @@ def scan_content(file: Path) -> bytes:
     comparator = file.parents[1] / "comparator.csv"
     with Store(file) as store:
         judging = find_judging(store, read_measurement_hash(comparator)) if comparator.exists() else None
-        scans = () if judging is None else checked_scans(store, judging, file.parent)
+        scans = () if judging is None else judging.scans()
         kept = [[scan_detail(scan, ""), *map(mark_row, scan.frame.marks)] for scan in scans]
         return b"" if judging is None else repr([judging.digest, *kept]).encode()
 

@@ -20,8 +20,7 @@ from adjust import AdjustmentError
 from measure import MeasurementError
 from measure.scans.remote import Address
 from pipeline import InputError, read_comparator, read_project
-from pipeline.archive.checked_statuses import latest
-from pipeline.archive.measurement import measured_scans
+from pipeline.archive.checked_results import latest, measured_scans
 from pipeline.archive.results_database import Store
 from pipeline.archive.status import archive_status
 from pipeline.cli import run

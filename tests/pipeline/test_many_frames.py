@@ -18,8 +18,7 @@ from measure import open_scan
 from measure.flags import Cause, Code, Reason, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from pipeline import read_project
-from pipeline.archive.checked_statuses import remember_written
-from pipeline.archive.measurement import read_fingerprints, read_measurement
+from pipeline.archive.checked_results import read_measurement, stored_judging
 from pipeline.archive.results_database import Store
 from pipeline.archive.thumbnails import Thumbnails, ThumbnailStore
 from pipeline.cli import run
@@ -172,8 +171,10 @@ def test_natural_points_are_no_questions_to_a_reviewer(tmp_path: Path) -> None:
 
 def as_written(folder: Path) -> None:
     """As `reseau measure` says it at its end."""
-    with Store(folder / "out" / "measurement.db") as store:
-        remember_written(store, read_measurement_hash(folder / "comparator.csv"), folder / "comparator.csv")
+    comparator = folder / "comparator.csv"
+    with stored_judging(folder / "out" / "measurement.db", read_measurement_hash(comparator)) as judging:
+        assert judging is not None
+        judging.remember_written(comparator)
 
 
 def test_frames_that_need_no_attention_are_counted_as_if_each_were_read(tmp_path: Path, monkeypatch: Any) -> None:
@@ -210,7 +211,9 @@ def folder(measured_folder: Path, tmp_path: Path) -> Path:
 
 def keys(folder: Path) -> dict[str, str]:
     digest = read_measurement_hash(folder / "comparator.csv")
-    return read_fingerprints(folder / "out" / "measurement.db", digest, ("a", "b", "c", "none"))
+    with stored_judging(folder / "out" / "measurement.db", digest) as judging:
+        assert judging is not None
+        return judging.fingerprints(("a", "b", "c", "none"))
 
 
 def grey(pixels: np.ndarray) -> np.ndarray:

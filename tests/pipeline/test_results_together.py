@@ -20,7 +20,7 @@ from adjust import Prior
 from measure import Status
 from pipeline import read_measurement, read_project, stages
 from pipeline.adjusting import second_visit
-from pipeline.archive.measurement import measured_from
+from pipeline.archive.made_from import measured_from
 from pipeline.cli import run
 from pipeline.provenance import fingerprint, parts_hash
 from pipeline.report.load import adjusted_data

@@ -15,18 +15,7 @@ from projects import FOLDER, changed, content, failed, kept_result, made_record,
 
 from measure import Code, Reason, Status
 from pipeline import InputError
-from pipeline.archive.checked_statuses import (
-    CheckedResult,
-    Judging,
-    Lot,
-    checked_marks,
-    checked_scans,
-    drop_all_but,
-    find_judging,
-    judge,
-    judge_lots,
-    latest,
-)
+from pipeline.archive.checked_results import CheckedResult, Judging, Lot, find_judging, judge, judge_lots, latest
 from pipeline.archive.results_database import Store, merge
 from pipeline.archive.schema import MEASUREMENTS, opened
 from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_verdict
@@ -40,9 +29,10 @@ LOOK = Reason("look", Code.PITCH)
 LOOKED_AT = made_record(problems=(LOOK,))
 
 
-def contents(store: Store, judging: Judging) -> list[tuple[object, ...]]:
+def contents(judging: Judging) -> list[tuple[object, ...]]:
     """Of every scan after the checks."""
-    return [content(scan) for scan in checked_scans(store, judging, FOLDER)]
+    judging.store.set_project_folder(FOLDER)
+    return [content(replace(scan, scan=os.path.normpath(scan.scan))) for scan in judging.scans()]
 
 
 @pytest.fixture
@@ -69,11 +59,10 @@ def test_a_judging_changes_what_is_visible_and_not_what_was_measured(path: Path)
         doubted = changed(made_record(1), [2], Status.WEAK, Reason("the others say otherwise", Code.OFF_GIVEN))
         now = [doubted, made_record(2, problems=(Reason("it is the frame of 1.", Code.COPY),))]
         frames = [CheckedResult(row, scan) for row, scan in zip(rows, now, strict=True)]
-        digest = judge(store, {"settings": "a"}, "input", frames)
-        judging = find_judging(store, digest)
+        judging = find_judging(store, judge(store, {"settings": "a"}, "input", frames).digest)
         assert judging is not None
         assert judging.made_from == {"settings": "a"}
-        assert contents(store, judging) == [content(scan) for scan in now]
+        assert contents(judging) == [content(scan) for scan in now]
         assert [stored(store, row, name) for row, name in zip(rows, "12", strict=True)] == [
             content(made_record(1)),
             content(made_record(2)),
@@ -101,26 +90,23 @@ def test_a_lot_whose_input_was_tested_is_not_tested_again(path: Path) -> None:
         first = judge_lots(store, {}, "1", [lot("a", 1, 2), lot("b", 3)])
         second = judge_lots(store, {}, "2", [lot("a", 1, 2), lot("c", 3, 4)])
         assert requests == ["a", "b", "c"]
-        assert first != second
-        drop_all_but(store, second)
-        judging = find_judging(store, second)
-        assert judging is not None
-        scans = list(checked_scans(store, judging, FOLDER))
+        assert first.digest != second.digest
+        second.drop_others()
+        scans = list(second.scans())
         reasons = {scan.frame.image: [str(mark.reason) for mark in scan.frame.marks if mark.reason] for scan in scans}
         assert reasons == {"1": ["by a"], "2": ["by a"], "3": ["by c"], "4": ["by c"]}
     other = path.parent / "other.db"
     with Store(other) as store:  # the same, all of it judged anew
-        assert judge_lots(store, {}, "2", [lot("a", 1, 2), lot("c", 3, 4)]) == second
-        judging = find_judging(store, second)
-        assert judging is not None
-        anew = contents(store, judging)
-        rows = list(checked_marks(store, judging))
+        again = judge_lots(store, {}, "2", [lot("a", 1, 2), lot("c", 3, 4)])
+        assert again.digest == second.digest
+        anew = contents(again)
+        rows = list(again.marks())
     with Store(path) as store:
-        judging = find_judging(store, second)
+        judging = find_judging(store, second.digest)
         assert judging is not None
-        assert contents(store, judging) == anew
-        assert list(checked_marks(store, judging)) == rows
-        assert list(mark_rows(scan.frame for scan in checked_scans(store, judging, FOLDER))) == rows
+        assert contents(judging) == anew
+        assert list(judging.marks()) == rows
+        assert list(mark_rows(scan.frame for scan in judging.scans())) == rows
 
 
 def test_one_judging_takes_the_place_of_another(path: Path) -> None:
@@ -129,12 +115,11 @@ def test_one_judging_takes_the_place_of_another(path: Path) -> None:
         first = judge(store, {}, "a", [CheckedResult(row, made_record())])
         same = judge(store, {}, "a", [CheckedResult(row, made_record())])
         second = judge(store, {}, "a", [CheckedResult(row, LOOKED_AT)])
-        assert first == same != second
-        assert find_judging(store, first) is not None
-        drop_all_but(store, second)
-        assert find_judging(store, first) is None
-        assert (found := latest(store)) is not None
-        assert found.digest == second
+        assert first.digest == same.digest != second.digest
+        assert find_judging(store, first.digest) is not None
+        second.drop_others()
+        assert find_judging(store, first.digest) is None
+        assert latest(store) == second
 
 
 def test_a_step_to_a_later_version_is_made_whole_or_not_at_all(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,454 @@
+"""Results after the cross-scan checks: stored beside the raw ones, and read by later stages; they can be rebuilt.
+
+The results of one run of the checks (a judging) are stored completely under a digest, which comparator.csv also names:
+database and file can be matched even if the process was ended in between. The earlier judging is dropped once the files
+that name the new one are in place.
+"""
+
+import hashlib
+import json
+import math
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from measure.flags import Code, Reason
+from measure.results import FrameMeasurement
+from pipeline.archive.results_database import Store, places
+from pipeline.archive.schema import (
+    FRAMES_DIGEST,
+    MARKS,
+    check_judging,
+    check_judgings,
+    checked_marks_digest,
+    damaged_frames,
+    damaged_judging,
+    damaged_result,
+    is_sound,
+    row_digest,
+)
+from pipeline.archive.verdicts import Verdict, scan_verdict
+from pipeline.errors import InputError
+from pipeline.provenance import hash_file
+from pipeline.results.comparator_file import (
+    CameraPerson,
+    ComparatorPoint,
+    MarkRow,
+    comparator_points,
+    read_measurement_hash,
+)
+from pipeline.results.measured_record import (
+    Failure,
+    FailureCode,
+    MeasuredScan,
+    mark_row,
+    read_mark_row,
+    read_scan,
+    scan_detail,
+    scan_location,
+)
+
+_AT_A_TIME = 500  # frames per transaction
+_WRITTEN = "comparator.csv"
+_UNFINISHED = "digest like 'unfinished%'"  # its process was ended before the judging was complete
+
+
+@dataclass(frozen=True)
+class Judging:
+    """One run of the cross-scan checks, in an open store.
+
+    Attributes
+    ----------
+    digest : SHA-256 of its whole content.
+    made_from : {name: fingerprint} of its inputs, as from `measured_from`.
+    input : SHA-256 of the results that were checked.
+    """
+
+    store: Store
+    row: int
+    digest: str
+    made_from: Mapping[str, str]
+    input: str
+
+    def check(self) -> None:
+        """Raise DamagedError where the list of frames is damaged."""
+        check_judging(self.store.connection, self.row, self.store.path)
+
+    def values(self, columns: str) -> list[tuple[Any, ...]]:
+        """Columns of checked_frame, for all frames."""
+        query = f"select {columns} from checked_frame where judging = ?"
+        return self.store.connection.execute(query, (self.row,)).fetchall()
+
+    def pitches_um(self) -> dict[str, tuple[float, float]]:
+        """{image: pixel pitch across and down}; NaN where it is unknown."""
+        unknown = (math.nan, math.nan)
+        rows = self.values("name, pitch_x_um, pitch_y_um")
+        return {name: unknown if across is None else (across, down) for name, across, down in rows}
+
+    def sizes_mm(self) -> dict[str, tuple[float, float]]:
+        """{image: width and height of the scan}; scans of unknown pitch are left out."""
+        rows = self.values("name, width_px * pitch_x_um / 1000.0, height_px * pitch_y_um / 1000.0")
+        return {name: (width, height) for name, width, height in rows if width and height}
+
+    def decisions(self) -> dict[CameraPerson, int]:
+        """Number of decisions, by camera and person."""
+        counts = Counter[CameraPerson]()
+        for camera, counts_json in self.values("camera, changed ->> '$.decided_by'"):
+            counts.update({(camera, who): count for who, count in json.loads(counts_json or "{}").items()})
+        return dict(sorted(counts.items()))
+
+    def fingerprints(self, images: Collection[str]) -> dict[str, str]:
+        """{image: fingerprint of its result}, for those of some images that it holds."""
+        found = dict(self.values("name, fingerprint"))
+        return {image: found[image] for image in images if image in found}
+
+    def written_scans(self) -> Iterator[MeasuredScan]:
+        """Scans on which writing was found."""
+        written = self.store.written()
+        return self.scans({name for name, result in self.values("name, result") if result in written})
+
+    def scans(self, images: Collection[str] | None = None) -> Iterator[MeasuredScan]:
+        """Yield every scan after the checks, sorted by name; a damaged one as a failure.
+
+        images: only these; None for all. Raises DamagedError where the list of frames is damaged.
+        """
+        folder = self.store.project_folder
+        for name, (uri, measured, changed), rows in self._frames(images):
+            try:
+                if rows is None:
+                    raise ValueError
+                detail = json.loads(measured) | json.loads(changed or "{}")
+                yield read_scan(name, detail, list(map(read_mark_row, rows)), scan_location(uri, folder))
+            except (ValueError, TypeError, KeyError):
+                sentence = str(damaged_result(name, self.store.path))
+                frame = FrameMeasurement(name, (), problems=(Reason(sentence, Code.FAILED_SCAN),))
+                yield MeasuredScan.failed("", frame, Failure(FailureCode.DAMAGED, sentence))
+
+    def marks(self, images: Collection[str] | None = None) -> Iterator[MarkRow]:
+        """Yield the marks of every frame after the checks, sorted by frame name.
+
+        images: only these; None for all. Raises DamagedError where a frame is damaged.
+        """
+        for name, _, rows in self._frames(images):
+            if rows is None:
+                raise damaged_result(name, self.store.path)
+            for point, kind, col, row, *spread, causes, status, _, reason, _ in rows:
+                center = None if col is None else (col, row)
+                yield MarkRow(name, point, kind, center, _covariance(spread, causes), status, reason)
+
+    def _frames(
+        self, images: Collection[str] | None
+    ) -> Iterator[tuple[str, tuple[str, str, str | None], list[Sequence[Any]] | None]]:
+        """Yield name, (uri, JSON of the raw result and of what the checks changed) and marks, None where damaged."""
+        db = self.store.connection
+        if images is None:
+            self.check()
+        wanted = "" if images is None else "and name in (select value from json_each(?))"
+        found = db.execute(
+            f"select scan from judged_frame where judging = ? {wanted} order by name",
+            (self.row, *([] if images is None else [json.dumps(sorted(images))])),
+        ).fetchall()
+        columns = "name, uri, measured, changed, marks_digest, is_sound"
+        frame = f"select {columns} from checked_frame where judging = ? and scan = ?"
+        marks = f"select number, {MARKS} from checked_mark where judging = ? and scan = ? order by number"
+        for (scan,) in found:
+            rows = db.execute(marks, (self.row, scan)).fetchall()
+            name, *result, digest, is_whole = db.execute(frame, (self.row, scan)).fetchone()
+            is_whole = is_whole and row_digest(*rows) == digest
+            yield name, tuple(result), [row[1:] for row in rows] if is_whole else None
+
+    def remember_written(self, comparator: Path) -> None:
+        """Record that the file now holds the marks."""
+        self.store.remember(_WRITTEN, self._written(comparator))
+
+    def is_written(self, comparator: Path) -> bool:
+        """Whether the file holds the marks and has not been changed since."""
+        return self.store.recall(_WRITTEN) == self._written(comparator)
+
+    def _written(self, comparator: Path) -> dict[str, str]:
+        return {"digest": self.digest, "file": hash_file(comparator) if comparator.exists() else ""}
+
+    def drop_others(self) -> None:
+        """Delete all other judgings."""
+        with self.store.writing():
+            self.store.connection.execute("delete from judging where digest <> ?", (self.digest,))
+
+    def rejudge(self, scans: Sequence[MeasuredScan]) -> "Judging":
+        """Store a judging of the same results after a second pass, which a later `measure` does not repeat."""
+        self.check()
+        rows = {name: known for name, *known in self.values("name, result, decisions")}
+        frames = (
+            CheckedResult(result, scan, decisions)
+            for scan in sorted(scans, key=lambda scan: scan.frame.image)
+            for result, decisions in [rows[scan.frame.image]]
+        )
+        return judge(self.store, self.made_from, f"second pass {self.input}", frames)
+
+
+@dataclass(frozen=True)
+class CheckedResult:
+    """A scan after the cross-scan checks.
+
+    Attributes
+    ----------
+    result : row of the raw result.
+    decisions : hash of the review decisions about the image that were considered.
+    """
+
+    result: int
+    scan: MeasuredScan
+    decisions: str = ""
+
+
+@dataclass(frozen=True)
+class Lot:
+    """Frames that are checked against each other and no others.
+
+    Attributes
+    ----------
+    input : SHA-256 of all inputs of the checks; "" if unknown.
+    frames : function that runs the checks when their result is needed.
+    """
+
+    input: str
+    frames: Callable[[], Iterable[CheckedResult]]
+
+
+def judge(store: Store, made_from: Mapping[str, str], input_hash: str, frames: Iterable[CheckedResult]) -> Judging:
+    """Store a judging of a single lot, without reuse of earlier judgings; see `judge_lots`."""
+    return judge_lots(store, made_from, input_hash, [Lot("", lambda: frames)])
+
+
+def judge_lots(store: Store, made_from: Mapping[str, str], input_hash: str, lots: Iterable[Lot]) -> Judging:
+    """Store a judging of all frames, completely or not at all, and return it.
+
+    A lot whose input is unchanged is copied from an earlier judging. Of each frame only differences from the raw result
+    are stored.
+    """
+    hasher = hashlib.sha256(json.dumps([dict(made_from), input_hash], sort_keys=True).encode())
+    db = store.connection
+    with store.writing():
+        db.execute(f"delete from judging where {_UNFINISHED}")
+        values = (f"unfinished {input_hash}", json.dumps(dict(made_from)), input_hash)
+        row = db.execute("insert into judging (digest, made_from, input) values (?, ?, ?)", values).lastrowid
+        assert row is not None
+    for number, lot in enumerate(lots):
+        output = _copy_lot(store, row, number, lot) or _write_lot(store, row, number, lot.frames())
+        hasher.update(output.encode())
+        with store.writing():
+            db.execute("insert into judged_lot values (?, ?, ?, ?)", (row, number, lot.input, output))
+    digest = hasher.hexdigest()
+    with store.writing():
+        db.execute("delete from judging where digest = ?", (digest,))
+        db.execute(f"update judging set digest = ?, frames_digest = {FRAMES_DIGEST} where id = ?", (digest, row))
+    return Judging(store, row, digest, dict(made_from), input_hash)
+
+
+def _copy_lot(store: Store, judging: int, number: int, lot: Lot) -> str:
+    """Copy a sound lot from a judging with the same input and return the hash of its content; "" if there is none."""
+    db, of_lot = store.connection, "from judged_frame where judging = ? and lot = ?"
+    found = db.execute(
+        "select judging, lot, output from judged_lot join judging on judging.id = judging "
+        f"where judged_lot.input = ? and not {_UNFINISHED} order by judging desc limit 1",
+        (lot.input,),
+    ).fetchone()
+    if not lot.input or found is None:
+        return ""
+    before, old, output = found
+    is_whole = f"{is_sound('judged_frame')} and (not own_marks or marks_digest is {checked_marks_digest()})"
+    if db.execute(f"select exists (select 1 {of_lot} and not ({is_whole}))", (before, old)).fetchone()[0]:
+        return ""
+    frame = "scan, result, name, verdict, own_marks, detail, decisions, marks_digest"
+    with store.writing():
+        db.execute(
+            f"insert into judged_frame (judging, lot, {frame}) select ?, ?, {frame} {of_lot}",
+            (judging, number, before, old),
+        )
+        db.execute(
+            f"insert into judged (judging, result, number, {MARKS}) select ?, result, number, {MARKS} "
+            f"from judged where judging = ? and result in (select result {of_lot} and own_marks)",
+            (judging, before, before, old),
+        )
+    return str(output)
+
+
+def _write_lot(store: Store, judging: int, number: int, frames: Iterable[CheckedResult]) -> str:
+    """Check the frames of a lot, store them, and return the hash of the content."""
+    hasher, left = hashlib.sha256(), iter(frames)
+    while some := list(islice(left, _AT_A_TIME)):  # no open transaction here: the checks may measure and store scans
+        with store.writing():
+            for frame in some:
+                hasher.update(_write_frame(store, judging, number, frame))
+    return hasher.hexdigest()
+
+
+def find_judging(store: Store, digest: str) -> Judging | None:
+    """Judging with that digest, None if there is none. Raises DamagedError where its row is damaged."""
+    query = f"select {is_sound('judging')}, id, digest, made_from, input from judging where digest = ?"
+    found = store.connection.execute(query, (digest,)).fetchone()
+    if found is None:
+        return None
+    is_whole, row, digest, made_from, input_hash = found
+    if not is_whole:
+        raise damaged_judging(store.path)
+    return Judging(store, row, digest, json.loads(made_from), input_hash)
+
+
+def latest(store: Store) -> Judging | None:
+    """Latest judging, None if there is none. Raises DamagedError where one is missing or damaged."""
+    check_judgings(store.connection, store.path)
+    found = store.connection.execute(
+        f"select digest from judging where not {_UNFINISHED} order by id desc limit 1"
+    ).fetchone()
+    if found is None:
+        return None
+    judging = find_judging(store, found[0])
+    if judging is None:  # the row exists, but the index of digests used for the lookup lacks it
+        raise damaged_judging(store.path)
+    return judging
+
+
+@contextmanager
+def stored_judging(path: Path, digest: str) -> Iterator[Judging | None]:
+    """Judging with that digest in a store; None where there is no such store or judging."""
+    if not digest or not path.exists():
+        yield None
+        return
+    with Store(path) as store:
+        yield find_judging(store, digest)
+
+
+def read_measurement(path: Path, digest: str = "") -> tuple[MeasuredScan, ...]:
+    """Scans of a store after the cross-scan checks, sorted by name. digest: of the judging; "" for the latest.
+
+    Raises InputError where there is no such store, or no judging in it.
+    """
+    return tuple(measured_scans(path, digest))
+
+
+def measured_scans(path: Path, digest: str = "", images: Collection[str] | None = None) -> Iterator[MeasuredScan]:
+    """Yield the scans of a store one by one; see `read_measurement`. images: only these; None for all."""
+    if not path.exists():
+        raise InputError(f"{path}: there is no such file. Run `reseau measure` first.")
+    with Store(path) as store:
+        judging = find_judging(store, digest) if digest else latest(store)
+        if judging is None:
+            raise InputError(
+                f"{path}: its scans have not passed the cross-scan checks. Run `reseau measure`, which continues."
+            )
+        yield from judging.scans(images)
+
+
+def _covariance(spread: Sequence[float | None], causes: str | None) -> tuple[float, float, float] | None:
+    """(col², row², col·row) elements of the covariance."""
+    # Values that are not finite are stored only in the JSON of the causes.
+    of_col, of_row, both = spread
+    if of_col is not None and of_row is not None and both is not None:
+        return of_col, of_row, both
+    if causes is None:
+        return None
+    (first, second), (_, third) = json.loads(causes)["sum"]
+    return float(first), float(third), float(second)
+
+
+def _write_frame(store: Store, judging: int, lot: int, frame: CheckedResult) -> bytes:
+    """Store the differences of a checked frame from its raw result, and return the stored content for hashing."""
+    db, measured = store.connection, json.loads(store.detail(frame.result))
+    now = scan_detail(frame.scan, measured["scan"])
+    changed = {key: value for key, value in now.items() if value != measured.get(key)}
+    detail = json.dumps(changed, ensure_ascii=False) if changed else None
+    rows = [mark_row(mark) for mark in frame.scan.frame.marks]
+    own_marks = rows != store.mark_rows(frame.result)
+    rows = rows if own_marks else []
+    scan, key = db.execute("select scan, fingerprint from result where id = ?", (frame.result,)).fetchone()
+    name, verdict = frame.scan.frame.image, str(scan_verdict(frame.scan))
+    db.execute(
+        "insert into judged_frame (judging, lot, scan, result, name, verdict, own_marks, detail, decisions) "
+        f"values ({places(9)})",
+        (judging, lot, scan, frame.result, name, verdict, own_marks, detail, frame.decisions),
+    )
+    db.executemany(
+        f"insert into judged (judging, result, number, {MARKS}) values ({places(15)})",
+        ((judging, frame.result, number, *row) for number, row in enumerate(rows)),
+    )
+    db.execute(
+        f"update judged_frame set marks_digest = {checked_marks_digest()} where judging = ? and scan = ?",
+        (judging, scan),
+    )
+    return json.dumps([name, key, detail, rows]).encode()
+
+
+class StoredFrame(NamedTuple):
+    """Frame that needs no look: its name, its scan's file and the row of its result."""
+
+    image: str
+    scan: str
+    result: int
+
+
+class StoredMarks:
+    """Marks of comparator.csv, unchanged since it was written from the store."""
+
+    def __init__(self, path: Path, digest: str) -> None:
+        self._path, self._digest = path, digest
+
+    @classmethod
+    def open(cls, path: Path, comparator: Path) -> "StoredMarks | None":
+        """Marks of a store. None where the file holds other marks, or either was changed since."""
+        with stored_judging(path, read_measurement_hash(comparator) if comparator.exists() else "") as judging:
+            if judging is None or not judging.is_written(comparator):
+                return None
+            judging.check()
+            is_whole = not damaged_frames(judging.store.connection, judging.row)
+            return cls(path, judging.digest) if is_whole else None
+
+    @contextmanager
+    def _judging(self) -> Iterator[Judging]:
+        with stored_judging(self._path, self._digest) as judging:
+            assert judging is not None
+            yield judging
+
+    @cached_property
+    def names(self) -> frozenset[str]:
+        """Names of all frames."""
+        with self._judging() as judging:
+            return frozenset(name for (name,) in judging.values("name"))
+
+    def rows(self, images: Collection[str]) -> list[ComparatorPoint]:
+        """Marks of some images, as in comparator.csv."""
+        with self._judging() as judging:
+            return list(comparator_points(judging.marks(images), judging.pitches_um()))
+
+    def scans(self, images: Collection[str]) -> Iterator[MeasuredScan]:
+        return measured_scans(self._path, self._digest, images)
+
+    @cached_property
+    def plain(self) -> tuple[StoredFrame, ...]:
+        """Frames that are reported only in totals: good ones in which, if they have targets, at least one is
+        observed."""
+        with self._judging() as judging:
+            rows = judging.store.connection.execute(_PLAIN, (judging.row, str(Verdict.GOOD)))
+            return tuple(StoredFrame(*row) for row in rows)
+
+    def plain_marks(self) -> Iterator[tuple[int, str, str, float | None, float | None]]:
+        """Row of the result, kind, status, column and row of each mark of the plain frames."""
+        plain = {frame.result for frame in self.plain}
+        with self._judging() as judging:
+            marks = judging.store.connection.execute(_MARKS, (judging.row, str(Verdict.GOOD)))
+            yield from (mark for mark in marks if mark[0] in plain)
+
+
+_PLAIN = """
+select name, uri, result from checked_frame where judging = ?1 and verdict = ?2 and result not in (
+    select result from checked_mark where judging = ?1 and kind <> 'fiducial'
+    group by result having not sum(status in ('measured', 'weak'))
+) order by name
+"""
+_MARKS = """
+select result, kind, status, col_px, row_px from checked_mark where judging = ? and verdict = ?
+"""

@@ -1,0 +1,106 @@
+"""Inputs of measurements and adjustments, by fingerprints: whether results are of other inputs than there are now."""
+
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from pipeline.archive.results_database import Store
+from pipeline.files.project_file import Project
+from pipeline.provenance import FileStates, Identity, fingerprint, hash_text, parts_hash
+from pipeline.results.comparator_file import ComparatorPoint
+
+MadeFrom = dict[str, str]
+
+# The names are used in messages: "is of other ... than there are now".
+CAMERAS, SETTINGS, SCAN, CAMERA = "cameras", "settings", "scan ", "camera "
+MARKS, POINTS, IMAGES, DISTANCES = "marks", "points", "images", "distances"
+DECISIONS = "decisions"
+PLACES = "points, orientations or lenses"
+
+# Fields of a project that are not settings; all others, including future ones, are.
+_FILES = {
+    "path", "cameras", "scans", "comparator", "output", "given_points", "given_images", "given_distances",
+    "images_path", "decisions", "decisions_cut_short",
+}  # fmt: skip
+_NO_MATTER = {"max_pixels", "crs"}
+# Fields of a camera that determine where its targets are expected, not what its marks look like.
+_LENS = {
+    "principal_distance_mm", "principal_point_mm", "principal_distance_sigma_mm", "principal_point_sigma_mm",
+    "distortion", "calibration",
+}  # fmt: skip
+_ORIGIN = {"path", "source"}
+
+
+def measured_from(project: Project) -> MadeFrom:
+    """Inputs of a measurement: every scan, what is sought in it, and the approximate values used to predict targets.
+    The latter do not change a measured mark, but determine which ones are found and how they are named."""
+    known, files = dict[str, Identity](), FileStates(project.path.resolve().parent)
+    if project.measurement_path.exists():
+        with Store(project.measurement_path) as store:
+            known = store.identities()
+    coordinates = {id: [prior and prior.value for prior in (p.X, p.Y, p.Z)] for id, p in project.object_points.items()}
+    places = [
+        coordinates,
+        project.given_points and project.given_points.normals,
+        project.given_images and project.given_images.exterior,
+        {camera.name: {name: getattr(camera, name) for name in _LENS} for camera in project.cameras.values()},
+        project.film,
+        *([project.given_images.part_of] if project.given_images and project.has_parts else []),
+    ]
+
+    return {
+        SETTINGS: fingerprint({name: value for name, value in _settings(project).items() if name != "adjust"}),
+        PLACES: fingerprint(places),
+        **({DECISIONS: project.decisions_hash} if project.decisions else {}),
+        **{
+            f"{CAMERA}{camera.name}": fingerprint(_fields_except(camera, _LENS | _ORIGIN))
+            for camera in project.cameras.values()
+        },
+        **{
+            f"{SCAN}{image}": hash_text(f"{_parts(path, known, files)} {project.image_camera(image).name}")
+            for image, path in project.scans.items()
+        },
+    }
+
+
+def adjusted_from(project: Project, marks: Sequence[ComparatorPoint]) -> MadeFrom:
+    """Inputs of an adjustment: the marks that are observations, the given values, and the settings."""
+    observations = sorted(
+        (mark.image, mark.kind, mark.point, *_numbers(mark)) for mark in marks if mark.status.is_observation
+    )
+    cameras = {name: [camera.camera(), camera.calibration, camera.frame_mm] for name, camera in project.cameras.items()}
+    return {
+        MARKS: fingerprint(observations),
+        CAMERAS: fingerprint(cameras),
+        POINTS: fingerprint([project.object_points, project.given_points and project.given_points.normals]),
+        IMAGES: fingerprint(project.given_images),
+        DISTANCES: fingerprint({fingerprint(given.distance) for given in project.given_distances}),
+        SETTINGS: fingerprint(_settings(project)),
+    }
+
+
+def _parts(path: Path, known: Mapping[str, Identity], files: FileStates) -> tuple[int, str]:
+    """Size of a scan's file and hash of its parts, read only where its state differs from that in the store."""
+    state = files.get(path)
+    found = known.get(state.uri)
+    is_known = found is not None and found.state == state
+    return state.bytes, found.parts_hash if found and is_known else parts_hash(path)
+
+
+def differing(made: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    """Names of the inputs that differ, or exist only in one of the two."""
+    return sorted(name for name in made.keys() | now.keys() if made.get(name) != now.get(name))
+
+
+def _numbers(mark: ComparatorPoint) -> tuple[Any, ...]:
+    assert mark.xy_mm is not None  # an observation has coordinates
+    return (*mark.xy_mm.tolist(), *(() if mark.sigma_mm is None else mark.sigma_mm.tolist()), mark.rho)
+
+
+def _settings(project: Project) -> dict[str, object]:
+    return _fields_except(project, _FILES | _NO_MATTER)
+
+
+def _fields_except(value: Any, names: Set[str]) -> dict[str, object]:
+    return {field.name: getattr(value, field.name) for field in fields(value) if field.name not in names}
