@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from projects import Capture, fiducial_tables, result_file, write_network_project, write_tables
 from real_data import DATA, needs
-from reference_cases import CASES, CAUSES, DROPPED, case_network
+from reference_cases import CASES, case_network
 from studies import parametrize_with_studies
 
 from adjust import Adjustment
@@ -25,7 +25,6 @@ from pipeline.opencv_check.check import check_against_opencv
 from pipeline.report import ReportData
 from pipeline.report.verdict import judge
 
-USUAL = ("F5-F9", "F7-F9")  # what is not left to the studies
 NAMES = sorted(path.stem for path in CASES.glob("*.json") if not path.stem.startswith("v_"))
 
 
@@ -53,46 +52,6 @@ def test_reference_case_through_files(name: str, tmp_path: Path) -> None:
             assert sigma == pytest.approx(expected["std_aposteriori"], rel=1e-6), parameter
         checked += 1
     assert checked == reference["unknowns"]
-
-
-@pytest.mark.parametrize(
-    "priors", [each if each in USUAL else pytest.param(each, marks=pytest.mark.study) for each in DROPPED]
-)
-@parametrize_with_studies("name", sorted(path.stem for path in CASES.glob("v_*.json")), quick=(0, 2))
-def test_singular_case_through_files(name: str, priors: str, tmp_path: Path) -> None:
-    """The number and the kinds of the null directions, from the case's own orientations as approximations."""
-    case = json.loads((CASES / f"{name}.json").read_text(encoding="utf-8"))
-    expected = case["expected_defects_by_dropped_pseudo_observations"][priors]
-    sigmas = {number: None if number in DROPPED[priors] else 1.0 for number in range(5, 10)}
-    case["input"]["fid_sigma"] = [[sigmas[5], sigmas[6]]] * len(case["input"]["fid_obs"])
-    case["input"]["io_sigma"][:3] = [sigmas[7], sigmas[8], sigmas[9]]
-    write_project(case, tmp_path)
-    write_images(case, tmp_path)
-    code = run(["adjust", str(tmp_path / "project.toml")])
-    result = result_file(tmp_path)
-    assert len(result["singular"]) == expected["total_defect"]
-    assert result["converged"] == (expected["total_defect"] == 0)
-    assert code == (1 if result["singular"] or result["warnings"] else 0)
-    datum, camera = np.split(np.array(result["singular"], dtype=object), [expected["object_datum_defect"]])
-    assert all("object space" in direction["cause"] and direction["remedy"] for direction in datum)
-    assert len(camera) == len(expected["directions"])
-    for direction, row in zip(camera, expected["directions"], strict=True):
-        assert CAUSES[row["lead"]] in direction["cause"]
-        assert direction["parameters"]
-        assert direction["remedy"]
-
-
-def write_images(case: dict[str, Any], folder: Path) -> None:
-    """images.csv with the orientations of the case's state, angles in degrees."""
-    state = case["state"]
-    rows = ["image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg"]
-    for image in sorted({row[0] for row in case["input"]["obs"]}):
-        angles = [np.rad2deg(state[f"EO{image}.{angle}"]) for angle in ("omega", "phi", "kappa")]
-        rows.append(",".join(map(str, [image, *(state[f"EO{image}.{axis}"] for axis in ("X0", "Y0", "Z0")), *angles])))
-    (folder / "images.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
-    project = folder / "project.toml"
-    text = project.read_text(encoding="utf-8")
-    project.write_text(text.replace("[object]", '[object]\nimages = "images.csv"'), encoding="utf-8")
 
 
 def full_name(parameter: str) -> str:
@@ -386,29 +345,6 @@ def test_fiducials_of_a_film_pair(kind: str, rms_um: Sequence[tuple[float, float
         v = [(row["vx_um"], row["vy_um"]) for row in result["residuals"] if row["image"] == image]
         assert np.sqrt((np.array(v) ** 2).mean(axis=0)) == pytest.approx(expected, abs=0.06)
     assert result["redundancy"] == 2 * (16 - {"affine": 6, "similarity": 4}[kind])
-
-
-@needs("film_numbers")
-def test_a_film_pair_on_its_ground_points(tmp_path: Path) -> None:
-    """Nine ground points of half a metre, four tie points: rays meet to 2 um, an eighth of a pixel; nothing else is
-    published."""
-    camera, project, marks = rc30("affine")
-    folder = FILM / "rc30_AR112_3574_3575"
-    rows = [
-        (row["image"], row["name"], "target", 0.016 * float(row["x_px"]), 0.016 * float(row["y_px"]), 0.005, 0.005)
-        for row in table(folder / "image_measurements.csv")
-    ]
-    points = "".join(
-        f"{row['name']},{row['X_m']},{row['Y_m']},{row['Z_m']},{'0.5,0.5,0.5' if row['X_m'] else ',,'}\n"
-        for row in table(folder / "points.csv")
-    )
-    result = adjusted_result(tmp_path, camera, project, [*marks, *rows], points)
-    assert result["redundancy"] == 42
-    groups = result["groups"]
-    assert max(groups["target"]["rms_x_um"], groups["target"]["rms_y_um"]) < 2.1
-    assert max(groups["control"]["rms_x_um"], groups["control"]["rms_y_um"]) < 0.07e6
-    heights = [result["images"][image]["exterior"]["Z0"]["value"] for image in ("3574", "3575")]
-    assert heights == pytest.approx([925.9, 925.4], abs=0.5)
 
 
 def rc30(kind: str) -> tuple[str, str, list[tuple[object, ...]]]:

@@ -1,18 +1,15 @@
 """adjustment.json and adjustment.npz: what is written is what was adjusted, and what is broken is said."""
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
-from itertools import product
 from pathlib import Path
 from typing import Any, NoReturn
 
 import made_up_calibration
 import numpy as np
 import pytest
-from networks import two_cameras
 
-from adjust import Adjustment, ObjectPoint, Parameter, Prior, adjust
+from adjust import Adjustment, ObjectPoint, Prior
 from adjust.quality.run import Residuals
 from pipeline import InputError, read_adjustment, write_adjustment
 from pipeline.results import covariance_file
@@ -215,24 +212,6 @@ def test_a_large_network_is_in_blocks(adjustment: Adjustment, path: Path, monkey
                     np.testing.assert_array_equal(matrix[: len(listed), : len(listed)], whole.select(listed))
                     assert not matrix[len(listed) :].any()
             assert arrays["point_names"].shape == (24, 3)
-
-
-def test_names_that_would_run_together_have_results_of_their_own(tmp_path: Path) -> None:
-    """Fiducial B.1 of camera A and fiducial 1 of camera A.B: each as under plain names."""
-    of: list[tuple[str, str, Callable[[str], str]]] = [("K", "A", "B.{}".format), ("W", "A.B", str)]
-    plain = adjust(*two_cameras(("K", "W"), (str, str), str, str))
-    other = adjust(*two_cameras(("A", "A.B"), ("B.{}".format, str), str, str))
-    write_adjustment(other, tmp_path / "adjustment.json")
-    cameras = file_content(tmp_path / "adjustment.json")["cameras"]
-    covariance = read_covariance(tmp_path / "adjustment.json")
-    assert covariance.parameters == other.parameters
-    for plain_name, name, mark in of:
-        for id, axis in product("12345", "xy"):
-            own, alike = Parameter.fiducial(plain_name, id, axis), Parameter.fiducial(name, mark(id), axis)
-            stored = cameras[name]["fiducials"][mark(id)][f"{axis}_mm"]
-            assert stored["value"] == plain.value(own)
-            assert stored["sigma"] == plain.sigma(own) > 0.0
-            assert covariance.select([alike])[0, 0] == pytest.approx(plain.sigma(own) ** 2, rel=1e-12)
 
 
 def test_a_check_is_read_as_it_was_written_and_a_wrong_value_refused_with_its_place(tmp_path: Path) -> None:
