@@ -111,23 +111,6 @@ def set_distortion(network: Network, distortion: Distortion) -> Network:
     return replace(network, cameras=(replace(network.cameras[0], distortion=distortion),))
 
 
-def test_brown_is_torlegards_without_r0() -> None:
-    """The planar board with the same polynomial under Brown's names: the reference's result again."""
-    case = load("iv_planar_board")
-    names = {"k1": "k3", "k2": "k5", "k3": "k7", "p1": "p1", "p2": "p2"}
-    network = case_network(case)
-    given = network.cameras[0].distortion.parameters
-    result = adjust_network(
-        case, set_distortion(network, Distortion("brown", {brown: given[name] for brown, name in names.items()}))
-    )
-    assert result.vpv == pytest.approx(case["result"]["vpv"], rel=1e-9)
-    for brown, name in names.items():
-        reference = case["result"]["parameters"][f"IO.{name}"]
-        position = result.index(f"IO.{CAMERA}.{brown}")
-        assert result.values[position] == pytest.approx(reference["value"], abs=1e-7 * reference["std_apriori"])
-        assert np.sqrt(result.cofactor.variances[position]) == pytest.approx(reference["std_apriori"], rel=1e-7)
-
-
 def test_opencvs_own_calibration_of_the_planar_board() -> None:
     """The `opencv` family on OpenCV's observations: its parameters, its standard deviations, its rms per point."""
     case = load("iv_planar_board")
@@ -332,21 +315,6 @@ def test_a_network_with_seven_digits_comes_to_the_same_result(sigma: float, datu
     for name in ("PT.3.X", "EO.f1.X0", "EO.f2.Y0"):
         axis = "XYZ".index(name.rsplit(".", 1)[1][0])
         assert there.value(name) - FAR[axis] == pytest.approx(here.value(name), abs=2e-9)
-
-
-def test_given_approximations_are_reduced_too() -> None:
-    network, start = small_network()
-    network, start = round_network(network), raised(start)
-    here = adjust(network, start)
-    there = adjust(shifted(network, FAR), Reduction(-FAR).approximations(start))
-    assert here.converged
-    assert (there.termination, there.iterations) == ("converged", here.iterations)
-
-
-def raised(start: Approximations) -> Approximations:
-    """With stations some centimetres off."""
-    exterior = {name: values + np.array([0.02, 0.0, 1.5, 0.0, 0.0, 0.0]) for name, values in start.exterior.items()}
-    return replace(start, exterior=exterior)
 
 
 def test_fixed_coordinates_come_back_as_they_were_given() -> None:

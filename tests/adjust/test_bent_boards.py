@@ -10,13 +10,11 @@ from networks import digital_network, view_rows
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from adjust import Adjustment, AdjustmentError, Camera, Distortion, Parameter, Prior, adjust, approximate
+from adjust import Adjustment, AdjustmentError, Camera, Distortion, Prior, adjust, approximate
 from adjust.functional_model.board import disk_directions
 from adjust.model_selection.model_choice import choose
-from adjust.problem.condition_equations import compute, computed_observations, derivatives
 from adjust.problem.estimates import adjusted_places
 from adjust.problem.network import Board, Network, ObjectPoint
-from adjust.problem.problem import number
 
 Array = NDArray[np.float64]
 
@@ -83,25 +81,6 @@ def test_a_board_lies_anyhow_in_the_object(turn: tuple[float, float, float]) -> 
     places = adjusted_places(found, [f"p{k}" for k in range(70)])
     np.testing.assert_allclose(places, bent_board() @ turned.T, atol=1e-6)
     assert found.vpv < 1e-10
-
-
-def test_derivatives_by_the_bends_are_differences_of_the_functions() -> None:
-    network = make_network(None)
-    problem = number(network, approximate(network))
-    state = problem.start()
-    computed = compute(problem, state)
-    assert computed is not None
-    at = derivatives(problem, state, computed)
-    for name in ("bend_x", "bend_y"):
-        position = problem.unknowns.parameters.index(Parameter.board("board", name))
-        step = np.zeros(len(problem.unknowns))
-        step[position] = 1e-3
-        numeric = computed_observations(problem, problem.step_state(state, step))
-        below = computed_observations(problem, problem.step_state(state, -step))
-        assert numeric is not None
-        assert below is not None
-        by_bend = -(at.by_unknowns * (problem.columns == position)[:, None, :]).sum(axis=2)
-        np.testing.assert_allclose(by_bend, (numeric - below) / 2e-3, atol=1e-8)
 
 
 def test_the_centre_of_gravity_of_an_imaged_disk() -> None:

@@ -181,30 +181,6 @@ def test_ray_tracing_through_spherical_layers(degrees: float, station_m: float, 
     assert 153e3 * abs(tangent - np.tan(nadir)) < (0.02 if degrees < 60.0 else 0.25)
 
 
-def test_curvature_is_spherical_geometry() -> None:
-    """Points placed on the sphere by their geocentric coordinates, to a micrometre over 40 km."""
-    station = np.array([1200.0, -700.0, 5000.0])
-    xyz = np.array([[1200.0, -700.0, 300.0], [1250.0, -700.0, 0.0], [9000.0, 12000.0, 1500.0], [40000.0, 0.0, -20.0]])
-    vectors = sight_vectors(LineOfSight(curvature=True), station, xyz).vector
-    for vector, point in zip(vectors, xyz, strict=True):
-        plan = point[:2] - station[:2]
-        arc = np.hypot(*plan) / EARTH_RADIUS_M
-        azimuth = np.arctan2(plan[1], plan[0])
-        direction = np.array([np.sin(arc) * np.cos(azimuth), np.sin(arc) * np.sin(azimuth), np.cos(arc)])
-        geocentric = (EARTH_RADIUS_M + point[2]) * direction - [0.0, 0.0, EARTH_RADIUS_M + station[2]]
-        np.testing.assert_allclose(vector, geocentric, atol=1e-6)
-        assert vector[2] - (point[2] - station[2]) == pytest.approx(-(plan @ plan) / (2 * EARTH_RADIUS_M), rel=5e-4)
-
-
-def test_the_unit_of_the_object_does_not_matter() -> None:
-    station, xyz = np.array([0.0, 0.0, 3000.0]), np.array([[900.0, 1500.0, 200.0]])
-    metres = sight_vectors(BENT, station, xyz)
-    millimetres = sight_vectors(replace(BENT, unit_m=1e-3), 1e3 * station, 1e3 * xyz)
-    np.testing.assert_allclose(millimetres.vector, 1e3 * metres.vector, rtol=1e-12)
-    np.testing.assert_allclose(millimetres.by_point, metres.by_point, rtol=1e-9)
-    np.testing.assert_allclose(millimetres.by_station, metres.by_station, rtol=1e-9)
-
-
 @pytest.mark.parametrize("setting", [BENT, replace(BENT, curvature=False), replace(BENT, refraction=False)])
 def test_derivatives(setting: LineOfSight) -> None:
     """Against differences: near the nadir, far away, above the tropopause, at the height of the station."""

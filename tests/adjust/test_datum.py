@@ -4,15 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from networks import Truth, rotation, simulated
+from networks import Truth, simulated
 from numpy.typing import NDArray
 from reference_cases import case_approximations, case_network, load
 
-from adjust import Adjustment, AdjustmentError, Prior, approximate
-from adjust.functional_model.rotation import angles_from_rotation
-from adjust.problem.network import EXTERIOR_NAMES, Exterior, Image, Network, ObjectPoint
-from adjust.problem.problem import number
-from adjust.rank_defect.datum import object_datum
+from adjust import Adjustment, AdjustmentError
+from adjust.problem.network import EXTERIOR_NAMES, Exterior, Image, Network
 from adjust.solution.adjustment import Datum, Options, adjust
 
 Array = NDArray[np.float64]
@@ -69,47 +66,6 @@ def test_chosen_coordinates_are_held_where_they_are_given() -> None:
         point, axis = name.split(".")
         given = getattr(network.point_by_id[point], axis).value
         assert (result.value(f"PT.{name}"), result.sigma(f"PT.{name}")) == (given, 0.0)
-
-
-def best_rms(model: Array, given: Array) -> float:
-    """The rms of points from where the best similarity transformation in closed form (Umeyama 1991) brings others."""
-    left, right = model - model.mean(axis=0), given - given.mean(axis=0)
-    u, singular, vt = np.linalg.svd(right.T @ left)
-    sign = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
-    scale = (singular * sign).sum() / (left**2).sum()
-    off = right - scale * left @ (u * sign @ vt).T
-    return float(np.sqrt((off**2).sum(axis=1).mean()))
-
-
-@pytest.mark.parametrize("turn", [None, 0.0, 2.8])
-@pytest.mark.parametrize("unknown", [0, 4])
-def test_a_free_network_lies_nearest_to_the_given_coordinates(turn: float | None, unknown: int) -> None:
-    """Coordinates known to some metres: not to intersections that orientations, turned by so much or none, give."""
-    rng = np.random.default_rng(21)
-    truth = Truth()
-    network, start = simulated(rng, truth, point_sigma=np.inf, free={"k3": np.inf})
-    rough = np.array([start.points[point.id] for point in network.points]) + rng.normal(0.0, 3.0, (12, 3))
-    points = tuple(
-        ObjectPoint(point.id, *(Prior(float(value), np.inf) if row >= unknown else None for value in xyz))
-        for row, (point, xyz) in enumerate(zip(network.points, rough, strict=True))
-    )
-    images = network.images
-    if turn is not None:
-        turned = rotation(0.0, 0.0, turn)  # of the ground, in which stations and attitudes are given
-        exteriors = [
-            np.array([*(turned.T @ station) + 30.0, *angles_from_rotation(rotation(*attitude) @ turned)])
-            for station, attitude in zip(np.array(truth.stations), truth.attitudes, strict=True)
-        ]
-        images = tuple(replace(image, exterior=Exterior(each)) for image, each in zip(images, exteriors, strict=True))
-    network = replace(network, points=points, images=images)
-    begun = approximate(network)
-    free, minimal = (adjust(network, begun, Options(datum=datum)) for datum in ("free", "minimal"))
-    model = np.array([[free.value(f"PT.{point.id}.{axis}") for axis in "XYZ"] for point in points[unknown:]])
-    rms = np.sqrt(((model - rough[unknown:]) ** 2).sum(axis=1).mean())
-    assert rms == pytest.approx(best_rms(model, rough[unknown:]), rel=1e-9)
-    values, sigmas = camera_part(minimal)
-    np.testing.assert_allclose((camera_part(free)[0] - values) / np.where(sigmas > 0, sigmas, 1.0), 0.0, atol=1e-8)
-    np.testing.assert_allclose(camera_part(free)[1], sigmas, rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -184,18 +140,6 @@ def test_a_coordinate_that_is_given_needs_no_holding() -> None:
     network, start = simulated(np.random.default_rng(5), point_sigma=0.05)
     with pytest.raises(AdjustmentError, match="X is given with the standard deviation"):
         adjust(network, start, Options("minimal", ("0.X",)))
-
-
-def test_a_generator_moves_a_point_at_the_fields_root_mean_square_distance_by_one_unit() -> None:
-    network, start = simulated(np.random.default_rng(5), point_sigma=np.inf)
-    problem = number(network, start)
-    datum = object_datum(problem, problem.start())
-    points = np.array(list(start.points.values()))
-    spread = np.sqrt(((points - points.mean(axis=0)) ** 2).sum() / len(points))
-    assert datum.extent == pytest.approx(spread, rel=1e-9)
-    positions = np.array([problem.unknowns.point[name] for name in start.points])
-    motions = datum.generators[positions, 6]
-    np.testing.assert_allclose(motions, (points - points.mean(axis=0)) / spread, atol=1e-9)
 
 
 @pytest.mark.parametrize("carrying", [(), ("1", "5", "7")], ids=["all", "some"])

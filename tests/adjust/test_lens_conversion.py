@@ -117,18 +117,6 @@ def test_a_frame_without_an_image_is_refused() -> None:
         convert_lens(Lens(Distortion("opencv"), INTERIOR, np.zeros(16)), Distortion("brown"), CORNERS_MM, ("a1",))
 
 
-@pytest.mark.parametrize("name", list(LENSES))
-def test_a_lens_is_found_from_exact_images(name: str) -> None:
-    """From start values that the points give, with nothing known of the lens."""
-    network = lens_network(name)
-    found = adjust(network, approximate(network))
-    assert found.converged
-    assert found.vpv < 1e-10
-    c, values = LENSES[name]
-    for each, value in (values | {"c": c, "x0": 0.12, "y0": -0.07}).items():
-        assert abs(found.value(f"IO.L.{each}") - value) < 1e-4 * found.sigma(f"IO.L.{each}") / found.sigma0, each
-
-
 @parametrize_with_studies("name", list(LENSES))
 def test_nothing_but_the_points_has_to_be_known(name: str) -> None:
     """Neither c nor the principal point; of the fisheye points up to 80 degrees off the axis."""

@@ -1,6 +1,6 @@
 """The elimination, by blocks and by fronts, against dense solutions of the same rows."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -100,52 +100,6 @@ def test_the_condition_is_not_squared() -> None:
     block = single(np.array([2, 3]), np.array([0, 1]), matrix, matrix @ truth)
     factor = eliminate([block], 4, np.zeros(4), np.zeros(4))
     np.testing.assert_allclose(factor.solution, truth[[2, 3, 0, 1]], atol=1e-4)
-
-
-@pytest.fixture
-def cost(monkeypatch: pytest.MonkeyPatch) -> Callable[[Network, Approximations], float]:
-    """Of an adjustment, a step: rows times columns squared of every factorisation, counted and not timed."""
-    costs: list[float] = []
-    original = sparse_factor.qr_triangle
-
-    def counted(rows: Array) -> Array:
-        costs.append(rows.size * rows.shape[-1])
-        return original(rows)
-
-    monkeypatch.setattr(elimination, "qr_triangle", counted)
-    monkeypatch.setattr(sparse_factor, "qr_triangle", counted)
-
-    def log_determinant(network: Network, start: Approximations) -> float:
-        costs.clear()
-        result = adjust(network, start)
-        assert result.converged
-        return sum(costs) / result.iterations
-
-    return log_determinant
-
-
-def test_the_cost_is_linear_in_the_images(cost: Callable[[Network, Approximations], float]) -> None:
-    """With known points."""
-
-    def images(count: int) -> tuple[Network, Approximations]:
-        rng = np.random.default_rng(4)
-        angles = np.linspace(0.0, 6.0, count)
-        truth = Truth(
-            stations=tuple((400 * np.cos(a), 400 * np.sin(a), 1500.0) for a in angles),
-            attitudes=tuple((-0.25 * np.sin(a), 0.25 * np.cos(a), a) for a in angles),
-            mirrored=(False,) * count,
-        )
-        return simulated(rng, truth, points=field_points(rng, 8), noise=False)
-
-    assert cost(*images(24)) < 2.2 * cost(*images(12))
-
-
-def test_the_cost_is_linear_in_unknown_points(cost: Callable[[Network, Approximations], float]) -> None:
-    def points(count: int) -> tuple[Network, Approximations]:
-        rng = np.random.default_rng(4)
-        return simulated(rng, points=field_points(rng, count), point_sigma=0.05, noise=False)
-
-    assert cost(*points(160)) < 2.2 * cost(*points(80))
 
 
 @pytest.mark.parametrize(("count", "own"), [(18, {0, 3}), (9, {12})])
@@ -358,24 +312,6 @@ def test_variances_along_a_line_are_those_of_its_differences(
     np.testing.assert_allclose(factor.variances(), weight**-2 + 0.5 * np.arange(count), rtol=1e-9)
     (roots,) = row_roots(factor, blocks)
     np.testing.assert_allclose(roots @ roots.swapaxes(1, 2), np.full((count - 1, 2, 2), 0.5), atol=1e-9)
-
-
-@pytest.mark.parametrize("cost", [0.0, 30.0, 300.0, 3000.0])
-def test_what_a_front_leaves_is_held_by_the_next_one_that_it_meets(
-    cost: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Also where neighbours in the order that do not meet are put together."""
-    monkeypatch.setattr(fronts, "FRONT_COST", cost)
-    rng = np.random.default_rng(3)
-    for _ in range(20):
-        met = csr_array((rng.random((60, 25)) < 0.12).astype(float))
-        meeting = csr_array(met.T @ met)
-        order = fronts.band_order(meeting)
-        of_network = make_fronts(meeting[order][:, order], rng.integers(1, 4, 25), 2)
-        for front in of_network:
-            if len(front.after):
-                next_one = of_network[int(of_network.home(front.after))]
-                assert np.isin(front.after, next_one.columns).all()
 
 
 @pytest.mark.usefixtures("finely")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from networks import Name, Truth, simulated, two_cameras, with_errors
 
-from adjust import Camera, Distortion, Exterior, Image, Network, ObjectPoint, Prior
+from adjust import Distortion, Exterior, Network, ObjectPoint, Prior
 from adjust.errors import AdjustmentError, DatumError
 from adjust.problem.parameter import (
     CODES,
@@ -155,19 +155,6 @@ def test_bad_values_are_refused_when_they_are_made() -> None:
         Distortion("fisheye")
     with pytest.raises(ValueError, match="r0 must be"):
         Distortion("torlegard", r0_mm=-80.0)
-
-
-def test_a_single_resection() -> None:
-    """One image, everything but its orientation fixed: the smallest network there is."""
-    truth = Truth(distortion={})
-    network, start = simulated(np.random.default_rng(2), truth, "none")
-    camera = Camera("K", Prior(truth.c), Prior(truth.x0), Prior(truth.y0))
-    observations = network.observations
-    one = rows(replace(network, cameras=(camera,)), [i for i, name in enumerate(observations.image) if name == "f1"])
-    result = adjust(replace(one, images=(Image("f1", "K", "none"),)), start)
-    assert result.converged
-    assert (result.conditions, result.unknowns) == (24, 6)
-    assert result.value("EO.f1.Z0") == pytest.approx(truth.stations[1][2], abs=5 * result.sigma("EO.f1.Z0"))
 
 
 ROOT = Path(__file__).parents[2]

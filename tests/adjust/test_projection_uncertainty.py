@@ -250,35 +250,6 @@ def test_prediction_errors_are_those_of_adjustments_without_a_fold() -> None:
             assert predicted[names.index(name)] == pytest.approx(squares.mean(), rel=0.01)
 
 
-@pytest.mark.study
-def test_it_holds_for_independent_errors_and_for_errors_that_pictures_share() -> None:
-    """Shared is a shift of a picture's points along x that grows with y², which no orientation takes up.
-
-    The jackknife overestimates a variance rather than not (Efron and Stein 1981), more so over twelve pictures.
-    """
-    rng = np.random.default_rng(8)
-    truth = np.array([BOARD_TRUTH[each] for each in QUANTITIES])
-    claimed, clustered = [], []
-    for shared in (0.0, 1.0):
-        misses, model, robust = [], [], []
-        for _ in range(60):
-            network = board_network(rng, 12, 4e-4)
-            own = np.repeat(rng.normal(size=12), 54)
-            xy_mm = network.observations.xy_mm.copy()
-            xy_mm[:, 0] += shared * 2e-3 * own * (xy_mm[:, 1] + 1.2) ** 2
-            result = adjust(replace(network, observations=replace(network.observations, xy_mm=xy_mm)))
-            misses.append(np.array(values(result)) - truth)
-            model.append([result.sigma(Parameter.interior("desk", each)) for each in QUANTITIES])
-            robust.append(scatter(result))
-        rms = np.sqrt(np.mean(np.square(misses), axis=0))
-        claimed.append(float(np.mean(rms / np.sqrt(np.mean(np.square(model), axis=0)))))
-        clustered.append(float(np.mean(rms / np.sqrt(np.mean(np.square(robust), axis=0)))))
-    assert 0.85 < claimed[0] < 1.15
-    assert 0.65 < clustered[0] < 1.15
-    assert claimed[1] > 1.6
-    assert 0.65 < clustered[1] < 1.15
-
-
 def test_few_pictures_tell_no_scatter() -> None:
     result = adjust(board_network(np.random.default_rng(1), 4, 5e-4))
     assert result.cluster_covariance_of([Parameter.interior("desk", "c")]) is None

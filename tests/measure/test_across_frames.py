@@ -127,15 +127,6 @@ def test_one_frame_names_the_mark_that_alone_is_off() -> None:
     assert known.sigmas_px[Cause.GIVEN_PLACES] == pytest.approx(3.0 / np.sqrt(2), rel=0.1)
 
 
-def test_the_projects_film_decides_how_far_off_a_mark_may_be() -> None:
-    rng = np.random.default_rng(4)
-    layout = make_layout(EIGHT)
-    (frame,) = make_frames(layout, 1, rng)
-    bent = shift_mark(frame, 1, (3.0, 0.0))
-    pitches = [(1000 / PX_PER_MM, 1000 / PX_PER_MM)]
-    assert weak(check_frames([bent], layout, pitches, BelievedFilm(0.04)).frames) == set()
-
-
 @pytest.mark.parametrize("count", [1, 4])
 def test_a_bent_frame_is_a_problem_of_the_frame(count: int) -> None:
     rng, layout = np.random.default_rng(7), make_layout(EIGHT)

@@ -214,19 +214,6 @@ def test_lines_of_a_board_are_evenly_spaced_under_one_homography(left_out: int |
     assert is_even(grid, (640, 480)) == (left_out is None)
 
 
-@pytest.mark.parametrize("left_out", [None, 2])
-def test_the_lines_of_a_board_are_evenly_spaced_in_a_fisheye(left_out: int | None) -> None:
-    matrix, lens = np.array([[230.0, 0, 325], [0, 231, 236], [0, 0, 1]]), np.array([0.05, -0.01, 0.004, -0.001])
-    points = np.stack([*np.meshgrid(25.0 * np.arange(9), 25.0 * np.arange(6)), np.zeros((6, 9))], axis=-1)
-    turn = np.array([0.45, -0.2, 0.0])
-    shift = np.array([-22.0, 28.0, 175.5]) - cv2.Rodrigues(turn)[0] @ [100.0, 62.5, 0.0]
-    places = cv2.fisheye.projectPoints(points.reshape(1, -1, 3), turn, shift, matrix, lens)[0]
-    grid: Array = np.asarray(places, float).reshape(6, 9, 2)
-    if left_out is not None:
-        grid = np.delete(grid, left_out, axis=1)
-    assert is_even(grid, (640, 480)) == (left_out is None)
-
-
 def test_a_pattern_grows_to_where_it_ends() -> None:
     """From a part of its lines; a line along its border is none of it, and one that the picture cuts is no end."""
     spec = ChessboardSpec(6, 5, 24.0)

@@ -20,7 +20,6 @@ from drawn import (
     paint,
     pixel_from_camera,
     pose_of,
-    written_scan,
 )
 from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
@@ -29,7 +28,6 @@ from measure import Code, FiducialOptions, Status
 from measure.geometry import POSES
 from measure.marks.shapes import (
     Disk,
-    FiducialLayout,
     MarkShape,
     Part,
     dot,
@@ -37,7 +35,6 @@ from measure.marks.shapes import (
     polygon,
     ring_cross,
 )
-from measure.marks.templates import cut, learn_template
 
 
 @parametrize_with_studies("pose", POSES, quick=(0, 7))
@@ -58,31 +55,6 @@ def test_like_marks_leave_the_pose_assumed_and_say_so(tmp_path: Path) -> None:
     assert (result.pose.name, result.pose.decided) == ("0", False)
     assert "alike" in result.pose.evidence[0]
     assert_right(result, ALIKE, matrix)
-
-
-@pytest.mark.study
-@pytest.mark.parametrize(("drawn", "decided"), [(ALIKE, False), (NUMBERED, True)])
-def test_learned_marks_tell_the_pose_only_where_they_differ(
-    drawn: FiducialLayout, decided: bool, tmp_path: Path
-) -> None:
-    """Somebody clicked elsewhere at each: under another pose they lie elsewhere, which is no evidence, and their places
-    are certain only where their names are."""
-    matrix, pose = pixel_from_camera("0"), "90m"
-    learned = []
-    with written_scan(frame_picture(drawn, matrix, seed=2), tmp_path, "another.tif") as scan:
-        for mark, off in zip(drawn.marks, ((0.12, -0.1), (0.05, 0.0), (-0.06, 0.13), (0.0, 0.0)), strict=True):
-            xy = (mark.xy_mm[0] + off[0], mark.xy_mm[1] + off[1])
-            template = learn_template([cut(scan, np.column_stack([matrix[:, :2], matrix @ (*xy, 1.0)]), 3.2)], 3.2)
-            learned.append(replace(mark, xy_mm=xy, mark=template))
-    given = replace(drawn, marks=tuple(learned))
-    result = measured(frame_picture(drawn, pixel_from_camera(pose)), given, tmp_path)
-    assert result.pose is not None
-    assert result.pose.decided is decided, result.pose.evidence
-    if decided:
-        assert result.pose.name == pose
-        assert_right(result, given, pixel_from_camera(pose))
-    else:
-        assert {mark.status for mark in result.marks} == {Status.WEAK}
 
 
 def test_writing_next_to_one_mark_names_no_pose(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 
 from measure import MarkFit, MatchOptions, ScanWindow, match
-from measure.marks.shapes import Mark, MarkShape, MarkTemplate, cross, dot, polygon, ring_cross, ring_dot
+from measure.marks.shapes import Mark, MarkShape, cross, dot, polygon, ring_cross, ring_dot
 from measure.matching.window import read_window
 from measure.tone.curve import Tone
 
@@ -177,24 +177,6 @@ def test_sigmas_hold_in_correlated_grain(grain_px: float) -> None:
         error = fit.center_px - place[:, 2]
         ratios.append(error / np.sqrt(np.diag(fit.covariance_px2)))
     assert 0.85 < np.sqrt(np.mean(np.square(ratios))) < 1.25  # 72 numbers: 8.3 % standard deviation
-
-
-def test_a_chip_is_matched_by_the_same_core() -> None:
-    rng = np.random.default_rng(19)
-    mark = MARKS["ring-cross"]
-    chip = brute_picture(mark, placed(SCALE, (20.0, 20.0)), 41, 41, 0.8)
-    template = MarkTemplate(chip, 100.0, (20.0, 20.0))
-    place = placed(SCALE, (27.37, 26.81))
-    shown = brute_picture(mark, place, 55, 55, 0.8)
-    errors = []
-    for _ in range(12):
-        grey = GROUND + CONTRAST * shown + rng.normal(0, 10, shown.shape)
-        options = MatchOptions(freedom="shift", estimate_blur=False)
-        fit = match(ScanWindow(grey), template, placed(SCALE, (27.0, 27.0)), options)
-        assert fit.converged, fit.reason
-        errors.append(fit.center_px - place[:, 2])
-    assert np.abs(np.mean(errors, axis=0)).max() < 0.006
-    assert np.sqrt(np.mean(np.square(errors))) < 0.015
 
 
 def test_an_ellipse_takes_five_parameters() -> None:

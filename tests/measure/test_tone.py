@@ -191,28 +191,6 @@ def test_a_picture_that_contradicts_the_others_hardly_moves_the_curve() -> None:
     assert np.sqrt(off @ np.linalg.solve(together.tone.covariance, off)) < 3
 
 
-@pytest.mark.study
-def test_what_is_wrong_alike_in_all_pictures_of_a_scanner_does_not_average() -> None:
-    """By simulation: twenty pictures each say the curve with noise of their own, and all of them the same wrong of it;
-    five of them are the scan's own, fifteen of other scans."""
-    rng = np.random.default_rng(4)
-    variance, squares = 0.16, []
-    for _ in range(60):
-        truth, wrong = rng.standard_normal(5), np.sqrt(variance) * rng.standard_normal(5)
-        each = [
-            replace(tone_information(truth + wrong + 0.1 * rng.standard_normal(5), 100.0), common_variance=variance)
-            for _ in range(20)
-        ]
-        at_once, in_turn = (
-            Tone.unknown().estimate(each).tone,
-            Tone.unknown().include_information(each[5:]).estimate(each[:5]).tone,
-        )
-        np.testing.assert_allclose(in_turn.mean, at_once.mean, atol=1e-9)
-        error = at_once.mean - truth
-        squares.append(error @ np.linalg.solve(at_once.covariance, error) / 5)
-    assert np.mean(squares) == pytest.approx(1.0, abs=0.25)  # as if each were wrong by itself: 16
-
-
 def test_many_scans_in_jpeg_tell_the_curve_no_better_than_rounding_lets_them() -> None:
     """The same wedge of 8 bits, as if sixteen scans showed it so: what noise makes of it averages, rounding by 12 grey
     values does not."""
