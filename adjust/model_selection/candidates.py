@@ -19,7 +19,6 @@ from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.scanner import is_left
 from adjust.functional_model.transformation import marks_needed
-from adjust.model_selection.cross_validation import CrossValidation
 from adjust.model_selection.scanner_choice import network_with_terms
 from adjust.problem.network import Network, Transformation
 from adjust.problem.observations import Calibration
@@ -158,6 +157,17 @@ def lenses(network: Network, transformation: Transformation, with_sets: bool) ->
 
 
 DECISIVE = 10.0  # difference of AICc above which the worse model has essentially no support (Burnham and Anderson)
+
+
+@dataclass(frozen=True)
+class CrossValidation:
+    """Prediction errors of the rays (image points) of left-out points."""
+
+    rms_um: float  # rms per axis, in the comparator
+    # the same in standard deviations of the observations; 1 for a perfect model, apart from the errors of the
+    # prediction itself
+    sigmas: float
+    rays: int  # number of predicted rays
 
 
 @dataclass(frozen=True)

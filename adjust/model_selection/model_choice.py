@@ -1,20 +1,24 @@
 """Model selection: compare film transformations, distortion families and scanner terms on the same observations.
 
 Every candidate is adjusted with the same weights. Nested models are compared by the F-test, any two by Akaike's
-criterion, and all by their prediction of points that were left out (`adjust.model_selection.cross_validation`). The
-simplest model that no richer one improves significantly is chosen.
+criterion, and all by their prediction of points that were left out (`cross_validate`). The simplest model that no
+richer one improves significantly is chosen.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.sparse import csr_array
 
+from adjust.array_types import Array, Indices
 from adjust.errors import AdjustmentError
 from adjust.initial_values.approximations import approximate
+from adjust.linear_algebra.small_matrices import applied, inverse, product
 from adjust.model_selection.candidates import (
     Bends,
     Candidate,
+    CrossValidation,
     Model,
     Nested,
     given_model,
@@ -26,15 +30,19 @@ from adjust.model_selection.candidates import (
     transformations,
     verdict,
 )
-from adjust.model_selection.cross_validation import cross_validate, folds
 from adjust.model_selection.scanner_choice import choose_bends
 from adjust.problem.network import Approximations, Network
-from adjust.problem.parameter import description
+from adjust.problem.parameter import description, object_coordinate
+from adjust.problem.problem import ABSENT
+from adjust.quality.run import UNCHECKED
 from adjust.quality.tested import NO_WEIGHT
 from adjust.rank_defect.datum import held_as_known
 from adjust.solution.adjustment import Options, adjust
 from adjust.solution.result import Adjustment
 
+FEWEST_FOLDS, MOST_FOLDS, RAYS_AT_ONCE = 5, 20, 300  # more folds than the fewest have about so many rays each
+FEWEST_KNOWN = 10  # fewer known points than this stay in every fit: they define the datum
+UM_PER_MM = 1000.0
 ROUNDS = 3  # rounds of selecting distortion, scanner terms and transformation in turn
 
 Progress = Callable[[str, int], None]
@@ -182,7 +190,7 @@ class _Fits:
             result.redundancy,
             result.vpv,
             result.sigma0,
-            cross_validate(result, folds(result.network, self.options), self.options),
+            cross_validate(result, self.options),
             _correlated(result),
             result.warnings,
         )
@@ -204,6 +212,76 @@ def _start(model: Model, near: Adjustment) -> Approximations:
     """Values of a similar model, with its distortion if that is of the same family."""
     same = near.network.cameras[0].distortion.family == model.family
     return near.approximations if same else replace(near.approximations, distortion={})
+
+
+def folds(network: Network, options: Options) -> tuple[frozenset[str], ...]:
+    """Divide the object points into folds that are left out together; of very many folds only the first are returned.
+
+    Points in distances or in the datum stay in all fits, and so do known points if there are few.
+    """
+    held = {name for distance in network.distances for name in (distance.start, distance.end)}
+    held |= {object_coordinate(text).id for text in options.datum_coordinates} | set(options.datum_points)
+    given = network.coordinates(firm=True)
+    known = {point for point in network.observed_points if not np.isnan(given[point]).all()}
+    if len(known) < FEWEST_KNOWN:
+        held |= known
+    free = sorted(network.observed_points - held)
+    count = max(FEWEST_FOLDS, int((~network.observations.is_fiducial).sum()) // RAYS_AT_ONCE)
+    return tuple(frozenset(free[i::count]) for i in range(min(count, MOST_FOLDS)) if free[i::count])
+
+
+def cross_validate(adjustment: Adjustment, options: Options) -> CrossValidation | None:
+    """Compute the prediction errors of an adjusted model over all folds.
+
+    Rays are predicted from the adjustment without the rays of their fold: of all points with given coordinates, and of
+    every second ray of the other points, which the remaining rays must determine; then of the others. With v the
+    residuals in unit weight of the rays left out and V their cofactor matrix, the prediction errors are V^-1 v, as in
+    data snooping. Returns None where a fold determines something that the others do not, or nothing is predicted.
+    """
+    run, errors, errors_mm = adjustment.run, list[Array](), list[Array]()
+    numbering, matrix, right = run.numbering, run.end.rows.matrix, run.end.rows.right
+    back = product(inverse(run.end.by_observation), run.end.rows.root)
+    for rows in left_out_rows(adjustment.network, options):
+        numbers = np.broadcast_to(numbering.numbers[numbering.problem.columns[rows]][:, None], matrix[rows].shape)
+        pairs = np.broadcast_to(np.arange(2 * len(rows)).reshape(-1, 2, 1), numbers.shape)
+        free = numbers != ABSENT
+        entries = matrix[rows][free], (pairs[free], numbers[free])
+        functions = csr_array(entries, shape=(2 * len(rows), len(numbering.free)))
+        cofactor = np.eye(2 * len(rows)) - run.factor.function_cofactor(functions)
+        try:
+            np.linalg.cholesky(cofactor - UNCHECKED * np.eye(len(cofactor)))
+        except np.linalg.LinAlgError:
+            return None
+        errors.append(np.asarray(np.linalg.solve(cofactor, right[rows].ravel()), dtype=np.float64).reshape(-1, 2))
+        errors_mm.append(applied(back[rows], errors[-1]))
+    if not errors:
+        return None
+    rms, rms_mm = (float(np.sqrt(np.square(np.concatenate(each)).mean())) for each in (errors, errors_mm))
+    return CrossValidation(UM_PER_MM * rms_mm, rms, sum(map(len, errors)))
+
+
+def left_out_rows(network: Network, options: Options) -> Iterator[Indices]:
+    """Rows of the rays that are left out together and predicted, see `cross_validate`."""
+    names, number = network.observations.numbered_points
+    given = network.coordinates(firm=True)
+    for points in folds(network, options):
+        rows = _rows(network, points)
+        point = number[rows]
+        is_known = ~np.array([np.isnan(given[names[i]]).any() for i in point], dtype=bool)
+        _, first, which = np.unique(point, return_index=True, return_inverse=True)
+        second = (np.arange(len(point)) - first[which]) % 2 == 1  # second, fourth, ... ray of its point
+        for half in (False, True):
+            others = np.bincount(which[second != half], minlength=len(first))[which]
+            chosen = rows[np.where(is_known, not half, (second == half) & (others >= 2))]
+            if len(chosen):
+                yield chosen
+
+
+def _rows(network: Network, points: frozenset[str]) -> Indices:
+    """Rows of some object points, sorted by point and image."""
+    observations = network.observations
+    named = np.flatnonzero(np.isin(observations.point, list(points)) & ~observations.is_fiducial)
+    return np.array(sorted(named, key=lambda row: (observations.point[row], observations.image[row])), dtype=np.intp)
 
 
 def _correlated(result: Adjustment) -> tuple[tuple[str, str, float], ...]:

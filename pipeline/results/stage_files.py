@@ -10,8 +10,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from adjust.model_selection.candidates import Candidate, Model
-from adjust.model_selection.cross_validation import CrossValidation
+from adjust.model_selection.candidates import Candidate, CrossValidation, Model
 from adjust.model_selection.model_choice import Choice
 from adjust.quality.lens_comparison import CameraCalibration, Comparison, Test, sigmas
 from pipeline.results.record_json import FOREIGN, Finite, Number, NumberOrNone, Sigma, Whole, read_record, record_from
