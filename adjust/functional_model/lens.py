@@ -18,7 +18,7 @@ import numpy as np
 from adjust.array_types import Array, Mask
 from adjust.functional_model.correction import Correction, Imaged, no_correction
 from adjust.functional_model.families import family, parameter_names
-from adjust.linear_algebra.small_matrices import columns, determinant, newton, zeros
+from adjust.linear_algebra.small_matrices import columns, determinant, newton
 
 Decentering = Literal["reduced", "paper"]
 
@@ -80,8 +80,8 @@ class Distortion:
 class ImageEquations:
     """Misclosures F (n, 2) in mm of the condition equations of n points, and their derivatives.
 
-    The derivatives are with respect to the observed point xy (n, 2, 2), the ray (n, 2, 2), the interior orientation c,
-    x0', y0' (n, 2, 3) and the family's parameters (n, 2, k).
+    The derivatives are with respect to the observed point xy (n, 2, 2), the ray (n, 2, 2), and the quantities c, x0',
+    y0' and the family's parameters (n, 2, 3 + k).
     """
 
     value: Array  # (n, 2) misclosures in mm
@@ -97,15 +97,9 @@ class ImageEquations:
         return -self.imaged.ray_jacobian
 
     @property
-    def interior_jacobian(self) -> Array:
-        return columns([self.quantity_derivative(k) for k in range(3)])
-
-    @property
-    def parameter_jacobian(self) -> Array:
-        count = self.correction.parameter_jacobian.shape[2]
-        return (
-            columns([self.quantity_derivative(3 + k) for k in range(count)]) if count else zeros(len(self.value), 2, 0)
-        )
+    def quantity_jacobian(self) -> Array:
+        count = len(INTERIOR_NAMES) + self.correction.parameter_jacobian.shape[2]
+        return columns([self.quantity_derivative(k) for k in range(count)])
 
     def quantity_derivative(self, k: int) -> Array:
         """Derivative (n, 2) with respect to quantity k: c, x0', y0', then the family's parameters."""
@@ -250,8 +244,7 @@ class Lens:
         ideal_mm[~imaged] = principal_point
         ray = (ideal_mm - principal_point) / c
         at = self.equations(xy_mm, ray)
-        by_unknowns = np.concatenate([at.interior_jacobian[:, :, :1], at.parameter_jacobian], axis=2)
-        derivatives = c * np.linalg.solve(at.ray_jacobian, by_unknowns)
+        derivatives = c * np.linalg.solve(at.ray_jacobian, np.delete(at.quantity_jacobian, [1, 2], axis=2))
         derivatives[:, :, 0] -= ray
         derivatives[~imaged] = 0.0
         return Displacement(np.where(imaged[:, None], 1e3 * (xy_mm - ideal_mm), np.nan), 1e3 * derivatives, imaged)

@@ -114,8 +114,8 @@ class _Rays:
                 "size."
             )
         at = source.equations(grid_mm[found], rays[found])
-        by_lens = np.concatenate([at.interior_jacobian, at.parameter_jacobian], axis=2)
-        return cls(source, rays[found], grid_mm[found], -np.linalg.solve(at.xy_jacobian, by_lens))
+        by_lens = np.asarray(-np.linalg.solve(at.xy_jacobian, at.quantity_jacobian), dtype=np.float64)
+        return cls(source, rays[found], grid_mm[found], by_lens)
 
     def fit(self, into: Distortion, estimated: tuple[str, ...], held: Sequence[str] = ()) -> ConvertedLens:
         names = parameter_names(into.family)
@@ -165,7 +165,7 @@ class _Rays:
         """Names of the parameters that have an effect at their values or depend on uncertain columns of the source."""
         lens = found.lens
         at = lens.equations(self.observed_mm, self.rays)
-        per_unit = np.abs(at.parameter_jacobian).max(axis=(0, 1))
+        per_unit = np.abs(at.quantity_jacobian[..., len(INTERIOR_NAMES) :]).max(axis=(0, 1))
         by_source = np.abs(found.by_source[len(INTERIOR_NAMES) :, uncertain] * per_unit[:, None])
         moved = (by_source > _RELATED * np.abs(self.by_lens[..., uncertain]).max(axis=(0, 1))).any(axis=1)
         does = moved | (per_unit * np.abs(lens.parameters) > SAME * lens.interior[0])

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtrc, chdtri, fdtrc
+from scipy.special import chdtri
 
 from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.lens import Prior
@@ -23,7 +23,7 @@ from adjust.model_selection.scanner_choice import network_with_terms
 from adjust.problem.network import Network, Transformation
 from adjust.problem.observations import Calibration
 from adjust.problem.parameter import Parameter
-from adjust.quality.significance import LEVEL
+from adjust.quality.significance import LEVEL, f_probability
 
 # Simpler transformations that each transformation contains, simplest first.
 TRANSFORMATIONS: Mapping[Transformation, tuple[Transformation, ...]] = {
@@ -238,8 +238,7 @@ def f_test(simpler: Candidate, richer: Candidate) -> Nested:
     more, redundancy = richer.unknowns - simpler.unknowns, richer.redundancy
     variance = richer.vpv / redundancy if redundancy > 0 else 1.0
     f = max(simpler.vpv - richer.vpv, 0.0) / more / variance
-    p = fdtrc(more, redundancy, f) if redundancy > 0 else chdtrc(more, f * more)
-    return Nested(simpler.model, richer.model, float(f), (more, redundancy), float(p))
+    return Nested(simpler.model, richer.model, f, (more, redundancy), f_probability(f, more, redundancy))
 
 
 def nested_tests(candidates: Sequence[Candidate]) -> tuple[Nested, ...]:

@@ -11,14 +11,13 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtrc, fdtrc
 
 from adjust.array_types import Array, Mask
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.scanner import carriage_terms, smooth_terms
 from adjust.problem.network import Network, Scanner
 from adjust.problem.parameter import Parameter
-from adjust.quality.significance import LEVEL
+from adjust.quality.significance import LEVEL, f_probability
 from adjust.rank_defect.directions import HARDLY, scan_poses, undetermined_term_sentences
 from adjust.solution.result import Adjustment
 
@@ -130,9 +129,8 @@ class _Equations:
         redundancy, at = self.redundancy - len(taken) - 1, [self.terms.index(each) for each in taken]
         by_taken = self.right[at] @ np.linalg.solve(self.normal[np.ix_(at, at)], self.right[at])
         left = self.vpv - float(by_taken) - float(explained[best])
-        if redundancy > 0 and left > 0.0:
-            return self.terms[best], float(fdtrc(1, redundancy, explained[best] / left * redundancy))
-        return self.terms[best], float(chdtrc(1, explained[best]))
+        variance, redundancy = (left / redundancy, redundancy) if redundancy > 0 and left > 0.0 else (1.0, 0)
+        return self.terms[best], f_probability(float(explained[best]) / variance, 1, redundancy)
 
     def _reduced(self, taken: Sequence[str]) -> tuple[Mask, Array]:
         """For every term, given those taken: whether it is estimable, and its decrease of v'Pv."""

@@ -174,7 +174,7 @@ class _View:
         self.ray = ray @ self.turn
         self.marks_mm = marks
         self.value = np.concatenate([self.c_um * self.ray, 1e3 * (marks - shift) @ np.linalg.inv(turn).T])
-        by = np.concatenate([self.equations.interior_jacobian, self.equations.parameter_jacobian], axis=2)
+        by = self.equations.quantity_jacobian
         names, width = list(own.fiducials), 2 * len(own.fiducials)
         rows = [2 * names.index(id) + axis for id in shared for axis in (0, 1)]
         of_marks = 1e3 * np.eye(width)[rows].reshape(len(rows), width)

@@ -312,8 +312,7 @@ class ProjectionField:
         """Derivatives of the images of fixed points by the calibration (n, 2, k) and by rotation and shift (n, 2,
         6)."""
         at = self._lens.equations(xy_mm, ray)
-        calibration = np.concatenate([at.interior_jacobian, at.parameter_jacobian], axis=2)
-        by: Array = -np.linalg.solve(at.xy_jacobian, calibration)
+        by = np.asarray(-np.linalg.solve(at.xy_jacobian, at.quantity_jacobian), dtype=np.float64)
         if self._film is not None:
             by = np.concatenate([by, -_by_film(self._film, xy_mm)], axis=2)
         orientation = ray_by_orientation(ray, inverse_depth)

@@ -60,7 +60,6 @@ class Reliability:
     effect : (N, 2) largest effect of an undetected error on any function of the unknowns, in its standard deviations.
     statistic : (N,) v'P (P Q_v P)^- P v of all coordinates together, chi-square with `sizes` degrees of freedom.
     sizes : (N,) number of tested coordinates.
-    smallest_together : (N,) smallest detectable error of a pair in its least favourable direction.
     outer : one entry for each free camera parameter.
     unchecked : coordinates without redundancy, which `outer` leaves out.
 
@@ -81,7 +80,6 @@ class Reliability:
     effect: Array
     statistic: Array
     sizes: Indices
-    smallest_together: Array
     outer: tuple[OuterEffect, ...]
     unchecked: tuple[str, ...]
 
@@ -99,10 +97,6 @@ def reliability(run: Run, sigma0: float, redundancy: int, probabilities: Probabi
     hidden = (found.transform * product(found.hat, found.transform)).sum(axis=1)
     effect = np.where(tests.checked, np.where(tests.checked, smallest, 0.0) * np.sqrt(hidden), np.inf)
     effect[(units.sizes == 1), 1] = 0.0
-    least = eigen(tests.discrepancy_weight)[0][:, 0]
-    both = np.asarray(tests.checked.all(axis=1))
-    everywhere = both & (least > UNCHECKED * own_weights.min(axis=1))
-    together = np.where(both, _over(probabilities.noncentrality(2), least, everywhere), smallest.min(axis=1))
     controlled = variance > UNCONTROLLED * own_weights
     uncontrolled = zip(*np.nonzero(~controlled & (np.arange(2) < units.sizes[:, None])), strict=True)
     return Reliability(
@@ -118,7 +112,6 @@ def reliability(run: Run, sigma0: float, redundancy: int, probabilities: Probabi
         effect=effect,
         statistic=tests.statistic,
         sizes=tests.sizes,
-        smallest_together=together,
         outer=_outer_effects(run, np.where(controlled, smallest, 0.0), tested, shift),
         unchecked=tuple(tested[i].coordinate_name(axis) for i, axis in uncontrolled),
     )

@@ -56,6 +56,11 @@ class SignificanceTest:
         return self.p < LEVEL
 
 
+def f_probability(statistic: float, freedom: int, redundancy: float) -> float:
+    """P-value of an F statistic; without redundancy of a chi-square one over its degrees of freedom."""
+    return float(fdtrc(freedom, redundancy, statistic) if redundancy > 0 else chdtrc(freedom, statistic * freedom))
+
+
 def significance_tests(estimates: Estimates) -> dict[tuple[str, str], tuple[SignificanceTest, ...]]:
     """Test every estimated parameter, then groups of at least two.
 
@@ -137,8 +142,7 @@ def _significance_test(
         return SignificanceTest(name, parameters, t, 2.0 * float(one_sided))
     square = float(normalised @ np.linalg.solve(cofactor / np.outer(scale, scale), normalised))
     statistic = square / (count * estimates.sigma0**2)
-    p = fdtrc(count, r, statistic) if r > 0 else chdtrc(count, square)
-    return SignificanceTest(name, parameters, statistic, float(p))
+    return SignificanceTest(name, parameters, statistic, f_probability(statistic, count, r))
 
 
 UNSEEN = 1e-6  # least redundancy of a direction that the other observations determine
@@ -193,7 +197,7 @@ def calibration_tests(run: Run, sigma0: float, redundancy: float) -> Iterator[Ca
             sigma=np.where(hidden, np.inf, sigma),
             statistic=test,
             freedom=freedom,
-            probability=float(fdtrc(freedom, left, test) if left > 0 else chdtrc(freedom, chi_square)),
+            probability=f_probability(test, freedom, left),
         )
 
 

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 from scipy.special import bdtrc
 
 from adjust.array_types import Array, Indices, Mask
+from adjust.functional_model.projection import ray_by_orientation
 from adjust.functional_model.rotation import rotation_from_vector
 
 _CELLS = 600  # cells of the look-up table along each side of the frame
@@ -115,15 +116,10 @@ class View:
 
     def derivatives(self, xyz: Array) -> Array:
         """(n, 2, 8) derivatives with respect to a small rotation, a shift in the camera frame, scale and radial."""
-        camera = self._camera(xyz)
-        u, v, w = camera.T
         p = self._ideal(xyz)
-        zero = np.zeros_like(w)
-        by_camera = np.stack([np.stack([-1 / w, zero, -p[:, 0] / w], 1), np.stack([zero, -1 / w, -p[:, 1] / w], 1)], 1)
-        turned = np.stack([np.stack([zero, w, -v], 1), np.stack([-w, zero, u], 1), np.stack([v, -u, zero], 1)], 1)
         r2 = (p**2).sum(axis=1)
         by_ideal = (1.0 + self.radial * r2)[:, None, None] * np.eye(2) + 2 * self.radial * p[:, :, None] * p[:, None]
-        by_pose = (1.0 + self.scale) * by_ideal @ np.concatenate([by_camera @ turned, by_camera], axis=2)
+        by_pose = (1.0 + self.scale) * by_ideal @ ray_by_orientation(p, -1.0 / self._camera(xyz)[:, 2])
         by_scale = p * (1.0 + self.radial * r2)[:, None]
         by_radial = (1.0 + self.scale) * p * r2[:, None]
         return np.concatenate([by_pose, by_scale[:, :, None], by_radial[:, :, None]], axis=2)

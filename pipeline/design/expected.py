@@ -196,8 +196,7 @@ class Expected:
         # The image of a ray by c, x0', y0' and the parameters: from F = 0 with a fixed ray.
         xy_mm = lens.interior[1:] + radius_mm * outward
         at = lens.equations(xy_mm, lens.ray_from_observed(xy_mm)[0])
-        by_unknowns = np.concatenate([at.interior_jacobian, at.parameter_jacobian], axis=2)
-        ray = -UM_PER_MM * np.linalg.solve(at.xy_jacobian, by_unknowns)
+        ray = -UM_PER_MM * np.linalg.solve(at.xy_jacobian, at.quantity_jacobian)
         return np.concatenate([by_interior, ray.reshape(-1, ray.shape[2])])
 
 

@@ -127,7 +127,7 @@ class CalibratedLens:
         c, point = self.lens.interior[0], self.lens.interior[1:]
         ray = (self.lens.ideal_from_observed(scan_mm)[0] - point) / c
         at = self.lens.equations(scan_mm, ray)
-        by_lens = c * np.linalg.solve(-at.ray_jacobian, np.dstack([at.interior_jacobian, at.parameter_jacobian]))
+        by_lens = c * np.linalg.solve(-at.ray_jacobian, at.quantity_jacobian)
         by_lens[:, :, 0] += ray
         by_lens[:, :, 1:3] += np.eye(2)
         by_lens = (by_lens * np.array([1000.0, -1000.0])[:, None] / np.array(self.pitch_um)[:, None]).reshape(

@@ -165,7 +165,7 @@ def columns(family: str, xy_mm: Array, half_mm: tuple[float, float] = (B, B)) ->
     interior = np.array([C, 0.3, -0.2])
     observed = xy_mm + interior[1:]
     at = Lens(Distortion(family, half_mm=half_mm), interior, np.zeros(len(names))).equations(observed, xy_mm / C)
-    return -at.parameter_jacobian
+    return -at.quantity_jacobian[..., 3:]
 
 
 def grid(points: Array, half_mm: tuple[float, float] = (B, B)) -> Array:

@@ -116,21 +116,6 @@ def test_the_cause_that_is_named_moves_the_parameter_by_what_is_reported() -> No
     assert {outer.parameter.text for outer in tests.outer} >= {"IO.K.c", "IO.K.x0", "IO.K.k3", "FID.K.1.x"}
 
 
-def test_an_error_in_the_least_favourable_direction_shifts_the_test_of_the_point() -> None:
-    network, start = exact_network()
-    tests = assess_reliability(adjust(network, start))
-    unit = row_of(network, "target", "f1", "4")
-    size = tests.smallest_together[unit]
-    turns = np.linspace(0.0, np.pi, 7)[:-1]
-    errors = size * np.column_stack([np.cos(turns), np.sin(turns)])
-    spoilt = [adjust(with_errors(network, {unit: error}), start) for error in errors]
-    statistics = [assess_reliability(result).statistic[unit] for result in spoilt]
-    # As a function of the direction it is a constant and a sine of twice the angle: its minimum follows from these.
-    mean = np.mean(statistics)
-    wave = np.hypot(np.mean(statistics * np.cos(2 * turns)), np.mean(statistics * np.sin(2 * turns)))
-    assert mean - 2.0 * wave == pytest.approx(Probabilities().noncentrality(2) ** 2, rel=5e-3)
-
-
 def test_an_undetected_error_of_an_earlier_calibration_moves_the_camera_as_stated() -> None:
     """Its values are correlated; the one that does most harm is wrong."""
     truth = Truth()
