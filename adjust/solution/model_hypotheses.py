@@ -303,14 +303,14 @@ def _wrong_points(run: Run) -> Iterator[ModelHypothesis]:
         return
     form, positions = _flat_form(network), np.concatenate([unknowns.point[name] for name in names])
     axes = np.eye(3) if form is None else form.axes
-    for group in displaced_points(run, axes, _freed(run, positions), names):
+    for group in displaced_points(run, axes, freed(run, positions), names):
         if group.words:
             moved = _of_targets(run, dict.fromkeys(group.names, np.eye(3)))
             found = _displaced(run, "group", "point", partial(_moved_words, group), moved)
         else:
             added = np.concatenate([unknowns.point[name] for name in group.names])
             words = partial(_point_words, group.names)
-            found = ModelHypothesis("point", words, _freed(run, added), added)
+            found = ModelHypothesis("point", words, freed(run, added), added)
         yield replace(found, choices=group.choices, contrasts=group.contrasts)
 
 
@@ -319,10 +319,11 @@ def _wrong_interior_orientation(run: Run, camera: Camera) -> Iterator[ModelHypot
     positions = run.problem.unknowns.camera[camera.name][: len(INTERIOR_NAMES)]
     added = positions[run.problem.unknowns.sigma[positions] == 0.0]
     if len(added):
-        yield ModelHypothesis("interior", partial(_interior_words, camera.name), _freed(run, added), added)
+        yield ModelHypothesis("interior", partial(_interior_words, camera.name), freed(run, added), added)
 
 
-def _freed(run: Run, positions: Indices) -> Problem:
+def freed(run: Run, positions: Indices) -> Problem:
+    """Free some quantities of a problem; start where an adjustment ended."""
     problem = _continued(run, run.problem.network)
     sigma = problem.unknowns.sigma.copy()
     sigma[positions] = np.inf

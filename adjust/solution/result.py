@@ -56,6 +56,7 @@ from adjust.quality.variance_components import factor_sigmas, variance_factor
 from adjust.rank_defect.flat_valleys import held_directions, inseparable
 from adjust.solution.explanations import Explanation, explain
 from adjust.solution.model_hypotheses import diameter_notes
+from adjust.solution.principal_points import curved_valley_warnings, held_decentering_notes
 from adjust.solution.warnings import run_warnings
 
 
@@ -276,14 +277,16 @@ class Adjustment(Estimates, PlottedResult):
         """
         left_out = (f"Left out of the adjustment: {reason}" for reason in dict.fromkeys(self.left_out.values()))
         own = () if self.slips and not self.converged else run_warnings(self.scaled, self.cofactor, self.residuals)
-        return (*self.misread, *self.slips, *left_out, *self.remarks, *own)
+        curved = curved_valley_warnings(self.run, self.cofactor) if self.converged else ()
+        return (*self.misread, *self.slips, *left_out, *self.remarks, *own, *curved)
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
         """Notes that need no action."""
         is_told = any(each.kind == "disks" for each in self.explanations)
         of_disks = () if is_told else diameter_notes(self.run)
-        return (*self.unused, *(sentence for _, sentence in self._inseparable.values()), *of_disks)
+        held = held_decentering_notes(self.run, self.cofactor) if self.converged else ()
+        return (*self.unused, *(sentence for _, sentence in self._inseparable.values()), *of_disks, *held)
 
     def inseparable(self, camera: str) -> list[str]:
         """Distortion parameters of a camera that the observations do not separate."""

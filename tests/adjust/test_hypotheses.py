@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
 from adjust import Adjustment, AdjustmentError, Network, ObjectPoint, Options, Prior, adjust, approximate
+from adjust.functional_model.rotation import rotation_from_angles
 from adjust.quality.tested import Probabilities
 from adjust.solution.explanations import explain
 from adjust.solution.unmodelled_error import adjust_unmodelled
@@ -434,3 +435,37 @@ def test_sigmas_that_are_somewhat_too_small_are_no_slip() -> None:
     given = blunder_network(4)
     close = given.observations.covariance_mm2 / 1.7**2
     assert adjust(replace(given, observations=replace(given.observations, covariance_mm2=close))).converged
+
+
+def _straight_on(seed: int, free: tuple[str, ...]) -> tuple[Network, float]:
+    """Images that look straight at a board, c known; also the truth of y0."""
+    rng = np.random.default_rng(seed)
+    made = scene(seed, flat=True)
+    angles = np.column_stack([np.zeros((len(made.rotations), 2)), rng.uniform(-0.3, 0.3, len(made.rotations))])
+    rotations = rotation_from_angles(angles)
+    depth = np.linalg.norm(made.stations - made.points.mean(axis=0), axis=1)
+    stations = made.points.mean(axis=0) + depth[:, None] * np.array([0.0, 0.0, 1.0]) + rng.normal(0.0, 15.0, (1, 3))
+    straight = replace(made, rotations=rotations, stations=stations + rng.normal(0.0, 8.0, stations.shape) * [1, 1, 0])
+    given = misfit_network(straight, Effects(), replace(SOUND, free=free, frame_given=True), rng)
+    camera = replace(given.cameras[0], principal_distance_mm=Prior(C_MM, 0.0))
+    return replace(given, cameras=(camera,)), float(made.point_mm[1])
+
+
+def test_straight_views_tell_where_the_principal_point_hangs_on_the_decentering() -> None:
+    """Decentering of the lens moves it by 4.7 standard deviations, and sigma0 is 1."""
+    given, y0_mm = _straight_on(2, ("k1", "k2", "k3"))
+    result = adjust(given)
+    assert abs(result.value("IO.cam.y0") - y0_mm) > 4.0 * result.sigma("IO.cam.y0")
+    assert any("with p1 and p2 free, its standard deviation would be" in note for note in result.notes)
+
+
+def test_no_principal_point_of_straight_views_is_claimed_that_images_do_not_tell() -> None:
+    """Linear standard deviations miss a curved valley, and other minima."""
+    told = 0
+    for seed in range(6):
+        given, y0_mm = _straight_on(seed, ("k1", "k2", "p1", "p2", "k3"))
+        result = adjust(given)
+        is_told = any("hardly tell y0 of camera cam from its distortion" in each for each in result.warnings)
+        assert is_told or abs(result.value("IO.cam.y0") - y0_mm) < 4.5 * result.sigma("IO.cam.y0")
+        told += is_told
+    assert told
