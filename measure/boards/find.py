@@ -424,13 +424,13 @@ def recognise_board(scan: Scan) -> str:
 
 def _searchable(scan: Scan, factor: int) -> tuple[Bytes, Reason]:
     """Reduced scan stretched to 8 bits, and the reason if it has no contrast to search in."""
-    grey = scan.reduced(factor)
+    grey = scan.reduced(factor) if factor > 1 else scan.window(0, 0, scan.width_px, scan.height_px)
     every = max(round(np.sqrt(grey.size / _ENOUGH_PIXELS)), 1)
     low, high = np.percentile(grey[::every, ::every], (1, 99)).astype(grey.dtype)  # doubles take three times as long
     if high - low < _LEAST_CONTRAST * scan.full_scale_dn:
         share = 100 * (high - low) / scan.full_scale_dn
         message = f"the scan has no contrast: its grey values span {share:.1f} % of the scale"
         return np.zeros((1, 1), np.uint8), Reason(message, Code.CONTRAST)
-    stretched = grey - low
-    stretched *= 255 / (high - low)
-    return np.clip(stretched, 0, 255, out=stretched).astype(np.uint8), NO_REASON
+    grey -= low
+    grey *= 255 / (high - low)
+    return np.clip(grey, 0, 255, out=grey).astype(np.uint8), NO_REASON

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from math import prod
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,13 +116,23 @@ def influence_covariances(
     squares = (kept**2).sum(axis=(1, 2))
     variances = squares / np.maximum(count - unknowns, 1)
     correlation = _covariance_along(kept, used, 1) / np.maximum(squares / count, 1e-300)
+    flat = influences.astype(np.float32).reshape(*influences.shape[:2], -1)
+    covariances = variances[:, None, None] * (flat @ flat.swapaxes(1, 2))
+    coloured = np.abs(correlation) >= 3 / np.sqrt(2 * count)
+    if coloured.any():
+        covariances[coloured] = _coloured_covariances(
+            influences[coloured], kept[coloured], used[coloured], variances[coloured]
+        )
+    return covariances, variances
+
+
+def _coloured_covariances(influences: NDArray[Real], kept: NDArray[Any], used: Mask, variances: Array) -> Array:
+    """Covariances (n, k, k) as of `influence_covariances`, with the autocovariance of the residuals kept."""
     index = np.arange(-REACH_PX, REACH_PX + 1)
-    is_white = np.abs(correlation) < 3 / np.sqrt(2 * count)
     lags = faded(autocovariance(kept, used, REACH_PX))
     lags *= (variances / np.maximum(lags[:, REACH_PX, REACH_PX], 1e-300))[:, None, None]
-    lags[is_white] = np.where(np.add.outer(abs(index), abs(index)) == 0, variances[is_white, None, None], 0.0)
-    size: list[int] = padded(tuple(residuals.shape[1:]), REACH_PX)
-    kernels = np.zeros((len(residuals), *size), np.float32)
+    size: list[int] = padded(tuple(kept.shape[1:]), REACH_PX)
+    kernels = np.zeros((len(kept), *size), np.float32)
     kernels[:, index[:, None], index] = lags
     weights = np.full(size[1] // 2 + 1, 2.0)  # columns of a real transform also stand for their conjugates
     weights[[0, *([-1] if size[1] % 2 == 0 else [])]] = 1.0
@@ -130,7 +141,7 @@ def influence_covariances(
     parts = [waves.real.reshape(*waves.shape[:2], -1), waves.imag.reshape(*waves.shape[:2], -1)]
     flat = weights.reshape(len(weights), 1, -1)
     real, imaginary = ((part * flat) @ part.swapaxes(1, 2) for part in parts)
-    return np.asarray(real + imaginary, float), variances
+    return np.asarray(real + imaginary, float)
 
 
 def faded(lags: Array) -> Array:
