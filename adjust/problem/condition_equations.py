@@ -155,8 +155,8 @@ def object_displacements(problem: Problem, state: State, camera_xy: Array, image
         at = _lens(problem, state, name).equations_with_image(camera_xy[rows], shown.imaged)
         misclosure = at.xy_jacobian @ image_mm[rows].swapaxes(1, 2)
         is_free = problem.unknowns.sigma[problem.unknowns.camera[name]] > 0.0
-        free = np.stack([at.quantity_derivative(int(k)) for k in np.flatnonzero(is_free)], axis=-1)
-        flat, by_free = misclosure.reshape(-1, misclosure.shape[2]), free.reshape(-1, free.shape[2])
+        by_free = at.quantity_jacobian[..., is_free].reshape(misclosure[..., 0].size, -1)
+        flat = misclosure.reshape(-1, misclosure.shape[2])
         rest = (flat - by_free @ np.linalg.lstsq(by_free, flat)[0]).reshape(misclosure.shape)
         in_plane = (np.linalg.solve(at.ray_jacobian, rest) * shown.in_camera[:, 2, None, None]).swapaxes(1, 2)
         found[rows] = in_plane @ state.rotations[problem.image_numbers[rows], :2]

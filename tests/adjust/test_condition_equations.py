@@ -18,10 +18,16 @@ from adjust.functional_model.projection import EARTH_RADIUS_M, sight_vectors
 from adjust.functional_model.rotation import (
     rotation_from_vector,
 )
-from adjust.problem.condition_equations import compute, computed_observations, derivatives
+from adjust.problem.condition_equations import (
+    compute,
+    computed_observations,
+    derivatives,
+    object_displacements,
+    observed_in_camera,
+)
 from adjust.problem.estimates import adjusted_image
 from adjust.problem.network import LineOfSight, Network, Transformation
-from adjust.problem.problem import Problem, number
+from adjust.problem.problem import Problem, State, number
 from adjust.solution.planning import plan
 
 Array = NDArray[np.float64]
@@ -64,6 +70,24 @@ def test_image_equations_by_complex_steps(family: str, decentering: Decentering)
             numeric = lens.replaced_values(moved[0]).equations(*moved[1:]).value.imag / STEP
             scale = np.abs(numeric).max() or 1.0
             np.testing.assert_allclose(derivative[..., column], numeric, rtol=0, atol=2e-14 * scale)
+
+
+def test_displacements_of_points_displace_their_images() -> None:
+    """Where no quantity of the camera is free, so that none of it displaces the images."""
+    problem = number(*simulated(np.random.default_rng(5), None, "none", noise=False))
+    problem = replace(problem, unknowns=problem.unknowns.fixed(problem.unknowns.camera["K"]))
+    state = problem.start()
+    computed_mm = computed_observations(problem, state)
+    assert computed_mm is not None
+    image_mm = np.array([1e-4, -2e-4])
+    fields_mm = np.broadcast_to(image_mm, (len(computed_mm), 1, 2))
+    moved = object_displacements(problem, state, observed_in_camera(problem, state), fields_mm)
+    rows = np.flatnonzero((problem.image_numbers == 0) & ~problem.is_fiducial)
+    values = state.values.copy()
+    values[problem.places[rows]] += moved[rows, 0]
+    displaced_mm = computed_observations(problem, State(values, state.rotations))
+    assert displaced_mm is not None
+    np.testing.assert_allclose((displaced_mm - computed_mm)[rows], np.tile(image_mm, (len(rows), 1)), atol=2e-7)
 
 
 @pytest.mark.parametrize("length", [1e-9, 0.3, 1.4, 3.1])
