@@ -67,14 +67,8 @@ def _check_fiducial_unit(comparator: Path, camera: CameraFile, marks: Sequence[C
 def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[Network, tuple[str, ...]]:
     """Build the network from the images, points and observations in `marks`.
 
-    Returns
-    -------
-    The network, and a sentence on everything that is left out.
-
-    Raises
-    ------
-    InputError
-        A mark names a point or fiducial that the project lacks, or there is nothing to adjust.
+    Returns the network, and a sentence on everything that is left out. Raises InputError where a mark names a point or
+    fiducial that the project lacks, or there is nothing to adjust.
     """
     used = rotate_to_sensor(project, [mark for mark in marks if mark.status.is_observation])
     if not used:

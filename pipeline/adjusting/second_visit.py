@@ -30,10 +30,7 @@ _SEARCH_PX = 2.0  # search radius: predictions of an adjusted orientation are fa
 class Visit:
     """Scan to be searched again.
 
-    Attributes
-    ----------
-    scan : path or address of its file.
-    sought : predictions of the missed targets.
+    scan: path or address of its file; sought: predictions of the missed targets.
     """
 
     image: str

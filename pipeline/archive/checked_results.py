@@ -194,10 +194,7 @@ class Judging:
 class CheckedResult:
     """A scan after the cross-scan checks.
 
-    Attributes
-    ----------
-    result : row of the raw result.
-    decisions : hash of the review decisions about the image that were considered.
+    result: row of the raw result; decisions: hash of the review decisions about the image that were considered.
     """
 
     result: int

@@ -48,10 +48,7 @@ _FORMATS = ("JPEG", "JPEG 2000", "PNG", "TIFF")  # in ascending order of prefere
 class NewProject:
     """A project to be written to `folder`.
 
-    Attributes
-    ----------
-    given : files and folders that were searched.
-    left_out : {reason: files that are not measured}.
+    given: files and folders that were searched; left_out: {reason: files that are not measured}.
     """
 
     folder: Path

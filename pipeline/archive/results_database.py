@@ -54,9 +54,7 @@ _LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "tifffile", "i
 class Kept:
     """Result to be stored.
 
-    Attributes
-    ----------
-    camera : name of the camera's file.
+    camera: name of the camera's file.
     """
 
     identity: Identity

@@ -43,9 +43,7 @@ _TELLING = {"camera_type", "principal_distance_mm"}  # fields of a plate that di
 class ScanGroup:
     """Scans of one format, size and resolution.
 
-    Attributes
-    ----------
-    samples : identifications of the scans that were tried.
+    samples: identifications of the scans that were tried.
     """
 
     folder: Path
@@ -237,16 +235,8 @@ def catalogue(given: Sequence[Path], count: Count, max_pixels: int | None = None
     Scans are grouped by format, channels, bits, camera, resolution and approximate size. Some kilobytes of each are
     read, and only the files' names are held in memory.
 
-    Parameters
-    ----------
-    by_folder : form separate groups for each folder, and leave out copies.
-
-    Raises
-    ------
-    InputError
-        There is no scan.
-    MeasurementError
-        An address cannot be listed.
+    by_folder: form separate groups for each folder, and leave out copies. Raises InputError where there is no scan, and
+    MeasurementError where an address cannot be listed.
     """
     files, endings = find_scan_files(given)
     heads, unread = defaultdict[tuple[object, ...], list[tuple[int, ScanHead]]](list), dict[Path, str]()

@@ -175,10 +175,8 @@ class Sight:
 class Mapped:
     """Result of COLMAP, in a coordinate system of its own.
 
-    Attributes
-    ----------
-    poses : by image, rotation (3, 3) and translation (3,) to axes x right, y down, z forward.
-    tracks : by point, its observations.
+    poses: by image, rotation (3, 3) and translation (3,) to axes x right, y down, z forward; tracks: by point, its
+    observations.
     """
 
     poses: dict[str, tuple[Array, Array]]

@@ -277,10 +277,7 @@ def camera_intrinsics(
 ) -> CameraIntrinsics:
     """Convert the adjustment of one camera from mm to px.
 
-    Parameters
-    ----------
-    pixel_mm : side of a pixel in the adjustment
-    left_out, lens, pitch_um, check : see `CameraIntrinsics`
+    pixel_mm: side of a pixel in the adjustment; left_out, lens, pitch_um, check: see `CameraIntrinsics`.
     """
     (camera,) = adjustment.network.cameras
     names = [name for name, prior in camera.distortion.parameters.items() if prior.sigma > 0.0]

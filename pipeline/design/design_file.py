@@ -23,10 +23,8 @@ Content = dict[str, object]
 class Design:
     """Result of a plan.
 
-    Attributes
-    ----------
-    alone : standard deviations without given fiducials and interior orientation.
-    files : written files by a description: design.json first, then the plot of every sweep.
+    alone: standard deviations without given fiducials and interior orientation; files: written files by a description:
+    design.json first, then the plot of every sweep.
     """
 
     scene: Path

@@ -237,13 +237,8 @@ def _gain(percent: float) -> str:
 def run_design(scene_path: Path, out_dir: Path | None, reporter: Reporter) -> Design:
     """Plan a scene, vary it, and write design.json and the plots of its sweeps.
 
-    Parameters
-    ----------
-    out_dir : None: a folder next to the scene file, with its name and "-design".
-
-    Raises
-    ------
-    InputError, AdjustmentError : the scene cannot be planned.
+    out_dir: None: a folder next to the scene file, with its name and "-design". Raises InputError or AdjustmentError
+    where the scene cannot be planned.
     """
     folder = out_dir or scene_path.with_name(f"{scene_path.stem}-design")
     scene = Variations.read(scene_path)

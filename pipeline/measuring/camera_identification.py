@@ -68,9 +68,7 @@ def add_plates(
 
     A principal distance read from a plate changes nothing.
 
-    Parameters
-    ----------
-    cameras : all cameras of the project, by their names in images.csv.
+    cameras: all cameras of the project, by their names in images.csv.
     """
     plates = [parse_plate(scan.frame.writing or ()) for scan in scans]
     numbers = sorted({plate["camera_number"] for plate in plates if "camera_number" in plate})

@@ -42,13 +42,8 @@ _NOT_COMMON = (
 def first_pictures(camera: CameraFile, tasks: Sequence[ScanTask], workers: Executor | None) -> CameraFile:
     """Learn first templates of the marks from one scan.
 
-    Returns
-    -------
-    The camera with the templates, and with the scan they come from.
-
-    Raises
-    ------
-    InputError, MeasurementError : the places of the marks cannot be determined.
+    Returns the camera with the templates, and with the scan they come from. Raises InputError or MeasurementError where
+    the places of the marks cannot be determined.
     """
     return _clicked(camera, camera.clicks, tasks) if camera.clicks else _learn_recurring_marks(camera, tasks, workers)
 

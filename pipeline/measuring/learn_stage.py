@@ -44,13 +44,8 @@ def learn_marks(
     that cannot be measured are left out. Marks that were learned once stay, whatever scans are added or removed, as
     long as their files stand in out/learned.
 
-    Returns
-    -------
-    The project with templates for the marks.
-
-    Raises
-    ------
-    InputError, MeasurementError : the marks cannot be learned.
+    Returns the project with templates for the marks. Raises InputError or MeasurementError where the marks cannot be
+    learned.
     """
     files = _file_names([camera.path for camera in project.cameras.values()], _learned_folder(project))
     known = add_learned_marks(project, memory)
@@ -243,9 +238,7 @@ def collect_tones(
 
     Scans that cannot be measured are left out. Estimates are kept, whatever scans are added or removed.
 
-    Returns
-    -------
-    By image, the information from other scans of its scanner.
+    Returns by image, the information from other scans of its scanner.
     """
     names = [name for name in project.scans if _leans_on_tone(project.image_camera(name))]
     if project.tone != "auto" or len(names) < 2:

@@ -128,9 +128,7 @@ def _known_line(frame: FrameMeasurement, line: Line) -> KnownLine | None:
 def poses_of_roll(scans: Sequence[MeasuredScan], places: Sequence[WrittenPlace]) -> Mapping[str, Pose]:
     """Scan orientations, by image, that change when all frames of one camera are considered together.
 
-    Parameters
-    ----------
-    scans : of one camera, with scan orientations that nobody has set.
+    scans: of one camera, with scan orientations that nobody has set.
     """
     frames = [scan.frame for scan in scans]
     poses = {frame.image: frame.pose for frame in frames if frame.pose is not None and frame.pose.writing}

@@ -61,9 +61,7 @@ def measured_scan(task: ScanTask, look: SecondPass | None = None) -> MeasuredSca
 
     A scan that cannot be measured gives a result with the reason. Raises nothing but interrupts.
 
-    Parameters
-    ----------
-    look : called with the open scan and its measurements.
+    look: called with the open scan and its measurements.
     """
     start = time.monotonic()
     try:

@@ -116,13 +116,8 @@ def scan_tasks(
 ) -> tuple[ScanTask, ...]:
     """Tasks of these images, in their order; scans with the same options share one object.
 
-    Parameters
-    ----------
-    said : by image, information on the scanner's tone curve from other scans.
-
-    Raises
-    ------
-    InputError : some marks cannot be searched for.
+    said: by image, information on the scanner's tone curve from other scans. Raises InputError where some marks cannot
+    be searched for.
     """
     options = image_options(project, said or {})
     scans = {name: project.scans.get(name) for name in names}

@@ -229,9 +229,7 @@ def checked_places(
 ) -> tuple[MarkMeasurement, ...]:
     """Compare the measured places with one another: improbable marks become weak, or are rejected.
 
-    Parameters
-    ----------
-    model : the image, with an orientation known to some degrees.
+    model: the image, with an orientation known to some degrees.
     """
     observed = {mark.point: mark for mark in marks if mark.status.is_observation}
     places_px = np.array([mark.center_px for mark in observed.values()]).reshape(-1, 2)

@@ -150,10 +150,7 @@ def likely_diameters_px(field: Field, measured: MeasuredScan) -> tuple[float, fl
 class NamedField:
     """Oriented image with identified targets.
 
-    Attributes
-    ----------
-    candidates : the identified candidates, by point.
-    gate_px : largest distance of a target from its place by the model.
+    candidates: the identified candidates, by point; gate_px: largest distance of a target from its place by the model.
     """
 
     model: ImageModel

@@ -36,9 +36,7 @@ WRITTEN = ("project.toml", "camera.toml", "points.csv", "images.csv")
 def render_project(scene_path: Path, out_dir: Path, progress: Progress | None = None) -> None:
     """Render a scene: scans, truth.json and the project's files (`reseau render`). Raises InputError.
 
-    Parameters
-    ----------
-    progress : called with the image's name, the steps done and the steps of the whole scene.
+    progress: called with the image's name, the steps done and the steps of the whole scene.
     """
     scene_file = read_scene(scene_path)
     _check_free(out_dir)
