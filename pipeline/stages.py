@@ -112,9 +112,10 @@ def run_adjust(project: Project, reporter: Reporter) -> Summary:
     """Adjust comparator.csv; write adjustment.json."""
     with _running(project, reporter) as run:
         with run.stage("adjusting", project.comparator.name):
-            # The result is not kept: it takes as much memory as the file that the summary reads.
             marks = run.marks()
-            run.write_adjustment(adjust_marks(project, marks), marks)
+            adjustment = adjust_marks(project, marks)
+            run.write_adjustment(adjustment, marks)
+            del adjustment  # it takes as much memory as the file that the summary reads
         earlier = project.adjustment_path
         if earlier.exists() and hash_file(earlier) != hash_file(run.new.current_path(earlier)):
             run.new.remove(project.check_path)  # it belongs to the earlier adjustment

@@ -107,12 +107,12 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
 
     Raises InputError or AdjustmentError where no adjustment is possible.
     """
+    options = adjustment_options(project.adjust)
+    adjusted = partial(adjust, options=options)
+    misnamed, notes = _misnamed(project, marks), (*_assumed_pitch(project), *_unmeasured(project, marks))
     if project.disk_radius > 0.0:
         check_spacing(project, target_field(project))
     network, left_out = build_network(project, marks)
-    misnamed, notes = _misnamed(project, marks), (*_assumed_pitch(project), *_unmeasured(project, marks))
-    options = adjustment_options(project.adjust)
-    adjusted = partial(adjust, options=options)
     network, untold = add_scanner_bends(project, network, adjusted)
     first = adjust_unmodelled(network, options) if project.adjust.unmodelled == "estimate" else adjusted(network)
     adjustment, network = first, first.network  # without images that were left out
