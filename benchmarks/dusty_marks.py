@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from drawn import scan_of
+from drawn import make_scan
 from numpy.typing import NDArray
 from true_marks import KIND, Kind, TrueMark, some_mark
 
@@ -108,7 +108,7 @@ def frame_of_disks(
         predictions.append(TargetPrediction(str(number), about, form, 3.0))
         parts.append((mark, speckled, view, corner))
     found = []
-    for each, (*_, corner) in zip(measure_disks(scan_of(frame), predictions), parts, strict=True):
+    for each, (*_, corner) in zip(measure_disks(make_scan(frame), predictions), parts, strict=True):
         place, flagged = each.center_px, "" if each.status is Status.MEASURED else each.reason
         given = each.status.is_observation and place is not None and each.covariance_px2 is not None
         found.append(Found(np.asarray(place) - corner, np.asarray(each.covariance_px2), flagged) if given else None)

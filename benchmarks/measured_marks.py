@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from drawn import scan_of
+from drawn import make_scan
 from numpy.typing import NDArray
 from true_marks import ALL_MOVES, TrueMark
 
@@ -114,7 +114,7 @@ def measure_mark(
 ) -> Found | None:
     """Measure a mark by the program's functions, from a start with an error of up to SHIFT_PX, and off (n,) from
     `start_off`."""
-    scan = scan_of(grey, full_scale, step_dn)
+    scan = make_scan(grey, full_scale, step_dn)
     center = mark.place[:, 2] + rng.uniform(-SHIFT_PX, SHIFT_PX, 2)
     if mark.kind.name == "ellipse":
         disk = fit_disk(scan, mark.place[:, 2] + rng.normal(0, 0.4, 2), mark.place[:, :2] * rng.uniform(0.9, 1.1))

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
-from drawn import scan_of
+from drawn import make_scan
 from numpy.typing import NDArray
 from skimage.feature import blob_log, corner_subpix
 from skimage.filters import threshold_local, window
@@ -117,7 +117,7 @@ def _first_looks(picture: Array, truth: Array) -> str:
 
     def own() -> Array:
         return np.array(
-            [each.center_px for each in disk_candidates(scan_of(picture), DiskSearch((5.0, 30.0), "light"))]
+            [each.center_px for each in disk_candidates(make_scan(picture), DiskSearch((5.0, 30.0), "light"))]
         )
 
     return " | ".join(f"{method.__name__}: {_count_outliers(method, truth)}" for method in (regions, laplacians, own))

@@ -111,7 +111,7 @@ def sparse_rows(seed: int) -> SparseRows:
     return SparseRows(pattern, matrix, rng.normal(size=(count, 2)), (further,), lambda: [])
 
 
-def elimination_of(rows: SparseRows) -> tuple[SparseBlocks, SharedEquations, NDArray[np.float64]]:
+def eliminate(rows: SparseRows) -> tuple[SparseBlocks, SharedEquations, NDArray[np.float64]]:
     """All blocks eliminated, what that leaves of the shared equations, and the cofactors of own unknowns."""
     unknowns = 40 + 3 * 40
     rng = np.random.default_rng(5)
@@ -132,9 +132,9 @@ def elimination_of(rows: SparseRows) -> tuple[SparseBlocks, SharedEquations, NDA
 @needs_kernels
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_compiled_elimination_is_that_of_numpy(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    found, left, cofactors = elimination_of(sparse_rows(seed))
+    found, left, cofactors = eliminate(sparse_rows(seed))
     monkeypatch.setattr(compiled, "kernels", None)
-    expected, expected_left, expected_cofactors = elimination_of(sparse_rows(seed))
+    expected, expected_left, expected_cofactors = eliminate(sparse_rows(seed))
     for name in ("triangle", "parts", "alone", "right", "orthonormal"):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-12, err_msg=name)
     np.testing.assert_allclose(np.tril(left.squares[0]), np.tril(expected_left.squares[0]), atol=1e-11)

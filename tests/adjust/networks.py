@@ -154,7 +154,7 @@ def simulated(
         for j, xyz in enumerate(points)
     )
     images = tuple(Image(f"f{i}", "K", kind) for i in range(len(truth.stations)))
-    return Network((camera,), images, object_points, make_observations(rows)), start_of(truth, kind, points)
+    return Network((camera,), images, object_points, make_observations(rows)), rough_start(truth, kind, points)
 
 
 ObservedRow = tuple[
@@ -182,13 +182,13 @@ def given_marks(places_mm: Mapping[str, Sequence[float] | Array], sigma: float) 
     return {id_: Fiducial(*(Prior(float(value), sigma) for value in place)) for id_, place in places_mm.items()}
 
 
-def row_of(network: Network, kind: ObservationKind, image: str, point: str) -> int:
+def observation_row(network: Network, kind: ObservationKind, image: str, point: str) -> int:
     """Where an observation stands."""
     rows = network.observations
     return list(zip(rows.kind, rows.image, rows.point, strict=True)).index((kind, image, point))
 
 
-def with_errors(network: Network, errors: dict[int, Array]) -> Network:
+def add_errors(network: Network, errors: dict[int, Array]) -> Network:
     """With errors in mm in the observations of some rows."""
     xy_mm = network.observations.xy_mm.copy()
     for row, error in errors.items():
@@ -196,11 +196,11 @@ def with_errors(network: Network, errors: dict[int, Array]) -> Network:
     return replace(network, observations=replace(network.observations, xy_mm=xy_mm))
 
 
-def with_covariance(network: Network, covariance_mm2: Array) -> Network:
+def set_covariance(network: Network, covariance_mm2: Array) -> Network:
     return replace(network, observations=replace(network.observations, covariance_mm2=covariance_mm2))
 
 
-def without_rows(network: Network, rows: list[int]) -> Network:
+def drop_rows(network: Network, rows: list[int]) -> Network:
     kept = np.setdiff1d(np.arange(len(network.observations)), rows)
     return replace(network, observations=network.observations.only(kept))
 
@@ -230,7 +230,7 @@ def join_observations(*parts: Observations) -> Observations:
     )
 
 
-def start_of(truth: Truth, kind: Transformation, points: Array) -> Approximations:
+def rough_start(truth: Truth, kind: Transformation, points: Array) -> Approximations:
     """The truth, coarsely rounded."""
     films = [film_parameters(truth, i, kind) for i in range(len(truth.stations))]
     return Approximations(
@@ -378,12 +378,12 @@ def give_values(network: Network, sigmas: Mapping[str, float], marks: int | None
     """Standard deviations for c, x0, y0 and for x and y of the first (None: all) fiducials, the others as they are."""
     first = list(network.cameras[0].fiducials)[:marks]
 
-    def given(name: str, prior: Prior) -> Prior:
+    def give(name: str, prior: Prior) -> Prior:
         *owner, quantity = name.split(".")
         is_given = quantity in sigmas and (owner[0] == "IO" or owner[-1] in first)
         return replace(prior, sigma=sigmas[quantity]) if is_given else prior
 
-    return map_priors(network, given)
+    return map_priors(network, give)
 
 
 def map_priors(network: Network, change: Callable[[str, Prior], Prior]) -> Network:

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 from dense_adjustment import solve_densely
-from networks import Truth, field_points, join_networks, rename_network, simulated, with_covariance
+from networks import Truth, field_points, join_networks, rename_network, set_covariance, simulated
 from numpy.typing import NDArray
 from reference_cases import CAMERA, Case, case_approximations, case_network, load, own_name
 from studies import parametrize_with_studies
@@ -211,7 +211,7 @@ def two_cameras() -> Variant:
     lens = Distortion("brown", {"k1": Prior(3e-7, np.inf), "b1": Prior(0.0, 1e-3), "b2": Prior(0.0, np.inf)})
     camera = Camera("D", Prior(80.5, np.inf), Prior(0.0, 1.0), Prior(0.0, 1.0), lens)
     correlated = np.tile(np.array([[1.0, 0.6], [0.6, 1.5]]) * 0.004**2, (len(other.observations), 1, 1))
-    other, begin = rename_network(with_covariance(other, correlated), begin, "D", str, "d{}".format, str)
+    other, begin = rename_network(set_covariance(other, correlated), begin, "D", str, "d{}".format, str)
     begin = replace(begin, interior={"D": np.array([80.5, 0.0, 0.0])})
     return join_networks((film, start), (replace(other, cameras=(camera,)), begin))
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from networks import KINDS, SCAN_MIDDLE_MM, Truth, bend_in_scanner, camera_point, field_points, simulated, start_of
+from networks import KINDS, SCAN_MIDDLE_MM, Truth, bend_in_scanner, camera_point, field_points, rough_start, simulated
 from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.optimize import brentq
@@ -253,7 +253,7 @@ def test_a_block_viewed_through_the_air_over_a_round_earth() -> None:
     """Exact observations: with the corrections the truth comes out, without them heights are wrong by a metre."""
     network, truth = bent_network()
     points = np.array([[p.value for p in (point.X, point.Y, point.Z) if p] for point in network.points])
-    start = start_of(truth, "none", points)
+    start = rough_start(truth, "none", points)
     camera = replace(network.cameras[0], principal_distance_mm=None, x0_mm=None, y0_mm=None, fiducials={})
     network = replace(network, cameras=(camera,))
     result = adjust(network, start)
@@ -278,7 +278,7 @@ def test_a_free_network_under_bent_lines_of_sight() -> None:
         replace(p, **{axis: replace(getattr(p, axis), sigma=np.inf) for axis in "XYZ"}) for p in network.points
     )
     network = replace(network, points=unknown, cameras=(replace(network.cameras[0], fiducials={}),))
-    start = start_of(truth, "none", points)
+    start = rough_start(truth, "none", points)
     lacking = adjust(network, start)
     assert len(lacking.singular) == 7
     assert lacking.network.line_of_sight == BENT

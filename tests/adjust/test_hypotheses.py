@@ -149,9 +149,9 @@ def test_images_with_numbers_one_off_are_left_out_or_all_is_refused(flat: bool) 
 
 def test_one_picture_under_two_names_is_named() -> None:
     given = misfit_network(scene(6, flat=True), Effects(), SOUND, np.random.default_rng(1))
-    rows, seen = np.array([name == "im02" for name in given.observations.image]), given.observations
-    twice = seen.only(np.append(np.arange(len(seen)), np.flatnonzero(rows)))
-    names = (*seen.image, *["copy"] * int(rows.sum()))
+    rows, observed = np.array([name == "im02" for name in given.observations.image]), given.observations
+    twice = observed.only(np.append(np.arange(len(observed)), np.flatnonzero(rows)))
+    names = (*observed.image, *["copy"] * int(rows.sum()))
     images = (*given.images, replace(given.image_by_name["im02"], name="copy"))
     result = adjust(replace(given, observations=replace(twice, image=names), images=images))
     assert ["copy as im02" in each for each in result.warnings] == [True]
@@ -169,16 +169,17 @@ def sound(frame_mm: tuple[float, float] = (12.8, 9.6), seed: int = 6) -> Network
     return replace(given, cameras=(replace(given.cameras[0], frame_mm=frame_mm),))
 
 
-def test_an_image_numbered_as_in_a_mirror_is_not_said_to_agree_with_its_picture_mirrored() -> None:
+def test_an_image_numbered_as_in_a_mirror_is_not_reported_to_agree_with_its_picture_mirrored() -> None:
     made = scene(10, flat=True)
     given = misfit_network(made, Effects(), SOUND, np.random.default_rng(4))
     columns = len(np.unique(made.points[:, 0]))
     mirrored = {f"p{k}": f"p{k + columns - 1 - 2 * (k % columns)}" for k in range(len(made.points))}
-    seen = given.observations
+    observed = given.observations
     names = tuple(
-        mirrored[point] if image == "im01" else point for image, point in zip(seen.image, seen.point, strict=True)
+        mirrored[point] if image == "im01" else point
+        for image, point in zip(observed.image, observed.point, strict=True)
     )
-    (sentence,) = adjust(replace(given, observations=replace(seen, point=names))).misread
+    (sentence,) = adjust(replace(given, observations=replace(observed, point=names))).misread
     assert sentence.startswith("Image im01 is mirrored, or numbered as in a mirror, or the flat board is transparent")
     assert "agree" not in sentence
 

@@ -8,7 +8,7 @@ from typing import cast
 
 import numpy as np
 import pytest
-from networks import Name, Truth, simulated, two_cameras, with_errors
+from networks import Name, Truth, add_errors, simulated, two_cameras
 
 from adjust import Distortion, Exterior, Network, ObjectPoint, Prior
 from adjust.errors import AdjustmentError, DatumError
@@ -69,7 +69,7 @@ GALLERY: dict[str, tuple[Change, list[str]]] = {
     "unknown fiducial": (drop_fiducial, ["fiducial 3", "image f0", "camera K"]),
     "observed twice": (lambda n: rows(n, [*range(len(n.observations)), 7]), ["point 2", "2 times", "image f0"]),
     "covariance": (bad_covariance, ["target 3", "image f0", "not positive definite"]),
-    "nan": (lambda n: with_errors(n, {9: np.array([0.0, np.nan])}), ["target 4", "image f0", "not a finite number"]),
+    "nan": (lambda n: add_errors(n, {9: np.array([0.0, np.nan])}), ["target 4", "image f0", "not a finite number"]),
     "two targets": (lambda n: drop_observations(n, "f1", "target", 2), ["image f1", "2 object points", "needs 3"]),
     "two fiducials": (
         lambda n: drop_observations(n, "f3", "fiducial", 2),

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from networks import Truth, field_points, row_of, simulated, with_errors, without_rows
+from networks import Truth, add_errors, drop_rows, field_points, observation_row, simulated
 from numpy.typing import NDArray
 
 from adjust import Adjustment, Calibration, Options, Parameter, Prior, adjust
@@ -25,7 +25,7 @@ def exact_network() -> tuple[Network, Approximations]:
         np.random.default_rng(3), truth, point_sigma=0.02, noise=False, fiducial_sigma=0.005, free={"k3": np.inf}
     )
     covariance = network.observations.covariance_mm2.copy()
-    covariance[row_of(network, "target", "f1", "4")] = 0.004**2 * np.array([[1.0, 0.6], [0.6, 2.0]])
+    covariance[observation_row(network, "target", "f1", "4")] = 0.004**2 * np.array([[1.0, 0.6], [0.6, 2.0]])
     values = np.array([*truth.stations[2], *truth.attitudes[2]])
     sigmas = np.array([0.1, 0.1, np.inf, np.inf, np.inf, np.inf])
     images = tuple(
@@ -65,8 +65,12 @@ def spoil_station(network: Network, error: float) -> Network:
 
 X, Y = np.array([1.0, 0.0]), np.array([0.0, 1.0])
 CASES: dict[str, tuple[str, int, Callable[[Network, float], Network]]] = {
-    "target": ("target 4 in image f1", 1, lambda n, e: with_errors(n, {row_of(n, "target", "f1", "4"): e * Y})),
-    "fiducial": ("fiducial 2 in image f3", 0, lambda n, e: with_errors(n, {row_of(n, "fiducial", "f3", "2"): e * X})),
+    "target": ("target 4 in image f1", 1, lambda n, e: add_errors(n, {observation_row(n, "target", "f1", "4"): e * Y})),
+    "fiducial": (
+        "fiducial 2 in image f3",
+        0,
+        lambda n, e: add_errors(n, {observation_row(n, "fiducial", "f3", "2"): e * X}),
+    ),
     "control": ("control point 5 Z", 0, spoil_control),
     "datum": ("given fiducial 3 (camera K)", 1, spoil_fiducial),
     "exterior": ("given X0 of image f2", 0, spoil_station),
@@ -108,7 +112,7 @@ def test_the_cause_that_is_named_moves_the_parameter_by_what_is_reported() -> No
         unit, axis = named[outer.cause]
         if unit < len(network.observations):
             error = tests.smallest[unit, axis] * np.eye(2)[axis]
-            dirty = adjust(with_errors(network, {unit: error}), start)
+            dirty = adjust(add_errors(network, {unit: error}), start)
             shift = dirty.value(outer.parameter) - clean.value(outer.parameter)
             assert shift == pytest.approx(outer.effect, rel=5e-3)
             checked += 1
@@ -140,8 +144,8 @@ def test_an_undetected_error_of_an_earlier_calibration_moves_the_camera_as_state
 def test_w_of_an_observation_does_not_depend_on_the_weight_that_it_was_left() -> None:
     """Nearly without weight it is predicted by the others; the test is that of the observation as it was given."""
     network, start = simulated(np.random.default_rng(5), fiducial_sigma=0.01)
-    unit = row_of(network, "target", "f1", "4")
-    spoilt = with_errors(network, {unit: np.array([0.03, 0.08])})
+    unit = observation_row(network, "target", "f1", "4")
+    spoilt = add_errors(network, {unit: np.array([0.03, 0.08])})
     plain, robust = adjust(spoilt, start), adjust(spoilt, start, Options(robust="igg3"))
     assert robust.weights[unit] < 1e-6
     others = np.delete(robust.weights, unit)
@@ -162,7 +166,7 @@ def test_what_nothing_checks_is_reported() -> None:
     images = tuple(replace(i, exterior=exterior) if i.name == "f0" else i for i in network.images)
     result = adjust(replace(network, observations=few, images=images), start)
     tests = assess_reliability(result)
-    unit = row_of(replace(network, observations=few), "fiducial", "f0", "1")
+    unit = observation_row(replace(network, observations=few), "fiducial", "f0", "1")
     assert np.isinf(tests.smallest[unit]).all()
     assert (tests.w[unit] == 0.0).all()
     assert {"fiducial 1 x in image f0", "fiducial 3 y in image f0"} <= set(tests.unchecked)
@@ -176,7 +180,7 @@ def test_the_usual_probabilities_give_baardas_delta0() -> None:
         Probabilities(power=80.0)
 
 
-def test_critical_tau_is_the_quantile_of_a_residual_over_the_sigma0_that_it_is_part_of() -> None:
+def test_critical_tau_is_the_quantile_of_a_residual_over_its_own_sigma0() -> None:
     rng = np.random.default_rng(1)
     for redundancy in (3, 12):
         z = rng.normal(size=(400_000, redundancy))
@@ -202,12 +206,12 @@ def row_name(network: Network, row: int) -> str:
 
 def test_what_is_removed_is_named_and_has_no_influence() -> None:
     network, start = checkable(1)
-    spoilt = with_errors(network, {8: np.array([0.06, 0.0]), 30: np.array([-0.04, 0.05])})
+    spoilt = add_errors(network, {8: np.array([0.06, 0.0]), 30: np.array([-0.04, 0.05])})
     result = adjust(spoilt, start, Options(snooping=True))
     assert named(result) == sorted([row_name(network, 8), row_name(network, 30)])
     assert all(suspect.removed for suspect in result.suspects)
     assert result.suspects[0].error == pytest.approx((-0.04, 0.05), abs=0.02)
-    expected = adjust(without_rows(network, [8, 30]), start)
+    expected = adjust(drop_rows(network, [8, 30]), start)
     assert (result.conditions, result.redundancy) == (expected.conditions, expected.redundancy)
     assert result.vpv == pytest.approx(expected.vpv, rel=1e-6)
     sigma = np.sqrt(expected.cofactor.variances)
@@ -220,7 +224,7 @@ def test_what_is_removed_is_named_and_has_no_influence() -> None:
 def test_suspects_are_named_without_being_removed() -> None:
     """The residuals of good observations that a gross error has spoilt do not make them suspect."""
     network, start = checkable(1)
-    spoilt = with_errors(network, {8: np.array([0.1, 0.0]), 30: np.array([-0.08, 0.1])})
+    spoilt = add_errors(network, {8: np.array([0.1, 0.0]), 30: np.array([-0.08, 0.1])})
     result = adjust(spoilt, start)
     w = np.abs(result.residuals.w).max(axis=1)
     assert (w > 4.5).sum() > 2
@@ -250,7 +254,7 @@ def test_observations_all_worse_than_stated_raise_the_limits_by_the_square_of_th
     claimed = replace(network, observations=replace(rows, covariance_mm2=rows.covariance_mm2 / 9.0))
     errors = np.arange(0, len(rows), 25)
     amounts = {int(row): np.array([0.12, -0.09]) for row in errors[1:2]}
-    spoilt = with_errors(claimed, amounts)
+    spoilt = add_errors(claimed, amounts)
     result = adjust(spoilt, start, Options(snooping=True))
     assert named(result) == sorted(row_name(network, row) for row in amounts)
 
@@ -262,8 +266,8 @@ def test_two_rays_of_a_point_cannot_be_distinguished() -> None:
     free = replace(next(point for point in network.points if point.id == "4"), X=None, Y=None, Z=None)
     points = tuple(free if point.id == "4" else point for point in network.points)
     of_point = [i for i in range(len(rows)) if rows.point[i] == "4" and rows.kind[i] == "target"]
-    two = without_rows(replace(network, points=points), of_point[2:])
-    result = adjust(with_errors(two, {of_point[0]: np.array([0.15, 0.15])}), start, Options(snooping=True))
+    two = drop_rows(replace(network, points=points), of_point[2:])
+    result = adjust(add_errors(two, {of_point[0]: np.array([0.15, 0.15])}), start, Options(snooping=True))
     rays = {row_name(network, of_point[0]), row_name(network, of_point[1])}
     assert len(result.suspects) == 1
     assert {result.suspects[0].tested.name, *result.suspects[0].alike} == rays
@@ -278,8 +282,8 @@ def test_five_percent_of_gross_errors_lose_their_influence_wholly(size_mm: float
     wrong = [int(i) for i in rng.choice(count, count // 20, replace=False)]
     direction = rng.uniform(0.0, 2.0 * np.pi, len(wrong))
     errors = size_mm * np.column_stack([np.cos(direction), np.sin(direction)])
-    spoilt = with_errors(network, dict(zip(wrong, errors, strict=True)))
-    expected = adjust(without_rows(network, wrong), start)
+    spoilt = add_errors(network, dict(zip(wrong, errors, strict=True)))
+    expected = adjust(drop_rows(network, wrong), start)
     sigma = np.sqrt(expected.cofactor.variances)
     free = sigma > 0.0
     for options in (Options(robust="igg3"), Options(snooping=True)):

@@ -314,7 +314,7 @@ def test_a_bend_takes_the_taking_lens_out_as_opencv_does_and_then_bends() -> Non
         np.testing.assert_allclose(both.gradient(values, scan_mm)[:, :, axis], slope, atol=1e-6)
 
 
-def test_scans_through_a_lens_adjust_as_those_without() -> None:
+def test_scans_through_a_lens_adjust_as_plain_ones() -> None:
     network, start = simulated(np.random.default_rng(5))
     straight = network.observations.xy_mm
     lens = replace(LENS, interior=np.array([600.0, 3.0, -5.0]))

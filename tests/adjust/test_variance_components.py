@@ -9,12 +9,12 @@ from networks import (
     FRAME_NOISE_MM,
     DrawnFrames,
     Truth,
+    add_errors,
     draw_frames,
     field_points,
-    row_of,
+    observation_row,
+    set_covariance,
     simulated,
-    with_covariance,
-    with_errors,
 )
 from numpy.typing import NDArray
 from reference_cases import exact, load, realisation
@@ -40,11 +40,11 @@ ROBUST = Options(robust=True)
 def test_redundancy_is_what_a_residual_shows_of_an_error() -> None:
     """An error in one coordinate appears in its residual times minus the redundancy number, correlations included."""
     network, start = simulated(np.random.default_rng(3), noise=False)
-    row = row_of(network, "target", "f2", "7")
+    row = observation_row(network, "target", "f2", "7")
     covariance = network.observations.covariance_mm2.copy()
     covariance[row] = 0.004**2 * np.array([[1.0, 0.6], [0.6, 2.0]])
     for axis in (0, 1):
-        spoilt = with_errors(with_covariance(network, covariance), {row: 1e-4 * np.eye(2)[axis]})
+        spoilt = add_errors(set_covariance(network, covariance), {row: 1e-4 * np.eye(2)[axis]})
         result = adjust(spoilt, start)
         shown = -result.residuals.v_mm[row, axis] / 1e-4
         assert shown == pytest.approx(result.residuals.redundancy[row, axis], rel=1e-4)
@@ -68,7 +68,7 @@ def test_variance_components_find_the_variances() -> None:
     network, start = simulated(rng, points=field_points(rng, 40))
     fiducial = np.array([kind == "fiducial" for kind in network.observations.kind])
     claimed = network.observations.covariance_mm2 * np.where(fiducial, 4.0, 0.25)[:, None, None]
-    result = adjust(with_covariance(network, claimed), start, Options(variance_components=True))
+    result = adjust(set_covariance(network, claimed), start, Options(variance_components=True))
     assert result.converged
     assert result.variance_factors["target"] == pytest.approx(4.0, rel=0.3)
     assert result.variance_factors["fiducial"] == pytest.approx(0.25, rel=0.6)
@@ -178,7 +178,7 @@ def test_a_group_without_redundancy_keeps_its_variance() -> None:
 @pytest.mark.study
 def test_a_gross_error_that_is_left_out_does_not_spoil_the_factors() -> None:
     network, start = checkable(5, 15)
-    spoilt = with_errors(network, {9: np.array([0.3, 0.1])})
+    spoilt = add_errors(network, {9: np.array([0.3, 0.1])})
     clean = adjust(network, start, Options(variance_components=True))
     result = adjust(spoilt, start, Options(variance_components=True, snooping=True))
     assert len(result.suspects) == 1

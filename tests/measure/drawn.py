@@ -30,16 +30,14 @@ Array = NDArray[np.float64]
 STRIP = 10_000  # samples that are asked together
 
 
-def scan_of(grey: Array, full_scale: int = 65535, rounding_step_dn: float = 0.0) -> Scan:
+def make_scan(grey: Array, full_scale: int = 65535, rounding_step_dn: float = 0.0) -> Scan:
     """Grey values (height, width), rounded and cut off, as a scan of 16 or 8 bits in memory."""
     rounded = np.clip(np.rint(grey), 0, full_scale)[..., None]
     stored: Samples = rounded.astype(np.uint16) if full_scale > 255 else rounded.astype(np.uint8)
     return Scan(Path("drawn.tif"), WholePicture(stored, rounding_step_dn), NO_TAGS)
 
 
-def drawn(
-    inside: Callable[[Array, Array], Array], width: int, height: int, blur_px: float, fineness: int = 16
-) -> Array:
+def draw(inside: Callable[[Array, Array], Array], width: int, height: int, blur_px: float, fineness: int = 16) -> Array:
     """(height, width) means over the pixels of a function of columns (1, n) and rows (m, 1), after a Gaussian blur."""
     pad = int(np.ceil(5 * blur_px)) + 1
     fine = [(np.arange((size + 2 * pad) * fineness) + 0.5) / fineness - 0.5 - pad for size in (width, height)]
@@ -194,7 +192,7 @@ RING_CROSS = ring_cross(0.5, 0.1, 0.8, 0.1)
 NOISE_DN = 200.0
 
 
-def layout_of(
+def lay_out(
     marks: Sequence[MarkShape],
     places: Sequence[tuple[float, float]] = CORNERS,
     frame_mm: tuple[float, float] = (17.0, 17.0),
@@ -213,8 +211,8 @@ def numbered(count: int) -> MarkShape:
     return MarkShape((*RING_CROSS, *dots))
 
 
-NUMBERED = layout_of([numbered(count) for count in range(4)])
-ALIKE = layout_of([MarkShape(RING_CROSS)] * 4)
+NUMBERED = lay_out([numbered(count) for count in range(4)])
+ALIKE = lay_out([MarkShape(RING_CROSS)] * 4)
 
 
 def pixel_from_camera(pose: str, turn_rad: float = 0.008, center: tuple[float, float] = (202.3, 197.6)) -> Array:
@@ -259,7 +257,7 @@ def paint(
     grey[rows[inside], cols[inside]] += contrast * shown[inside]
 
 
-def measured(
+def measure_grey(
     grey: Array, layout: FiducialLayout, folder: Path, options: FiducialOptions | None = None, pitch: bool = True
 ) -> FrameMeasurement:
     with written_scan(grey, folder) as scan:
@@ -268,7 +266,7 @@ def measured(
     return result
 
 
-def pose_of(frame: FrameMeasurement) -> tuple[str, bool]:
+def found_pose(frame: FrameMeasurement) -> tuple[str, bool]:
     """The name of a frame's scan orientation, and whether it is decided."""
     assert frame.pose is not None
     return frame.pose.name, frame.pose.decided
@@ -311,7 +309,7 @@ def take_picture(spec: BoardSpec, homography: Array, is_dark: Any, seed: int = 1
         return np.asarray(1.0 - is_dark(x / w + middle[0], y / w + middle[1]))
 
     rng = np.random.default_rng(seed)
-    clean = drawn(light, WIDTH, HEIGHT, 0.8, fineness=6)
+    clean = draw(light, WIDTH, HEIGHT, 0.8, fineness=6)
     return 8000 + 30000 * clean + rng.normal(0, 300, clean.shape)
 
 
@@ -420,5 +418,5 @@ def tile_boards(spec: BoardSpec, is_dark: Any, shown: tuple[float, ...], finenes
         x, y = (col - which * width - 30.0) / scale, (height - row - 30.0) / scale
         return np.asarray(1.0 - is_dark(x, y))
 
-    clean = drawn(light, width * len(shown), height, 0.8, fineness=fineness)
+    clean = draw(light, width * len(shown), height, 0.8, fineness=fineness)
     return 8000 + 30000 * clean + np.random.default_rng(4).normal(0, 300, clean.shape)

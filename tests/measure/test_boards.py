@@ -11,11 +11,11 @@ from drawn import (
     board_from_pixel,
     chessboard_dark,
     circles_dark,
-    drawn,
+    draw,
     errors_px,
+    make_scan,
     mapped,
     read_truth,
-    scan_of,
     squares_dark,
     take_picture,
     tile_boards,
@@ -48,7 +48,7 @@ Array = NDArray[np.float64]
 def test_a_chessboard_in_any_direction_keeps_its_names(turn_deg: float) -> None:
     spec = ChessboardSpec(6, 5, 24.0)
     homography = board_from_pixel(turn_deg)
-    board = measure_board(scan_of(take_picture(spec, homography, chessboard_dark(spec))), spec)
+    board = measure_board(make_scan(take_picture(spec, homography, chessboard_dark(spec))), spec)
     assert board.reason == ""
     assert all(mark.status is Status.MEASURED for mark in board.marks)
     errors = errors_px(board, read_truth(spec, homography))
@@ -61,10 +61,10 @@ def test_trap_half_a_pixel_lost() -> None:
     spec = ChessboardSpec(6, 5, 24.0)
     homography = board_from_pixel(3.0)
     picture = take_picture(spec, homography, chessboard_dark(spec))
-    board = measure_board(scan_of(picture), spec)
+    board = measure_board(make_scan(picture), spec)
     assert np.abs(errors_px(board, read_truth(spec, homography)).mean(axis=0)).max() < 0.006
     large = np.pad(np.kron(picture, np.ones((4, 4))), ((0, 0), (0, 1100)), constant_values=38000.0)
-    board = measure_board(scan_of(large), spec)
+    board = measure_board(make_scan(large), spec)
     centers = {mark.point: mark.center_px for mark in board.marks if mark.center_px is not None}
     errors = np.array([(centers[name] - 1.5) / 4 - place for name, place in read_truth(spec, homography).items()])
     assert np.abs(errors.mean(axis=0)).max() < 0.01
@@ -73,7 +73,7 @@ def test_trap_half_a_pixel_lost() -> None:
 def test_a_board_that_a_half_turn_does_not_change_is_taken_as_upright_and_says_so() -> None:
     spec = ChessboardSpec(6, 4, 24.0)
     homography = board_from_pixel(10.0)
-    board = measure_board(scan_of(take_picture(spec, homography, chessboard_dark(spec))), spec)
+    board = measure_board(make_scan(take_picture(spec, homography, chessboard_dark(spec))), spec)
     assert "looks the same after a half turn" in board.notes[0]
     assert np.abs(errors_px(board, read_truth(spec, homography))).max() < 0.05
 
@@ -88,7 +88,7 @@ def test_a_board_that_a_half_turn_does_not_change_is_taken_as_upright_and_says_s
 )
 def test_circle_grids(spec: CircleGridSpec) -> None:
     homography = board_from_pixel(tilt=5e-5)
-    board = measure_board(scan_of(take_picture(spec, homography, circles_dark(spec))), spec)
+    board = measure_board(make_scan(take_picture(spec, homography, circles_dark(spec))), spec)
     assert board.reason == ""
     errors = errors_px(board, read_truth(spec, homography))
     assert len(errors) == len(spec.places())
@@ -101,7 +101,7 @@ def test_dots_that_the_edge_of_the_picture_cuts_are_not_measured(left_px: int, c
     spec, homography = CircleGridSpec(6, 5, 30.0, 14.0), board_from_pixel(20.0, tilt=5e-5)
     truth = read_truth(spec, homography)
     left = round(truth["r0c0"][0]) + left_px
-    board = measure_board(scan_of(take_picture(spec, homography, circles_dark(spec))[:, left:]), spec)
+    board = measure_board(make_scan(take_picture(spec, homography, circles_dark(spec))[:, left:]), spec)
     outside = [mark for mark in board.marks if mark.reason.codes == (Code.OUTSIDE,)]
     assert [(mark.point, mark.status) for mark in outside] == [(f"r{row}c0", Status.ABSENT) for row in range(cut)]
     errors = errors_px(board, {name: place - [left, 0] for name, place in truth.items()})
@@ -116,7 +116,7 @@ def test_an_asymmetric_grid_in_a_mirror_keeps_its_names(is_mirrored: bool) -> No
     if is_mirrored:
         picture = picture[:, ::-1]
         truth = {name: np.array([picture.shape[1] - 1, 0]) + place * (-1, 1) for name, place in truth.items()}
-    board = measure_board(scan_of(picture), spec)
+    board = measure_board(make_scan(picture), spec)
     assert (board.reason, board.is_mirrored) == ("", is_mirrored)
     errors = errors_px(board, truth)
     half_turned = dict(zip(truth, reversed(truth.values()), strict=True))
@@ -137,7 +137,7 @@ def test_an_asymmetric_grid_in_a_mirror_keeps_its_names(is_mirrored: bool) -> No
 def test_a_chessboard_of_another_count_is_refused_with_its_own(columns: int, rows: int, words: str) -> None:
     spec = ChessboardSpec(6, 5, 24.0)
     picture = take_picture(spec, board_from_pixel(8.0, 6e-4), chessboard_dark(spec))
-    board = measure_board(scan_of(picture), ChessboardSpec(columns, rows, 24.0))
+    board = measure_board(make_scan(picture), ChessboardSpec(columns, rows, 24.0))
     assert words in board.reason
     assert {mark.status for mark in board.marks} == {Status.ABSENT}
 
@@ -161,7 +161,7 @@ def test_a_part_of_a_chessboard_has_the_names_of_the_whole(
 ) -> None:
     """Its light border is seen on two sides or more; the colours tell which end is which."""
     picture, truth = large_board
-    board = measure_board(scan_of(picture[shown]), LARGE)
+    board = measure_board(make_scan(picture[shown]), LARGE)
     errors = errors_px(
         board, {name: place - [shown[1].start or 0, shown[0].start or 0] for name, place in truth.items()}
     )
@@ -175,7 +175,7 @@ def test_a_part_of_a_chessboard_has_the_names_of_the_whole(
 def test_what_covers_a_chessboard_is_no_end_of_it(large_board: tuple[Array, dict[str, Array]], covered: Any) -> None:
     picture, truth = large_board[0].copy(), large_board[1]
     picture[covered] = 22000.0
-    errors = errors_px(measure_board(scan_of(picture), LARGE), truth)
+    errors = errors_px(measure_board(make_scan(picture), LARGE), truth)
     assert len(errors) >= 45
     assert np.abs(errors).max() < 0.03
 
@@ -185,7 +185,7 @@ def test_a_part_of_a_chessboard_that_may_be_another_is_refused(
     large_board: tuple[Array, dict[str, Array]], shown: Any
 ) -> None:
     """Of one corner's border with fewer squares than tell the longer side; and without an end of the longer side."""
-    board = measure_board(scan_of(large_board[0][shown]), LARGE)
+    board = measure_board(make_scan(large_board[0][shown]), LARGE)
     assert not any(mark.status.is_observation for mark in board.marks)
     assert "nothing tells which part it is" in board.reason
 
@@ -193,7 +193,7 @@ def test_a_part_of_a_chessboard_that_may_be_another_is_refused(
 def test_a_board_whose_outer_corners_lie_outside_is_refused_in_words_that_fit(
     large_board: tuple[Array, dict[str, Array]],
 ) -> None:
-    board = measure_board(scan_of(large_board[0][:195, 52:256]), LARGE)
+    board = measure_board(make_scan(large_board[0][:195, 52:256]), LARGE)
     assert not any(mark.status.is_observation for mark in board.marks)
     assert "9 x 6 inner corners is whole in the scan: some of its corners, or of the light border" in board.reason
 
@@ -237,7 +237,7 @@ def test_corners_of_separate_squares(turn_deg: float, gap_mm: float) -> None:
     """Named by row, column and corner, to some hundredths of a pixel, their standard deviations honest."""
     spec = SquareGridSpec(5, 4, 45.0 - gap_mm, gap_mm)
     homography = board_from_pixel(turn_deg, 2e-4)
-    board = measure_board(scan_of(take_picture(spec, homography, squares_dark(spec))), spec)
+    board = measure_board(make_scan(take_picture(spec, homography, squares_dark(spec))), spec)
     assert board.notes == ("the grid looks the same when turned: it was taken as upright in the scan",)
     errors = errors_px(board, read_truth(spec, homography))
     assert len(errors) >= 78
@@ -256,7 +256,7 @@ def test_a_grid_of_squares_with_some_hidden_keeps_its_names() -> None:
     picture, truth = take_picture(spec, homography, squares_dark(spec)), read_truth(spec, homography)
     col, row = np.mean([truth[f"r1c2.{i}"] for i in range(4)], axis=0).astype(int)
     picture[row - 22 : row + 22, col - 22 : col + 22] = 38000.0
-    board = measure_board(scan_of(picture), spec)
+    board = measure_board(make_scan(picture), spec)
     hidden = [mark for mark in board.marks if not mark.status.is_observation]
     assert {mark.point for mark in hidden} == {f"r1c2.{i}" for i in range(4)}
     assert {str(mark.reason) for mark in hidden} == {"its square was not found"}
@@ -276,10 +276,10 @@ def test_of_boards_that_are_alike_none_is_observed(kind: str) -> None:
     else:
         spec = CircleGridSpec(6, 5, 28.0, 13.0)
         dark, words = circles_dark(spec), "3 grids of 6 x 5 dots"
-    one = measure_board(scan_of(tile_boards(spec, dark, (1.0,))), spec)
+    one = measure_board(make_scan(tile_boards(spec, dark, (1.0,))), spec)
     assert not one.ambiguous
     assert all(mark.status is Status.MEASURED for mark in one.marks)
-    three = measure_board(scan_of(tile_boards(spec, dark, (1.0, 0.9, 1.0))), spec)
+    three = measure_board(make_scan(tile_boards(spec, dark, (1.0, 0.9, 1.0))), spec)
     assert words in three.ambiguous
     places = [float(place) for place in re.findall(r"\((\d+), \d+\)", three.ambiguous)]
     width = np.ptp([point[:2] for point in spec.object_points().values()], axis=0)[0] + 60.0
@@ -296,14 +296,14 @@ def test_a_board_of_less_than_half_the_size_is_another_one() -> None:
         dark = np.pad(np.kron(squares, np.ones((side, side))), side, constant_values=1)
         picture[top : top + dark.shape[0], left : left + dark.shape[1]] = 25 + 200 * dark
     blurred = np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.8), float) + rng.normal(0, 2, picture.shape)
-    board = measure_board(scan_of(blurred, 255), ChessboardSpec(9, 6, 30.0))
+    board = measure_board(make_scan(blurred, 255), ChessboardSpec(9, 6, 30.0))
     assert "2 boards of 9 x 6 inner corners" in board.ambiguous
     assert {mark.status for mark in board.marks} == {Status.REJECTED}
 
 
 def test_a_circle_grid_is_no_part_of_a_larger_one() -> None:
     spec, larger = CircleGridSpec(6, 5, 28.0, 13.0), CircleGridSpec(7, 5, 28.0, 13.0)
-    board = measure_board(scan_of(tile_boards(larger, circles_dark(larger), (1.0,))), spec)
+    board = measure_board(make_scan(tile_boards(larger, circles_dark(larger), (1.0,))), spec)
     assert "the grid is larger than 6 x 5 dots" in board.reason
     assert {mark.status for mark in board.marks} == {Status.ABSENT}
 
@@ -316,10 +316,10 @@ def test_a_few_spots_are_no_circle_grid() -> None:
     def light(col: Array, row: Array) -> Array:
         return np.asarray(np.min([np.hypot(col - x, row - y) for x, y in places], axis=0) > 8.0, float)
 
-    board = measure_board(scan_of(8000 + 30000 * drawn(light, 340, 250, 0.8, fineness=4)), spec)
+    board = measure_board(make_scan(8000 + 30000 * draw(light, 340, 250, 0.8, fineness=4)), spec)
     assert "no grid of 6 x 5 dots is whole in the scan; 5 spots are candidates for dots" in board.reason
     staggered = CircleGridSpec(8, 11, 28.0, 12.0, asymmetric=True)
-    board = measure_board(scan_of(8000 + 30000 * drawn(light, 340, 250, 0.8, fineness=4)), staggered)
+    board = measure_board(make_scan(8000 + 30000 * draw(light, 340, 250, 0.8, fineness=4)), staggered)
     assert "no grid of 44 dots in 11 rows is whole in the scan" in board.reason  # 4 x 11, as OpenCV counts
 
 
@@ -337,7 +337,7 @@ def test_a_few_spots_are_no_circle_grid() -> None:
 @pytest.mark.parametrize("level", [0.0, 30.0])
 def test_why_a_board_was_not_found(spec: BoardSpec, level: float) -> None:
     rng = np.random.default_rng(3)
-    board = measure_board(scan_of(level + rng.normal(0, level / 10, (480, 640))), spec)
+    board = measure_board(make_scan(level + rng.normal(0, level / 10, (480, 640))), spec)
     assert board.reason
     assert {mark.point for mark in board.marks} == set(spec.object_points())
     assert all(mark.status is Status.ABSENT and mark.reason for mark in board.marks)

@@ -15,7 +15,7 @@ from drawn import (
     Array,
     assert_right,
     frame_picture,
-    layout_of,
+    lay_out,
     pixel_from_camera,
     written_scan,
 )
@@ -92,7 +92,7 @@ def test_of_a_large_scan_with_all_marks_clear_only_windows_are_read(
     """One of eight marks lies farther off than most, by next to nothing or as much as film bends: none is missing, and
     no more of the file is read. How much is, a reader counts that decodes its tiles."""
     places = [(4.5 * x, 4.5 * y) for x, y in (*CORNERS, (7.0, 0.0), (-7.0, 0.0), (0.0, 7.0), (0.0, -7.0))]
-    layout = layout_of([MarkShape(RING_CROSS)] * 8, places, (66.0, 66.0))
+    layout = lay_out([MarkShape(RING_CROSS)] * 8, places, (66.0, 66.0))
     matrix = pixel_from_camera("0", center=(705.3, 694.6))
     first = layout.marks[0]
     bent = replace(first, xy_mm=(first.xy_mm[0] - bent_mm, first.xy_mm[1] + bent_mm))
@@ -116,9 +116,9 @@ def test_a_lattice_is_distinguished_from_a_frame() -> None:
     cross = MarkShape(ring_cross(0.5, 0.1, 0.8, 0.1))
     places = [(10.0 * i, 10.0 * j) for i in range(5) for j in range(5)]
     sides = ((7.7, 0.0), (0.0, 7.7), (-7.7, 0.0), (0.0, -7.7))
-    assert is_lattice(layout_of([cross] * 25, places))
-    assert not is_lattice(layout_of([cross] * 4))
-    assert not is_lattice(layout_of([cross] * 8, CORNERS + sides))
+    assert is_lattice(lay_out([cross] * 25, places))
+    assert not is_lattice(lay_out([cross] * 4))
+    assert not is_lattice(lay_out([cross] * 8, CORNERS + sides))
 
 
 @pytest.mark.parametrize("center", [(225.0, 180.0), (190.0, 206.0)])

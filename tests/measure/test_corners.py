@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from drawn import drawn, transformed, whitened
+from drawn import draw, transformed, whitened
 from numpy.typing import NDArray
 from scipy.special import ndtr
 from scipy.stats import multivariate_normal
@@ -54,7 +54,7 @@ def square_picture(center: Array, steps: Array, blur_px: float, alone: bool) -> 
         s, t = transformed(inverse, col - center[0], row - center[1])
         return np.asarray((s > 0) & (t > 0) if alone else (np.floor(s) + np.floor(t)) % 2 == 0)
 
-    return 50 + CONTRAST * drawn(light, SIZE, SIZE, blur_px)
+    return 50 + CONTRAST * draw(light, SIZE, SIZE, blur_px)
 
 
 def fit_mark(window: Array, start: Array, steps: Array, alone: bool) -> Corner:

@@ -10,7 +10,7 @@ import imagecodecs
 import numpy as np
 import pytest
 import tifffile
-from drawn import scan_of
+from drawn import make_scan
 from scipy.ndimage import gaussian_filter
 from true_marks import KIND, some_mark
 
@@ -141,7 +141,7 @@ def frame(
         light[corner[1] :, corner[0] :][: mark.size, : mark.size] -= 0.25 * mark.picture
         true_px.append(linear @ place + middle)
     marks = tuple(LayoutMark(str(n), place, (0.005, 0.005), kind.shape) for n, place in enumerate(PLACES))
-    scan = scan_of(FULL * np.clip(sharpened(light ** (1 / tone), amount, radius_px), 0.0, 1.0))
+    scan = make_scan(FULL * np.clip(sharpened(light ** (1 / tone), amount, radius_px), 0.0, 1.0))
     options, pitch_um = FiducialOptions(pose="0"), 1000 / PX_PER_MM
     layout = FiducialLayout(tuple(marks), (17.0, 17.0))
     return measure_fiducials(scan.replace_tone(Tone.unknown()), layout, (pitch_um, pitch_um), options), np.array(
@@ -168,7 +168,7 @@ def test_what_an_unsharp_mask_did_is_undone(amount: float, radius_px: float) -> 
 def test_a_window_is_read_as_it_was_before_the_scan_was_sharpened() -> None:
     codes = 30000 + 8000 * gaussian_filter(np.random.default_rng(2).standard_normal((150, 150)), 1.5)
     mask = Sharpening(1.5, 1.2)
-    scan = scan_of(sharpened(codes, 1.5, 1.2)).replace_tone(Tone().sharpened(mask))
+    scan = make_scan(sharpened(codes, 1.5, 1.2)).replace_tone(Tone().sharpened(mask))
     np.testing.assert_allclose(scan.light(60, 50, 40, 30), codes[50:80, 60:100], atol=20)
 
 

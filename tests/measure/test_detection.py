@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drawn import Array, brute_picture, placed, scan_of, written_scan
+from drawn import Array, brute_picture, make_scan, placed, written_scan
 from scipy import ndimage
 from scipy.ndimage import gaussian_filter
 from true_marks import KIND, some_mark
@@ -159,7 +159,7 @@ def test_noise_is_rarely_worth_a_fit_however_coarse_it_is(texture_px: float) -> 
         if texture_px:
             noise = gaussian_filter(noise, texture_px) * texture_px * 3
         expected = MarkPrediction(mark.kind.shape, mark.place, 3.0, 1)
-        answers += localise(scan_of(GROUND + 3000 * noise), expected) is not None
+        answers += localise(make_scan(GROUND + 3000 * noise), expected) is not None
     assert answers <= 13  # of sixty at a twentieth, sharp or soft: more in one run of a thousand
 
 
@@ -169,7 +169,7 @@ def test_a_soft_mark_that_hardly_stands_out_of_the_noise_is_measured() -> None:
         mark = some_mark(KIND["gap cross"], 2.5, rng)
         grey = GROUND + CONTRAST * (mark.picture + rng.standard_normal((mark.size, mark.size)) / 5)
         start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + rng.uniform(-1, 1, 2)])
-        fit = detect_mark(scan_of(grey), MarkPrediction(mark.kind.shape, start, 3.0, 1), FiducialOptions().match).fit
+        fit = detect_mark(make_scan(grey), MarkPrediction(mark.kind.shape, start, 3.0, 1), FiducialOptions().match).fit
         assert fit is not None
         error = fit.center_px - mark.place[:, 2]
         assert error @ np.linalg.solve(fit.covariance_px2, error) < 13.8  # one in a thousand
@@ -180,7 +180,7 @@ def test_a_line_far_thinner_than_a_pixel_is_not_detected_in_noise_and_warns_of_n
     mark = MarkShape(cross(1.5, 0.06), "dark")
     noise = np.random.default_rng(3).standard_normal((60, 60))
     place = np.array([[1.5, 0.0, 30.0], [0.0, -1.5, 30.0]])  # 0.67 mm a pixel
-    assert localise(scan_of(GROUND + 3000 * noise), MarkPrediction(mark, place, 3.0, -1)) is None
+    assert localise(make_scan(GROUND + 3000 * noise), MarkPrediction(mark, place, 3.0, -1)) is None
 
 
 def test_a_solid_mark_at_the_frames_border_is_visible_however_far_about_it_is_sought() -> None:
@@ -193,7 +193,7 @@ def test_a_solid_mark_at_the_frames_border_is_visible_however_far_about_it_is_so
     ground = 30000 + 2500 * 14 * gaussian_filter(rng.standard_normal((size, size)), 4.0)
     border = 14000 + 3000 * rng.standard_normal((size, size))
     light = gaussian_filter(exposed.astype(float), 1.0)
-    scan = scan_of(light * ground + (1 - light) * border)
+    scan = make_scan(light * ground + (1 - light) * border)
     for search_px in (5.0, 24.0):
         start = np.column_stack([place[:, :2], center + np.array([3.0, -2.0])])
         observation = localise(scan, MarkPrediction(block, start, search_px, -1))
@@ -212,7 +212,7 @@ def test_a_wing_is_measured_whose_base_is_the_frames_edge() -> None:
     grey = BEYOND_EDGE_GROUND + 5500.0 * brute_picture(WING, place, 121, 121, 1.0)
     grey[:, 84:] = EDGE
     grey += np.random.default_rng(1).normal(0.0, NOISE, grey.shape)
-    detection = detect_mark(scan_of(grey), MarkPrediction(WING, place, 4.0, 1, surroundings=CLOSE), MatchOptions())
+    detection = detect_mark(make_scan(grey), MarkPrediction(WING, place, 4.0, 1, surroundings=CLOSE), MatchOptions())
     assert detection.fit is not None
     assert np.hypot(*(detection.fit.center_px - place[:, 2])) < 0.2
 
@@ -224,7 +224,7 @@ def test_a_faint_light_cross_is_measured_whose_dark_pad_ends_next_to_it_in_a_lig
     landscape = 30000.0 + 6000.0 * gaussian_filter(rng.normal(size=(121, 121)), 3.0) * 10.0
     grey = np.where(np.hypot(col - 60.3, row - 59.7) < 20.0, 4000.0, landscape)
     grey += 3500.0 * brute_picture(mark, place, 121, 121, 0.7) + rng.normal(0.0, 900.0, grey.shape)
-    detection = detect_mark(scan_of(grey), MarkPrediction(mark, place, 4.0, 1, surroundings=CLOSE), MatchOptions())
+    detection = detect_mark(make_scan(grey), MarkPrediction(mark, place, 4.0, 1, surroundings=CLOSE), MatchOptions())
     assert detection.fit is not None, detection.reason
     assert np.hypot(*(detection.fit.center_px - place[:, 2])) < 0.3
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drawn import drawn, ellipse, scan_of, whitened
+from drawn import draw, ellipse, make_scan, whitened
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
@@ -31,9 +31,9 @@ def test_errors_are_as_large_as_their_sigmas_say(radius_px: float, flatness: flo
     errors, offsets = [], []
     for _ in range(8):
         center, shape = size // 2 + rng.uniform(-0.5, 0.5, 2), some_ellipse(rng, radius_px, flatness)
-        clean = GROUND + CONTRAST * drawn(ellipse(center, shape), size, size, 0.9)
+        clean = GROUND + CONTRAST * draw(ellipse(center, shape), size, size, 0.9)
         for _ in range(6):
-            scan = scan_of(clean + rng.normal(0, NOISE, clean.shape))
+            scan = make_scan(clean + rng.normal(0, NOISE, clean.shape))
             disk = fit_disk(scan, center + rng.normal(0, 0.4, 2), shape * rng.uniform(0.9, 1.1))
             assert not disk.reason
             offsets.append(disk.center_px - center)
@@ -59,12 +59,12 @@ def test_many_disks_at_once_are_placed_as_well_as_their_sigmas_say_and_odd_ones_
         corner = np.array([80 * (number % 8) + 8, 48 * (number // 8)])
         place, shape = corner + rng.uniform(23.5, 24.5, 2), some_ellipse(rng, 9.0, 0.8)
         window = picture[corner[1] : corner[1] + 48, corner[0] : corner[0] + 64]
-        window += CONTRAST * drawn(ellipse(place - corner, shape), 64, 48, 0.9)
+        window += CONTRAST * draw(ellipse(place - corner, shape), 64, 48, 0.9)
         starts.append(Candidate(place + rng.normal(0, 0.2, 2), shape * rng.uniform(0.95, 1.05), CONTRAST))
         true.append(place)
     covered = true[0] - 9.0
     picture[max(round(covered[1]), 0) : round(covered[1]) + 9, round(covered[0]) : round(covered[0]) + 18] = GROUND
-    disks = fit_plain_disks(scan_of(picture + rng.normal(0, NOISE, picture.shape)), starts, [10.0] * len(starts))
+    disks = fit_plain_disks(make_scan(picture + rng.normal(0, NOISE, picture.shape)), starts, [10.0] * len(starts))
     errors = [whitened(disk.center_px - place, disk.covariance_px2) for disk, place in zip(disks, true, strict=True)]
     assert 0.85 < np.sqrt(np.mean(np.square(errors[1:]))) < 1.15  # 78 numbers: 8 % standard deviation
     assert all(not disk.reason and not disk.weakness for disk in disks[1:])
@@ -76,8 +76,8 @@ def test_dark_disks_at_the_edge_of_the_scan_and_large_coordinates() -> None:
     rng = np.random.default_rng(2)
     picture = 30000 + rng.normal(0, 300, (60, 3000))
     center, shape = np.array([2990.3, 30.4]), some_ellipse(rng, 6.0, 0.8)
-    picture[:, 2960:] -= CONTRAST * drawn(ellipse(center - (2960, 0), shape), 40, 60, 0.9)
-    disk = fit_disk(scan_of(picture), center + 0.5, shape)
+    picture[:, 2960:] -= CONTRAST * draw(ellipse(center - (2960, 0), shape), 40, 60, 0.9)
+    disk = fit_disk(make_scan(picture), center + 0.5, shape)
     assert disk.contrast_dn < 0
     assert np.abs(disk.center_px - center).max() < 0.03
 
@@ -94,7 +94,7 @@ def field(rng: np.random.Generator, count: int) -> tuple[Array, list[Array]]:
         corner = np.round(place).astype(int) - 24
         shape = some_ellipse(rng, rng.uniform(3, 12), rng.uniform(0.6, 1.0))
         window = picture[corner[1] : corner[1] + 49, corner[0] : corner[0] + 49]
-        window += CONTRAST * drawn(ellipse(place - corner, shape), 49, 49, 0.9)
+        window += CONTRAST * draw(ellipse(place - corner, shape), 49, 49, 0.9)
         centers.append(place)
     for row in range(20, 490, 60):
         picture[row : row + 3, 10:400] += 0.6 * CONTRAST
@@ -110,7 +110,7 @@ def fitted_disks(scan: Scan, search: DiskSearch) -> list[FittedDisk]:
 
 def test_all_disks_of_a_frame_and_nothing_else() -> None:
     picture, centers = field(np.random.default_rng(3), 32)
-    found = fitted_disks(scan_of(picture), DiskSearch((5.0, 30.0), "light"))
+    found = fitted_disks(make_scan(picture), DiskSearch((5.0, 30.0), "light"))
     nearest = [min(float(np.hypot(*(disk.center_px - center))) for center in centers) for disk in found]
     hit = {int(np.argmin([np.hypot(*(disk.center_px - center)) for center in centers])) for disk in found}
     assert max(nearest) < 0.5
@@ -129,9 +129,9 @@ def test_disks_of_all_sizes_are_found_nearly_where_they_are(snr: float, blur_px:
             shape = some_ellipse(rng, radius, rng.uniform(0.6, 1.0) if radius > 3 else 1.0)
             corner = np.maximum(np.round(place).astype(int) - 48, 0)
             window = picture[corner[1] : corner[1] + 97, corner[0] : corner[0] + 97]
-            window += CONTRAST * drawn(ellipse(place - corner, shape), window.shape[1], window.shape[0], blur_px, 5)
+            window += CONTRAST * draw(ellipse(place - corner, shape), window.shape[1], window.shape[0], blur_px, 5)
             true.append(place)
-    found = disk_candidates(scan_of(picture), DiskSearch((5.0, 70.0), "light"))
+    found = disk_candidates(make_scan(picture), DiskSearch((5.0, 70.0), "light"))
     assert len(found) == len(true)
     for place in true:
         nearest = min(found, key=lambda disk: float(np.hypot(*(disk.center_px - place))))

@@ -14,12 +14,12 @@ from drawn import (
     PX_PER_MM,
     RING_CROSS,
     assert_right,
+    found_pose,
     frame_picture,
-    layout_of,
-    measured,
+    lay_out,
+    measure_grey,
     paint,
     pixel_from_camera,
-    pose_of,
 )
 from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
@@ -40,8 +40,8 @@ from measure.marks.shapes import (
 @parametrize_with_studies("pose", POSES, quick=(0, 7))
 def test_identification_dots_decide_each_of_eight_poses(pose: str, tmp_path: Path) -> None:
     matrix = pixel_from_camera(pose)
-    result = measured(frame_picture(NUMBERED, matrix), NUMBERED, tmp_path)
-    assert pose_of(result) == (pose, True), result.pose
+    result = measure_grey(frame_picture(NUMBERED, matrix), NUMBERED, tmp_path)
+    assert found_pose(result) == (pose, True), result.pose
     assert_right(result, NUMBERED, matrix)
     assert result.pixel_from_camera is not None
     np.testing.assert_allclose(result.pixel_from_camera, matrix, atol=0.02)
@@ -50,7 +50,7 @@ def test_identification_dots_decide_each_of_eight_poses(pose: str, tmp_path: Pat
 
 def test_like_marks_leave_the_pose_assumed_and_say_so(tmp_path: Path) -> None:
     matrix = pixel_from_camera("0")
-    result = measured(frame_picture(ALIKE, matrix), ALIKE, tmp_path)
+    result = measure_grey(frame_picture(ALIKE, matrix), ALIKE, tmp_path)
     assert result.pose is not None
     assert (result.pose.name, result.pose.decided) == ("0", False)
     assert "alike" in result.pose.evidence[0]
@@ -62,7 +62,7 @@ def test_writing_next_to_one_mark_names_no_pose(tmp_path: Path) -> None:
     matrix = pixel_from_camera("0")
     grey = frame_picture(ALIKE, matrix)
     paint(grey, MarkShape(tuple(Disk((1.0, 0.3 * k - 0.3), 0.08) for k in range(3))), CORNERS[1], matrix, 9000.0)
-    result = measured(grey, NUMBERED, tmp_path)
+    result = measure_grey(grey, NUMBERED, tmp_path)
     assert result.pose is not None
     assert not result.pose.decided, result.pose.evidence
 
@@ -70,8 +70,8 @@ def test_writing_next_to_one_mark_names_no_pose(tmp_path: Path) -> None:
 def test_what_covers_a_dot_and_resembles_a_smaller_one_is_doubted(tmp_path: Path) -> None:
     dot, speck = MarkShape((Disk((0.0, 0.0), 0.4),)), MarkShape((Disk((0.01, -0.015), 0.34),))
     matrix = pixel_from_camera("0")
-    given = layout_of([dot] * 4)
-    result = measured(frame_picture(layout_of([dot, dot, dot, speck]), matrix), given, tmp_path)
+    given = lay_out([dot] * 4)
+    result = measure_grey(frame_picture(lay_out([dot, dot, dot, speck]), matrix), given, tmp_path)
     assert [mark.status for mark in result.marks] == [Status.MEASURED] * 3 + [Status.WEAK]
     assert "0.85 times as large as the other marks" in result.marks[3].reason
 
@@ -82,7 +82,7 @@ def test_a_scan_without_a_frame_says_if_its_pixels_are_large_for_the_marks(
 ) -> None:
     """Lines of 0.1 mm at 50 µm a pixel are 2 px wide, a dot of 0.8 mm is 16 px wide."""
     grain = np.random.default_rng(5).normal(8000.0, 200.0, (400, 400))
-    (problem,) = measured(grain, layout_of([MarkShape(mark)] * 4), tmp_path).problems
+    (problem,) = measure_grey(grain, lay_out([MarkShape(mark)] * 4), tmp_path).problems
     coarse = "the finest detail of the marks, 100 µm, is 2.0 px wide. Scan at 33 µm or finer."
     assert (coarse in problem, Code.SMALL in problem.codes) == (is_coarse, is_coarse)
 
@@ -102,7 +102,7 @@ def test_a_frame_without_a_mark_free_of_blemish_has_no_settled_pose(tmp_path: Pa
     for mark in NUMBERED.marks:
         col, row = np.rint(matrix @ (*mark.xy_mm, 1.0)).astype(int)
         grey[row + 1 : row + 20, col - 18 : col + 17] = 3000
-    result = measured(grey, NUMBERED, tmp_path)
+    result = measure_grey(grey, NUMBERED, tmp_path)
     assert {mark.status for mark in result.marks} == {Status.WEAK}
     assert result.pose is not None
     assert (result.pose.name, result.pose.decided) == ("90", False)
@@ -111,7 +111,7 @@ def test_a_frame_without_a_mark_free_of_blemish_has_no_settled_pose(tmp_path: Pa
 
 def test_the_users_pose_is_taken(tmp_path: Path) -> None:
     matrix = pixel_from_camera("270m")
-    result = measured(frame_picture(ALIKE, matrix), ALIKE, tmp_path, FiducialOptions(pose="270m"))
+    result = measure_grey(frame_picture(ALIKE, matrix), ALIKE, tmp_path, FiducialOptions(pose="270m"))
     assert result.pose is not None
     assert (result.pose.name, result.pose.decided, result.pose.evidence) == ("270m", True, ("set in the project.",))
     assert_right(result, ALIKE, matrix)
@@ -120,8 +120,8 @@ def test_the_users_pose_is_taken(tmp_path: Path) -> None:
 
 def test_a_pose_of_the_user_that_the_picture_contradicts_is_reported(tmp_path: Path) -> None:
     matrix = pixel_from_camera("90m")
-    result = measured(frame_picture(NUMBERED, matrix), NUMBERED, tmp_path, FiducialOptions(pose="0"))
-    assert pose_of(result) == ("0", True)
+    result = measure_grey(frame_picture(NUMBERED, matrix), NUMBERED, tmp_path, FiducialOptions(pose="0"))
+    assert found_pose(result) == ("0", True)
     assert any(
         "pose 0 is set in the project, but the marks of this frame show 90m" in problem
         and "identification dots" in problem
@@ -130,10 +130,10 @@ def test_a_pose_of_the_user_that_the_picture_contradicts_is_reported(tmp_path: P
 
 
 def test_marks_places_decide_where_they_are_not_symmetric(tmp_path: Path) -> None:
-    uneven = layout_of([MarkShape(RING_CROSS)] * 4, ((7.0, -7.0), (-7.0, -7.0), (-7.0, 6.0), (6.5, 7.0)))
+    uneven = lay_out([MarkShape(RING_CROSS)] * 4, ((7.0, -7.0), (-7.0, -7.0), (-7.0, 6.0), (6.5, 7.0)))
     matrix = pixel_from_camera("90")
-    result = measured(frame_picture(uneven, matrix), uneven, tmp_path)
-    assert pose_of(result) == ("90", True), result.pose
+    result = measure_grey(frame_picture(uneven, matrix), uneven, tmp_path)
+    assert found_pose(result) == ("90", True), result.pose
     assert_right(result, uneven, matrix)
 
 
@@ -141,9 +141,9 @@ def test_dark_marks_and_an_unknown_pitch(tmp_path: Path) -> None:
     matrix = pixel_from_camera("0")
     negative = 20000 - frame_picture(NUMBERED, matrix)
     light = [replace(mark, mark=replace(mark.mark, polarity="light")) for mark in NUMBERED.marks]
-    lost = measured(negative, replace(NUMBERED, marks=tuple(light)), tmp_path, pitch=False)
+    lost = measure_grey(negative, replace(NUMBERED, marks=tuple(light)), tmp_path, pitch=False)
     assert 'no negative of what the camera file draws (polarity = "auto" takes both)' in lost.problems[0]
-    result = measured(negative, NUMBERED, tmp_path, pitch=False)
+    result = measure_grey(negative, NUMBERED, tmp_path, pitch=False)
     assert result.pose is not None
     assert result.pose.name == "0"
     assert_right(result, NUMBERED, matrix)
@@ -152,7 +152,7 @@ def test_dark_marks_and_an_unknown_pitch(tmp_path: Path) -> None:
 def test_zero_marks_give_no_silent_identity(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     for grey in (np.full((300, 300), 700.0), 8000 + rng.normal(0, 2000, (400, 400))):
-        result = measured(grey, ALIKE, tmp_path)
+        result = measure_grey(grey, ALIKE, tmp_path)
         assert result.pixel_from_camera is None
         assert {mark.status for mark in result.marks} == {Status.ABSENT}
         assert all(mark.center_px is None and mark.reason for mark in result.marks)
@@ -163,8 +163,8 @@ def test_zero_marks_give_no_silent_identity(tmp_path: Path) -> None:
 
 @pytest.mark.study
 def test_the_scan_of_another_camera_is_refused_with_a_count(tmp_path: Path) -> None:
-    smaller = layout_of([MarkShape(RING_CROSS)] * 4, ((5.6, -5.6), (-5.6, -5.9), (-4.9, 5.6), (5.8, 5.6)))
-    result = measured(frame_picture(smaller, pixel_from_camera("0")), ALIKE, tmp_path)
+    smaller = lay_out([MarkShape(RING_CROSS)] * 4, ((5.6, -5.6), (-5.6, -5.9), (-4.9, 5.6), (5.8, 5.6)))
+    result = measure_grey(frame_picture(smaller, pixel_from_camera("0")), ALIKE, tmp_path)
     assert result.pixel_from_camera is None
     assert not any(mark.status.is_observation for mark in result.marks)
     assert "does not fit: only" in result.problems[0]
@@ -177,7 +177,7 @@ def test_predicted_marks_are_not_written_as_measured(tmp_path: Path) -> None:
     col, row = np.rint(matrix @ (*CORNERS[2], 1.0)).astype(int)
     rng = np.random.default_rng(3)
     grey[row - 30 : row + 31, col - 30 : col + 31] = 3000 + rng.normal(0, NOISE_DN, (61, 61))
-    result = measured(grey, ALIKE, tmp_path)
+    result = measure_grey(grey, ALIKE, tmp_path)
     covered = result.marks[2]
     assert covered.status is Status.PREDICTED
     assert covered.reason
@@ -189,9 +189,9 @@ def test_predicted_marks_are_not_written_as_measured(tmp_path: Path) -> None:
 
 
 def test_a_mark_beyond_the_edge_is_absent(tmp_path: Path) -> None:
-    six = layout_of([MarkShape(RING_CROSS)] * 6, (*CORNERS, (7.0, 0.0), (-7.0, 0.0)))
+    six = lay_out([MarkShape(RING_CROSS)] * 6, (*CORNERS, (7.0, 0.0), (-7.0, 0.0)))
     matrix = pixel_from_camera("0", center=(202.3, 123.0))
-    result = measured(frame_picture(six, matrix), six, tmp_path)
+    result = measure_grey(frame_picture(six, matrix), six, tmp_path)
     upper = [given.xy_mm[1] > 0 for given in six.marks]
     # Four marks of six lie as well on the other four: what is seen has no certain name.
     assert [mark.status for mark in result.marks] == [Status.ABSENT if up else Status.WEAK for up in upper]
@@ -205,7 +205,7 @@ def test_the_neighbouring_frames_marks_are_not_taken_for_this_frames(tmp_path: P
     neighbour[0, 2] += 18.5 * PX_PER_MM
     for place in CORNERS[1:3]:  # its left marks reach into this scan, brighter than our own
         paint(grey, MarkShape(RING_CROSS), place, neighbour, 14000.0)
-    result = measured(grey, ALIKE, tmp_path)
+    result = measure_grey(grey, ALIKE, tmp_path)
     assert_right(result, ALIKE, matrix)
 
 
@@ -213,18 +213,18 @@ def test_of_two_whole_frames_in_a_scan_none_is_taken_in_silence(tmp_path: Path) 
     matrix = pixel_from_camera("0")
     grey = np.hstack([frame_picture(NUMBERED, matrix, seed) for seed in (1, 2)])
     grey[:, FRAME_PX:] = gaussian_filter(grey[:, FRAME_PX:], 1.0)  # this one answers less
-    result = measured(grey, NUMBERED, tmp_path)
-    assert pose_of(result) == ("0", False)
+    result = measure_grey(grey, NUMBERED, tmp_path)
+    assert found_pose(result) == ("0", False)
     assert any("the scan shows another frame (20.0, " in text for text in result.problems)
 
 
 def test_a_mark_off_the_constellation_is_no_observation(tmp_path: Path) -> None:
     places = (*CORNERS, (0.0, -7.0), (0.0, 7.0))
     marks = [MarkShape(RING_CROSS)] * 6
-    given = layout_of(marks, places)
-    moved = layout_of(marks, (*places[:5], (0.55, 7.0)))
+    given = lay_out(marks, places)
+    moved = lay_out(marks, (*places[:5], (0.55, 7.0)))
     matrix = pixel_from_camera("0")
-    result = measured(frame_picture(moved, matrix), given, tmp_path)
+    result = measure_grey(frame_picture(moved, matrix), given, tmp_path)
     assert [mark.status for mark in result.marks[:5]] == [Status.MEASURED] * 5
     assert result.marks[5].status is Status.PREDICTED
     assert "nothing within 6 px of its place" in result.marks[5].reason
@@ -239,14 +239,14 @@ def test_a_missing_mark_is_stated_to_be_hidden_only_where_its_ground_hides_it(
 ) -> None:
     """Nothing but the marks is dark in the scan, so that its darkest half per cent is lighter than they are."""
     places = [(7.0 * i, 7.0 * j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-    dark = layout_of([MarkShape(RING_CROSS, "dark")] * 9, places)
+    dark = lay_out([MarkShape(RING_CROSS, "dark")] * 9, places)
     matrix = pixel_from_camera("0")
     grey = np.random.default_rng(3).normal(20000.0, NOISE_DN, (FRAME_PX, FRAME_PX))
     for given in dark.marks[:8]:
         paint(grey, given.mark, given.xy_mm, matrix, -12000.0)
     col, row = np.rint(matrix @ (*dark.marks[8].xy_mm, 1.0)).astype(int)
     grey[row - 30 : row + 31, col - 30 : col + 31] += blot_dn - 20000.0
-    result = measured(np.clip(grey, 0.0, None), dark, tmp_path, FiducialOptions(pose="0"))
+    result = measure_grey(np.clip(grey, 0.0, None), dark, tmp_path, FiducialOptions(pose="0"))
     assert [mark.status for mark in result.marks] == [*[Status.MEASURED] * 8, Status.PREDICTED]
     assert result.marks[8].reason.startswith(said)
 

@@ -4,7 +4,7 @@ import csv
 
 import numpy as np
 import pytest
-from drawn import scan_of
+from drawn import make_scan
 from numpy.typing import NDArray
 from real_data import DATA, needs
 
@@ -125,7 +125,7 @@ def test_the_curve_by_which_a_scan_stores_light_does_not_decide_whether_its_fram
     with open_scan(SCANS / "aerial" / "08320661.jpeg") as scan:
         grey, full, pitch_um = scan.window(0, 0, scan.width_px, scan.height_px), scan.full_scale_dn, scan.pitch_um
         at_first = measure_fiducials(scan.replace_tone(Tone.unknown()), ring_cross_corners, pitch_um)
-    bent = scan_of(65535 * (grey.astype(float) / full) ** exponent).replace_tone(Tone.unknown())
+    bent = make_scan(65535 * (grey.astype(float) / full) ** exponent).replace_tone(Tone.unknown())
     result = measure_fiducials(bent, ring_cross_corners, pitch_um)
     first, then = (
         {mark.point: mark.center_px for mark in each.marks if mark.center_px is not None and mark.status.is_observation}

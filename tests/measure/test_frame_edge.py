@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from drawn import Array, drawn, layout_of, pixel_from_camera, scan_of, transformed, written_scan
+from drawn import Array, draw, lay_out, make_scan, pixel_from_camera, transformed, written_scan
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
@@ -48,7 +48,7 @@ def layout(vertices: tuple[Point, ...], at_mm: float) -> FiducialLayout:
     turns = [float(np.degrees(np.arctan2(up, right))) for right, up in SIDES]
     marks = [MarkShape((turned_part(Polygon(vertices), turn),)) for turn in turns]
     places = [(at_mm * x, at_mm * y) for x, y in SIDES]
-    return layout_of(marks, places, (2 * HALF_MM, 2 * HALF_MM))
+    return lay_out(marks, places, (2 * HALF_MM, 2 * HALF_MM))
 
 
 @cache
@@ -77,12 +77,12 @@ def light_profile(at_mm: float, is_notch: bool, blur_px: float) -> Array:
                 frame &= ~((out > 0) & (along < out * 0.7 / 1.6))
         return np.asarray(frame)
 
-    return drawn(exposed, 400, 400, blur_px, fineness=4)
+    return draw(exposed, 400, 400, blur_px, fineness=4)
 
 
 def measure_picture(camera: FiducialLayout, picture: Array) -> list[Measured]:
     """What is measured of the marks in it, none of them damaged or in doubt."""
-    result = measure_fiducials(scan_of(picture), camera, (50.0, 50.0), FiducialOptions(pose="90"))
+    result = measure_fiducials(make_scan(picture), camera, (50.0, 50.0), FiducialOptions(pose="90"))
     found = []
     for mark, given in zip(result.marks, camera.marks, strict=True):
         assert mark.status is Status.MEASURED, mark.reason
@@ -166,7 +166,7 @@ def picture(seed: int, radius_mm: float = 0.0, neighbour: bool = False, negative
             exposed(x, y) | exposed(x - 2 * FRAME_CORNER_HALF_MM - 1.2, y) if neighbour else exposed(x, y)
         )
 
-    share = drawn(inside, SIZE, SIZE, 0.0, FINE)
+    share = draw(inside, SIZE, SIZE, 0.0, FINE)
     land = 15000 + 3000 * gaussian_filter(rng.normal(0, 1, (SIZE, SIZE)), 3.0) / 0.09
     grey = 2000 + share * (np.clip(land, 6000, None) - 2000)
     grey = gaussian_filter(grey, 0.8)
@@ -214,7 +214,7 @@ def test_no_corner_is_visible_in_a_landscape(tmp_path: Path) -> None:
 def test_a_corner_moves_with_the_tone_curve_as_its_edges_say(gamma: float) -> None:
     corner = frame_corner((-10.0, 10.0), 5.0)
     start = np.column_stack([MATRIX[:, :2], MATRIX @ (-10.0, 10.0, 1.0)])
-    scan = scan_of(65535 * (picture(4) / 65535) ** (1 / gamma))
+    scan = make_scan(65535 * (picture(4) / 65535) ** (1 / gamma))
     tone = Tone(power(gamma), covariance=np.eye(5))
 
     def fit_mark(tone: Tone) -> MarkFit:

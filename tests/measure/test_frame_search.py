@@ -6,7 +6,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from drawn import ALIKE, layout_of, paint, placed, scan_of
+from drawn import ALIKE, lay_out, make_scan, paint, placed
 from numpy.typing import NDArray
 
 from measure import FiducialOptions, measure_fiducials
@@ -104,7 +104,7 @@ def test_a_posed_placement_is_moved_by_what_the_coordinates_differ() -> None:
 
 
 GIVEN = PitchHypothesis((0.05, 0.05), 0.04, (0.05, 0.05))
-SCAN = scan_of(np.zeros((400, 400)))
+SCAN = make_scan(np.zeros((400, 400)))
 
 
 class Stand:
@@ -203,12 +203,12 @@ def test_wings_are_found_next_to_an_edge_that_is_nine_times_as_strong(contrast: 
     edge = slice(round(MIDDLE_PX - HALF_MM * PX_PER_MM), round(MIDDLE_PX + HALF_MM * PX_PER_MM))
     grey[edge, edge] = 13000.0
     matrix = placed(PX_PER_MM, (MIDDLE_PX, MIDDLE_PX))
-    layout = layout_of([wing(*place) for place in CLOSER_LOOK_PLACES], CLOSER_LOOK_PLACES, (2 * HALF_MM, 2 * HALF_MM))
+    layout = lay_out([wing(*place) for place in CLOSER_LOOK_PLACES], CLOSER_LOOK_PLACES, (2 * HALF_MM, 2 * HALF_MM))
     for mark in layout.marks:
         paint(grey, mark.mark, mark.xy_mm, matrix, -contrast, blur_px=0.9)
     grey += rng.normal(0.0, 900.0, grey.shape)
     result = measure_fiducials(
-        scan_of(grey), layout, (1000 / PX_PER_MM,) * 2, FiducialOptions(pose="0", pitch_is_right=True)
+        make_scan(grey), layout, (1000 / PX_PER_MM,) * 2, FiducialOptions(pose="0", pitch_is_right=True)
     )
     if not contrast:
         assert {mark.status for mark in result.marks} == {Status.ABSENT}

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drawn import Array, brute_picture, layout_of, paint, scan_of
+from drawn import Array, brute_picture, lay_out, make_scan, paint
 from numpy.typing import NDArray
 
 from measure import Scan, Status
@@ -254,7 +254,7 @@ PX_PER_MM = 20.0
 CONTRAST_DN = 8000.0
 CORNERS = ((7.0, -7.0), (-7.0, -7.0), (-7.0, 7.0), (7.0, 7.0))
 DOT = MarkShape(dot(0.2), "light")
-DOTS = layout_of([DOT] * 4, CORNERS, (16.0, 16.0))
+DOTS = lay_out([DOT] * 4, CORNERS, (16.0, 16.0))
 OPTIONS = FiducialOptions()
 
 
@@ -297,7 +297,7 @@ def make_frame_chance(scan: Scan, layout: FiducialLayout) -> Frame:
 
 
 def test_three_plain_dots_of_four_are_no_chance() -> None:
-    scan = scan_of(picture(DOTS, "0", hidden=1))
+    scan = make_scan(picture(DOTS, "0", hidden=1))
     frame = make_frame_chance(scan, DOTS)
     assert frame.inliers.tolist() == [True, False, True, True]
     assert doubt_frame(FrameSearch(scan, DOTS, OPTIONS), frame) == ""
@@ -305,8 +305,8 @@ def test_three_plain_dots_of_four_are_no_chance() -> None:
 
 def test_a_frame_moved_on_by_the_distance_of_two_marks_is_known_by_its_marks() -> None:
     """It has the left and the middle ones under the names of the middle and the right ones; the rest is outside."""
-    layout = layout_of([DOT] * 8, (*CORNERS, (0.0, -7.0), (-7.0, 0.0), (0.0, 7.0), (7.0, 0.0)), (16.0, 16.0))
-    scan = scan_of(picture(layout, "0", hidden=7))
+    layout = lay_out([DOT] * 8, (*CORNERS, (0.0, -7.0), (-7.0, 0.0), (0.0, 7.0), (7.0, 0.0)), (16.0, 16.0))
+    scan = make_scan(picture(layout, "0", hidden=7))
     frame = make_frame_chance(scan, layout)
     moved_on = placement("0").pixel_from_camera - np.array([[0.0, 0.0, 7.0 * PX_PER_MM], [0.0, 0.0, 0.0]])
     other = measure_frame(scan, layout, replace(placement("0"), pixel_from_camera=moved_on), OPTIONS)
@@ -320,7 +320,7 @@ def test_specks_that_lie_as_three_marks_of_four_are_doubted_with_numbers() -> No
     as_marks = np.rint(centers_px(DOTS, "0")).astype(int)
     elsewhere = np.random.default_rng(1).integers(10, 360, (300, 2))
     free = np.hypot(*(elsewhere[:, None] - as_marks).T).min(axis=0) > 22
-    scan = scan_of(strewn(np.concatenate([elsewhere[free], as_marks[1:]])))
+    scan = make_scan(strewn(np.concatenate([elsewhere[free], as_marks[1:]])))
     frame = make_frame_chance(scan, DOTS)
     assert frame.inliers.tolist() == [False, True, True, True]
     sentence = doubt_frame(FrameSearch(scan, DOTS, OPTIONS), frame)
@@ -332,7 +332,7 @@ def test_a_frame_that_chance_is_likelier_to_have_made_than_not_gives_no_observat
     grey = picture(DOTS, "0", hidden=1)
     at = np.rint(centers_px(DOTS, "0")[2]).astype(int)
     grey[at[1] - 24 : at[1] + 25, at[0] - 24 : at[0] + 25] = 20000.0
-    scan = scan_of(grey)
+    scan = make_scan(grey)
     frame = make_frame_chance(scan, DOTS)
     chance = doubt_frame(FrameSearch(scan, DOTS, OPTIONS), frame)
     assert "(p = 1.00): the frame may lie elsewhere" in chance
@@ -347,8 +347,8 @@ def test_a_frame_that_chance_is_likelier_to_have_made_than_not_gives_no_observat
 def test_one_mark_and_the_places_of_the_others_tell_the_pose() -> None:
     """Marks that differ by their identification dots are not found under one another's names."""
     ids = [tuple(Disk((0.9, 0.4 * k - 0.4), 0.12) for k in range(count)) for count in range(4)]
-    layout = layout_of([MarkShape((*dot(0.2), *dots), "light") for dots in ids], CORNERS, (16.0, 16.0))
-    scan = scan_of(picture(layout, "90"))
+    layout = lay_out([MarkShape((*dot(0.2), *dots), "light") for dots in ids], CORNERS, (16.0, 16.0))
+    scan = make_scan(picture(layout, "90"))
     frame = replace(make_frame_chance(scan, layout), inliers=np.array([True, False, False, False]))
     pose = decide_pose(scan, [placement(pose) for pose in POSES], frame)
     assert (pose.name, pose.decided) == ("90", True)
@@ -360,7 +360,7 @@ def test_pictures_of_one_scan_alone_decide_a_pose_only_beyond_chance(
 ) -> None:
     """Among eight poses four marks agree on one by chance in one of 512 frames; three of them, whichever they are, in
     one of 18. What is drawn, or was averaged over scans, has no landscape that could agree."""
-    scan = scan_of(picture(DOTS, "0"))
+    scan = make_scan(picture(DOTS, "0"))
     frame = make_frame_chance(scan, DOTS)
     with_chips = [
         replace(mark, mark=learn_template([cut(scan, centred(mark.xy_mm), 2.0)], 2.0)) if chips else mark

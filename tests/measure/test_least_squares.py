@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drawn import Array, brute_picture, drawn, transformed
+from drawn import Array, brute_picture, draw, transformed
 from numpy.typing import NDArray
 
 from measure import MatchOptions, ScanWindow, match
@@ -151,7 +151,7 @@ def fits(scale: float, turn: float, sigma: float, count: int) -> list[MarkFit]:
         x, y = transformed(mark_from_pixel, col - PLACE[0], row - PLACE[1])
         return np.asarray((x < 0.8) & (np.abs(y) < x * 0.35 / 0.8))
 
-    grey, rng = 1000 + CONTRAST * drawn(inside, SIZE, SIZE, 1.0), np.random.default_rng(6)
+    grey, rng = 1000 + CONTRAST * draw(inside, SIZE, SIZE, 1.0), np.random.default_rng(6)
     return [match(ScanWindow(grey + rng.normal(0, sigma, grey.shape)), WEDGE, START, FRAME) for _ in range(count)]
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drawn import layout_of, paint, pixel_from_camera, written_scan
+from drawn import lay_out, paint, pixel_from_camera, written_scan
 from true_marks import KIND, TrueMark, some_mark
 
 from measure import FiducialLayout, FiducialOptions, LayoutMark, Scan
@@ -58,7 +58,7 @@ def test_a_width_of_lines_that_most_crosses_show_is_taken_and_that_of_few_is_not
 
 
 def test_crosses_whose_lines_are_narrower_than_drawn_are_drawn_so_and_fitted(tmp_path: Path) -> None:
-    shown, given = (layout_of([MarkShape(cross(2.4, mm), "dark")] * 4) for mm in (0.1, 0.12))
+    shown, given = (lay_out([MarkShape(cross(2.4, mm), "dark")] * 4) for mm in (0.1, 0.12))
     matrix, size = pixel_from_camera("0"), 400
     grey = 30000 + np.random.default_rng(3).normal(0, 400.0, (size, size))
     for mark in shown.marks:

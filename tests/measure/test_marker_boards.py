@@ -11,10 +11,10 @@ from drawn import (
     board_from_pixel,
     charuco_picture,
     errors_px,
+    make_scan,
     mapped,
     printed,
     read_truth,
-    scan_of,
     take_picture,
 )
 from numpy.typing import NDArray
@@ -36,7 +36,7 @@ def test_trap_charuco_corners_shifted_by_half_a_pixel(turn_deg: float) -> None:
     homography = board_from_pixel(turn_deg, 2e-4)
     corner = np.array([-32.0, 4 * 32.0])
     picture = take_picture(spec, homography, printed(drawing, spec, (192, 160), corner))
-    board = measure_board(scan_of(picture), spec)
+    board = measure_board(make_scan(picture), spec)
     errors = errors_px(board, read_truth(spec, homography))
     assert len(errors) >= 16
     assert np.abs(errors).max() < 0.06
@@ -65,7 +65,7 @@ def test_the_markers_tell_the_layout_of_a_charuco_board(legacy: bool) -> None:
     assert f"but as with legacy = {str(legacy).lower()}" in refused.reason
 
 
-def test_a_charuco_board_of_which_one_line_of_corners_is_seen_is_not_placed() -> None:
+def test_a_charuco_board_of_which_one_line_of_corners_is_visible_is_not_placed() -> None:
     """All of it but two rows of squares is covered: one line had ended in a traceback."""
     spec = CharucoSpec("4X4_50", 6, 4, 32.0, 24.0)
     drawing = charuco_board(spec).generateImage((400, 300), marginSize=50)
@@ -115,12 +115,12 @@ def test_charuco_numbers_that_begin_later() -> None:
     spec = CharucoSpec("4X4_50", 6, 5, 32.0, 24.0, first_id=6)
     homography = board_from_pixel(4.0, 2e-4)
     picture = charuco_picture(spec, homography)
-    board = measure_board(scan_of(picture), spec)
+    board = measure_board(make_scan(picture), spec)
     errors = errors_px(board, read_truth(spec, homography))
     assert len(errors) >= 16
     assert np.abs(errors).max() < 0.06
-    assert "but as with first_id = 6" in measure_board(scan_of(picture), replace(spec, first_id=0)).reason
-    assert "but as with first_id = 6" in measure_board(scan_of(picture), replace(spec, first_id=30)).reason
+    assert "but as with first_id = 6" in measure_board(make_scan(picture), replace(spec, first_id=0)).reason
+    assert "but as with first_id = 6" in measure_board(make_scan(picture), replace(spec, first_id=30)).reason
 
 
 def test_a_charuco_corner_is_held_against_the_markers_next_to_it() -> None:
@@ -144,7 +144,7 @@ def test_aruco_and_apriltag_corners(dictionary: str) -> None:
     drawing = cv2.aruco.GridBoard((3, 2), 63.0, 21.0, aruco_dictionary(dictionary), np.arange(7, 13))
     homography = board_from_pixel(4.0, 1e-4)
     picture = take_picture(spec, homography, printed(drawing, spec, (231, 147), np.array([0.0, 147.0])))
-    board = measure_board(scan_of(picture), spec)
+    board = measure_board(make_scan(picture), spec)
     errors = errors_px(board, read_truth(spec, homography))
     assert len(errors) == 24
     assert np.sqrt(np.mean(errors**2)) < 0.03
@@ -155,13 +155,13 @@ def test_a_grid_of_april_tags_has_its_corners_at_the_junctions(turn_deg: float, 
     """Counted from the lower left, however each tag is turned; two modules of border, squares at all corners."""
     homography = board_from_pixel(turn_deg, 1e-4)
     picture = take_picture(APRIL_GRID, homography, april_grid_dark(APRIL_GRID, quarter_turns))
-    board = measure_board(scan_of(picture), APRIL_GRID)
+    board = measure_board(make_scan(picture), APRIL_GRID)
     errors = errors_px(board, read_truth(APRIL_GRID, homography))
     assert len(errors) == 24
     assert np.sqrt(np.mean(errors**2)) < 0.03
     assert np.abs(errors.mean(axis=0)).max() < 0.008
     assert all("junction_col_px" in mark.quality for mark in board.marks)
-    other = measure_board(scan_of(picture), replace(APRIL_GRID, first_marker=0))
+    other = measure_board(make_scan(picture), replace(APRIL_GRID, first_marker=0))
     assert "but as with first_id = 5" in other.reason
 
 
@@ -180,7 +180,7 @@ def test_a_board_in_a_mirror_keeps_its_names(kind: str) -> None:
     else:
         picture = take_picture(spec, homography, april_grid_dark(APRIL_GRID))
     truth = read_truth(spec, homography)
-    board = measure_board(scan_of(picture[:, ::-1]), spec)
+    board = measure_board(make_scan(picture[:, ::-1]), spec)
     assert board.is_mirrored
     errors = errors_px(board, {name: np.array([WIDTH - 1 - col, row]) for name, (col, row) in truth.items()})
     assert len(errors) >= 16
@@ -210,7 +210,7 @@ def test_a_marker_read_twice_is_the_one_where_its_board_has_it(name: str) -> Non
 
     def measure_picture(grey: Array) -> BoardMeasurement:
         noise = np.random.default_rng(2).normal(0, 300, grey.shape)
-        return measure_board(scan_of(8000 + 120 * cv2.GaussianBlur(grey, (0, 0), 0.8) + noise), spec)
+        return measure_board(make_scan(8000 + 120 * cv2.GaussianBlur(grey, (0, 0), 0.8) + noise), spec)
 
     measured_marks = [mark.center_px for mark in measure_picture(picture).marks if mark.status is Status.MEASURED]
     assert len(measured_marks) == len(spec.object_points())
@@ -218,9 +218,9 @@ def test_a_marker_read_twice_is_the_one_where_its_board_has_it(name: str) -> Non
     neither = measure_picture(two)
     assert "was read at 2 places" in neither.reason
     assert all(mark.status is Status.ABSENT for mark in neither.marks)
-    beside = measure_picture(half)
-    assert all(mark.status is Status.MEASURED for mark in beside.marks)
-    assert "of which one lies on the board: there may be another such board" in beside.refused[0]
+    both = measure_picture(half)
+    assert all(mark.status is Status.MEASURED for mark in both.marks)
+    assert "of which one lies on the board: there may be another such board" in both.refused[0]
 
 
 @pytest.mark.parametrize("gap", [60.0, 130.0])
@@ -235,6 +235,6 @@ def test_markers_of_two_boards_are_not_those_of_one(gap: float) -> None:
             marker = cv2.aruco.generateImageMarker(aruco_dictionary("4X4_50"), number, 48)
             picture[top : top + 48, left : left + 48] = marker
     noise = np.random.default_rng(2).normal(0, 300, picture.shape)
-    board = measure_board(scan_of(8000 + 120 * cv2.GaussianBlur(picture, (0, 0), 0.8) + noise), spec)
+    board = measure_board(make_scan(8000 + 120 * cv2.GaussianBlur(picture, (0, 0), 0.8) + noise), spec)
     assert "do not agree on where the board lies" in board.reason
     assert all(mark.status is Status.ABSENT for mark in board.marks)

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from drawn import Array, brute_picture, placed, scan_of
+from drawn import Array, brute_picture, make_scan, placed
 from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 
@@ -143,7 +143,7 @@ def test_clipped_grey_values_are_like_a_drawing_beyond_the_range() -> None:
     rng = np.random.default_rng(31)
     for shown, place in draw_mark("ring-cross", 1.0):
         grey = 100 + 150 * shown + rng.normal(0, 10, shown.shape)
-        scan = scan_of((grey - 100) * 255 / 60, full_scale=255).replace_tone(Tone.unknown())
+        scan = make_scan((grey - 100) * 255 / 60, full_scale=255).replace_tone(Tone.unknown())
         start = placed(SCALE, tuple(place[:, 2] + rng.uniform(-0.5, 0.5, 2)))
         fit = match(read_window(scan, (0, 0, SIZE, SIZE)), MARKS["ring-cross"], start)
         assert fit.likeness > 0.2

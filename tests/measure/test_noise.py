@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from drawn import scan_of
+from drawn import make_scan
 from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 from true_marks import KIND, TrueMark, some_mark, whitened_rms
@@ -69,7 +69,7 @@ def test_a_light_mark_is_not_damaged_for_its_noise(alike_in: str) -> None:
             code = np.clip(light + 0.004 * noise, 0.0, 1.0) ** (1 / 2.2)
         else:
             code = light ** (1 / 2.2) + 0.02 * noise
-        scan = scan_of(FULL * code).replace_tone(Tone(power(2.2)))
+        scan = make_scan(FULL * code).replace_tone(Tone(power(2.2)))
         window = read_window(scan, (0, 0, mark.size, mark.size))
         fit = match(window, mark.kind.shape, mark.place, MatchOptions(linear_sigma=0.05))
         assert fit.converged, fit.reason
@@ -147,7 +147,7 @@ def test_disks_in_whole_grey_values_are_as_far_off_as_they_say() -> None:
     for _ in range(20):
         mark = some_mark(KIND["ellipse"], 1.0, rng)
         ground = 60 + rng.uniform(-0.5, 0.5) + 1.5 * rng.uniform() * np.arange(mark.size) / mark.size
-        disk = fit_disk(scan_of(ground + 120 * mark.picture, 255), mark.place[:, 2] + 0.3, mark.place[:, :2])
+        disk = fit_disk(make_scan(ground + 120 * mark.picture, 255), mark.place[:, 2] + 0.3, mark.place[:, :2])
         errors.append(disk.center_px - mark.place[:, 2])
         covariances.append(disk.covariance_px2)
     assert np.sqrt(np.mean(np.square(errors))) < 0.0025
@@ -186,7 +186,7 @@ def sighted(mark: TrueMark, grey: np.ndarray, polarity: int = -1) -> MarkFit:
     start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + (0.7, -0.6)])
     frame_sigma = mark.kind.known if np.isfinite(mark.kind.known) else None
     fit = detect_mark(
-        scan_of(grey), MarkPrediction(mark.kind.shape, start, 3.0, polarity), FiducialOptions().match, frame_sigma
+        make_scan(grey), MarkPrediction(mark.kind.shape, start, 3.0, polarity), FiducialOptions().match, frame_sigma
     ).fit
     assert fit is not None
     return fit
@@ -243,11 +243,11 @@ def test_the_sigma_of_a_mark_on_ground_just_at_the_end_of_the_range_is_honest() 
 def test_ends_of_the_range_are_those_of_the_converter() -> None:
     grey = np.full((40, 40), 9000.0)
     grey[3, 4], grey[5, 6] = 4095 << 4, 0
-    sides = clipped_sides(scan_of(grey), 0, 0, 40, 40, None)
+    sides = clipped_sides(make_scan(grey), 0, 0, 40, 40, None)
     assert sides[3, 4] == 1
     assert sides[5, 6] == -1
     assert np.count_nonzero(sides) == 2
-    assert not clipped_sides(scan_of(grey), 10, 10, 20, 20, None).any()
+    assert not clipped_sides(make_scan(grey), 10, 10, 20, 20, None).any()
 
 
 def test_whites_cut_off_below_the_end_of_the_range_are_limits_too() -> None:
@@ -255,7 +255,7 @@ def test_whites_cut_off_below_the_end_of_the_range_are_limits_too() -> None:
     for beyond in (-0.05, 0.3):
         mark = some_mark(KIND["wing"], 1.0, rng)
         natural = 250 + 100 * (beyond - mark.picture + rng.standard_normal((mark.size, mark.size)) / 20)
-        scan = scan_of(np.minimum(natural, 250), 255)
+        scan = make_scan(np.minimum(natural, 250), 255)
         sides = clipped_sides(scan, 0, 0, mark.size, mark.size, None)
         np.testing.assert_array_equal(sides == 1, np.rint(natural) >= 250)
         start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + (0.7, -0.6)])
@@ -267,4 +267,4 @@ def test_whites_cut_off_below_the_end_of_the_range_are_limits_too() -> None:
         assert error @ np.linalg.solve(fit.covariance_px2, error) < 13.8  # one in a thousand
     for sigma in np.geomspace(0.2, 20, 40):
         grey = 128 + sigma * rng.standard_normal((60, 60)) - 40 * (np.arange(60) > 40)
-        assert not clipped_sides(scan_of(grey, 255), 0, 0, 60, 60, None).any()
+        assert not clipped_sides(make_scan(grey, 255), 0, 0, 60, 60, None).any()

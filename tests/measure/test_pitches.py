@@ -17,12 +17,12 @@ from drawn import (
     RING_CROSS,
     Array,
     assert_right,
+    found_pose,
     frame_picture,
-    layout_of,
-    measured,
+    lay_out,
+    measure_grey,
     paint,
     pixel_from_camera,
-    pose_of,
     written_scan,
 )
 from scipy.ndimage import gaussian_filter
@@ -52,7 +52,7 @@ STIFF = FiducialOptions(pose="0", misfit_mm=0.03, affinity=1e-4, gate_mm=0.03)
 def test_pixels_longer_one_way_are_found_out(tmp_path: Path) -> None:
     matrix = pixel_from_camera("0", turn_rad=0.0)
     matrix[:, :2] = np.diag([1.012, 0.988]) @ matrix[:, :2]
-    result = measured(frame_picture(ALIKE, matrix), ALIKE, tmp_path, STIFF)
+    result = measure_grey(frame_picture(ALIKE, matrix), ALIKE, tmp_path, STIFF)
     assert_right(result, ALIKE, matrix)
     (stretched,) = [problem for problem in result.problems if "more than film deforms" in problem]
     assert "a pixel is 49.4 µm wide and 50.6 µm tall, but 50.0 x 50.0 µm is given" in stretched  # 50 / 1.012, / 0.988
@@ -81,18 +81,16 @@ def test_wrong_resolution_tags_are_named_with_the_pitch_of_the_marks(tmp_path: P
 @pytest.mark.study
 def test_marks_outside_of_the_scan_are_named_where_the_others_are_too_few(tmp_path: Path) -> None:
     """Four side marks, of which the upper and the lower one are cut off."""
-    layout = layout_of(
-        [MarkShape(RING_CROSS)] * 4, ((-10.0, 0.0), (10.0, 0.3), (0.0, 10.0), (0.2, -10.0)), (22.0, 22.0)
-    )
+    layout = lay_out([MarkShape(RING_CROSS)] * 4, ((-10.0, 0.0), (10.0, 0.3), (0.0, 10.0), (0.2, -10.0)), (22.0, 22.0))
     matrix = np.column_stack([pixel_from_camera("0", 0.0)[:, :2], (260.0, 260.0)])
-    result = measured(frame_picture(layout, matrix, size=520)[100:420], layout, tmp_path)
+    result = measure_grey(frame_picture(layout, matrix, size=520)[100:420], layout, tmp_path)
     (problem,) = result.problems
     assert "only 2 of 4 marks were found where the others put them, and these put 3, 4 outside of the scan" in problem
 
 
 def test_two_marks_are_stated_to_give_a_similarity(tmp_path: Path) -> None:
-    layout = layout_of([MarkShape(RING_CROSS)] * 2, ((-7.0, 0.0), (7.0, 0.2)))
-    result = measured(frame_picture(layout, pixel_from_camera("0")), layout, tmp_path)
+    layout = lay_out([MarkShape(RING_CROSS)] * 2, ((-7.0, 0.0), (7.0, 0.2)))
+    result = measure_grey(frame_picture(layout, pixel_from_camera("0")), layout, tmp_path)
     assert any("a similarity on 2 fiducials has no redundancy" in problem for problem in result.problems)
 
 
@@ -109,19 +107,19 @@ def test_pixels_given_as_longer_one_way_need_no_attention(tmp_path: Path) -> Non
 def test_three_of_many_marks_that_lie_as_the_cameras_are_no_frame(tmp_path: Path) -> None:
     """With pixels longer one way three of sixty strewn marks fit, which is no wonder; three of three are a frame."""
     places = ((10.0, -10.0), (-10.0, -10.0), (-10.0, 10.0), (10.0, 10.0))
-    layout, matrix = layout_of([MarkShape(RING_CROSS)] * 4, places, (23.0, 23.0)), pixel_from_camera("0", 0.0)
+    layout, matrix = lay_out([MarkShape(RING_CROSS)] * 4, places, (23.0, 23.0)), pixel_from_camera("0", 0.0)
     matrix = np.diag([1.012, 0.988]) @ np.column_stack([matrix[:, :2], (260.0, 261.0)])
     rng = np.random.default_rng(5)
     alone = 8000 + 1000 * gaussian_filter(rng.normal(0, 1, (520, 520)), 2.0) / 0.14 + rng.normal(0, 100.0, (520, 520))
     for given in layout.marks[:3]:
         paint(alone, given.mark, given.xy_mm, matrix, 9000.0)
-    result = measured(alone, layout, tmp_path, STIFF)
+    result = measure_grey(alone, layout, tmp_path, STIFF)
     assert [mark.status.is_observation for mark in result.marks] == [True, True, True, False]
     another = np.zeros((61, 61))
     paint(another, MarkShape(RING_CROSS), (0.0, 0.0), np.column_stack([matrix[:, :2], (30.3, 29.6)]), 9000.0)
     for col, row in np.random.default_rng(4).integers(32, 488, (60, 2)):
         alone[row - 30 : row + 31, col - 30 : col + 31] += another
-    result = measured(alone, layout, tmp_path, STIFF)
+    result = measure_grey(alone, layout, tmp_path, STIFF)
     assert not any(mark.status.is_observation for mark in result.marks)
     (problem,) = result.problems
     assert "under another pitch 3 of them fit, which may be a false alarm: try pitch_um = [" in problem
@@ -139,43 +137,43 @@ def make_clicks(matrix: Array, points: str, off_px: tuple[float, float] = (1.2, 
 def test_three_clicks_find_a_frame_in_any_pose_that_no_search_finds(pose: str, tmp_path: Path) -> None:
     matrix = pixel_from_camera(pose, FAR_TURN_RAD)
     grey = frame_picture(ALIKE, matrix)
-    result = measured(grey, ALIKE, tmp_path, FiducialOptions(clicks=make_clicks(matrix, "124")))
-    assert pose_of(result) == (pose, True)
+    result = measure_grey(grey, ALIKE, tmp_path, FiducialOptions(clicks=make_clicks(matrix, "124")))
+    assert found_pose(result) == (pose, True)
     assert_right(result, ALIKE, matrix)
 
 
 @pytest.mark.study
 def test_no_search_finds_a_frame_that_lies_so(tmp_path: Path) -> None:
     grey = frame_picture(ALIKE, pixel_from_camera("0", FAR_TURN_RAD))
-    assert not any(mark.status.is_observation for mark in measured(grey, ALIKE, tmp_path).marks)
+    assert not any(mark.status.is_observation for mark in measure_grey(grey, ALIKE, tmp_path).marks)
 
 
 def test_clicks_that_contradict_the_set_pose_give_no_observation(tmp_path: Path) -> None:
     """As in a viewer that turns the picture: the names would be those of other marks."""
     matrix = pixel_from_camera("180")
     grey = frame_picture(ALIKE, matrix)
-    result = measured(grey, ALIKE, tmp_path, FiducialOptions("0", clicks=make_clicks(matrix, "124")))
+    result = measure_grey(grey, ALIKE, tmp_path, FiducialOptions("0", clicks=make_clicks(matrix, "124")))
     assert {mark.status for mark in result.marks} == {Status.REJECTED}
     assert "show the scan orientation 180, and 0 is set" in result.problems[0]
     assert_right(
-        measured(grey, ALIKE, tmp_path, FiducialOptions("180", clicks=make_clicks(matrix, "124"))), ALIKE, matrix
+        measure_grey(grey, ALIKE, tmp_path, FiducialOptions("180", clicks=make_clicks(matrix, "124"))), ALIKE, matrix
     )
 
 
 def test_clicks_tell_the_pitch_where_nothing_else_does(tmp_path: Path) -> None:
     matrix = pixel_from_camera("0", FAR_TURN_RAD)
     options = FiducialOptions(clicks=make_clicks(matrix, "123"))
-    result = measured(frame_picture(ALIKE, matrix), ALIKE, tmp_path, options, pitch=False)
+    result = measure_grey(frame_picture(ALIKE, matrix), ALIKE, tmp_path, options, pitch=False)
     assert result.px_per_mm == pytest.approx(20.0, rel=1e-3)
     assert_right(result, ALIKE, matrix)
 
 
 def test_marks_on_a_line_do_not_tell_the_pose(tmp_path: Path) -> None:
     places = (*CORNERS, (0.0, 0.0))
-    layout = layout_of([MarkShape(RING_CROSS)] * 5, places)
+    layout = lay_out([MarkShape(RING_CROSS)] * 5, places)
     matrix = pixel_from_camera("0")
     clicks = tuple(Click(str(k), *(matrix @ (*places[k - 1], 1.0))) for k in (1, 3, 5))
-    result = measured(frame_picture(layout, matrix), layout, tmp_path, FiducialOptions(clicks=clicks))
+    result = measure_grey(frame_picture(layout, matrix), layout, tmp_path, FiducialOptions(clicks=clicks))
     assert result.pose is not None
     assert not result.pose.decided
 
@@ -205,7 +203,7 @@ def test_a_click_says_which_of_two_marks_is_meant(tmp_path: Path) -> None:
     col, line = np.rint(meant @ (*CORNERS[3], 1.0)).astype(int)
     grey[line - 25 : line + 26, col - 10 : col + 26] = grey_neighbour[line - 25 : line + 26, col - 10 : col + 26]
     click = Click("4", *(meant @ (*CORNERS[3], 1.0)))
-    mark = row(measured(grey, ALIKE, tmp_path, FiducialOptions(clicks=(click,))), "4")
+    mark = row(measure_grey(grey, ALIKE, tmp_path, FiducialOptions(clicks=(click,))), "4")
     assert mark.center_px is not None
     assert mark.status.is_observation, mark.reason
     np.testing.assert_allclose(mark.center_px, (click.col_px, click.row_px), atol=0.1)
@@ -216,7 +214,7 @@ def bare_corner(matrix: Array, folder: Path, clicks: tuple[Click, ...]) -> Frame
     col, line = np.rint(matrix @ (*CORNERS[2], 1.0)).astype(int)
     rng = np.random.default_rng(4)
     grey[line - 40 : line + 41, col - 40 : col + 41] = 3000 + rng.normal(0, NOISE_DN, (81, 81))
-    return measured(grey, ALIKE, folder, FiducialOptions(clicks=clicks))
+    return measure_grey(grey, ALIKE, folder, FiducialOptions(clicks=clicks))
 
 
 def row(result: FrameMeasurement, point: str) -> MarkMeasurement:
@@ -239,8 +237,8 @@ def red_on_grey() -> Array:
 
 def test_red_marks_as_light_as_their_grey_ground_are_found_and_right(tmp_path: Path) -> None:
     """The search answers to the green here, in which they are dark."""
-    result = measured(red_on_grey(), NUMBERED, tmp_path)
-    assert pose_of(result) == ("90", True)
+    result = measure_grey(red_on_grey(), NUMBERED, tmp_path)
+    assert found_pose(result) == ("90", True)
     assert_right(result, NUMBERED, MATRIX)
     assert result.weights is not None
     np.testing.assert_allclose(result.weights, RED, atol=0.06)
@@ -267,7 +265,7 @@ def test_where_channels_do_not_coincide_marks_are_measured_in_those_that_do(tmp_
     """Green lies three columns to the right: marks had been `measured` where the channels' mean has them."""
     red = frame_picture(NUMBERED, MATRIX)
     grain = np.random.default_rng(2).normal(0.0, NOISE_DN, (2, *red.shape))
-    result = measured(np.dstack([red, np.roll(red + grain[0], 3, axis=1), red + grain[1]]), NUMBERED, tmp_path)
+    result = measure_grey(np.dstack([red, np.roll(red + grain[0], 3, axis=1), red + grain[1]]), NUMBERED, tmp_path)
     assert_right(result, NUMBERED, MATRIX)
     assert result.weights is not None
     assert result.weights[1] == 0.0
@@ -284,7 +282,7 @@ def test_channels_coincide_where_their_peaks_do_or_are_not_the_marks() -> None:
         assert registered_channels(peaks) == ([0, 1, 2], "")
 
 
-def test_learned_marks_are_cut_in_the_channels_they_are_measured_in(tmp_path: Path) -> None:
+def test_learned_marks_are_cut_in_the_measured_channels(tmp_path: Path) -> None:
     """Else the same mark has another contrast there, which counts as changed light."""
     place = np.column_stack([MATRIX[:, :2], MATRIX @ (*NUMBERED.marks[0].xy_mm, 1.0)])
     with written_scan(red_on_grey(), tmp_path) as scan:
@@ -317,8 +315,8 @@ def test_balls_under_a_perspective_are_found_and_the_perspective_is_named(tmp_pa
     for mark in frame.marks:
         assert mark.center_px is not None
         assert np.abs(mark.center_px - truth.fiducials[mark.point].center_px).max() < 0.05
-    (said,) = (problem for problem in frame.problems if Code.PERSPECTIVE in problem.codes)
-    assert 'transformation = "projective"' in said
+    (problem,) = (each for each in frame.problems if Code.PERSPECTIVE in each.codes)
+    assert 'transformation = "projective"' in problem
 
 
 @parametrize_with_studies(("second", "is_named"), [("0", True), ("90", True), (None, False)])

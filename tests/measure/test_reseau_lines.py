@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from drawn import Array, scan_of
+from drawn import Array, make_scan
 from scipy.special import ndtr
 
 from measure import FiducialOptions, Status, measure_fiducials
@@ -51,7 +51,7 @@ def plate() -> Array:
 
 
 def test_crossings_are_measured_with_claims_that_hold_and_those_under_stars_are_not() -> None:
-    scan = scan_of(plate()).replace_tone(LINEAR)
+    scan = make_scan(plate()).replace_tone(LINEAR)
     frame = measure_fiducials(scan, layout(), (1000 / PX_PER_MM,) * 2, FiducialOptions("0"))
     good = [mark for mark in frame.marks if mark.status is Status.MEASURED]
     assert len(good) >= 20

@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from drawn import NUMBERED, drawn, ellipse, frame_picture, layout_of, measured, pixel_from_camera, scan_of
+from drawn import NUMBERED, draw, ellipse, frame_picture, lay_out, make_scan, measure_grey, pixel_from_camera
 from scipy.ndimage import gaussian_filter
 
 from measure import FiducialOptions, TargetPrediction, measure_disks
@@ -21,7 +21,7 @@ from measure.results import MEASURE_REVISION, MarkMeasurement
 TABLE = Path(__file__).with_name("revision.json")
 PLACE_PX, SIGMA = 1e-4, 0.01  # which processors may make of rounding; SIGMA is a share
 WEDGE = polygon([(0.0, 0.0), (0.9, -0.5), (0.9, 0.5)])
-WEDGES = layout_of([MarkShape((turned_part(WEDGE[0], turn),)) for turn in (135.0, 45.0, -45.0, -135.0)])
+WEDGES = lay_out([MarkShape((turned_part(WEDGE[0], turn),)) for turn in (135.0, 45.0, -45.0, -135.0)])
 
 Row = tuple[str, tuple[float, ...]]  # status; column, row and their standard deviations
 
@@ -30,8 +30,8 @@ def results(folder: Path) -> dict[str, Row]:
     """What measuring gives of a few small pictures, by their kind and the mark."""
     turned, wedges = frame_picture(NUMBERED, pixel_from_camera("90m")), frame_picture(WEDGES, pixel_from_camera("0"))
     frames = {
-        "ring-crosses in a pose that is not known": measured(turned, NUMBERED, folder),
-        "wedges in coarse steps": measured(np.rint(wedges / 800) * 800, WEDGES, folder, FiducialOptions("0")),
+        "ring-crosses in a pose that is not known": measure_grey(turned, NUMBERED, folder),
+        "wedges in coarse steps": measure_grey(np.rint(wedges / 800) * 800, WEDGES, folder, FiducialOptions("0")),
     }
     marks = {f"{kind}: {mark.point}": mark for kind, frame in frames.items() for mark in frame.marks}
     poses = {f"{kind}: pose {frame.pose.name}": ("", ()) for kind, frame in frames.items() if frame.pose}
@@ -44,7 +44,7 @@ def chessboard() -> tuple[MarkMeasurement, ...]:
     squares = np.kron(np.indices((4, 5)).sum(axis=0) % 2, np.ones((24, 24)))
     sharp = np.pad(squares, 24, constant_values=1.0)
     grey = gaussian_filter(sharp, 1.0) * 40000.0 + 5000.0 + np.random.default_rng(3).normal(0.0, 300.0, sharp.shape)
-    return measure_board(scan_of(grey), ChessboardSpec(4, 3, 10.0)).marks
+    return measure_board(make_scan(grey), ChessboardSpec(4, 3, 10.0)).marks
 
 
 def disks() -> tuple[MarkMeasurement, ...]:
@@ -54,9 +54,9 @@ def disks() -> tuple[MarkMeasurement, ...]:
     for number in range(5):
         place, shape = np.array([40.3 + 52 * number, 60.7]), np.diag([6.0, 5.0])
         col0, row0 = np.round(place).astype(int) - 16
-        grey[row0 : row0 + 33, col0 : col0 + 33] += 20000 * drawn(ellipse(place - (col0, row0), shape), 33, 33, 0.9)
+        grey[row0 : row0 + 33, col0 : col0 + 33] += 20000 * draw(ellipse(place - (col0, row0), shape), 33, 33, 0.9)
         predictions.append(TargetPrediction(str(number), place + np.array([3.0, -2.0]), shape, 12.0))
-    return measure_disks(scan_of(grey), predictions)
+    return measure_disks(make_scan(grey), predictions)
 
 
 def _row(mark: MarkMeasurement) -> Row:

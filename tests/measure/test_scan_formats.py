@@ -248,7 +248,7 @@ def test_a_full_picture_below_a_thumbnail_is_read(flag: int, tmp_path: Path) -> 
         assert not scan.problems
 
 
-def test_a_second_full_picture_below_a_page_is_told(tmp_path: Path) -> None:
+def test_a_second_full_picture_below_a_page_is_reported(tmp_path: Path) -> None:
     """No column of images.csv names a SubIFD: without a word its frame would be lost."""
     with tifffile.TiffWriter(tmp_path / "s.tif") as file:
         file.write(picture(), subifds=2, metadata=None)

@@ -13,12 +13,12 @@ from drawn import (
     PITCH_UM,
     RING_CROSS,
     Array,
+    found_pose,
     frame_picture,
-    layout_of,
+    lay_out,
+    make_scan,
     paint,
     pixel_from_camera,
-    pose_of,
-    scan_of,
     written_scan,
 )
 from numpy.typing import NDArray
@@ -49,7 +49,7 @@ WILD = (WrittenPlace("left", "90"), WrittenPlace("right", "270", plate=True))
 DECIDED = 7.0
 SIZE_PX = 640
 CORNERS = ((10.0, -10.0), (-10.0, -10.0), (-10.0, 10.0), (10.0, 10.0))
-LAYOUT = layout_of([MarkShape(RING_CROSS)] * 4, CORNERS, (23.0, 23.0))
+LAYOUT = lay_out([MarkShape(RING_CROSS)] * 4, CORNERS, (23.0, 23.0))
 
 
 def line(text: str, pose: str, side: Side, share: float = 0.2) -> Line:
@@ -178,7 +178,7 @@ def test_where_no_place_is_known_frames_are_named_so_that_their_writing_is_uprig
 def test_nothing_is_read_where_nobody_asks_and_a_mirror_is_not_assumed(tmp_path: Path) -> None:
     silent = measure_picture("90m", tmp_path, WILD, "none")
     assert silent.writing is None
-    assert pose_of(silent) == ("0", False)
+    assert found_pose(silent) == ("0", False)
 
 
 TITLE = KnownLine("RUN 31  CANBERRA  17.6.69", "90", "left", ((-13.9, -9.0), (-13.9, 2.0), (-13.1, 2.0), (-13.1, -9.0)))
@@ -187,7 +187,7 @@ TITLE = KnownLine("RUN 31  CANBERRA  17.6.69", "90", "left", ((-13.9, -9.0), (-1
 def test_a_frame_that_lies_as_others_of_its_roll_is_read_only_where_their_line_stands(tmp_path: Path) -> None:
     alike = measure_picture("0", tmp_path, WILD, known_lines=(TITLE,))
     assert [(each.side, each.pose) for each in alike.writing or ()] == [("left", "90")]
-    assert pose_of(alike) == ("0", True)
+    assert found_pose(alike) == ("0", True)
 
 
 @pytest.mark.study
@@ -196,7 +196,7 @@ def test_a_frame_that_lies_otherwise_is_read_as_a_whole(pose: str, tmp_path: Pat
     """The plate lies where the title is looked for, or the title itself in a mirror."""
     other = measure_picture(pose, tmp_path, WILD, known_lines=(TITLE,))
     assert {each.side for each in other.writing or ()} == {"left", "right"}
-    assert pose_of(other) == (pose, True)
+    assert found_pose(other) == (pose, True)
 
 
 def test_a_known_line_is_one_that_says_the_same_and_lies_so_plainly() -> None:
@@ -248,7 +248,7 @@ def among_landscape(template: MarkTemplate, linear: NDArray[np.float64], seed: i
 
 HALF_WEDGE = MarkShape(polygon(((0.0, 0.0), (1.4, 0.0), (1.4, 0.8))))
 ANGLES = [float(np.degrees(np.arctan2(y, x))) for x, y in FRAME_CORNERS]
-LEANING = layout_of([MarkShape(tuple(turned_part(part, angle) for part in HALF_WEDGE.parts)) for angle in ANGLES])
+LEANING = lay_out([MarkShape(tuple(turned_part(part, angle) for part in HALF_WEDGE.parts)) for angle in ANGLES])
 PITCH = (PITCH_UM, PITCH_UM)
 OPTIONS = FiducialOptions()
 # Blocks that reach into the frame at the middles of its sides, whose coordinates tell the poses apart.
@@ -309,7 +309,7 @@ def block_picture(pose: str) -> tuple[Array, Array]:
 def test_blocks_at_the_border_are_measured_alike_with_their_pose_open_and_set(pose: str, requested: str) -> None:
     grey, matrix = block_picture(pose)
     truth = right_mm(BLOCKS) @ matrix[:, :2].T + matrix[:, 2]
-    frame = measure_fiducials(scan_of(grey), BLOCKS, (1000 / PX_PER_MM,) * 2, replace(OPTIONS, pose=requested))
+    frame = measure_fiducials(make_scan(grey), BLOCKS, (1000 / PX_PER_MM,) * 2, replace(OPTIONS, pose=requested))
     assert frame.pose is not None
     assert frame.pose.name == pose
     assert not frame.problems

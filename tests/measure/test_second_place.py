@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drawn import Array, brute_picture, drawn, ellipse, placed, scan_of
+from drawn import Array, brute_picture, draw, ellipse, make_scan, placed
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from true_marks import ALL_MOVES, KIND, Kind, TrueMark, grainy, some_mark, whitened_rms
@@ -56,7 +56,7 @@ def disks(slope: float, sigma: float, count: int) -> list[MarkFit]:
     def painted(col: Array, row: Array) -> Array:
         return np.asarray(inside(col, row) * (1 + slope * (col - DISK_PLACE[0]) / RADIUS))
 
-    grey, rng = 1000 - CONTRAST * drawn(painted, DISK_SIZE, DISK_SIZE, 1.0), np.random.default_rng(5)
+    grey, rng = 1000 - CONTRAST * draw(painted, DISK_SIZE, DISK_SIZE, 1.0), np.random.default_rng(5)
     options = MatchOptions(freedom="ellipse")
     return [match(ScanWindow(grey + rng.normal(0, sigma, grey.shape)), UNIT_DISK, start, options) for _ in range(count)]
 
@@ -171,7 +171,7 @@ def test_a_mark_in_a_textured_border_is_known_as_badly_as_it_is() -> None:
     assert 0.6 < whitened_rms(errors, known) < 1.3
 
 
-def test_what_damage_leaves_beside_itself_is_a_cause_of_a_marks_covariance() -> None:
+def test_what_damage_leaves_next_to_itself_is_a_cause_of_a_marks_covariance() -> None:
     """A region of 4 x 4 px on a line, of which the pixels about it may have any amount up to what is cut out."""
     line = -np.gradient(np.exp(-((np.mgrid[0:40, 0:40][1] - 19.5) ** 2) / 2), axis=1)
     design, used = np.stack([line, line.T, np.ones_like(line)]), np.ones(line.shape, dtype=bool)
@@ -180,8 +180,8 @@ def test_what_damage_leaves_beside_itself_is_a_cause_of_a_marks_covariance() -> 
     by_grey = combined(np.asarray(np.linalg.inv(products(design, design)), np.float64), design)
     noise = NoiseModel(4.0, np.full((1, 1), 4.0), 0.0)
     fit = LinearFit(np.where(damaged, 1000.0, 0.0), used & ~damaged, design, by_grey, noise, np.ones_like(line))
-    beside = gaussian_filter(damaged * 3.2 * 2.0, 1.0, mode="constant")
-    moved = (by_grey[:2] * beside * fit.used).sum(axis=(1, 2))
+    margin = gaussian_filter(damaged * 3.2 * 2.0, 1.0, mode="constant")
+    moved = (by_grey[:2] * margin * fit.used).sum(axis=(1, 2))
     np.testing.assert_allclose(fit.damage_px2(damaged), np.outer(moved, moved) / 3, rtol=1e-6)
     assert not fit.damage_px2(np.zeros_like(used)).any()
 
@@ -223,7 +223,7 @@ GROUND, PRECISION_CONTRAST, SNR = 25000.0, 15000.0, 20.0
 def sighted(mark: TrueMark, grey: np.ndarray, rng: np.random.Generator, rounding_step_dn: float = 0.0) -> MarkFit:
     start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + rng.uniform(-1, 1, 2)])
     frame_sigma = mark.kind.known if np.isfinite(mark.kind.known) else None
-    scan, options = scan_of(grey, rounding_step_dn=rounding_step_dn), FiducialOptions().match
+    scan, options = make_scan(grey, rounding_step_dn=rounding_step_dn), FiducialOptions().match
     fit = detect_mark(scan, MarkPrediction(mark.kind.shape, start, 3.0, 1), options, frame_sigma).fit
     assert fit is not None
     return fit
@@ -257,7 +257,7 @@ def test_faint_soft_disks_are_at_the_bound() -> None:
     for _ in range(10):
         noise = rng.standard_normal((mark.size, mark.size)) / 5
         start = mark.place[:, 2] + rng.normal(0, 0.4, 2), mark.place[:, :2] * rng.uniform(0.9, 1.1)
-        disk = fit_disk(scan_of(GROUND + PRECISION_CONTRAST * (mark.picture + noise)), *start)
+        disk = fit_disk(make_scan(GROUND + PRECISION_CONTRAST * (mark.picture + noise)), *start)
         assert not disk.reason
         beyond.append(disk.center_px - mark.place[:, 2] - mark.best_errors(noise, 1 / 5))
     assert np.square(beyond).sum() < 10 * 0.3 * np.trace(mark.bound(1 / 5))
@@ -281,7 +281,7 @@ def test_wings_take_rotation_and_scale_from_their_frame() -> None:
         grey[corner[1] : corner[1] + 81, corner[0] : corner[0] + 81] += PRECISION_CONTRAST * shown
         true.append(center)
     grey += 150 * rng.standard_normal(grey.shape)
-    result = measure_fiducials(scan_of(grey), FiducialLayout(marks, (60.0, 60.0)), (100.7, 100.7))
+    result = measure_fiducials(make_scan(grey), FiducialLayout(marks, (60.0, 60.0)), (100.7, 100.7))
     errors = [np.asarray(mark.center_px) - place for mark, place in zip(result.marks, true, strict=True)]
     assert np.sqrt(np.mean(np.square(errors))) < 0.009  # of a placement's rotation alone: 0.012 and more
 
@@ -315,7 +315,7 @@ def test_lines_far_wider_than_the_mark_s_are_not_the_mark() -> None:
     wide, fine = (MarkShape(cross(1.5, line_mm)) for line_mm in (0.5, 0.03))
     mark = TrueMark(Kind("wide cross", wide), np.array([[10.0, 0.0, 40.3], [0.0, -10.0, 39.8]]), 81, 3.0)
     grey = 30 + 200 * mark.picture + np.random.default_rng(1).normal(0, 3, mark.picture.shape)
-    detection = detect_mark(scan_of(grey, 255), MarkPrediction(fine, mark.place, 3.0, 1), FiducialOptions().match)
+    detection = detect_mark(make_scan(grey, 255), MarkPrediction(fine, mark.place, 3.0, 1), FiducialOptions().match)
     assert detection.fit is None
     assert "far wider than the mark's lines" in detection.reason
 
@@ -326,7 +326,7 @@ def test_what_compression_makes_of_the_tone_curve_is_alike_in_all_marks() -> Non
     grey = GROUND + PRECISION_CONTRAST * (mark.picture + rng.standard_normal((mark.size, mark.size)) / 100)
     expected = MarkPrediction(mark.kind.shape, mark.place, 3.0, 1)
     for step, alike in ((0.0, 0.0), (0.1, 0.35**2)):  # 3.5 times the step over the contrast
-        scan = scan_of(grey, rounding_step_dn=step * PRECISION_CONTRAST).replace_tone(Tone.unknown())
+        scan = make_scan(grey, rounding_step_dn=step * PRECISION_CONTRAST).replace_tone(Tone.unknown())
         fit = detect_mark(scan, expected, FiducialOptions().match, mark.kind.known).fit
         assert fit is not None
         assert fit.tone is not None

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drawn import drawn, ellipse, scan_of, transformed
+from drawn import draw, ellipse, make_scan, transformed
 from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
@@ -102,9 +102,9 @@ def ringed(number: int, code: RingCode, turn: float, light: bool = False, tilt: 
         ring = (radius > code.ring[0]) & (radius < code.ring[1]) & bits[segment]
         return np.asarray((radius < 1) | ring)
 
-    picture = drawn(inside, SIZE, SIZE, 0.9, fineness=4)
+    picture = draw(inside, SIZE, SIZE, 0.9, fineness=4)
     noise = np.random.default_rng(number).normal(0, 600, picture.shape)
-    return scan_of((12000 + 30000 * picture if light else 45000 - 30000 * picture) + noise)
+    return make_scan((12000 + 30000 * picture if light else 45000 - 30000 * picture) + noise)
 
 
 def dot(light: bool = False, spin: float = 0.0) -> Candidate:
@@ -159,7 +159,7 @@ def test_green_alone_is_the_grey_value_of_a_scan_requested_it() -> None:
     before = scan.window(2, 3, 10, 8)
     np.testing.assert_array_equal(scan.green_channel().window(2, 3, 10, 8), colours[3:11, 2:12, 1])
     np.testing.assert_array_equal(scan.window(2, 3, 10, 8), before)
-    grey = scan_of(colours[..., 0].astype(float))
+    grey = make_scan(colours[..., 0].astype(float))
     np.testing.assert_array_equal(grey.green_channel().window(0, 0, 30, 20), colours[..., 0])
 
 
@@ -315,19 +315,19 @@ def test_a_speck_that_passes_for_the_disk_is_known_by_the_other_disks() -> None:
         shape = 2.6 * np.diag([1.0, rng.uniform(0.85, 0.95)])
         window = picture[:, 40 * number : 40 * number + 40]
         at = place - (40 * number, 0)
-        window -= rng.normal(1.0, 0.04) * CONTRAST * drawn(ellipse(at, shape), 40, 60, 1.0)
+        window -= rng.normal(1.0, 0.04) * CONTRAST * draw(ellipse(at, shape), 40, 60, 1.0)
         if number == 7:
-            speck = drawn(ellipse(at + np.array([0.6, 0.5]), 2.9 * np.eye(2)), 40, 60, 1.0)
+            speck = draw(ellipse(at + np.array([0.6, 0.5]), 2.9 * np.eye(2)), 40, 60, 1.0)
             window += (GROUND - 1.6 * CONTRAST - window) * speck
         predictions.append(TargetPrediction(str(number), place + 0.3, 1.05 * shape, 4.0))
-    marks = measure_disks(scan_of(picture), predictions)
+    marks = measure_disks(make_scan(picture), predictions)
     assert [mark.point for mark in marks if mark.status is Status.WEAK] == ["7"]
     assert "not like the other targets" in marks[7].reason
     assert all(mark.status is Status.MEASURED for mark in marks if mark.point != "7")
 
 
 @pytest.mark.parametrize(("share", "doubted"), [(0.0, 0.04), (0.2, 0.15)])
-def test_targets_are_odd_by_more_than_noise_and_what_all_differ_by(share: float, doubted: float) -> None:
+def test_targets_are_odd_by_more_than_noise_and_common_differences(share: float, doubted: float) -> None:
     """Looks drawn as the comparison takes them to be, 5 % in contrast and 2 % in form, in noise of half to five times
     that variance; a share of them changed by 20 standard deviations; their paint slopes by no more than
     noise of 0.1 px."""

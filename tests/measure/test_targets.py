@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from drawn import drawn, ellipse, scan_of, transformed, whitened
+from drawn import draw, ellipse, make_scan, transformed, whitened
 from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
@@ -38,7 +38,7 @@ class Field:
     def draw(self, place: Array, shape: Array) -> None:
         corner = np.round(place).astype(int) - 16
         window = self.picture[corner[1] : corner[1] + 33, corner[0] : corner[0] + 33]
-        window += self.sign * CONTRAST * drawn(ellipse(place - corner, shape), 33, 33, 0.9, fineness=10)
+        window += self.sign * CONTRAST * draw(ellipse(place - corner, shape), 33, 33, 0.9, fineness=10)
 
     def hide(self, name: str) -> None:
         col, row = np.round(self.places[name]).astype(int)
@@ -46,7 +46,7 @@ class Field:
         patch[:] = self.sign * GROUND + 40000 * (self.sign < 0) + self.rng.normal(0, NOISE, patch.shape)
 
     def scan(self) -> Scan:
-        return scan_of(self.picture)
+        return make_scan(self.picture)
 
     def measure_picture(self, options: TargetOptions | None = None) -> dict[str, MarkMeasurement]:
         return {mark.point: mark for mark in measure_disks(self.scan(), self.predictions, options)}
@@ -165,10 +165,10 @@ def test_crosses() -> None:
             x, y = np.abs(col - middle[0]), np.abs(row - middle[1])
             return np.asarray(((x < 12) & (y < 1.5)) | ((y < 12) & (x < 1.5)))
 
-        picture[corner[1] : corner[1] + 49, corner[0] : corner[0] + 49] += CONTRAST * drawn(arms, 49, 49, 0.9)
+        picture[corner[1] : corner[1] + 49, corner[0] : corner[0] + 49] += CONTRAST * draw(arms, 49, 49, 0.9)
         places[f"x{number}"] = place
         predictions.append(TargetPrediction(f"x{number}", place + np.array([4, -3]), np.diag([12.0, 12.0]), 15.0))
-    for mark in measure_crosses(scan_of(picture), predictions, 3 / 12):
+    for mark in measure_crosses(make_scan(picture), predictions, 3 / 12):
         assert mark.status is Status.MEASURED, mark.reason
         assert mark.center_px is not None
         assert np.abs(mark.center_px - places[mark.point]).max() < 0.04
@@ -185,7 +185,7 @@ def test_a_cross_viewed_obliquely() -> None:
         x, y = np.abs(flat / (1 - np.tensordot(nearer, flat, axes=1)))
         return np.asarray(((x < 1) & (y < 0.125)) | ((y < 1) & (x < 0.125)))
 
-    scan = scan_of(GROUND + CONTRAST * drawn(inside, 49, 49, 0.9))
+    scan = make_scan(GROUND + CONTRAST * draw(inside, 49, 49, 0.9))
 
     def error(perspective: Array) -> float:
         prediction = TargetPrediction("x", place + np.array([0.7, -0.5]), upright, 5.0, perspective)
@@ -202,7 +202,7 @@ def test_two_blobs_on_a_faint_line_are_no_cross() -> None:
     picture[43:47, 20:70] += 0.2 * CONTRAST
     picture[40:50, 20:27] += CONTRAST
     picture[40:50, 63:70] += CONTRAST
-    assert cross_candidates(scan_of(picture), CrossSearch((12.0, 25.0), 0.25)) == []
+    assert cross_candidates(make_scan(picture), CrossSearch((12.0, 25.0), 0.25)) == []
 
 
 def test_bad_predictions_are_refused() -> None:
@@ -212,4 +212,4 @@ def test_bad_predictions_are_refused() -> None:
         TargetPrediction("a", np.zeros(2), np.zeros((2, 3)), 5.0)
     twice = [TargetPrediction("a", np.zeros(2), np.eye(2), 5.0)] * 2
     with pytest.raises(ValueError, match="predicted twice: a"):
-        measure_disks(scan_of(np.zeros((9, 9))), twice)
+        measure_disks(make_scan(np.zeros((9, 9))), twice)

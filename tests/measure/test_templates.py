@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drawn import brute_picture, frame_picture, layout_of, measured, pixel_from_camera
+from drawn import brute_picture, frame_picture, lay_out, measure_grey, pixel_from_camera
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
@@ -205,16 +205,16 @@ GIVEN = MarkShape(cross(0.8, 0.1))
 SHORT = MarkShape((Bar((-0.7, 0.0), (0.7, 0.0), 0.1), Bar((0.0, -0.8), (0.0, 0.7), 0.1)))
 COVERED = MarkShape((Bar((-0.8, 0.0), (0.8, 0.0), 0.1), Bar((0.0, -0.8), (0.0, 0.5), 0.1)))
 OWN_FIGURES_PLACES = tuple((7.0 * x, 7.0 * y) for y in (1, 0, -1) for x in (-1, 0, 1))
-LAYOUT, PITCH = layout_of([GIVEN] * 9, OWN_FIGURES_PLACES), (50.0, 50.0)
+LAYOUT, PITCH = lay_out([GIVEN] * 9, OWN_FIGURES_PLACES), (50.0, 50.0)
 
 
 def plate_frame(number: int, folder: Path, covered: bool = False) -> FrameMeasurement:
     """A frame of a plate whose third cross has three short arms; an arm of the sixth one may be covered."""
-    plate = layout_of(
+    plate = lay_out(
         [SHORT if k == 2 else COVERED if k == 5 and covered else GIVEN for k in range(9)], OWN_FIGURES_PLACES
     )
     matrix = pixel_from_camera("0", 0.008 + 0.001 * number, (202.3 + 0.3 * number, 197.6 - 0.4 * number))
-    return replace(measured(frame_picture(plate, matrix, seed=number), LAYOUT, folder), image=str(number))
+    return replace(measure_grey(frame_picture(plate, matrix, seed=number), LAYOUT, folder), image=str(number))
 
 
 def test_what_is_alike_in_all_frames_is_the_plates_and_what_one_has_is_damage(tmp_path: Path) -> None:
@@ -231,7 +231,7 @@ def test_what_is_alike_in_all_frames_is_the_plates_and_what_one_has_is_damage(tm
     assert [frame.marks[2].status for frame in pair] == [frame.marks[2].status for frame in frames[:2]]
 
 
-def test_lengths_of_arms_are_those_drawn_and_known_as_well_as_they_are_said_to_be() -> None:
+def test_lengths_of_arms_are_those_drawn_and_known_as_well_as_claimed() -> None:
     rng, place = np.random.default_rng(1), np.array([[27.0, 0.3, 40.3], [0.25, -27.0, 39.6]])
     drawn = MarkShape((Bar((-0.8, 0.0), (0.72, 0.0), 0.1), Bar((0.0, -0.8), (0.0, 0.64), 0.1)))
     truth, shown = np.array((1.0, 0.9, 1.0, 0.8)), 6000 * brute_picture(drawn, place, 80, 80, 1.0) + 3000

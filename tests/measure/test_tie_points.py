@@ -174,7 +174,7 @@ def test_scans_of_one_exposed_frame_are_one_sight_of_a_point() -> None:
 TREES_PX = 25.0  # from row to row
 
 
-def seen_twice(rng: np.random.Generator, relief: float, count: int = 200) -> tuple[Array, Array]:
+def view_pairs(rng: np.random.Generator, relief: float, count: int = 200) -> tuple[Array, Array]:
     """Places (count, 2) in two frames of 1500 px, flying along the columns: height moves them along the rows of these,
     by relief px, rms, in hills of some 300 px; 0.1 px of noise."""
     first = rng.uniform(0.0, 1500.0, (count, 2))
@@ -189,7 +189,7 @@ def seen_twice(rng: np.random.Generator, relief: float, count: int = 200) -> tup
 def test_a_tree_of_the_next_row_is_an_outlier() -> None:
     rng = np.random.default_rng(1)
     for _ in range(20):
-        first, second = seen_twice(rng, relief=1.0)
+        first, second = view_pairs(rng, relief=1.0)
         second[7] += [TREES_PX, 0.0]
         assert np.flatnonzero(neighbour_outliers(first, second)).tolist() == [7]
 
@@ -197,7 +197,7 @@ def test_a_tree_of_the_next_row_is_an_outlier() -> None:
 def test_a_false_point_takes_none_of_its_neighbours_with_it() -> None:
     rng = np.random.default_rng(5)
     for _ in range(20):
-        first, second = seen_twice(rng, relief=1.0)
+        first, second = view_pairs(rng, relief=1.0)
         false = np.sort(rng.choice(len(first), 8, replace=False))
         second[false] += rng.choice([-60.0, 60.0, 400.0], (8, 1)) * [1.0, 0.0]
         assert np.flatnonzero(neighbour_outliers(first, second)).tolist() == false.tolist()
@@ -206,7 +206,7 @@ def test_a_false_point_takes_none_of_its_neighbours_with_it() -> None:
 def test_hills_are_no_outliers() -> None:
     rng = np.random.default_rng(3)
     alarms = sum(
-        int(neighbour_outliers(*seen_twice(rng, relief)).sum()) for relief in (0.0, 2.0, 20.0) for _ in range(20)
+        int(neighbour_outliers(*view_pairs(rng, relief)).sum()) for relief in (0.0, 2.0, 20.0) for _ in range(20)
     )
     assert alarms <= 4, "of 12,000 points 1.2 may be"
 

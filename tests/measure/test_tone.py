@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drawn import ALIKE, frame_picture, pixel_from_camera, scan_of
+from drawn import ALIKE, frame_picture, make_scan, pixel_from_camera
 from studies import parametrize_with_studies
 from true_marks import KIND, Kind, TrueMark, some_mark, whitened_rms
 
@@ -37,7 +37,7 @@ def encode_mark(mark: TrueMark, curve: float | str, snr: float, rng: np.random.G
 
 
 def fit_mark(mark: TrueMark, code: np.ndarray, tone: Tone) -> MarkFit:
-    scan = scan_of(code).replace_tone(tone)
+    scan = make_scan(code).replace_tone(tone)
     options = options_for(mark.kind.shape, MatchOptions(linear_sigma=0.05), mark.kind.known)
     return match(read_window(scan, (0, 0, mark.size, mark.size)), mark.kind.shape, mark.place, options)
 
@@ -199,7 +199,7 @@ def test_many_scans_in_jpeg_tell_the_curve_no_better_than_rounding_lets_them() -
     code = encode_mark(mark, 2.2, 80.0, rng) / 257
     known = []
     for step_dn in (0.0, 12.0):
-        scan = scan_of(code, 255, step_dn).replace_tone(Tone.unknown())
+        scan = make_scan(code, 255, step_dn).replace_tone(Tone.unknown())
         expected = MarkPrediction(mark.kind.shape, mark.place, 3.0, 1)
         fit = detect_mark(scan, expected, MatchOptions(linear_sigma=0.05), mark.kind.known).fit
         assert fit is not None
@@ -303,7 +303,7 @@ def test_a_curve_far_from_the_first_one_is_reached_from_another_start() -> None:
     """Light stored as its power of 1.5: the first linearisation led to a power of 0.3, which no scanner has."""
     matrix = pixel_from_camera("0", turn_rad=0.004)
     light = (6000.0 + 40000.0 * (frame_picture(ALIKE, matrix) - 7382.0) / 7500.0) / FULL
-    scan = scan_of(FULL * np.clip(light, 0.0, 1.0) ** 1.5).replace_tone(Tone.unknown())
+    scan = make_scan(FULL * np.clip(light, 0.0, 1.0) ** 1.5).replace_tone(Tone.unknown())
     placement = Placement("0", matrix, 4.0, 4, 1, 1, (0.05, 0.05))
     frame = measure_frame(scan, ALIKE, placement, FiducialOptions(pose="0"))
     power, sigma = frame.tone.tone.equivalent_power(frame.tone.least, frame.tone.greatest)

@@ -226,11 +226,11 @@ MESSAGE, RESULT, LONGEST_MESSAGE = "message", "result", 4000
 
 def command_ending(arguments: list[str], capsys: Capture, trial: str) -> str:
     """How a command ended: MESSAGE, RESULT, or what was wrong in a trial of this name."""
-    code, said = run(arguments), capsys.readouterr()
-    if code not in (0, 1, 2) or "Traceback" in said.err or (code == 2) != (said.err.count("reseau: ") == 1):
-        return f"code {code}: {trial}: {said.err[-2000:]}"
-    if len(said.err) > LONGEST_MESSAGE or "\x1b" in said.out + said.err:
-        return f"too long, or an escape sequence: {trial}: {said.err[:500]}"
+    code, captured = run(arguments), capsys.readouterr()
+    if code not in (0, 1, 2) or "Traceback" in captured.err or (code == 2) != (captured.err.count("reseau: ") == 1):
+        return f"code {code}: {trial}: {captured.err[-2000:]}"
+    if len(captured.err) > LONGEST_MESSAGE or "\x1b" in captured.out + captured.err:
+        return f"too long, or an escape sequence: {trial}: {captured.err[:500]}"
     return MESSAGE if code == 2 else RESULT
 
 

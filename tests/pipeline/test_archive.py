@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from drawn import layout_of
+from drawn import lay_out
 from projects import CAMERA, Capture, change_camera, change_project, replace_text, write_project, write_tables
 from studies import parametrize_with_studies
 
@@ -314,7 +314,7 @@ TIP_MM = ((0.0, 0.0), (0.8, -1.0), (0.8, 1.0))  # of a wedge, whose sides lean o
 @pytest.mark.study
 def test_the_tone_of_a_scanner_stays_when_scans_come_and_go(tmp_path: Path, capsys: Capture) -> None:
     folder = tmp_path / "p"
-    write_project(folder, ["a", "b"], layout=layout_of([MarkShape(polygon(TIP_MM))] * 4))
+    write_project(folder, ["a", "b"], layout=lay_out([MarkShape(polygon(TIP_MM))] * 4))
     mark = f'[mark.m]\nkind = "polygon"\nvertices_mm = {[*map(list, TIP_MM)]}\n'
     (folder / "camera.toml").write_text(CAMERA.split("[mark.m]")[0] + mark, encoding="utf-8")
     measure(folder)

@@ -363,7 +363,7 @@ def test_a_scan_that_is_stored_twice_counts_once() -> None:
         marks = (replace(mark, center_px=np.asarray(mark.center_px)) for mark in made.frame.marks)
         return replace(made, frame=replace(made.frame, image=name, marks=tuple(marks), **changes))
 
-    def moved(scan: MeasuredScan, matrix: Any, shift: Any, **changes: Any) -> MeasuredScan:
+    def move_marks(scan: MeasuredScan, matrix: Any, shift: Any, **changes: Any) -> MeasuredScan:
         marks = (replace(each, center_px=matrix @ each.center_px + shift) for each in scan.frame.marks)
         return replace(scan, frame=replace(scan.frame, marks=tuple(marks)), **changes)
 
@@ -373,8 +373,8 @@ def test_a_scan_that_is_stored_twice_counts_once() -> None:
     quarter = replace(first.frame.pose, name="180m")  # (column, row) becomes (row, width - 1 - column)
     turned = replace(turned, frame=replace(turned.frame, pose=quarter), width_px=8000, height_px=10000)
     matrix = 2 * np.array([[0.0, 1.0], [-1.0, 0.0]])
-    turned = moved(turned, matrix, (0.5, 2 * first.width_px - 1.5))
-    scans = [first, moved(again, np.eye(2), 0.05), turned, moved(other, np.eye(2), (0.5, 0.0))]
+    turned = move_marks(turned, matrix, (0.5, 2 * first.width_px - 1.5))
+    scans = [first, move_marks(again, np.eye(2), 0.05), turned, move_marks(other, np.eye(2), (0.5, 0.0))]
     checked = {each.frame.image: each.frame for each in check_repeated_views(scans, False)}
     left_out = {name for name, each in checked.items() if not any(mark.status.is_observation for mark in each.marks)}
     assert left_out == {"again", "turned"} == {name for name, each in checked.items() if each.problems}
@@ -464,13 +464,13 @@ def test_of_lenses_as_good_the_simplest_is_taken(errors: dict[int | str, float],
     network = board_network(np.random.default_rng(4), 6, ERROR_PX * PIXEL_MM)
     scatter = np.random.default_rng(1).uniform(0.9, 1.1, (9, len(network.images)))
 
-    def adjusted(network: Network, _: Approximations | None) -> Any:
+    def stand_in(network: Network, _: Approximations | None) -> Any:
         distortion = network.cameras[0].distortion
         count = len(distortion.parameters)
         squares = errors["fisheye" if "fisheye" in distortion.family else count] * scatter[count]
         return SimpleNamespace(converged=True, start=None, value=lambda _: 1.0, prediction_errors=lambda _: squares)
 
-    assert choose_lens(network, True, PIXEL_MM, adjusted).model == wanted
+    assert choose_lens(network, True, PIXEL_MM, stand_in).model == wanted
 
 
 @pytest.mark.parametrize("model", ["opencv4", "opencv5", "opencv8", "fisheye"])

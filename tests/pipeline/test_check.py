@@ -143,7 +143,7 @@ def test_a_tilted_sensor_agrees(known: bool) -> None:
     assert max(row.difference_sigmas for row in check.rows) < 0.1
 
 
-def test_what_cannot_be_checked_is_told_with_its_reason() -> None:
+def test_what_cannot_be_checked_is_reported_with_its_reason() -> None:
     check = check_network(simulated(VERTICAL, relief_m=0.0, lens=[0.0] * 5))
     assert check.verdict == "not possible"
     assert check.reason.startswith("Priors carried the solution")
@@ -341,12 +341,12 @@ def test_opencvs_own_families_keep_values_projection_and_derivatives(family: str
     np.testing.assert_allclose(ours, np.reshape(projected, (-1, 2)) * (1.0, -1.0), atol=1e-12)
     start = np.concatenate([INTERIOR, make_lens(family, **VALUES[family])])
 
-    def values_at(at: Array) -> Array:
+    def converted_values(at: Array) -> Array:
         return opencv_values(Lens(Distortion(family), at[:3], at[3:]))[0]
 
     _, by_lens = opencv_values(lens)
     for k, step in enumerate(1e-6 * np.eye(len(start))):
-        numeric = (values_at(start + step) - values_at(start - step)) / 2e-6
+        numeric = (converted_values(start + step) - converted_values(start - step)) / 2e-6
         np.testing.assert_allclose(by_lens[:, k], numeric, atol=1e-7)
 
 

@@ -276,7 +276,7 @@ def one_place(kind: str) -> Changes:
     return {rf"(?m)^(f\d,\w+,{kind}),[^,]+,[^,]+": r"\1,30.0,-30.0"}
 
 
-def judged(first: str, others: str, columns: str) -> Changes:
+def set_status(first: str, others: str, columns: str) -> Changes:
     """The marks with further columns; of the first the place is blank."""
     return {
         r"(?m)^(f.*)$": rf"\1,{others}",
@@ -345,13 +345,13 @@ def judged(first: str, others: str, columns: str) -> Changes:
         ("comparator.csv", one_place("fiducial"), ["image f", "fiducials are at one place"]),
         (
             "comparator.csv",
-            judged("measured", "measured", "status"),
+            set_status("measured", "measured", "status"),
             ["is blank, but the status is 'measured'. Give x_"],
         ),
-        ("comparator.csv", judged("weak", "measured", "status"), ["the status is 'weak'"]),
+        ("comparator.csv", set_status("weak", "measured", "status"), ["the status is 'weak'"]),
         (
             "comparator.csv",
-            judged("absent,covered", "absent,one of 6 x 5 is", "status,reason"),
+            set_status("absent,covered", "absent,one of 6 x 5 is", "status,reason"),
             ["Most have this reason (", "): one of 6 x 5 is."],
         ),
         (

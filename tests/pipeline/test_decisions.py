@@ -172,7 +172,7 @@ def test_lines_that_do_not_apply_are_named_and_do_not_count(tmp_path: Path, caps
         assert "Decisions stand behind" not in output
 
 
-def test_status_is_stale_until_a_decision_is_taken_in(tmp_path: Path, capsys: Capture) -> None:
+def test_status_is_stale_until_a_decision_is_used(tmp_path: Path, capsys: Capture) -> None:
     project = write_project(tmp_path / "p", ["a", "b"])
     assert run(["measure", str(project)]) == 0
     append_decisions(project.with_name("decisions.jsonl"), [mark_decision(Choice.REJECT)])

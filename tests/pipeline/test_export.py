@@ -61,7 +61,7 @@ def exported(project: Path, format: str, folder: Path, *options: str, code: int 
     return folder / format
 
 
-def told_misfit_px(folder: Path) -> float:
+def stated_misfit_px(folder: Path) -> float:
     """The residual that the README tells."""
     text = (folder / "README.txt").read_text(encoding="utf-8")
     return float(text[text.index("off by ") + 7 :].split()[0])
@@ -75,7 +75,7 @@ def test_frames_with_and_without_their_lens_are_as_reported(format: str, project
         there = frame_px(i, ideal_mm(i), ideal=True)
         np.testing.assert_allclose(reader(folder, f"f{i}", POINTS), there, atol=SAME_PX, rtol=0)
     folder = exported(project, format, tmp_path)
-    stated_px = told_misfit_px(folder)
+    stated_px = stated_misfit_px(folder)
     assert 0.0 < stated_px < 0.05
     for i in IMAGES:
         off = np.linalg.norm(reader(folder, f"f{i}", POINTS) - frame_px(i, camera_mm(i)), axis=1)
@@ -101,7 +101,7 @@ def test_colmap_has_the_tracks_of_the_marks_and_opencv_the_pitch_that_was_set(pr
 def test_micmac_makes_the_frames_that_its_camera_is_for(project: Path, tmp_path: Path) -> None:
     """From the scan's pixels through MicMac's own fit and ReSampFid's box to the pixels of camera and pose."""
     folder = exported(project, "micmac", tmp_path)
-    stated_px = told_misfit_px(folder)
+    stated_px = stated_misfit_px(folder)
     text = (folder / "README.txt").read_text(encoding="utf-8")
     box = [float(value) for value in text[text.index("BoxCh=[") + 7 :].split("]")[0].split(",")]
     assert box == [-114.0, -114.0, 114.0, 114.0]
@@ -285,7 +285,7 @@ def test_a_strong_lens_is_refused_unless_requested(tmp_path: Path, refusal: Refu
     project = adjusted_project(tmp_path, strong)
     assert "allow more with --misfit-px" in refusal(["export", str(project), "asp", str(tmp_path / "a")])
     folder = exported(project, "asp", tmp_path, "--misfit-px", "100")
-    stated_px = told_misfit_px(folder)
+    stated_px = stated_misfit_px(folder)
     assert stated_px > 0.05
     off = np.linalg.norm(asp_px(folder, "f0", POINTS) - frame_px(0, camera_mm(0, strong), truth=strong), axis=1)
     assert off.max() < 1.05 * stated_px
@@ -319,7 +319,7 @@ def test_a_digital_camera_goes_out_as_its_pictures_are(tmp_path: Path, monkeypat
     for format, reader in PINHOLES.items():
         folder = exported(project, format, tmp_path)
         off = np.linalg.norm(reader(folder, "f1", POINTS) - pixels[1], axis=1)
-        assert off.max() < 1.05 * told_misfit_px(folder) + SAME_PX
+        assert off.max() < 1.05 * stated_misfit_px(folder) + SAME_PX
     folder = exported(project, "bingo", tmp_path)
     rows = [line.split() for line in (folder / "bingo.txt").read_text(encoding="utf-8").splitlines()[1:101]]
     ideal = ideal_mm(0, here) - (here.x0, here.y0)
@@ -328,7 +328,7 @@ def test_a_digital_camera_goes_out_as_its_pictures_are(tmp_path: Path, monkeypat
     folder = exported(project, "micmac", tmp_path)
     assert not (folder / "Ori-InterneScan").exists()
     off = np.linalg.norm(micmac_px(folder, "f3", POINTS, "") - pixels[3], axis=1)
-    assert off.max() < 1.05 * told_misfit_px(folder) + SAME_PX
+    assert off.max() < 1.05 * stated_misfit_px(folder) + SAME_PX
 
 
 def test_how_far_out_an_estimated_lens_is_known_goes_out(tmp_path: Path) -> None:

@@ -202,7 +202,7 @@ def test_a_mistake_in_a_camera_file_is_named(tmp_path: Path, old: str, new: str,
     refused(read_camera, path, [str(path), *words])
 
 
-def test_what_is_missing_for_a_camera_or_a_project_is_told(tmp_path: Path) -> None:
+def test_what_is_missing_for_a_camera_or_a_project_is_reported(tmp_path: Path) -> None:
     text = CAMERA.replace("frame_mm = [228.0, 228.0]\n", "").replace('"torlegard"', '"ebner"')
     message = refused(read_camera, written(tmp_path, "camera.toml", text))
     assert "line 8: [distortion] family: ebner counts in halves of the frame" in message

@@ -83,7 +83,7 @@ def read_px(format: str, folder: Path, image: int) -> Array:
     return reader(folder, f"f{image}", POINTS) - middle
 
 
-def told_px(folder: Path) -> float:
+def stated_error_px(folder: Path) -> float:
     """The misfit that the README tells."""
     text = (folder / "README.txt").read_text(encoding="utf-8")
     return 0.0 if "nothing was fitted" in text else float(text[text.index("off by ") + 7 :].split()[0])
@@ -103,7 +103,7 @@ def test_a_lens_in_a_format_is_as_reported_or_refused(lens: str, tmp_path: Path,
             assert not folder.exists()
             continue
         assert code == (LOOK if format == "metashape" else DONE)  # which takes no mirrored scan
-        stated_px = told_px(folder)
+        stated_px = stated_error_px(folder)
         assert (stated_px == 0.0) == (expected == EXACT)
         assert stated_px <= 0.05
         for i in set(IMAGES) - ({MIRRORED} if format == "metashape" else set()):
@@ -113,7 +113,7 @@ def test_a_lens_in_a_format_is_as_reported_or_refused(lens: str, tmp_path: Path,
             )  # the told one is of a grid
         if format in IMPORTED and format != "micmac":
             back = imported(format, folder, tmp_path / f"{format}-back")
-            np.testing.assert_allclose(seen_px(back, format), read_px(format, folder, 0), atol=1e-6, rtol=0)
+            np.testing.assert_allclose(projected_px(back, format), read_px(format, folder, 0), atol=1e-6, rtol=0)
 
 
 def imported(format: str, folder: Path, back: Path) -> CameraFile:
@@ -123,7 +123,7 @@ def imported(format: str, folder: Path, back: Path) -> CameraFile:
     return read_camera(back / ("camera1.toml" if format == "colmap" else "camera.toml"))
 
 
-def seen_px(camera: CameraFile, format: str) -> Array:
+def projected_px(camera: CameraFile, format: str) -> Array:
     """Where an imported camera shows the points in image 0, as `read_px`."""
     u, v, w = object_rotation(*TRUTH.attitudes[0]) @ (POINTS - np.array(TRUTH.stations[0])).T
     given = camera.distortion.parameters
@@ -152,7 +152,7 @@ def fisheye_px(camera: CameraFile, rays_down: Array) -> Array:
     return np.asarray(places * [1.0, -1.0] / FISHEYE_PITCH_MM)
 
 
-def test_skews_of_other_programs_come_in(tmp_path: Path) -> None:
+def test_skews_of_other_programs_are_imported(tmp_path: Path) -> None:
     """Zhang's matrix, a fisheye with alpha, and Metashape's b2 in its own formula."""
     rays = np.random.default_rng(3).uniform(-0.5, 0.5, (30, 2))
     directions = np.column_stack([rays, np.ones(30)])

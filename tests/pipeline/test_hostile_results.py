@@ -179,14 +179,14 @@ def answers(folder: Path, server: Served, trials: int, seed: int) -> Counter[str
         if rng.random() < 0.7:
             name, body = rng.choice(sorted(BODIES.items()))
             text, what = changed(json.dumps(body), rng)
-            status, said = ask("POST", f"/api/{name}", text)
+            status, answer = ask("POST", f"/api/{name}", text)
         else:
             name, query = rng.choice(sorted(QUERIES.items()))
             text, what = changed(json.dumps(query), rng)
-            status, said = ask("GET", f"/api/{name}?{urlencode(json.loads(text))}")
+            status, answer = ask("GET", f"/api/{name}?{urlencode(json.loads(text))}")
         read_decisions(folder / "decisions.jsonl")
         is_plain = status in (200, 400, 404) and sorted(folder.parent.iterdir()) == around
-        counted[str(status) if is_plain else f"{name}: {what}: {status} {said[:200]!r}"] += 1
+        counted[str(status) if is_plain else f"{name}: {what}: {status} {answer[:200]!r}"] += 1
     connection.close()
     return counted
 

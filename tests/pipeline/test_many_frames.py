@@ -165,8 +165,8 @@ def test_natural_points_are_no_questions_to_a_reviewer(tmp_path: Path) -> None:
     digest = keep_scans(tmp_path / "out" / "measurement.db", [replace(first, frame=replace(first.frame, marks=marks))])
     frames = {first.frame.image: first.pitch_um}
     write_comparator(tmp_path / "comparator.csv", mark_rows([replace(first.frame, marks=marks)]), frames, digest)
-    asked = Session(read_project(project), "bob").page(Filters())["entries"]
-    assert [(one["point"], one["kind"]) for one in asked] == [("m1", "fiducial")]
+    entries = Session(read_project(project), "bob").page(Filters())["entries"]
+    assert [(one["point"], one["kind"]) for one in entries] == [("m1", "fiducial")]
 
 
 def as_written(folder: Path) -> None:

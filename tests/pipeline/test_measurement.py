@@ -126,7 +126,7 @@ def test_few_of_many_scans_are_the_same_when_another_one_comes() -> None:
     assert sample_names(names[:3], 4) == names[:3]
 
 
-def measured(tasks: Iterable[ScanTask], executor: Executor, in_flight: int = 4) -> Iterator[MeasuredScan]:
+def measure_tasks(tasks: Iterable[ScanTask], executor: Executor, in_flight: int = 4) -> Iterator[MeasuredScan]:
     for task, result in iterate_results(measured_scan, tasks, executor, in_flight):
         yield ended_scan(task, result) if isinstance(result, Exception) else result
 
@@ -141,7 +141,7 @@ def test_results_come_one_by_one_and_few_tasks_are_handed_out_at_a_time(two: Pat
             requests.append(number)
             yield replace(lost, name=str(number))
 
-    results = measured(tasks(), Here(), in_flight=3)
+    results = measure_tasks(tasks(), Here(), in_flight=3)
     first = next(results)
     assert first.failure is not None
     assert len(requests) == 3
@@ -153,7 +153,7 @@ def test_results_come_one_by_one_and_few_tasks_are_handed_out_at_a_time(two: Pat
 def test_a_scan_whose_process_ends_is_a_result(two: Path) -> None:
     project = read_project(two)
     tasks = scan_tasks(project, ["a", "b"])
-    results = {scan.frame.image: scan for scan in measured(tasks, Loses(lambda _, given: given[0].name == "b"))}
+    results = {scan.frame.image: scan for scan in measure_tasks(tasks, Loses(lambda _, given: given[0].name == "b"))}
     assert results["a"].failure is None
     assert results["b"].failure is not None
     assert results["b"].failure.code is FailureCode.ENDED

@@ -245,7 +245,7 @@ def test_tie_points_are_not_called_targets(measured_data: ReportData) -> None:
         ({"covariance": None}, "The camera has no distortion parameters, or their covariance is missing."),
     ],
 )
-def test_what_is_missing_is_told(adjusted_data: ReportData, change: dict[str, Any], words: str) -> None:
+def test_what_is_missing_is_reported(adjusted_data: ReportData, change: dict[str, Any], words: str) -> None:
     assert words in rendered(replace(adjusted_data, **change)).text
 
 
@@ -293,7 +293,7 @@ def test_a_weak_fiducial_that_the_others_contradict_is_a_problem(measured_data: 
     assert "weak fiducial mark" not in texts[1]
 
 
-def test_reasons_are_told_once(measured_data: ReportData) -> None:
+def test_reasons_are_reported_once(measured_data: ReportData) -> None:
     data = set_mark(measured_data, 2, Status.REJECTED, "4.2 px off the other marks' places")
     data = set_mark(data, 4, Status.REJECTED, "3.1 px off the other marks' places")
     first, second = (data.comparator[row].point for row in (2, 4))

@@ -54,7 +54,7 @@ def test_good(adjusted_data: ReportData) -> None:
     assert judge(some).sentence.startswith("Calibrated from 128 marks in 4 frames: ")
 
 
-def test_sigma0_beyond_its_bounds_is_told_with_what_explains_it(adjusted_data: ReportData) -> None:
+def test_sigma0_beyond_its_bounds_is_reported_with_its_explanation(adjusted_data: ReportData) -> None:
     assert "σ₀ = 1.60 is above 1.11" in describe(changed(adjusted_data, sigma0=1.6))
     assert "film_sigma_um" in describe(changed(adjusted_data, sigma0=1.6))
     assert "(target 1.02, fiducial 0.97)" in describe(changed(adjusted_data, sigma0=1.6)), "no group without a check"
@@ -148,7 +148,7 @@ def test_the_table_of_exit_code_1_is_that_of_the_code() -> None:
     assert [line.split(" | ")[0].removeprefix("| ") for line in table.splitlines()] == list(NEEDS_A_LOOK)
 
 
-def test_problems_and_notes_of_a_frame_and_of_the_caller_are_passed_on(measured_data: ReportData) -> None:
+def test_problems_and_notes_of_frames_and_callers_are_kept(measured_data: ReportData) -> None:
     dark = (Reason("nearly black.", Code.NO_FRAME),)
     data = set_frames(measured_data, lambda frame: replace(frame, problems=dark) if frame.image == "f4" else frame)
     data = replace(data, problems=(Problem("points.csv: 99 was not measured."),))
@@ -210,7 +210,7 @@ def test_without_a_solution_there_is_no_result(adjusted_data: ReportData) -> Non
     assert verdict.problems[1].what == "Not final."
 
 
-def test_positions_that_prefer_parts_of_a_pixel_are_told_from_even_ones() -> None:
+def test_positions_that_prefer_parts_of_a_pixel_are_distinguished_from_even_ones() -> None:
     rng = np.random.default_rng(2)
     even = rng.uniform(0.0, 2000.0, 800)
     assert not fraction_test(even).is_locked

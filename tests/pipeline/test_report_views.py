@@ -154,7 +154,7 @@ def test_residuals_and_vectors_are_to_scale_and_y_points_up() -> None:
 FRAME = Plane(np.array([[-60.0, -30.0], [60.0, 30.0]]), 652.0)  # 5 px per mm
 
 
-def test_coverage_is_counted_in_the_cell_that_an_observation_lies_in() -> None:
+def test_coverage_is_counted_in_the_cell_of_each_observation() -> None:
     places_mm = np.array([[-59.0, -29.0], [-58.0, -21.0], [59.0, 29.0]])
     counts, _, _ = coverage_counts(FRAME, places_mm)
     assert counts.shape == (CELLS // 2, CELLS)
@@ -251,24 +251,24 @@ def test_the_effect_of_a_parameter_is_the_displacement_it_makes() -> None:
 WIDE_FRAME = Plane(np.array([[-75.0, -75.0], [75.0, 75.0]]), 500.0)
 
 
-def of_k3() -> Lens:
+def third_degree_lens() -> Lens:
     return lens("A", camera("torlegard", k3=1e-7), covariance("A", ("k3",), np.array([[1e-18]])))
 
 
 def test_the_map_shows_the_longest_vector_and_what_lies_beyond_the_targets() -> None:
     """k3 r³ with r to the outermost of 15 x 15 squares over a frame of 150 mm: 70 mm in x and y, less x0', y0'."""
-    drawn = lens_map(of_k3(), WIDE_FRAME)
+    drawn = lens_map(third_degree_lens(), WIDE_FRAME)
     r = np.hypot(70.3, 70.2)
     assert drawn.largest_um == pytest.approx((1e3 * 1e-7 * r**3, 1e3 * 1e-9 * r**3))
     assert drawn.plot.count("M") == 2 * 15**2 + drawn.plot.count('class="bar"')
     # Of 15 x 15 squares of 10 mm about (0.3, -0.2) the middles of 37 lie within 35 mm.
-    drawn = lens_map(of_k3(), WIDE_FRAME, 35.0)
+    drawn = lens_map(third_degree_lens(), WIDE_FRAME, 35.0)
     dots = {kind: re.search(f'd="([^"]*)" class="dot {kind}"', drawn.plot) for kind in ("target", "extrapolated")}
     counts = {kind: found[1].count("M") for kind, found in dots.items() if found}
     assert counts == {"target": 37, "extrapolated": 15**2 - 37}
     assert drawn.extrapolated
-    assert not lens_map(of_k3(), WIDE_FRAME, 110.0).extrapolated
-    curves = distortion_curves(of_k3(), RADIUS_MM)
+    assert not lens_map(third_degree_lens(), WIDE_FRAME, 110.0).extrapolated
+    curves = distortion_curves(third_degree_lens(), RADIUS_MM)
     assert "no targets here" in curves_plot(curves, 100.0)
     assert "no targets here" not in curves_plot(curves, RADIUS_MM)
 

@@ -133,7 +133,7 @@ def drop_provenance(folder: Path) -> None:
     path.write_text(json.dumps(content), encoding="utf-8")
 
 
-def moved(name: str, is_moved: Callable[[str], bool], column: int) -> Spoil:
+def shift_column(name: str, is_moved: Callable[[str], bool], column: int) -> Spoil:
     """A table of which one number, in the first of such rows, is another one."""
 
     def change(folder: Path) -> None:
@@ -145,8 +145,8 @@ def moved(name: str, is_moved: Callable[[str], bool], column: int) -> Spoil:
     return change
 
 
-moved_mark = moved("comparator.csv", lambda line: ",target," in line and ",measured," in line, 3)
-moved_point = moved("points.csv", lambda line: not line.startswith("point"), 1)
+moved_mark = shift_column("comparator.csv", lambda line: ",target," in line and ",measured," in line, 3)
+moved_point = shift_column("points.csv", lambda line: not line.startswith("point"), 1)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ def test_a_taking_lens_puts_pixels_where_opencv_does_and_gives_them_back() -> No
     rays = np.column_stack([(ideal - CENTER) / LENS.focal_px, np.ones(len(ideal))])
     matrix = np.array([[500.0, 0.0, 170.0], [0.0, 500.0, 160.0], [0.0, 0.0, 1.0]])
     expected = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, np.array([-0.2, 0.1, 2e-3, -1e-3, 0.05]))[0]
-    seen = through.pixel_from_camera(PLACES)
-    np.testing.assert_allclose(seen, expected[:, 0], atol=1e-9)
-    assert np.abs(seen - ideal).max() > 1.0
-    np.testing.assert_allclose(through.camera_from_scan(seen), PLACES, atol=1e-6)
+    pictured = through.pixel_from_camera(PLACES)
+    np.testing.assert_allclose(pictured, expected[:, 0], atol=1e-9)
+    assert np.abs(pictured - ideal).max() > 1.0
+    np.testing.assert_allclose(through.camera_from_scan(pictured), PLACES, atol=1e-6)

@@ -42,7 +42,7 @@ def test_torlegard_with_literal_decentring_agrees_with_exact_observations() -> N
     assert worst < 1e-12  # mm
 
 
-def test_juhl_leaves_the_noise_that_his_example_was_simulated_with() -> None:
+def test_juhl_leaves_the_noise_of_his_simulated_example() -> None:
     reference = case("ii_juhl_3photos")
     truth, given = reference["truth"], reference["input"]
     parameters = {name: truth[f"IO.{name}"] for name in PARAMETERS["juhl"]}
