@@ -8,12 +8,11 @@ import logging
 import math
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
 
 import numpy as np
-from tifffile import TIFF, TiffFile, TiffPage
+from tifffile import TIFF, TiffFile, TiffPage, TiffTag
 
 from measure.errors import MeasurementError
 from measure.scans.cache import OpenedPicture, Segments
@@ -37,14 +36,14 @@ from measure.tone.declared import ColourTags
 
 Extent = tuple[int, int]
 
-_MOST_DIRECTORIES, _MOST_ENTRIES = 1000, 4096  # of a file and of a directory: more are damage
-_WHOLE = {1: "B", 3: "H", 4: "I", 13: "I", 16: "Q", 18: "Q"}  # unsigned integers, by their types
+_MOST_DIRECTORIES, _MOST_TAGS = 1000, 4096  # of a file and of a directory: more are damage
+_WHOLE = (1, 3, 4, 13, 16, 18)  # types of unsigned integers
 _TYPE_BYTES = {int(kind): struct.calcsize(f"={form}") for kind, form in TIFF.DATA_FORMATS.items()}
 # What is read with a picture: tags of one number, and of several.
 _ONE_NUMBER = frozenset((254, 256, 257, 259, 262, 266, 274, 277, 278, 284, 317, 322, 323))
 _NUMBERS = frozenset((258, 273, 279, 320, 324, 325, 338, 339))
 _SIZES = (256, 257, 277, 278, 322, 323)  # none of which may be 0
-_CHILDREN = (330, 34665, 34853, 40965)  # places of directories: SubIFDs, Exif, GPS, Interoperability
+_SUB_IFDS, _CHILDREN = 330, (34665, 34853, 40965)  # tags of further directories; Exif, GPS, Interoperability
 _STORED = ((273, 279), (324, 325), (513, 514))  # places and numbers of bytes of what no tag holds itself
 _TRANSFER_FUNCTION, _ICC_PROFILE = 301, 34675  # tags of the tone curve (TIFF 6.0; ICC.1:2022, B.4)
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what it finds odd is said in our own messages
@@ -62,118 +61,96 @@ class BadDirectory(ValueError):
     """What is wrong with a file's directories, a part of a sentence."""
 
 
-class _Entry(NamedTuple):
-    """One tag: its type, how many numbers it has, and where these stand, (first byte, byte after the last)."""
-
-    tag: int
-    kind: int
-    length: int
-    extent: Extent
-
-
-def check_directories(path: Path) -> list[Extent]:
+def check_directories(file: TiffFile) -> list[Extent]:
     """What lies where in the file, (first byte, byte after the last) each: the directories, the numbers of their tags,
     and the pixels that these tell of.
 
     Raises BadDirectory for a chain of directories that leads back to itself, and for tags of a count, type or value
     that no picture can have.
     """
-    with path.open("rb") as file:
-        directories = _Directories(file, path.stat().st_size)
-        place, extents = directories.start()
-        chain, children, found = [place], list[int](), set[int]()
-        while chain or children:
-            is_picture = bool(chain)
-            place = chain.pop() if is_picture else children.pop()
-            if not place or (place in found and not is_picture):
-                continue
-            if place in found:
-                raise BadDirectory("its list of pictures leads back to itself")
-            if len(found) == _MOST_DIRECTORIES:
-                raise BadDirectory(f"it lists more than {_MOST_DIRECTORIES} pictures")
-            found.add(place)
-            try:
-                entries, following, extent = directories.read(place)
-                for entry in entries if is_picture else ():
-                    directories.check(entry)
-            except BadDirectory:
-                if is_picture:
-                    raise
-                continue  # what is beside the pictures is not read
-            chain += [following] if is_picture else []
-            for entry in entries:
-                children += directories.numbers(entry) if entry.tag in _CHILDREN else ()
-            extents += [extent, *directories.extents(entries)]
+    file.filehandle.seek(file.tiff.offsetsize if file.is_bigtiff else 4)
+    chain = [_number(file, file.tiff.offsetformat)]
+    extents, children, found = [(0, file.filehandle.tell())], list[int](), set[int]()
+    while chain or children:
+        is_picture = bool(chain)
+        place = chain.pop() if is_picture else children.pop()
+        if not place or (place in found and not is_picture):
+            continue
+        if place in found:
+            raise BadDirectory("its list of pictures leads back to itself")
+        if len(found) == _MOST_DIRECTORIES:
+            raise BadDirectory(f"it lists more than {_MOST_DIRECTORIES} pictures")
+        found.add(place)
+        try:
+            tags, following = _directory(file, place)
+            for tag in tags if is_picture else ():
+                _check_tag(tag, file.filehandle.size)
+        except BadDirectory:
+            if is_picture:
+                raise
+            continue  # what is beside the pictures is not read
+        chain += [following] if is_picture else []
+        children += [number for tag in tags if tag.code == _SUB_IFDS for number in _numbers(tag)]
+        children += [tag.valueoffset for tag in tags if tag.code in _CHILDREN]
+        extents += [(place, place + file.tiff.tagnosize + len(tags) * file.tiff.tagsize), *_extents(tags, file)]
     return extents
 
 
-class _Directories:
-    """The directories of a file: byte order, and struct's letters for a number of entries and a place."""
+def _number(file: TiffFile, form: str) -> int:
+    try:
+        return int(struct.unpack(form, file.filehandle.read(struct.calcsize(form)))[0])
+    except struct.error:
+        raise BadDirectory("its list of tags is cut short") from None
 
-    def __init__(self, file: BinaryIO, file_bytes: int) -> None:
-        self._file, self._file_bytes = file, file_bytes
-        start = file.read(4)
-        self._order = "<" if start[:2] == b"II" else ">"
-        self._count, self._place = ("Q", "Q") if start[2:] in (b"+\0", b"\0+") else ("H", "I")
-        self._room = struct.calcsize(f"={self._place}")
 
-    def start(self) -> tuple[int, list[Extent]]:
-        """The place of the first directory, and what the head takes."""
-        first = 8 if self._room == 8 else 4
-        return self._unpack(first, self._place)[0], [(0, first + self._room)]
+def _directory(file: TiffFile, place: int) -> tuple[list[TiffTag], int]:
+    """A directory's tags, and the place of the next one."""
+    file.filehandle.seek(place)
+    count = _number(file, file.tiff.tagnoformat)
+    if count > _MOST_TAGS:
+        raise BadDirectory(f"a picture has {count} tags")
+    first = file.filehandle.tell()
+    stored = file.filehandle.read(count * file.tiff.tagsize)
+    following = _number(file, file.tiff.offsetformat)
+    steps = range(0, len(stored), file.tiff.tagsize)
+    heads = ((first + step, stored[step : step + file.tiff.tagsize]) for step in steps)
+    return [TiffTag.fromfile(file, offset=at, header=head, validate=False) for at, head in heads], following
 
-    def _unpack(self, place: int, letters: str) -> tuple[int, ...]:
-        self._file.seek(place)
-        try:
-            return struct.unpack(form := self._order + letters, self._file.read(struct.calcsize(form)))
-        except (struct.error, MemoryError, OverflowError):
-            raise BadDirectory("its list of tags is cut short") from None
 
-    def read(self, place: int) -> tuple[list[_Entry], int, Extent]:
-        """A directory's entries, the place of the next one, and where its entries stand."""
-        (count,) = self._unpack(place, self._count)
-        if count > _MOST_ENTRIES:
-            raise BadDirectory(f"a picture has {count} tags")
-        entries, first = [], place + struct.calcsize(f"={self._count}")
-        numbers = self._unpack(first, f"{count * f'HH2{self._place}'}{self._place}")
-        entry_bytes = 4 + 2 * self._room
-        for number in range(count):
-            tag, kind, amount, there = numbers[4 * number : 4 * number + 4]
-            size = amount * _TYPE_BYTES.get(kind, 0)
-            at = there if size > self._room else first + number * entry_bytes + 4 + self._room
-            entries.append(_Entry(tag, kind, amount, (at, at + size)))
-        return entries, numbers[-1], (place, place + count * entry_bytes)
+def _check_tag(tag: TiffTag, file_bytes: int) -> None:
+    """One tag, if it is one that pictures are read by."""
+    if tag.code not in _ONE_NUMBER | _NUMBERS:
+        return
+    name = TIFF.TAGS[tag.code]
+    if tag.dtype not in _WHOLE:
+        raise BadDirectory(f"its tag {name} is no whole number (type {int(tag.dtype)})")
+    if tag.count < 1 or (tag.code in _ONE_NUMBER and tag.count != 1):
+        only = ", not one" if tag.code in _ONE_NUMBER else ""
+        raise BadDirectory(f"its tag {name} holds {tag.count} numbers{only}")
+    if tag.valueoffset + tag.valuebytecount > file_bytes:
+        raise BadDirectory(f"the {tag.count} numbers of its tag {name} lie beyond its end of {file_bytes} bytes")
+    if tag.code in _SIZES and _numbers(tag) == [0]:
+        raise BadDirectory(f"its tag {name} is 0")
 
-    def check(self, entry: _Entry) -> None:
-        """One entry, if its tag is one that pictures are read by."""
-        if entry.tag not in _ONE_NUMBER | _NUMBERS:
-            return
-        name = TIFF.TAGS[entry.tag]
-        if entry.kind not in _WHOLE:
-            raise BadDirectory(f"its tag {name} is no whole number (type {entry.kind})")
-        if entry.length < 1 or (entry.tag in _ONE_NUMBER and entry.length != 1):
-            only = ", not one" if entry.tag in _ONE_NUMBER else ""
-            raise BadDirectory(f"its tag {name} holds {entry.length} numbers{only}")
-        if entry.extent[1] > self._file_bytes:
-            size = f"its end of {self._file_bytes} bytes"
-            raise BadDirectory(f"the {entry.length} numbers of its tag {name} lie beyond {size}")
-        if entry.tag in _SIZES and self.numbers(entry) == (0,):
-            raise BadDirectory(f"its tag {name} is 0")
 
-    def extents(self, entries: list[_Entry]) -> Iterator[Extent]:
-        """Of the numbers of a directory's tags, and of the pixels that they tell of."""
-        by_tag = {entry.tag: entry for entry in entries}
-        yield from (entry.extent for entry in entries if entry.extent[1] - entry.extent[0] > self._room)
-        for places, counts in _STORED:
-            if places in by_tag and counts in by_tag:
-                both = (self.numbers(by_tag[tag]) for tag in (places, counts))
-                yield from ((place, place + count) for place, count in zip(*both, strict=False) if count)
+def _extents(tags: Sequence[TiffTag], file: TiffFile) -> Iterator[Extent]:
+    """Of the numbers of a directory's tags, and of the pixels that they tell of."""
+    for tag in tags:
+        size = tag.count * _TYPE_BYTES.get(int(tag.dtype), 0)
+        if size > file.tiff.tagoffsetthreshold:
+            yield tag.valueoffset, tag.valueoffset + size
+    by_code = {tag.code: tag for tag in tags}
+    for places, counts in _STORED:
+        if places in by_code and counts in by_code:
+            both = zip(_numbers(by_code[places]), _numbers(by_code[counts]), strict=False)
+            yield from ((place, place + count) for place, count in both if count)
 
-    def numbers(self, entry: _Entry) -> tuple[int, ...]:
-        """None where the tag holds no whole numbers, or the file does not hold them."""
-        if entry.kind not in _WHOLE or entry.extent[1] > self._file_bytes:
-            return ()
-        return self._unpack(entry.extent[0], f"{entry.length}{_WHOLE[entry.kind]}")
+
+def _numbers(tag: TiffTag) -> list[int]:
+    """None where the tag holds no whole numbers, or the file does not hold them."""
+    if tag.dtype not in _WHOLE or tag.valueoffset + tag.valuebytecount > tag.parent.filehandle.size:
+        return []
+    return [int(number) for number in np.ravel(tag.value)]
 
 
 def open_tiff(path: Path, max_pixels: int | None = None) -> OpenedPicture:
@@ -192,11 +169,11 @@ def open_tiff(path: Path, max_pixels: int | None = None) -> OpenedPicture:
         than such a file can hold.
     """
     try:
-        taken = check_directories(path)
         file = tiff_file(path)
-    except (BadDirectory, *DECODING_ERRORS) as error:
+    except DECODING_ERRORS as error:
         raise damage_error(path, str(error)) from error
     try:
+        taken = check_directories(file)
         page, problems = _main_page(file, path)
         _check_original(page, path)
         radiometry = page_radiometry(page, path)
