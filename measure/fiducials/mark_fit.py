@@ -14,7 +14,7 @@ from measure.matching.match import MatchOptions, mark_window, match
 from measure.matching.window import FAINT, pixels_beyond_edge, read_window
 from measure.noise.grain import BESIDE_PX
 from measure.results import MarkFit
-from measure.scans.compression import covariance_of_compression, tone_variance
+from measure.scans.jpeg import covariance_of_compression, tone_variance
 from measure.scans.scan import Scan
 from measure.tone.curve import LINEAR
 

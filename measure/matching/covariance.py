@@ -11,8 +11,7 @@ from measure.array_types import Array, Mask
 from measure.geometry import Affine, linear_scale
 from measure.marks.rendering import render
 from measure.marks.shapes import MarkTemplate
-from measure.marks.shared_picture import SMOOTHED_PX2
-from measure.marks.templates import GRAIN_PX
+from measure.marks.templates import GRAIN_PX, SMOOTHED_PX2
 from measure.matching.models import GREY
 from measure.noise.noise_model import (
     SCALE_VARIANCE,

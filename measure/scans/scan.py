@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.scans.cache import LostPart, OpenedPicture, SegmentCache, Segments
-from measure.scans.compression import earlier_step_dn
+from measure.scans.jpeg import earlier_step_dn
 from measure.scans.metadata import Pitch, Samples
 from measure.scans.parallel import map_in_threads
 from measure.scans.remote import ScanPart, Window

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from tifffile import TIFF, TiffFile, TiffPage, TiffTag
+from tifffile import TIFF, TiffFile, TiffFileError, TiffPage, TiffTag
 
 from measure.errors import MeasurementError
 from measure.scans.cache import OpenedPicture, Segments
@@ -171,7 +171,9 @@ def open_tiff(path: Path, max_pixels: int | None = None) -> OpenedPicture:
     try:
         file = tiff_file(path)
     except DECODING_ERRORS as error:
-        raise damage_error(path, str(error)) from error
+        # Others than these are of tags that are no numbers, or several.
+        reason = str(error) if isinstance(error, OSError | TiffFileError) else "its list of tags is damaged"
+        raise damage_error(path, reason) from error
     try:
         taken = check_directories(file)
         page, problems = _main_page(file, path)

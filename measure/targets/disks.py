@@ -17,7 +17,7 @@ from measure.noise.grain import BESIDE_PX
 from measure.noise.noise_model import may_be_noise
 from measure.noise.robust_estimation import MEDIAN_EFFICIENCY, SIGMA_OF_DEVIATION
 from measure.results import Covariance, MarkFit, SecondPlace
-from measure.scans.compression import covariance_of_compression
+from measure.scans.jpeg import covariance_of_compression
 from measure.scans.scan import Scan
 from measure.targets.block_search import Block, Candidate, Patches
 from measure.targets.detection import LEAST_SNR

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from measure import MarkShape, Scan, ScanWindow, match, open_scan, ring_cross
 from measure.scans.cache import WholePicture
-from measure.scans.compression import covariance_of_compression
-from measure.scans.jpeg import rounding_step_dn
+from measure.scans.jpeg import covariance_of_compression, rounding_step_dn
 from measure.scans.metadata import NO_TAGS
 
 # Annex K of ITU-T T.81, luminance, the first 15 in zigzag order: what "quality 50" is.
