@@ -426,7 +426,8 @@ def _searchable(scan: Scan, factor: int) -> tuple[Bytes, Reason]:
     """Reduced scan stretched to 8 bits, and the reason if it has no contrast to search in."""
     grey = scan.reduced(factor) if factor > 1 else scan.window(0, 0, scan.width_px, scan.height_px)
     every = max(round(np.sqrt(grey.size / _ENOUGH_PIXELS)), 1)
-    low, high = np.percentile(grey[::every, ::every], (1, 99)).astype(grey.dtype)  # doubles take three times as long
+    shown = np.sort(grey[::every, ::every], axis=None)  # several times as fast as np.percentile
+    low, high = shown[len(shown) // 100], shown[-1 - len(shown) // 100]
     if high - low < _LEAST_CONTRAST * scan.full_scale_dn:
         share = 100 * (high - low) / scan.full_scale_dn
         message = f"the scan has no contrast: its grey values span {share:.1f} % of the scale"
