@@ -139,7 +139,7 @@ def _dot_mark(name: str, disk: FittedDisk | None, is_detected: bool) -> MarkMeas
         return MarkMeasurement(name, "target", disk.center_px, None, status, reason)
     weakness = disk.weakness or disk.dust_reason
     status = Status.WEAK if weakness else Status.MEASURED
-    return MarkMeasurement(name, "target", disk.center_px, disk.covariance, status, weakness, disk.quality)
+    return MarkMeasurement(name, "target", disk.center_px, disk.place_covariance, status, weakness, disk.quality)
 
 
 def measure_board(scan: Scan, spec: BoardSpec) -> BoardMeasurement:

@@ -12,8 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from measure.flags import NO_REASON, Code, Reason
+from measure.matching.models import PIXEL_VARIANCE_PX2
 from measure.noise.noise_model import influence_covariances
 from measure.noise.robust_estimation import SIGMA_OF_DEVIATION, gauss_newton_step, tukey_weights
+from measure.results import Covariance, MarkFit
 from measure.targets.block_search import Block, Patches, concatenate
 
 Array = NDArray[np.float64]
@@ -28,9 +31,9 @@ _HOPELESS = 1.5  # times the allowed misfit: patches above it are dropped before
 _LONGEST_STEP = 0.3  # in radii: the limit of linearisation
 _PLAIN_STEPS, _MOST_STEPS, _SETTLED_PX = 2, 30, 1e-3  # of a fit to convergence
 _UNDAMAGED = 0.05  # robust weight below which a pixel shows something else
-_APPEARANCE = [2, 3, 4, 6, 5]  # of the unknowns: size, stretch, shear, gain, blur
 _DAMPING = 1e-4  # the unknowns of a faint disk are nearly dependent
-_UNKNOWNS = 10  # place (2), size, stretch, shear, blur, gain, offset, slopes (2)
+_UNKNOWNS, _BLUR = 10, 5  # place (2), size, stretch, shear, blur, gain, offset, slopes (2)
+_NO_DISK = Reason("no disk explains the picture there", Code.LIKENESS)
 _SCALE_FLOOR = 0.015  # of the contrast, under Tukey's scale
 WORST_MISFIT, WORST_SMOOTH_MISFIT = 0.23, 0.08  # residuals over contrast; above: texture or a stain
 SMOOTH = 0.5  # correlation of neighbouring residuals above which they are not noise
@@ -78,27 +81,10 @@ def _fit_patches(
     return concatenate(*found), np.concatenate(blurs_found)
 
 
-@dataclass(frozen=True, eq=False)
-class PlacedDisk:
-    """A disk fitted to convergence. center_px (2,); covariance_px2 (2, 2) under the autocovariance of the residuals;
-    shape (2, 2) as a candidate's; blur_px: pixel width included; appearance_covariance (5, 5), see
-    `FittedDisk.appearance_covariance`, under white noise; is_disk: whether the fit converged and a disk explains it."""
-
-    center_px: Array
-    covariance_px2: Array
-    shape: Array
-    contrast_dn: float
-    noise_dn: float
-    blur_px: float
-    damaged_fraction: float
-    appearance_covariance: Array
-    is_disk: bool
-
-
-def place_disks(block: Block, patches: Patches, margins_px: Array) -> list[PlacedDisk]:
+def place_disks(block: Block, patches: Patches, margins_px: Array) -> list[MarkFit]:
     """Fit many disks at once to convergence, each with margins_px (n,) of background."""
     strides, blurs = np.ones(len(patches.radii), np.intp), np.full(len(patches.radii), _FIRST_BLUR_PX)
-    placed: dict[int, PlacedDisk] = {}
+    placed: dict[int, MarkFit] = {}
     for group in _groups(patches, strides, margins_px):
         own = patches.part(group)
         fit = _Fit(block, own, blurs[group], strides[group], margins_px[group])
@@ -188,7 +174,7 @@ class _Fit:
         scale = np.maximum(self.scale, _SCALE_FLOOR * np.abs(self.greys[:, 0]) + 1e-6)
         return np.asarray(self.used * tukey_weights(self.residuals / scale[:, None].astype(np.float32), 1.0))
 
-    def placed(self, is_disk: Mask) -> Iterator[PlacedDisk]:
+    def placed(self, is_disk: Mask) -> Iterator[MarkFit]:
         """The disks in scan pixels, with covariances."""
         weights, found = self._weights(), self.patches()
         counted = weights > _UNDAMAGED
@@ -199,22 +185,22 @@ class _Fit:
         covariances, variances = influence_covariances(
             influence.reshape(size), self.residuals.reshape(size)[:, 0], counted.reshape(size)[:, 0], _UNKNOWNS
         )
-        appearances = inverse[:, _APPEARANCE][:, :, _APPEARANCE] * variances[:, None, None]
-        per = np.ones((len(weights), len(_APPEARANCE)))
-        per[:, 3], per[:, 4] = 1 / self.greys[:, 0], 2 * self.blur  # relative contrast, the blur's variance
-        appearances *= per[:, :, None] * per[:, None]
+        inverse[:, _BLUR] *= 2 * self.blur[:, None]  # of the blur's variance
+        inverse[:, :, _BLUR] *= 2 * self.blur[:, None]
+        blurs_px = np.sqrt(np.maximum(self.blur**2 - PIXEL_VARIANCE_PX2, 0.0))
         damaged = 1 - weights.sum(axis=1) / np.maximum(self.used.sum(axis=1), 1)
-        for number, center_px in enumerate(found.centers):
-            yield PlacedDisk(
+        for number, (center_px, shape) in enumerate(zip(found.centers, found.shapes, strict=True)):
+            yield MarkFit(
+                converged=bool(is_disk[number]),
+                reason=NO_REASON if is_disk[number] else _NO_DISK,
                 center_px=center_px,
-                covariance_px2=covariances[number],
-                shape=found.shapes[number],
+                place_covariance=Covariance.from_noise(covariances[number]),
+                pixel_from_mark=np.column_stack([shape, center_px]),
                 contrast_dn=float(found.contrasts[number]),
                 noise_dn=float(np.sqrt(variances[number])),
-                blur_px=float(self.blur[number]),
+                blur_px=float(blurs_px[number]),
                 damaged_fraction=float(damaged[number]),
-                appearance_covariance=appearances[number],
-                is_disk=bool(is_disk[number]),
+                covariance=inverse[number] * variances[number],
             )
 
     def misfit(self) -> Array:

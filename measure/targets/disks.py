@@ -11,12 +11,12 @@ from measure.flags import DISK_UNLIKE_THE_OTHERS, LARGE_ERROR, NO_REASON, Cause,
 from measure.geometry import linear_scale
 from measure.marks.shapes import Disk, MarkShape
 from measure.matching.match import MatchOptions, mark_window, match
-from measure.matching.models import GREY, PIXEL_VARIANCE_PX2
+from measure.matching.models import GREY
 from measure.matching.window import read_window
 from measure.noise.grain import BESIDE_PX
 from measure.noise.noise_model import may_be_noise
 from measure.noise.robust_estimation import MEDIAN_EFFICIENCY, SIGMA_OF_DEVIATION
-from measure.results import Covariance, MarkFit, SecondPlace
+from measure.results import MarkFit
 from measure.scans.jpeg import covariance_of_compression
 from measure.scans.scan import Scan
 from measure.targets.block_search import Block, Candidate, Patches
@@ -27,7 +27,6 @@ from measure.targets.disk_fit_batch import (
     SMOOTH,
     WORST_MISFIT,
     WORST_SMOOTH_MISFIT,
-    PlacedDisk,
     place_disks,
 )
 
@@ -59,38 +58,25 @@ _LEAST_SPREAD = 1e-4  # variance of 1 %: no frame's targets are more alike, nor 
 
 
 @dataclass(frozen=True, eq=False)
-class FittedDisk:
-    """A fitted ellipse.
+class FittedDisk(MarkFit):
+    """A fitted ellipse: the fit of a unit disk. reason: why it is no disk; weakness: why it is doubtful."""
 
-    Attributes
-    ----------
-    center_px : (2,) column and row.
-    covariance : of the centre, by causes.
-    pixel_from_disk : (2, 2) image of the unit disk; the columns are two radius vectors, px.
-    contrast_dn : positive for a light disk.
-    appearance_covariance : (5, 5) of the relative changes in size, stretch along the columns, shear and contrast, and
-        of the blur's variance, px².
-    sloping : centre under the hypothesis that the grey value slopes across the disk; None where it was not estimated.
-    weakness : why the disk is doubtful.
-    reason : why it is not a disk; the other values are then those of the last iteration.
-    """
-
-    center_px: Array
-    covariance: Covariance
-    pixel_from_disk: Array
-    contrast_dn: float
-    noise_dn: float
-    blur_px: float
-    damaged_fraction: float
-    appearance_covariance: Array
-    sloping: SecondPlace | None = None
     weakness: Reason = NO_REASON
-    reason: Reason = NO_REASON
 
     @property
-    def covariance_px2(self) -> Array:
-        """(2, 2) of the centre, sum of all causes."""
-        return self.covariance.px2
+    def pixel_from_disk(self) -> Array:
+        """(2, 2) image of the unit disk; the columns are two radius vectors, px."""
+        return self.pixel_from_mark[:, :2]
+
+    @property
+    def appearance_covariance(self) -> Array:
+        """(5, 5) of the relative changes in size, stretch along the columns, shear and contrast, and of the blur's
+        variance, px²."""
+        assert self.covariance is not None
+        gain = len(self.covariance) - GREY
+        figures = [2, 3, 4, gain, gain - 1]
+        per = np.array([1.0, 1.0, 1.0, self.contrast_dn or 1.0, 1.0])
+        return np.asarray(self.covariance[np.ix_(figures, figures)] / np.outer(per, per))
 
     @property
     def half_axes_px(self) -> Array:
@@ -222,48 +208,18 @@ def fit_plain_disks(
     ]
 
 
-def _plain_disk(scan: Scan, disk: PlacedDisk) -> FittedDisk | None:
+def _plain_disk(scan: Scan, fit: MarkFit) -> FittedDisk | None:
     """The disk as a result; None if it is doubtful."""
-    compression_px2 = covariance_of_compression(scan.rounding_step_dn, disk.contrast_dn)
-    fitted = FittedDisk(
-        center_px=disk.center_px,
-        covariance=Covariance.from_noise(disk.covariance_px2).plus(Cause.COMPRESSION, compression_px2),
-        pixel_from_disk=disk.shape,
-        contrast_dn=disk.contrast_dn,
-        noise_dn=disk.noise_dn,
-        blur_px=float(np.sqrt(max(disk.blur_px**2 - PIXEL_VARIANCE_PX2, 0.0))),
-        damaged_fraction=disk.damaged_fraction,
-        appearance_covariance=disk.appearance_covariance,
-    )
-    stands_out = disk.is_disk and abs(disk.contrast_dn) > _PLAIN_SNR * disk.noise_dn
-    is_clean = disk.damaged_fraction < _WEAK_DAMAGE and fitted.half_axes_px[1] >= _SMALL_RADIUS_PX
-    return fitted if stands_out and is_clean and not fitted.dust_reason else None
-
-
-def _appearance_covariance(fit: MarkFit) -> Array:
-    """(5, 5), see `FittedDisk.appearance_covariance`."""
-    assert fit.covariance is not None
-    gain = len(fit.covariance) - GREY
-    figures = [2, 3, 4, gain, gain - 1]
-    per = np.array([1.0, 1.0, 1.0, fit.contrast_dn or 1.0, 1.0])
-    return np.asarray(fit.covariance[np.ix_(figures, figures)] / np.outer(per, per))
+    disk = _assess(fit, covariance_of_compression(scan.rounding_step_dn, fit.contrast_dn))
+    stands_out = abs(disk.contrast_dn) > _PLAIN_SNR * disk.noise_dn
+    return disk if stands_out and not (disk.reason or disk.weakness or disk.dust_reason) else None
 
 
 def _assess(fit: MarkFit, compression_px2: Array) -> FittedDisk:
     """Convert a fit to a disk, with a reason or weakness where its figures give one. Correlated residuals show that the
     window holds something else."""
-    disk = FittedDisk(
-        center_px=fit.center_px,
-        covariance=fit.place_covariance.plus(Cause.COMPRESSION, compression_px2),
-        pixel_from_disk=fit.pixel_from_mark[:, :2],
-        contrast_dn=fit.contrast_dn,
-        noise_dn=fit.noise_dn,
-        blur_px=fit.blur_px,
-        damaged_fraction=fit.damaged_fraction,
-        appearance_covariance=_appearance_covariance(fit),
-        sloping=fit.sloping,
-        reason=NO_REASON if fit.converged else fit.reason,
-    )
+    covariance = fit.place_covariance.plus(Cause.COMPRESSION, compression_px2)
+    disk = FittedDisk(**{**vars(fit), "place_covariance": covariance})
     if disk.reason:
         return disk
     reason = weakness = NO_REASON

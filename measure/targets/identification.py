@@ -178,7 +178,9 @@ def _identified_marks(
             reason = Reason.combine([one for one in (disk.weakness, next(unlike)) if one])
             status = Status.WEAK if reason else Status.MEASURED
         marks.append(
-            MarkMeasurement(prediction.point, "target", disk.center_px, disk.covariance, status, reason, disk.quality)
+            MarkMeasurement(
+                prediction.point, "target", disk.center_px, disk.place_covariance, status, reason, disk.quality
+            )
         )
     return marks
 

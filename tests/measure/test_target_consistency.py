@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
 from measure import Scan, Status, TargetPrediction, measure_disks
+from measure.flags import NO_REASON
 from measure.results import Covariance, SecondPlace
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
@@ -348,7 +349,22 @@ def test_targets_are_odd_by_more_than_noise_and_common_differences(share: float,
             contrast = float(np.exp(observation[3])) * CONTRAST
             sloping = SecondPlace(of_slope.normal(0, 0.1, 2), 0.01 * np.eye(2))
             known = Covariance.from_noise(0.001 * np.eye(2))
-            disks.append(FittedDisk(np.zeros(2), known, shape, contrast, 100.0, blur, 0.0, noise, sloping))
+            unknowns, figures = np.zeros((10, 10)), np.array([2, 3, 4, 6, 5])
+            unknowns[np.ix_(figures, figures)] = noise * np.outer(per := np.array([1, 1, 1, contrast, 1]), per)
+            disks.append(
+                FittedDisk(
+                    converged=True,
+                    reason=NO_REASON,
+                    center_px=np.zeros(2),
+                    place_covariance=known,
+                    pixel_from_mark=np.column_stack([shape, np.zeros(2)]),
+                    contrast_dn=contrast,
+                    noise_dn=100.0,
+                    blur_px=blur,
+                    sloping=sloping,
+                    covariance=unknowns,
+                )
+            )
         weak += [bool(reason) for reason in dust_reasons(disks, [3 * np.eye(2)] * 25)]
         odd += is_odd.tolist()
     assert np.mean(np.array(weak)[~np.array(odd)]) < doubted
