@@ -2,10 +2,12 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import tifffile
+from in_process import Loses
 from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
@@ -158,6 +160,7 @@ def test_scans_of_one_exposed_frame_are_one_sight_of_a_point() -> None:
         features.append(Features(places, view, np.ones(len(places)), np.ones(len(places)), (end - first, 1200)))
         none = np.zeros((0, 3))
         frames.append(TieFrame(image, Path(f"{image}.tif"), pixel_from_camera, None, none, part_of=part_of))
+    assert not any(map(len, verify_pairs(frames, features, Loses(lambda *_: True)).values()))
     shared = verify_pairs(frames, features, None)
     assert set(shared) == {(0, 2), (0, 3), (1, 2), (1, 3), (2, 3)}
     assert min(len(pairs) for pairs in shared.values()) > 40
@@ -279,6 +282,22 @@ def test_marks_that_are_known_are_no_joins(tmp_path: Path) -> None:
     for mark in joins.marks["a"]:
         assert mark.center_px is not None
         assert np.hypot(*(mark.center_px - (300.0, 110.0))) > 60.0
+
+
+def test_a_worker_that_is_ended_over_a_place_costs_no_other_join(tmp_path: Path) -> None:
+    lost = list[object]()
+
+    def is_deadly(_: object, args: tuple[Any, ...]) -> bool:
+        matched = args[1] if getattr(args[0], "__name__", "") == "_match" else []
+        lost[:] = lost or matched[:1]
+        return any(each is lost[0] for each in matched)
+
+    parts, _ = scanned(tmp_path, 500.0, FEW_ROWS)
+    alone, joins = measure_joins(parts, 4), measure_joins(parts, 4, Loses(is_deadly))
+    assert lost
+    found, expected = ({tuple(np.asarray(mark.center_px)) for mark in each.marks["a"]} for each in (joins, alone))
+    assert len(found) == 4
+    assert len(found & expected) == 3
 
 
 def test_a_scan_that_cannot_be_read_costs_the_other_nothing(tmp_path: Path) -> None:

@@ -140,19 +140,23 @@ def adjusted_project(folder: Path, truth: Truth = TRUTH, crs: str = "", kind: st
 
 
 def make_project(network: Network, folder: Path, crs: str = "") -> Path:
-    """The same of a network of four images f0 to f3."""
+    """The same of a network, whose frames may be in parts."""
     path = write_network_project(network, folder)
     text = path.read_text(encoding="utf-8")
     more = f'crs = "{crs}"\n' if crs else ""
+    if any(image.part_of for image in network.images):
+        rows = "".join(f"{image.name},{image.part_of}\n" for image in network.images)
+        (folder / "images.csv").write_text(f"image,part_of\n{rows}", encoding="utf-8")
+        more += 'images = "images.csv"\n'
     text = text.replace("[object]\n", f"[object]\n{more}")
     path.write_text(f'scans = ["scans/*.tif"]\npitch_um = {1000.0 * PITCH_MM}\n{text}', encoding="utf-8")
     comparator = folder / "comparator.csv"
     marks = comparator.read_text(encoding="utf-8")
     comparator.write_text(f"# comparator coordinates, reseau\n{marks}", encoding="utf-8")
     (folder / "scans").mkdir()
-    for i in IMAGES:
+    for image in network.images:
         empty = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
-        tifffile.imwrite(folder / "scans" / f"f{i}.tif", empty, compression="deflate")
+        tifffile.imwrite(folder / "scans" / f"{image.name}.tif", empty, compression="deflate")
     assert run(["adjust", str(path)]) in (DONE, LOOK)  # a network may show points beyond its frame
     return path
 

@@ -18,14 +18,17 @@ from projects import CAMERA, Capture, change_camera, change_project, replace_tex
 from studies import parametrize_with_studies
 
 from measure import MarkShape, Pose, polygon
+from measure.fiducials.options import BelievedFilm
 from pipeline import read_project
 from pipeline.archive.schema import FRAMES_DIGEST, MEASUREMENTS, Schema, opened
 from pipeline.archive.status import archive_status
 from pipeline.archive.verdicts import NEXT_STEP, Verdict
 from pipeline.cli import run
+from pipeline.files.camera_file import CameraFile
+from pipeline.measuring.roll import check_scans
 from pipeline.measuring.scan_measurement import MeasuredFile, measure_file
 from pipeline.measuring.scan_task import Measure, ScanTask
-from pipeline.results.measured_record import FailureCode, pose_record
+from pipeline.results.measured_record import FailureCode, MeasuredScan, pose_record
 
 measured: list[str] = []  # the images that were measured, in their order
 
@@ -255,6 +258,25 @@ def test_shards_joined_are_the_same_as_one_machine(folder: Path, three: Path, tm
 def test_a_shard_that_is_none_is_refused(folder: Path, shard: str, capsys: Capture) -> None:
     assert measure(folder, "--shard", shard) == 2
     assert "is not K/N" in capsys.readouterr().err
+
+
+def test_a_new_scan_has_its_own_lot_checked_again_and_no_other(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lots = list[set[str]]()
+
+    def note_lot(camera: CameraFile, scans: Sequence[MeasuredScan], film: BelievedFilm) -> tuple[MeasuredScan, ...]:
+        lots.append({scan.frame.image for scan in scans})
+        return check_scans(camera, scans, film)
+
+    monkeypatch.setattr("pipeline.archive.measure_archive.check_scans", note_lot)
+    monkeypatch.setattr(
+        "pipeline.archive.measure_archive._TOGETHER", 1
+    )  # lots as of an archive of 2000 times as many scans
+    measure(folder, "--retry")
+    assert lots == [{"a", "b", "c"}]  # by a hash of their names
+    one_more(folder)
+    measure(folder)
+    assert lots[1:] == [{"d"}]
+    assert set(verdicts(folder)) == {"a", "b", "c", "d"}
 
 
 def test_status_tells_what_changed_outside(folder: Path, capsys: Capture) -> None:

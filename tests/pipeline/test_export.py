@@ -12,9 +12,10 @@ from unittest.mock import MagicMock
 import cv2
 import numpy as np
 import pyarrow.parquet
+import pycolmap
 import pytest
 from foreign_readers import asp_px, colmap_px, micmac_affine, micmac_px, opencv_px, values
-from networks import simulated
+from networks import camera_point, halves, simulated
 from numpy.typing import NDArray
 from projects import (
     IMAGES,
@@ -65,6 +66,22 @@ def stated_misfit_px(folder: Path) -> float:
     """The residual that the README tells."""
     text = (folder / "README.txt").read_text(encoding="utf-8")
     return float(text[text.index("off by ") + 7 :].split()[0])
+
+
+@pytest.mark.parametrize("format", ["colmap", "asp"])
+def test_a_frame_in_parts_is_one_picture(format: str, tmp_path: Path) -> None:
+    """Points lie in it as the camera images them, but for where the picture begins."""
+    made = halves(np.random.default_rng(3), join_count=25)
+    folder = exported(make_project(made.network, tmp_path), format, tmp_path)
+    xyz = np.array([[getattr(point, axis).value for axis in "XYZ"] for point in made.network.points])
+    for i in range(4):
+        ideal_px = camera_point(made.truth, i, xyz) * (1.0, -1.0) / PITCH_MM
+        off_px = PINHOLES[format](folder, f"f{i}", xyz) - ideal_px
+        assert np.ptp(off_px, axis=0).max() < 0.2
+    if format == "colmap":
+        model = pycolmap.Reconstruction(str(folder / "sparse"))
+        assert sorted(image.name for image in model.images.values()) == [f"f{i}.tif" for i in range(4)]
+        assert {len(image.points2D) for image in model.images.values()} == {len(xyz)}
 
 
 @pytest.mark.parametrize("format", PINHOLES)
