@@ -19,7 +19,7 @@ from adjust.problem.camera import Camera
 from adjust.problem.estimates import adjusted_image, adjusted_places
 from adjust.problem.network import Network, ObjectPoint
 from adjust.problem.parameter import Parameter, shortened
-from adjust.solution.misnumbered_images import FEWEST, linear_transformation
+from adjust.solution.misnumbered_images import FEWEST, linear_transformations
 from adjust.solution.result import Adjustment
 
 TOLERATED = 2.0  # factor on the given standard deviations up to which residuals need no explanation
@@ -158,7 +158,7 @@ def _mirrored_images(network: Network) -> Iterator[NetworkHypothesis]:
         known = [row for row in own if network.observations.point[row] in network.known_places]
         places = np.array([network.known_places[network.observations.point[row]] for row in known]).reshape(-1, 3)
         if image.transformation == "none" and len(known) >= FEWEST:
-            handedness, _ = linear_transformation(places, network.observations.xy_mm[known])
+            (handedness,), _ = linear_transformations(places[None], network.observations.xy_mm[known][None])
             names += [image.name] if handedness > 0.0 else []
     if 0 < len(names) < len(network.images):
         who = f"image {names[0]} is" if len(names) == 1 else f"the images {shortened(names, NAMED)} are"

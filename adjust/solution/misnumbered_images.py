@@ -27,29 +27,36 @@ SAME_LINE = 1e-3  # fraction of the field's extent
 def misnumbered_images(network: Network) -> dict[str, str]:
     """Find the frames whose point numbers are off, with the reasons; empty where all may be right."""
     places, observations = network.known_places, network.observations
-    is_known = np.array([name in places for name in observations.point], dtype=bool) & ~observations.is_fiducial
-    numbers_of = network.image_numbers[is_known]
-    rows_of = np.split(
-        np.flatnonzero(is_known)[np.argsort(numbers_of, kind="stable")], np.cumsum(np.bincount(numbers_of))
-    )
-    rows_of = [rows for rows in rows_of if len(rows) >= FEWEST]
+    names, number = observations.numbered_points
+    known = np.flatnonzero(np.array([name in places for name in names])[number] & ~observations.is_fiducial)
+    known = known[np.argsort(network.image_numbers[known], kind="stable")]
+    counts = np.bincount(network.image_numbers[known], minlength=len(network.images))
+    rows_of = [rows for rows in np.split(known, np.cumsum(counts)[:-1]) if len(rows) >= FEWEST]
     if len(rows_of) < FEWEST_IMAGES:
         return {}
-    names = sorted(places, key=_natural)
-    of_name, xyz = {name: k for k, name in enumerate(names)}, np.array([places[name] for name in names])
-
-    def misfit(rows: Indices, order: Indices) -> float:
-        numbers = [of_name[observations.point[row]] for row in rows]
-        return linear_transformation(xyz[order[numbers]], observations.xy_mm[rows])[1]
-
-    as_given = np.array([misfit(rows, np.arange(len(names))) for rows in rows_of])
+    nowhere = np.full(3, np.nan)
+    given = np.array([places.get(name, nowhere) for name in names])[number]
+    as_given = np.empty(len(rows_of))
+    sizes = np.array([len(rows) for rows in rows_of])
+    for size in np.unique(sizes):
+        rows = np.array([each for each in rows_of if len(each) == size])
+        as_given[sizes == size] = linear_transformations(given[rows], observations.xy_mm[rows])[1]
+    is_worse = as_given > WORSE * np.median(as_given)
+    doubted = np.flatnonzero(is_worse | (as_given > LARGE))
+    if not len(doubted):
+        return {}
+    in_order = sorted(places, key=_natural)
+    place_of, xyz = {name: k for k, name in enumerate(in_order)}, np.array([places[name] for name in in_order])
     orders, frames = list(_orders(xyz)), defaultdict[str, list[str]](list)
-    for rows, own in zip(rows_of, as_given, strict=True):
-        is_worse = own > WORSE * np.median(as_given)
-        if is_worse or own > LARGE:
-            least, words = min((misfit(rows, order), words) for words, order in orders)
-            if (BETTER if is_worse else MUCH_BETTER) * least < own:
-                frames[words].append(network.image_by_name[observations.image[rows[0]]].frame)
+    for image in doubted:
+        rows = rows_of[image]
+        numbers = [place_of[observations.point[row]] for row in rows]
+        reordered = np.array([xyz[order[numbers]] for _, order in orders])
+        xy_mm = np.broadcast_to(observations.xy_mm[rows], (*reordered.shape[:2], 2))
+        misfits = linear_transformations(reordered, xy_mm)[1]
+        best = int(np.argmin(misfits))
+        if (BETTER if is_worse[image] else MUCH_BETTER) * misfits[best] < as_given[image]:
+            frames[orders[best][0]].append(network.image_by_name[observations.image[rows[0]]].frame)
     return {
         frame: f"the points of {shortened(some, NAMED)} are not numbered as they are given: {words}. Correct them."
         for words, some in frames.items()
@@ -78,28 +85,37 @@ def _orders(xyz: Array) -> Iterator[tuple[str, Indices]]:
         yield "these are numbered to and fro, or only here not", turned.ravel()
 
 
-def linear_transformation(xyz: Array, xy_mm: Array) -> tuple[float, float]:
-    """Handedness and misfit of the direct linear transformation of points (n, 3) to an image (n, 2).
+def linear_transformations(xyz: Array, xy_mm: Array) -> tuple[Array, Array]:
+    """Handedness (m,) and misfit (m,) of direct linear transformations of points (m, n, 3) to images (m, n, 2).
 
     Handedness: positive for a mirrored image, 0 for a flat field, whose mirror images are images. The misfit is the
     median residual in units of the image's extent.
     """
-    (points, extents), (xy, _) = (_normalised(each) for each in (xyz, xy_mm))
-    is_flat = extents[-1] < FLAT_FIELD * extents[0]
-    axes = np.linalg.svd(points, full_matrices=False)[2][: 2 if is_flat else 3]
-    at = np.column_stack([points @ axes.T if is_flat else points, np.ones(len(points))])
-    none = np.zeros_like(at)
-    rows = np.vstack([np.hstack([at, none, -xy[:, :1] * at]), np.hstack([none, at, -xy[:, 1:] * at])])
-    projection = np.linalg.eigh(rows.T @ rows)[1][:, 0].reshape(3, -1)
-    projected = at @ projection.T
-    depths = projected[:, 2]
-    off = projected[:, :2] / np.where(depths == 0.0, 1e-300, depths)[:, None] - xy
-    misfit = float(np.median(np.linalg.norm(off, axis=1)))
-    return 0.0 if is_flat else float(np.linalg.det(projection[:, :3]) * np.median(depths)), misfit
+    (points, extents, axes), (xy, _, _) = _normalised(xyz), _normalised(xy_mm)
+    is_flat = extents[:, -1] < FLAT_FIELD * extents[:, 0]
+    handedness, misfits = np.zeros(len(xyz)), np.zeros(len(xyz))
+    for flat in np.unique(is_flat):
+        own = is_flat == flat
+        of, to = points[own], xy[own]
+        at = of @ axes[own, :, :2] if flat else of
+        at = np.concatenate([at, np.ones((*at.shape[:2], 1))], axis=2)
+        none = np.zeros_like(at)
+        along = np.concatenate([at, none, -to[..., :1] * at], axis=2)
+        rows = np.concatenate([along, np.concatenate([none, at, -to[..., 1:] * at], axis=2)], axis=1)
+        normal = rows.swapaxes(1, 2) @ rows
+        projection = np.linalg.eigh(normal)[1][:, :, 0].reshape(len(at), 3, -1)
+        projected = at @ projection.swapaxes(1, 2)
+        depths = projected[..., 2]
+        off = projected[..., :2] / np.where(depths == 0.0, 1e-300, depths)[..., None] - to
+        misfits[own] = np.median(np.linalg.norm(off, axis=2), axis=1)
+        if not flat:
+            handedness[own] = np.linalg.det(projection[..., :3]) * np.median(depths, axis=1)
+    return handedness, misfits
 
 
-def _normalised(places: Array) -> tuple[Array, Array]:
-    """Places about their centroid, of size 1, and their singular values."""
-    centred = places - places.mean(axis=0)
-    extents = np.linalg.svd(centred, compute_uv=False)
-    return centred / max(extents[0], 1e-300), extents
+def _normalised(places: Array) -> tuple[Array, Array, Array]:
+    """Places (m, n, k) about their centroid, of size 1, their extents (m, k) along their axes, and these (m, k, k)."""
+    centred = places - places.mean(axis=1, keepdims=True)
+    squares, axes = np.linalg.eigh(centred.swapaxes(1, 2) @ centred)
+    extents = np.sqrt(np.maximum(squares[:, ::-1], 0.0))
+    return centred / np.maximum(extents[:, :1, None], 1e-300), extents, axes[..., ::-1]
