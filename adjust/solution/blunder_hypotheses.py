@@ -29,7 +29,6 @@ MOST_PAIRS = 15  # pairs of frames tried as exchanged, largest residuals first
 HEIGHTS = 10.0  # sigma0 that heights in another unit leave at least
 UNITS = (1000.0, 100.0, 10.0, 0.3048)  # ratios of length units: m, dm, cm, mm, feet
 FACTORS = (*UNITS, *(1.0 / each for each in UNITS))
-HEIGHT_FACTORS = (0.3048, 1.0 / 0.3048)  # of heights in feet beside m, or the reverse
 
 AXES = {  # blunders that mirror the points, and the matrices that correct them
     **{f"the sign of {'XYZ'[i]} of all points is wrong": np.diag(1.0 - 2.0 * np.eye(3)[i]) for i in range(3)},
@@ -90,9 +89,7 @@ def network_hypotheses(
         remedy = "Give both in the unit that [object] unit names."
         yield [NetworkHypothesis(unit_words(factor), _move_points(network, by), remedy, by)]
     has_relief = len({place[2] for place in network.known_places.values()}) > 1
-    for factor in (
-        HEIGHT_FACTORS if has_relief and (given is None or not given.converged or given.sigma0 > HEIGHTS) else ()
-    ):
+    for factor in FACTORS if has_relief and (given is None or not given.converged or given.sigma0 > HEIGHTS) else ():
         by, how = np.diag([1.0, 1.0, factor]), "large" if factor < 1.0 else "small"
         words = f"Z of all points is {max(factor, 1.0 / factor):.4g} times too {how} for X and Y: another unit"
         yield [NetworkHypothesis(words, _move_points(network, by), moved=by)]

@@ -111,7 +111,7 @@ def diameter_notes(run: Run) -> Iterator[str]:
 
 
 def _lens_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
-    """The lowest radial terms that a camera lacks, its next decentering terms, and non-square pixels.
+    """The lowest radial terms that a camera lacks, its next decentering terms, and affinity of the pixels.
 
     Polynomials of the observed point in units of half the frame, so that their parameters are in mm at its edge.
     """
@@ -134,8 +134,9 @@ def _lens_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
         yield lacking("decentering", words, decentering(int(bool(free.intersection(own("decentering"))))))
     images = run.problem.network.images
     digital = all(image.transformation == "none" for image in images if image.camera == camera.name)
-    if digital and not free.intersection(own("affinity")[:1]):
-        yield lacking("pixels", partial(_pixel_words, camera.name, 1.0 / half_mm), AFFINITY_TERMS[:1])
+    for k, (name, described) in enumerate((("pixels", _pixel_words), ("shear", _shear_words)) if digital else ()):
+        if not free.intersection(own("affinity")[k : k + 1]):
+            yield lacking(name, partial(described, camera.name, 1.0 / half_mm), AFFINITY_TERMS[k : k + 1])
 
 
 def _drift(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
@@ -415,6 +416,15 @@ def _pixel_words(camera: str, per_mm: float, run: Run, added: Indices, _: float)
     return cause, (
         f"Give pitch_um as [x, y] with x / y = {ratio:.6f}, or free the affinity b1 of the distortion (families brown, "
         "opencv)."
+    )
+
+
+def _shear_words(camera: str, per_mm: float, run: Run, added: Indices, _: float) -> tuple[str, str]:
+    value, covariance = _estimate(run, added)
+    return (
+        f"The axes of the pictures of camera {camera} are not perpendicular: b2 = {per_mm * float(value[0]):+.2g} ± "
+        f"{per_mm * float(np.sqrt(covariance[0, 0])):.1g}",
+        "Free the shear b2 of the distortion (families brown, opencv), or scan them anew: digital sensors have none.",
     )
 
 

@@ -20,7 +20,7 @@ from adjust.rank_defect.directions import weak_term_sentences
 from adjust.solution.reweighting import ROUNDS
 
 GROSS = 20.0  # in a-priori standard deviations: a larger residual may come from a confused mark
-NEARER = 0.5  # fraction of the distance of two marks: largest offset of one from the other's expected place
+NEARER = 0.25  # fraction of the distance of two marks: largest offset of one from the other's expected place
 NAMED = 5  # images named in a warning
 UNCHECKED = 1e-6  # redundancy of all targets of an image below which its orientation is unchecked
 

@@ -530,6 +530,7 @@ class Effects:
     """What the pictures have and the model does not, in the unit of each."""
 
     b1: float = 0.0
+    b2: float = 0.0
     radial: float = 0.0
     tangential: float = 0.0
     zoom: float = 0.0
@@ -682,7 +683,7 @@ def _through_lens(effects: Effects, kind: Misfit, x: Array, y: Array, c: float) 
     p1, p2 = lens["p1"] + effects.tangential, lens["p2"] - effects.tangential
     xd = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x**2)
     yd = y * radial + p1 * (r2 + 2.0 * y**2) + 2.0 * p2 * x * y
-    return np.stack([c * xd * (1.0 + effects.b1), -c * yd], axis=-1)
+    return np.stack([c * (xd * (1.0 + effects.b1) + effects.b2 * yd), -c * yd], axis=-1)
 
 
 def center_of_gravity(outline: Array) -> Array:
@@ -696,6 +697,7 @@ WRONG_POINT = 17
 MISFITS = {
     NOTHING: Misfit(lambda e: Effects(), ()),
     "pixels not square": Misfit(lambda e: Effects(b1=1e-3 * e), ("pixels of camera cam are not square",)),
+    "axes not perpendicular": Misfit(lambda e: Effects(b2=1e-3 * e), ("are not perpendicular",)),
     "two principal distances": Misfit(lambda e: Effects(zoom=0.05 * e), ("another principal distance",)),
     "sizes: scaled": Misfit(lambda e: Effects(scale=0.01 * e), ("images of different sizes in one camera (scaled)",)),
     "sizes: cropped": Misfit(
