@@ -17,6 +17,7 @@ from adjust.least_squares.equations import Numbering
 from adjust.least_squares.iteration import linearise
 from adjust.problem.problem import Problem
 from adjust.quality.run import Run
+from adjust.solution.image_groups import FLAT, quadratic
 
 FEWEST_IMAGES = 2  # images of a point that tell it from its mark
 FEWEST = 5  # given points that tell a wrong one
@@ -25,7 +26,6 @@ MOST_WRONG = 1 / 3  # fraction of the points
 SAME_LINE = 1e-3  # fraction of the field's extent by which the points of a line lie off it
 REGULAR = 2.0  # points per line of a regular field, on average, at least
 LEVEL = 0.001  # probability of a point that is not wrong beside those that are
-DEPENDENT = 1e-9  # fraction of the largest eigenvalue below which a direction is undetermined
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def displaced_points(run: Run, axes: Array, freed: Problem, names: tuple[str, ..
     if groups:
         members = np.array([mask for _, mask in groups], dtype=float)
         of_group = np.einsum("li,iajb,lj->lab", members, normal, members, optimize=True), members @ right
-        best = int(np.argmax(_falls(*of_group)))
+        best = int(np.argmax(quadratic(*of_group)))
         words, mask = groups[best]
         some = tuple(name for name, is_in in zip(names, mask, strict=True) if is_in)
         yield PointGroup(some, words, float(np.log(len(groups))))
@@ -96,12 +96,6 @@ def _reduced(run: Run, freed: Problem, names: tuple[str, ...]) -> tuple[Array, A
     return normal.reshape(count, 3, count, 3), right.reshape(count, 3)
 
 
-def _falls(normal: Array, right: Array) -> Array:
-    """(m,) g' N⁻¹ g of systems (m, 3, 3), (m, 3)."""
-    solved = np.linalg.pinv(normal, rcond=DEPENDENT, hermitian=True) @ right[..., None]
-    return np.asarray((right * solved[..., 0]).sum(axis=1))
-
-
 def _single_points(normal: Array, right: Array, vpv: float, redundancy: float) -> list[int]:
     """Select points by forward selection, as long as one is significant beside those before it."""
     count = len(right)
@@ -109,11 +103,11 @@ def _single_points(normal: Array, right: Array, vpv: float, redundancy: float) -
     chosen, left = list[int](), [vpv]
     for _ in range(min(int(MOST_WRONG * count), int(redundancy / 3.0) - 1)):
         blocks = flat.reshape(count, 3, count, 3)[range(count), :, range(count)]
-        falls = _falls(blocks, g.reshape(count, 3))
+        falls = quadratic(blocks, g.reshape(count, 3))
         falls[chosen] = 0.0
         best = int(np.argmax(falls))
         own = slice(3 * best, 3 * best + 3)
-        inverse = np.linalg.pinv(flat[own, own], rcond=DEPENDENT, hermitian=True)
+        inverse = np.linalg.pinv(flat[own, own], rcond=FLAT, hermitian=True)
         through = flat[:, own] @ inverse
         g, flat = g - through @ g[own], flat - through @ flat[own]
         chosen.append(best)

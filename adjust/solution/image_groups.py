@@ -49,7 +49,7 @@ def two_groups(run: Run, camera: str) -> ImageGroups | None:
 
     def gain(mask: Mask) -> float:
         """Decrease of v'Pv with separate shifts of two groups."""
-        return float(sum(_quadratic(normal[some].sum(axis=0), right[some].sum(axis=0)) for some in (mask, ~mask)))
+        return float(sum(quadratic(normal[some].sum(axis=0), right[some].sum(axis=0)) for some in (mask, ~mask)))
 
     mask = max((_two_means(normal, right, start) for start in starts), key=gain)
     smaller = mask if 2 * mask.sum() <= len(names) else ~mask
@@ -98,7 +98,7 @@ def _threshold(normal: Array, right: Array, shift: Array) -> Mask:
     below = np.cumsum(normal[order], axis=0)[:-1], np.cumsum(right[order], axis=0)[:-1]
     above = normal.sum(axis=0) - below[0], right.sum(axis=0) - below[1]
     mask = np.ones(len(order), dtype=bool)
-    mask[order[: np.argmax(_quadratic(*below) + _quadratic(*above)) + 1]] = False
+    mask[order[: np.argmax(quadratic(*below) + quadratic(*above)) + 1]] = False
     return mask
 
 
@@ -139,7 +139,7 @@ def _clearness(shifts: Array, weight: Array) -> Array:
     return np.asarray(between.max(axis=1) / (weights * centred**2).sum(axis=1))
 
 
-def _quadratic(normal: Array, right: Array) -> Array:
+def quadratic(normal: Array, right: Array) -> Array:
     """g' N⁻¹ g of one system (k, k), (k,) or of many."""
     return np.asarray((right * _solved(normal, right)).sum(axis=-1))
 

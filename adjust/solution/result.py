@@ -55,8 +55,8 @@ from adjust.quality.tested import Probabilities
 from adjust.quality.variance_components import factor_sigmas, variance_factor
 from adjust.rank_defect.flat_valleys import held_directions, inseparable
 from adjust.solution.explanations import Explanation, explain
+from adjust.solution.interior_claims import curved_valley_warnings, film_scale_notes, held_decentering_notes
 from adjust.solution.model_hypotheses import diameter_notes
-from adjust.solution.principal_points import curved_valley_warnings, held_decentering_notes
 from adjust.solution.warnings import run_warnings
 
 
@@ -285,8 +285,9 @@ class Adjustment(Estimates, PlottedResult):
         """Notes that need no action."""
         is_told = any(each.kind == "disks" for each in self.explanations)
         of_disks = () if is_told else diameter_notes(self.run)
-        held = held_decentering_notes(self.run, self.cofactor) if self.converged else ()
-        return (*self.unused, *(sentence for _, sentence in self._inseparable.values()), *of_disks, *held)
+        notes = (held_decentering_notes, film_scale_notes) if self.converged else ()
+        of_interior = (note for each in notes for note in each(self.run, self.cofactor))
+        return (*self.unused, *(sentence for _, sentence in self._inseparable.values()), *of_disks, *of_interior)
 
     def inseparable(self, camera: str) -> list[str]:
         """Distortion parameters of a camera that the observations do not separate."""

@@ -470,3 +470,18 @@ def test_no_principal_point_of_straight_views_is_claimed_that_images_do_not_tell
         assert is_told or abs(result.value("IO.cam.y0") - y0_mm) < 4.5 * result.sigma("IO.cam.y0")
         told += is_told
     assert told
+
+
+def test_another_unit_of_the_fiducials_is_noted_with_what_it_does_to_c() -> None:
+    """No residual shows it: c and all films take it up."""
+    given = blunder_network(2)
+    camera = replace(given.cameras[0], principal_distance_mm=Prior(Truth().c, 1.0))
+    marks = {
+        id_: replace(mark, x_mm=Prior(1.002 * mark.x_mm.value, 0.01), y_mm=Prior(1.002 * mark.y_mm.value, 0.01))
+        for id_, mark in camera.fiducials.items()
+    }
+    result = adjust(replace(given, cameras=(replace(camera, fiducials=marks),)))
+    note = next(note for note in result.notes if "lie 0.3 % nearer to each other in the scans than given" in note)
+    assert float(note.split("c is ")[1].split(" mm off")[0]) == pytest.approx(0.003 * Truth().c, rel=0.1)
+    sound = adjust(replace(given, cameras=(camera,)))
+    assert not any("in the scans than given" in note for note in sound.notes)

@@ -1,7 +1,7 @@
-"""Principal points that images hardly tell from decentering distortion: straight views of a flat field, say.
+"""Interior orientations that depend on what images do not tell: decentering in straight views of a flat field, say.
 
 Decentering that is held at 0 is then taken up by the principal point; where it is free, standard deviations, which are
-linear, may miss a curved valley and other minima.
+linear, may miss a curved valley and other minima. The principal distance of films has the unit of their fiducials.
 """
 
 from collections.abc import Iterator
@@ -24,6 +24,8 @@ from adjust.solution.reweighting import again
 WORSE = 2.0  # ratio of standard deviations with decentering free and held at 0 above which it is told
 CORRELATED = 0.9  # correlation of a principal point with a distortion parameter above which its valley is followed
 FAR = 5.0  # standard deviations by which it is moved
+FILM_SCALE = 1.5e-3  # film keeps its size better than that, most scanners too
+CLAIMS = 5.0  # standard deviations of c by which another unit of the fiducials would move it
 CURVED = 0.5  # share of the rise of v'Pv that these promise below which they are too small
 STEPS = 15
 
@@ -86,3 +88,30 @@ def curved_valley_warnings(run: Run, cofactor: Cofactor) -> Iterator[str]:
                     f"{'better' if least < 0.0 else 'nearly as well'} (v'Pv rises by {least:.2g}, not by {FAR**2:g}). "
                     "Hold the decentering distortion at 0, give principal_point_mm, or add images with other tilts."
                 )
+
+
+def film_scale_notes(run: Run, cofactor: Cofactor) -> Iterator[str]:
+    """Note where the fiducials of all films lie farther apart, or nearer, than given: c changes in that ratio."""
+    problem, observations = run.problem, run.problem.network.observations
+    for camera in problem.network.cameras:
+        given = {id_: np.array([mark.x_mm.value, mark.y_mm.value]) for id_, mark in camera.fiducials.items()}
+        scales = []
+        for number, image in enumerate(problem.network.images):
+            rows = np.flatnonzero(problem.is_fiducial & (problem.image_numbers == number))
+            rows = np.array([row for row in rows if observations.point[row] in given], dtype=np.intp)
+            if image.camera == camera.name and image.transformation != "congruent" and len(rows) > 2:
+                places = np.array([given[observations.point[row]] for row in rows]), observations.xy_mm[rows]
+                expected, found = (np.linalg.norm(each - each.mean(axis=0)) for each in places)
+                scales.append(found / expected)
+        at = problem.unknowns.camera.get(camera.name)
+        if at is None or not scales:
+            continue
+        off, c_mm = float(np.mean(scales)) - 1.0, float(run.end.state.values[at[0]])
+        sigma_mm = float(np.sqrt(cofactor.variances[at[0]]))
+        if abs(off) > FILM_SCALE and 0.0 < CLAIMS * sigma_mm < abs(off) * c_mm:
+            yield (
+                f"The fiducials of camera {camera.name} lie {100.0 * abs(off):.2g} % "
+                f"{'farther apart' if off > 0.0 else 'nearer to each other'} in the scans than given. c counts in the "
+                f"unit of the given coordinates: if these are wrong, not the film or the scanner's pitch, c is "
+                f"{abs(off) * c_mm:.2g} mm off."
+            )
