@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 
 from adjust.array_types import Array, Indices
 from adjust.functional_model.board import BoardForm, board_form, disk_directions, strain_directions
-from adjust.functional_model.correction import AFFINITY_TERMS, PolynomialTerms, Term, decentering, radial
+from adjust.functional_model.correction import AFFINITY_TERMS, ZERO, PolynomialTerms, Term, decentering, radial
 from adjust.functional_model.families import family
 from adjust.functional_model.lens import INTERIOR_NAMES, Prior
 from adjust.functional_model.scanner import is_left
@@ -27,12 +27,14 @@ from adjust.problem.network import Approximations, Board, Network, Scanner
 from adjust.problem.parameter import shortened
 from adjust.problem.problem import Problem, State, number
 from adjust.quality.cofactor import free_cofactor
-from adjust.quality.run import Run
+from adjust.quality.run import UM_PER_MM, Run
 from adjust.solution.displaced_points import PointGroup, displaced_points
 from adjust.solution.image_groups import ImageGroups, two_groups
 
 FREE = Prior(0.0, np.inf)
 RADIAL_DEGREES = (3, 5, 7, 9, 11, 13)
+# Of the six terms of degree 2 two are decentering, and the tilts of the images take two.
+BOW: tuple[Term, Term] = (({(0, 2): 1.0}, ZERO), (ZERO, {(2, 0): 1.0}))
 TERMS_TOGETHER = 2  # radial terms tested jointly
 FEWEST_DRIFTING = 4  # images that tell a drift from their scatter
 LEAST_CHANGE = 0.05  # of the distance
@@ -111,7 +113,7 @@ def diameter_notes(run: Run) -> Iterator[str]:
 
 
 def _lens_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
-    """The lowest radial terms that a camera lacks, its next decentering terms, and affinity of the pixels.
+    """The lowest radial terms that a camera lacks, its next decentering terms, a bow, and affinity of the pixels.
 
     Polynomials of the observed point in units of half the frame, so that their parameters are in mm at its edge.
     """
@@ -132,6 +134,7 @@ def _lens_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
     if not free.intersection(own("decentering")[2:]):
         words = partial(_lens_words, camera, "decentering", "a tangential pattern (decentering)")
         yield lacking("decentering", words, decentering(int(bool(free.intersection(own("decentering"))))))
+    yield lacking("bow", partial(_bow_words, camera.name), BOW)
     images = run.problem.network.images
     digital = all(image.transformation == "none" for image in images if image.camera == camera.name)
     for k, (name, described) in enumerate((("pixels", _pixel_words), ("shear", _shear_words)) if digital else ()):
@@ -416,6 +419,18 @@ def _pixel_words(camera: str, per_mm: float, run: Run, added: Indices, _: float)
     return cause, (
         f"Give pitch_um as [x, y] with x / y = {ratio:.6f}, or free the affinity b1 of the distortion (families brown, "
         "opencv)."
+    )
+
+
+def _bow_words(camera: str, run: Run, added: Indices, _: float) -> tuple[str, str]:
+    value, covariance = _estimate(run, added)
+    x_um, y_um = UM_PER_MM * value
+    sigma_um = UM_PER_MM * np.sqrt(np.diag(covariance))
+    return (
+        f"The pictures of camera {camera} are bowed: half the frame off the middle, columns lie {x_um:+.3g} ± "
+        f"{sigma_um[0]:.1g} µm aside and rows {y_um:+.3g} ± {sigma_um[1]:.1g} µm",
+        "Look for a rolling shutter, stabilisation or a scanner's lens. A distortion family with such terms takes it "
+        "up, legendre(3) say.",
     )
 
 

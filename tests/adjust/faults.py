@@ -531,6 +531,7 @@ class Effects:
 
     b1: float = 0.0
     b2: float = 0.0
+    bow: float = 0.0
     radial: float = 0.0
     tangential: float = 0.0
     zoom: float = 0.0
@@ -668,7 +669,7 @@ def _projected(made: Scene, effects: Effects, kind: Misfit, image: int, rotation
         angles = np.linspace(0.0, 2.0 * np.pi, 40, endpoint=False)
         circle = np.sqrt(abs(effects.disk)) * np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
         at += np.sign(effects.disk) * (center_of_gravity(imaged(points[:, None] + circle)) - imaged(points))
-    at[:, 0] += own * effects.crop
+    at[:, 0] += own * effects.crop + effects.bow * (at[:, 1] - MIDDLE_MM[1]) ** 2
     at[:, 1] += 0.7 * own * effects.crop
     if (effects.mirrored and image == int(np.argmax(made.groups))) or (effects.group_mirrored and own):
         at[:, 0] = 2.0 * MIDDLE_MM[0] - at[:, 0]
@@ -698,6 +699,7 @@ MISFITS = {
     NOTHING: Misfit(lambda e: Effects(), ()),
     "pixels not square": Misfit(lambda e: Effects(b1=1e-3 * e), ("pixels of camera cam are not square",)),
     "axes not perpendicular": Misfit(lambda e: Effects(b2=1e-3 * e), ("are not perpendicular",)),
+    "pictures bowed": Misfit(lambda e: Effects(bow=1e-4 * e), ("are bowed",), size=2),
     "two principal distances": Misfit(lambda e: Effects(zoom=0.05 * e), ("another principal distance",)),
     "sizes: scaled": Misfit(lambda e: Effects(scale=0.01 * e), ("images of different sizes in one camera (scaled)",)),
     "sizes: cropped": Misfit(
