@@ -38,7 +38,7 @@ from pipeline.progress import Reporter
 from pipeline.publishing import unpublished
 from pipeline.results.comparator_file import ComparatorPoint, has_pixels_alone, read_comparator
 from pipeline.results.record_json import write_record
-from pipeline.results.stage_files import ChoiceRecord, choice_record
+from pipeline.results.stage_files import choice_content
 from pipeline.text.wording import listed
 from pipeline.types import Array
 
@@ -239,7 +239,7 @@ def _not_corrected(network: Network, possible_mm: Array) -> tuple[str, ...]:
     )
 
 
-def run_choose(project: Project, reporter: Reporter) -> tuple[Choice, ChoiceRecord]:
+def run_choose(project: Project, reporter: Reporter) -> tuple[Choice, dict[str, object]]:
     """Compare models on the observations of the project's own adjustment, with disks corrected for eccentricity; write
     and return the result.
 
@@ -257,10 +257,10 @@ def run_choose(project: Project, reporter: Reporter) -> tuple[Choice, ChoiceReco
                 half_mm,
                 lambda name, done: count(name, done, done + 1),
             )
-        record = choice_record(choice, adjusted_from(project, marks))
-        write_record(record, new.place(project.choice_path))
+        content = choice_content(choice, adjusted_from(project, marks))
+        write_record(content, new.place(project.choice_path))
         new.publish()
-    return choice, record
+    return choice, content
 
 
 def print_choice(choice: Choice, console: Console, path: Path) -> None:

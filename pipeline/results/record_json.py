@@ -15,6 +15,7 @@ from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin, get_type_hints
 
+import numpy as np
 from pydantic import (
     AfterValidator,
     GetCoreSchemaHandler,
@@ -206,6 +207,8 @@ def _plain(value: Any) -> Any:
         return {key: _plain(item) for key, item in value.items()}
     if hasattr(value, "_fields"):
         return _content(value)
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
     return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
 
 

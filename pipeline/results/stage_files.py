@@ -6,14 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 
-from adjust.model_selection.candidates import Candidate, CrossValidation, Model
+from adjust.model_selection.candidates import Candidate, Model
 from adjust.model_selection.model_choice import Choice
 from adjust.quality.lens_comparison import CameraCalibration, Comparison, Test, sigmas
-from pipeline.results.record_json import FOREIGN, Finite, Number, NumberOrNone, Sigma, Whole, read_record, record_from
+from pipeline.results.record_json import Finite, Number, Sigma, Whole, read_record
 from pipeline.types import Array
 
 Verdict = Literal["agrees", "differs", "not possible"]
@@ -116,114 +116,39 @@ def read_check(path: Path) -> Check:
     return read_record(Check, path, "Run `reseau check` again; it writes this file.")
 
 
-@dataclass(frozen=True)
-class ModelRecord:
-    """Film transformation, distortion family with its estimated parameters, and terms of scanner errors by scanner."""
-
-    transformation: str
-    family: str
-    parameters: tuple[str, ...]
-    bends: Mapping[str, tuple[str, ...]]
-
-    @classmethod
-    def from_model(cls, model: Model) -> "ModelRecord":
-        return record_from(cls, model, bends=dict(model.bends))
-
-
-@dataclass(frozen=True)
-class ParameterCorrelation:
-    """Two highly correlated parameters."""
-
-    parameters: tuple[str, str]
-    correlation: Number
+def choice_content(choice: Choice, made_from: Mapping[str, str]) -> dict[str, object]:
+    """Content of `choose.json`. given: the model in the project; made_from: fingerprints of the input."""
+    return {
+        "reseau": version("reseau"),
+        "made_from": made_from,
+        "chosen": _model(choice.chosen.model) if choice.chosen else None,
+        "given": _model(choice.given),
+        "verdict": choice.verdict,
+        "reasons": choice.reasons,
+        "candidates": [_candidate(each) for each in choice.candidates],
+        "tests": [
+            {"simpler": t.simpler.name, "richer": t.richer.name, "F": t.f, "degrees": t.degrees, "p": t.p}
+            for t in choice.tests
+        ],
+    }
 
 
-@dataclass(frozen=True, kw_only=True)
-class CandidateRecord:
-    """Adjusted model. problem: why it has no solution; the statistics are then None."""
-
-    name: str
-    transformation: str
-    family: str
-    parameters: tuple[str, ...]
-    bends: Mapping[str, tuple[str, ...]]
-    problem: str = ""
-    observations: Whole | None = None
-    unknowns: Whole | None = None
-    redundancy: Whole | None = None
-    vpv: NumberOrNone = None
-    sigma0: NumberOrNone = None
-    aic: NumberOrNone = None
-    aicc: NumberOrNone = None
-    cross_validation: Annotated[CrossValidation, FOREIGN] | None = field(default_factory=lambda: None)
-    correlated: tuple[ParameterCorrelation, ...] | None = None
-    warnings: tuple[str, ...] | None = None
-
-    @classmethod
-    def from_candidate(cls, candidate: Candidate) -> "CandidateRecord":
-        model = {"name": candidate.model.name, **vars(ModelRecord.from_model(candidate.model))}
-        if candidate.problem:
-            return cls(**model, problem=candidate.problem)
-        correlated = tuple(ParameterCorrelation((a, b), rho) for a, b, rho in candidate.correlated)
-        return record_from(cls, candidate, **model, correlated=correlated)
+def _model(model: Model) -> dict[str, object]:
+    return {**vars(model), "bends": dict(model.bends)}
 
 
-@dataclass(frozen=True)
-class ModelTest:
-    """F-test of a model against one with more parameters. degrees: of freedom, numerator and denominator."""
+def _candidate(candidate: Candidate) -> dict[str, object]:
+    """Adjusted model; without statistics where it has no solution."""
+    content = {"name": candidate.model.name, **_model(candidate.model), "problem": candidate.problem}
+    if candidate.problem:
+        return content | {"cross_validation": None}
+    names = ("observations", "unknowns", "redundancy", "vpv", "sigma0", "aic", "aicc", "cross_validation")
+    correlated = [{"parameters": (a, b), "correlation": rho} for a, b, rho in candidate.correlated]
+    own = {name: getattr(candidate, name) for name in names}
+    return content | own | {"correlated": correlated, "warnings": candidate.warnings}
 
-    simpler: str
-    richer: str
-    F: Number
-    degrees: tuple[Whole, Whole]
-    p: Number
-
-
-@dataclass(frozen=True, kw_only=True)
-class ChoiceRecord:
-    """Model choice as stored. given: the model in the project; made_from: fingerprints of the input."""
-
-    reseau: str = ""
-    made_from: Mapping[str, str] = field(default_factory=dict)
-    chosen: ModelRecord | None
-    given: ModelRecord
-    verdict: str
-    reasons: tuple[str, ...]
-    candidates: tuple[CandidateRecord, ...]
-    tests: tuple[ModelTest, ...]
-
-
-def choice_record(choice: Choice, made_from: Mapping[str, str]) -> ChoiceRecord:
-    """Convert a choice to its record."""
-    return ChoiceRecord(
-        reseau=version("reseau"),
-        made_from=made_from,
-        chosen=ModelRecord.from_model(choice.chosen.model) if choice.chosen else None,
-        given=ModelRecord.from_model(choice.given),
-        verdict=choice.verdict,
-        reasons=choice.reasons,
-        candidates=tuple(map(CandidateRecord.from_candidate, choice.candidates)),
-        tests=tuple(ModelTest(t.simpler.name, t.richer.name, t.f, t.degrees, t.p) for t in choice.tests),
-    )
-
-
-def read_choice(path: Path) -> ChoiceRecord:
-    """Read `choose.json`. Raises FileNotFoundError, and InputError for invalid content."""
-    return read_record(ChoiceRecord, path, "Run `reseau choose` again; it writes this file.")
-
-
-Pair = tuple[Number, Number]
 
 DRIFT, NO_DRIFT = "drift", "no drift"
-
-
-@dataclass(frozen=True)
-class ComparedCalibration:
-    """Calibration in a comparison. time: in the user's unit, or the number of the calibration."""
-
-    name: str
-    time: Number
-    family: str
 
 
 @dataclass(frozen=True)
@@ -235,57 +160,48 @@ class ParameterDifference:
     """
 
     name: str
-    first: Number
-    other: Number
-    difference: Number
-    sigma: Number
-    sigmas: Number
-
-
-@dataclass(frozen=True)
-class MarkDifference:
-    """Difference of a fiducial mark from the first calibration after a similarity, and its standard deviation."""
-
-    um: Pair
-    sigma_um: Pair
+    first: float
+    other: float
+    difference: float
+    sigma: float
+    sigmas: float
 
 
 @dataclass(frozen=True)
 class CalibrationDifference:
     """Differences of a calibration from the first one: parameters, image displacements at places_mm with their standard
-    deviations, and fiducial marks by name."""
+    deviations, and fiducial marks by name after a similarity."""
 
-    parameters: tuple[ParameterDifference, ...]
-    field_um: tuple[Pair, ...]
-    field_sigma_um: tuple[Pair, ...]
-    fiducials: Mapping[str, MarkDifference]
+    parameters: Sequence[ParameterDifference]
+    field_um: Array
+    field_sigma_um: Array
+    fiducials: Mapping[str, Mapping[str, Array]]
 
 
 @dataclass(frozen=True)
 class ComparisonRecord:
-    """Comparison as stored; see `Comparison`.
+    """Content of `compare.json`; see `Comparison`.
 
     Attributes
     ----------
     verdict, probability, level : drift if probability, a p-value, is below the significance level.
-    same : test of the hypothesis that all calibrations are equal.
-    trend : test of a linear change with time; None for two calibrations.
+    calibrations : name, time in the user's unit or number of the calibration, and distortion family.
     places_mm : places of the displacements in `CalibrationDifference` and of the trend.
     trend_um, trend_sigma_um : linear change from the first time to the last, by place; None without a trend.
     """
 
     verdict: str
-    probability: Number
-    level: Number
+    probability: float
+    level: float
     use: str
-    same: Annotated[Test, FOREIGN]
-    trend: Annotated[Test, FOREIGN] | None
-    calibrations: tuple[ComparedCalibration, ...]
-    places_mm: tuple[Pair, ...]
-    differences: tuple[CalibrationDifference, ...]
-    trend_um: tuple[Pair, ...] | None
-    trend_sigma_um: tuple[Pair, ...] | None
-    remarks: tuple[str, ...]
+    same: Test
+    trend: Test | None
+    calibrations: Sequence[Mapping[str, object]]
+    places_mm: Array
+    differences: Sequence[CalibrationDifference]
+    trend_um: Array | None
+    trend_sigma_um: Array | None
+    remarks: Sequence[str]
 
 
 def comparison_record(comparison: Comparison, remarks: Sequence[str], level: float) -> ComparisonRecord:
@@ -298,35 +214,31 @@ def comparison_record(comparison: Comparison, remarks: Sequence[str], level: flo
         use=comparison.use,
         same=comparison.same,
         trend=trend,
-        calibrations=tuple(
-            ComparedCalibration(each.name, time, each.lens.distortion.family)
+        calibrations=[
+            {"name": each.name, "time": time, "family": each.lens.distortion.family}
             for each, time in zip(comparison.calibrations, comparison.times.tolist(), strict=True)
-        ),
-        places_mm=_pairs(comparison.places_mm),
-        differences=tuple(_difference(comparison, k) for k in range(len(comparison.calibrations) - 1)),
-        trend_um=_pairs(comparison.trend_um) if trend else None,
-        trend_sigma_um=_pairs(sigmas(comparison.trend_covariance_um2)) if trend else None,
-        remarks=tuple(remarks),
+        ],
+        places_mm=comparison.places_mm,
+        differences=[_difference(comparison, k) for k in range(len(comparison.calibrations) - 1)],
+        trend_um=comparison.trend_um if trend else None,
+        trend_sigma_um=sigmas(comparison.trend_covariance_um2) if trend else None,
+        remarks=remarks,
     )
-
-
-def read_comparison(path: Path) -> ComparisonRecord:
-    """Read `compare.json`. Raises FileNotFoundError, and InputError for invalid content."""
-    return read_record(ComparisonRecord, path, "Run `reseau compare` again; it writes this file.")
 
 
 def _difference(comparison: Comparison, number: int) -> CalibrationDifference:
     first, *others = comparison.calibrations
     marks = zip(
-        _pairs(comparison.fiducials_um[number]),
-        _pairs(sigmas(comparison.fiducials_covariance_um2[number])),
+        comparison.fiducials,
+        comparison.fiducials_um[number],
+        sigmas(comparison.fiducials_covariance_um2[number]),
         strict=True,
     )
     return CalibrationDifference(
-        parameters=tuple(_parameter_differences(first, others[number])),
-        field_um=_pairs(comparison.field_um[number]),
-        field_sigma_um=_pairs(sigmas(comparison.field_covariance_um2[number])),
-        fiducials={id: MarkDifference(*each) for id, each in zip(comparison.fiducials, marks, strict=True)},
+        parameters=_parameter_differences(first, others[number]),
+        field_um=comparison.field_um[number],
+        field_sigma_um=sigmas(comparison.field_covariance_um2[number]),
+        fiducials={id: {"um": um, "sigma_um": sigma_um} for id, um, sigma_um in marks},
     )
 
 
@@ -342,7 +254,3 @@ def _parameter_differences(first: CameraCalibration, other: CameraCalibration) -
         size = (after - before) / joint if joint > 0 else np.nan
         rows.append(ParameterDifference(name, before, after, after - before, joint, size))
     return rows
-
-
-def _pairs(values: Array) -> tuple[Pair, ...]:
-    return tuple((x, y) for x, y in np.reshape(values, (-1, 2)).tolist())
