@@ -280,7 +280,7 @@ class Schema:
         return self.first + len(self.migrations) - 1
 
 
-MEASUREMENTS = Schema(APPLICATION, 5, (_FIRST,), "measurements")
+MEASUREMENTS = Schema(APPLICATION, 6, (_FIRST,), "measurements")
 
 
 class Database:

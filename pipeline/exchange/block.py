@@ -103,29 +103,10 @@ class OutFrame:
 
 
 @dataclass(frozen=True)
-class WholeFrame:
-    """An exposed frame, by its name: one scan, or several partial scans."""
+class WholeFrame(OutFrame):
+    """An exposed frame, by its name: as its first scan, with further scans of the same exterior orientation."""
 
-    image: str
-    scans: tuple[OutFrame, ...]
-
-    @property
-    def camera(self) -> str:
-        return self.scans[0].camera
-
-    @property
-    def model(self) -> ImageModel | None:
-        """Model of the first scan; all scans share one exterior orientation."""
-        return self.scans[0].model
-
-    @property
-    def lens(self) -> Lens:
-        return self.scans[0].lens
-
-    @property
-    def known_pitch_um(self) -> tuple[float, float]:
-        """Pixel pitch of the first scan. Raises InputError where it is unknown."""
-        return self.scans[0].known_pitch_um
+    scans: tuple[OutFrame, ...] = ()
 
     def observed(self, fiducials: bool) -> tuple[ComparatorPoint, ...]:
         """Its fiducials, or its object points; the most precise mark of those observed in several scans."""
@@ -149,9 +130,6 @@ class WholeFrame:
         for scan in self.scans:
             found[images == scan.image] = places(scan, tuple(mark for mark in marks if mark.image == scan.image))
         return found
-
-
-Frame = OutFrame | WholeFrame
 
 
 @dataclass(frozen=True)
@@ -206,7 +184,7 @@ class Block:
         parts: dict[str, list[OutFrame]] = {}
         for scan in scans:
             parts.setdefault(self.project.image_frame(scan.image), []).append(scan)
-        return [WholeFrame(name, tuple(own)) for name, own in parts.items()]
+        return [WholeFrame(**{**vars(own[0]), "image": name}, scans=tuple(own)) for name, own in parts.items()]
 
     def unoriented_note(self) -> tuple[str, ...]:
         """One sentence per image without exterior orientation."""

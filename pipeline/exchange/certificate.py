@@ -11,7 +11,8 @@ a decentering part P = -k_n d R^(n-3) 6 (3 n + 1) / (10 (n + 3)), fitted over th
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -41,32 +42,6 @@ NUMBERS = Key("list of numbers", numbers)
 
 
 @dataclass(frozen=True)
-class Certificate:
-    """Certificate as printed.
-
-    Attributes
-    ----------
-    principal_distance_mm : the one that the table refers to.
-    principal_point_mm : of autocollimation.
-    symmetry_mm : principal point of best symmetry, if given separately.
-    radius_mm : (n,).
-    tangent : (n,) of the angle from the axis.
-    sigma_um : standard deviation of one value.
-    """
-
-    name: str
-    principal_distance_mm: float
-    principal_point_mm: Point | None
-    symmetry_mm: Point | None
-    fiducials: tuple[GivenFiducial, ...]
-    distances: tuple[FiducialDistance, ...]
-    radius_mm: Array
-    tangent: Array
-    radial_um: Array
-    sigma_um: float
-
-
-@dataclass(frozen=True)
 class FittedTable:
     """Fit of the distortion table.
 
@@ -88,19 +63,25 @@ class FittedTable:
 def import_certificate(paths: Sequence[Path], options: ImportOptions) -> Incoming:
     """Read certificates from TOML files, as camera files with the equivalent principal distance and tables of the
     residuals."""
-    certificates = [read_certificate(path) for path in paths]
-    fits = [fit(certificate) for certificate in certificates]
-    pairs = list(zip(certificates, fits, strict=True))
-    tables = {f"{path.stem}-residuals.csv": _residuals(*pair) for path, pair in zip(paths, pairs, strict=True)}
-    notes = tuple(note for pair in pairs for note in _notes(*pair))
-    return Incoming(cameras=tuple(_camera(*pair) for pair in pairs), notes=notes, tables=tables)
+    cameras, notes, tables = [], list[str](), dict[str, str]()
+    for path in paths:
+        certificate = read_certificate(path)
+        fitted = fit(certificate)
+        cameras.append(_camera(certificate, fitted))
+        notes += _notes(certificate, fitted)
+        tables[f"{path.stem}-residuals.csv"] = _residuals(certificate, fitted)
+    return Incoming(cameras=tuple(cameras), notes=tuple(notes), tables=tables)
 
 
 @table_model
-class CertificateTable:
-    """Keys of a certificate's file: the distortions at angles or at radii, and one principal point or two."""
+class Certificate:
+    """Certificate as printed: the distortions at angles or at radii, and one principal point or two.
 
-    name: str | None = None
+    sigma_um: standard deviation of one value; principal_point_mm: the only point of a certificate; else
+    autocollimation_mm and symmetry_mm.
+    """
+
+    name: str = ""
     refers_to: Literal["calibrated", "equivalent"] = "calibrated"
     calibrated_principal_distance_mm: Positive | None = None
     equivalent_principal_distance_mm: Positive | None = None
@@ -116,7 +97,7 @@ class CertificateTable:
 
     def __post_init__(self) -> None:
         """Raises WrongKey for keys that are missing or contradict each other."""
-        if self.distance_mm is None:
+        if not self.distance_mm:
             key = f"{self.refers_to}_principal_distance_mm"
             raise WrongKey(key, f"is missing: the table refers to the {self.refers_to} principal distance.")
         if (self.angle_deg is None) == (self.radius_mm is None):
@@ -138,37 +119,39 @@ class CertificateTable:
             )
 
     @property
-    def distance_mm(self) -> float | None:
-        """Principal distance to which the distortions refer."""
+    def distance_mm(self) -> float:
+        """Principal distance to which the distortions refer; 0 if it is missing."""
         is_equivalent = self.refers_to == "equivalent"
-        return self.equivalent_principal_distance_mm if is_equivalent else self.calibrated_principal_distance_mm
+        own = self.equivalent_principal_distance_mm if is_equivalent else self.calibrated_principal_distance_mm
+        return own or 0.0
+
+    @property
+    def point_mm(self) -> Point | None:
+        """Principal point of autocollimation."""
+        return self.principal_point_mm or self.autocollimation_mm
+
+    @cached_property
+    def curve(self) -> tuple[Array, Array, Array]:
+        """(n,) radii in mm, tangents of the angles from the axis, and distortions in mm."""
+        radial_mm = np.array(self.radial_um, dtype=float) / 1000.0
+        if self.angle_deg is not None:
+            tangent = np.tan(np.radians(self.angle_deg))
+            return self.distance_mm * tangent + radial_mm, tangent, radial_mm
+        radius_mm = np.array(self.radius_mm, dtype=float)
+        return radius_mm, (radius_mm - radial_mm) / self.distance_mm, radial_mm
+
+    @property
+    def distances(self) -> tuple[FiducialDistance, ...]:
+        return tuple(FiducialDistance(one.start, one.end, one.mm, one.sigma_mm) for one in self.fiducial_distance)
 
 
 def read_certificate(path: Path) -> Certificate:
     """Read a certificate. Raises InputError, with the key, for a missing principal distance, for both or none of angles
     and radii, and for lists of different lengths."""
     table = read_toml(path)
-    given = read_model(table, CertificateTable)
-    distance, radial_um = given.distance_mm or 0.0, np.array(given.radial_um, dtype=float)
-    if given.angle_deg is not None:
-        tangent = np.tan(np.radians(given.angle_deg))
-        radius_mm = distance * tangent + radial_um / 1000.0
-    else:
-        radius_mm = np.array(given.radius_mm, dtype=float)
-        tangent = (radius_mm - radial_um / 1000.0) / distance
-    entries, ids = table.tables("fiducial_distance"), [each.id for each in given.fiducial]
-    return Certificate(
-        given.name or path.stem,
-        distance,
-        given.principal_point_mm or given.autocollimation_mm,
-        given.symmetry_mm,
-        tuple(GivenFiducial(each.id, each.xy_mm, each.sigma_mm, None) for each in given.fiducial),
-        fiducial_distances(entries, given.fiducial_distance, ids),
-        radius_mm,
-        tangent,
-        radial_um,
-        given.sigma_um,
-    )
+    given = read_model(table, Certificate)
+    fiducial_distances(table.tables("fiducial_distance"), given.fiducial_distance, [one.id for one in given.fiducial])
+    return replace(given, name=given.name or path.stem)
 
 
 def fit(certificate: Certificate) -> FittedTable:
@@ -176,11 +159,10 @@ def fit(certificate: Certificate) -> FittedTable:
 
     The standard deviations are based on sigma_um, or on the residuals where these are larger.
     """
-    radius, tangent = certificate.radius_mm, certificate.tangent
+    radius, tangent, observed = certificate.curve
     count = max(min(len(POWERS), len(radius) - 2), 0)
     design = np.column_stack([tangent, *(radius**power for power in POWERS[:count])])
     scale = np.linalg.norm(design, axis=0)
-    observed = certificate.radial_um / 1000.0
     solution = np.linalg.lstsq(design / scale, observed)[0] / scale
     residuals = observed - design @ solution
     redundancy = len(radius) - design.shape[1]
@@ -192,7 +174,7 @@ def fit(certificate: Certificate) -> FittedTable:
     sigmas[: design.shape[1]] = sigma * np.sqrt(np.diag(cofactor))
     coefficients = np.zeros(len(POWERS))
     coefficients[:count] = solution[1:]
-    equivalent = certificate.principal_distance_mm + float(solution[0])
+    equivalent = certificate.distance_mm + float(solution[0])
     calibrated = balanced_mm(equivalent, coefficients, float(radius.max()))
     return FittedTable(equivalent, calibrated, coefficients, sigmas, 1000.0 * residuals)
 
@@ -217,10 +199,10 @@ def _curve(coefficients: Array, radius_mm: Array) -> Array:
 
 def decentering(certificate: Certificate, fitted: FittedTable) -> Array:
     """P1 and P2 (2,) that move the origin of the distortion from the point of symmetry to that of autocollimation."""
-    if certificate.symmetry_mm is None or certificate.principal_point_mm is None:
+    if certificate.symmetry_mm is None or certificate.point_mm is None:
         return np.zeros(2)
-    off_mm = np.subtract(certificate.symmetry_mm, certificate.principal_point_mm)
-    reach_mm, powers = float(certificate.radius_mm.max()), np.array(POWERS)
+    off_mm = np.subtract(certificate.symmetry_mm, certificate.point_mm)
+    reach_mm, powers = float(certificate.curve[0].max()), np.array(POWERS)
     parts = fitted.coefficients * reach_mm ** (powers - 3) * 0.6 * (3 * powers + 1) / (powers + 3)
     return np.asarray(-off_mm * parts.sum())
 
@@ -228,18 +210,18 @@ def decentering(certificate: Certificate, fitted: FittedTable) -> Array:
 def _camera(certificate: Certificate, fitted: FittedTable) -> CameraFile:
     names = [f"k{power}" for power in POWERS]
     off = {name: Prior(p) for name, p in zip(("p1", "p2"), decentering(certificate, fitted).tolist(), strict=True) if p}
-    point_sigma = math.inf if certificate.principal_point_mm is None else DEFAULT_SIGMA_MM
+    point_sigma = math.inf if certificate.point_mm is None else DEFAULT_SIGMA_MM
     given = zip(names, fitted.coefficients.tolist(), fitted.sigmas[1:].tolist(), strict=True)
     return CameraFile(
         path=Path(certificate.name),
         name=certificate.name,
         frame_mm=None,
         principal_distance_mm=fitted.equivalent_mm,
-        principal_point_mm=certificate.principal_point_mm,
+        principal_point_mm=certificate.point_mm,
         principal_distance_sigma_mm=float(fitted.sigmas[0]),
         principal_point_sigma_mm=(point_sigma, point_sigma),
         distortion=Distortion("torlegard", {name: Prior(k, sigma) for name, k, sigma in given if sigma > 0.0} | off),
-        fiducials=certificate.fiducials,
+        fiducials=tuple(GivenFiducial(one.id, one.xy_mm, one.sigma_mm, None) for one in certificate.fiducial),
         distances=certificate.distances,
     )
 
@@ -250,7 +232,7 @@ def _notes(certificate: Certificate, fitted: FittedTable) -> list[str]:
     k3, k5, k7 = fitted.coefficients
     point = (
         "gives no principal point: it is left to the points"
-        if certificate.principal_point_mm is None
+        if certificate.point_mm is None
         else f"gives no standard deviation of the principal point: {DEFAULT_SIGMA_MM:g} mm is assumed"
     )
     off = decentering(certificate, fitted)
@@ -262,7 +244,7 @@ def _notes(certificate: Certificate, fitted: FittedTable) -> list[str]:
     return [
         f"{certificate.name}: equivalent principal distance {fitted.equivalent_mm:.4f} mm, its standard deviation "
         f"{fitted.sigmas[0]:.4f}; calibrated {fitted.calibrated_mm:.4f} mm, by the balance of the fitted curve; the "
-        f"table refers to {certificate.principal_distance_mm:.4f} mm. The camera file has the equivalent one.",
+        f"table refers to {certificate.distance_mm:.4f} mm. The camera file has the equivalent one.",
         f"{certificate.name}: k3 {k3:.4g}, k5 {k5:.4g}, k7 {k7:.4g}; residuals of the table {rms:.2f} µm rms, "
         f"{largest:.2f} µm at most, {over} values more than unknowns.",
         f"{certificate.name}: the certificate {point}.",
@@ -273,11 +255,12 @@ def _notes(certificate: Certificate, fitted: FittedTable) -> list[str]:
 def _residuals(certificate: Certificate, fitted: FittedTable) -> str:
     """CSV table of the certificate's values with the residuals of the fit."""
     lines = [
-        f"# radial distortion of {certificate.name}, against c = {certificate.principal_distance_mm!r} mm",
+        f"# radial distortion of {certificate.name}, against c = {certificate.distance_mm!r} mm",
         "angle_deg,radius_mm,radial_um,fitted_um,residual_um",
     ]
-    angles = np.degrees(np.arctan(certificate.tangent))
-    for row in zip(angles, certificate.radius_mm, certificate.radial_um, fitted.residuals_um, strict=True):
+    radius_mm, tangent, _ = certificate.curve
+    angles = np.degrees(np.arctan(tangent))
+    for row in zip(angles, radius_mm, certificate.radial_um, fitted.residuals_um, strict=True):
         angle, radius, value, residual = (float(number) for number in row)
         lines.append(f"{angle:.4f},{radius:.4f},{value:.3f},{value - residual:.3f},{residual:.3f}")
     return "\n".join(lines) + "\n"

@@ -52,12 +52,13 @@ class Conversion:
     ----------
     sigmas : (3 + k,) of c, x0', y0' and the parameters, the larger of model and left-out images; inf: free.
     sentences : lines of the README.
+    files : content by name.
     """
 
     lens: ConvertedLens
     sigmas: Array
     sentences: tuple[str, ...]
-    files: tuple[str, ...]
+    files: dict[str, str | bytes]
 
     @property
     def misfit_um(self) -> float:
@@ -111,13 +112,13 @@ def run_convert(path: Path, folder: Path, options: ConvertOptions) -> Conversion
         raise InputError(f"{options.family} needs a radius r0: say with --r0-mm which.")
     check_folder(folder)
     convert = _converted_adjustment if path.suffix == ".json" else _converted_camera
-    lens, sigmas, sentences, files = convert(path, folder, options)
-    readme_text = readme("a lens converted", [f"From: {path.name}", "", *(f"- {line}" for line in sentences)], {})
-    publish(folder, files, readme_text)
-    return Conversion(lens, sigmas, sentences, tuple(files))
-
-
-Converted = tuple[ConvertedLens, Array, tuple[str, ...], dict[str, str | bytes]]
+    done = convert(path, folder, options)
+    publish(
+        folder,
+        done.files,
+        readme("a lens converted", [f"From: {path.name}", "", *(f"- {line}" for line in done.sentences)], {}),
+    )
+    return done
 
 
 def _convert(
@@ -139,7 +140,7 @@ def _convert(
     return found, (sentence, f"Fitted: c, x0', y0' and {listed(found.estimated) or 'no parameter'}.")
 
 
-def _converted_adjustment(path: Path, folder: Path, options: ConvertOptions) -> Converted:
+def _converted_adjustment(path: Path, folder: Path, options: ConvertOptions) -> Conversion:
     """Convert one camera's lens within the whole adjustment.json and adjustment.npz."""
     content, covariance = read_adjustment(path), read_own_covariance(path)
     name, given = calibrated_lens(path, content, options.camera)
@@ -161,7 +162,7 @@ def _converted_adjustment(path: Path, folder: Path, options: ConvertOptions) -> 
     kept |= moved.arrays()
     kept["fingerprint"] = np.array(hash_content(text.encode("utf-8")))
     np.savez_compressed(arrays, allow_pickle=False, **kept)
-    return lens, sigmas, sentences, {"adjustment.json": text, "adjustment.npz": arrays.getvalue()}
+    return Conversion(lens, sigmas, sentences, {"adjustment.json": text, "adjustment.npz": arrays.getvalue()})
 
 
 def _parameters(camera: str, lens: Lens) -> tuple[Parameter, ...]:
@@ -199,7 +200,7 @@ def _camera_entry(camera: CameraRecord, source: Distortion, lens: ConvertedLens,
     )
 
 
-def _converted_camera(path: Path, folder: Path, options: ConvertOptions) -> Converted:
+def _converted_camera(path: Path, folder: Path, options: ConvertOptions) -> Conversion:
     """Convert the values and standard deviations of a camera file's lens."""
     camera = read_camera(path)
     distance, point = camera.principal_distance_mm, camera.principal_point_mm
@@ -241,7 +242,7 @@ def _converted_camera(path: Path, folder: Path, options: ConvertOptions) -> Conv
         return f"{name}.tif"
 
     files["camera.toml"] = camera_text(converted, save)
-    return found, sigmas, sentences, files
+    return Conversion(found, sigmas, sentences, files)
 
 
 def _sigmas(given: Array, source: Lens, found: ConvertedLens) -> Array:

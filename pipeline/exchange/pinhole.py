@@ -13,7 +13,7 @@ from adjust.functional_model.lens_conversion import convert_lens, frame_grid_mm
 from adjust.functional_model.projection import STRAIGHT
 from measure.errors import MeasurementError
 from pipeline.errors import InputError
-from pipeline.exchange.block import Block, Frame, WholeFrame
+from pipeline.exchange.block import Block, OutFrame, WholeFrame
 from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.opencv_check.opencv_calibration import FISHEYE, INTERIOR, fixed, model_names, opencv_values
 from pipeline.resampling.canvas import Canvas, outline_canvas
@@ -52,7 +52,7 @@ class FittedLens:
         return float(self.lens.parameters[-1])
 
 
-def nearest_lens(block: Block, frame: Frame, models: Sequence[Sequence[str]], options: ExportOptions) -> FittedLens:
+def nearest_lens(block: Block, frame: OutFrame, models: Sequence[Sequence[str]], options: ExportOptions) -> FittedLens:
     """Fit the lens of an image's camera in one of several models, each given by names of OpenCV's parameters.
 
     The first model that is identical is taken; else the first that is close enough; else the last. If the lens
@@ -71,7 +71,7 @@ def nearest_lens(block: Block, frame: Frame, models: Sequence[Sequence[str]], op
     return fitted
 
 
-def fisheye_lens(block: Block, frame: Frame, options: ExportOptions) -> FittedLens | None:
+def fisheye_lens(block: Block, frame: OutFrame, options: ExportOptions) -> FittedLens | None:
     """The lens of an image's camera if it is OpenCV's fisheye. Its shear, which programs leave out, becomes the
     misfit."""
     lens = frame.lens
@@ -81,7 +81,7 @@ def fisheye_lens(block: Block, frame: Frame, options: ExportOptions) -> FittedLe
     return FittedLens(lens, abs(float(lens.parameters[-1])) * farthest_mm)
 
 
-def sheared_lens(block: Block, frame: Frame, at_ideal: bool) -> FittedLens:
+def sheared_lens(block: Block, frame: OutFrame, at_ideal: bool) -> FittedLens:
     """The lens of an image's camera with k1, k2, k3, p1, p2, affinity and shear.
 
     Parameters
@@ -103,7 +103,7 @@ def sheared_lens(block: Block, frame: Frame, at_ideal: bool) -> FittedLens:
     return FittedLens(fitted, float(np.linalg.norm(_sheared(fitted, rays) - observed_mm, axis=1).max()))
 
 
-def frame_corners_mm(block: Block, frame: Frame) -> Array:
+def frame_corners_mm(block: Block, frame: OutFrame) -> Array:
     """(2, 2) opposite corners of the exposed frame, camera mm: from the camera file, or the extent of the
     observations."""
     camera = block.camera_file(frame.camera)
@@ -130,7 +130,7 @@ def _has_only(lens: Lens, names: Sequence[str]) -> bool:
     return family == "opencv" and not any(value for name, value in known if name not in names)
 
 
-def _fit_opencv(block: Block, frame: Frame, names: Sequence[str]) -> FittedLens:
+def _fit_opencv(block: Block, frame: OutFrame, names: Sequence[str]) -> FittedLens:
     """Fit parameters of these names in OpenCV's model."""
     lens = frame.lens
     family = lens.distortion.family
@@ -247,7 +247,7 @@ def pinhole_frames(
 
 
 def checked_misfits(
-    block: Block, frames: Sequence[Frame], lens: FittedLens, box: Canvas, options: ExportOptions, format: str
+    block: Block, frames: Sequence[OutFrame], lens: FittedLens, box: Canvas, options: ExportOptions, format: str
 ) -> float:
     """Largest misfit, px, of a lens over a camera's images. Raises InputError where it is larger than the options
     allow."""
@@ -267,7 +267,7 @@ def _check_misfit(misfit_px: dict[str, float], options: ExportOptions, format: s
         )
 
 
-def sight_misfit_mm(block: Block, frame: Frame) -> float:
+def sight_misfit_mm(block: Block, frame: OutFrame) -> float:
     """Largest shift of an image's points by refraction and earth curvature, which other programs do not model."""
     model = frame.model
     assert model is not None

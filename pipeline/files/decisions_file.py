@@ -4,7 +4,6 @@ The last line about a mark applies; an `undo` cancels the last one before it. Li
 that the file keeps a record of who decided what, and when.
 """
 
-import gc
 import json
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -21,7 +20,7 @@ from measure.flags import MeaningfulWord
 from measure.geometry import POSES
 from pipeline.errors import InputError
 from pipeline.provenance import NO_FINGERPRINT
-from pipeline.text.files import quote_value, read_bytes, refuse_constant, write_atomically, writing
+from pipeline.text.files import quote_value, read_bytes, write_atomically, writing
 from pipeline.text.table_models import WrongKey
 from pipeline.text.wording import did_you_mean
 
@@ -32,7 +31,6 @@ except ImportError:  # not available on every system
 
 FILE = "decisions.jsonl"
 _LONGEST_LINE = 4_000_000  # bytes
-_BYTES_AT_A_TIME = 300_000
 _MOST_MB = 2000
 KINDS = ("fiducial", "target", "tie")
 LEARNED = "learned"  # kind of decisions about the appearance of a camera's marks, not about their places
@@ -150,7 +148,7 @@ def _check_decision(decision: Decision) -> Decision:
     return replace(decision, pose="") if decision.pose and kind is not Choice.POSE else decision
 
 
-_DECISIONS = TypeAdapter(list[Annotated[Decision, AfterValidator(_check_decision)]])
+_DECISION = TypeAdapter(Annotated[Decision, AfterValidator(_check_decision)])
 
 
 def decision_line(decision: Decision) -> str:
@@ -159,7 +157,7 @@ def decision_line(decision: Decision) -> str:
     content = {key: value for key, value in values.items() if value not in (None, "", {})}
     try:
         line = json.dumps(content, ensure_ascii=False, allow_nan=False)
-        decisions_of_lines([(0, line.encode())])
+        parse_decision(line.encode())
     except (LineError, ValueError) as error:
         about = f"{decision.image}{f', {decision.point}' if decision.point else ''}"
         raise InputError(f"the decision about {about}{error}. Nothing was written.") from None
@@ -169,18 +167,14 @@ def decision_line(decision: Decision) -> str:
 class LineError(Exception):
     """Error in a line; its text follows the line's number."""
 
-    def __init__(self, number: int, message: str, key: str = "") -> None:
+    def __init__(self, message: str, key: str = "") -> None:
         super().__init__(f"{f', {key}' if key else ''}: {message}")
-        self.number = number
-
-
-_read_json = json.JSONDecoder(parse_constant=refuse_constant).decode
 
 
 def is_cut_short(line: bytes) -> bool:
     """Whether a line ends within its JSON object, as after a crash, rather than having a typing error."""
     try:
-        _read_json(line.decode("utf-8", "replace"))
+        json.loads(line.decode("utf-8", "replace"))
     except json.JSONDecodeError as error:
         ends = error.pos >= len(error.doc.rstrip()) or error.msg.startswith("Unterminated string")
         return ends and line.lstrip().startswith(b"{")
@@ -189,31 +183,15 @@ def is_cut_short(line: bytes) -> bool:
     return False
 
 
-def decisions_of_lines(numbered: Sequence[tuple[int, bytes]]) -> list[Decision]:
-    """Decisions of lines, parsed all at once; one by one only where that fails, to find the line."""
-    numbers, lines = [number for number, _ in numbered], [line for _, line in numbered]
+def parse_decision(line: bytes, number: int = 0) -> Decision:
+    """Decision of a line of the file. number: of the line. Raises LineError."""
     try:
-        objects = _read_json(f"[{b','.join(lines).decode()}]")
-    except (ValueError, RecursionError):
-        objects = []
-    if len(objects) != len(lines):
-        objects = [_json_object(number, line) for number, line in numbered]
-    try:
-        decisions = _DECISIONS.validate_python(objects)
+        decision = _DECISION.validate_json(line)
     except ValidationError as error:
         found = error.errors(include_url=False)
-        first = min(found, key=lambda each: (each["loc"][0], each["type"] != "unexpected_keyword_argument"))
-        raise LineError(numbers[int(first["loc"][0])], *_problem(first)) from None
-    for decision, number in zip(decisions, numbers, strict=True):
-        object.__setattr__(decision, "line", number)  # a copy of each would take as long as reading them
-    return decisions
-
-
-def _json_object(number: int, line: bytes) -> Any:
-    try:
-        return _read_json(line.decode())
-    except (ValueError, RecursionError) as error:
-        raise LineError(number, f"is no JSON ({error}). Mend the line, or take it out.") from None
+        raise LineError(*_problem(min(found, key=lambda each: each["type"] != "unexpected_keyword_argument"))) from None
+    object.__setattr__(decision, "line", number)  # a copy would take as long as reading it
+    return decision
 
 
 def _problem(error: Any) -> tuple[str, str]:
@@ -221,12 +199,14 @@ def _problem(error: Any) -> tuple[str, str]:
     cause = error.get("ctx", {}).get("error")
     if isinstance(cause, WrongKey):
         return str(cause), cause.key
-    if len(error["loc"]) == 1:
+    if error["type"] == "json_invalid":
+        return f"is no JSON ({cause}). Mend the line, or take it out.", ""
+    if not error["loc"]:
         return f"must be a JSON object, not {quote_value(error['input'])}.", ""
-    key, value = str(error["loc"][1]), error["input"]
+    key, value = str(error["loc"][0]), error["input"]
     if error["type"] == "unexpected_keyword_argument":
         return f"there is no such key.{did_you_mean(key, _KEYS)} Known: {', '.join(_KEYS)}.", key
-    if error["type"] == "missing" and len(error["loc"]) == 2:
+    if error["type"] == "missing" and len(error["loc"]) == 1:
         return "is missing.", key
     hint = did_you_mean(value, _WORDS[key]) if key in _WORDS and isinstance(value, str) else ""
     return f"must be {_MUST_BE[key]}, not {quote_value(value)}.{hint}", key
@@ -255,19 +235,15 @@ def decisions_bytes(path: Path) -> bytes:
 
 def parse_decisions(path: Path, data: bytes) -> tuple[Decision, ...]:
     """Decisions of the content of the file. path: for messages."""
-    decisions, start, number = list[Decision](), 0, 1
-    with _pause_garbage_collection():
-        while start < len(data):
-            end = data.find(b"\n", start + _BYTES_AT_A_TIME) + 1 or len(data)
-            lines = data[start:end].split(b"\n")
-            if end == len(data) and is_cut_short(lines[-1]):
-                lines.pop()
-            numbered = [(at, line) for at, line in enumerate(lines, number) if line and not line.isspace()]
+    lines, decisions = data.split(b"\n"), list[Decision]()
+    if is_cut_short(lines[-1]):
+        lines.pop()
+    for number, line in enumerate(lines, 1):
+        if line and not line.isspace():
             try:
-                decisions += decisions_of_lines(numbered)
+                decisions.append(parse_decision(line, number))
             except LineError as error:
-                raise InputError(f"{path}, line {error.number}{error}") from None
-            number, start = number + data.count(b"\n", start, end), end
+                raise InputError(f"{path}, line {number}{error}") from None
     return tuple(decisions)
 
 
@@ -365,19 +341,7 @@ def _end_last_line(file: BinaryIO, path: Path) -> None:
         file.truncate(size - len(last))
     elif last.strip():
         try:
-            decisions_of_lines([(0, last)])
+            parse_decision(last)
         except LineError as error:
             raise InputError(f"{path}, its last line{error} Nothing was written.") from None
         file.write(b"\n")
-
-
-@contextmanager
-def _pause_garbage_collection() -> Iterator[None]:
-    """Disable the garbage collector, which doubles the time of creating a million objects without cycles."""
-    was_enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_enabled:
-            gc.enable()

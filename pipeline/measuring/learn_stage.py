@@ -27,7 +27,7 @@ from pipeline.measuring.first_pictures import first_pictures
 from pipeline.measuring.scan_task import Measure, Memory, ScanTask, sample_names, scan_tasks
 from pipeline.progress import Reporter
 from pipeline.provenance import content_hash, fingerprint, hash_content, hash_file
-from pipeline.results.measured_record import read_tone_information, tone_information_record
+from pipeline.results.measured_record import plain_json, read_plain
 from pipeline.text.files import write_atomically
 
 _SAMPLES = 8  # scans of a scanner from which its curve is estimated
@@ -250,14 +250,14 @@ def collect_tones(
     before = {kind: memory.recall(key) for kind, key in keys.items()}
     samples = {kind: sample_names(kinds[kind], _SAMPLES) for kind, by_image in before.items() if by_image is None}
     tasks = [task.fiducials_alone(project.tone) for task in scan_tasks(project, list(chain(*samples.values())))]
-    known = {name: read_tone_information(one) for kept in before.values() for name, one in (kept or {}).items()}
+    known = {name: read_plain(ToneInformation, one) for kept in before.values() for name, one in (kept or {}).items()}
     with reporter.stage("tone curve estimated from") as tell:
         for done, scan in enumerate(measure(tasks), 1):
             tell(scan.frame.image, done, len(tasks))
             if scan.frame.tone is not None and scan.frame.tone.information is not None:
                 known[scan.frame.image] = scan.frame.tone.information
     for kind, names_of in samples.items():
-        memory.remember(keys[kind], {name: tone_information_record(known[name]) for name in names_of if name in known})
+        memory.remember(keys[kind], {name: plain_json(known[name]) for name in names_of if name in known})
     by_image = dict[str, tuple[ToneInformation, ...]]()
     for kind, kept in before.items():
         of_kind = samples[kind] if kept is None else list(kept)
@@ -272,7 +272,7 @@ def _tone_key(project: Project, kind: str, names: Sequence[str]) -> str:
     firsts = {project.image_camera(name).path: name for name in reversed(names)}
     tasks = scan_tasks(project, sorted(firsts.values()))
     options = sorted(task.fiducials_alone(project.tone).options.json for task in tasks)
-    return f"tone {fingerprint([kind, options, MEASURE_REVISION])}"
+    return f"tone curve {fingerprint([kind, options, MEASURE_REVISION])}"
 
 
 def _kind(project: Project, image: str) -> str:

@@ -2,22 +2,20 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 from markupsafe import Markup
 
 from adjust.functional_model.families import parameter_names
 from adjust.problem.parameter import Parameter, parameter_from_text
-from adjust.quality.lens_uncertainty import Curves, distortion_curves, is_defined_over_frame
+from adjust.quality.lens_uncertainty import distortion_curves, is_defined_over_frame
 from pipeline.drawing import svg
 from pipeline.report import fiducials, lens, vectors
 from pipeline.report.data import ReportData
 from pipeline.report.frame_views import residuals_by_image
 from pipeline.report.numbers import fixed, significant
 from pipeline.report.parameters import (
-    CameraValue,
-    ParameterRow,
     camera_values,
     high_correlations,
     parameter_rows,
@@ -28,7 +26,6 @@ from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, S
 from pipeline.results.assessment_record import ResidualRecord
 from pipeline.results.covariance_file import Covariance
 from pipeline.results.image_unit import ImageUnit
-from pipeline.results.stage_files import CameraCheck
 from pipeline.types import Array
 
 PLOT_PX = 400.0
@@ -43,59 +40,13 @@ ROOM = 0.06  # margin around the extent, fraction of its longer side
 UM_PER_MM = 1000.0
 
 
-@dataclass(frozen=True)
-class LensView:
-    """Distortion of a camera. rows: indices of the curve points in the table; certificate: None for digital cameras."""
-
-    curves: Curves
-    plot: Markup
-    rows: list[int]
-    certificate: lens.Certificate | None
-    map: lens.LensMap | None
-
-
-@dataclass(frozen=True)
-class CameraView:
-    """Camera in the report; None or empty where the files lack the data.
-
-    Attributes
-    ----------
-    effect_where : place at which the effects of distortion parameters are stated.
-    parameters : table of parameters with their priors and significance.
-    vectors, coverage : plots of the residuals and of the number of observations over the frame.
-    observed : number of observations in the coverage.
-    maps : contour plots of the standard deviation of projected points, with their distance in words.
-    corrections, corrections_sentence, corrections_plot : fiducials against their given coordinates.
-    """
-
-    name: str
-    record: CameraRecord
-    is_calibrated: bool
-    images: int
-    unit: ImageUnit
-    values: list[CameraValue]
-    effect_where: str
-    parameters: list[ParameterRow]
-    correlations: list[tuple[str, str, float]]
-    correlation_causes: list[str]
-    lens: LensView | None
-    vectors: Markup | None
-    coverage: Markup | None
-    observed: int
-    maps: list[tuple[str, Markup]]
-    corrections: fiducials.Figure | None
-    corrections_sentence: str
-    corrections_plot: Markup | None
-    check: CameraCheck | None
-
-
-def camera_views(data: ReportData) -> list[CameraView]:
-    """Views of all cameras of the adjustment; empty without an adjustment."""
+def camera_views(data: ReportData) -> list[SimpleNamespace]:
+    """Cameras of the adjustment for the templates; empty without an adjustment."""
     stored = data.adjustment
     return [_view(data, stored, name, camera) for name, camera in stored.cameras.items()] if stored else []
 
 
-def _view(data: ReportData, stored: AdjustmentRecord, name: str, camera: CameraRecord) -> CameraView:
+def _view(data: ReportData, stored: AdjustmentRecord, name: str, camera: CameraRecord) -> SimpleNamespace:
     images, by_image = stored.camera_images(name), residuals_by_image(data)
     rows = [row for image in images for row in by_image.get(image, [])]
     known, unit = data.covariance if stored.converged else None, data.unit_of_camera(name)
@@ -110,7 +61,7 @@ def _view(data: ReportData, stored: AdjustmentRecord, name: str, camera: CameraR
     places = np.array([(row.camera_x_mm, row.camera_y_mm) for row in rows if row.kind not in ("fiducial", "join")])
     has_scale = stored.sigma0 > 0.0 and ("interior", name) not in stored.variance_factor.left_out
     parameters = list(parameter_rows(name, camera, stored.sigma0 if has_scale else 1.0, radius_mm, unit))
-    return CameraView(
+    return SimpleNamespace(
         name=name,
         record=camera,
         is_calibrated=is_calibrated,
@@ -166,7 +117,7 @@ def _correlation_causes(name: str, stored: AdjustmentRecord) -> list[str]:
 
 def _lens_view(
     name: str, camera: CameraRecord, covariance: Covariance, on: vectors.Plane | None, radius_mm: float, unit: ImageUnit
-) -> LensView | None:
+) -> SimpleNamespace | None:
     """Distortion out to the corner of the frame or, if its size is unknown, of the observed area."""
     reach = camera.lens_known
     corner_mm = reach.corner_mm if reach is not None and reach.corner_mm > 0.0 else 0.0
@@ -180,12 +131,12 @@ def _lens_view(
         largest = min(largest, *known.distortion.half_mm)
     curves = distortion_curves(known, largest)
     reach_mm = min(radius_mm or np.inf, float(curves.radius_mm[-1]))
-    return LensView(
-        curves,
-        lens.curves_plot(curves, radius_mm, unit),
-        np.linspace(0, len(curves.radius_mm) - 1, CURVE_TABLE_ROWS + 1).round().astype(int)[1:].tolist(),
-        None if unit.is_pixel else lens.certificate(known, reach_mm),
-        lens.lens_map(known, on, radius_mm) if on is not None else None,
+    return SimpleNamespace(
+        curves=curves,
+        plot=lens.curves_plot(curves, radius_mm, unit),
+        rows=np.linspace(0, len(curves.radius_mm) - 1, CURVE_TABLE_ROWS + 1).round().astype(int)[1:].tolist(),
+        certificate=None if unit.is_pixel else lens.certificate(known, reach_mm),
+        map=lens.lens_map(known, on, radius_mm) if on is not None else None,
     )
 
 
@@ -198,32 +149,19 @@ def _uncertainty_maps(camera: CameraRecord, on: vectors.Plane, unit: str) -> Ite
             yield where, plot
 
 
-@dataclass(frozen=True)
-class ScannerView:
-    """Scanner in the report. field: plot of the displacements, None without terms or without a solution; largest_um:
-    largest displacement with its sigma."""
-
-    name: str
-    record: ScannerRecord
-    images: int
-    rows: list[ParameterRow]
-    field: Markup | None = None
-    largest_um: tuple[float, float] = (0.0, 0.0)
-
-
-def scanner_views(data: ReportData) -> list[ScannerView]:
-    """Views of all scanners of the adjustment; empty without an adjustment or without scanners."""
+def scanner_views(data: ReportData) -> list[SimpleNamespace]:
+    """Scanners of the adjustment for the template; empty without an adjustment or without scanners."""
     stored = data.adjustment
     return [_scanner_view(stored, data.covariance, *each) for each in stored.scanners.items()] if stored else []
 
 
 def _scanner_view(
     stored: AdjustmentRecord, covariance: Covariance | None, name: str, scanner: ScannerRecord
-) -> ScannerView:
-    images = sum(image.scanner == name for image in stored.images.values())
-    rows = list(term_rows(scanner.terms))
+) -> SimpleNamespace:
+    images, rows = sum(image.scanner == name for image in stored.images.values()), list(term_rows(scanner.terms))
+    view = SimpleNamespace(name=name, record=scanner, images=images, rows=rows, field=None)
     if not rows or covariance is None or not stored.converged:
-        return ScannerView(name, scanner, images, rows)
+        return view
     center, half = np.array(scanner.center_mm), np.array(scanner.half_mm)
     counts = np.maximum(np.rint(GRID * half / half.max()), 2.0).astype(int)
     xy_mm = grid_mm(np.linspace(c - h, c + h, count) for c, h, count in zip(center, half, counts, strict=True))
@@ -237,8 +175,9 @@ def _scanner_view(
     ends = starts + px_per_um * value_um * (1.0, -1.0)
     ellipses = svg.ellipses(ends, px_per_um * radii_um, angles)
     title = "The scanner's bend with 95 % ellipses over its scans"
-    field = on.picture(title, px_per_um, *ellipses, strokes_and_dots(starts, ends, "target"))
-    return ScannerView(name, scanner, images, rows, field, longest_vector(value_um, covariance_um2))
+    view.field = on.picture(title, px_per_um, *ellipses, strokes_and_dots(starts, ends, "target"))
+    view.largest_um = longest_vector(value_um, covariance_um2)
+    return view
 
 
 def bend_field(name: str, scanner: ScannerRecord, covariance: Covariance, xy_mm: Array) -> tuple[Array, Array]:

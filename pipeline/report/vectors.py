@@ -3,6 +3,7 @@
 import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 from markupsafe import Markup
@@ -153,27 +154,20 @@ def strokes_and_dots(starts: Array, ends: Array, kind: str, dots: Array | None =
     return svg.strokes(starts, ends, f"vector {kind}") + svg.strokes(at, at, f"dot {kind}")
 
 
-@dataclass(frozen=True)
-class JoinedView:
-    """Frame scanned in parts. rms_um: RMS difference at tie points in x' and y'; largest: name and length of the
-    largest."""
-
-    record: JoinedFrameRecord
-    rms_um: tuple[float | None, float | None]
-    largest: str
-    plot: Markup | None
-
-
-def joined_view(frame: JoinedFrameRecord) -> JoinedView:
-    """View of the tie points between the partial scans of a frame."""
+def joined_view(frame: JoinedFrameRecord) -> SimpleNamespace:
+    """Frame scanned in parts for the template: RMS difference at tie points in x' and y', name and length of the
+    largest, and a plot."""
     if not frame.joins:
-        return JoinedView(frame, (None, None), "–", None)
+        return SimpleNamespace(record=frame, rms_um=(None, None), largest="–", plot=None)
     apart = VectorField.from_joins(frame.joins)
     lengths_um = np.hypot(*apart.vectors_um.T)
-    x_um, y_um = np.sqrt(np.mean(apart.vectors_um**2, axis=0)).tolist()
-    largest = f"{frame.joins[int(lengths_um.argmax())].point}: {fixed(float(lengths_um.max()), 1)} µm"
     on = plane(apart.places_mm, None, JOINED_PLOT_PX)
-    return JoinedView(frame, (x_um, y_um), largest, all_images_plot(apart, on, apart.scale(LONGEST_JOIN_PX)))
+    return SimpleNamespace(
+        record=frame,
+        rms_um=np.sqrt(np.mean(apart.vectors_um**2, axis=0)).tolist(),
+        largest=f"{frame.joins[int(lengths_um.argmax())].point}: {fixed(float(lengths_um.max()), 1)} µm",
+        plot=all_images_plot(apart, on, apart.scale(LONGEST_JOIN_PX)),
+    )
 
 
 def coverage_counts(on: Plane, places_mm: Array) -> tuple[Array, Array, Array]:

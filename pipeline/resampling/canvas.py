@@ -58,11 +58,6 @@ class FrameChain:
         return self.lens.ideal_from_observed(observed)
 
 
-def adjusted_chain(measured: MeasuredScan, adjustment: AdjustmentRecord, with_lens: bool) -> FrameChain:
-    """Chain of a scan from adjustment.json, with the adjusted film transformation and scanner bend."""
-    return image_chain(measured.frame.image, adjustment, measured.pitch_um, _middle_mm(measured), with_lens)
-
-
 def image_chain(
     name: str, adjustment: AdjustmentRecord, pitch_um: tuple[float, float], middle_mm: Array, with_lens: bool
 ) -> FrameChain:
@@ -88,10 +83,11 @@ def measured_chain(measured: MeasuredScan, taking_lens: Lens | None = None) -> F
     back = Affine(comparator_from_pixel(matrix.T, measured.pitch_um).T).inverse
     known = dict(zip(("a2", "a3", "a1", "b2", "b3", "b1"), back.matrix.ravel().tolist(), strict=True))
     parameters = np.array([known[name] for name in film_parameter_names("affine")])
-    return FrameChain(measured.pitch_um, Film("affine", parameters, _middle_mm(measured)), Bend(lens=taking_lens))
+    return FrameChain(measured.pitch_um, Film("affine", parameters, middle_mm(measured)), Bend(lens=taking_lens))
 
 
-def _middle_mm(measured: MeasuredScan) -> Array:
+def middle_mm(measured: MeasuredScan) -> Array:
+    """(2,) centre of a scan in the comparator."""
     middle_px = np.array([measured.width_px - 1, measured.height_px - 1]) / 2.0
     return comparator_from_pixel(middle_px, measured.pitch_um)
 

@@ -1,6 +1,5 @@
 """`reseau resample`: all measured scans, and the TIFF file of a frame, written tile by tile."""
 
-import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
@@ -22,8 +21,8 @@ from pipeline.archive.checked_results import read_measurement
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
-from pipeline.provenance import file_state
-from pipeline.resampling.canvas import Canvas, FrameChain, adjusted_chain, measured_chain, outline_canvas
+from pipeline.provenance import file_state, fingerprint
+from pipeline.resampling.canvas import Canvas, FrameChain, image_chain, measured_chain, middle_mm, outline_canvas
 from pipeline.resampling.interpolation import (
     MARGIN_PX,
     Degree,
@@ -201,20 +200,9 @@ class ResampleTask:
     def fingerprint(self) -> str:
         """Fingerprint of the scans' files and everything else that the result depends on; a frame with an equal one is
         up to date."""
-        first, *others = (self._scan_fingerprint(each.scan, each.chain) for each in self.scans)
-        return hashlib.sha256("".join([first, *others]).encode()).hexdigest() if others else first
-
-    def _scan_fingerprint(self, scan: Path, chain: FrameChain) -> str:
-        numbers = [*chain.film.parameters, *chain.bend_parameters, *chain.pitch_um, self.pitch_mm, float(self.degree)]
-        words: list[Any] = [self.image, self.camera, self.pose, chain.film.transformation, chain.film.mirrored]
-        words += [chain.bend.terms, chain.bend.center_mm, chain.bend.half_mm]
-        for lens in (chain.lens, chain.bend.lens):
-            if lens is not None:
-                numbers += [*lens.interior, *lens.parameters]
-                words += [lens.distortion.family, lens.distortion.decentering, lens.distortion.r0_mm]
-        file = file_state(scan, Path())
-        words += [file.bytes, file.mtime_ns, file.etag, [float(number).hex() for number in numbers]]
-        return hashlib.sha256(json.dumps(words).encode()).hexdigest()
+        states = [file_state(each.scan, Path())[1:] for each in self.scans]
+        frame = [self.image, self.camera, self.pose, self.pitch_mm, self.degree]
+        return fingerprint([*frame, [each.chain for each in self.scans], states])
 
 
 @dataclass(frozen=True)
@@ -305,8 +293,9 @@ def _chain(
     taking_lens: Lens | None = None,
 ) -> FrameChain | str:
     """Adjusted chain of an image, or the chain from its fiducials, or the reason why there is none."""
-    if adjustment is not None and adjustment.converged and measured.frame.image in adjustment.images:
-        return adjusted_chain(measured, adjustment, with_lens)
+    image = measured.frame.image
+    if adjustment is not None and adjustment.converged and image in adjustment.images:
+        return image_chain(image, adjustment, measured.pitch_um, middle_mm(measured), with_lens)
     if with_lens:
         return "it has no part in the adjustment, so its lens is not known: resample it without --lens"
     if is_part:
@@ -332,8 +321,7 @@ def _resampled(task: ResampleTask) -> Resampled:
         scans = [(opened.enter_context(open_scan(each.scan, task.max_pixels)), each.chain) for each in task.scans]
         canvas = outline_canvas([(chain, scan.part_px) for scan, chain in scans], task.pitch_mm)
         done = Resampled(task.image, task.target, canvas.width_px, canvas.height_px)
-        fingerprint = task.fingerprint
-        if before is not None and before.get("fingerprint") == fingerprint:
+        if before is not None and before.get("fingerprint") == task.fingerprint:
             return replace(done, kept=True)
         task.target.parent.mkdir(parents=True, exist_ok=True)
         parts = []
@@ -342,7 +330,7 @@ def _resampled(task: ResampleTask) -> Resampled:
             parts.append(Part(opened.enter_context(open_source(scan, rows, task.target.parent)), chain))
         parts = find_inner_edges(parts)
         described: dict[str, object] = {"image": task.image, "camera": task.camera, "pose": task.pose}
-        described |= {"lens": task.scans[0].chain.lens is not None, "fingerprint": fingerprint}
+        described |= {"lens": task.scans[0].chain.lens is not None, "fingerprint": task.fingerprint}
         if names := [each.image for each in task.scans if each.image != task.image]:
             described |= {"parts": names, "seams_mm": seams_mm(parts, canvas)}
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 from pydantic import TypeAdapter
@@ -15,20 +15,19 @@ from pydantic import TypeAdapter
 from measure.annotations.lines import Field, Line, find_fields
 from measure.flags import Cause, MeaningfulWord, Reason, Status
 from measure.results import Covariance, FrameMeasurement, Kind, MarkMeasurement, Pose
-from measure.tone.curve import Tone, ToneInformation, power, srgb
+from measure.tone.curve import power, srgb
 from measure.tone.estimate import FrameTone
-from measure.tone.sharpening import Sharpening
 from pipeline.text.csv_table import csv_line
 from pipeline.text.files import write_atomically
 from pipeline.types import Array
 
 _SRGB = "srgb"
+Record = TypeVar("Record")
 MARK_COLUMNS = (
     "point", "kind", "col_px", "row_px", "var_col", "var_row", "cov", "causes", "status", "reason_code", "reason",
     "quality",
 )  # fmt: skip
 _KINDS: Mapping[str, Kind] = {kind: kind for kind in get_args(Kind)}
-_TONE_NUMBERS = ("least", "greatest", "scatter", "apart")
 _POSE, _LINES = TypeAdapter(Pose), TypeAdapter(tuple[Line, ...])
 
 
@@ -122,7 +121,7 @@ def scan_detail(measured: MeasuredScan, uri: str) -> dict[str, object]:
         "failure": measured.failure and {"code": str(measured.failure.code), "sentence": measured.failure.sentence},
         "pose": frame.pose and pose_record(frame.pose),
         # The text is the chosen reading, for other readers of the database.
-        "writing": None if frame.writing is None else [{"text": one.text, **_plain(one)} for one in frame.writing],
+        "writing": None if frame.writing is None else [{"text": one.text, **plain_json(one)} for one in frame.writing],
         "pixel_from_camera": _numbers(frame.pixel_from_camera),
         "weights": _numbers(frame.weights),
         "tone": frame.tone and _frame_tone(frame.tone),
@@ -206,15 +205,28 @@ def _numbers(values: Any) -> Any:
     return number if np.isfinite(number) else repr(number)
 
 
-def _plain(value: Any) -> Any:
-    """JSON of a record with its mappings and sequences; non-finite numbers as strings."""
+def plain_json(value: Any) -> Any:
+    """JSON of a record with its mappings and sequences; fields that are not compared are left out."""
     if is_dataclass(value):
-        return {each.name: _plain(getattr(value, each.name)) for each in fields(value)}
+        return {each.name: plain_json(getattr(value, each.name)) for each in fields(value) if each.compare}
     if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: plain_json(item) for key, item in value.items()}
     if isinstance(value, tuple):
-        return [_plain(item) for item in value]
-    return value if isinstance(value, str | bool) else _numbers(value)
+        return [plain_json(item) for item in value]
+    return value if isinstance(value, str | int) else _numbers(value)
+
+
+def read_plain(kind: type[Record], record: Mapping[str, Any]) -> Record:
+    """Read the output of `plain_json`: a record of numbers, arrays, words and further records."""
+    values: dict[str, Any] = {}
+    for name, hint in get_type_hints(kind).items():
+        if (value := record.get(name)) is not None:
+            inner = next((each for each in (hint, *get_args(hint)) if is_dataclass(each)), None)
+            if inner is not None:
+                values[name] = read_plain(inner, value)
+            else:
+                values[name] = _array(value) if get_origin(hint) is np.ndarray else hint(value)
+    return kind(**values)
 
 
 def _array(values: Any) -> Array:
@@ -223,48 +235,17 @@ def _array(values: Any) -> Array:
 
 def pose_record(pose: Pose) -> dict[str, object]:
     """Scan orientation (pose) with its evidence, as JSON."""
-    record: dict[str, object] = _plain(pose)
+    record: dict[str, object] = plain_json(pose)
     return record
 
 
 def _frame_tone(tone: FrameTone) -> dict[str, object]:
-    return {
-        "base": _base(tone.tone.base),
-        "mean": _numbers(tone.tone.mean),
-        "covariance": _numbers(tone.tone.covariance),
-        "source": tone.tone.source,
-        "is_declared": tone.tone.is_declared,
-        "sharpening": sharpening_record(tone.tone.sharpening),
-        "said": tone.information and tone_information_record(tone.information),
-        **{name: _numbers(getattr(tone, name)) for name in _TONE_NUMBERS},
-    }
+    """JSON of a tone, its curve as its name where it has one."""
+    return {**plain_json(tone), "tone": {**plain_json(tone.tone), "base": _base(tone.tone.base)}}
 
 
 def _read_frame_tone(tone: Mapping[str, Any]) -> FrameTone:
-    prior = Tone(
-        _read_base(tone["base"]),
-        _array(tone["mean"]),
-        _array(tone["covariance"]),
-        tone["source"],
-        tone["is_declared"],
-        sharpening=read_sharpening(tone.get("sharpening")),
-    )
-    information = tone["said"] and read_tone_information(tone["said"])
-    return FrameTone(prior, information, *(float(tone[name]) for name in _TONE_NUMBERS))
-
-
-def sharpening_record(sharpening: Sharpening) -> dict[str, object] | None:
-    """Sharpening as JSON; None if there is none."""
-    if not sharpening:
-        return None
-    return {name: _numbers(getattr(sharpening, name)) for name in ("amount", "radius_px", "covariance")}
-
-
-def read_sharpening(record: Mapping[str, Any] | None) -> Sharpening:
-    """Read the output of `sharpening_record`."""
-    if record is None:
-        return Sharpening()
-    return Sharpening(float(record["amount"]), float(record["radius_px"]), _array(record["covariance"]))
+    return read_plain(FrameTone, {**tone, "tone": {**tone["tone"], "base": _read_base(tone["tone"]["base"])}})
 
 
 def _base(base: Array) -> Any:
@@ -280,25 +261,6 @@ def _read_base(base: Any) -> Array:
     if base == _SRGB:
         return srgb()
     return _array(base) if isinstance(base, list) else power(float(base))
-
-
-def tone_information_record(tone: ToneInformation) -> dict[str, object]:
-    """Normal equations of a scan for the tone curve of its scanner, as JSON."""
-    return {
-        "information": _numbers(tone.matrix),
-        "right": _numbers(tone.right_side),
-        "square": _numbers(tone.sum_of_squares),
-        "count": tone.count,
-        "alike": _numbers(tone.common_variance),
-        "sharpening": sharpening_record(tone.sharpening),
-    }
-
-
-def read_tone_information(tone: Mapping[str, Any]) -> ToneInformation:
-    """Read the output of `tone_information_record`."""
-    information, right = _array(tone["information"]), _array(tone["right"])
-    square, count, alike = float(tone["square"]), int(tone["count"]), float(tone["alike"])
-    return ToneInformation(information, right, square, count, alike, read_sharpening(tone.get("sharpening")))
 
 
 COLUMNS = ("image", "field", "text", "value", "confidence", "place", "col_px", "row_px")

@@ -20,7 +20,6 @@ from pipeline.types import Array
 Result = TypeVar("Result")
 
 _OPEN = 4  # scans kept open
-_KEPT_MB = 64  # MB, size of the image cache
 _WINDOW_PX = 480  # px, larger windows are reduced to about this width
 _FRAME_PX = 1400  # px, longer side of a whole scan
 _POSE_PX = 180
@@ -35,8 +34,7 @@ class Pictures:
     def __init__(self, max_pixels: int | None = None) -> None:
         self._max_pixels = max_pixels
         self._open: OrderedDict[str, Scan] = OrderedDict()
-        self._kept: OrderedDict[tuple[object, ...], bytes] = OrderedDict()
-        self._lock, self._reading = threading.Lock(), threading.Lock()
+        self._reading = threading.Lock()
 
     def close(self) -> None:
         with self._reading:
@@ -54,46 +52,35 @@ class Pictures:
 
     def window(self, scan: str, col0: int, row0: int, size: int) -> bytes:
         """Square window; a large one is reduced. Raises MeasurementError if the file cannot be read."""
-        return self._png(("window", scan, col0, row0, size), lambda: _window(self._scan(scan), col0, row0, size))
+        return self._png(lambda: _window(self._scan(scan), col0, row0, size))
 
     def residual(self, scan: str, mark: Mark, pixel_from_mark: Array, blur_px: float, half: int) -> bytes:
         """Residual image around a mark, after subtraction of the fitted mark and a linear background."""
-        key = ("residual", scan, hash(mark), *pixel_from_mark.ravel(), blur_px, half)
-        return self._png(key, lambda: _residual(self._scan(scan), mark, pixel_from_mark, blur_px, half))
+        return self._png(lambda: _residual(self._scan(scan), mark, pixel_from_mark, blur_px, half))
 
     def drawing(self, mark: Mark, pixel_from_mark: Array, blur_px: float, half: int) -> bytes:
         """Mark as rendered for the fit, transparent outside, in the window of `residual`."""
-        key = ("drawing", hash(mark), *pixel_from_mark.ravel(), blur_px, half)
-        return self._png(key, lambda: _drawing(mark, pixel_from_mark, blur_px, half))
+        return self._png(lambda: _drawing(mark, pixel_from_mark, blur_px, half))
 
     def frame(self, scan: str) -> bytes:
         """Whole scan, reduced."""
-        return self._png(("frame", scan), lambda: stretched(self._reduced(scan, _FRAME_PX)))
+        return self._png(lambda: stretched(self._reduced(scan, _FRAME_PX)))
 
     def posed(self, scan: str, pose: str) -> bytes:
         """Whole scan rotated and mirrored back from a scan orientation (pose): upright if that pose is right."""
-        return self._png(("pose", scan, pose), lambda: upright(stretched(self._reduced(scan, _POSE_PX)), pose))
+        return self._png(lambda: upright(stretched(self._reduced(scan, _POSE_PX)), pose))
 
     def _reduced(self, name: str, side_px: int) -> Array:
         scan = self._scan(name)
-        factor = max(1, -(-max(scan.width_px, scan.height_px) // _FRAME_PX))  # cached, for both sizes
+        factor = max(1, -(-max(scan.width_px, scan.height_px) // _FRAME_PX))  # kept by the scan, for both sizes
         grey = np.asarray(scan.reduced(factor), dtype=np.float64)
         smaller = min(side_px / max(grey.shape), 1.0)
         return np.asarray(cv2.resize(grey, None, fx=smaller, fy=smaller, interpolation=cv2.INTER_AREA))
 
-    def _png(self, key: tuple[object, ...], make: Callable[[], NDArray[np.uint8]]) -> bytes:
-        with self._lock:
-            if key in self._kept:
-                self._kept.move_to_end(key)
-                return self._kept[key]
+    def _png(self, make: Callable[[], NDArray[np.uint8]]) -> bytes:
         with self._reading:
             _, data = cv2.imencode(".png", make(), [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        png = data.tobytes()
-        with self._lock:
-            self._kept[key] = png
-            while sum(map(len, self._kept.values())) > _KEPT_MB * 1_000_000:
-                self._kept.popitem(last=False)
-        return png
+        return data.tobytes()
 
     def _scan(self, name: str) -> Scan:
         """Open a scan, or get it from the cache. The caller holds `_reading`."""

@@ -28,7 +28,7 @@ from measure.errors import MeasurementError
 from measure.fiducials.options import Click
 from measure.geometry import POSES
 from pipeline.errors import InputError
-from pipeline.files.decisions_file import Choice, Decision, LineError, decisions_of_lines
+from pipeline.files.decisions_file import Choice, Decision, LineError, parse_decision
 from pipeline.files.mark_table import MARK_TABLES
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_task import sample_names
@@ -310,10 +310,9 @@ class _Answers:
 def _decision(given: Mapping[str, Any]) -> Decision:
     """Check a decision like a line of decisions.jsonl."""
     try:
-        (decision,) = decisions_of_lines([(0, json.dumps(given).encode())])
+        return parse_decision(json.dumps(given).encode())
     except LineError as error:
         raise InputError(f"the decision{error}") from None
-    return decision
 
 
 def _trial_json(scan: MeasuredScan) -> Any:

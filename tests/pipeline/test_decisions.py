@@ -18,7 +18,6 @@ from measure.results import Covariance, FrameMeasurement, MarkMeasurement
 from pipeline.archive.review_decisions import after_checks, apply_decisions, before_checks
 from pipeline.cli import run
 from pipeline.errors import InputError, WriteError
-from pipeline.files import decisions_file
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.decisions_file import Choice, Decision, append_decisions, read_decisions, standing
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
@@ -130,9 +129,7 @@ def test_what_would_not_be_read_is_not_written(decision: Decision, path: Path) -
     assert not path.exists()
 
 
-@pytest.mark.parametrize(
-    "line", ['{"image": "a" "point": "1"}', "nothing", "{'image': 'a'}", '{"image": "a", "decision": NaN}']
-)
+@pytest.mark.parametrize("line", ['{"image": "a" "point": "1"}', "nothing", "{'image': 'a'}"])
 def test_a_typing_error_in_the_last_line_is_named(line: str, path: Path) -> None:
     append_decisions(path, [mark_decision(Choice.ACCEPT)])
     with path.open("a") as file:
@@ -189,7 +186,7 @@ def test_status_is_stale_until_a_decision_is_used(tmp_path: Path, capsys: Captur
 
 @pytest.mark.study
 def test_a_million_lines_are_read_in_little_more_than_their_json_takes(path: Path) -> None:
-    """1.1 to 1.8 times as long; 4.2 to 4.5 s of CPU."""
+    """1.3 times as long."""
     line = '{{"image": "box/{0:05d}", "point": "{1}", "kind": "fiducial", "decision": "reject", "who": "ann"}}'
     path.write_text("\n".join(line.format(k % 50_000, k % 8) for k in range(1_000_000)) + "\n")
     began = time.process_time()
@@ -201,9 +198,7 @@ def test_a_million_lines_are_read_in_little_more_than_their_json_takes(path: Pat
     assert reading_s < 2.5 * (time.process_time() - began)
 
 
-def test_lines_of_all_forms_are_read_in_their_order(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lines are checked many at a time, those of one form together."""
-    monkeypatch.setattr(decisions_file, "_BYTES_AT_A_TIME", 500)
+def test_lines_of_all_forms_are_read_in_their_order(path: Path) -> None:
     forms: Sequence[dict[str, Any]] = [
         {"image": "a", "point": "{}", "decision": "accept"},
         {"decision": "place", "image": "b", "point": "{}", "kind": "target", "col_px": 3, "row_px": 4.5},
@@ -236,6 +231,7 @@ def test_lines_of_all_forms_are_read_in_their_order(path: Path, monkeypatch: pyt
     [
         ('{"image": "a", "decision": "acept", "point": "1"}', "line 2, decision.*Did you mean 'accept'"),
         ('{"image": "a", "decision": "accept"}', "line 2, point: is missing"),
+        ('{"image": "a", "decision": NaN}', "line 2, decision: must be one of accept.* not nan"),
         ('{"image": "a", "decision": "place", "point": "1", "col_px": 1}', "row_px: must be a number of pixels"),
         ('{"image": "a", "decision": "place", "point": "1", "col_px": true, "row_px": 1}', "col_px: must be a number"),
         ('{"image": "a", "decision": "pose", "pose": "91"}', "pose: must be one of"),

@@ -211,8 +211,8 @@ def test_a_certificate_gives_back_the_lens_that_it_was_made_of_by_angles_and_rad
     rng, off = np.random.default_rng(4), []
     exact = read_certificate(printed(tmp_path / "c.toml", c, table, sigma_um="2.0"))
     for _ in range(300):
-        noisy = exact.radial_um + rng.normal(0.0, 2.0, len(table))
-        off.append(fit(replace(exact, radial_um=noisy)).equivalent_mm - equivalent)
+        noisy = np.array(exact.radial_um) + rng.normal(0.0, 2.0, len(table))
+        off.append(fit(replace(exact, radial_um=tuple(noisy.tolist()))).equivalent_mm - equivalent)
     assert np.std(off) == pytest.approx(fit(exact).sigmas[0], rel=0.15)
 
 
