@@ -3,7 +3,7 @@ short file from the kinds and distances of a camera's marks."""
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,9 @@ from measure.marks.shapes import Point
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.camera_tables import written_place_text
-from pipeline.text.wording import did_you_mean, quoted
+from pipeline.files.mark_table import MARK_TABLES, MarkJson, scaled_mark
+from pipeline.text.table_models import key_rows
+from pipeline.text.wording import did_you_mean, quoted, table_lines
 
 PREFIX = "library:"
 FOLDER = Path(__file__).parents[1] / "cameras"
@@ -125,34 +127,14 @@ _PLACES: Mapping[str, Mapping[str, Point]] = {  # in units of the distances, num
 _NAMES = {"square": "corner", "side": "side"}  # of the tables [mark.NAME]
 
 
-# Lines of the tables [mark.NAME], for aerial cameras; sizes in <> are scaled with the distances of the marks.
-_CROSS = """arm_mm = <1.75>  # half its length
-line_mm = <0.12>
-gap_mm = <0.25>  # half the gap in its middle; 0: none
-angle_deg = {angle}  # 0 upright, 45 diagonal
-"""
-_RING = """ring_mm = <0.8>  # mean radius
-ring_line_mm = <0.17>
-"""
-_PARTS = """[[mark.{name}.part]]
-shape = "ring"
-radius_mm = <1.6>
-line_mm = <0.17>
-[[mark.{name}.part]]
-shape = "bar"
-from_mm = [<-1.2>, 0.0]
-to_mm = [<1.2>, 0.0]
-line_mm = <0.12>
-[[mark.{name}.part]]
-shape = "bar"
-from_mm = [0.0, <-1.2>]
-to_mm = [0.0, <1.2>]
-line_mm = <0.12>
-[[mark.{name}.part]]
-shape = "disk"
-center_mm = [<2.4>, 0.0]
-radius_mm = <0.25>
-"""
+_CROSS = {"arm_mm": 1.75, "line_mm": 0.12, "gap_mm": 0.25, "angle_deg": 0.0}
+_RING = {"ring_mm": 0.8, "ring_line_mm": 0.17}
+_PARTS = [
+    {"shape": "ring", "radius_mm": 1.6, "line_mm": 0.17},
+    {"shape": "bar", "from_mm": [-1.2, 0.0], "to_mm": [1.2, 0.0], "line_mm": 0.12},
+    {"shape": "bar", "from_mm": [0.0, -1.2], "to_mm": [0.0, 1.2], "line_mm": 0.12},
+    {"shape": "disk", "center_mm": [2.4, 0.0], "radius_mm": 0.25},
+]
 
 
 @dataclass(frozen=True)
@@ -161,24 +143,16 @@ class MarkKind:
 
     Attributes
     ----------
-    lines : of the table [mark.NAME].
+    drawing : content of the table [mark.NAME], for aerial cameras.
     reach_mm : extent from the mark's point.
     edge_mm : distance of the frame's edge beyond the point of a side mark; None for free-standing marks.
     at : where the kind is used: "square" (corners), "side".
     """
 
-    lines: str
+    drawing: MarkJson
     reach_mm: float = 0.0
     edge_mm: float | None = None
     at: tuple[str, ...] = ("square", "side")
-
-    def drawn(self, scale: float, **words: str) -> list[str]:
-        """Lines of the table at a scale, with words in the place of their names."""
-        text = self.lines
-        for name, word in words.items():
-            text = text.replace(f"{{{name}}}", word)
-        text = re.sub("<([-.0-9]+)>", lambda size: f"{scale * float(size[1]):.3g}", text)
-        return [_line(*line.split("  # ")) if "#" in line else line for line in text.splitlines()]
 
 
 def _line(text: str, comment: str) -> str:
@@ -186,26 +160,24 @@ def _line(text: str, comment: str) -> str:
 
 
 def _polygon(*vertices_mm: Point) -> MarkKind:
-    """Solid mark of a side, drawn for the right side."""
-    corners = ", ".join(f"[<{x}>, <{y}>]" for x, y in vertices_mm)
+    """Solid mark of a side, drawn for the right side, x outwards."""
     edge_mm = max(x for x, _ in vertices_mm) or min(x for x, _ in vertices_mm)
-    lines = f'vertices_mm = [{corners}]\nrotate = "radial"  # drawn as on the right, x outwards\n'
-    return MarkKind(lines, 0.0, edge_mm, ("side",))
+    drawing = {"kind": "polygon", "vertices_mm": list(map(list, vertices_mm)), "rotate": "radial"}
+    return MarkKind(drawing, 0.0, edge_mm, ("side",))
 
 
 MARK_KINDS: Mapping[str, MarkKind] = {
-    "cross": MarkKind(_CROSS, 1.75),
-    "dot": MarkKind("radius_mm = <0.25>", 0.25),
-    "ring-cross": MarkKind(_RING + _CROSS, 1.75),
-    "ring-dot": MarkKind(_RING + "radius_mm = <0.2>", 0.9),
+    "cross": MarkKind({"kind": "cross", **_CROSS}, 1.75),
+    "dot": MarkKind({"kind": "dot", "radius_mm": 0.25}, 0.25),
+    "ring-cross": MarkKind({"kind": "ring-cross", **_RING, **_CROSS}, 1.75),
+    "ring-dot": MarkKind({"kind": "ring-dot", **_RING, "radius_mm": 0.2}, 0.9),
     "wedge": _polygon((0.0, 0.0), (3.0, 1.8), (3.0, -1.8)),
     "notch": _polygon((0.0, 0.0), (-2.5, 1.5), (-2.5, -1.5)),
     "wing": _polygon((0.0, 0.0), (0.0, 4.1), (3.15, 6.4), (3.15, -6.4), (-3.1, -2.0), (-3.15, -1.8), (-3.15, 0.0)),
-    "parts": MarkKind(_PARTS, 2.65),
-    "frame-corner": MarkKind("", 0.0, 0.0, ("square",)),
-    "learned": MarkKind("size_mm = <6>  # width of its picture", 3.0),
+    "parts": MarkKind({"kind": "parts", "part": _PARTS}, 2.65),
+    "frame-corner": MarkKind({"kind": "frame-corner"}, 0.0, 0.0, ("square",)),
+    "learned": MarkKind({"kind": "learned", "size_mm": 6.0}, 3.0),
 }
-_WRITTEN = {"wedge": "polygon", "notch": "polygon", "wing": "polygon"}  # names in the camera file
 
 
 @dataclass(frozen=True)
@@ -325,10 +297,22 @@ def camera_template(sizes: CameraSizes) -> str:
             xy_mm = f"[{right * size[0]:g}, {up * size[1]:g}]"
             lines.append(f'    {{id = "{id}", xy_mm = {xy_mm}, sigma_mm = 1.0, mark = "{_NAMES[place]}"}},')
     lines.append("]")
-    for place, (kind, _) in sizes.kinds.items():
-        lines += ["", f"[mark.{_NAMES[place]}]", f"kind = {quoted(_WRITTEN.get(kind, kind))}"]
-        if kind != "learned":
-            lines.append(_line('polarity = "auto"', "light or dark, where all scans have it so"))
-        angle = "45" if place == "square" else "0"
-        lines += MARK_KINDS[kind].drawn(sizes.scale, name=_NAMES[place], angle=angle)
-    return "\n".join(lines) + "\n"
+    drawings = {_NAMES[place]: _drawing(kind, place, sizes.scale) for place, (kind, _) in sizes.kinds.items()}
+    return "\n".join([*lines, *_commented(drawings)]) + "\n"
+
+
+def _drawing(kind: str, place: str, scale: float) -> MarkJson:
+    """Content of the table of a kind of mark; crosses in corners are diagonal."""
+    drawing = scaled_mark(MARK_KINDS[kind].drawing, scale)
+    polarity = {} if kind == "learned" else {"polarity": "auto"}
+    turned = {"angle_deg": 45.0} if "angle_deg" in drawing and place == "square" else {}
+    return {"kind": drawing["kind"], **polarity, **drawing, **turned}
+
+
+def _commented(drawings: Mapping[str, MarkJson]) -> Iterator[str]:
+    """Yield the lines of the tables [mark.NAME], each key of a mark with its meaning."""
+    for name, drawing in drawings.items():
+        meanings = {row.name: row.meaning for row in key_rows(MARK_TABLES[drawing["kind"]]) if row.name != "kind"}
+        for line in table_lines({"mark": {name: drawing}}):
+            meaning = meanings.get(line.partition(" = ")[0])
+            yield _line(line, meaning) if meaning and len(line) < 40 else line

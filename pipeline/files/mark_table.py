@@ -33,8 +33,10 @@ from pipeline.types import Array
 
 Picture = NDArray[np.uint16]
 SavePicture = Callable[[str, Picture], str]
+MarkJson = Mapping[str, Any]  # content of a table [mark.NAME]
 
 _FULL = 65535
+_DECIMALS = 4  # of values in mm: 0.1 µm
 _ANY_CORNER = (-1.0, -1.0)  # placeholder: the fiducial's place determines the quadrant
 
 
@@ -437,3 +439,29 @@ def _part(table: Table) -> shapes.Part:
     given: Any = read_kind(table, _PARTS, "shape")
     plain: type[shapes.Part] = type(given).__bases__[0]
     return plain(**{field.name: getattr(given, field.name) for field in dataclasses.fields(plain)})
+
+
+def scaled_mark(mark: MarkJson, factor: float) -> MarkJson:
+    """Scale all lengths of a mark by a factor."""
+
+    def scaled(key: str, value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {name: scaled(name, one) for name, one in value.items()}
+        if isinstance(value, list):
+            return [scaled(key, one) for one in value]
+        return value * factor if key.endswith("_mm") else value
+
+    return rounded_mark({key: scaled(key, value) for key, value in mark.items()})
+
+
+def rounded_mark(mark: MarkJson) -> MarkJson:
+    """Round all numbers of a mark to 0.1 µm."""
+
+    def rounded(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {name: rounded(one) for name, one in value.items()}
+        if isinstance(value, list):
+            return [rounded(one) for one in value]
+        return round(float(value), _DECIMALS) if isinstance(value, float | int) else value
+
+    return {key: rounded(value) for key, value in mark.items()}

@@ -221,7 +221,7 @@ def read_plain(kind: type[Record], record: Mapping[str, Any]) -> Record:
     values: dict[str, Any] = {}
     for name, hint in get_type_hints(kind).items():
         if (value := record.get(name)) is not None:
-            inner = next((each for each in (hint, *get_args(hint)) if is_dataclass(each)), None)
+            inner: Any = next((each for each in (hint, *get_args(hint)) if is_dataclass(each)), None)
             if inner is not None:
                 values[name] = read_plain(inner, value)
             else:

@@ -20,7 +20,7 @@ from measure.matching.models import MatchOptions
 from measure.scans.scan import Scan
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
-from pipeline.files.mark_table import MARK_TABLES, Clicks
+from pipeline.files.mark_table import MARK_TABLES, Clicks, MarkJson, scaled_mark
 from pipeline.review.camera_drawing import (
     MARK,
     CameraDrawing,
@@ -39,13 +39,11 @@ from pipeline.review.camera_drawing import (
 from pipeline.review.frame_view import camera_as_shown, check_clicks, outlines_px
 from pipeline.review.mark_handles import (
     Handle,
-    MarkJson,
     add_vertex,
     first_drawing,
     first_part,
     handles,
     remove_part,
-    scaled_mark,
 )
 from pipeline.review.pictures import Pictures, window_start
 from pipeline.review.requests import DrawnCamera, Query, ShownMarks, parse_values

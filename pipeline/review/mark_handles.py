@@ -5,7 +5,7 @@ the place to which one was dragged.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -14,11 +14,9 @@ import numpy as np
 
 from measure.marks.shapes import Point
 from pipeline.errors import InputError
+from pipeline.files.mark_table import MarkJson, rounded_mark
 from pipeline.types import Array
 
-MarkJson = Mapping[str, Any]
-
-_DECIMALS = 4  # of values in mm: 0.1 µm
 _LEAST_MM = 1e-3
 _RING_DEG, _LINE_DEG = 22.5, -22.5  # degrees, handles on a ring, clear of upright and diagonal arms
 _LINE_AT = 0.7  # fraction of an arm's length at which the handle of its width lies
@@ -91,7 +89,7 @@ def first_drawing(kind: str, size_mm: float) -> MarkJson:
     }
     if kind not in starts:
         raise InputError(f"{kind!r} is no kind of mark; {', '.join(starts)} are.")
-    return _rounded({"kind": kind, **starts[kind]})
+    return rounded_mark({"kind": kind, **starts[kind]})
 
 
 def first_part(shape: str, size_mm: float) -> MarkJson:
@@ -105,20 +103,7 @@ def first_part(shape: str, size_mm: float) -> MarkJson:
     }
     if shape not in parts:
         raise InputError(f"{shape!r} is no shape of a part; {', '.join(parts)} are.")
-    return _rounded({"shape": shape, **parts[shape]})
-
-
-def scaled_mark(mark: MarkJson, factor: float) -> MarkJson:
-    """Scale all lengths of a mark by a factor."""
-
-    def scaled(key: str, value: Any) -> Any:
-        if isinstance(value, Mapping):
-            return {name: scaled(name, one) for name, one in value.items()}
-        if isinstance(value, list):
-            return [scaled(key, one) for one in value]
-        return value * factor if key.endswith("_mm") else value
-
-    return _rounded({key: scaled(key, value) for key, value in mark.items()})
+    return rounded_mark({"shape": shape, **parts[shape]})
 
 
 def add_vertex(mark: MarkJson, place_mm: Array) -> MarkJson:
@@ -131,7 +116,7 @@ def add_vertex(mark: MarkJson, place_mm: Array) -> MarkJson:
         along = np.sum((place_mm - starts) * sides, axis=1) / np.maximum(np.sum(sides**2, axis=1), 1e-12)
         nearest = starts + np.clip(along, 0.0, 1.0)[:, None] * sides
         at = int(np.hypot(*(place_mm - nearest).T).argmin()) + 1
-    return _rounded({**mark, "vertices_mm": [*vertices[:at], place_mm.tolist(), *vertices[at:]]})
+    return rounded_mark({**mark, "vertices_mm": [*vertices[:at], place_mm.tolist(), *vertices[at:]]})
 
 
 def remove_part(mark: MarkJson, key: str) -> MarkJson:
@@ -149,17 +134,6 @@ def remove_part(mark: MarkJson, key: str) -> MarkJson:
 
 def _remove_item(values: list[Any], at: int) -> list[Any]:
     return [*values[:at], *values[at + 1 :]]
-
-
-def _rounded(mark: MarkJson) -> MarkJson:
-    def rounded(value: Any) -> Any:
-        if isinstance(value, Mapping):
-            return {name: rounded(one) for name, one in value.items()}
-        if isinstance(value, list):
-            return [rounded(one) for one in value]
-        return round(float(value), _DECIMALS) if isinstance(value, float | int) else value
-
-    return {key: rounded(value) for key, value in mark.items()}
 
 
 def _unit(angle_deg: float) -> Array:
@@ -189,7 +163,7 @@ def _place(mark: MarkJson, key: str) -> Handle:
 
 
 def _changed(mark: MarkJson, key: str, value: Any) -> MarkJson:
-    return _rounded({**mark, key: value})
+    return rounded_mark({**mark, key: value})
 
 
 def _drag_item(mark: MarkJson, key: str, at: int, dragged: Callable[[Array], Any], place: Array) -> MarkJson:
