@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from difflib import SequenceMatcher
 
 import numpy as np
-from numpy.typing import NDArray
 
+from measure.array_types import Array
 from measure.geometry import pose_in_camera, up_from_camera
 from measure.marks.shapes import Side, WrittenPlace
 
@@ -37,7 +37,6 @@ _TYPES = (
 )
 _MAKERS = {"ILD": "Wild", "UAG": "Wild", "RMK": "Zeiss", "ZEISS": "Zeiss", "LMK": "Jena", "FAIRCHILD": "Fairchild"}
 _FILM = re.compile(r"KODAK|SAFETY|\bFILM\b|ESTAR|AGFA|GEVAERT|AVIPHOT|ILFORD|FERRANIA|AEROGRAPHIC|PLUS.?X|DOUBLE.?X")
-Array = NDArray[np.float64]
 
 _A_CHARACTER = 1.4  # log-odds of an orientation for each legible character more than in another one
 # Log-odds that a line lies where the camera writes rather than by chance, among four sides with two directions. On

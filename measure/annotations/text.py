@@ -22,11 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.annotations.lines import Line, Reading, read_from_one_face
-from measure.array_types import Array
+from measure.array_types import Array, Bytes
 from measure.marks.shapes import Side
 from measure.scans.scan import Scan
-
-Picture = NDArray[np.uint8]
 
 PACKAGE = "rapidocr_onnxruntime"
 MISSING = (
@@ -133,7 +131,7 @@ class Place:
         return cv2.pointPolygonTest(outline, other.center_px, False) >= 0
 
 
-def find_writing(picture: Picture, networks: Networks) -> list[Place]:
+def find_writing(picture: Bytes, networks: Networks) -> list[Place]:
     """Detect the lines of text in an image (rows, columns), in arbitrary order."""
     probability = _probability(picture, networks)
     written = (probability > _WRITTEN).astype(np.uint8)
@@ -142,7 +140,7 @@ def find_writing(picture: Picture, networks: Networks) -> list[Place]:
     return [place for place in places if place is not None]
 
 
-def _probability(picture: Picture, networks: Networks) -> NDArray[np.float32]:
+def _probability(picture: Bytes, networks: Networks) -> NDArray[np.float32]:
     height, width = picture.shape
     below, right = -height % _MULTIPLE_PX, -width % _MULTIPLE_PX
     padded = cv2.copyMakeBorder(picture, 0, below, 0, right, cv2.BORDER_REPLICATE)
@@ -171,18 +169,18 @@ def _mean_probability(contour: NDArray[np.int32], probability: NDArray[np.float3
     return float(probability[row : row + height, col : col + width][inside > 0].mean())
 
 
-def read_ways(line: Picture, networks: Networks) -> Mapping[str, Reading]:
+def read_ways(line: Bytes, networks: Networks) -> Mapping[str, Reading]:
     """Read the image of a line (HEIGHT_PX, width) in all four orientations: upright, upside down, mirrored, both."""
     ways = (line, line[::-1, ::-1], line[:, ::-1], line[::-1])  # one by one, which takes a quarter of the memory
     return {way: _read(turned, networks) for way, turned in zip(WAYS, ways, strict=True)}
 
 
-def _read(picture: Picture, networks: Networks) -> Reading:
+def _read(picture: Bytes, networks: Networks) -> Reading:
     networks.recognition.setInput(_input(picture))
     return _decoded(np.asarray(networks.recognition.forward()[0]), networks.characters)
 
 
-def _input(picture: Picture) -> NDArray[np.float32]:
+def _input(picture: Bytes) -> NDArray[np.float32]:
     """(1, 3, rows, columns) values from -1 to 1, as the networks take an image."""
     grey = np.asarray(picture, np.float32) / 127.5 - 1.0
     return np.ascontiguousarray(np.repeat(grey[None, None], 3, axis=1))
@@ -241,7 +239,7 @@ class _Strip:
     """A side of the scan as an image from left to right. scan_from_strip (2, 3): pixels; poses: orientation in the scan
     by orientation in the strip; found: reduction factors of the images for detection."""
 
-    picture: Picture
+    picture: Bytes
     side: Side
     scan_from_strip: Array
     poses: Mapping[str, str]
@@ -271,7 +269,7 @@ class _Strip:
             side=self.side,
         )
 
-    def _cut(self, place: Place) -> Picture:
+    def _cut(self, place: Place) -> Bytes:
         """Rectified image of a line (HEIGHT_PX, width)."""
         scale = place.height_px / HEIGHT_PX
         width = int(np.clip(round(place.length_px / scale), HEIGHT_PX // 2, _LONGEST_PX))
@@ -330,6 +328,6 @@ def _side_range(scan: Scan, side: Side, frame_px: Array | None) -> tuple[Array, 
     return low, high, longer_px
 
 
-def _to_8_bits(grey: NDArray[np.float32]) -> Picture:
+def _to_8_bits(grey: NDArray[np.float32]) -> Bytes:
     black, white = np.percentile(grey[::2, ::2], (_BLACK, _WHITE))
     return np.ascontiguousarray((255 * (grey - black) / max(white - black, 1e-9)).clip(0, 255), np.uint8)

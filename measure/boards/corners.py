@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.array_types import Array, Single
+from measure.array_types import Array, Indices, Single
 from measure.flags import NO_REASON, Code, Reason
 from measure.matching.gauss_newton import UNDETERMINED, UNSETTLED
 from measure.matching.models import PIXEL_VARIANCE_PX2
@@ -108,7 +108,6 @@ def _gauss_legendre(nodes: int) -> list[tuple[float, float]]:
     return list(zip(*(each.tolist() for each in np.polynomial.legendre.leggauss(nodes)), strict=True))
 
 
-Indices = NDArray[np.intp]
 _SCALE_FLOOR = 0.05  # fraction of the contrast, floor of Tukey's scale: sharpening and tone curves are not damage
 _MAX_ITERATIONS = 30  # per stage
 _UNDAMAGED = 0.05  # robust weight below which a pixel counts as an outlier

@@ -7,8 +7,8 @@ from itertools import islice
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from measure.array_types import Array, Bytes, Integers
 from measure.boards.lattice import find_squares
 from measure.boards.markers import find_aruco, find_charuco, read_any_markers
 from measure.boards.specs import (
@@ -22,10 +22,6 @@ from measure.boards.specs import (
 from measure.flags import NO_REASON, Code, Reason
 from measure.scans.scan import Scan
 from measure.targets.sheets import fit_view_robustly
-
-Array = NDArray[np.float64]
-Bytes = NDArray[np.uint8]
-Integers = NDArray[np.int64]
 
 _UNEVEN = 0.25  # in squares, largest median deviation of a line from a regular grid; next to a skipped line it is 0.5
 _TRUSTED = 0.1  # in squares, largest deviation of any corner accepted from OpenCV's older detector

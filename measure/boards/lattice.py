@@ -7,16 +7,13 @@ from itertools import product
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from measure.array_types import Array, Bytes, Integers
 from measure.boards.specs import CircleGridSpec, FoundBoard, FoundCorner, SquareGridSpec, corners_of_square
 from measure.flags import NO_REASON, Code, Reason
 
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
 Place = tuple[int, int]
-Bytes = NDArray[np.uint8]
 
 _NEIGHBOURS = 8  # of a point: those that touch its square
 _STEP_TOLERANCE = 0.3  # in steps, between expected and actual place of a neighbour

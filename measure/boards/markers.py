@@ -7,8 +7,8 @@ from typing import Any, TypeVar, cast
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from measure.array_types import Array, Bytes
 from measure.boards.lattice import homography_steps
 from measure.boards.specs import (
     AprilGridSpec,
@@ -22,8 +22,6 @@ from measure.boards.specs import (
 from measure.flags import NO_REASON, Code, Reason
 from measure.targets.sheets import SheetView, fit_view_robustly
 
-Array = NDArray[np.float64]
-Bytes = NDArray[np.uint8]
 Markers = Mapping[int, Array]  # the corners (4, 2) of each on its board, by number
 Changes = dict[str, Any]
 Layout = TypeVar("Layout", ArucoSpec, CharucoSpec)

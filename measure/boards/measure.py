@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from measure.array_types import Array
 from measure.boards.corners import Corner, CornerStart, Surface, crossing, fit_corners, quarter
 from measure.boards.find import find_board
 from measure.boards.lattice import Place, find_grid
@@ -28,8 +28,6 @@ from measure.scans.scan import Scan
 from measure.targets.block_search import Candidate, Patches
 from measure.targets.detection import DiskSearch, disk_candidates
 from measure.targets.disks import FittedDisk, fit_plain_disks
-
-Array = NDArray[np.float64]
 
 _MIRROR = np.array([-1.0, 1.0])  # of column and row
 _SMALLEST_DOT_PX = 5.0  # px, diameter

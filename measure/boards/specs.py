@@ -11,12 +11,11 @@ from typing import ClassVar
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from measure.array_types import Array
 from measure.flags import NO_REASON, Reason
 
 Point3 = tuple[float, float, float]
-Array = NDArray[np.float64]
 
 
 class _Spec:

@@ -14,9 +14,9 @@ from typing import Literal
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from measure.array_types import Array, Mask, Single
+from measure.array_types import Array, Indices, Mask, Single
 from measure.geometry import Affine, linear_scale
 from measure.marks.shapes import (
     Bar,
@@ -31,8 +31,6 @@ from measure.marks.shapes import (
     known_outline_mm,
     outline_mm,
 )
-
-Integers = NDArray[np.intp]
 
 _DRAWINGS = 16  # cached drawings, more than a camera has kinds of marks
 ROUGH_CELLS = 2  # cells along a pixel's side, for images exact to 0.01
@@ -179,7 +177,7 @@ class _Drawing:
 
     sharp: Single
     cells: int
-    first: Integers
+    first: Indices
     shift_px: Array
 
 
@@ -228,7 +226,7 @@ def _drawing(mark: MarkShape, pixel_from_mark: Array, blur_px: float, cells: int
 
 
 @lru_cache(maxsize=_DRAWINGS)
-def _sharp_cells(mark: MarkShape, linear: bytes, origin_px: tuple[float, float], cells: int) -> tuple[Single, Integers]:
+def _sharp_cells(mark: MarkShape, linear: bytes, origin_px: tuple[float, float], cells: int) -> tuple[Single, Indices]:
     """Draw the mark in cells with its origin at origin_px from a pixel's centre. Returns the cells and that pixel (col,
     row). Marks of the same drawing share the cached result."""
     place = np.column_stack([np.frombuffer(linear).reshape(2, 2), origin_px])
@@ -359,8 +357,8 @@ class _Pieces:
     """Outline of a part, cut into n pieces, each within one cell. row, col: (n,) of the cell; tall: (n,) height,
     positive downwards; middle: (n,) column of the centre."""
 
-    row: Integers
-    col: Integers
+    row: Indices
+    col: Indices
     tall: Array
     middle: Array
 
@@ -410,7 +408,7 @@ def _circle(part: Disk | Ring, radius_mm: float, cell_from_mark: Array) -> Array
     return np.asarray(part.center_mm + corner_mm * np.stack([np.cos(angles), np.sin(angles)], axis=1))
 
 
-def _split(start: Array, end: Array, part_of: Integers, axis: int) -> tuple[Array, Array, Integers]:
+def _split(start: Array, end: Array, part_of: Indices, axis: int) -> tuple[Array, Array, Indices]:
     """Cut lines, start and end (n, 2), at integers of a coordinate. Returns start, end and part number of the pieces in
     order."""
     first, last = np.floor(start[:, axis]), np.floor(end[:, axis])

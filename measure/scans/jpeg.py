@@ -36,6 +36,7 @@ from scipy.fft import dct
 from scipy.special import ndtri, stdtrit
 from tifffile import TiffFile, TiffPage
 
+from measure.array_types import Array
 from measure.errors import MeasurementError
 from measure.flags import JPEG_GRID, JPEG_STEP
 from measure.scans.cache import OpenedPicture, WholePicture
@@ -74,7 +75,6 @@ _DQT = 0xDB
 UNKNOWN_DN = 15.0  # where a file does not say it: as at quality 50, which no scan should be below
 _INKS = 4  # components
 _COARSE = 15  # coefficients in the order of the table: up to two periods in a block of 8 px, as blurred edges have them
-Array = NDArray[np.float64]
 
 BLOCK_PX = 8  # a side of a block (ITU-T T.81)
 _PERIODS = 5  # coefficients (u, v) with 0 < u + v below it: up to two periods in a block, as blurred edges have them

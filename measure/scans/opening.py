@@ -30,7 +30,6 @@ from measure.scans.tiff import TIFF_STARTS, open_tiff, tiff_colour_tags
 from measure.tone.curve import Tone
 from measure.tone.declared import tone_of_tags
 
-Array = NDArray[np.float32]
 _HEADERS_BYTES = 1 << 18  # head of a JPEG or PNG file: profiles and Exif blocks are smaller
 _END_BYTES = 1 << 16  # end of a complete JPEG or PNG file, which holds the end marker
 _BAND_PX = 1 << 18  # approximate number of pixels read at a time

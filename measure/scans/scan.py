@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.array_types import Single
 from measure.scans.cache import LostPart, OpenedPicture, SegmentCache, Segments
 from measure.scans.jpeg import earlier_step_dn
 from measure.scans.metadata import Pitch, Samples
@@ -19,8 +20,6 @@ from measure.scans.parallel import map_in_threads
 from measure.scans.remote import ScanPart, Window
 from measure.scans.tiff_segments import RawRows
 from measure.tone.curve import LINEAR, Tone
-
-Array = NDArray[np.float32]
 
 LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601: red, green, blue
 _GREEN = (0.0, 1.0, 0.0)
@@ -70,7 +69,7 @@ class Scan:
         self._segments = segments
         self._cache = SegmentCache(segments)
         self._source = segments if isinstance(segments, RawRows) else self._cache
-        self._reduced: dict[int, Array] = {}
+        self._reduced: dict[int, Single] = {}
         self._overviews = [Scan(path, own, pitch) for own in opened.overviews]
         self._grey_weights: Sequence[float] = (1.0,) if self.channels == 1 else LUMINANCE
 
@@ -135,7 +134,7 @@ class Scan:
         aberration scales red and blue by some 1e-4, so that a mark in a mixture of channels has no unique place."""
         return self.replace_weights(_GREEN) if self.weights == LUMINANCE else self
 
-    def window(self, col0: int, row0: int, width: int, height: int, weights: Sequence[float] | None = None) -> Array:
+    def window(self, col0: int, row0: int, width: int, height: int, weights: Sequence[float] | None = None) -> Single:
         """(height, width) float32 grey values; outside of the scan its edge is repeated.
 
         weights: (channels,) of the channels; None: the grey value itself, or the luminance of a colour.
@@ -144,7 +143,7 @@ class Scan:
             raise ValueError(f"a window has at least one pixel, not {width} x {height}")
         return weighted(self.samples(col0, row0, width, height), self._weights(weights))
 
-    def light(self, col0: int, row0: int, width: int, height: int, weights: Sequence[float] | None = None) -> Array:
+    def light(self, col0: int, row0: int, width: int, height: int, weights: Sequence[float] | None = None) -> Single:
         """(height, width) window in linear light, by the tone curve: blur is linear in light, so marks are fitted
         there."""
         if not self.tone.sharpening:
@@ -220,7 +219,7 @@ class Scan:
         )
         return f"the scan's file is damaged: {what}"
 
-    def reduced(self, factor: int, weights: Sequence[float] | None = None) -> Array:
+    def reduced(self, factor: int, weights: Sequence[float] | None = None) -> Single:
         """Reduce the whole scan by area averages over factor x factor pixels.
 
         The centre of pixel (i, j) lies at column factor * j + (factor - 1) / 2; partial rows and columns at the end are
@@ -236,13 +235,13 @@ class Scan:
         return weighted(self._reduced[factor], self._weights(weights))
 
     @property
-    def last_reduction(self) -> tuple[int, Array] | None:
+    def last_reduction(self) -> tuple[int, Single] | None:
         """Factor and grey values of the last reduction of the whole scan; None before the first one."""
         return next(((f, weighted(grey, self._grey_weights)) for f, grey in self._reduced.items()), None)
 
     def reduced_window(
         self, factor: int, col0: int, row0: int, width: int, height: int, weights: Sequence[float] | None = None
-    ) -> Array:
+    ) -> Single:
         """(height, width) window of the reduced scan from its column col0 and row row0, decoded on its own; outside of
         the scan its edge is repeated."""
         return weighted(self._reduced_part(factor, col0, row0, width, height), self._weights(weights))
@@ -285,7 +284,7 @@ class Scan:
         step_dn = unit * earlier_step_dn(luminance / np.float32(unit))
         return step_dn if step_dn > _PLAINLY_COARSER * self._segments.rounding_step_dn else 0.0
 
-    def _reduced_channels(self, factor: int, width: int, height: int) -> Array:
+    def _reduced_channels(self, factor: int, width: int, height: int) -> Single:
         """(height, width, channels) reduction of the whole scan; every segment is decoded once."""
         if overview := self._overview(factor):
             return overview._enlarged_to(self, factor, width, height)
@@ -308,7 +307,7 @@ class Scan:
         fine = [one for one in self._overviews if one.width_px * factor >= self.width_px]
         return min(fine, key=lambda one: one.width_px, default=None)
 
-    def _reduced_part(self, factor: int, col0: int, row0: int, width: int, height: int) -> Array:
+    def _reduced_part(self, factor: int, col0: int, row0: int, width: int, height: int) -> Single:
         """(height, width, channels) window of the reduced scan."""
         if overview := self._overview(factor):
             whole, scale, shift = overview._steps_to(self, factor)
@@ -319,7 +318,7 @@ class Scan:
             return _interpolated(means_, scale, scale * first + shift - low, width, height)
         return means(self.samples(col0 * factor, row0 * factor, width * factor, height * factor), factor)
 
-    def _enlarged_to(self, scan: "Scan", factor: int, width: int, height: int) -> Array:
+    def _enlarged_to(self, scan: "Scan", factor: int, width: int, height: int) -> Single:
         """Resample this overview to the size of its scan reduced by a factor."""
         whole, scale, shift = self._steps_to(scan, factor)
         means_ = self._reduced_channels(whole, self.width_px // whole, self.height_px // whole)
@@ -342,8 +341,8 @@ class Scan:
 
 
 def _interpolated(
-    picture: Array, scale: NDArray[np.float64], shift: NDArray[np.float64], width: int, height: int
-) -> Array:
+    picture: Single, scale: NDArray[np.float64], shift: NDArray[np.float64], width: int, height: int
+) -> Single:
     """(height, width, channels) image (rows, columns, channels) sampled in steps of scale (x, y) from shift (x, y)."""
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     matrix = np.column_stack([np.diag(scale), shift])
@@ -357,7 +356,7 @@ def _reduced_side(fine_px: int, factor: int, most_px: int) -> int:
     return max((unit * max(most_px // unit, 1) if unit <= _LARGEST_PART_PX else most_px) // factor, 1)
 
 
-def means(samples: Samples | Array, factor: int) -> Array:
+def means(samples: Samples | Single, factor: int) -> Single:
     """(height / factor, width / factor, channels) means of samples (height, width, channels) over squares."""
     height, width, channels = samples.shape
     result = np.empty((height // factor, width // factor, channels), np.float32)
@@ -378,7 +377,7 @@ def _reduction_steps(factor: int) -> tuple[int, ...]:
     return (factor,) if factor > 1 else ()
 
 
-def weighted(samples: Samples | Array, weights: Sequence[float]) -> Array:
+def weighted(samples: Samples | Single, weights: Sequence[float]) -> Single:
     """(..., height, width) float32 grey values of (..., height, width, channels) samples."""
     grey = samples[..., 0].astype(np.float32)
     if weights[0] != 1.0:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from measure.array_types import Array, Single
 from measure.scans.metadata import Samples
 from measure.scans.parallel import map_in_threads
 from measure.scans.scan import Scan, means, weighted
@@ -19,10 +20,8 @@ from measure.scans.scan import Scan, means, weighted
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-Image = NDArray[np.float32]
 
 Record = TypeVar("Record", bound="DataclassInstance")
-Array = NDArray[np.float64]
 
 _WIDEST_PX = 1536  # width of a part that is searched with one level of texture and noise
 ROW_BYTES, BLOCK_BYTES = 1 << 14, 1 << 24  # largest block, without its margin; strips are not divided
@@ -49,7 +48,7 @@ class Block:
         end = np.minimum(np.add(self.place_px, self.size_px), (self.scan.width_px, self.scan.height_px))
         return np.asarray((places >= first[:, None]) & (places < end[:, None]))
 
-    def grey_values(self, corners: NDArray[np.intp], col: NDArray[np.intp], row: NDArray[np.intp]) -> Image:
+    def grey_values(self, corners: NDArray[np.intp], col: NDArray[np.intp], row: NDArray[np.intp]) -> Single:
         """(n, count) grey values at columns and rows (n, count) counted from corners (n, 2) in the scan; arbitrary ones
         outside the block."""
         width, height = self.size_px
@@ -57,10 +56,10 @@ class Block:
         at += (corners - self.place_px) @ np.array([[1], [width]])
         return weighted(self.samples.reshape(width * height, -1).take(at, axis=0, mode="clip"), self.scan.weights)
 
-    def reductions(self, factors: Iterable[int]) -> dict[int, Image]:
+    def reductions(self, factors: Iterable[int]) -> dict[int, Single]:
         """Area averages of the grey values by each factor, computed from the coarsest finer one that divides it. Each
         halving of stored samples rounds to whole grey values."""
-        known: dict[int, Image] = {}
+        known: dict[int, Single] = {}
         for factor in sorted(factors):
             finer = [other for other in known if factor % other == 0]
             if finer:
@@ -70,7 +69,7 @@ class Block:
         return known
 
 
-def _halved_means(samples: Samples, factor: int) -> Samples | Image:
+def _halved_means(samples: Samples, factor: int) -> Samples | Single:
     """(height / factor, width / factor, channels) means over squares. An even factor is taken by repeated halving, with
     rounded grey values: a quarter of the time, and exact enough for a search."""
     while factor % 2 == 0:
@@ -144,7 +143,7 @@ class Octave:
 
     factor: int
     margin: int
-    find: Callable[[Image], Patches]
+    find: Callable[[Single], Patches]
 
     @property
     def margin_px(self) -> int:

@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import fdtrc
 
+from measure.array_types import Array, Mask
 from measure.noise.robust_estimation import MEDIAN_EFFICIENCY, STUDENT_FREEDOM, student_weights
 from measure.targets.sheets import SheetView, fit_view_robustly, focal_length
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # Prior standard deviations, in image diagonals: shift, scale and shear; radial distortion of degree 3, 5 and 7 in the
 # corners; decentring of the third degree; candidates for the polynomials of degree 2 to 5, chosen by the targets.

@@ -15,16 +15,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.array_types import Array, Mask, Single
 from measure.marks.shapes import Polarity
 from measure.noise.robust_estimation import robust_scale
 from measure.scans.scan import Scan
 from measure.targets.block_search import Block, Candidate, Octave, Patches, concatenate, search_blocks
 from measure.targets.disk_fit_batch import fit_disks
 
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
-Sampler = Callable[[NDArray[np.intp], Array], Image]
+Sampler = Callable[[NDArray[np.intp], Array], Single]
 
 _RAYS, _FEW_RAYS = 32, (8, 16)  # of an outline, and of the quick tests before it: the first rejects half of the blobs
 REACH = 3.0  # radii of a blob within which its patch must end
@@ -90,7 +88,7 @@ class Outlines:
 _NONE = Outlines(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0))
 
 
-def blob_outlines(image: Image, blobs: Blobs) -> Outlines:
+def blob_outlines(image: Single, blobs: Blobs) -> Outlines:
     """Outlines of the light blobs that end on every ray; most structures of a landscape go on along some ray."""
     near, between = partial(_nearest_values, image), partial(_interpolated_values, image)
     found = []
@@ -129,7 +127,7 @@ class _Profiles:
         is_below = (self.values[1:].min(axis=0) < self.level).all(axis=0)
         self.ends = (self.values[0, 0] >= self.level) & is_below & (self.height >= _LEAST_HEIGHT * blobs.contrast)
 
-    def radii(self) -> Image:
+    def radii(self) -> Single:
         """(rays, blobs that end) distance at which a ray falls below half the height, px."""
         values, level = self.values[..., self.ends], self.level[self.ends]
         last = (values < level).argmax(axis=0)[None] - 1
@@ -138,7 +136,7 @@ class _Profiles:
         return np.asarray(self.step_px * (last[0] + np.clip(share, 0.0, 1.0)), np.float32)
 
 
-def _nearest_values(image: Image, places: NDArray[np.intp], offsets: Array) -> Image:
+def _nearest_values(image: Single, places: NDArray[np.intp], offsets: Array) -> Single:
     """(steps, rays, n) nearest pixel values at offsets (2, steps, rays) from places (n, 2)."""
     col, row = np.rint(offsets).astype(np.intp)
     width = image.shape[1]
@@ -146,7 +144,7 @@ def _nearest_values(image: Image, places: NDArray[np.intp], offsets: Array) -> I
     return np.asarray(image.ravel().take(at), np.float32)
 
 
-def _interpolated_values(image: Image, places: NDArray[np.intp], offsets: Array) -> Image:
+def _interpolated_values(image: Single, places: NDArray[np.intp], offsets: Array) -> Single:
     """(steps, rays, n) interpolated grey values at offsets (2, steps, rays) from places (n, 2)."""
     at, off = places.T.astype(np.float32), offsets.reshape(2, -1, 1).astype(np.float32)
     values = cv2.remap(image, at[0] + off[0], at[1] + off[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -198,7 +196,7 @@ def _margin(radii: list[float]) -> int:
     return int(np.ceil(REACH * radii[-1])) + 3
 
 
-def _patches(radii: list[float], search: DiskSearch, full_scale_dn: float, factor: int, small: Image) -> Patches:
+def _patches(radii: list[float], search: DiskSearch, full_scale_dn: float, factor: int, small: Single) -> Patches:
     """Elliptical patches in a reduced image, within its margin."""
     small = np.ascontiguousarray(small)
     is_textured = small.size * factor**2 >= _TEXTURE_PX**2
@@ -211,11 +209,11 @@ def _patches(radii: list[float], search: DiskSearch, full_scale_dn: float, facto
 
 
 def _blobs(
-    small: Image, radii: list[float], search: DiskSearch, full_scale_dn: float, is_textured: bool
+    small: Single, radii: list[float], search: DiskSearch, full_scale_dn: float, is_textured: bool
 ) -> Iterator[tuple[int, Blobs]]:
     """Yield -1 with the dark blobs and 1 with the light ones, within the image's margin. is_textured: whether a blob
     must exceed the background's texture."""
-    contrasts, levels = list[Image](), list[float]()
+    contrasts, levels = list[Single](), list[float]()
     smooth, blurred = small, 0.0
     for radius in radii:
         sigma = radius / np.sqrt(2)
@@ -242,7 +240,7 @@ def _blobs(
             yield sign, Blobs(np.stack([cols, rows], axis=1), radius, contrast)
 
 
-def _fine_structure(small: Image) -> Array:
+def _fine_structure(small: Single) -> Array:
     """Samples of the image's second differences, scaled to the standard deviation of white noise (Immerkaer, 1996, Fast
     noise variance estimation)."""
     above, row, below = (small[first : len(small) - 2 + first : _EVERY] for first in range(3))
@@ -339,7 +337,7 @@ def _cross_octaves(search: CrossSearch, full_scale_dn: float) -> list[Octave]:
 
 
 def _cross_patches(
-    half: tuple[float, float], margin: int, search: CrossSearch, full_scale_dn: float, small: Image
+    half: tuple[float, float], margin: int, search: CrossSearch, full_scale_dn: float, small: Single
 ) -> Patches:
     """Crosses of these half lengths in a reduced image, within its margin."""
     wide = 2 * int(np.ceil(search.line * half[1]) + 1) + 1
@@ -358,7 +356,9 @@ def _cross_patches(
     return found.part(np.all((found.centers >= margin - 0.5) & (found.centers < last), axis=1))
 
 
-def _crosses(thin: Image, level: float, half: tuple[float, float], search: CrossSearch, sign: float) -> list[Candidate]:
+def _crosses(
+    thin: Single, level: float, half: tuple[float, float], search: CrossSearch, sign: float
+) -> list[Candidate]:
     _, labels, stats, _ = cv2.connectedComponentsWithStats((thin > level).astype(np.uint8))
     found = []
     for label, (left, top, wide, tall, area) in enumerate(stats[1:], 1):

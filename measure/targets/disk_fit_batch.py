@@ -9,20 +9,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from measure.array_types import Array, Indices, Mask, Single
 from measure.flags import NO_REASON, Code, Reason
 from measure.matching.models import PIXEL_VARIANCE_PX2
 from measure.noise.noise_model import influence_covariances
 from measure.noise.robust_estimation import SIGMA_OF_DEVIATION, gauss_newton_step, tukey_weights
 from measure.results import Covariance, MarkFit
 from measure.targets.block_search import Block, Patches, concatenate
-
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
-Indices = NDArray[np.intp]
 
 _GROUP_PIXELS = 1 << 16  # pixels of the windows that are fitted together: 10 MiB with their derivatives
 _FIRST_BLUR_PX, _BLUR_PX = 1.0, (0.5, 8.0)  # initial value and limits, standard deviations, pixel width included
@@ -149,7 +144,7 @@ class _Fit:
         self.greys = gauss_newton_step(design[:, 6:], self.grey, self.used.astype(np.float32), _DAMPING)
         self.linearise(design)
 
-    def linearise(self, design: Image) -> None:
+    def linearise(self, design: Single) -> None:
         """Set the design matrix (n, unknowns, pixels), the residuals (n, pixels) and their robust scale (n,)."""
         self.design = design
         self.residuals = self.grey - (self.greys[:, None].astype(np.float32) @ self.design[:, 6:])[:, 0]
@@ -169,7 +164,7 @@ class _Fit:
         self.greys = self.greys + change[:, 6:]
         self.linearise(_Edges.from_fit(self).design(self))
 
-    def _weights(self) -> Image:
+    def _weights(self) -> Single:
         """(n, pixels), Tukey's."""
         scale = np.maximum(self.scale, _SCALE_FLOOR * np.abs(self.greys[:, 0]) + 1e-6)
         return np.asarray(self.used * tukey_weights(self.residuals / scale[:, None].astype(np.float32), 1.0))
@@ -230,11 +225,11 @@ class _Edges:
     """Position of pixels (n, pixels) relative to their ellipse. radius: normalised, 1 on the ellipse; col, row:
     direction in the unit disk; px: length of a radius across the edge; distance: to the edge, px, positive inside."""
 
-    radius: Image
-    col: Image
-    row: Image
-    px: Image
-    distance: Image
+    radius: Single
+    col: Single
+    row: Single
+    px: Single
+    distance: Single
 
     @classmethod
     def from_fit(cls, fit: _Fit) -> "_Edges":
@@ -247,7 +242,7 @@ class _Edges:
         px = 1 / np.maximum(np.sqrt(across[:, 0] ** 2 + across[:, 1] ** 2), np.float32(1e-6))
         return cls(radius, direction[:, 0], direction[:, 1], px, (1 - radius) * px)
 
-    def design(self, fit: _Fit) -> Image:
+    def design(self, fit: _Fit) -> Single:
         """(n, unknowns, pixels) derivatives with respect to centre, size, stretch and shear (in units of the ellipse)
         and blur (px), all divided by the gain; then with respect to gain, offset and slopes."""
         blur, size = (one[:, None].astype(np.float32) for one in (fit.blur, fit.radius))
@@ -261,7 +256,7 @@ class _Edges:
         return np.stack([*ellipse, *greys], axis=1).astype(np.float32, copy=False)
 
 
-def _robust_scales_of_used(residuals: Image, used: Mask) -> Array:
+def _robust_scales_of_used(residuals: Single, used: Mask) -> Array:
     """(n,) robust standard deviation of the used residuals."""
     middle, count = used.shape[1] // 2, used.sum(axis=1)
     # Unused pixels are put below and above all others in equal numbers, so that the median stays the median.

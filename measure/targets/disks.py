@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc
 
+from measure.array_types import Array
 from measure.flags import DISK_UNLIKE_THE_OTHERS, LARGE_ERROR, NO_REASON, Cause, Code, Reason
 from measure.geometry import linear_scale
 from measure.marks.shapes import Disk, MarkShape
@@ -29,8 +29,6 @@ from measure.targets.disk_fit_batch import (
     WORST_SMOOTH_MISFIT,
     place_disks,
 )
-
-Array = NDArray[np.float64]
 
 UNIT_DISK = MarkShape((Disk((0.0, 0.0), 1.0),))
 # Background used around a disk.

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from measure.array_types import Array, Integers
 from measure.detection.correlation import local_maxima
 from measure.flags import NO_REASON, Code, Reason, Status
 from measure.marks.rendering import extent_px, picture
@@ -16,9 +17,6 @@ from measure.noise.robust_estimation import robust_scale
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
 from measure.targets.disks import SMALLEST_RADIUS_PX, UNIT_DISK, FittedDisk, dust_reasons, fit_disk
-
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 _SEARCHED_RADIUS_PX = 4.0  # shorter half axis in the reduced window, provided that...
 _THINNEST_PX = 1.5  # ...the thinnest line keeps this width

@@ -6,10 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.array_types import Array
 from measure.scans.scan import Scan
 from measure.targets.block_search import Candidate
-
-Array = NDArray[np.float64]
 
 _SAMPLES = 16  # along each segment
 _RING_SHARES = (0.35, 0.5, 0.65)  # sampled positions across the ring, away from its blurred edges

@@ -10,11 +10,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
+from measure.array_types import Array, Integers
 from measure.noise.robust_estimation import robust_scale
-
-Array = NDArray[np.float64]
-
-Indices = NDArray[np.int64]
 
 _RADIAL_FROM, _SECOND_RADIAL_FROM = 10, 30  # points needed to estimate k1, and k2
 _LARGEST_RADIAL = 3.0  # at the image corner, relative; a fisheye has up to 1.5
@@ -285,14 +282,14 @@ def _rotation(start: Array, end: Array) -> Array:
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
-def _neighbourhood(sheet: Array, points: list[int]) -> Indices:
-    """Indices of points of the sheet and of their neighbours."""
+def _neighbourhood(sheet: Array, points: list[int]) -> Integers:
+    """Integers of points of the sheet and of their neighbours."""
     count = min(_NEIGHBOURS + 1, len(sheet))
     _, near = cKDTree(sheet).query(sheet[points], k=np.arange(1, count + 1))
     return np.unique(near)
 
 
-def _pair_dots(view: SheetView, sheet: Array, centers_px: Array, among: Indices) -> dict[int, int]:
+def _pair_dots(view: SheetView, sheet: Array, centers_px: Array, among: Integers) -> dict[int, int]:
     """Dot of each of the points `among`: mutual nearest neighbours, much closer than the next point."""
     places = view.places_px(sheet)
     visible = among[np.isfinite(places[among]).all(axis=1)]
@@ -356,7 +353,7 @@ def _verify(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int])
     return Naming(places, shapes, named, gate_px, misread)
 
 
-def _neighbour_residuals(sheet: Array, points: Indices, residuals: Array) -> Array:
+def _neighbour_residuals(sheet: Array, points: Integers, residuals: Array) -> Array:
     """(n, 2) median residual of the neighbours of each point, px, without its own: a sheet that is not quite flat
     shifts neighbouring dots alike."""
     count = min(_NEIGHBOURS + 1, len(points))

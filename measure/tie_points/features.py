@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.array_types import Array, Indices, Mask
 from measure.errors import MeasurementError
 from measure.flags import Code, Reason
 from measure.geometry import linear_scale
@@ -18,10 +19,6 @@ from measure.scans.opening import open_scan
 from measure.scans.parallel import map_or_replace
 from measure.scans.scan import Scan
 from measure.tie_points.multi_image import RADIUS_PX, SPARE_PX, Piece
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Indices = NDArray[np.intp]
 
 _LONGEST_PX = 3000  # longer side of the reduced scan
 _TILE_PX, _OVERLAP_PX = 1024, 96  # SIFT needs some 130 bytes per pixel: one tile at a time

@@ -12,10 +12,10 @@ from functools import partial
 from itertools import chain, combinations, compress
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import ndtri
 
+from measure.array_types import Array, Mask
 from measure.errors import MeasurementError
 from measure.flags import NO_REASON, POINT_REFUSED, Code, Reason, Status
 from measure.noise.robust_estimation import robust_scale
@@ -34,8 +34,6 @@ from measure.tie_points.tracks import (
     verify_pairs,
 )
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Pieces = dict[int, Piece | Reason]  # by frame; a reason where there is none
 
 _RADII_PX = (RADIUS_PX, 21, 30)  # of patches: the next one, of twice the area, where the texture is too weak

@@ -13,8 +13,8 @@ from itertools import combinations, compress
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from measure.array_types import Array
 from measure.errors import MeasurementError
 from measure.flags import NO_REASON, POINT_REFUSED, Cause, Code, Reason, Status
 from measure.results import Covariance, MarkMeasurement
@@ -29,8 +29,6 @@ from measure.tie_points.features import (
 )
 from measure.tie_points.multi_image import RADIUS_PX, Matched, Piece, match_pieces
 from measure.tie_points.tracks import neighbour_outliers
-
-Array = NDArray[np.float64]
 
 WANTED = 60  # joins per pair of scans
 _FEW = 12  # fewer joins are reported as a problem

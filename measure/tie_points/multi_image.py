@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.special import chdtrc
 
+from measure.array_types import Array, Mask
 from measure.flags import NO_REASON, Code, Reason
 from measure.matching.gauss_newton import UNSETTLED, gauss_newton
 from measure.noise.noise_model import NoiseModel, correlated, noise_model
-
-Array = NDArray[np.float64]
 
 # Covariance, up to scale, of the coefficients of u², uv and v² of a surface with isotropic curvature.
 _ISOTROPIC = np.array([[0.75, 0.0, 0.25], [0.0, 1.0, 0.0], [0.25, 0.0, 0.75]])
@@ -30,7 +29,6 @@ _DIRECTIONS = np.array([[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [1.0, 0.0]], [[0.
 _ROUNDS = 8  # of Fisher scoring
 _LEAST_NOISE_EIGENVALUE = 1e-9  # of a covariance, relative to its largest
 _FEWEST = 20  # patches needed to estimate the variance of their bendings
-Mask = NDArray[np.bool_]
 
 RADIUS_PX = 15  # of a round patch: enough texture nearly everywhere, and small enough for plane ground
 SPARE_PX = 12  # border of the window: room for shifts, deformation and smoothing

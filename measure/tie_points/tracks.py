@@ -13,21 +13,17 @@ from itertools import combinations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.special import ndtr, ndtri
 
+from measure.array_types import Array, Indices, Mask
 from measure.flags import POINT_OFF_ITS_NEIGHBOURS, POINT_OFF_ITS_RAY
 from measure.noise.robust_estimation import least_distances, robust_scale
 from measure.scans.parallel import map_or_replace
 from measure.tie_points.features import Features, TieFrame, interleave_groups, shared_features
 from measure.tie_points.multi_image import RADIUS_PX
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 _PLACE_PX, _LOCAL = 5.0, 0.1  # deviation of places from a local affine map, and of that from the pair's global one
 _REWEIGHTINGS = 6  # of the least absolute deviations
