@@ -174,14 +174,8 @@ class CornerStart:
 def fit_corners(
     read: Callable[[int, int, int], ScanWindow], starts: Sequence[CornerStart], surface: Surface
 ) -> list[Corner]:
-    """Fit all corners of a board at once.
-
-    Parameters
-    ----------
-    read : returns the square window with the given first column, first row and side in px
-    starts : initial values
-    surface : `crossing` or `quarter`
-    """
+    """Fit all corners of a board at once. read: returns the square window with the given first column, first row and
+    side, px; surface: `crossing` or `quarter`."""
     if not starts:
         return []
     half = max(start.half_px for start in starts)
@@ -381,17 +375,13 @@ def junctions(greys: NDArray[np.floating], starts_px: Array, reach_px: float) ->
 
     Parameters
     ----------
-    greys
-        Grey values (n, height, width) around each place.
-    starts_px
-        (n, 2) column and row in these windows.
-    reach_px
-        Distance up to which the windows show only the edges of the junction.
+    greys : (n, height, width) grey values around each place.
+    starts_px : (n, 2) column and row in these windows.
+    reach_px : distance up to which the windows show only the edges of the junction.
 
     Returns
     -------
-    Array
-        (n, 2) column and row; nan where OpenCV finds no place within its window.
+    (n, 2) column and row; nan where OpenCV finds no place within its window.
 
     Notes
     -----

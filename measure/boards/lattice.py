@@ -35,10 +35,8 @@ def grid_places(points_px: Array, appearances: Array, places: list[Place]) -> li
 
     Parameters
     ----------
-    points_px : (n, 2)
-        Detected points, which may include others.
-    appearances : (n, k)
-        Logarithms of size and contrast, in which neighbours differ little.
+    points_px : (n, 2) detected points, which may include others.
+    appearances : (n, k) logarithms of size and contrast, in which neighbours differ little.
 
     Returns
     -------
@@ -177,12 +175,7 @@ class FoundGrid:
 
 def find_grid(points_px: Array, appearances: Array, spec: CircleGridSpec | SquareGridSpec, what: str) -> FoundGrid:
     """Find the grid formed by points. Of several orientations the most upright one in the scan is returned.
-
-    Parameters
-    ----------
-    points_px, appearances : as in `grid_places`.
-    what : word for the points in messages.
-    """
+    points_px, appearances: as in `grid_places`; what: word for the points in messages."""
     size, places = f"{spec.columns} x {spec.rows} {what}", spec.places()
     if isinstance(spec, CircleGridSpec) and spec.asymmetric:  # its columns may be counted as dots or as places
         size = f"{len(places)} {what} in {spec.rows} rows"

@@ -284,13 +284,11 @@ def one_definition(pictures: Sequence[Sequence[MarkMeasurement]]) -> tuple[tuple
 
     Parameters
     ----------
-    pictures
-        The marks of each image of one camera.
+    pictures : the marks of each image of one camera.
 
     Returns
     -------
-    tuple of tuples
-        The same marks. If the lens has coma, those with a junction are moved there and get its covariance.
+    The same marks. If the lens has coma, those with a junction are moved there and get its covariance.
 
     Notes
     -----

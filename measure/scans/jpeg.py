@@ -226,18 +226,8 @@ def rounding_step_dn(data: bytes) -> float:
 
 
 def open_jpeg(path: Path, max_pixels: int | None = None) -> OpenedPicture:
-    """The picture of a JPEG file, decoded whole.
-
-    Parameters
-    ----------
-    max_pixels : as `check_size` takes it.
-
-    Raises
-    ------
-    MeasurementError
-        For a truncated file, for one that claims more than such a file can hold, and for one of inks. A damaged one is
-        opened: its pixels count as lost.
-    """
+    """The picture of a JPEG file, decoded whole. A damaged one is opened: its pixels count as lost. Raises
+    MeasurementError for a truncated file, for one that claims more than such a file can hold, and for one of inks."""
     data = path.read_bytes()
     samples, damage = _jpeg_samples(path, data, max_pixels)
     exif = _exif_page(data)

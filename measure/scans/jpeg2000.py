@@ -40,18 +40,8 @@ class Jpeg2000Form:
 
 
 def open_jpeg2000(path: Path, max_pixels: int | None = None) -> OpenedPicture:
-    """The picture of a JPEG 2000 file, decoded whole.
-
-    Parameters
-    ----------
-    max_pixels : as `check_size` takes it.
-
-    Raises
-    ------
-    MeasurementError
-        For a truncated or damaged file, for one that claims more than such a file can hold, and for samples that are
-        not of 2 to 16 bits without sign.
-    """
+    """The picture of a JPEG 2000 file, decoded whole. Raises MeasurementError for a truncated or damaged file, for one
+    that claims more than such a file can hold, and for samples that are not of 2 to 16 bits without sign."""
     data = path.read_bytes()
     form = jpeg2000_form(data)
     if form is None:

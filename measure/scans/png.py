@@ -29,17 +29,8 @@ _PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 1, 6: 3}  # by that kind, without transpar
 
 
 def open_png(path: Path, max_pixels: int | None = None) -> OpenedPicture:
-    """The picture of a PNG file, decoded whole.
-
-    Parameters
-    ----------
-    max_pixels : as `check_size` takes it.
-
-    Raises
-    ------
-    MeasurementError
-        For a truncated or damaged file, and for one that claims more than such a file can hold.
-    """
+    """The picture of a PNG file, decoded whole. Raises MeasurementError for a truncated or damaged file, and for one
+    that claims more than such a file can hold."""
     data = path.read_bytes()
     return OpenedPicture(WholePicture(_png_samples(path, data, max_pixels)), png_pitch(data))
 

@@ -156,17 +156,9 @@ def _numbers(tag: TiffTag) -> list[int]:
 def open_tiff(path: Path, max_pixels: int | None = None) -> OpenedPicture:
     """The first full-resolution picture of a TIFF file, or that of the page that the path names.
 
-    Parameters
-    ----------
-    path : of an address the overviews are opened, too. Of a local file the picture itself is averaged, for how others
-        averaged is not known.
-    max_pixels : as `check_size` takes it.
-
-    Raises
-    ------
-    MeasurementError
-        For a truncated file, for pictures of a kind that `page_radiometry` does not know, and for those that claim more
-        than such a file can hold.
+    Of an address the overviews are opened, too. Of a local file the picture itself is averaged, for how others averaged
+    is not known. Raises MeasurementError for a truncated file, for pictures of a kind that `page_radiometry` does not
+    know, and for those that claim more than such a file can hold.
     """
     try:
         file = tiff_file(path)

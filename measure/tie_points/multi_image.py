@@ -138,18 +138,8 @@ class Matched:
 
 
 def match_pieces(pieces: Sequence[Piece], reference: int, radius_px: int = RADIUS_PX) -> tuple[Matched, ...]:
-    """Match the pieces of one point jointly.
-
-    Parameters
-    ----------
-    pieces : images of the point.
-    reference : index of the piece that defines the point.
-    radius_px : of the patch.
-
-    Returns
-    -------
-    The matched pieces in their order, with reasons where matching failed.
-    """
+    """Match the pieces of one point jointly. reference: index of the piece that defines the point; radius_px: of the
+    patch. Returns the matched pieces in their order, with reasons where matching failed."""
     fit = _Fit(pieces, reference, radius_px)
     best: tuple[Matched, ...] = ()
     for smoothing_px in _SMOOTHING_PX:
