@@ -106,6 +106,7 @@ def _is_better(squares: Array | None, than: Array | None) -> bool:
 
 
 HIGHLY_CORRELATED = 0.9
+ONE_UNKNOWN = 1.0 - 1e-9  # correlation of fx and fy of square pixels
 _WORST = 3  # images named
 _FIGURES = ("rms_px", "sigma0", "corner_sigma_px", "unmodelled_sigma_px", "known_share")
 
@@ -303,7 +304,7 @@ def camera_intrinsics(
         correlations=tuple(
             (one, other, float(correlation[row, column]))
             for (row, one), (column, other) in combinations(enumerate(values), 2)
-            if abs(correlation[row, column]) > HIGHLY_CORRELATED
+            if HIGHLY_CORRELATED < abs(correlation[row, column]) < ONE_UNKNOWN
         ),
         left_out=left_out,
         used=len(adjustment.network.images),

@@ -40,7 +40,7 @@ from pipeline.adjusting.network import turned_back
 from pipeline.calibration import calibrate_stage, intrinsics
 from pipeline.calibration.calibrate_stage import Calibration
 from pipeline.calibration.intrinsics import LensChoice, LensModel, choose_lens
-from pipeline.calibration.pictures import find_pictures
+from pipeline.calibration.pictures import CameraPictures, find_pictures
 from pipeline.calibration.project_files import board_options
 from pipeline.cli import run
 from pipeline.files.target_table import read_targets
@@ -406,6 +406,33 @@ def test_boards_as_project_files_have_them() -> None:
     assert april.object_points()["3.3"] == pytest.approx((0.0, 0.0, 0.0))  # lower left corner of the lower left tag
     charuco = board("charuco", "5x7", "30mm", "22mm", "4X4_250", first_id=20)
     assert (charuco.legacy, charuco.first_id) == (None, 20)
+
+
+@pytest.mark.parametrize("square_pixels", [False, True])
+def test_focal_lengths_of_square_pixels_are_one_unknown(square_pixels: bool) -> None:
+    network = board_network(np.random.default_rng(4), 6, ERROR_PX * PIXEL_MM)
+    camera = replace(network.cameras[0], distortion=intrinsics.free_lens("opencv4", square_pixels))
+    pictures = CameraPictures(camera.name, 640, 480, None, tuple(image.name for image in network.images))
+    result = adjust(replace(network, cameras=(camera,)))
+    found = intrinsics.camera_intrinsics(result, pictures, PIXEL_MM, {}, None, None, None)
+    assert (found.values["fx"] == found.values["fy"]) == square_pixels
+    assert not square_pixels or ("fx", "fy") not in {(one, other) for one, other, _ in found.correlations}
+
+
+@pytest.mark.study
+def test_square_pixels_have_one_focal_length(folder: Path, tmp_path: Path) -> None:
+    printed = io.StringIO()
+    with redirect_stdout(printed):
+        options = ("--lens", "opencv4", "--square-pixels", "--out", str(tmp_path / "out"), "--json")
+        run(["calibrate", str(folder), *CALIBRATED_BOARD, *options])
+    (camera,) = json.loads(printed.getvalue())["cameras"]
+    assert camera["fx_px"] == camera["fy_px"]
+    assert abs(camera["fx_px"]["value"] - FOCAL_PX) < 4.0 * camera["fx_px"]["sigma"] < 4.0
+    assert camera["distortion"].keys() == {"family", "k1", "k2", "p1", "p2"}
+    assert not any({"fx", "fy"} <= set(each["of"]) for each in camera["correlations"])
+    storage = cv2.FileStorage(str(tmp_path / "out" / "camera.yaml"), cv2.FILE_STORAGE_READ)
+    matrix = storage.getNode("camera_matrix").mat()
+    assert matrix[0, 0] == matrix[1, 1] == pytest.approx(camera["fx_px"]["value"])
 
 
 def test_a_count_that_is_wrong_is_named_with_the_one_that_fits(tmp_path: Path, refusal: Refusal) -> None:
