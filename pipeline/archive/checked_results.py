@@ -32,7 +32,7 @@ from pipeline.archive.schema import (
     is_sound,
     row_digest,
 )
-from pipeline.archive.verdicts import Verdict, scan_verdict
+from pipeline.archive.verdicts import Verdict, scan_doubt, scan_verdict
 from pipeline.errors import InputError
 from pipeline.provenance import hash_file
 from pipeline.results.comparator_file import (
@@ -260,7 +260,7 @@ def _copy_lot(store: Store, judging: int, number: int, lot: Lot) -> str:
     is_whole = f"{is_sound('judged_frame')} and (not own_marks or marks_digest is {checked_marks_digest()})"
     if db.execute(f"select exists (select 1 {of_lot} and not ({is_whole}))", (before, old)).fetchone()[0]:
         return ""
-    frame = "scan, result, name, verdict, own_marks, detail, decisions, marks_digest"
+    frame = "scan, result, name, verdict, why, own_marks, detail, decisions, marks_digest"
     with store.writing():
         db.execute(
             f"insert into judged_frame (judging, lot, {frame}) select ?, ?, {frame} {of_lot}",
@@ -363,11 +363,11 @@ def _write_frame(store: Store, judging: int, lot: int, frame: CheckedResult) -> 
     own_marks = rows != store.mark_rows(frame.result)
     rows = rows if own_marks else []
     scan, key = db.execute("select scan, fingerprint from result where id = ?", (frame.result,)).fetchone()
-    name, verdict = frame.scan.frame.image, str(scan_verdict(frame.scan))
+    name, verdict, why = frame.scan.frame.image, str(scan_verdict(frame.scan)), scan_doubt(frame.scan)
     db.execute(
-        "insert into judged_frame (judging, lot, scan, result, name, verdict, own_marks, detail, decisions) "
-        f"values ({places(9)})",
-        (judging, lot, scan, frame.result, name, verdict, own_marks, detail, frame.decisions),
+        "insert into judged_frame (judging, lot, scan, result, name, verdict, why, own_marks, detail, decisions) "
+        f"values ({places(10)})",
+        (judging, lot, scan, frame.result, name, verdict, why, own_marks, detail, frame.decisions),
     )
     db.executemany(
         f"insert into judged (judging, result, number, {MARKS}) values ({places(15)})",

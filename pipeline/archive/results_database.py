@@ -29,7 +29,7 @@ from pipeline.archive.schema import (
     measured_marks_digest,
     row_digest,
 )
-from pipeline.archive.verdicts import Verdict, scan_verdict
+from pipeline.archive.verdicts import Verdict, scan_doubt, scan_verdict
 from pipeline.errors import InputError
 from pipeline.provenance import FileState, Identity, hash_text, result_key
 from pipeline.results.measured_record import (
@@ -315,12 +315,13 @@ class Store(Database):
             scan, kept.fingerprint, self._program, self._options(kept.options_json),
             pose and pose.name, pose and pose.decided,
             *([None] * 6 if matrix is None else map(finite_or_none, matrix.ravel().tolist())),
-            *map(finite_or_none, measured.pitch_um), str(scan_verdict(measured)), measured.seconds, kept.bytes_read,
-            datetime.now(UTC).isoformat(timespec="seconds"), json.dumps(scan_detail(measured, uri), ensure_ascii=False),
+            *map(finite_or_none, measured.pitch_um), str(scan_verdict(measured)), scan_doubt(measured),
+            measured.seconds, kept.bytes_read, datetime.now(UTC).isoformat(timespec="seconds"),
+            json.dumps(scan_detail(measured, uri), ensure_ascii=False),
         )  # fmt: skip
         result = self.connection.execute(
             "insert into result (scan, fingerprint, program, options, pose, pose_decided, a, b, c, d, e, f, "
-            f"pitch_x_um, pitch_y_um, verdict, seconds, bytes_read, finished, detail) values ({places(19)})",
+            f"pitch_x_um, pitch_y_um, verdict, why, seconds, bytes_read, finished, detail) values ({places(20)})",
             values,
         ).lastrowid
         assert result is not None

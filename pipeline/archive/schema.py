@@ -27,9 +27,11 @@ COLUMNS = {
     ),
     "result": (
         "id", "scan", "fingerprint", "program", "options", "pose", "pose_decided", "a", "b", "c", "d", "e", "f",
-        "pitch_x_um", "pitch_y_um", "verdict", "seconds", "bytes_read", "finished", "detail", "marks_digest",
+        "pitch_x_um", "pitch_y_um", "verdict", "why", "seconds", "bytes_read", "finished", "detail", "marks_digest",
     ),
-    "judged_frame": ("scan", "result", "name", "verdict", "own_marks", "detail", "lot", "decisions", "marks_digest"),
+    "judged_frame": (
+        "scan", "result", "name", "verdict", "why", "own_marks", "detail", "lot", "decisions", "marks_digest",
+    ),
     "judging": ("id", "digest", "made_from", "input", "frames_digest"),
     "kept": ("key", "value"),
 }  # fmt: skip
@@ -190,7 +192,8 @@ create table result (
     pose text, pose_decided integer,
     a real, b real, c real, d real, e real, f real,   -- pixel_from_camera: col = a x' + b y' + c, row = d x' + e y' + f
     pitch_x_um real, pitch_y_um real,
-    verdict text not null, seconds real not null, bytes_read integer not null, finished text not null,
+    verdict text not null, why text not null, -- why it needs a look
+    seconds real not null, bytes_read integer not null, finished text not null,
     detail text not null,                    -- JSON: all else that the scan gave
     marks_digest text, digest text
 );
@@ -212,7 +215,7 @@ create table judging (
 create table judged_frame (
     judging integer not null references judging on delete cascade,
     scan integer not null references scan, result integer not null references result,
-    name text not null, verdict text not null, own_marks integer not null,
+    name text not null, verdict text not null, why text not null, own_marks integer not null,
     detail text,                             -- JSON: what of the result is another now; null: nothing
     lot integer not null default 0,
     decisions text,                          -- hash of the decisions about the image that were considered

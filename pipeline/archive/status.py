@@ -106,53 +106,24 @@ def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
 
 def _status_rows(store: Store, judging: Judging | None) -> Iterator[Sequence[Any]]:
     """Rows of the query; a damaged row is reported as a failure."""
-    # Marks are checked only in frames where the reason of one may be shown.
-    rows = store.connection.execute(_QUERY, (-1 if judging is None else judging.row,)).fetchall()
-    damaged = set[str]()
     if judging is not None:
         judging.check()
-        names_to_check = {row[-2] for row in rows if row[6] and row[-2]}
-        scans = judging.scans(names_to_check) if names_to_check else ()
-        damaged = {scan.frame.image for scan in scans if scan.failure and scan.failure.code is FailureCode.DAMAGED}
     why = "what is stored of it is not what was measured: `reseau measure --retry` measures it again"
-    for *row, name, is_whole in rows:
-        if is_whole and name not in damaged:
-            yield row
-        else:
-            yield (*row[:5], str(Verdict.FAILED), why, str(FailureCode.DAMAGED), None, "", row[10], None)
+    for *row, is_whole in store.connection.execute(_QUERY, (-1 if judging is None else judging.row,)):
+        yield (
+            row if is_whole else (*row[:5], str(Verdict.FAILED), why, str(FailureCode.DAMAGED), None, "", row[10], None)
+        )
 
 
-# Most scans are good, and need no reason.
-_QUERY = """
-with frame as (
-    select scan.uri, scan.bytes, scan.mtime_ns, scan.etag, scan.is_current, scan.asked,
-        coalesce(f.verdict, result.verdict) as verdict, result.seconds, result.finished, result.id as result,
-        result.detail as measured, f.detail as changed, result.pose, result.pose_decided,
-        scan.duplicate_of as original, f.decisions, f.name,
-        {scan} and (scan.result is null or {result} and result.scan = scan.id)
-        and (f.result is null or {frame}) as is_whole
-    from scan left join result on result.id = scan.result
-    left join judged_frame f on f.judging = ?1 and f.scan = scan.id and f.result = scan.result
-),
-doubt as (
-    select result, min(number), point || ': ' || reason as why from checked_mark
-    where judging = ?1 and verdict not in ('good', 'decided') and reason <> '' and reason_code not like 'decided%'
-    group by result
-)
-select uri, bytes, mtime_ns, etag, is_current, verdict,
-    case when verdict not in ('good', 'decided') then coalesce(
-        changed ->> '$.problems[0]', measured ->> '$.problems[0]',
-        case when not coalesce(changed ->> '$.pose.decided', pose_decided)
-            then 'pose ' || coalesce(changed ->> '$.pose.name', pose) || ' is assumed' end,
-        'its file is a copy of that of ' || (select name from scan where id = frame.original),
-        (select why from doubt where doubt.result = frame.result),
-        (select point || ': ' || reason from mark where mark.result = frame.result and reason <> ''
-         order by number limit 1)
-    ) end,
-    case when verdict = 'failed' then measured ->> '$.failure.code' end,
-    seconds, finished, asked, decisions, name, is_whole
-from frame
-""".format(scan=is_sound("scan"), result=is_sound("result"), frame=is_sound("judged_frame", "f"))
+_QUERY = f"""
+select uri, bytes, mtime_ns, etag, is_current, coalesce(f.verdict, result.verdict), coalesce(f.why, result.why),
+    case when result.verdict = '{Verdict.FAILED}' then result.detail ->> '$.failure.code' end,
+    seconds, finished, asked, f.decisions,
+    {is_sound("scan")} and (scan.result is null or {is_sound("result")} and result.scan = scan.id)
+    and (f.result is null or {is_sound("judged_frame", "f")})
+from scan left join result on result.id = scan.result
+left join judged_frame f on f.judging = ?1 and f.scan = scan.id and f.result = scan.result
+"""
 
 
 def status_json(status: ArchiveStatus) -> dict[str, object]:

@@ -1,6 +1,7 @@
 """Verdicts on scans, in one table: source of the documentation and of `reseau status`."""
 
 from collections.abc import Collection, Mapping, Sequence
+from itertools import chain
 from typing import TYPE_CHECKING
 
 from measure.flags import Code, MeaningfulWord, Status
@@ -64,6 +65,16 @@ def scan_verdict(scan: "MeasuredScan", marks: Sequence[MarkState] | None = None)
         marks = [(mark.kind, mark.status, mark.reason.codes) for mark in scan.frame.marks]
     has_frame = scan.frame.pixel_from_camera is not None
     return frame_verdict(marks, has_frame, has_problem(scan), bool(scan.decided_by))
+
+
+def scan_doubt(scan: "MeasuredScan") -> str:
+    """First reason why a scan needs a look; "" if it needs none."""
+    frame = scan.frame
+    if not scan_verdict(scan).needs_look:
+        return ""
+    of_pose = [f"pose {frame.pose.name} is assumed"] if frame.pose is not None and not frame.pose.decided else []
+    marks = (mark for mark in frame.marks if mark.reason and not is_answered(mark.reason.codes))
+    return next(chain(frame.problems, of_pose, (f"{mark.point}: {mark.reason}" for mark in marks)), "")
 
 
 def has_problem(scan: "MeasuredScan") -> bool:

@@ -6,7 +6,7 @@ import re
 import shutil
 import sqlite3
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,18 +17,19 @@ from drawn import lay_out
 from projects import CAMERA, Capture, change_camera, change_project, replace_text, write_project, write_tables
 from studies import parametrize_with_studies
 
-from measure import MarkShape, Pose, polygon
+from measure import Code, MarkShape, Pose, Reason, Status, polygon
 from measure.fiducials.options import BelievedFilm
 from pipeline import read_project
-from pipeline.archive.schema import FRAMES_DIGEST, MEASUREMENTS, Schema, opened
+from pipeline.archive.checked_results import read_measurement
+from pipeline.archive.schema import MEASUREMENTS, Schema, opened
 from pipeline.archive.status import archive_status
-from pipeline.archive.verdicts import NEXT_STEP, Verdict
+from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_doubt
 from pipeline.cli import run
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.roll import check_scans
 from pipeline.measuring.scan_measurement import MeasuredFile, measure_file
 from pipeline.measuring.scan_task import Measure, ScanTask
-from pipeline.results.measured_record import FailureCode, MeasuredScan, pose_record
+from pipeline.results.measured_record import FailureCode, MeasuredScan
 
 measured: list[str] = []  # the images that were measured, in their order
 
@@ -299,17 +300,13 @@ def test_status_tells_what_changed_outside(folder: Path, capsys: Capture) -> Non
 
 
 def test_status_says_why_a_scan_needs_attention(folder: Path) -> None:
-    db = opened(folder / "out" / "measurement.db")
-    with closing(db):
-        db.execute("update result set pose_decided = 0")
-        db.execute("update judged_frame set verdict = 'look'")
-        for image, is_certain in (("b", False), ("c", True)):
-            detail = json.dumps({"pose": pose_record(Pose("90", is_certain))})
-            db.execute("update judged_frame set detail = ? where name = ?", (detail, image))
-        db.execute(f"update judging set frames_digest = {FRAMES_DIGEST}")
-    status = archive_status(read_project(folder / "project.toml"))
-    whys = {scan.image: scan.why for scan in status.scans}
-    assert whys == {"a": "pose 0 is assumed", "b": "pose 90 is assumed", "c": ""}
+    scan, *_ = read_measurement(folder / "out" / "measurement.db")
+    assumed = replace(scan, frame=replace(scan.frame, pose=Pose("90", decided=False)))
+    doubted = scan.restated("fiducial", Status.WEAK, Reason("it is dusty", Code.DUST))
+    assert scan_doubt(scan) == ""
+    assert scan_doubt(assumed) == "pose 90 is assumed"
+    assert scan_doubt(assumed.changed(problems=[Reason("it is bent", Code.PITCH)])) == "it is bent"
+    assert scan_doubt(doubted) == f"{scan.frame.marks[0].point}: it is dusty"
 
 
 def test_the_pages_of_results_and_scans_have_the_tables_of_verdicts_and_failures() -> None:
