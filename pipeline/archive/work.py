@@ -6,6 +6,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import lru_cache
+from itertools import chain
+from statistics import fmean
 
 from measure.scans.remote import scan_path
 from pipeline.archive.results_database import Kept, Store
@@ -29,38 +31,6 @@ from pipeline.text.wording import count_sentence, counted, drop_file_name, liste
 from pipeline.workers import TASKS_A_CORE, NotMeasured, WorkOptions, iterate_results
 
 _hash_of = lru_cache(maxsize=4096)(hash_text)
-
-
-class ExpectedTime:
-    """Estimate of the remaining time, by kind of scan: camera and file format."""
-
-    def __init__(self, tasks: Sequence[ScanTask], cameras: Sequence[str], at_a_time: int) -> None:
-        """Count the scans of each kind. tasks: all scans to be measured; cameras: of each; at_a_time: number of
-        processes."""
-        kinds = zip(tasks, cameras, strict=True)
-        self._kind = {task.name: f"{camera} {task.shown_scan.rpartition('.')[2].lower()}" for task, camera in kinds}
-        self._left = Counter(self._kind.values())
-        self._done = defaultdict[str, list[float]](list)
-        self._at_a_time = at_a_time
-
-    def is_done(self, name: str, seconds: float) -> None:
-        kind = self._kind[name]
-        self._left[kind] -= 1
-        self._done[kind].append(seconds)
-
-    @property
-    def left_s(self) -> float:
-        """Remaining time, s. A kind without finished scans is assumed to take the mean time of all others."""
-        all_s = [seconds for each in self._done.values() for seconds in each]
-        usual = sum(all_s) / len(all_s) if all_s else 0.0
-        means = {kind: sum(each) / len(each) for kind, each in self._done.items()}
-        return sum(left * means.get(kind, usual) for kind, left in self._left.items()) / self._at_a_time
-
-    @property
-    def groups(self) -> str:
-        """Number of finished kinds, as text."""
-        done = sum(not self._left[kind] for kind in self._left)
-        return f"{done} of {counted(len(self._left), 'group')}"
 
 
 class Work:
@@ -159,24 +129,32 @@ class Work:
 
     def _complete(self, tasks: Sequence[ScanTask], scans: int, reporter: Reporter) -> None:
         """Measure the missing scans. scans: number of all scans; those measured earlier count as done."""
-        cameras = [self._project.image_camera(task.name).path.stem for task in tasks]
-        expected = ExpectedTime(tasks, cameras, self._at_a_time)
-        failed = defaultdict[str, list[str]](list)
+        kinds = {task.name: self._kind(task) for task in tasks}
+        left, failed = Counter(kinds.values()), defaultdict[str, list[str]](list)
+        seconds = defaultdict[tuple[str, str], list[float]](list)
         with reporter.stage("measured") as count:
-            for done, (task, scan) in enumerate(self._measure(tasks, as_scans=True), 1):
-                measured = scans - len(tasks) + done
-                expected.is_done(task.name, scan.seconds)
+            for measured, (task, scan) in enumerate(self._measure(tasks, as_scans=True), scans - len(tasks) + 1):
+                kind = kinds[task.name]
+                left[kind] -= 1
+                seconds[kind].append(scan.seconds)
                 if scan.failure:
                     same = drop_file_name(scan.failure.sentence, task.shown_scan)
                     if same not in failed:  # one message for all scans with the same failure
                         reporter.say(f"failed: {task.name}: {same}")
                     failed[same].append(task.name)
+                usual_s = fmean(chain(*seconds.values()))  # of a kind without finished scans
+                left_s = sum(number * fmean(seconds[each] or [usual_s]) for each, number in left.items())
+                groups = f"{list(left.values()).count(0)} of {counted(len(left), 'group')}"
                 failures = sum(map(len, failed.values()))
-                what = f"scans, {expected.groups}{f', {failures} failed' if failures else ''}"
-                count(what, measured, scans, expected.left_s)
+                what = f"scans, {groups}{f', {failures} failed' if failures else ''}"
+                count(what, measured, scans, left_s / self._at_a_time)
         for first, *others in failed.values():
             if others:
                 reporter.say(f"failed as {first} did: {counted(len(others), 'scan')} more, {listed(others)}")
+
+    def _kind(self, task: ScanTask) -> tuple[str, str]:
+        """Camera and file format, on which the time for a scan depends."""
+        return self._project.image_camera(task.name).path.stem, task.shown_scan.rpartition(".")[2].lower()
 
     def _reviewed_task(self, task: ScanTask) -> ScanTask:
         """Task with the decisions about its scan applied."""

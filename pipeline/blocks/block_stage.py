@@ -216,32 +216,14 @@ def oriented_by_control(
 MOST_PX = 3000  # pixels along the longer side of a frame, unless the user gives a pitch
 
 
-@dataclass(frozen=True)
-class OrientedBlock:
-    """Result of the orientation of a block.
-
-    Attributes
-    ----------
-    project : project with the block's own comparator.csv, images.csv and output.
-    oriented : number of images that COLMAP oriented.
-    seconds : duration of each step.
-    left_out : images that COLMAP did not orient.
-    ties, tracks : number of tie marks and of tie points.
-    """
-
-    project: Project
-    oriented: int
-    seconds: dict[str, float]
-    left_out: tuple[str, ...]
-    ties: int
-    tracks: int
-
-
-def run_block(project: Project, folder: Path, pitch_um: float | None, reporter: Reporter) -> OrientedBlock:
+def run_block(
+    project: Project, folder: Path, pitch_um: float | None, reporter: Reporter
+) -> tuple[Project, tuple[str, ...], list[str]]:
     """Orient a block by COLMAP; its adjustment is then run as for any project.
 
-    pitch_um: of the resampled frames; None: chosen. Raises InputError where COLMAP is not installed, fiducials are not
-    measured, COLMAP orients nothing, or control is missing.
+    Returns the project with the block's own comparator.csv, images.csv and output; the images that COLMAP did not
+    orient; and lines about the block for the user. pitch_um: of the resampled frames; None: chosen. Raises InputError
+    where COLMAP is not installed, fiducials are not measured, COLMAP orients nothing, or control is missing.
     """
     quiet_colmap()  # fails before the resampling, which takes far longer
     if not project.comparator.exists():
@@ -268,7 +250,13 @@ def run_block(project: Project, folder: Path, pitch_um: float | None, reporter: 
         poses = oriented_by_control(found, pictures, marks, project.object_points, interior)
         own = written_block(project, folder, (*marks, *ties), poses)
     left_out = tuple(sorted({project.image_frame(mark.image) for mark in marks} - set(poses)))
-    return OrientedBlock(own, len(found.poses), seconds, left_out, len(ties), len({tie.point for tie in ties}))
+    lines = [
+        f"COLMAP oriented {counted(len(found.poses), 'image')}; {counted(len(ties), 'tie mark')} of "
+        f"{counted(len({tie.point for tie in ties}), 'point')} are observations now.",
+        *([f"not oriented: {', '.join(left_out)}"] if left_out else []),
+        *(f"{step}: {duration:.0f} s" for step, duration in seconds.items()),
+    ]
+    return own, left_out, lines
 
 
 def coarse_pitch_um(project: Project) -> float | None:
@@ -279,16 +267,6 @@ def coarse_pitch_um(project: Project) -> float | None:
     enough = 1000.0 * max(sides, default=0.0) / MOST_PX
     finest = min((min(pitch) for pitch in pitches.values()), default=0.0)
     return enough if enough > finest else None
-
-
-def block_lines(block: OrientedBlock) -> list[str]:
-    """Lines for the user about a block."""
-    lines = [
-        f"COLMAP oriented {counted(block.oriented, 'image')}; {counted(block.ties, 'tie mark')} of "
-        f"{counted(block.tracks, 'point')} are observations now."
-    ]
-    lines += [f"not oriented: {', '.join(block.left_out)}"] if block.left_out else []
-    return [*lines, *(f"{step}: {seconds:.0f} s" for step, seconds in block.seconds.items())]
 
 
 def written_block(

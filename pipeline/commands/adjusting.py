@@ -69,19 +69,19 @@ def block(
     as_json: AsJson = False,
 ) -> int:
     """Orient overlapping frames by COLMAP, and adjust them."""
-    from pipeline.blocks.block_stage import block_lines, run_block
+    from pipeline.blocks.block_stage import run_block
     from pipeline.progress import Reporter
     from pipeline.stages import run_adjust
 
     reporter = Reporter()
-    oriented = run_block(read(project, max_pixels), out_dir, pitch_um, reporter)
-    summary = run_adjust(oriented.project, reporter)
+    oriented, left_out, lines = run_block(read(project, max_pixels), out_dir, pitch_um, reporter)
+    summary = run_adjust(oriented, reporter)
     if not as_json:
-        say(*block_lines(oriented))
+        say(*lines)
     code = finish(summary, as_json, None)
     files = f"{out_dir / 'comparator.csv'} and {out_dir / 'images.csv'}"
     print_next(as_json, f"name {files} in a copy of project.toml without scans, then reseau run that copy")
-    return max(code, LOOK) if oriented.left_out else code
+    return max(code, LOOK) if left_out else code
 
 
 def compare(
