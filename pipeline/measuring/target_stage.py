@@ -8,6 +8,7 @@ import numpy as np
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
 from measure.boards.measure import measure_board
+from measure.boards.specs import BoardSpec
 from measure.flags import Code, Reason
 from measure.results import ON_FILM, MarkMeasurement
 from measure.scans.scan import Scan
@@ -99,37 +100,38 @@ def _check(project: Project, settings: TargetSettings, field: Field) -> None:
     check_spacing(project, field)
 
 
-# The image model before the targets are known: the camera from its file, and the film from the fiducials.
-
-
 def measure_targets(options: ScanOptions, scan: Scan, measured: MeasuredScan) -> MeasuredScan:
     """Measure the targets of a scan, in addition to its fiducials: one mark for each target that could be in it."""
     sought = options.targets
     if sought is None:
         return measured
-    settings, field = sought.settings, sought.field
+    if sought.settings.board is not None:
+        return _board(sought, sought.settings.board, scan, measured)
+    if sought.coded is not None and sought.coded.is_flat:
+        return replace_targets(measured, *measure_sheet(scan, sought.coded))
     if sought.coded is not None:
-        if sought.coded.is_flat:
-            return replace_targets(measured, *measure_sheet(scan, sought.coded))
-        return replace_targets(measured, *measure_coded_field(scan, sought.coded, field, options.camera, measured))
-    if settings.board is not None:
-        board = measure_board(scan, settings.board)
-        refused = (
-            (f"Of the board's markers {len(board.refused)} are not used: {board.refused[0]}.",) if board.refused else ()
-        )
-        problems = (f"The board was not found: {board.reason}.",) if board.reason else refused
-        if board.ambiguous:
-            problems = (f"No point of the board is used: {board.ambiguous}. Cover all but one, or cut the scan.",)
-        # A board with symmetry under a half turn may be named either way, unless its points were surveyed.
-        notes = tuple(f"{note}." for note in board.notes) if sought.surveyed else ()
-        mirrored = (_MIRRORED,) if board.is_mirrored and not settings.transparent else ()
-        return replace_targets(measured, board.marks, (*problems, *mirrored, *notes), Code.NO_BOARD)
-    found, notes = _oriented_by_targets(options, sought, scan, measured)
-    if isinstance(found, str):
-        return replace_targets(measured, absent_targets(field.ids, found), (*notes, f"No target has a name: {found}."))
-    model, predictions = found
-    fitted = measure_single_targets(scan, predictions, settings)
-    return replace_targets(measured, checked_places(fitted, field, model, measured), notes)
+        field, camera = sought.field, options.camera
+        return replace_targets(measured, *measure_coded_field(scan, sought.coded, field, camera, measured))
+    named, notes = _named(options, sought, scan, measured)
+    if isinstance(named, str):
+        absent = absent_targets(sought.field.ids, named)
+        return replace_targets(measured, absent, (*notes, f"No target has a name: {named}."))
+    fitted = measure_single_targets(scan, named.predictions(sought.field, measured), sought.settings)
+    return replace_targets(measured, checked_places(fitted, sought.field, named.model, measured), notes)
+
+
+def _board(sought: SoughtTargets, spec: BoardSpec, scan: Scan, measured: MeasuredScan) -> MeasuredScan:
+    board = measure_board(scan, spec)
+    problems = [f"Of the board's markers {len(board.refused)} are not used: {one}." for one in board.refused[:1]]
+    if board.reason:
+        problems = [f"The board was not found: {board.reason}."]
+    if board.ambiguous:
+        problems = [f"No point of the board is used: {board.ambiguous}. Cover all but one, or cut the scan."]
+    if board.is_mirrored and not sought.settings.transparent:
+        problems.append(_MIRRORED)
+    # A board with symmetry under a half turn may be named either way, unless its points were surveyed.
+    notes = [f"{note}." for note in board.notes] if sought.surveyed else []
+    return replace_targets(measured, board.marks, (*problems, *notes), Code.NO_BOARD)
 
 
 def replace_targets(
@@ -143,28 +145,24 @@ def replace_targets(
     return measured.changed([*fiducials, *targets], [Reason(problem, code) for problem in problems])
 
 
-def _oriented_by_targets(
+def _named(
     options: ScanOptions, sought: SoughtTargets, scan: Scan, measured: MeasuredScan
-) -> tuple[tuple[ImageModel, Sequence[TargetPrediction]] | str, tuple[str, ...]]:
-    """Orient by the approximate orientation, else by the pattern: model and predictions, or a reason; notes."""
-    camera, settings, field = options.camera, sought.settings, sought.field
+) -> tuple[NamedField | str, tuple[str, ...]]:
+    """Identify the targets by the approximate orientation, else by the field's pattern, or tell why not; notes."""
+    camera, field, exterior, notes = options.camera, sought.field, options.exterior, tuple[str, ...]()
     model = camera_model(camera, measured)
     if isinstance(model, str):
         return model, ()
-    exterior = options.exterior
-    notes: tuple[str, ...] = ()
     if exterior is not None and camera.principal_distance_mm is not None:
         approximate = replace(model, rotation=rotation_from_angles(exterior.values[3:]), station=exterior.center)
         named = _named_by_orientation(approximate, options, sought, scan, measured)
         if isinstance(named, NamedField):
-            return (named.model, named.predictions(field, measured)), ()
+            return named, ()
         notes = (f"Its orientation in images.csv was not used to name the targets: {named}.",)
     diameters = likely_diameters_px(field, measured)
     if diameters[1] < LEAST_DIAMETER_PX:
         return _too_small(sought, diameters[1]), notes
-    found = target_candidates(scan, settings, diameters)
-    named = name_field(field, model, camera, measured, found)
-    return (named if isinstance(named, str) else (named.model, named.predictions(field, measured))), notes
+    return name_field(field, model, camera, measured, target_candidates(scan, sought.settings, diameters)), notes
 
 
 def _too_small(sought: SoughtTargets, largest_px: float) -> str:
