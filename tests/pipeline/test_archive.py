@@ -268,7 +268,7 @@ def test_a_new_scan_has_its_own_lot_checked_again_and_no_other(folder: Path, mon
         lots.append({scan.frame.image for scan in scans})
         return check_scans(camera, scans, film)
 
-    monkeypatch.setattr("pipeline.archive.measure_archive.check_scans", note_lot)
+    monkeypatch.setattr("pipeline.archive.cross_scan_checks.check_scans", note_lot)
     monkeypatch.setattr(
         "pipeline.archive.measure_archive._TOGETHER", 1
     )  # lots as of an archive of 2000 times as many scans
