@@ -27,7 +27,7 @@ _LONGEST_STEP = 0.3  # in radii: the limit of linearisation
 _PLAIN_STEPS, _MOST_STEPS, _SETTLED_PX = 2, 30, 1e-3  # of a fit to convergence
 _UNDAMAGED = 0.05  # robust weight below which a pixel shows something else
 _DAMPING = 1e-4  # the unknowns of a faint disk are nearly dependent
-_UNKNOWNS, _BLUR = 10, 5  # place (2), size, stretch, shear, blur, gain, offset, slopes (2)
+_UNKNOWNS = 10  # place (2), size, stretch, shear, blur, gain, offset, slopes (2)
 _NO_DISK = Reason("no disk explains the picture there", Code.LIKENESS)
 _SCALE_FLOOR = 0.015  # of the contrast, under Tukey's scale
 WORST_MISFIT, WORST_SMOOTH_MISFIT = 0.23, 0.08  # residuals over contrast; above: texture or a stain
@@ -180,8 +180,6 @@ class _Fit:
         covariances, variances = influence_covariances(
             influence.reshape(size), self.residuals.reshape(size)[:, 0], counted.reshape(size)[:, 0], _UNKNOWNS
         )
-        inverse[:, _BLUR] *= 2 * self.blur[:, None]  # of the blur's variance
-        inverse[:, :, _BLUR] *= 2 * self.blur[:, None]
         blurs_px = np.sqrt(np.maximum(self.blur**2 - PIXEL_VARIANCE_PX2, 0.0))
         damaged = 1 - weights.sum(axis=1) / np.maximum(self.used.sum(axis=1), 1)
         for number, (center_px, shape) in enumerate(zip(found.centers, found.shapes, strict=True)):
@@ -195,7 +193,6 @@ class _Fit:
                 noise_dn=float(np.sqrt(variances[number])),
                 blur_px=float(blurs_px[number]),
                 damaged_fraction=float(damaged[number]),
-                covariance=inverse[number] * variances[number],
             )
 
     def misfit(self) -> Array:

@@ -69,7 +69,7 @@ class FittedDisk(MarkFit):
     @property
     def appearance_covariance(self) -> Array:
         """(5, 5) of the relative changes in size, stretch along the columns, shear and contrast, and of the blur's
-        variance, px²."""
+        variance, px²; unknown of disks fitted in batches."""
         assert self.covariance is not None
         gain = len(self.covariance) - GREY
         figures = [2, 3, 4, gain, gain - 1]
