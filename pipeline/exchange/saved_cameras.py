@@ -230,7 +230,7 @@ def _adjusted_camera(one: _Calibration, record: CameraRecord, earlier: Path, pat
         replace(each, xy_mm=record.fiducials[each.id].xy_mm) if each.id in record.fiducials else each
         for each in camera.fiducials
     )
-    calibration = EarlierCalibration(earlier, {}, one.parameters, one.values, one.covariance, {})
+    calibration = EarlierCalibration(earlier, one.parameters, one.values, one.covariance, {})
     return replace(
         camera,
         path=path,

@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,7 +16,6 @@ from pipeline.files.camera_tables import SigmaTable
 from pipeline.results.adjustment_file import read_adjustment
 from pipeline.results.adjustment_record import CameraRecord, DistortionRecord
 from pipeline.results.covariance_file import Covariance, covariance_path, read_covariance
-from pipeline.results.record_json import plain_json
 from pipeline.text.tables import Table
 from pipeline.types import Array
 
@@ -40,7 +38,6 @@ class EarlierCalibration:
     """
 
     path: Path
-    distortion: Mapping[str, Any]
     parameters: tuple[Parameter, ...]
     values: Array
     covariance: Array
@@ -102,7 +99,7 @@ def read_calibration(sigma: Table, given: SigmaTable, camera: Camera) -> Earlier
     name = camera.name if camera.name in names else names[0]
     distortion = content.cameras[name].distortion
     _check_family(sigma, path, distortion, camera.distortion)
-    earlier = _calibration(path, distortion, covariance, name, camera, given.calibration_fiducials)
+    earlier = _calibration(path, covariance, name, camera, given.calibration_fiducials)
     if not np.isfinite(earlier.values).all():
         raise sigma.error("calibration", f"{path} holds no interior orientation: it was made without object points.")
     _check_agreement(sigma, path, name, content.cameras[name], covariance)
@@ -175,9 +172,7 @@ def _check_family(sigma: Table, path: Path, earlier: DistortionRecord, distortio
             )
 
 
-def _calibration(
-    path: Path, distortion: DistortionRecord, covariance: Covariance, there: str, camera: Camera, fiducials: bool
-) -> EarlierCalibration:
+def _calibration(path: Path, covariance: Covariance, there: str, camera: Camera, fiducials: bool) -> EarlierCalibration:
     parameters = [Parameter.interior(there, name) for name in (*INTERIOR, *parameter_names(camera.distortion.family))]
     if fiducials:
         parameters += [Parameter.fiducial(there, id, axis) for id in camera.fiducials for axis in "xy"]
@@ -188,7 +183,6 @@ def _calibration(
     free = np.diag(matrix) > 0.0
     return EarlierCalibration(
         path=path,
-        distortion=plain_json(distortion),
         parameters=tuple(each for each, is_free in zip(parameters, free, strict=True) if is_free),
         values=values[free],
         covariance=matrix[np.ix_(free, free)],

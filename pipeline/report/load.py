@@ -4,6 +4,7 @@ from array import array
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from heapq import nsmallest
 from operator import itemgetter
 from pathlib import Path
@@ -29,7 +30,7 @@ from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.provenance import hash_file
 from pipeline.publishing import outside_note
-from pipeline.report.data import Frame, FrameTotals, Problem, ReportData, frames
+from pipeline.report.data import Frame, Problem, ReportData, frames
 from pipeline.report.frame_problems import (
     Gathered,
     centers_px,
@@ -53,6 +54,7 @@ from pipeline.results.covariance_file import read_covariance
 from pipeline.results.measured_record import FailureCode, MeasuredScan
 from pipeline.results.stage_files import read_check
 from pipeline.text.wording import counted, did_you_mean, listed
+from pipeline.types import Array
 
 MOST_FRAMES = 200  # largest number of frames shown with their marks
 _MOST_PROBLEMS = 50  # largest number of different problems listed
@@ -62,20 +64,37 @@ _OBSERVED = {str(status) for status in Status if status.is_observation}
 
 
 @dataclass
-class _Totals:
-    """Accumulator of `FrameTotals`."""
+class FrameTotals:
+    """Totals of all frames, for a report that does not show all of them.
+
+    Attributes
+    ----------
+    marks : number of marks by image and status.
+    of_targets : number of marks other than fiducials, by kind and status.
+    verdicts : number of frames by (camera, kind of file) and verdict.
+    centers_px : columns and rows of the observed marks.
+    """
 
     marks: dict[str, Counter[str]] = field(default_factory=dict)
     of_targets: Counter[tuple[str, str]] = field(default_factory=Counter)
     verdicts: dict[tuple[str, str], Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
-    problems: Gathered = field(default_factory=dict)
+    gathered: Gathered = field(default_factory=dict)
     centers_px: "array[float]" = field(default_factory=lambda: array("d"))
+
+    @cached_property
+    def problems(self) -> tuple[Problem, ...]:
+        return tuple(_listed(self.gathered))
+
+    @cached_property
+    def places_px(self) -> Mapping[str, Array]:
+        """Distinct positions of the observed marks by axis, see `frame_problems.places_px`."""
+        return places_apart(np.array(self.centers_px))
 
     def add(self, frame: Frame, kind: tuple[str, str], verdict: Verdict, problems: Iterable[Problem]) -> None:
         self.verdicts[kind][verdict] += 1
         self.marks[frame.image] = Counter(str(mark.status) for mark in frame.marks)
         self.of_targets.update((mark.kind, mark.status) for mark in frame.marks if not mark.is_fiducial)
-        gather(self.problems, frame.image, problems)
+        gather(self.gathered, frame.image, problems)
         for center in centers_px(frame):
             self.centers_px.extend(center.tolist())
 
@@ -94,15 +113,6 @@ class _Totals:
             count = counts[frame.result]
             self.marks[frame.image] = alike.setdefault(frozenset(count.items()), count)
 
-    def result(self) -> FrameTotals:
-        return FrameTotals(
-            marks=self.marks,
-            of_targets=self.of_targets,
-            verdicts={kind: {v: counts[v] for v in _BEST_FIRST} for kind, counts in sorted(self.verdicts.items())},
-            problems=tuple(_listed(self.problems)),
-            places_px=places_apart(np.array(self.centers_px)),
-        )
-
 
 def reduced(
     data: ReportData,
@@ -118,7 +128,7 @@ def reduced(
     stored : stored marks, of whose frames without problems only columns are read; data.comparator then holds all other
         frames.
     """
-    totals = _Totals()
+    totals = FrameTotals()
     if stored is not None:
         totals.add_plain(stored, camera_of)
     suspect = {row.image for row in suspect_rows(data.adjustment)} if data.adjustment else set[str]()
@@ -139,7 +149,7 @@ def reduced(
         data,
         comparator=[row for one in shown for row in one.comparator],
         measurement={name: scan for one in shown for name, scan in (one.measurement or {}).items()},
-        totals=totals.result(),
+        totals=totals,
     )
 
 

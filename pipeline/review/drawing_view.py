@@ -46,7 +46,7 @@ from pipeline.review.mark_handles import (
     remove_part,
 )
 from pipeline.review.pictures import Pictures, window_start
-from pipeline.review.requests import DrawnCamera, Query, ShownMarks, parse_values
+from pipeline.review.requests import DrawnCamera, Query, ShownMarks, parse_json, parse_values, whole
 from pipeline.review.session import Session
 from pipeline.text.table_models import key_rows
 from pipeline.types import Array
@@ -277,12 +277,12 @@ class DrawingAnswers:
 
     def picture(self, query: Query) -> bytes:
         """Rendered drawing or residual image around the mark shown."""
-        drawing = parse_drawing(query.table("drawing"))
-        half, shown = query.whole("half", 8, _WIDEST_PX), drawn_mark(drawing, self._placement(drawing))
+        drawing = parse_drawing(parse_json(query.get("drawing", "")))
+        half, shown = whole(query, "half", 8, _WIDEST_PX), drawn_mark(drawing, self._placement(drawing))
         if shown is None or not isinstance(shown.mark, MarkShape):
             raise MeasurementError("nothing is drawn there")
         matrix, blur_px = shown.pixel_from_mark, shown.clicked.blur_px
-        if query.text("of") == "drawing":
+        if query.get("of", "") == "drawing":
             return self._pictures.drawing(shown.mark, matrix, blur_px, half)
         return self._pictures.residual(self._session.scan_location(drawing.image), shown.mark, matrix, blur_px, half)
 

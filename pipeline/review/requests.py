@@ -14,6 +14,7 @@ _MOST_PX = 1e7  # larger than any scan
 Pixels = Annotated[float, Field(strict=True, gt=-_MOST_PX, lt=_MOST_PX)]
 Places = dict[str, tuple[Pixels, Pixels]]  # columns and rows by fiducial
 Value = TypeVar("Value")
+Query = Mapping[str, str]  # parameters of a request
 
 
 @dataclass(frozen=True)
@@ -70,28 +71,15 @@ def parse_values(kind: type[Value], given: Any, what: str = "the request") -> Va
         raise InputError(f"{where}: {first['msg']}.") from None
 
 
-class Query:
-    """Query parameters of a request."""
-
-    def __init__(self, values: Mapping[str, str]) -> None:
-        self._values = values
-
-    def text(self, name: str) -> str:
-        return self._values.get(name, "")
-
-    def whole(self, name: str, least: int, most: int) -> int:
-        """Whole number between least and most. Raises InputError otherwise."""
-        try:
-            value = round(float(self._values.get(name, "0")))
-        except (ValueError, OverflowError):
-            value = least - 1
-        if not least <= value <= most:
-            raise InputError(f"{name} must be a whole number from {least} to {most}.")
-        return value
-
-    def table(self, name: str) -> Any:
-        """Value parsed as JSON. Raises InputError if it is not JSON."""
-        return parse_json(self.text(name))
+def whole(query: Query, name: str, least: int, most: int) -> int:
+    """Whole number between least and most. Raises InputError otherwise."""
+    try:
+        value = round(float(query.get(name, "0")))
+    except (ValueError, OverflowError):
+        value = least - 1
+    if not least <= value <= most:
+        raise InputError(f"{name} must be a whole number from {least} to {most}.")
+    return value
 
 
 def parse_json(text: str | bytes) -> Any:

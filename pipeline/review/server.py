@@ -36,7 +36,7 @@ from pipeline.results.measured_record import MeasuredScan
 from pipeline.review.drawing_view import DrawingAnswers
 from pipeline.review.frame_view import mark_json, measured_as_shown, measured_from_clicks
 from pipeline.review.pictures import Pictures
-from pipeline.review.requests import Decide, MeasureFrame, Query, ShownMarks, parse_json, parse_values
+from pipeline.review.requests import Decide, MeasureFrame, Query, ShownMarks, parse_json, parse_values, whole
 from pipeline.review.session import Filters, Session
 
 HEADERS = {
@@ -218,11 +218,11 @@ class _Answers:
         }
 
     def queue(self, query: Query) -> Any:
-        filters = Filters(**{one.name: query.text(one.name) for one in fields(Filters)})
-        return self._session.page(filters, query.whole("start", 0, 10**9))
+        filters = Filters(**{one.name: query.get(one.name, "") for one in fields(Filters)})
+        return self._session.page(filters, whole(query, "start", 0, 10**9))
 
     def mark(self, query: Query) -> Any:
-        image, point, kind = query.text("image"), query.text("point"), query.text("kind")
+        image, point, kind = query.get("image", ""), query.get("point", ""), query.get("kind", "")
         view, session = self._session.looking.view(image), self._session
         others = [session.looking.view(name) for name in session.looking.others(image, point, kind)]
         return {
@@ -239,12 +239,12 @@ class _Answers:
         }
 
     def frame(self, query: Query) -> Any:
-        image = query.text("image")
+        image = query.get("image", "")
         return {**self._session.looking.view(image).frame_json(), "decided": self._session.image_decisions(image)}
 
     def camera(self, query: Query) -> Any:
         """Camera with marks to be learned: their names, and scans in which to click them."""
-        entry = self._session.entry(query.text("key"))
+        entry = self._session.entry(query.get("key", ""))
         camera = self._session.project.image_camera(entry.images[0])
         return {
             "camera": camera.name,
@@ -255,7 +255,7 @@ class _Answers:
 
     def scan(self, query: Query) -> Any:
         """Size of a scan, measured or not."""
-        image = query.text("image")
+        image = query.get("image", "")
         learned = self._session.project.image_camera(image).learned if self._session.project.cameras else ()
         size_px, pitch_um = self._pictures.size(self._session.scan_location(image))
         pitch_um = self._session.project.pitch_um or pitch_um
@@ -264,12 +264,12 @@ class _Answers:
         return {"image": image, "size": size_px, "half": max(_HALF_PX, round(half_px))}
 
     def window(self, query: Query) -> bytes:
-        place = (query.whole("col", -_WIDEST_PX, 10**6), query.whole("row", -_WIDEST_PX, 10**6))
-        return self._pictures.window(self._scan(query), *place, query.whole("size", 8, _WIDEST_PX))
+        place = (whole(query, "col", -_WIDEST_PX, 10**6), whole(query, "row", -_WIDEST_PX, 10**6))
+        return self._pictures.window(self._scan(query), *place, whole(query, "size", 8, _WIDEST_PX))
 
     def residual(self, query: Query) -> bytes:
-        view = self._session.looking.view(query.text("image"))
-        point, kind = query.text("point"), query.text("kind")
+        view = self._session.looking.view(query.get("image", ""))
+        point, kind = query.get("point", ""), query.get("kind", "")
         matrix, blur_px = view.pixel_from_mark(point, kind), view.mark(point, kind).quality.get("blur_px", 0.0)
         if matrix is None or blur_px <= 0:
             raise MeasurementError("nothing was fitted there")
@@ -280,7 +280,7 @@ class _Answers:
         return self._pictures.frame(self._scan(query))
 
     def posed(self, query: Query) -> bytes:
-        pose = query.text("pose")
+        pose = query.get("pose", "")
         if pose not in POSES:
             raise KeyError(pose)
         return self._pictures.posed(self._scan(query), pose)
@@ -304,7 +304,7 @@ class _Answers:
         return _trial_json(measured_as_shown(self._session.project, given.image, given.px, given.of))
 
     def _scan(self, query: Query) -> str:
-        return self._session.scan_location(query.text("image"))
+        return self._session.scan_location(query.get("image", ""))
 
 
 def _decision(given: Mapping[str, Any]) -> Decision:
@@ -336,7 +336,7 @@ def _answering(answer: Callable[..., Any]) -> Callable[[Request], Any]:
 
     async def answering(request: Request) -> Response:
         try:
-            given = [Query(request.query_params), *([await _body(request)] if request.method == "POST" else [])]
+            given = [request.query_params, *([await _body(request)] if request.method == "POST" else [])]
             found = await anyio.to_thread.run_sync(answer, *given)
         except Exception as error:
             return _refusal(error)

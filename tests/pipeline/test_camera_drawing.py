@@ -35,7 +35,6 @@ from pipeline.review.camera_drawing import (
 from pipeline.review.drawing_view import DrawingAnswers, take_step
 from pipeline.review.mark_handles import add_vertex, first_drawing, handles, remove_part
 from pipeline.review.pictures import Pictures
-from pipeline.review.requests import Query
 from pipeline.review.session import Session
 
 SIZES = {"ring_mm": 0.5, "ring_line_mm": 0.1, "arm_mm": 0.8, "line_mm": 0.1}  # of the marks in the scan
@@ -377,8 +376,8 @@ def test_marks_of_one_scan_are_saved_as_a_camera_file(project: Path) -> None:
     answers = DrawingAnswers(Session(read_project(project), "ann"), pictures)
     px = {point: (place + off).tolist() for point, place in zip("1234", learned_px("a"), strict=True)}
     with pytest.raises(InputError, match="click 4, too"):
-        answers.save_learned(Query({}), {"image": "a", "px": {p: px[p] for p in "123"}, "file": "own"})
-    result = answers.save_learned(Query({}), {"image": "a", "px": px, "file": "own"})
+        answers.save_learned({}, {"image": "a", "px": {p: px[p] for p in "123"}, "file": "own"})
+    result = answers.save_learned({}, {"image": "a", "px": px, "file": "own"})
     pictures.close()
     assert "own.toml with 4 marks" in result["text"]
     assert 'name it in the project, camera = "own.toml"' in result["text"]
