@@ -438,7 +438,7 @@ def test_sigmas_that_are_somewhat_too_small_are_no_slip() -> None:
     assert adjust(replace(given, observations=replace(given.observations, covariance_mm2=close))).converged
 
 
-def _straight_on(seed: int, free: tuple[str, ...]) -> tuple[Network, float]:
+def _straight_images(seed: int, free: tuple[str, ...]) -> tuple[Network, float]:
     """Images that look straight at a board, c known; also the truth of y0."""
     rng = np.random.default_rng(seed)
     made = scene(seed, flat=True)
@@ -454,7 +454,7 @@ def _straight_on(seed: int, free: tuple[str, ...]) -> tuple[Network, float]:
 
 def test_straight_views_tell_where_the_principal_point_hangs_on_the_decentering() -> None:
     """Decentering of the lens moves it by 4.7 standard deviations, and sigma0 is 1."""
-    given, y0_mm = _straight_on(2, ("k1", "k2", "k3"))
+    given, y0_mm = _straight_images(2, ("k1", "k2", "k3"))
     result = adjust(given)
     assert abs(result.value("IO.cam.y0") - y0_mm) > 4.0 * result.sigma("IO.cam.y0")
     assert any("with p1 and p2 free, its standard deviation would be" in note for note in result.notes)
@@ -462,14 +462,14 @@ def test_straight_views_tell_where_the_principal_point_hangs_on_the_decentering(
 
 def test_no_principal_point_of_straight_views_is_claimed_that_images_do_not_tell() -> None:
     """Linear standard deviations miss a curved valley, and other minima."""
-    told = 0
+    reported = 0
     for seed in range(6):
-        given, y0_mm = _straight_on(seed, ("k1", "k2", "p1", "p2", "k3"))
+        given, y0_mm = _straight_images(seed, ("k1", "k2", "p1", "p2", "k3"))
         result = adjust(given)
-        is_told = any("hardly tell y0 of camera cam from its distortion" in each for each in result.warnings)
-        assert is_told or abs(result.value("IO.cam.y0") - y0_mm) < 4.5 * result.sigma("IO.cam.y0")
-        told += is_told
-    assert told
+        is_reported = any("hardly tell y0 of camera cam from its distortion" in each for each in result.warnings)
+        assert is_reported or abs(result.value("IO.cam.y0") - y0_mm) < 4.5 * result.sigma("IO.cam.y0")
+        reported += is_reported
+    assert reported
 
 
 def test_another_unit_of_the_fiducials_is_noted_with_what_it_does_to_c() -> None:

@@ -3,6 +3,7 @@
 import os
 import struct
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -34,25 +35,24 @@ def zeros_png(side: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
-def test_a_missing_file_is_named_with_the_place_inspected_for(tmp_path: Path) -> None:
-    with pytest.raises(MeasurementError, match=r"no scan .*nowhere\.tif.*searched at.*check its name"):
-        open_scan(tmp_path / "nowhere.tif")
-
-
-def test_an_empty_file(tmp_path: Path) -> None:
-    (tmp_path / "s.tif").write_bytes(b"")
-    with pytest.raises(MeasurementError, match="empty"):
-        open_scan(tmp_path / "s.tif")
-
-
-def test_a_folder_is_no_scan(tmp_path: Path) -> None:
-    with pytest.raises(MeasurementError, match="cannot be read"):
-        open_scan(tmp_path)
-
-
-def test_a_text_file_named_tif(tmp_path: Path) -> None:
-    (tmp_path / "s.tif").write_text("These are my notes on the scans.")
-    with pytest.raises(MeasurementError, match=r"s\.tif is no TIFF, JPEG, JPEG 2000 or PNG.*These ar"):
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda path: None, r"no scan .*s\.tif.*searched at.*check its name"),
+        (lambda path: path.write_bytes(b""), "empty"),
+        (lambda path: path.mkdir(), "cannot be read"),
+        (lambda path: path.symlink_to(path), "cannot be read"),
+        (
+            lambda path: path.write_text("These are my notes on the scans."),
+            r"s\.tif is no TIFF, JPEG, JPEG 2000 or PNG.*These ar",
+        ),
+        (os.mkfifo, "no regular file, but a pipe or a device"),
+    ],
+    ids=["missing", "empty", "folder", "link to itself", "text", "pipe"],
+)
+def test_what_is_no_scan_is_named(make: Callable[[Path], object], words: str, tmp_path: Path) -> None:
+    make(tmp_path / "s.tif")
+    with pytest.raises(MeasurementError, match=words):
         open_scan(tmp_path / "s.tif")
 
 
@@ -183,19 +183,6 @@ def test_a_strip_of_zstd_that_decodes_to_gigabytes(tmp_path: Path) -> None:
         assert not scan.window(0, 0, 9, 9).any()
     with pytest.raises(MeasurementError, match="--max-pixels allows 1000"):
         open_scan(tmp_path / "s.tif", max_pixels=1000)
-
-
-def test_a_pipe_or_a_device_is_not_read(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "s.tif")
-    for path in (tmp_path / "s.tif", Path("/dev/zero")):
-        with pytest.raises(MeasurementError, match="no regular file, but a pipe or a device"):
-            open_scan(path)
-
-
-def test_a_scan_that_links_to_itself(tmp_path: Path) -> None:
-    (tmp_path / "s.tif").symlink_to(tmp_path / "s.tif")
-    with pytest.raises(MeasurementError, match="cannot be read"):
-        open_scan(tmp_path / "s.tif")
 
 
 def test_a_jpeg_that_decodes_to_nothing_is_unknown(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ SIGMA_MM = 0.004
 
 
 @dataclass(frozen=True)
-class Dense:
+class DenseCofactor:
     """A cofactor matrix that is there as a whole."""
 
     matrix: Array
@@ -118,7 +118,7 @@ def adjustment() -> MadeUpAdjustment:
         variance=VarianceFactor(math.sqrt(262.1 / 257), 257),
         parameters=parameters,
         values=values,
-        cofactor=Dense(correlation * np.outer(sigmas, sigmas)),
+        cofactor=DenseCofactor(correlation * np.outer(sigmas, sigmas)),
         known={
             "residuals": Residuals(v, redundancy, w),
             "groups": {
@@ -227,7 +227,7 @@ def singular_adjustment() -> Adjustment:
     )
     count = len(adjustment().parameters)
     return replace(
-        adjustment(), termination="singular", singular=(null,), cofactor=Dense(np.full((count, count), np.nan))
+        adjustment(), termination="singular", singular=(null,), cofactor=DenseCofactor(np.full((count, count), np.nan))
     )
 
 

@@ -491,13 +491,13 @@ def test_of_lenses_as_good_the_simplest_is_taken(errors: dict[int | str, float],
     network = board_network(np.random.default_rng(4), 6, ERROR_PX * PIXEL_MM)
     scatter = np.random.default_rng(1).uniform(0.9, 1.1, (9, len(network.images)))
 
-    def stand_in(network: Network, _: Approximations | None) -> Any:
+    def fake_adjust(network: Network, _: Approximations | None) -> Any:
         distortion = network.cameras[0].distortion
         count = len(distortion.parameters)
         squares = errors["fisheye" if "fisheye" in distortion.family else count] * scatter[count]
         return SimpleNamespace(converged=True, start=None, value=lambda _: 1.0, prediction_errors=lambda _: squares)
 
-    assert choose_lens(network, True, PIXEL_MM, stand_in).model == wanted
+    assert choose_lens(network, True, PIXEL_MM, fake_adjust).model == wanted
 
 
 @pytest.mark.parametrize("model", ["opencv4", "opencv5", "opencv8", "fisheye"])

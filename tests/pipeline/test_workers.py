@@ -241,8 +241,8 @@ def test_workers_are_requested_their_versions_and_their_way_to_the_scans() -> No
             workers._check_workers(Answers({"a": good, "b": answer}), "x", [])
 
 
-class Loses(Executor):
-    """Loses the first tasks that it is given."""
+class LosesFirst(Executor):
+    """LosesFirst the first tasks that it is given."""
 
     def __init__(self, times: int) -> None:
         self.times = times
@@ -259,6 +259,6 @@ class Loses(Executor):
 
 @pytest.mark.filterwarnings("ignore")
 def test_what_an_executor_loses_is_submitted_again_once() -> None:
-    assert SubmittedAgain(Loses(1)).submit(cluster_process, 3).result()[0] == 3
+    assert SubmittedAgain(LosesFirst(1)).submit(cluster_process, 3).result()[0] == 3
     with pytest.raises(WorkerKilled):
-        SubmittedAgain(Loses(2)).submit(cluster_process, 3).result()
+        SubmittedAgain(LosesFirst(2)).submit(cluster_process, 3).result()
