@@ -70,6 +70,9 @@ def test_many_disks_at_once_are_placed_as_well_as_their_sigmas_say_and_odd_ones_
     assert all(not disk.reason and not disk.weakness for disk in disks[1:])
     assert len(alone) == 1
     assert disks[0].reason or disks[0].weakness
+    for disk in disks[1:]:
+        np.testing.assert_allclose(disk.half_axes_px, (9.0, 7.2), atol=0.2)
+        assert abs(disk.blur_px - 0.9) < 0.15
 
 
 def test_dark_disks_at_the_edge_of_the_scan_and_large_coordinates() -> None:
