@@ -116,6 +116,7 @@ def linear_transformations(xyz: Array, xy_mm: Array) -> tuple[Array, Array]:
 def _normalised(places: Array) -> tuple[Array, Array, Array]:
     """Places (m, n, k) about their centroid, of size 1, their extents (m, k) along their axes, and these (m, k, k)."""
     centred = places - places.mean(axis=1, keepdims=True)
+    centred /= np.maximum(np.abs(centred).max(axis=(1, 2), keepdims=True), 1e-300)  # for the squares
     squares, axes = np.linalg.eigh(centred.swapaxes(1, 2) @ centred)
     extents = np.sqrt(np.maximum(squares[:, ::-1], 0.0))
     return centred / np.maximum(extents[:, :1, None], 1e-300), extents, axes[..., ::-1]
