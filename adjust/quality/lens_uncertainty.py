@@ -83,6 +83,23 @@ def radial_part(lens: Lens, radius_mm: Array) -> tuple[Array, Array, Array, Arra
     return radial, radial_by, rest, by - radial_by[:, None, None, :] * outward[:, :, None]
 
 
+def balanced_distance(radius: Array, tangent: Array) -> tuple[float, int, int]:
+    """Calibrated principal distance, which balances the largest and smallest distortion r - C tan t at some radii.
+
+    Also returns the indices of these extremes. An exchange algorithm: the pair of radii is replaced by the current
+    extremes until it no longer changes. The axis, without distortion, may be one of them.
+    """
+    distance, high, low = float(radius[-1] / tangent[-1]), 0, 0
+    for _ in range(50):
+        distortion = radius - distance * tangent
+        high, low = int(distortion.argmax()), int(distortion.argmin())
+        better = float((radius[high] + radius[low]) / (tangent[high] + tangent[low]))
+        if abs(better - distance) < 1e-12 * distance:
+            break
+        distance = better
+    return distance, high, low
+
+
 def displacement_cofactor(lens: Lens) -> Array:
     """(1 + k, 1 + k) covariance of c and the parameters, on which a displacement about the principal point depends."""
     return np.delete(np.delete(lens.covariance, [1, 2], axis=0), [1, 2], axis=1)

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from scipy.optimize import brentq
 
 from adjust.functional_model.lens import Distortion, Prior
 from adjust.problem.camera import FiducialDistance
+from adjust.quality.lens_uncertainty import balanced_distance
 from measure.marks.shapes import Point
 from pipeline.exchange.formats import Convention
 from pipeline.exchange.incoming import ImportOptions, Incoming
@@ -175,21 +175,9 @@ def fit(certificate: Certificate) -> FittedTable:
     coefficients = np.zeros(len(POWERS))
     coefficients[:count] = solution[1:]
     equivalent = certificate.distance_mm + float(solution[0])
-    calibrated = balanced_mm(equivalent, coefficients, float(radius.max()))
+    along = np.linspace(0.0, radius.max(), _CURVE)[1:]
+    calibrated, *_ = balanced_distance(along, (along - _curve(coefficients, along)) / equivalent)
     return FittedTable(equivalent, calibrated, coefficients, sigmas, 1000.0 * residuals)
-
-
-def balanced_mm(equivalent_mm: float, coefficients: Array, largest_radius_mm: float) -> float:
-    """Calibrated principal distance: the largest and smallest distortion up to a radius have the same magnitude."""
-    radius = np.linspace(0.0, largest_radius_mm, _CURVE)
-    tangent = (radius - _curve(coefficients, radius)) / equivalent_mm
-
-    def imbalance(distance_mm: float) -> float:
-        distortion = radius - distance_mm * tangent
-        return float(distortion.max() + distortion.min())
-
-    reach = 2.0 * np.abs(_curve(coefficients, radius)).max() / max(float(tangent[-1]), 1e-9) + 1e-6
-    return float(brentq(imbalance, equivalent_mm - reach, equivalent_mm + reach, xtol=1e-9))
 
 
 def _curve(coefficients: Array, radius_mm: Array) -> Array:

@@ -11,6 +11,7 @@ from adjust.functional_model.lens import Lens
 from adjust.problem.parameter import Parameter
 from adjust.quality.lens_uncertainty import (
     Curves,
+    balanced_distance,
     directions,
     displacement_cofactor,
     distortion_curves,
@@ -114,7 +115,7 @@ def certificate(lens: Lens, largest_radius_mm: float) -> Certificate:
     tangent = (radius - radial_um / 1e3) / c
     by = -radial_by / (1e3 * c)
     by[:, 0] -= tangent / c
-    calibrated, high, low = _balanced(radius, tangent)
+    calibrated, high, low = balanced_distance(radius, tangent)
     calibrated_by = -calibrated * (by[high] + by[low]) / (tangent[high] + tangent[low])
     near = float(radius[0] / tangent[0])
     angles = _angles_deg(float(np.degrees(np.arctan(tangent[-1]))))
@@ -141,23 +142,6 @@ def _angles_deg(largest: float) -> list[float]:
     if len(usual) >= _FEWEST_ANGLES:
         return usual
     return [float(each) for each in np.floor(10.0 * np.linspace(0.0, largest, len(ANGLES_DEG) + 1)[1:]) / 10.0]
-
-
-def _balanced(radius: Array, tangent: Array) -> tuple[float, int, int]:
-    """Principal distance that balances the largest and smallest distortion, and the indices of these extremes.
-
-    An exchange algorithm: the pair of radii is replaced by the current extremes until it no longer changes. The axis,
-    without distortion, may be one of them.
-    """
-    distance, high, low = float(radius[-1] / tangent[-1]), 0, 0
-    for _ in range(50):
-        distortion = radius - distance * tangent
-        high, low = int(distortion.argmax()), int(distortion.argmin())
-        better = float((radius[high] + radius[low]) / (tangent[high] + tangent[low]))
-        if abs(better - distance) < 1e-12 * distance:
-            break
-        distance = better
-    return distance, high, low
 
 
 def lens_map(lens: Lens, on: Plane, observed_radius_mm: float = np.inf) -> LensMap:
