@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from adjust.array_types import Array, Indices
 from adjust.errors import AdjustmentError
@@ -33,7 +32,6 @@ from adjust.model_selection.candidates import (
 from adjust.model_selection.scanner_choice import choose_bends
 from adjust.problem.network import Approximations, Network
 from adjust.problem.parameter import description, object_coordinate
-from adjust.problem.problem import ABSENT
 from adjust.quality.run import UNCHECKED
 from adjust.quality.tested import NO_WEIGHT
 from adjust.rank_defect.datum import held_as_known
@@ -238,15 +236,10 @@ def cross_validate(adjustment: Adjustment, options: Options) -> CrossValidation 
     residuals in unit weight of the rays left out and V their cofactor matrix, the prediction errors are V^-1 v, as in
     data snooping. Returns None where a fold determines something that the others do not, or nothing is predicted.
     """
-    run, errors, errors_mm = adjustment.run, list[Array](), list[Array]()
-    numbering, matrix, right = run.numbering, run.end.rows.matrix, run.end.rows.right
+    run, right, errors, errors_mm = adjustment.run, adjustment.run.end.rows.right, list[Array](), list[Array]()
     back = product(inverse(run.end.by_observation), run.end.rows.root)
     for rows in left_out_rows(adjustment.network, options):
-        numbers = np.broadcast_to(numbering.numbers[numbering.problem.columns[rows]][:, None], matrix[rows].shape)
-        pairs = np.broadcast_to(np.arange(2 * len(rows)).reshape(-1, 2, 1), numbers.shape)
-        free = numbers != ABSENT
-        entries = matrix[rows][free], (pairs[free], numbers[free])
-        functions = csr_array(entries, shape=(2 * len(rows), len(numbering.free)))
+        functions = run.unit_functions[(2 * rows[:, None] + np.arange(2)).ravel()]
         cofactor = np.eye(2 * len(rows)) - run.factor.function_cofactor(functions)
         try:
             np.linalg.cholesky(cofactor - UNCHECKED * np.eye(len(cofactor)))

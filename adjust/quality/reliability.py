@@ -9,7 +9,7 @@ then tested again without the later ones, so that two errors neither mask each o
 and cofactor matrix V = I - T B C_xx B' T', in unit weight, give the residuals without any subset of observations.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,10 +19,8 @@ from scipy import special
 from adjust.array_types import Array, Indices, Mask
 from adjust.linear_algebra.small_matrices import applied, eigen, product
 from adjust.problem.parameter import Parameter
-from adjust.quality.run import UNCHECKED, GrossError, Run
+from adjust.quality.run import UNCHECKED, GrossError, Run, surplus
 from adjust.quality.tested import Probabilities, Tested, robust_scale
-
-Effects = tuple[Array, Callable[[int], str]]  # effects (k, c) of errors on the cameras' parameters, and their names
 
 UNCONTROLLED = 1e-4  # redundancy number below which only errors of hundreds of standard deviations are detectable
 
@@ -124,56 +122,34 @@ def _over(shift: float, variance: Array, checked: Mask) -> Array:
 
 def _outer_effects(run: Run, errors: Array, tested: tuple[Tested, ...], shift: float) -> tuple[OuterEffect, ...]:
     """Largest effect of single errors on every free camera parameter."""
-    # The errors are those of units (N, 2), and those of further observations that shift their test by `shift`.
-    unknowns, factor = run.numbering.problem.unknowns, run.factor
-    cameras = np.concatenate([*unknowns.camera.values(), *unknowns.fiducial.values()]).astype(np.intp)
-    free = run.numbering.free[: factor.shared_count]
-    members = np.flatnonzero(np.isin(free, cameras))
-    of_cameras = np.zeros((factor.shared_count, len(members)))
-    of_cameras[members, np.arange(len(members))] = 1.0 / factor.scale[members]
-    by_shared = factor.triangle.cofactor_times(of_cameras)
-    largest = np.zeros(len(members))
-    causes = np.full(len(members), "", dtype=object)
-    for effects, name_of in (*_unit_effects(run, errors, by_shared, tested), *_further_effects(run, by_shared, shift)):
-        if len(effects) == 0:
-            continue
-        worst = np.abs(effects).argmax(axis=0)
-        values = effects[worst, np.arange(len(members))]
-        for i in np.flatnonzero(np.abs(values) > np.abs(largest)):
-            largest[i], causes[i] = values[i], name_of(int(worst[i]))
-    sigma = np.sqrt((of_cameras * by_shared).sum(axis=0))
-    return tuple(
-        OuterEffect(
-            unknowns.parameters[free[members[i]]], float(largest[i]), float(abs(largest[i]) / sigma[i]), causes[i]
-        )
-        for i in np.argsort(free[members])
-    )
-
-
-def _unit_effects(run: Run, errors: Array, by_shared: Array, tested: tuple[Tested, ...]) -> Iterator[Effects]:
-    """dx = C_xx B' T' T h times the error; the own unknowns of a block are eliminated."""
-    turned = np.append(run.misfits.transform * errors[:, None, :], np.zeros((1, 2, 2)), axis=0)  # last is of ABSENT
-    for rows in run.unit_rows():
-        units: Indices = rows.units.ravel()
-
-        def unit_name(row: int, units: Indices = units) -> str:
-            return tested[int(units[row // 2])].coordinate_name(row % 2)
-
-        moved = rows.through @ by_shared[rows.shared][:, None]
-        yield -(turned[rows.units].swapaxes(2, 3) @ moved).reshape(2 * len(units), by_shared.shape[1]), unit_name
-
-
-def _further_effects(run: Run, by_shared: Array, shift: float) -> Iterator[Effects]:
-    """Effects of errors in further observations with whitened rows L^-1 J: dx = C_xx J' L^-T L^-1 h times the error."""
-    for each, block in zip(run.numbering.problem.further, run.end.rows.further, strict=True):
+    # The errors are those of units (N, 2), and those of further observations that shift their test by `shift`:
+    # dx = C_xx B' T' T h times the error.
+    numbering, unknowns = run.numbering, run.numbering.problem.unknowns
+    cameras = np.unique(np.concatenate([*unknowns.camera.values(), *unknowns.fiducial.values()]).astype(np.intp))
+    cameras = cameras[unknowns.sigma[cameras] > 0.0]
+    of_cameras = np.zeros((len(numbering.free), len(cameras)))
+    of_cameras[numbering.numbers[cameras], np.arange(len(cameras))] = 1.0
+    cofactor = run.factor.cofactor_times(of_cameras)
+    by_units = (run.unit_functions @ cofactor).reshape(len(tested), 2, len(cameras))
+    turned = run.misfits.transform * errors[:, None, :]
+    effects = [-(turned.swapaxes(1, 2) @ by_units).reshape(2 * len(tested), -1)]
+    names = list[str]()
+    for each, block in zip(numbering.problem.further, run.end.rows.further, strict=True):
         inward = np.linalg.inv(np.linalg.cholesky(each.covariance))
-        through = block.matrix[0] / run.factor.scale[block.shared[0]]
-        roots = through @ run.factor.triangle.group_roots(block.shared)[0]
-        variance = np.diag(inward.T @ (np.eye(len(roots)) - roots @ roots.T) @ inward)
+        variance = np.diag(inward.T @ surplus(block, run.factor) @ inward)
         controlled = variance > UNCONTROLLED * (inward**2).sum(axis=0)
-        errors = np.where(controlled, _over(shift, variance, controlled), 0.0)
-        names = [f"{each.group} {label}" for label in each.labels]
-        yield errors[:, None] * (inward.T @ (through @ by_shared[block.shared[0]])), names.__getitem__
+        own_errors = np.where(controlled, _over(shift, variance, controlled), 0.0)
+        effects.append(own_errors[:, None] * (inward.T @ (block.matrix[0] @ cofactor[block.shared[0]])))
+        names += [f"{each.group} {label}" for label in each.labels]
+    together = np.concatenate(effects)
+    found = []
+    for k, position in enumerate(cameras):
+        worst = int(np.abs(together[:, k]).argmax())
+        effect, beyond = float(together[worst, k]), worst - 2 * len(tested)
+        cause = names[beyond] if beyond >= 0 else tested[worst // 2].coordinate_name(worst % 2)
+        in_sigmas = abs(effect) / float(np.sqrt(cofactor[numbering.numbers[position], k]))
+        found.append(OuterEffect(unknowns.parameters[position], effect, in_sigmas, cause if effect else ""))
+    return tuple(found)
 
 
 TOLD_APART = 7.0  # difference of two statistics that decides between explanations: odds of 30 to 1
@@ -379,23 +355,11 @@ class Snooping:
     def _prepare(self, units: list[int]) -> None:
         """Compute the columns (N, 2, 2) of some units in one pass."""
         units = [unit for unit in units if unit not in self._columns]
-        # By unit: number of the rows and of the block that hold it, its own rows, its covariances with the shared.
-        homes: dict[int, tuple[int, int, Array, Array]] = {}
-        triangle = self.run.factor.triangle
-        for part, rows in enumerate(self.run.unit_rows()):
-            for block, place in np.argwhere(np.isin(rows.units, units)):
-                through = np.zeros((len(triangle), 2))
-                np.add.at(through, rows.shared[block], rows.through[block, place].T)
-                by_shared = triangle.cofactor_times(through)
-                homes[int(rows.units[block, place])] = (part, int(block), rows.own[block, place], by_shared)
-        columns = {unit: np.zeros((len(self.critical) + 1, 2, 2)) for unit in units}  # the last entry is ABSENT
-        for part, rows in enumerate(self.run.unit_rows()):
-            for unit, (home, block, own, by_shared) in homes.items():
-                columns[unit][rows.units] = -(rows.through @ by_shared[rows.shared][:, None])
-                if part == home:
-                    columns[unit][rows.units[block]] -= rows.own[block] @ own.T
-        for unit in units:
-            self._columns[unit] = columns[unit][:-1]
+        rows = (2 * np.array(units)[:, None] + np.arange(2)).ravel()
+        functions = self.run.unit_functions
+        columns = -(functions @ self.run.factor.cofactor_times(functions[rows].T.toarray()))
+        for unit, own in zip(units, columns.reshape(len(self.critical), 2, len(units), 2).swapaxes(0, 2), strict=True):
+            self._columns[unit] = own.swapaxes(0, 1)
             self._columns[unit][unit] = np.eye(2) - self.run.misfits.hat[unit]
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from adjust.array_types import Array, Indices, Mask
 from adjust.least_squares.equations import Numbering, prior_differences
@@ -188,6 +189,20 @@ class Run:
         vpv = float((self.misfits.residual[members] ** 2).sum())
         # A missing second coordinate has a 1 in the hat matrix and so adds no redundancy.
         return vpv, float(2 * members.sum() - np.trace(self.misfits.hat[members], axis1=1, axis2=2).sum())
+
+    @cached_property
+    def unit_functions(self) -> csr_array:
+        """(2 N, n) rows T B of all tested units in the free unknowns; 0 for a missing second coordinate."""
+        numbering, matrix = self.numbering, self.end.rows.matrix
+        observed = np.broadcast_to(numbering.numbers[numbering.problem.columns][:, None], matrix.shape)
+        column = np.append(observed.ravel(), numbering.numbers[self.units.positions].ravel())
+        value = np.append(matrix.ravel(), -self.prior_pairs(self._prior_root_weights).ravel())
+        row = np.append(
+            np.arange(2 * len(matrix)).repeat(matrix.shape[2]), np.arange(2 * len(matrix), 2 * len(self.units))
+        )
+        free = column != ABSENT
+        shape = 2 * len(self.units), len(numbering.free)
+        return csr_array((value[free], (row[free], column[free])), shape=shape)
 
     def unit_rows(self) -> Iterator[UnitRows]:
         """Yield the rows of all tested units: block by block, each with the priors of its own unknowns; then the priors
