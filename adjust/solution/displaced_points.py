@@ -42,10 +42,11 @@ class PointGroup:
     contrasts: int = 0
 
 
-def displaced_points(run: Run, axes: Array, freed: Problem, names: tuple[str, ...]) -> Iterator[PointGroup]:
+def displaced_points(run: Run, axes: Array, freed: Problem, names: tuple[str, ...], most: int) -> Iterator[PointGroup]:
     """Select the best single points and the best group with one shift among points.
 
-    axes (m, 3): of the field, along which points form lines; freed: the problem in which the points `names` are free.
+    axes (m, 3): of the field, along which points form lines; freed: the problem in which the points `names` are free;
+    most: single points at most.
     """
     if not FEWEST <= len(names) <= MOST or freed.further:
         return
@@ -54,7 +55,7 @@ def displaced_points(run: Run, axes: Array, freed: Problem, names: tuple[str, ..
         return
     normal, right = system
     vpv, redundancy = run.group_sums(run.weighting.used)
-    single = _single_points(normal, right, vpv, redundancy)
+    single = _single_points(normal, right, vpv, redundancy)[:most]
     if len(single):
         count = len(names)
         choices = gammaln(count + 1) - gammaln(len(single) + 1) - gammaln(count - len(single) + 1)

@@ -49,6 +49,7 @@ MOST_ADJUSTED = 4  # hypotheses adjusted per round
 LEFT = 0.5  # fraction of the excess of v'Pv over its redundancy that may remain
 WORTH = 0.3  # fraction of the largest first-order decrease above which a hypothesis is adjusted
 STEPS = 20
+GROUP_SHARE = 0.5  # of v'Pv; curled edges of real boards remove up to 0.3 as points beside a line
 LEAST_SHARE = 0.05  # of v'Pv; further lens terms remove up to 0.02 on real boards
 
 
@@ -159,7 +160,8 @@ class _Model:
 
     def is_significant(self, hypothesis: ModelHypothesis, fall: float, level: float) -> bool:
         """Whether a decrease of v'Pv is significant, and larger than errors correlated within images cause."""
-        is_large = not self.is_noise_fitted or (fall > LEAST_SHARE * self.vpv and hypothesis.p_scatter() < LEVEL)
+        share = GROUP_SHARE if hypothesis.name == "group" else LEAST_SHARE
+        is_large = not self.is_noise_fitted or (fall > share * self.vpv and hypothesis.p_scatter() < LEVEL)
         return is_large and self.probability(hypothesis, fall) < level
 
     def probability(self, hypothesis: ModelHypothesis, fall: float) -> float:
@@ -199,8 +201,10 @@ class _Model:
 def _best(model: _Model) -> tuple[list[_Model], bool]:
     """Models with the best significant hypotheses, several where these are not distinguished."""
     # Also returns whether gross errors of single observations explain the residuals as well.
-    is_thorough = model.is_noise_fitted or model.exceeds(SUSPECTED) or bool(model.gross_errors)
-    falls = [(_first_order_fall(model.run, each.problem), each) for each in model_hypotheses(model.run, is_thorough)]
+    # Errors of a real board's points are part of the noise that is fitted: none of them is told but the worst.
+    most_points = len(model.run.problem.network.points) if model.exceeds(SUSPECTED) or model.gross_errors else 0
+    most_points = 1 if model.is_noise_fitted else most_points
+    falls = [(_first_order_fall(model.run, each.problem), each) for each in model_hypotheses(model.run, most_points)]
     level = LEVEL / max(len(falls), 1)
     worth = WORTH * max((fall for fall, _ in falls), default=0.0)
     likely = [(fall, each) for fall, each in falls if fall > worth and model.is_significant(each, fall, level)]

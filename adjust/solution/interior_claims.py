@@ -27,7 +27,7 @@ FAR = 5.0  # standard deviations by which it is moved
 FILM_SCALE = 1.5e-3  # film keeps its size better than that, most scanners too
 CLAIMS = 5.0  # standard deviations of c by which another unit of the fiducials would move it
 CURVED = 0.5  # share of the rise of v'Pv that these promise below which they are too small
-STEPS = 15
+STEPS = 60
 
 
 def held_decentering_notes(run: Run, cofactor: Cofactor) -> Iterator[str]:

@@ -65,8 +65,8 @@ class ModelHypothesis:
     p_scatter: Callable[[], float] = float  # of groups of images, see `ImageGroups`; 0 for other hypotheses
 
 
-def model_hypotheses(run: Run, is_thorough: bool) -> Iterator[ModelHypothesis]:
-    """Generate all hypotheses on what the model of an adjustment may lack; is_thorough: also which points are wrong."""
+def model_hypotheses(run: Run, most_points: int) -> Iterator[ModelHypothesis]:
+    """Generate all hypotheses on what the model of an adjustment may lack; most_points: that may be wrong together."""
     network = run.problem.network
     used = run.problem.unknowns.camera.keys() - network.idle_cameras
     cameras = [camera for camera in network.cameras if camera.name in used]
@@ -78,8 +78,8 @@ def model_hypotheses(run: Run, is_thorough: bool) -> Iterator[ModelHypothesis]:
             yield from (each for each in hypotheses(run, camera) if each.name not in tested)
     yield from _scanner_pixels(run)
     yield from (each for each in _deformations(run) if each.name not in tested)
-    if is_thorough:
-        yield from (each for each in _wrong_points(run) if each.name not in tested)
+    if most_points:
+        yield from (each for each in _wrong_points(run, most_points) if each.name not in tested)
 
 
 def diameter_notes(run: Run) -> Iterator[str]:
@@ -289,7 +289,7 @@ def _displaced(run: Run, name: str, kind: str, words: Words, directions: Array) 
     return ModelHypothesis(kind, words, problem, problem.unknowns.board[name], name=name)
 
 
-def _wrong_points(run: Run) -> Iterator[ModelHypothesis]:
+def _wrong_points(run: Run, most: int) -> Iterator[ModelHypothesis]:
     """Wrong coordinates of fixed points, each by itself, or of a line or a side of a regular field by one shift.
 
     Coordinates that are given with a standard deviation are observations, tested by data snooping.
@@ -307,7 +307,7 @@ def _wrong_points(run: Run) -> Iterator[ModelHypothesis]:
         return
     form, positions = _flat_form(network), np.concatenate([unknowns.point[name] for name in names])
     axes = np.eye(3) if form is None else form.axes
-    for group in displaced_points(run, axes, freed(run, positions), names):
+    for group in displaced_points(run, axes, freed(run, positions), names, most):
         if group.words:
             moved = _of_targets(run, dict.fromkeys(group.names, np.eye(3)))
             found = _displaced(run, "group", "point", partial(_moved_words, group), moved)
