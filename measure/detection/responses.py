@@ -29,6 +29,7 @@ _CANDIDATES = 100  # largest number per template
 _NARROWED = 0.7  # factor of the tolerance for refined placements
 LEAST_TOLERANCE_PX = 1.5  # px of the reduced scan, accuracy of correlation peaks
 _BACKGROUND_PERCENT = 95  # percentile of the NCC that defines the background's response
+_LEAST_BESIDE = 0.5  # fraction of the map taken for background at least
 _SAMPLED = slice(None, None, 3)  # subsampling for that estimate, since neighbours are correlated
 
 
@@ -190,13 +191,16 @@ class ScanMaps(Mapping[Key, Map]):
 
 
 class Dilation:
-    """Correlation map dilated by a disk. area_px: of the disk; background: 95th percentile of the map, at least 0."""
+    """Correlation map dilated by a disk. area_px: of the disk; background: 95th percentile beside the marks, at least
+    0."""
 
-    def __init__(self, map_: Map, origin: NDArray[np.int_], radius_px: float) -> None:
+    def __init__(self, map_: Map, origin: NDArray[np.int_], radius_px: float, marks: int) -> None:
         size = 2 * round(radius_px) + 1
         disk = np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)), np.uint8)
         self.map, self.origin, self.area_px = np.asarray(cv2.dilate(map_, disk)), origin, int(disk.sum())
-        self.background = max(float(np.percentile(self.map[_SAMPLED, _SAMPLED], _BACKGROUND_PERCENT)), 0.0)
+        # The disks about the marks of a dense lattice cover a tenth of the scan: they would be the background.
+        beside = max(1 - marks * self.area_px / map_.size, _LEAST_BESIDE)
+        self.background = max(float(np.percentile(self.map[_SAMPLED, _SAMPLED], _BACKGROUND_PERCENT * beside)), 0.0)
 
     def share(self, place: Array) -> float:
         """Fraction of all places whose response is at least that of a place (2,) of the reduced scan."""
@@ -220,9 +224,11 @@ class Dilation:
 class ResponseMap:
     """Responses to one template, with derived quantities shared by all orientations and hypotheses."""
 
-    def __init__(self, maps: Mapping[Key, Map], key: Key, cache: ByteCache[Dilation], origin: NDArray[np.int_]) -> None:
+    def __init__(
+        self, maps: Mapping[Key, Map], key: Key, cache: ByteCache[Dilation], origin: NDArray[np.int_], marks: int
+    ) -> None:
         # No reference to the `Responses` that hold this map: in a cycle their large maps would outlive the search.
-        self._maps, self._key, self._cache, self.origin = maps, key, cache, origin
+        self._maps, self._key, self._cache, self.origin, self._marks = maps, key, cache, origin, marks
         self._own = object()  # identifies this map in the cache; self would create a reference cycle
 
     @property
@@ -239,7 +245,7 @@ class ResponseMap:
         key = self._own, round(radius_px)
         dilation = self._cache.get(key)
         if dilation is None:
-            dilation = Dilation(self.map, self.origin, radius_px)
+            dilation = Dilation(self.map, self.origin, radius_px, self._marks)
             self._cache.put(key, dilation, dilation.map.nbytes)
         return dilation
 
@@ -263,6 +269,7 @@ class Responses:
     origins : (kinds, 2) column and row of the reduced scan where the maps of each kind begin; None: maps of the whole
         scan.
     surroundings : treatment of the background.
+    marks : number of marks that each map may show.
     """
 
     maps: Mapping[Key, Map]
@@ -271,12 +278,13 @@ class Responses:
     cache: ByteCache[Dilation]
     origins: NDArray[np.int_] | None = None
     surroundings: Surroundings = WIDE
+    marks: int = 0
 
     @cached_property
     def by_key(self) -> dict[Key, ResponseMap]:
         """Response maps by kind of template and sign."""
         origins = np.zeros((len(self.maps), 2), dtype=int) if self.origins is None else self.origins
-        return {key: ResponseMap(self.maps, key, self.cache, origins[key[0]]) for key in self.maps}
+        return {key: ResponseMap(self.maps, key, self.cache, origins[key[0]], self.marks) for key in self.maps}
 
     def reduced_px(self, scan_px: Array) -> Array:
         """Convert scan pixels (..., 2) to pixels of the reduced scan."""
@@ -294,6 +302,7 @@ def correlate_scan(
     surroundings: Surroundings,
     caches: tuple[ByteCache[Map], ByteCache[Dilation]],
     half_px: int = FULL.half_px,
+    marks: int = 0,
 ) -> Responses:
     """Correlate the whole scan with mark views.
 
@@ -302,13 +311,14 @@ def correlate_scan(
     signs : lighter (+1) or darker (-1) than the background.
     caches : of correlation maps and of dilations.
     half_px : largest half size of the template of a cross, px of the reduced scan.
+    marks : number of marks in the frame.
     """
     reduction = search_reduction(scan, views)
     templates, kinds = distinct_templates(views, reduction, half_px)
     details = [ground_detail_px(views[kinds.index(kind)], reduction) for kind in range(len(templates))]
     template_set = TemplateSet(templates, details, signs, surroundings, scan.full_scale_dn * FAINT)
     maps = ScanMaps(scan, reduction, template_set, caches[0])
-    return Responses(maps, kinds, reduction, caches[1], surroundings=surroundings)
+    return Responses(maps, kinds, reduction, caches[1], surroundings=surroundings, marks=marks)
 
 
 def correlate_windows(

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from measure.annotations.lines import KnownLine, Line
 from measure.annotations.text import networks, read_writing
@@ -34,6 +35,7 @@ _OBLIQUE = Reason(
 )
 _BESIDE = 0.95  # fraction of the frame's size: a rival shifted by more is another photograph
 _AMBIGUOUS = 0.9  # fraction of the best score from which another placement is a rival
+_HARDLY = 0.5  # times the fraction of all marks found
 _ROOM = 0.9  # fraction of the frame's sides: a free margin narrower than this holds no second frame
 _MOST_MARKS = 0.75  # fraction of the layout's marks that must be measured in a second frame
 _FEWEST_MARKS = 3
@@ -170,7 +172,9 @@ def _rivals(search: FrameSearch, found: Sequence[Placement], frame: Frame) -> li
     for other in found:
         if other.pose != best.pose or other.same_place(best) or _leads_to(other, frame):
             continue
-        as_good = other.score >= _AMBIGUOUS * best.score and other.supported >= best.supported - 1
+        as_good = other.score >= _AMBIGUOUS * best.score and (
+            other.supported >= best.supported - 1 or _lacks_its_own(frame, other)
+        )
         if not (as_good or _is_another_frame(search, other, frame)):
             continue
         linear, shifts = best.pixel_from_camera[:, :2], (each.pixel_from_camera[:, 2] for each in (other, best))
@@ -197,6 +201,16 @@ def _leads_to(placement: Placement, frame: Frame) -> bool:
     places = np.array([fit.center_px for fit in fits.values()]).reshape(-1, 2)
     off_px = np.hypot(*(placement.places_px(frame.camera_mm[list(fits)]) - places).T)
     return bool(fits) and bool(off_px.max() <= frame.first_search_px())
+
+
+def _lacks_its_own(frame: Frame, rival: Placement) -> bool:
+    """Whether the marks that a frame has and a rival placement lacks are hardly found: in a lattice that is named one
+    step off, the outermost line."""
+    found = np.array([fit is not None for fit in frame.fits])
+    inside = np.array([detection.inside for detection in frame.detections])
+    apart_px, _ = cKDTree(rival.places_px(frame.camera_mm)).query(frame.predicted_px)
+    own = inside & (apart_px > frame.first_search_px())
+    return bool(own.any() and found[own].mean() < _HARDLY * found[inside].mean())
 
 
 def _is_another_frame(search: FrameSearch, other: Placement, frame: Frame) -> bool:

@@ -190,7 +190,7 @@ class FrameSearch:
             return self._found[key]
         for drawn_mm, alike in groupby(hypotheses, attrgetter("drawn_mm")):
             if self._responses is None or self._responses[0] != drawn_mm:
-                effort = self._caches, self._effort.half_px
+                effort = self._caches, self._effort.half_px, len(self.layout.marks)
                 views = self._views(drawn_mm)
                 self._responses = drawn_mm, correlate_scan(self.scan, views, self._signs, self.surroundings, *effort)
             found += self._placements(list(alike), self._responses[1])

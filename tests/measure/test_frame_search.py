@@ -1,6 +1,7 @@
 """The search for a frame: the list of attempts, hypotheses, and what is found at a closer look or not believed."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -14,6 +15,7 @@ from measure.detection.responses import ByteCache, Responses
 from measure.fiducials import stages
 from measure.fiducials.constellation import Bounds, Placement, PlacementSearch, same_picture
 from measure.fiducials.frame import Frame
+from measure.fiducials.measurement import _lacks_its_own
 from measure.fiducials.rows import pitch_problem
 from measure.fiducials.search import FrameSearch, PitchHypothesis
 from measure.fiducials.stages import Attempt, Found, Kind, find_frame
@@ -79,6 +81,34 @@ def test_a_lattice_of_more_marks_than_candidates_is_not_a_step_off() -> None:
     best = search.find_placements("0", [0] * len(lattice))[0]
     found = camera @ best.pixel_from_camera[:, :2].T + best.pixel_from_camera[:, 2]
     assert np.abs(found - true).max() < 1.5
+
+
+def test_a_lattice_whose_marks_cover_a_tenth_of_the_scan_is_not_its_own_background() -> None:
+    steps = 6.0 * (np.arange(33) - 16)
+    lattice = [LayoutMark(f"{x}, {y}", (float(x), float(y)), (0.01, 0.01), DOT) for x in steps for y in steps]
+    camera = np.array([mark.xy_mm for mark in lattice])
+    true = camera @ np.array([[1.01, 0.02], [0.02, -1.01]]) / PITCH_MM + 265.0
+    answers = replace(responses(true, np.full(len(true), 0.8)), marks=len(lattice))
+    search = PlacementSearch(lattice, answers, (PITCH_MM, PITCH_MM), Bounds(0.04, 0.1, 1.5))
+    best = search.find_placements("0", [0] * len(lattice))[0]
+    assert best.supported == len(lattice)
+    assert np.abs(best.places_px(camera) - true).max() < 1.5
+
+
+def test_a_lattice_named_one_step_off_lacks_the_line_that_it_alone_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    steps = 5.0 * (np.arange(9) - 4)
+    marks = tuple(LayoutMark(f"{x}, {y}", (float(x), float(y)), (0.01, 0.01), DOT) for x in steps for y in steps)
+    layout = FiducialLayout(marks, (50.0, 50.0))
+    off, right = (
+        Placement("0", np.array([[8.0, 0.0, 250.0 + shift], [0.0, -8.0, 250.0]]), 1.0, 80, 1, 1, (0.125, 0.125))
+        for shift in (40.0, 0.0)
+    )
+    for placement, lacks in ((off, True), (right, False)):
+        frame = Frame.from_placement(make_scan(np.zeros((500, 500))), layout, placement, FiducialOptions())
+        is_shown = [place[0] < 415.0 for place in frame.predicted_px]
+        monkeypatch.setattr(Frame, "fits", [object() if shown else None for shown in is_shown])
+        frame = replace(frame, detections=tuple(replace(each, inside=True) for each in frame.detections))
+        assert _lacks_its_own(frame, right if placement is off else off) == lacks
 
 
 def test_a_square_is_alike_in_all_poses_and_six_marks_do_not() -> None:
