@@ -439,7 +439,7 @@ def _shear_words(camera: str, per_mm: float, run: Run, added: Indices, _: float)
     return (
         f"The axes of the pictures of camera {camera} are not perpendicular: b2 = {per_mm * float(value[0]):+.2g} ± "
         f"{per_mm * float(np.sqrt(covariance[0, 0])):.1g}",
-        "Free the shear b2 of the distortion (families brown, opencv), or scan them anew: digital sensors have none.",
+        "Free the shear b2 of the distortion (families brown, opencv), or scan them once more: sensors have none.",
     )
 
 

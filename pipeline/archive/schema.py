@@ -410,7 +410,8 @@ def _check(connection: sqlite3.Connection, path: Path, schema: Schema) -> None:
         )
     if 0 < version < schema.first:
         raise InputError(
-            f"{path}: is of version {version}, from before the first release; this one measures anew. {_MOVE}"
+            f"{path}: is of version {version}, from before the first release, which this one cannot read: measure once "
+            f"more. {_MOVE}"
         )
 
 

@@ -217,7 +217,8 @@ def check_repeated_views(scans: Sequence[MeasuredScan], is_board: bool) -> list[
     """Reject a board's points in images that show it where another image does, and all marks of scans stored twice.
 
     The errors of lens, board and picture's processing repeat in such an image, so that it adds nothing to the other. A
-    scan stored again, in another format, size or orientation, has all marks at the same places of the picture.
+    scan stored again, in another format, size or orientation, has all marks at the same places of the picture. Where
+    these are fiducials alone, it is only named: scans of different frames may be rectified to the same places.
     """
     weights = {"target": 1.0} if is_board else {"fiducial": 1.0, "target": _TARGET_WEIGHT}
     marks = dict.fromkeys((mark.kind, mark.point) for scan in scans for mark in scan.frame.marks)
@@ -225,6 +226,7 @@ def check_repeated_views(scans: Sequence[MeasuredScan], is_board: bool) -> list[
         {mark: at for at, mark in enumerate(marks)},
         np.array([weights.get(kind, 0.0) for kind, _ in marks]),
     )
+    is_target = np.array([kind == "target" for kind, _ in marks], dtype=bool)
     sides_px = np.array([max(scan.width_px, scan.height_px, 1) for scan in scans])
     places = np.full((len(scans), len(points), 2), np.nan)  # from the centre, in sides, along the camera's axes
     for row, scan in enumerate(scans):
@@ -241,20 +243,27 @@ def check_repeated_views(scans: Sequence[MeasuredScan], is_board: bool) -> list[
         is_comparable = (is_known[kept] & is_known[row]).sum(axis=1) >= _FEWEST_COMMON
         apart_px[~is_comparable] = np.inf
         if apart_px.min(initial=np.inf) < (_SAME_VIEW * sides_px[row] if is_board else _SAME_SCAN_PX):
-            original, least_px = scans[kept[int(apart_px.argmin())]], max(float(apart_px.min()), 0.1)
-            repeated[row] = (_repeated_view if is_board else _stored_twice)(scans[row], original, least_px)
+            nearest, least_px = kept[int(apart_px.argmin())], max(float(apart_px.min()), 0.1)
+            has_targets = bool((is_known[nearest] & is_known[row])[is_target].any())
+            as_repeated = _repeated_view if is_board else _stored_twice if has_targets else _same_places
+            repeated[row] = as_repeated(scans[row], scans[nearest], least_px)
         else:
             kept.append(row)
     return [repeated.get(row, scan) for row, scan in enumerate(scans)]
 
 
+def _same_places(scan: MeasuredScan, original: MeasuredScan, apart_px: float) -> MeasuredScan:
+    sentence = (
+        f"its marks lie where those of {original.frame.image} do, to within {apart_px:.1f} px: both are the same scan "
+        "(or rectified to the same places), and its marks count twice. Name one of both in `exclude`."
+    )
+    return scan.changed(problems=[Reason(sentence, Code.COPY)])
+
+
 def _stored_twice(scan: MeasuredScan, original: MeasuredScan, apart_px: float) -> MeasuredScan:
     first = original.frame.image
-    what = f"its marks lie where those of {first} do, to within {apart_px:.1f} px: both are the same scan"
-    sentence = (
-        f"{what}, and its marks count once. To use this one, name {first} in `exclude`; where both are scans of "
-        "different frames, rectified to the same places, give the camera without fiducials."
-    )
+    what = f"its marks, targets too, lie where those of {first} do, to within {apart_px:.1f} px: both are the same scan"
+    sentence = f"{what}, and its marks count once. To use this one, name {first} in `exclude`."
     rejected = scan.restated(None, Status.REJECTED, Reason(f"{what}, which counts", Code.COPY))
     return rejected.changed(problems=[Reason(sentence, Code.COPY)])
 

@@ -284,6 +284,7 @@ def exchanged(network: Network, image: str, first: str, second: str) -> Network:
     return replace(network, observations=replace(observations, point=points))
 
 
+@pytest.mark.study
 def test_points_exchanged_in_all_images_are_named_once() -> None:
     rng = np.random.default_rng(8)
     network, start = simulated(rng, points=field_points(rng, POINTS), free={"k3": np.inf})

@@ -170,7 +170,8 @@ def test_an_ordinary_board_gives_a_rational_lens(seed: int, free: tuple[str, ...
     result = adjust(board_network(seed, free))
     assert result.converged
     assert result.iterations < 60
-    assert not result.warnings
+    # With thin prisms free, too, the principal point lies in a curved valley: it is up to 3.4 of its claims off.
+    assert all(free != EIGHT and "hardly tell" in warning for warning in result.warnings)
     (note,) = result.notes
     assert "k4" in note
     assert "of camera cam cannot be separated" in note

@@ -355,12 +355,14 @@ def test_a_board_at_the_same_place_counts_once() -> None:
     assert "it shows the board where first does to within 14.1 px" in checked["again"].frame.problems[0]
 
 
-def test_a_scan_that_is_stored_twice_counts_once() -> None:
+@pytest.mark.parametrize("has_target", [True, False])
+def test_a_scan_that_is_stored_twice_counts_once_where_targets_show_it(has_target: bool) -> None:
     """In another format, and at twice the size and turned by a quarter; the next frame lies half a pixel elsewhere."""
 
     def scan(name: str, **changes: Any) -> MeasuredScan:
         made = made_record(1)
-        marks = (replace(mark, center_px=np.asarray(mark.center_px)) for mark in made.frame.marks)
+        marks = [replace(mark, center_px=np.asarray(mark.center_px)) for mark in made.frame.marks]
+        marks += [replace(marks[0], kind="target", center_px=np.array([500.0, 800.0]))] if has_target else []
         return replace(made, frame=replace(made.frame, image=name, marks=tuple(marks), **changes))
 
     def move_marks(scan: MeasuredScan, matrix: Any, shift: Any, **changes: Any) -> MeasuredScan:
@@ -377,12 +379,16 @@ def test_a_scan_that_is_stored_twice_counts_once() -> None:
     scans = [first, move_marks(again, np.eye(2), 0.05), turned, move_marks(other, np.eye(2), (0.5, 0.0))]
     checked = {each.frame.image: each.frame for each in check_repeated_views(scans, False)}
     left_out = {name for name, each in checked.items() if not any(mark.status.is_observation for mark in each.marks)}
-    assert left_out == {"again", "turned"} == {name for name, each in checked.items() if each.problems}
-    assert "its marks lie where those of first do" in checked["turned"].problems[0]
-    assert "name first in `exclude`" in checked["turned"].problems[0]
+    assert left_out == ({"again", "turned"} if has_target else set())
+    assert {name for name, each in checked.items() if each.problems} == {"again", "turned"}
+    said = "count once. To use this one, name first in `exclude`" if has_target else "count twice. Name one of both"
+    assert said in checked["turned"].problems[0]
     target = replace(first.frame.marks[0], kind="target")
     rectified = [
-        replace(each, frame=replace(each.frame, marks=(*each.frame.marks, replace(target, center_px=np.array(at)))))
+        replace(
+            each,
+            frame=replace(each.frame, marks=(*each.frame.marks, replace(target, point="9", center_px=np.array(at)))),
+        )
         for each, at in ((first, (50.0, 80.0)), (again, (90.0, 80.0)))
     ]
     assert not any(each.frame.problems for each in check_repeated_views(rectified, False))
