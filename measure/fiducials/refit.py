@@ -33,7 +33,7 @@ from measure.noise.noise_model import may_be_noise
 from measure.results import MarkFit
 from measure.tone.curve import Tone
 from measure.tone.estimate import FrameTone, MarkTone
-from measure.tone.sharpening import Sharpening, estimate_sharpening
+from measure.tone.sharpening import FEWEST_MARKS, Sharpening, estimate_sharpening
 
 _STRAINED = 1 / 3  # fraction of a mark's standard deviation: a larger strain error raises it by more than a twentieth
 _TONE_ROUNDS = 5  # largest number of refits with an improved tone curve
@@ -71,9 +71,10 @@ def fit_lines_and_sharpening(frame: Frame, fewest: int = 0) -> Frame:
     for _ in range(_SHARED_ROUNDS):
         drawn = _widen_drawings(frame, telling)
         fits = (frame.detections[index].fit for index in telling)
-        scores = [fit.sharpening for fit in fits if fit and fit.sharpening and begun.agrees]
-        scores = scores if len(scores) >= fewest else []
-        found = estimate_sharpening(before, scores, len(frame.scan.tone.mean)) or Sharpening()
+        scores = [fit.sharpening for fit in fits if fit and fit.sharpening and fit.sharpening.normal.any()]
+        found = before
+        if begun.agrees and len(scores) >= max(fewest, FEWEST_MARKS):
+            found = estimate_sharpening(before, scores, len(frame.scan.tone.mean)) or Sharpening()
         if drawn is frame and found.is_as(before):
             break
         last, before = before, found.damped(before, last) if last else found

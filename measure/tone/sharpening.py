@@ -26,7 +26,7 @@ _LONGEST = np.array([1.0, 0.3])  # their largest step
 _TAIL = 1e-3  # fraction of a pixel's weight, below which the inverse filter is truncated
 _EVIDENCE = np.log(100.0)  # log-odds above which a scan counts as sharpened
 _LEAST_AMOUNT = 0.1
-_FEWEST, _ODD = 3, 3.0  # marks needed; standard deviations from the median beyond which a mark is an outlier
+FEWEST_MARKS, _ODD = 3, 3.0  # marks needed; standard deviations from the median beyond which a mark is an outlier
 _SAME = 0.01  # of amount and log radius, convergence limit in addition to the next one
 _CLOSE = 0.5  # in standard deviations, convergence limit
 
@@ -188,7 +188,7 @@ def estimate_sharpening(before: Sharpening, scores: Sequence[SharpeningScore], d
     Sharpening, or None if it is not significant.
     """
     scores = [score for score in scores if score.normal.any()]
-    if len(scores) < _FEWEST:
+    if len(scores) < FEWEST_MARKS:
         return None
     tone, count = list(range(departures)), len(scores[0].value) - departures
     if before:

@@ -16,6 +16,7 @@ from measure.fiducials import stages
 from measure.fiducials.constellation import Bounds, Placement, PlacementSearch, same_picture
 from measure.fiducials.frame import Frame
 from measure.fiducials.measurement import _lacks_its_own
+from measure.fiducials.refit import fit_lines_and_sharpening
 from measure.fiducials.rows import pitch_problem
 from measure.fiducials.search import FrameSearch, PitchHypothesis
 from measure.fiducials.stages import Attempt, Found, Kind, find_frame
@@ -23,6 +24,8 @@ from measure.flags import FRAMES_BY_CHANCE, NO_REASON, Reason, Status
 from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, dot, polygon, turned_part
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement
+from measure.tone.curve import Tone
+from measure.tone.sharpening import Sharpening
 
 DOT = MarkShape(dot(0.3), "light")
 PLACES = ((100.0, -100.0), (-100.0, -100.0), (-100.0, 100.0), (100.0, 100.0), (0.0, -103.0), (0.0, 95.0))
@@ -109,6 +112,14 @@ def test_a_lattice_named_one_step_off_lacks_the_line_that_it_alone_has(monkeypat
         monkeypatch.setattr(Frame, "fits", [object() if shown else None for shown in is_shown])
         frame = replace(frame, detections=tuple(replace(each, inside=True) for each in frame.detections))
         assert _lacks_its_own(frame, right if placement is off else off) == lacks
+
+
+def test_without_marks_that_tell_the_sharpening_stays_as_it_is_known() -> None:
+    known = Sharpening(0.8, 1.2, 0.01 * np.eye(2))
+    scan = make_scan(np.zeros((400, 400))).replace_tone(Tone.unknown().sharpened(known))
+    placement = Placement("0", np.array([[1.0, 0.0, 200.0], [0.0, -1.0, 200.0]]), 1.0, 6, 1, 1, (1.0, 1.0))
+    frame = Frame.from_placement(scan, FiducialLayout(tuple(MARKS), (220.0, 220.0)), placement, FiducialOptions())
+    assert fit_lines_and_sharpening(frame) is frame
 
 
 def test_a_square_is_alike_in_all_poses_and_six_marks_do_not() -> None:
