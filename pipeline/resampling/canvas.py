@@ -126,9 +126,13 @@ def outline_canvas(scans: Sequence[tuple[FrameChain, Window]], pitch_mm: float) 
     The ideal image of a fisheye is unbounded: it is cut off where it would be stretched by a factor of five (63
     degrees).
 
-    Raises MeasurementError where the lens or the film folds within the scan.
+    Raises MeasurementError where the lens or the film folds within the scan, or a value of theirs is missing.
     """
     outline = np.concatenate([_outline_mm(*scan) for scan in scans])
+    if not np.isfinite(outline).all():
+        raise MeasurementError(
+            "a value of its film transformation or of its camera is missing in adjustment.json; adjust again"
+        )
     (left, bottom), (right, top) = outline.min(axis=0) / pitch_mm, outline.max(axis=0) / pitch_mm
     first, last = (ceil(left), floor(top)), (floor(right), ceil(bottom))
     return Canvas(first[0] * pitch_mm, first[1] * pitch_mm, pitch_mm, last[0] - first[0] + 1, first[1] - last[1] + 1)

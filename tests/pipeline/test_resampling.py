@@ -197,6 +197,12 @@ def test_a_lens_is_taken_out_as_opencv_has_it(scan: Path, tmp_path: Path) -> Non
     assert np.abs(pixels[inside] - light(col[inside], row[inside])).max() < 20.0
 
 
+def test_a_missing_value_of_the_film_is_named() -> None:
+    chain = FrameChain((10.0, 10.0), Film("affine", np.array([1.0, 0.0, np.nan, 0.0, 1.0, 0.0]), np.zeros(2)))
+    with pytest.raises(MeasurementError, match=r"is missing in adjustment\.json"):
+        outline_canvas([(chain, (0, 0, 1600, 1600))], 0.01)
+
+
 def test_a_fisheyes_ideal_picture_ends_where_it_would_be_stretched_without_end() -> None:
     """A picture of 180 degrees: two principal distances to either side, and pixels where OpenCV's fisheye has them."""
     c, k = 5.0, np.array([0.02, -0.005, 0.0, 0.0])
