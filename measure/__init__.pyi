@@ -1,3 +1,10 @@
+from .boards.measure import BoardMeasurement as BoardMeasurement
+from .boards.measure import measure_board as measure_board
+from .boards.specs import AprilGridSpec as AprilGridSpec
+from .boards.specs import ArucoSpec as ArucoSpec
+from .boards.specs import CharucoSpec as CharucoSpec
+from .boards.specs import ChessboardSpec as ChessboardSpec
+from .boards.specs import CircleGridSpec as CircleGridSpec
 from .errors import MeasurementError as MeasurementError
 from .fiducials.measurement import measure_fiducials as measure_fiducials
 from .fiducials.options import FiducialOptions as FiducialOptions
@@ -29,3 +36,6 @@ from .targets.identification import TargetOptions as TargetOptions
 from .targets.identification import TargetPrediction as TargetPrediction
 from .targets.identification import measure_crosses as measure_crosses
 from .targets.identification import measure_disks as measure_disks
+from .tie_points.find_points import TieOptions as TieOptions
+from .tie_points.find_points import Ties as Ties
+from .tie_points.find_points import measure_ties as measure_ties

@@ -21,7 +21,7 @@ WORSE, LARGE = 4.0, 0.01  # times the median misfit of the images, and misfit ab
 BETTER, MUCH_BETTER = 3.0, 10.0  # ratio by which right numbers lower the misfit of an image worse than most, or alike
 NAMED = 5  # images named in a message
 MOST_OFF = 30  # largest shift of numbers tried
-SAME_LINE = 1e-3  # fraction of the field's extent
+LEAST_DEPTH = 1e-12  # of points in a field of size 1: nearer ones are imaged as far off as that
 
 
 def misnumbered_images(network: Network) -> dict[str, str]:
@@ -106,7 +106,7 @@ def linear_transformations(xyz: Array, xy_mm: Array) -> tuple[Array, Array]:
         projection = np.linalg.eigh(normal)[1][:, :, 0].reshape(len(at), 3, -1)
         projected = at @ projection.swapaxes(1, 2)
         depths = projected[..., 2]
-        off = projected[..., :2] / np.where(depths == 0.0, 1e-300, depths)[..., None] - to
+        off = projected[..., :2] / np.where(np.abs(depths) < LEAST_DEPTH, LEAST_DEPTH, depths)[..., None] - to
         misfits[own] = np.median(np.linalg.norm(off, axis=2), axis=1)
         if not flat:
             handedness[own] = np.linalg.det(projection[..., :3]) * np.median(depths, axis=1)

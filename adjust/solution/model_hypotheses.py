@@ -8,7 +8,7 @@ estimates the fall of v'Pv.
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations, product
+from itertools import product
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -16,7 +16,6 @@ from scipy.spatial import KDTree
 from adjust.array_types import Array, Indices
 from adjust.functional_model.board import BoardForm, board_form, disk_directions, strain_directions
 from adjust.functional_model.correction import AFFINITY_TERMS, ZERO, PolynomialTerms, Term, decentering, radial
-from adjust.functional_model.families import family
 from adjust.functional_model.lens import INTERIOR_NAMES, Prior
 from adjust.functional_model.scanner import is_left
 from adjust.least_squares.equations import Numbering
@@ -24,12 +23,28 @@ from adjust.least_squares.iteration import linearise
 from adjust.problem.camera import Camera
 from adjust.problem.condition_equations import computed_observations, in_camera, object_displacements
 from adjust.problem.network import Approximations, Board, Network, Scanner
-from adjust.problem.parameter import shortened
 from adjust.problem.problem import Problem, State, number
 from adjust.quality.cofactor import free_cofactor
-from adjust.quality.run import UM_PER_MM, Run
-from adjust.solution.displaced_points import PointGroup, displaced_points
-from adjust.solution.image_groups import ImageGroups, two_groups
+from adjust.quality.run import Run
+from adjust.solution.displaced_points import displaced_points
+from adjust.solution.hypothesis_words import (
+    bend_words,
+    bow_words,
+    disk_words,
+    drift_words,
+    free_terms,
+    group_words,
+    interior_words,
+    lens_words,
+    moved_words,
+    own_terms,
+    pixel_words,
+    point_words,
+    shear_words,
+    strain_words,
+    twist_words,
+)
+from adjust.solution.image_groups import two_groups
 
 FREE = Prior(0.0, np.inf)
 RADIAL_DEGREES = (3, 5, 7, 9, 11, 13)
@@ -42,11 +57,8 @@ OTHERS = " (other images)"  # suffix of a camera's name for the images with a di
 FEWEST_GIVEN, FEWEST_IMAGES = 5, 2  # given points, and images of one, that tell a wrong one
 MISMEASURED = 0.1  # relative error of the given diameter of disks whose effect is reported
 CLEAR = 3.0  # standard deviations above which one of two changes of a board is told
-NAMED = 5  # images named in a message, and points with their errors
-MOST_NAMED = 10  # points named in a message
-ALIKE = 7.0  # difference of chi-square plus twice the unknowns below which two readings are not distinguished
 
-# Arguments: adjustment with the added unknowns, their positions, rms of the residuals that they explain (µm).
+# Of `adjust.solution.hypothesis_words`, with all arguments that belong to the hypothesis given.
 Words = Callable[[Run, Indices, float], tuple[str, str]]
 
 
@@ -54,7 +66,7 @@ Words = Callable[[Run, Indices, float], tuple[str, str]]
 class ModelHypothesis:
     """Model with additional unknowns."""
 
-    kind: str  # "radial", "decentering", "pixels", "groups", "drift", "interior", "board", "disks" or "point"
+    kind: str  # of what is wrong: "radial", "pixels", "groups", "drift", "interior", "board", "disks", "point", ...
     words: Words  # returns cause (with figures) and remedy
     problem: Problem  # problem that starts where the simpler model ended
     added: Indices  # (k,) positions of the additional unknowns
@@ -117,7 +129,7 @@ def _lens_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
 
     Polynomials of the observed point in units of half the frame, so that their parameters are in mm at its edge.
     """
-    free, own = _free_terms(camera), partial(_own_terms, camera)
+    free, own = free_terms(camera), partial(own_terms, camera)
     half_mm = _lens_half_mm(run.problem.network, camera)
     places = _from_principal_point(run, camera)
 
@@ -129,15 +141,15 @@ def _lens_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
     degrees = [degree for degree in RADIAL_DEGREES if degree not in freed] or RADIAL_DEGREES[-TERMS_TOGETHER:]
     degrees = degrees[:TERMS_TOGETHER]
     pattern = f"a radial pattern, of the degrees {', '.join(map(str, degrees))} in r"
-    words = partial(_lens_words, camera, "radial", pattern)
+    words = partial(lens_words, camera, "radial", pattern)
     yield lacking("radial", words, [radial((degree - 1) // 2) for degree in degrees])
     if not free.intersection(own("decentering")[2:]):
-        words = partial(_lens_words, camera, "decentering", "a tangential pattern (decentering)")
+        words = partial(lens_words, camera, "decentering", "a tangential pattern (decentering)")
         yield lacking("decentering", words, decentering(int(bool(free.intersection(own("decentering"))))))
-    yield lacking("bow", partial(_bow_words, camera.name), BOW)
+    yield lacking("bow", partial(bow_words, camera.name), BOW)
     images = run.problem.network.images
     digital = all(image.transformation == "none" for image in images if image.camera == camera.name)
-    for k, (name, described) in enumerate((("pixels", _pixel_words), ("shear", _shear_words)) if digital else ()):
+    for k, (name, described) in enumerate((("pixels", pixel_words), ("shear", shear_words)) if digital else ()):
         if not free.intersection(own("affinity")[k : k + 1]):
             yield lacking(name, partial(described, camera.name, 1.0 / half_mm), AFFINITY_TERMS[k : k + 1])
 
@@ -157,7 +169,7 @@ def _drift(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
         if np.ptp(by) > LEAST_CHANGE * by.max():
             share = np.zeros(len(outward))
             share[rows] = ((by - by.mean()) / np.ptp(by))[of_row]
-            words = partial(_drift_words, camera.name, name)
+            words = partial(drift_words, camera.name, name)
             yield _displaced_images(run, name, camera, words, (outward * share[:, None])[:, None], "drift")
 
 
@@ -191,7 +203,7 @@ def _scanner_pixels(run: Run) -> Iterator[ModelHypothesis]:
     scanner = Scanner("scanner", {"stretch": FREE}, (x, y), (half_mm, half_mm))
     images = tuple(replace(image, scanner=scanner.name) if image in films else image for image in network.images)
     problem = _continued(run, replace(network, images=images, scanners=(scanner,)))
-    words = partial(_pixel_words, films[0].camera, 2.0 / half_mm)
+    words = partial(pixel_words, films[0].camera, 2.0 / half_mm)
     yield ModelHypothesis("pixels", words, problem, problem.unknowns.scanner[scanner.name])
 
 
@@ -205,7 +217,7 @@ def _second_interior_orientation(run: Run, camera: Camera) -> Iterator[ModelHypo
     apart = replace(network, images=images, cameras=(*network.cameras, others))
     problem = _continued(run, apart, {others.name: camera.name})
     added = problem.unknowns.camera[others.name][: len(INTERIOR_NAMES)]
-    words, contrasts = partial(_group_words, camera.name, groups), len(INTERIOR_NAMES) * (groups.count - 1)
+    words, contrasts = partial(group_words, camera.name, groups), len(INTERIOR_NAMES) * (groups.count - 1)
     own = ModelHypothesis("groups", words, problem, added)
     yield replace(own, choices=groups.choices, contrasts=contrasts, p_scatter=groups.p_scatter)
 
@@ -219,12 +231,12 @@ def _deformations(run: Run) -> Iterator[ModelHypothesis]:
     form = _flat_form(network)
     axes = np.eye(3) if form is None else form.axes
     fields: list[tuple[str, Words, Array]] = [
-        ("strain", partial(_strain_words, len(axes)), strain_directions(xyz, axes))
+        ("strain", partial(strain_words, len(axes)), strain_directions(xyz, axes))
     ]
     if form is not None:
         is_bent = any(board.by_observation is None for board in network.boards)
-        fields += [] if is_bent else [("bend", _bend_words, form.bend_directions)]
-        fields += [("twist", _twist_words, form.twist_directions)]
+        fields += [] if is_bent else [("bend", bend_words, form.bend_directions)]
+        fields += [("twist", twist_words, form.twist_directions)]
     for name, words, directions in fields:
         by_point = dict(zip(network.known_places, directions, strict=True))
         yield _displaced(run, name, "board", words, _of_targets(run, by_point))
@@ -278,7 +290,7 @@ def _disks(run: Run) -> Iterator[ModelHypothesis]:
     directions = np.zeros((len(shown), 1, 3))
     directions[shown] = disk_directions(at, form.axes, radius)
     limits = (-np.inf, np.inf) if network.disk_radius is not None else (0.0, (2.0 * radius) ** 2)
-    yield replace(_displaced(run, "disks", "disks", _disk_words, directions), limits=limits)
+    yield replace(_displaced(run, "disks", "disks", disk_words, directions), limits=limits)
 
 
 def _displaced(run: Run, name: str, kind: str, words: Words, directions: Array) -> ModelHypothesis:
@@ -310,10 +322,10 @@ def _wrong_points(run: Run, most: int) -> Iterator[ModelHypothesis]:
     for group in displaced_points(run, axes, freed(run, positions), names, most):
         if group.words:
             moved = _of_targets(run, dict.fromkeys(group.names, np.eye(3)))
-            found = _displaced(run, "group", "point", partial(_moved_words, group), moved)
+            found = _displaced(run, "group", "point", partial(moved_words, group), moved)
         else:
             added = np.concatenate([unknowns.point[name] for name in group.names])
-            words = partial(_point_words, group.names)
+            words = partial(point_words, group.names)
             found = ModelHypothesis("point", words, freed(run, added), added)
         yield replace(found, choices=group.choices, contrasts=group.contrasts)
 
@@ -323,7 +335,7 @@ def _wrong_interior_orientation(run: Run, camera: Camera) -> Iterator[ModelHypot
     positions = run.problem.unknowns.camera[camera.name][: len(INTERIOR_NAMES)]
     added = positions[run.problem.unknowns.sigma[positions] == 0.0]
     if len(added):
-        yield ModelHypothesis("interior", partial(_interior_words, camera.name), freed(run, added), added)
+        yield ModelHypothesis("interior", partial(interior_words, camera.name), freed(run, added), added)
 
 
 def freed(run: Run, positions: Indices) -> Problem:
@@ -332,15 +344,6 @@ def freed(run: Run, positions: Indices) -> Problem:
     sigma = problem.unknowns.sigma.copy()
     sigma[positions] = np.inf
     return replace(problem, unknowns=replace(problem.unknowns, sigma=sigma))
-
-
-def _free_terms(camera: Camera) -> set[str]:
-    return {name for name, prior in camera.distortion.parameters.items() if prior.sigma > 0.0}
-
-
-def _own_terms(camera: Camera, group: str) -> tuple[str, ...]:
-    """Terms of a group in the camera's own family."""
-    return tuple(dict(family(camera.distortion.family).groups).get(group, ()))
 
 
 def _lens_half_mm(network: Network, camera: Camera) -> float:
@@ -394,239 +397,3 @@ def _continued(run: Run, network: Network, like: Mapping[str, str] | None = None
                 fiducial[name, id_] = fiducial[other, id_]
     shared = replace(unknowns, given=given, sigma=sigma, start=start, camera=camera, fiducial=fiducial)
     return replace(problem, unknowns=shared)
-
-
-def _lens_words(camera: Camera, group: str, what: str, run: Run, added: Indices, rms_um: float) -> tuple[str, str]:
-    cause = f"The lens model of camera {camera.name} is too simple: the residuals have {what}, {rms_um:.2g} µm rms"
-    if camera.distortion.family == "none":
-        names = "k1 and k2" if group == "radial" else "p1 and p2"
-        return cause, f'Give the camera a [distortion] of the family "brown", say, with {names} free.'
-    denominator = family(camera.distortion.family).alike_at_zero  # asked for by nobody at first
-    known = {*denominator, *_free_terms(camera)}
-    if fixed := [name for name in _own_terms(camera, group) if name not in known]:
-        return cause, f'Free {", ".join(fixed)} under [distortion.sigma] of the camera ("free").'
-    return cause, "Choose a distortion family with more terms, legendre(5) say; `reseau adjust --choose` compares some."
-
-
-def _pixel_words(camera: str, per_mm: float, run: Run, added: Indices, _: float) -> tuple[str, str]:
-    """Describe non-square pixels; per_mm: change of the aspect ratio per mm of the added unknown."""
-    value, covariance = _estimate(run, added)
-    ratio = 1.0 - per_mm * float(value[0])
-    cause = (
-        f"The pixels of camera {camera} are not square: their width is {ratio:.6f} ± "
-        f"{per_mm * float(np.sqrt(covariance[0, 0])):.6f} times their height (b1 = {1.0 - ratio:+.2g})"
-    )
-    return cause, (
-        f"Give pitch_um as [x, y] with x / y = {ratio:.6f}, or free the affinity b1 of the distortion (families brown, "
-        "opencv)."
-    )
-
-
-def _bow_words(camera: str, run: Run, added: Indices, _: float) -> tuple[str, str]:
-    value, covariance = _estimate(run, added)
-    x_um, y_um = UM_PER_MM * value
-    sigma_um = UM_PER_MM * np.sqrt(np.diag(covariance))
-    return (
-        f"The pictures of camera {camera} are bowed: half the frame off the middle, columns lie {x_um:+.3g} ± "
-        f"{sigma_um[0]:.1g} µm aside and rows {y_um:+.3g} ± {sigma_um[1]:.1g} µm",
-        "Look for a rolling shutter, stabilisation or a scanner's lens. A distortion family with such terms takes it "
-        "up, legendre(3) say.",
-    )
-
-
-def _shear_words(camera: str, per_mm: float, run: Run, added: Indices, _: float) -> tuple[str, str]:
-    value, covariance = _estimate(run, added)
-    return (
-        f"The axes of the pictures of camera {camera} are not perpendicular: b2 = {per_mm * float(value[0]):+.2g} ± "
-        f"{per_mm * float(np.sqrt(covariance[0, 0])):.1g}",
-        "Free the shear b2 of the distortion (families brown, opencv), or scan them once more: sensors have none.",
-    )
-
-
-def _bend_words(run: Run, added: Indices, _: float) -> tuple[str, str]:
-    value, covariance = _estimate(run, added)
-    sigma = np.sqrt(np.diag(covariance))
-    cause = (
-        f"The board of the given points is not flat: its middle stands {value[0]:.3g} ± {sigma[0]:.1g} off along its "
-        f"first axis and {value[1]:.3g} ± {sigma[1]:.1g} along its second (points' unit; ± for independent errors, "
-        "on real boards up to 5 times as much)"
-    )
-    return (
-        cause,
-        'Put it on a flat plate, or let its bend be adjusted: board_bend = "free" under [object] in project.toml.',
-    )
-
-
-def _strain_words(count: int, run: Run, added: Indices, _: float) -> tuple[str, str]:
-    """Describe stretches and shears of a flat board (count 2) or of an object in space (3)."""
-    value, covariance = _estimate(run, added)
-    names = ("X", "Y", "Z") if count > 2 else ("its first axis", "its second")
-    middle = int(np.argsort([*value[: count - 1], 0.0])[(count - 1) // 2 if count > 2 else 1])
-    # Stretches relative to the axis in the middle.
-    by_value = np.vstack([np.eye(len(value))[: count - 1], np.zeros(len(value))])
-    by_value -= by_value[middle]
-    rows = [
-        (row, 100.0, f"% {{}} along {names[i]} than along {names[middle]}")
-        for i, row in enumerate(by_value)
-        if i != middle
-    ]
-    rows += [
-        (row, 1000.0, f"mrad off in the angle of {names[i]} and {names[j]}")
-        for row, (i, j) in zip(np.eye(len(value))[count - 1 :], combinations(range(count), 2), strict=True)
-    ]
-    changes = [(float(row @ value), float(np.sqrt(row @ covariance @ row)), unit, what) for row, unit, what in rows]
-    significant = [each for each in changes if abs(each[0]) > CLEAR * each[1]] or changes
-    found = " and ".join(
-        f"{abs(unit * v):.3g} ± {unit * s:.1g} {what.format('longer' if v > 0.0 else 'shorter')}"
-        for v, s, unit, what in significant
-    )
-    what = "board" if count == 2 else "object"
-    return (
-        f"The {what} of the given points has another shape than given: it is {found}",
-        f"Measure the {what} and give the coordinates that it has: printers stretch paper in one direction.",
-    )
-
-
-def _twist_words(run: Run, added: Indices, _: float) -> tuple[str, str]:
-    value, covariance = _estimate(run, added)
-    return (
-        f"The board of the given points is twisted: two opposite corners stand {abs(value[0]):.3g} ± "
-        f"{np.sqrt(covariance[0, 0]):.1g} above its plane, the others as much below it (points' unit; ± for "
-        "independent errors, on real boards up to 5 times as much)",
-        "Put it on a flat plate.",
-    )
-
-
-def _disk_words(run: Run, added: Indices, _: float) -> tuple[str, str]:
-    value, covariance = _estimate(run, added)
-    given = run.problem.network.disk_radius
-    square, sigma = (given or 0.0) ** 2 + float(value[0]), float(np.sqrt(covariance[0, 0]))
-    diameter = 2.0 * np.sqrt(max(square, 0.0))
-    found = f"{diameter:.3g} ± {2.0 * sigma / max(diameter, np.sqrt(sigma)):.1g} (points' unit)"
-    if given is None:
-        return (
-            f"The points are centres of dots, whose perspective is not corrected: their diameter is found as {found}",
-            'Give their diameter_mm under [targets], kind = "disk".',
-        )
-    return (
-        f"The disks do not have the diameter of {2.0 * given:.4g} that is given, or the points another spacing: by the "
-        f"coordinates it is found as {found}",
-        "Measure a disk, and from one to the next; correct diameter_mm or the coordinates and their unit.",
-    )
-
-
-def _point_words(names: Sequence[str], run: Run, added: Indices, _: float) -> tuple[str, str]:
-    value, covariance = _estimate(run, added)
-    offs = (run.problem.unknowns.given[added] - value).reshape(-1, 3)
-    sigmas = np.sqrt(np.diag(covariance)).reshape(-1, 3)
-    by = [_shift_words(off, sigma) for off, sigma in zip(offs, sigmas, strict=True)]
-    if len(names) == 1:
-        return (
-            f"Point {names[0]} is not where it is given: its coordinates are off, {by[0]} (points' unit)",
-            "Correct the coordinates of this point, or its number among the marks.",
-        )
-    worst = np.argsort(-np.linalg.norm(offs, axis=1), kind="stable")[:NAMED]
-    told = "; ".join(f"{names[k]}: {by[k]}" for k in worst)
-    return (
-        f"{len(names)} points are not where they are given: {shortened(names, MOST_NAMED)}; the coordinates of the "
-        f"worst are off, {told} (points' unit)",
-        "Correct the coordinates of these points, or their numbers among the marks.",
-    )
-
-
-def _moved_words(group: PointGroup, run: Run, added: Indices, _: float) -> tuple[str, str]:
-    value, covariance = _estimate(run, added)
-    return (
-        f"The points {shortened(group.names, MOST_NAMED)} ({group.words}) are not where they are given: all their "
-        f"coordinates are off, {_shift_words(-value, np.sqrt(np.diag(covariance)))} (points' unit)",
-        "Correct the coordinates of these points, or their numbers among the marks.",
-    )
-
-
-def _shift_words(off: Array, sigma: Array) -> str:
-    digits = [max(0, -int(np.floor(np.log10(max(s, 1e-12))))) for s in sigma]
-    return ", ".join(f"{axis} by {d:+.{n}f} ± {s:.1g}" for axis, d, s, n in zip("XYZ", off, sigma, digits, strict=True))
-
-
-def _drift_words(camera: str, by: str, run: Run, added: Indices, _: float) -> tuple[str, str]:
-    value, covariance = _estimate(run, added)
-    change, sigma = float(value[0]), float(np.sqrt(covariance[0, 0]))
-    along = "from the first image to the last" if by == "order" else "from the farthest image to the nearest"
-    return (
-        f"The principal distance of camera {camera} changes {along}, by {change:+.3g} ± {sigma:.1g} mm: the focus "
-        "drifts",
-        "Fix focus and zoom, switch autofocus and stabilisation off, and take the pictures again.",
-    )
-
-
-def _interior_words(camera: str, run: Run, added: Indices, _: float) -> tuple[str, str]:
-    value, covariance = _estimate(run, added)
-    names, given = [run.problem.unknowns.parameters[i].quantity for i in added], run.problem.unknowns.given[added]
-    found = ", ".join(
-        f"{name} = {v:.5g} ± {s:.1g} in place of {g:.5g} mm"
-        for name, v, s, g in zip(names, value, np.sqrt(np.diag(covariance)), given, strict=True)
-    )
-    return (
-        f"The interior orientation given for camera {camera} as exact is not that of the images: {found}",
-        "Correct it, or give its standard deviations.",
-    )
-
-
-def _group_words(camera: str, groups: ImageGroups, run: Run, added: Indices, _: float) -> tuple[str, str]:
-    """Describe two groups of images by the simplest differences of interior orientation that fit."""
-    values, covariance = _estimate(run, np.concatenate([added, run.problem.unknowns.camera[camera][:3]]))
-    base, difference = values[3:], values[:3] - values[3:]
-    by_both = np.hstack([np.eye(3), -np.eye(3)])
-    spread = by_both @ covariance @ by_both.T
-    who = f"the images {shortened(groups.images, NAMED)} ({len(groups.images)} of {groups.count}) of camera {camera}"
-    sigma = np.sqrt(np.diag(spread))
-    scale = 1.0 + float(difference @ base) / float(base @ base)
-    readings = (
-        (
-            np.eye(3)[:, :1],
-            f"{who} have another principal distance than the others, by {difference[0]:+.4g} ± {sigma[0]:.1g} mm "
-            "(zoom or focus changed)",
-        ),
-        (
-            np.eye(3)[:, 1:],
-            f"{who} have another principal point than the others, by ({difference[1]:+.4g}, {difference[2]:+.4g}) ± "
-            f"({sigma[1]:.1g}, {sigma[2]:.1g}) mm: images of different sizes in one camera (cropped), or turned or "
-            "mirrored pictures",
-        ),
-        (
-            base[:, None] / np.linalg.norm(base),
-            f"{who} are {scale:.5g} times as large as the others: images of different sizes in one camera (scaled)",
-        ),
-        (
-            np.eye(3),
-            f"{who} have another interior orientation than the others: c is {1.0 + difference[0] / base[0]:.4g} times "
-            f"as long, the principal point ({difference[1]:+.4g}, {difference[2]:+.4g}) mm off (another camera, or "
-            "pictures cropped and enlarged)",
-        ),
-    )
-    costs = [_misfit(difference, spread, along) + 2.0 * along.shape[1] for along, _cause in readings]
-    fitting = [each for each, cost in zip(readings, costs, strict=True) if cost < min(costs) + ALIKE]
-    special = [cause for along, cause in fitting if along.shape[1] < len(base)]
-    causes = "; or ".join(special or [cause for _, cause in fitting])
-    return (
-        f"{causes[0].upper()}{causes[1:]}",
-        "Give these images a camera of their own (column camera of images.csv), or a folder and project of their own.",
-    )
-
-
-def _misfit(difference: Array, covariance: Array, along: Array) -> float:
-    """Chi-square of a difference (3,) constrained to given directions."""
-    weight = np.linalg.pinv(covariance, hermitian=True)
-    normal = along.T @ weight @ along
-    rest = difference - along @ np.linalg.pinv(normal, hermitian=True) @ (along.T @ weight @ difference)
-    return float(rest @ weight @ rest)
-
-
-def _estimate(run: Run, positions: Indices) -> tuple[Array, Array]:
-    """Values (k,) of unknowns and their covariance matrix (k, k)."""
-    # Scaled by the variance factor of the extended model where that exceeds 1: what it leaves unexplained is noise to
-    # its unknowns.
-    cofactor = free_cofactor(run.numbering, run.end.state, run.factor)
-    vpv, redundancy = run.group_sums(run.weighting.used)
-    variance = max(vpv / redundancy, 1.0) if redundancy >= 1.0 else 1.0
-    return run.end.state.values[positions], variance * cofactor.part(positions)

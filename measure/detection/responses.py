@@ -29,7 +29,7 @@ _CANDIDATES = 100  # largest number per template
 _NARROWED = 0.7  # factor of the tolerance for refined placements
 LEAST_TOLERANCE_PX = 1.5  # px of the reduced scan, accuracy of correlation peaks
 _BACKGROUND_PERCENT = 95  # percentile of the NCC that defines the background's response
-_LEAST_BESIDE = 0.5  # fraction of the map taken for background at least
+_LEAST_BACKGROUND = 0.5  # fraction of the map taken for background at least
 _SAMPLED = slice(None, None, 3)  # subsampling for that estimate, since neighbours are correlated
 
 
@@ -199,8 +199,8 @@ class Dilation:
         disk = np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)), np.uint8)
         self.map, self.origin, self.area_px = np.asarray(cv2.dilate(map_, disk)), origin, int(disk.sum())
         # The disks about the marks of a dense lattice cover a tenth of the scan: they would be the background.
-        beside = max(1 - marks * self.area_px / map_.size, _LEAST_BESIDE)
-        self.background = max(float(np.percentile(self.map[_SAMPLED, _SAMPLED], _BACKGROUND_PERCENT * beside)), 0.0)
+        percent = _BACKGROUND_PERCENT * max(1 - marks * self.area_px / map_.size, _LEAST_BACKGROUND)
+        self.background = max(float(np.percentile(self.map[_SAMPLED, _SAMPLED], percent)), 0.0)
 
     def share(self, place: Array) -> float:
         """Fraction of all places whose response is at least that of a place (2,) of the reduced scan."""

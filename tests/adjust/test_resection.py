@@ -347,7 +347,6 @@ def test_where_half_of_the_images_fail_it_is_no_single_one() -> None:
         adjust(network)
 
 
-@pytest.mark.study
 @pytest.mark.parametrize("robust", [False, True])
 def test_an_image_with_a_point_behind_its_camera_is_left_out(robust: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """One number of 55 is wrong: its point, in sight of all others, lies behind that one camera."""
