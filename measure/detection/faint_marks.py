@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from measure.array_types import Array, Mask
 from measure.detection.localisation import MarkPrediction
-from measure.detection.mark_views import detail_px
 from measure.flags import NO_REASON, Cause
-from measure.marks.rendering import extent_px, picture
+from measure.marks.rendering import detail_px, extent_px, picture
 from measure.matching.window import FAINT, Coding
 from measure.results import Covariance, MarkFit
 from measure.scans.scan import Scan, means

@@ -4,10 +4,10 @@ A single mark gives false peaks on every film: the constellation decides.
 """
 
 from collections import OrderedDict
-from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Generic, TypeVar
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -15,14 +15,23 @@ from numpy.typing import NDArray
 
 from measure.array_types import Array, Mask
 from measure.detection.correlation import WIDE, Map, Surroundings, correlation, highest_about, local_maxima, variation
-from measure.detection.mark_views import MarkView, distinct_templates, ground_detail_px, search_reduction
+from measure.geometry import linear_scale, turn_by_quarters
+from measure.marks.rendering import detail_px, extent_px, known_picture
+from measure.marks.shapes import Bar, Mark, MarkShape, MarkTemplate, thinnest_mm
 from measure.matching.window import FAINT
 from measure.scans.parallel import map_in_threads
 from measure.scans.scan import SINGLE_CHANNELS, Scan
 
-Cached = TypeVar("Cached")
 Key = tuple[int, int]  # a kind of template, and the sign of the mark
+Value = TypeVar("Value", bound="Map | Dilation")
 
+_EXTENT_PX = 14.0  # px, smallest extent of the reduced mark
+_THINNEST_PX = 1.2  # px, smallest width of its thinnest line, which would otherwise vanish
+_BLUR_PX = 0.6  # px, blur of the reduced mark: 0.3 from averaging, and the rest from the scan
+_RIM_PX = 2  # px of the reduced scan around the drawing, reach of the blur
+_LARGEST_PX = 3000  # px, larger side of the reduced scan; a larger one costs seconds
+_ALIKE = 0.8  # NCC above which two templates share one response
+_LEARNED = 2.0  # in widths of the finest detail: wide notches and blocks would dominate the median of the background
 _GRID_PX = 16  # px of the reduced scan: places in one cell of this grid share a window
 _LEAST_RESPONSE = 0.2  # smallest NCC of a candidate
 _CANDIDATES = 100  # largest number per template
@@ -31,6 +40,9 @@ LEAST_TOLERANCE_PX = 1.5  # px of the reduced scan, accuracy of correlation peak
 _BACKGROUND_PERCENT = 95  # percentile of the NCC that defines the background's response
 _LEAST_BACKGROUND = 0.5  # fraction of the map taken for background at least
 _SAMPLED = slice(None, None, 3)  # subsampling for that estimate, since neighbours are correlated
+_MOST_CACHED = 768 << 20  # bytes, enough for four different marks in a large scan
+_SMALL_MAPS = 32  # maps of a small scan at full resolution
+_LEAST_CACHED = 32 << 20  # bytes
 
 
 def narrow_tolerance_px(tolerance_px: float) -> float:
@@ -40,154 +52,196 @@ def narrow_tolerance_px(tolerance_px: float) -> float:
 
 @dataclass(frozen=True)
 class Effort:
-    """Effort of a search.
+    """Effort of a search. cache_bytes: largest size of the cache; half_px: largest half size of the template of a
+    cross, px of the reduced scan, since the centre suffices where one arm is far longer."""
 
-    cache_bytes: size of the cache of correlation maps; half_px: largest half size of the template of a cross, px of the
-    reduced scan, since the centre suffices where one arm is far longer; all_orientations: whether scan orientations
-    that show the same marks in the same places are searched separately.
+    cache_bytes: int = _MOST_CACHED
+    half_px: int = 1000
+
+    def make_cache(self, scan: Scan) -> "ByteCache":
+        """Create the cache shared by all searches of a scan; limited for small scans."""
+        pixels = scan.width_px * scan.height_px
+        return ByteCache(min(self.cache_bytes, max(_SMALL_MAPS * 4 * pixels, _LEAST_CACHED)))
+
+
+class ByteCache:
+    """Least-recently-used cache of maps and dilations, limited by size in bytes.
+
+    Marks that look different in every orientation have dozens of maps, each as large as the reduced scan.
     """
-
-    cache_bytes: int
-    half_px: int
-    all_orientations: bool
-
-    def scan_cache_bytes(self, pixels: int) -> int:
-        """Size of the cache shared by all searches of a scan with this number of pixels; limited for small scans."""
-        return min(self.cache_bytes, max(_SMALL_MAPS * 4 * pixels, _LEAST_CACHED))
-
-
-_SMALL_MAPS = 32  # maps of a small scan at full resolution
-_LEAST_CACHED = 32 << 20  # bytes
-_SIXTEEN_MAPS = 768 << 20  # bytes, maps of four different marks in a large scan
-FULL = Effort(cache_bytes=_SIXTEEN_MAPS, half_px=1000, all_orientations=True)
-
-
-class ByteCache(Generic[Cached]):
-    """Least-recently-used cache, limited by size in bytes."""
 
     def __init__(self, limit_bytes: int) -> None:
         self.limit_bytes = limit_bytes
-        self._entries: OrderedDict[Hashable, tuple[Cached, int]] = OrderedDict()
+        self._entries = OrderedDict[Hashable, Map | Dilation]()
         self._bytes = 0
 
-    def get(self, key: Hashable) -> Cached | None:
-        """Cached value of a key; None if absent."""
-        if key not in self._entries:
-            return None
-        self._entries.move_to_end(key)
-        return self._entries[key][0]
-
-    def put(self, key: Hashable, value: Cached, size_bytes: int) -> None:
-        """Add a value, in place of an earlier one of the same key."""
-        self._bytes -= self._entries.pop(key, (value, 0))[1]
-        self.make_room(size_bytes)
-        self._entries[key] = value, size_bytes
-        self._bytes += size_bytes
-
-    def make_room(self, size_bytes: int) -> None:
-        """Drop the least recently used entries until size_bytes fit or the cache is empty."""
-        while self._entries and self._bytes + size_bytes > self.limit_bytes:
-            self._bytes -= self._entries.popitem(last=False)[1][1]
+    def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
+        """Return the value of a key; one that is absent, or was dropped, is made."""
+        if key in self._entries:
+            self._entries.move_to_end(key)
+            return self._entries[key]  # type: ignore[return-value]
+        value = make()
+        while self._entries and self._bytes + value.nbytes > self.limit_bytes:
+            self._bytes -= self._entries.popitem(last=False)[1].nbytes
+        self._entries[key] = value
+        self._bytes += value.nbytes
+        return value
 
 
-@dataclass(frozen=True)
-class TemplateSet:
-    """Templates of the distinct kinds of mark views.
+@dataclass(frozen=True, eq=False)
+class MarkView:
+    """A mark in one scan orientation. linear: (2, 2) part of pixel_from_mark in the scan."""
+
+    mark: Mark
+    linear: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Templates:
+    """Distinct templates of mark views.
 
     Attributes
     ----------
-    templates : one per kind.
+    images : one per kind; nan where a mark is not known.
     details_px : width of the finest structure that is not background, px of the reduced scan, one per kind.
-    signs : lighter (+1) or darker (-1) than the background.
-    surroundings : treatment of the background.
-    faint_dn : contrast at the level of rounding.
+    kinds : of the template of each view.
+    reduction : factor by which the scan is reduced.
     """
 
-    templates: Sequence[Array]
+    images: Sequence[Array]
     details_px: Sequence[float]
-    signs: Collection[int]
-    surroundings: Surroundings
-    faint_dn: float
+    kinds: tuple[int, ...]
+    reduction: int
+
+    @classmethod
+    def render(cls, scan: Scan, views: Sequence[MarkView], half_px: int) -> "Templates":
+        """Render mark views. half_px: largest half size of the template of a cross, px of the reduced scan."""
+        reduction = _search_reduction(scan, views)
+        images = _images(views, reduction, half_px)
+        own = list({id(image): image for image in images}.values())
+        correlations = _correlations(own)
+        first: list[int] = []
+        kind_by_id: dict[int, int] = {}
+        for number, image in enumerate(own):
+            if not (correlations[number, first] > _ALIKE).any():
+                first.append(number)
+            kind_by_id[id(image)] = int(correlations[number, first].argmax())
+        kinds = tuple(kind_by_id[id(image)] for image in images)
+        details = [_ground_detail_px(views[kinds.index(kind)], reduction) for kind in range(len(first))]
+        return cls([own[number] for number in first], details, kinds, reduction)
 
     @property
     def half_px(self) -> int:
         """Margin (px) by which an image must exceed its correlation map."""
-        return max(len(template) for template in self.templates) // 2
-
-    def maps(self, kinds: Sequence[int], pictures: Sequence[Map] | Iterator[Map]) -> dict[Key, Map]:
-        """Correlation maps of kinds with equal detail width, the maximum over the images of all channels. Kinds with
-        the same mask, such as one template in eight orientations, share the image's variation."""
-        maps, detail_px = dict[Key, Map](), self.details_px[kinds[0]]
-        for picture in pictures:
-            image = self.surroundings.flattened(picture, detail_px, self.faint_dn)
-            height, width = (side - 2 * self.half_px for side in image.shape)
-            variations = dict[bytes, Map]()
-            for kind in kinds:
-                chip, counts = self.surroundings.pattern(self.templates[kind], detail_px, image)
-                if counts.tobytes() not in variations:
-                    variations[counts.tobytes()] = variation(image, counts)
-                response = correlation(image, chip, counts, variations[counts.tobytes()])
-                margin = self.half_px - len(chip) // 2
-                response = response[margin : margin + height, margin : margin + width]
-                for sign in self.signs:
-                    signed = response if sign > 0 else -response
-                    known = maps.setdefault((kind, sign), signed)
-                    np.maximum(known, signed, out=known)
-        return maps
+        return max(len(image) for image in self.images) // 2
 
 
-class ScanMaps(Mapping[Key, Map]):
-    """Correlation maps of a whole reduced scan, computed on demand.
+def _search_reduction(scan: Scan, views: Sequence[MarkView]) -> int:
+    """Reduction factor of the search: as large as needed, limited so that marks and lines remain visible."""
+    limits = []
+    for view in views:
+        least, greatest = extent_px(view.mark, np.column_stack([view.linear, np.zeros(2)]))
+        thinnest_px = linear_scale(view.linear) * thinnest_mm(view.mark)
+        limits.append(min((greatest - least).max() / _EXTENT_PX, thinnest_px / _THINNEST_PX))
+    needed = max(scan.width_px, scan.height_px) / _LARGEST_PX
+    return min(max(1, int(min(limits)), int(np.ceil(needed))), scan.width_px, scan.height_px)
 
-    Marks that look different in every orientation have dozens of maps, each as large as the reduced scan. The cache
-    shared by all searches of a scan is therefore limited, and dropped maps are recomputed.
+
+def _ground_detail_px(view: MarkView, reduction: int) -> float:
+    """Width of the structure that is not background, px of the reduced scan: the finest detail, more for a template."""
+    wide = _LEARNED if isinstance(view.mark, MarkTemplate) else 1.0
+    return max(wide * detail_px(view.mark, view.linear) / reduction, 1.0)
+
+
+def _images(views: Sequence[MarkView], reduction: int, half_px: int) -> list[Array]:
+    """Templates of views. Equal marks in the same direction share one; quarter turns and mirroring reuse it turned."""
+    first: dict[Mark, tuple[Array, Array]] = {}
+    drawn: dict[tuple[Mark, bytes], Array] = {}
+    for view in views:
+        key = view.mark, view.linear.tobytes()
+        if key in drawn:
+            continue
+        if view.mark not in first:
+            first[view.mark] = view.linear, _image(view, reduction, half_px)
+        linear, image = first[view.mark]
+        turn = view.linear @ np.linalg.inv(linear)
+        drawn[key] = turn_by_quarters(image, turn) if _is_quarter(turn) else _image(view, reduction, half_px)
+    return [drawn[view.mark, view.linear.tobytes()] for view in views]
+
+
+def _is_quarter(turn: Array) -> bool:
+    whole = np.rint(turn)
+    return bool(np.allclose(turn, whole, atol=1e-9) and np.array_equal(np.abs(whole).sum(axis=0), [1, 1]))
+
+
+def _image(view: MarkView, reduction: int, half_px: int) -> Array:
+    place = np.column_stack([view.linear, np.zeros(2)]) / reduction
+    half = int(np.ceil(np.abs(np.concatenate(extent_px(view.mark, place))).max())) + _RIM_PX
+    if isinstance(view.mark, MarkShape) and any(isinstance(part, Bar) for part in view.mark.parts):
+        half = min(half, half_px)
+    place[:, 2] = half
+    return known_picture(view.mark, place, 2 * half + 1, 2 * half + 1, _BLUR_PX)
+
+
+def _correlations(images: Sequence[Array]) -> Array:
+    """(n, n) correlations of concentric templates; the smaller one of two is padded with zeros."""
+    sizes = np.array([len(image) for image in images])
+    flat = np.stack([np.pad(np.nan_to_num(each), (sizes.max() - len(each)) // 2).ravel() for each in images])
+    sums, count = flat.sum(axis=1), np.maximum(sizes[:, None], sizes) ** 2
+    squares = (flat**2).sum(axis=1)
+    spread = squares[:, None] - sums[:, None] ** 2 / count
+    return np.asarray((flat @ flat.T - np.outer(sums, sums) / count) / np.sqrt(spread * spread.T))
+
+
+class CorrelationMaps(Mapping[Key, Map]):
+    """Correlation maps of a part of the reduced scan by kind and sign: lighter (+1) or darker (-1) than the background.
+
+    They are computed on demand, the maximum over all channels.
     """
 
     def __init__(
         self,
-        scan: Scan,
-        reduction: int,
-        template_set: TemplateSet,
-        cache: ByteCache[Map],
+        channels: Sequence[Map],
+        templates: Templates,
+        signs: Collection[int],
+        surroundings: Surroundings,
+        faint_dn: float,
+        cache: ByteCache,
     ) -> None:
-        self._scan, self._reduction, self._set, self._cache = scan, reduction, template_set, cache
-        self._own = object()  # identifies these maps in the cache
+        """channels: images that exceed the maps by the templates' half_px; faint_dn: contrast at the level of
+        rounding."""
+        self._channels, self._templates, self._signs, self._cache = channels, templates, tuple(signs), cache
+        self._surroundings, self._faint_dn = surroundings, faint_dn
+        self._own = object()  # identifies these maps in the cache; self would create a reference cycle
 
     def __getitem__(self, key: Key) -> Map:
-        map_ = self._cache.get((self._own, key))
-        return self._make(key[0])[key] if map_ is None else map_
+        both = self._cache.get((self._own, key[0]), partial(self._both_signs, key[0]))
+        return np.asarray(both[self._signs.index(key[1])])
 
     def __iter__(self) -> Iterator[Key]:
-        return ((kind, sign) for kind in range(len(self._set.templates)) for sign in self._set.signs)
+        return ((kind, sign) for kind in range(len(self._templates.images)) for sign in self._signs)
 
     def __len__(self) -> int:
-        return len(self._set.templates) * len(self._set.signs)
+        return len(self._templates.images) * len(self._signs)
 
-    def _make(self, first: int) -> dict[Key, Map]:
-        """Compute the maps of a kind and of as many later ones with equal detail width as fit: they share most of the
-        computation."""
-        height, width = self._scan.height_px // self._reduction, self._scan.width_px // self._reduction
-        kind_bytes = 4 * height * width * len(self._set.signs)
-        most = max(self._cache.limit_bytes // kind_bytes, 1)
-        details = self._set.details_px
-        missing = [
-            kind
-            for kind in range(first, len(details))
-            if details[kind] == details[first]
-            and any(self._cache.get((self._own, (kind, sign))) is None for sign in self._set.signs)
-        ][:most]
-        self._cache.make_room(len(missing) * kind_bytes)
-        maps = self._set.maps(missing, self._pictures())
-        for key, map_ in maps.items():
-            self._cache.put((self._own, key), map_, map_.nbytes)
+    def _both_signs(self, kind: int) -> Map:
+        """(signs, rows, columns) maps of a kind."""
+        image, detail, get = self._templates.images[kind], self._templates.details_px[kind], self._cache.get
+        margin = self._templates.half_px - len(image) // 2
+        signed = np.array(self._signs, np.float32)[:, None, None]
+        maps = None
+        for number, channel in enumerate(self._channels):
+            # Kinds of equal detail share the flattened image, kinds with equal masks its variation under them.
+            key = self._own, number, detail
+            flat = get(key, partial(self._surroundings.flattened, channel, detail, self._faint_dn))
+            chip, mask = self._surroundings.pattern(image, detail, flat)
+            varied = get((key, mask.tobytes()), partial(variation, flat, mask))
+            response = correlation(flat, chip, mask, varied)
+            rows, cols = (slice(margin, side - margin) for side in response.shape)
+            own = signed * response[rows, cols]
+            maps = own if maps is None else np.maximum(maps, own, out=maps)
+        assert maps is not None
         return maps
-
-    def _pictures(self) -> Iterator[Map]:
-        """Reduced scan in every channel, with its edge replicated as a margin."""
-        half = self._set.half_px
-        for weights in _channels(self._scan):
-            grey = self._scan.reduced(self._reduction, weights)
-            yield np.asarray(cv2.copyMakeBorder(grey, half, half, half, half, cv2.BORDER_REPLICATE), np.float32)
 
 
 class Dilation:
@@ -201,6 +255,10 @@ class Dilation:
         # The disks about the marks of a dense lattice cover a tenth of the scan: they would be the background.
         percent = _BACKGROUND_PERCENT * max(1 - marks * self.area_px / map_.size, _LEAST_BACKGROUND)
         self.background = max(float(np.percentile(self.map[_SAMPLED, _SAMPLED], percent)), 0.0)
+
+    @property
+    def nbytes(self) -> int:
+        return self.map.nbytes
 
     def share(self, place: Array) -> float:
         """Fraction of all places whose response is at least that of a place (2,) of the reduced scan."""
@@ -221,44 +279,9 @@ class Dilation:
         return np.maximum(np.maximum(response, 0.0) ** 2 - self.background**2, 0.0), inside
 
 
-class ResponseMap:
-    """Responses to one template, with derived quantities shared by all orientations and hypotheses."""
-
-    def __init__(
-        self, maps: Mapping[Key, Map], key: Key, cache: ByteCache[Dilation], origin: NDArray[np.int_], marks: int
-    ) -> None:
-        # No reference to the `Responses` that hold this map: in a cycle their large maps would outlive the search.
-        self._maps, self._key, self._cache, self.origin, self._marks = maps, key, cache, origin, marks
-        self._own = object()  # identifies this map in the cache; self would create a reference cycle
-
-    @property
-    def map(self) -> Map:
-        return self._maps[self._key]
-
-    @cached_property
-    def candidates(self) -> Array:
-        """(n, 2) candidates, px of the reduced scan."""
-        return np.asarray(local_maxima(self.map, _CANDIDATES, _LEAST_RESPONSE)[0] + self.origin)
-
-    def dilated(self, radius_px: float) -> Dilation:
-        """Dilate the map by a radius, rounded to whole pixels."""
-        key = self._own, round(radius_px)
-        dilation = self._cache.get(key)
-        if dilation is None:
-            dilation = Dilation(self.map, self.origin, radius_px, self._marks)
-            self._cache.put(key, dilation, dilation.map.nbytes)
-        return dilation
-
-    def highest_about(self, places: Array, radius_px: float) -> tuple[Array, Array]:
-        """Places (n, 2) of the highest responses around places (n, 2) of the reduced scan, and (n,) heights; 0 outside
-        the map."""
-        tops, heights = highest_about(self.map, places - self.origin, radius_px)
-        return tops + self.origin, heights
-
-
 @dataclass(frozen=True, eq=False)
 class Responses:
-    """Correlations of the reduced scan with the templates of mark views.
+    """Correlations of the reduced scan with the templates of mark views, and quantities derived from them.
 
     Attributes
     ----------
@@ -275,16 +298,38 @@ class Responses:
     maps: Mapping[Key, Map]
     kinds: tuple[int, ...]
     reduction: int
-    cache: ByteCache[Dilation]
+    cache: ByteCache
     origins: NDArray[np.int_] | None = None
     surroundings: Surroundings = WIDE
     marks: int = 0
+    _candidates: dict[Key, Array] = field(default_factory=dict)
 
     @cached_property
-    def by_key(self) -> dict[Key, ResponseMap]:
-        """Response maps by kind of template and sign."""
-        origins = np.zeros((len(self.maps), 2), dtype=int) if self.origins is None else self.origins
-        return {key: ResponseMap(self.maps, key, self.cache, origins[key[0]], self.marks) for key in self.maps}
+    def _own(self) -> object:
+        """Identifies the responses in the cache; self would create a reference cycle."""
+        return object()
+
+    def origin(self, key: Key) -> NDArray[np.int_]:
+        """(2,) column and row of the reduced scan where a map begins."""
+        return np.zeros(2, dtype=int) if self.origins is None else np.asarray(self.origins[key[0]])
+
+    def candidates(self, key: Key) -> Array:
+        """(n, 2) highest peaks of a map, px of the reduced scan."""
+        if key not in self._candidates:
+            peaks, _ = local_maxima(self.maps[key], _CANDIDATES, _LEAST_RESPONSE)
+            self._candidates[key] = peaks + self.origin(key)
+        return self._candidates[key]
+
+    def dilated(self, key: Key, radius_px: float) -> Dilation:
+        """Dilate a map by a radius, rounded to whole pixels."""
+        own = self._own, key, round(radius_px)
+        return self.cache.get(own, lambda: Dilation(self.maps[key], self.origin(key), radius_px, self.marks))
+
+    def highest_about(self, key: Key, places: Array, radius_px: float) -> tuple[Array, Array]:
+        """Places (n, 2) of the highest responses around places (n, 2) of the reduced scan, and (n,) heights; 0 outside
+        the map."""
+        tops, heights = highest_about(self.maps[key], places - self.origin(key), radius_px)
+        return tops + self.origin(key), heights
 
     def reduced_px(self, scan_px: Array) -> Array:
         """Convert scan pixels (..., 2) to pixels of the reduced scan."""
@@ -300,25 +345,24 @@ def correlate_scan(
     views: Sequence[MarkView],
     signs: Collection[int],
     surroundings: Surroundings,
-    caches: tuple[ByteCache[Map], ByteCache[Dilation]],
-    half_px: int = FULL.half_px,
-    marks: int = 0,
+    cache: ByteCache,
+    half_px: int,
+    marks: int,
 ) -> Responses:
     """Correlate the whole scan with mark views.
 
     Parameters
     ----------
     signs : lighter (+1) or darker (-1) than the background.
-    caches : of correlation maps and of dilations.
     half_px : largest half size of the template of a cross, px of the reduced scan.
     marks : number of marks in the frame.
     """
-    reduction = search_reduction(scan, views)
-    templates, kinds = distinct_templates(views, reduction, half_px)
-    details = [ground_detail_px(views[kinds.index(kind)], reduction) for kind in range(len(templates))]
-    template_set = TemplateSet(templates, details, signs, surroundings, scan.full_scale_dn * FAINT)
-    maps = ScanMaps(scan, reduction, template_set, caches[0])
-    return Responses(maps, kinds, reduction, caches[1], surroundings=surroundings, marks=marks)
+    templates = Templates.render(scan, views, half_px)
+    half = (templates.half_px,) * 4
+    reduced = (scan.reduced(templates.reduction, weights) for weights in _channels(scan))
+    channels = [np.asarray(cv2.copyMakeBorder(grey, *half, cv2.BORDER_REPLICATE), np.float32) for grey in reduced]
+    maps = CorrelationMaps(channels, templates, signs, surroundings, scan.full_scale_dn * FAINT, cache)
+    return Responses(maps, templates.kinds, templates.reduction, cache, None, surroundings, marks)
 
 
 def correlate_windows(
@@ -327,31 +371,31 @@ def correlate_windows(
     places_px: Array,
     reach_px: float,
     signs: Collection[int],
-    cache: ByteCache[Dilation],
-    half_px: int = FULL.half_px,
+    cache: ByteCache,
+    half_px: int,
 ) -> Responses:
     """Correlate windows around the expected places (n, 2) of mark views, up to reach_px and slightly beyond.
 
     Only these windows of the file are read. A kind is a template at one place.
     """
-    reduction = search_reduction(scan, views)
-    templates, template_numbers = distinct_templates(views, reduction, half_px)
-    details = [ground_detail_px(views[0], reduction)] * len(templates)
-    template_set = TemplateSet(templates, details, signs, WIDE, scan.full_scale_dn * FAINT)
-    reach, half = int(np.ceil(reach_px / reduction)), template_set.half_px
+    templates = Templates.render(scan, views, half_px)
+    reduction, half = templates.reduction, templates.half_px
+    reach = int(np.ceil(reach_px / reduction))
     # Row by row, so that file strips shared by windows are still decoded for the next one.
     squares = np.floor(places_px[:, ::-1] / reduction / _GRID_PX)
     corners, numbers = np.unique(squares, axis=0, return_inverse=True)
     origins = corners[:, ::-1].astype(int) * _GRID_PX - reach
     size = _GRID_PX + 2 * reach + 2 * half
-    pairs = list(zip(numbers.tolist(), template_numbers, strict=True))
+    pairs = list(zip(numbers.tolist(), templates.kinds, strict=True))
     kinds = sorted(set(pairs))
 
     def window_maps(corner: int) -> dict[Key, Map]:
         col0, row0 = (origins[corner] - half).tolist()
-        pictures = [scan.reduced_window(reduction, col0, row0, size, size, weights) for weights in _channels(scan)]
-        maps = template_set.maps([template for own, template in kinds if own == corner], pictures)
-        return {(kinds.index((corner, template)), sign): map_ for (template, sign), map_ in maps.items()}
+        channels = [scan.reduced_window(reduction, col0, row0, size, size, weights) for weights in _channels(scan)]
+        own_cache = ByteCache(_MOST_CACHED)
+        maps = CorrelationMaps(channels, templates, signs, WIDE, scan.full_scale_dn * FAINT, own_cache)
+        own = (pair for pair in kinds if pair[0] == corner)
+        return {(kinds.index(pair), sign): maps[pair[1], sign] for pair in own for sign in signs}
 
     maps = {key: map_ for each in map_in_threads(window_maps, range(len(corners))) for key, map_ in each.items()}
     own_origins = origins[[corner for corner, _ in kinds]]

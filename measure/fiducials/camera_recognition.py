@@ -12,21 +12,21 @@ from scipy.special import comb
 
 from measure.detection.localisation import localise
 from measure.detection.responses import Effort
-from measure.fiducials.constellation import Placement
+from measure.fiducials.constellation import Placement, distinct_places
 from measure.fiducials.frame import Frame
 from measure.fiducials.measure_frame import detect_frame
 from measure.fiducials.options import FiducialOptions
 from measure.fiducials.search import FrameSearch, PitchHypothesis
+from measure.fiducials.significance import false_placements
 from measure.flags import CAMERA_BY_CHANCE, CAMERA_BY_NOISE
 from measure.marks.shapes import FiducialLayout
 from measure.matching.models import MatchOptions
 from measure.scans.scan import Scan
 
-_COMPARED = 3  # best placements: the one with the fewest false alarms is among them
-_QUICK = Effort(cache_bytes=48 << 20, half_px=16, all_orientations=False)
+_COMPARED = 3  # best places: the one with the fewest false alarms is among them
+_QUICK = Effort(cache_bytes=48 << 20, half_px=16)
 _AT_LEAST = 3  # marks of a frame that must be detected
-_TRIED = 3  # best placements that are tried
-_PLACES = 2  # distinct places that are tried, each in the poses that respond there
+_PLACES = 2  # best places that are tried
 _QUICK_OPTIONS = FiducialOptions(match=MatchOptions(damage_rounds=1))  # likeness needs less accuracy than the place
 
 
@@ -44,9 +44,10 @@ class Answer:
 
 def search_camera(scan: Scan, layout: FiducialLayout, hypotheses: Sequence[PitchHypothesis], tried: int = 0) -> Answer:
     """Search a scan for the constellation of a camera, under pitch hypotheses. tried: number of earlier hypotheses."""
-    search, tried = FrameSearch(scan, layout, FiducialOptions(), effort=_QUICK), tried + len(hypotheses)
-    found = search.search_room(hypotheses)[:_COMPARED]
-    expected = [tried * search.false_placements(placement) for placement in found]
+    options, tried = FiducialOptions(), tried + len(hypotheses)
+    result = FrameSearch(scan, layout, options, _QUICK).search_room(options, hypotheses)
+    found = distinct_places(result.placements, _COMPARED)
+    expected = [tried * false_placements(result, placement) for placement in found]
     return Answer(min(expected, default=np.inf), tuple(found))
 
 
@@ -55,15 +56,10 @@ def recognise_frame(scan: Scan, layout: FiducialLayout, answered: Answer, times:
 
     Parameters
     ----------
-    answered : response of a thumbnail of the scan; at most two places are tried, in all poses that respond there.
+    answered : response of a thumbnail of the scan; at most two places are tried.
     times : pixels of the scan for one pixel of the thumbnail, along a side.
     """
-    places = list[Placement]()
-    for placement in answered.placements[:_TRIED]:
-        if not any(placement.same_place(other) for other in places):
-            places.append(placement)
-        if len(places) > _PLACES:
-            break
+    for placement in answered.placements[:_PLACES]:
         enlarged = _enlarged(placement, times)
         if answered.expected <= CAMERA_BY_CHANCE or _may_be_there(scan, layout, enlarged):
             # All marks count in the score: without the missing ones, a camera of eight loses to one that has four.

@@ -3,7 +3,7 @@
 Places are complex numbers here, x + iy in mm of the scan's axes (right, up), so that a similarity is `a w + b`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -13,10 +13,10 @@ from scipy.spatial import cKDTree
 
 from measure.array_types import Array
 from measure.detection.correlation import WIDE, Surroundings
-from measure.detection.responses import LEAST_TOLERANCE_PX, ResponseMap, Responses, narrow_tolerance_px
+from measure.detection.responses import LEAST_TOLERANCE_PX, Key, Responses, narrow_tolerance_px
 from measure.fiducials.interior_orientation import FilmFit
 from measure.fiducials.options import TakingLens
-from measure.geometry import linear_scale, up_from_camera
+from measure.geometry import Affine, linear_scale, up_from_camera
 from measure.marks.shapes import LayoutMark, Mark
 
 Complex = NDArray[np.complex128]
@@ -135,14 +135,32 @@ class Placement:
         pitch = np.array(self.pitch_mm)
         own, other = self._ideal_px(camera_mm), renamed._ideal_px(camera_mm)[names]
         to, from_ = ((each * pitch) @ (1.0, 1.0j) for each in (own, other))
-        mean_to, mean_from = to.mean(), from_.mean()
-        scale = np.vdot(from_ - mean_from, to - mean_to) / np.vdot(from_ - mean_from, from_ - mean_from)
-        similarity = np.array([[scale.real, -scale.imag], [scale.imag, scale.real]])
-        moved = np.column_stack([linear, shift]) * pitch[:, None]
-        moved = similarity @ moved
-        offset = mean_to - scale * mean_from
-        moved[:, 2] += (offset.real, offset.imag)
+        correction = _similarity_matrix(*_fit_similarity(from_, to, np.ones(len(to))))
+        moved = Affine(correction).compose(Affine(renamed.pixel_from_camera * pitch[:, None])).matrix
         return replace(renamed, pixel_from_camera=moved / pitch[:, None])
+
+
+def distinct_places(found: Iterable[Placement], most: int) -> list[Placement]:
+    """Return the first placements of different places, at most so many."""
+    places = list[Placement]()
+    for placement in found:
+        if len(places) < most and not any(placement.same_place(other) for other in places):
+            places.append(placement)
+    return places
+
+
+def _fit_similarity(from_: Complex, to: Complex, weight: Array) -> tuple[Complex, Complex]:
+    """Similarities (...,) from weighted places (..., n), by least squares."""
+    total = weight.sum(axis=-1)
+    mean_from, mean_to = ((weight * places).sum(axis=-1) / total for places in (from_, to))
+    reduced, target = from_ - mean_from[..., None], to - mean_to[..., None]
+    scale = (weight * np.conj(reduced) * target).sum(axis=-1) / (weight * np.abs(reduced) ** 2).sum(axis=-1)
+    return scale, mean_to - scale * mean_from
+
+
+def _similarity_matrix(scale: complex | Complex, offset: complex | Complex) -> Array:
+    """(2, 3) matrix of a similarity."""
+    return np.array([[scale.real, -scale.imag, offset.real], [scale.imag, scale.real, offset.imag]])
 
 
 def same_picture(
@@ -172,15 +190,6 @@ def mark_signs(marks: Sequence[LayoutMark]) -> set[int]:
     return {mark_sign(mark.mark, assumed) for mark in marks for assumed in (1, -1)}
 
 
-def _different(found: Sequence[Placement], camera_mm: Array, tolerance_px: float) -> list[Placement]:
-    kept: list[tuple[Placement, Array]] = []
-    for placement in found:
-        places = placement.places_px(camera_mm)
-        if all(np.hypot(*(places - other).T).max() > 2 * tolerance_px for _, other in kept):
-            kept.append((placement, places))
-    return [placement for placement, _ in kept]
-
-
 class PlacementSearch:
     """Search for placements of a frame under one pitch, in one scan orientation after another.
 
@@ -189,7 +198,7 @@ class PlacementSearch:
     tolerance_px : deviation allowed to a mark, px of the reduced scan.
     kinds : by orientation, the kind of template of every mark.
     placements : by orientation. An orientation with equal marks at the places of an earlier one gets the placements of
-        that one, converted, if all_orientations is set, else none.
+        that one, converted.
     distinct : orientations whose marks do not coincide, within the tolerance, with those of an earlier one.
     """
 
@@ -199,13 +208,11 @@ class PlacementSearch:
         responses: Responses,
         pitch_mm: tuple[float, float],
         bounds: Bounds,
-        all_orientations: bool = True,
         lens: TakingLens | None = None,
     ) -> None:
-        self.marks, self.responses, self.bounds, self.all_orientations = marks, responses, bounds, all_orientations
-        self.lens = lens
+        self.marks, self.responses, self.bounds, self.lens = marks, responses, bounds, lens
         self.camera_mm = np.array([mark.xy_mm for mark in marks])
-        self.pitch = np.asarray(pitch_mm)
+        self.pitch_mm, self.pitch = pitch_mm, np.asarray(pitch_mm)
         self.tolerance_px = max(bounds.misfit_mm / float(self.pitch.mean()) / responses.reduction, LEAST_TOLERANCE_PX)
         self.kinds: dict[str, tuple[int, ...]] = {}
         self.placements: dict[str, list[Placement]] = {}
@@ -219,8 +226,7 @@ class PlacementSearch:
             for within_mm in (_SAME * misfit_mm, misfit_mm)
         )
         if same:
-            known = self.placements[same] if self.all_orientations else []
-            self.placements[pose] = [placement.posed(pose, self.camera_mm) for placement in known]
+            self.placements[pose] = [placement.posed(pose, self.camera_mm) for placement in self.placements[same]]
         else:
             self.placements[pose] = self.find_placements(pose, kinds)
         self.kinds[pose] = kinds
@@ -230,10 +236,9 @@ class PlacementSearch:
     def _same_picture(self, known: str, pose: str, kinds: tuple[int, ...], within_mm: float) -> bool:
         return same_picture(self.marks, (known, self.kinds[known]), (pose, kinds), within_mm)
 
-    def response_map(self, placement: Placement, index: int) -> ResponseMap:
-        """Responses to a mark, by index, in the orientation and polarity of a placement."""
-        sign = mark_sign(self.marks[index].mark, placement.polarity)
-        return self.responses.by_key[self.kinds[placement.pose][index], sign]
+    def key(self, placement: Placement, index: int) -> Key:
+        """Key of the responses to a mark, by index, in the orientation and polarity of a placement."""
+        return self.kinds[placement.pose][index], mark_sign(self.marks[index].mark, placement.polarity)
 
     @cached_property
     def steps_mm(self) -> Array:
@@ -254,44 +259,40 @@ class PlacementSearch:
         found: list[Placement] = []
         for polarity in (1, -1) if unsaid else (1,):
             signs = [mark_sign(mark.mark, polarity) for mark in self.marks]
-            maps = [self.responses.by_key[key] for key in zip(kinds, signs, strict=True)]
-            found += _Constellation(self, pose, maps).placements(polarity)
-        found.sort(key=lambda placement: -placement.score)
-        return _different(found, self.camera_mm, self.bounds.misfit_mm / float(self.pitch[0]))
+            found += _Constellation(self, pose, list(zip(kinds, signs, strict=True))).placements(polarity)
+        kept: list[tuple[Placement, Array]] = []
+        for placement in sorted(found, key=lambda placement: -placement.score):
+            places = placement.places_px(self.camera_mm)
+            apart_px = 2 * self.bounds.misfit_mm / self.pitch_mm[0]
+            if all(np.hypot(*(places - other).T).max() > apart_px for _, other in kept):
+                kept.append((placement, places))
+        return [placement for placement, _ in kept]
 
 
 class _Constellation:
-    """Marks in one pose, each with its response map."""
+    """Marks in one pose, each with the key of its responses."""
 
-    def __init__(self, search: PlacementSearch, pose: str, maps: Sequence[ResponseMap]) -> None:
-        self.search, self.pose, self.maps = search, pose, maps
-        self.responses, self.bounds, self.pitch = search.responses, search.bounds, search.pitch
-        turned = search.camera_mm @ up_from_camera(pose).T
-        self.camera: Complex = turned[:, 0] + 1j * turned[:, 1]
+    def __init__(self, search: PlacementSearch, pose: str, keys: Sequence[Key]) -> None:
+        self.search, self.pose, self.keys, self.responses = search, pose, keys, search.responses
+        self.camera: Complex = np.asarray(search.camera_mm @ up_from_camera(pose).T @ (1.0, 1.0j), complex)
 
     def placements(self, polarity: int) -> list[Placement]:
+        """Score the hypotheses, and refine the best ones."""
+        search, turn = self.search, up_from_camera(self.pose)
         scale, offset = self._hypotheses()
         if len(scale) == 0:
             return []
-        scores, _ = self._scores(self.search.tolerance_px, scale, offset)
+        scores, _ = self._scores(search.tolerance_px, scale, offset)
         kept = np.argsort(-scores, kind="stable")[:_KEPT]
         stepped = self._step_along_lattice(scale[kept[:_STEPPED]], offset[kept[:_STEPPED]])
         scale, offset = self._refined(np.append(scale[kept], stepped[0]), np.append(offset[kept], stepped[1]))
-        scores, supported = self._scores(narrow_tolerance_px(self.search.tolerance_px), scale, offset)
+        scores, supported = self._scores(narrow_tolerance_px(search.tolerance_px), scale, offset)
+        per_mm = np.array([1.0, -1.0])[:, None] / search.pitch[:, None]
+        settings = polarity, self.responses.reduction, search.pitch_mm, self.responses.surroundings, search.lens
         return [
-            Placement(
-                self.pose,
-                self._pixel_from_camera(a, b),
-                score,
-                count,
-                polarity,
-                self.responses.reduction,
-                (float(self.pitch[0]), float(self.pitch[1])),
-                self.responses.surroundings,
-                self.search.lens,
-            )
-            for a, b, score, count in zip(
-                scale.tolist(), offset.tolist(), scores.tolist(), supported.tolist(), strict=True
+            Placement(self.pose, per_mm * np.column_stack([up[:, :2] @ turn, up[:, 2]]), score, count, *settings)
+            for up, score, count in zip(
+                map(_similarity_matrix, scale, offset), scores.tolist(), supported.tolist(), strict=True
             )
         ]
 
@@ -307,25 +308,28 @@ class _Constellation:
             offset = tried[np.arange(len(best)), best]
         return scale[: len(best)], offset[: len(best)]
 
-    def _complex(self, scan_px: Array) -> Complex:
-        scaled = (scan_px if self.search.lens is None else self.search.lens.ideal_px(scan_px)) * self.pitch
-        return np.asarray(scaled[..., 0] - 1j * scaled[..., 1])
+    def _complex(self, reduced_px: Array) -> Complex:
+        scan_px, lens = self.responses.scan_px(reduced_px), self.search.lens
+        return np.asarray((scan_px if lens is None else lens.ideal_px(scan_px)) * self.search.pitch @ (1.0, -1.0j))
 
-    def _scan_px(self, places: Complex) -> Array:
-        ideal = np.asarray(np.stack([places.real, -places.imag], axis=-1) / self.pitch)
-        return ideal if self.search.lens is None else self.search.lens.scan_px(ideal)
+    def _reduced_px(self, scale: Complex, offset: Complex) -> Array:
+        """(n, marks, 2) places of the marks in the reduced scan under similarities (n,)."""
+        places, lens = scale[:, None] * self.camera + offset[:, None], self.search.lens
+        ideal = np.asarray(np.stack([places.real, -places.imag], axis=-1) / self.search.pitch)
+        return self.responses.reduced_px(ideal if lens is None else lens.scan_px(ideal))
 
     def _hypotheses(self) -> tuple[Complex, Complex]:
         """All similarities within bounds through two marks and two of their candidates."""
-        candidates = {each: self._complex(self.responses.scan_px(each.candidates)) for each in dict.fromkeys(self.maps)}
+        bounds = self.search.bounds
+        candidates = {key: self._complex(self.responses.candidates(key)) for key in dict.fromkeys(self.keys)}
         scales, offsets = [np.zeros(0, complex)], [np.zeros(0, complex)]
-        upright = np.cos(self.bounds.rotation_rad)
+        upright = np.cos(bounds.rotation_rad)
         for first, second in self._pairs():
-            of_first, of_second = candidates[self.maps[first]], candidates[self.maps[second]]
+            of_first, of_second = candidates[self.keys[first]], candidates[self.keys[second]]
             base = self.camera[second] - self.camera[first]
             scale = (of_second[None, :] - of_first[:, None]) / base
             size = np.abs(scale)
-            allowed = (np.abs(size - 1) < self.bounds.scale_tolerance) & (scale.real > upright * size)
+            allowed = (np.abs(size - 1) < bounds.scale_tolerance) & (scale.real > upright * size)
             at = np.flatnonzero(allowed)
             scales.append(scale.ravel()[at])
             offsets.append(of_first[at // len(of_second)] - scales[-1] * self.camera[first])
@@ -342,9 +346,10 @@ class _Constellation:
 
     def _scores(self, radius_px: float, scale: Complex, offset: Complex) -> tuple[Array, Array]:
         """Scores of many placements, and numbers of their marks that respond within the radius."""
-        places = self.responses.reduced_px(self._scan_px(scale[:, None] * self.camera + offset[:, None]))
-        nearest = np.rint(places).astype(int)
-        answers = [each.dilated(radius_px).strength(nearest[:, k]) for k, each in enumerate(self.maps)]
+        nearest = np.rint(self._reduced_px(scale, offset)).astype(int)
+        answers = [
+            self.responses.dilated(key, radius_px).strength(nearest[:, mark]) for mark, key in enumerate(self.keys)
+        ]
         strength, inside = (np.stack(each, axis=1) for each in zip(*answers, strict=True))
         score = strength.sum(axis=1) - _OUTSIDE_COST * (~inside).sum(axis=1)
         return score, (strength > 0).sum(axis=1)
@@ -355,20 +360,13 @@ class _Constellation:
         scale, offset = scale.copy(), offset.copy()
         moving = np.ones(len(scale), dtype=bool)
         for tolerance_px in (widest, narrow_tolerance_px(widest)):
-            predicted = self.responses.reduced_px(self._scan_px(scale[:, None] * self.camera + offset[:, None]))
-            found = [each.highest_about(predicted[:, k], tolerance_px) for k, each in enumerate(self.maps)]
+            predicted = self._reduced_px(scale, offset)
+            found = [
+                self.responses.highest_about(key, predicted[:, mark], tolerance_px)
+                for mark, key in enumerate(self.keys)
+            ]
             tops, heights = (np.stack(each, axis=1) for each in zip(*found, strict=True))
             weight = np.maximum(heights - _LEAST_WEIGHED, 0.0)
             moving &= (weight > 0).sum(axis=1) >= 2
-            weight, places = weight[moving], self._complex(self.responses.scan_px(tops[moving]))
-            total = weight.sum(axis=1)
-            mean_from, mean_to = ((weight * p).sum(axis=1) / total for p in (self.camera, places))
-            from_, to = self.camera - mean_from[:, None], places - mean_to[:, None]
-            scale[moving] = (weight * np.conj(from_) * to).sum(axis=1) / (weight * np.abs(from_) ** 2).sum(axis=1)
-            offset[moving] = mean_to - scale[moving] * mean_from
+            scale[moving], offset[moving] = _fit_similarity(self.camera, self._complex(tops[moving]), weight[moving])
         return scale, offset
-
-    def _pixel_from_camera(self, scale: complex, offset: complex) -> Array:
-        turn = np.array([[scale.real, -scale.imag], [scale.imag, scale.real]]) @ up_from_camera(self.pose)
-        up = np.column_stack([turn, [offset.real, offset.imag]])
-        return np.asarray(np.diag([1.0, -1.0]) @ up / self.pitch[:, None])

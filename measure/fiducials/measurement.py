@@ -16,8 +16,9 @@ from measure.fiducials.measure_frame import measure_frame, rename_frame
 from measure.fiducials.options import FiducialOptions
 from measure.fiducials.rows import absent_frame, lost_frame, present_frame
 from measure.fiducials.scan_orientation import decide_pose
-from measure.fiducials.search import FrameSearch, pitch_hypotheses
-from measure.fiducials.stages import doubt_frame, find_frame, likeliest_pose
+from measure.fiducials.search import SearchResult
+from measure.fiducials.significance import doubt_frame, false_placements
+from measure.fiducials.stages import find_frame
 from measure.flags import FRAMES_BY_CHANCE, NO_REASON, Code, Reason, Status
 from measure.geometry import up_from_camera
 from measure.marks.shapes import FiducialLayout, limit_to_crossings, limit_to_frame
@@ -90,25 +91,23 @@ def _search_frame(
     scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
 ) -> FrameMeasurement:
     """Search for the frame without clicks that give its place, and measure its marks."""
-    hypotheses = pitch_hypotheses(scan, layout, pitch_um, options)
-    result = find_frame(scan, layout, hypotheses, pitch_um is not None, options)
-    search, frame = result.search, result.frame
+    found = find_frame(scan, layout, pitch_um, options)
+    frame, result = found.frame, found.result
     if frame is None:
-        absent = absent_frame(scan, layout, result.misfit, options.rotation_deg, pitch_um)
+        absent = absent_frame(scan, layout, found.misfit, options.rotation_deg, pitch_um)
         return replace(absent, writing=_read(scan, layout, None)) if options.writing == "all" else absent
-    found = [placement for placement in result.placements if placement.pitch_mm == frame.placement.pitch_mm]
     lines = _read(scan, layout, frame) if options.writing == "all" else None
     pose, against = Pose(options.pose, True, _SET), NO_REASON
     if options.pose == "auto":
-        pose = likeliest_pose(search, frame, lines or ())
+        pose = decide_pose(frame, lines or ())
         if options.writing == "pose" and not pose.decided and frame.accepted:
             lines = _read(scan, layout, frame, options.known_lines)
-            pose = likeliest_pose(search, frame, lines or ())
-        frame, pose = _rename(search, frame, pose)
+            pose = decide_pose(frame, lines or ())
+        frame, pose = _rename(frame, pose)
     else:
-        against = _against_the_set_pose(search, frame, lines or ())
-    chance = doubt_frame(search, frame)
-    problems = [each.reword(f"{each}.") for each in (*_rivals(search, found, frame), chance, against) if each]
+        against = _against_the_set_pose(frame, lines or ())
+    chance = doubt_frame(result, frame)
+    problems = [each.reword(f"{each}.") for each in (*_rivals(result, frame), chance, against) if each]
     doubts = problems if frame.measured_count else [_UNSURE, *problems]
     if doubts and options.pose == "auto":
         pose = replace(pose, decided=False, evidence=(*pose.evidence, *doubts))
@@ -117,11 +116,11 @@ def _search_frame(
     return replace(present_frame(frame, pose, pitch_um, problems, chance), writing=lines)
 
 
-def _rename(search: FrameSearch, frame: Frame, pose: Pose) -> tuple[Frame, Pose]:
+def _rename(frame: Frame, pose: Pose) -> tuple[Frame, Pose]:
     """Rename the marks to those of a pose. If fewer of them agree then, keep the frame, its pose only assumed."""
     if pose.name == frame.placement.pose:
         return frame, pose
-    renamed = rename_frame(search.scan, frame, pose.name)
+    renamed = rename_frame(frame.scan, frame, pose.name)
     if renamed is not frame:
         return renamed, pose
     against = f"fewer of the marks agree in pose {pose.name} than in pose {frame.placement.pose}, which is assumed."
@@ -148,39 +147,38 @@ def _read(
     return read_writing(scan, nets, frame_px)
 
 
-def _against_the_set_pose(search: FrameSearch, frame: Frame, lines: Sequence[Line]) -> Reason:
+def _against_the_set_pose(frame: Frame, lines: Sequence[Line]) -> Reason:
     """Warn if the image decides for another pose than the one set in the project; empty otherwise."""
-    likeliest = likeliest_pose(search, frame, lines)
-    if likeliest.name == frame.placement.pose or not frame.measured_count:
+    own, likeliest = frame.placement.pose, decide_pose(frame, lines)
+    if likeliest.name == own or not frame.measured_count:
         return NO_REASON
-    own = frame.fitted_placement
-    both = [own, own.posed(likeliest.name, frame.camera_mm)]
-    pose = decide_pose(search.scan, both, frame, lines)
-    if not pose.decided or pose.name == frame.placement.pose:
+    pose = decide_pose(frame, lines, (own, likeliest.name))
+    if not pose.decided or pose.name == own:
         return NO_REASON
     evidence = " ".join(pose.evidence).rstrip(".")
     return Reason(
-        f"pose {frame.placement.pose} is set in the project, but the marks of this frame show {pose.name}, "
+        f"pose {own} is set in the project, but the marks of this frame show {pose.name}, "
         f'and then the marks have other names (pose = "auto" takes each scan as it lies): {evidence}',
         Code.POSE,
     )
 
 
-def _rivals(search: FrameSearch, found: Sequence[Placement], frame: Frame) -> list[Reason]:
+def _rivals(result: SearchResult, frame: Frame) -> list[Reason]:
     """Warn of other placements in the same pose that are nearly as good, or that show another frame."""
     problems, best = [], frame.placement
-    for other in found:
-        if other.pose != best.pose or other.same_place(best) or _leads_to(other, frame):
+    for other in result.placements:
+        is_rival = other.pose == best.pose and other.pitch_mm == best.pitch_mm and not other.same_place(best)
+        if not is_rival or _leads_to(other, frame):
             continue
         as_good = other.score >= _AMBIGUOUS * best.score and (
             other.supported >= best.supported - 1 or _lacks_its_own(frame, other)
         )
-        if not (as_good or _is_another_frame(search, other, frame)):
+        if not (as_good or _is_another_frame(result, other, frame)):
             continue
         linear, shifts = best.pixel_from_camera[:, :2], (each.pixel_from_camera[:, 2] for each in (other, best))
         shift = np.linalg.solve(linear, np.subtract(*shifts))
         shift_mm = f"({shift[0]:.1f}, {shift[1]:.1f}) mm"
-        if (np.abs(shift) > _BESIDE * np.array(search.layout.frame_mm)).any():
+        if (np.abs(shift) > _BESIDE * np.array(frame.layout.frame_mm)).any():
             sentence = (
                 f"the scan shows another frame {shift_mm} from this one, with {other.supported} marks where this one "
                 f"has {best.supported}: give a scan of one frame, or name both in images.csv by the column window"
@@ -213,13 +211,13 @@ def _lacks_its_own(frame: Frame, rival: Placement) -> bool:
     return bool(own.any() and found[own].mean() < _HARDLY * found[inside].mean())
 
 
-def _is_another_frame(search: FrameSearch, other: Placement, frame: Frame) -> bool:
+def _is_another_frame(result: SearchResult, other: Placement, frame: Frame) -> bool:
     """Whether a placement with as many supporting marks is another frame, as in a scan of two photographs."""
-    if other.supported < frame.placement.supported or not search.is_exhaustive(other):
+    if other.supported < frame.placement.supported or not result.is_exhaustive(other):
         return False
-    if search.false_placements(other) > FRAMES_BY_CHANCE:
+    if false_placements(result, other) > FRAMES_BY_CHANCE:
         return False
-    frame_there = measure_frame(search.scan, search.layout, other, search.options)
+    frame_there = measure_frame(frame.scan, frame.layout, other, frame.options)
     return frame_there.is_sure and not frame.contains(frame_there)
 
 

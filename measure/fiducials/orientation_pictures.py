@@ -11,9 +11,8 @@ import numpy as np
 from scipy import ndimage
 
 from measure.array_types import Array, Mask
-from measure.detection.mark_views import detail_px
 from measure.geometry import linear_scale, turn_by_quarters
-from measure.marks.rendering import ROUGH_CELLS, chip_mask, extent_px, picture
+from measure.marks.rendering import ROUGH_CELLS, chip_mask, detail_px, extent_px, picture
 from measure.marks.shapes import Mark, MarkTemplate
 from measure.noise.robust_estimation import TukeyFit, robust_scale, tukey_fit
 from measure.results import MarkFit

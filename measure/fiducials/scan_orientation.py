@@ -18,11 +18,10 @@ from measure.fiducials.frame import Frame
 from measure.fiducials.interior_orientation import fit_frame
 from measure.fiducials.options import SCATTER_DEGREES
 from measure.fiducials.orientation_pictures import Drawings, MarkSite, PosedMark
-from measure.geometry import pose_in_camera, up_from_camera
+from measure.geometry import POSES, pose_in_camera, up_from_camera
 from measure.marks.shapes import LEARNED_ORIGIN, Disk, FiducialLayout, LayoutMark, Mark, MarkShape, MarkTemplate
 from measure.results import MarkFit, Pose
 from measure.scans.parallel import map_in_threads
-from measure.scans.scan import Scan
 
 DECIDED = 7.0  # log-odds: a thousand to one
 TOLD = 1.0  # log-odds: weaker evidence, below e to one, is not reported
@@ -103,19 +102,19 @@ class _Hypothesis:
         return self.likelihood + (0.0 if self.pose.endswith("m") else _UNMIRRORED)
 
 
-def decide_pose(scan: Scan, placements: Sequence[Placement], frame: Frame, lines: Sequence[Line] = ()) -> Pose:
+def decide_pose(frame: Frame, lines: Sequence[Line] = (), poses: Sequence[str] = POSES) -> Pose:
     """Decide the scan orientation of a measured frame.
 
     Parameters
     ----------
-    scan : scan, with the tone curve in which images are compared.
-    placements : one for each orientation, all at the place of the measured frame.
     frame : frame measured in one of the orientations.
     lines : writing around the frame, as far as it was read.
+    poses : orientations that are compared.
     """
     layout, fits = frame.layout, list(frame.inlier_fits.values())
     inside = np.array([detection.inside for detection in frame.detections])
     missed = frame.predicted_px[inside & ~frame.inliers]
+    placements = (frame.fitted_placement.posed(pose, frame.camera_mm) for pose in poses)
     every = (_Hypothesis.from_placement(placement, frame, fits, missed) for placement in placements)
     hypotheses = [each for each in every if each is not None]
     if not hypotheses:
@@ -126,7 +125,7 @@ def decide_pose(scan: Scan, placements: Sequence[Placement], frame: Frame, lines
     # Sites without a mark take contrast and noise from a typical one: another orientation may predict a mark there.
     usual = sorted(fits, key=lambda fit: abs(fit.contrast_dn))[len(fits) // 2]
     places = [*((fit, fit.center_px) for fit in fits), *((usual, place) for place in missed)]
-    sites = [MarkSite(scan, *each, frame.weights, drawings, frame.first_search_px()) for each in places]
+    sites = [MarkSite(frame.scan, *each, frame.weights, drawings, frame.first_search_px()) for each in places]
 
     def site_likelihoods(index: int) -> Array:
         return sites[index].likelihoods([each.posed_mark(index, layout) for each in hypotheses])

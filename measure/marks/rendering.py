@@ -30,6 +30,7 @@ from measure.marks.shapes import (
     drawn_outline_mm,
     known_outline_mm,
     outline_mm,
+    thinnest_mm,
 )
 
 _DRAWINGS = 16  # cached drawings, more than a camera has kinds of marks
@@ -103,6 +104,11 @@ def extent_px(mark: Mark, pixel_from_mark: Array) -> tuple[Array, Array]:
     """Bounding box of the mark: (2,) smallest and (2,) largest column and row."""
     points = Affine(pixel_from_mark).apply(_outline_mm(mark))
     return points.min(axis=0), points.max(axis=0)
+
+
+def detail_px(mark: Mark, linear: Array) -> float:
+    """Width of the mark's finest detail in px, at least 1. linear (2, 2): px from mm."""
+    return max(linear_scale(linear) * thinnest_mm(mark), 1.0)
 
 
 def reach_px(mark: Mark, linear: Array) -> float:

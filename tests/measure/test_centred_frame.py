@@ -23,6 +23,7 @@ from studies import parametrize_with_studies
 
 from measure import FiducialOptions, FrameMeasurement, Scan, Status, measure_fiducials, open_scan
 from measure.fiducials.search import FrameSearch, PitchHypothesis, is_lattice
+from measure.fiducials.significance import false_placements
 from measure.marks.shapes import FiducialLayout, MarkShape, ring_cross
 from measure.scans.metadata import Samples
 
@@ -129,14 +130,15 @@ def test_a_frame_that_the_scan_holds_is_found_by_windows_as_by_the_whole(
     pitch_mm = (PITCH_UM[0] / 1000, PITCH_UM[1] / 1000)
     with written_scan(frame_picture(NUMBERED, matrix), tmp_path) as scan:
         hypothesis = [PitchHypothesis(pitch_mm, 0.02, pitch_mm)]
-        whole = FrameSearch(scan, NUMBERED, FiducialOptions()).search_scan(hypothesis)[0]
+        options = FiducialOptions()
+        whole = FrameSearch(scan, NUMBERED, options).search_scan(options, hypothesis).placements[0]
         monkeypatch.setattr("measure.fiducials.search._WINDOWS_SHARE", np.inf)
         monkeypatch.setattr(FrameSearch, "search_scan", None)
-        search = FrameSearch(scan, NUMBERED, FiducialOptions())
-        found = search.search_room(hypothesis)[0]
-        assert search.false_placements(found) < 0.01
+        result = FrameSearch(scan, NUMBERED, options).search_room(options, hypothesis)
+        found = result.placements[0]
+        assert false_placements(result, found) < 0.01
         neighbour = np.add(found.pixel_from_camera, [[0.0, 0.0, 9999.0], [0.0, 0.0, 0.0]])
-        assert np.isinf(search.false_placements(replace(found, pixel_from_camera=neighbour)))
+        assert np.isinf(false_placements(result, replace(found, pixel_from_camera=neighbour)))
     assert found.pose == whole.pose
     assert found.same_place(whole)
     assert np.hypot(*(found.pixel_from_camera - matrix)[:, 2]) < 3.0

@@ -15,7 +15,7 @@ from measure import FiducialOptions, MatchOptions, Scan
 from measure.detection.correlation import CLOSE, GRAINY, WIDE, Map, Surroundings, correlation
 from measure.detection.faint_marks import FaintMark, detect_faint
 from measure.detection.localisation import MarkPrediction, localise
-from measure.detection.responses import ByteCache, Dilation, Responses, ScanMaps, TemplateSet
+from measure.detection.responses import ByteCache, CorrelationMaps, Responses, Templates
 from measure.fiducials.mark_fit import detect_mark
 from measure.flags import Cause
 from measure.marks.shapes import Bar, MarkShape, cross, dot, polygon, ring_cross
@@ -250,8 +250,8 @@ def responses_to(
 
 
 def test_responses_are_freed_with_the_search_and_not_by_the_next_garbage_collection() -> None:
-    responses = Responses({(0, 1): MAP}, (0,), 1, ByteCache[Dilation](1 << 30))
-    assert responses.by_key[0, 1].dilated(2.0).map.shape == MAP.shape
+    responses = Responses({(0, 1): MAP}, (0,), 1, ByteCache(1 << 30))
+    assert responses.dilated((0, 1), 2.0).map.shape == MAP.shape
     alive = weakref.ref(responses)
     gc.disable()
     try:
@@ -265,12 +265,13 @@ RNG = np.random.default_rng(4)
 SCAN = Scan(Path("noise.tif"), WholePicture(RNG.integers(0, 65535, (90, 110, 3), np.uint16)), NO_TAGS)
 CHIPS = RNG.normal(size=(2, 9, 9))
 TURNED = [np.rot90(chip, turn) for turn in range(4) for chip in CHIPS]  # in one pose after another
-SET = TemplateSet(TURNED, [2.0, 3.0] * 4, (1, -1), WIDE, 100.0)
+SET = Templates(TURNED, [2.0, 3.0] * 4, (), 1)
 MAP_BYTES = 4 * 90 * 110
 
 
-def maps(cache: ByteCache[Map]) -> ScanMaps:
-    return ScanMaps(SCAN, 1, SET, cache)
+def maps(cache: ByteCache) -> CorrelationMaps:
+    channels = [SCAN.window(-4, -4, 118, 98, weights) for weights in np.eye(3).tolist()]
+    return CorrelationMaps(channels, SET, (1, -1), WIDE, 100.0, cache)
 
 
 def test_a_map_is_the_strongest_correlation_of_all_channels() -> None:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 from drawn import ALIKE, lay_out, make_scan, paint, placed
 from numpy.typing import NDArray
 
-from measure import FiducialOptions, measure_fiducials
+from measure import FiducialOptions, Scan, measure_fiducials
 from measure.detection.responses import ByteCache, Responses
 from measure.fiducials import stages
 from measure.fiducials.constellation import Bounds, Placement, PlacementSearch, same_picture
@@ -18,8 +17,8 @@ from measure.fiducials.frame import Frame
 from measure.fiducials.measurement import _lacks_its_own
 from measure.fiducials.refit import fit_lines_and_sharpening
 from measure.fiducials.rows import pitch_problem
-from measure.fiducials.search import FrameSearch, PitchHypothesis
-from measure.fiducials.stages import Attempt, Found, Kind, find_frame
+from measure.fiducials.search import PitchHypothesis, SearchResult
+from measure.fiducials.stages import Found, Kind, Stage, find_frame
 from measure.flags import FRAMES_BY_CHANCE, NO_REASON, Reason, Status
 from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, dot, polygon, turned_part
@@ -172,22 +171,23 @@ def search_attempts(
     which of the others is under the given pitch."""
     checked: list[int] = []
 
-    def attempt(number: int) -> Attempt:
+    def stage(number: int) -> Stage:
         kind = "given" if number < given else "pitch" if number != at_given else "faint"
-        return Attempt(
-            cast(Kind, kind), cast(FrameSearch, SimpleNamespace(number=number)), [GIVEN, GIVEN], number == at_given
-        )
+        return Stage(cast(Kind, kind), [GIVEN, GIVEN], FiducialOptions(), at_given=number == at_given)
 
-    def make(attempt: Attempt, tried: int) -> Any:
-        number = cast(Any, attempt.search).number
+    made = [stage(number) for number in range(len(expected))]
+
+    def measure(scan: Scan, layout: FiducialLayout, stage: Stage, result: SearchResult, tried: int) -> Any:
+        number = made.index(stage)
         each = expected[number]
         checked.append(tried)
-        return [], [] if each is None else [(tried * each, cast(Frame, Stand(str(number))))]
+        return [] if each is None else [(tried * each, cast(Frame, Stand(str(number))))]
 
-    monkeypatch.setattr(stages, "list_attempts", lambda *_: [attempt(number) for number in range(len(expected))])
-    monkeypatch.setattr(stages, "make_attempt", make)
+    monkeypatch.setattr(stages, "list_stages", lambda *_: made)
+    monkeypatch.setattr(stages, "search_stage", lambda *_: SearchResult())
+    monkeypatch.setattr(stages, "measure_stage", measure)
     monkeypatch.setattr(stages, "doubt_frame", lambda *_: NO_REASON)
-    return find_frame(SCAN, ALIKE, [[GIVEN]], True, FiducialOptions()), checked
+    return find_frame(SCAN, ALIKE, None, FiducialOptions()), checked
 
 
 def name(found: Found) -> str:

@@ -19,8 +19,8 @@ from measure.fiducials.options import AFFINITY_SIGMA, FiducialOptions
 from measure.fiducials.orientation_pictures import SPOILT, MarkSite, PosedMark
 from measure.fiducials.rows import present_frame
 from measure.fiducials.scan_orientation import decide_pose
-from measure.fiducials.search import FrameSearch
-from measure.fiducials.stages import doubt_frame
+from measure.fiducials.search import SearchResult
+from measure.fiducials.significance import doubt_frame
 from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, cross, dot
 from measure.marks.templates import cut, learn_template
@@ -300,7 +300,7 @@ def test_three_plain_dots_of_four_are_no_chance() -> None:
     scan = make_scan(picture(DOTS, "0", hidden=1))
     frame = make_frame_chance(scan, DOTS)
     assert frame.inliers.tolist() == [True, False, True, True]
-    assert doubt_frame(FrameSearch(scan, DOTS, OPTIONS), frame) == ""
+    assert doubt_frame(SearchResult(), frame) == ""
 
 
 def test_a_frame_moved_on_by_the_distance_of_two_marks_is_known_by_its_marks() -> None:
@@ -323,7 +323,7 @@ def test_specks_that_lie_as_three_marks_of_four_are_doubted_with_numbers() -> No
     scan = make_scan(strewn(np.concatenate([elsewhere[free], as_marks[1:]])))
     frame = make_frame_chance(scan, DOTS)
     assert frame.inliers.tolist() == [False, True, True, True]
-    sentence = doubt_frame(FrameSearch(scan, DOTS, OPTIONS), frame)
+    sentence = doubt_frame(SearchResult(), frame)
     assert "only 3 of 4 marks were found, and 1 of 64 random places match as well (p = 0.06)" in sentence
 
 
@@ -334,7 +334,7 @@ def test_a_frame_that_chance_is_likelier_to_have_made_than_not_gives_no_observat
     grey[at[1] - 24 : at[1] + 25, at[0] - 24 : at[0] + 25] = 20000.0
     scan = make_scan(grey)
     frame = make_frame_chance(scan, DOTS)
-    chance = doubt_frame(FrameSearch(scan, DOTS, OPTIONS), frame)
+    chance = doubt_frame(SearchResult(), frame)
     assert "(p = 1.00): the frame may lie elsewhere" in chance
     result = present_frame(frame, Pose("0", False), (50.0, 50.0), (), chance)
     assert [mark.status for mark in result.marks] == [Status.PREDICTED] * 4
@@ -350,7 +350,7 @@ def test_one_mark_and_the_places_of_the_others_tell_the_pose() -> None:
     layout = lay_out([MarkShape((*dot(0.2), *dots), "light") for dots in ids], CORNERS, (16.0, 16.0))
     scan = make_scan(picture(layout, "90"))
     frame = replace(make_frame_chance(scan, layout), inliers=np.array([True, False, False, False]))
-    pose = decide_pose(scan, [placement(pose) for pose in POSES], frame)
+    pose = decide_pose(frame)
     assert (pose.name, pose.decided) == ("90", True)
 
 
@@ -374,8 +374,7 @@ def test_pictures_of_one_scan_alone_decide_a_pose_only_beyond_chance(
         return likelihoods
 
     monkeypatch.setattr(MarkSite, "likelihoods", best)
-    placements = [placement(pose) for pose in POSES]
-    pose = decide_pose(scan, placements, replace(frame, layout=replace(DOTS, marks=tuple(with_chips))))
+    pose = decide_pose(replace(frame, layout=replace(DOTS, marks=tuple(with_chips))))
     assert pose.decided is decided, pose.evidence
     assert pose.name == POSES[1]
 

@@ -271,8 +271,9 @@ BLOCKS = FiducialLayout(
 
 def test_a_frame_viewed_as_its_mirror_image_is_renamed_as_it_lies(tmp_path: Path) -> None:
     with written_scan(frame_picture(LEANING, pixel_from_camera("0")), tmp_path) as scan:
-        found = FrameSearch(scan, LEANING, OPTIONS).search_scan(pitch_hypotheses(scan, LEANING, PITCH, OPTIONS)[0])
-        right = next(each for each in found if each.pose == "0")
+        hypotheses = pitch_hypotheses(scan, LEANING, PITCH, OPTIONS)[0]
+        found = FrameSearch(scan, LEANING, OPTIONS).search_scan(OPTIONS, hypotheses)
+        right = next(each for each in found.placements if each.pose == "0")
         mirrored = measure_frame(scan, LEANING, right.posed("0m", right_mm(LEANING)), OPTIONS)
         assert int(mirrored.inliers.sum()) < 4
         frame = rename_frame(scan, mirrored, "0")
