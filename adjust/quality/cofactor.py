@@ -3,8 +3,10 @@
 In the cluster-robust covariance of the cameras, residuals within an image may be correlated; images are the clusters.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -14,7 +16,9 @@ from adjust.functional_model.rotation import vector_by_angles
 from adjust.least_squares.equations import Numbering
 from adjust.least_squares.iteration import Linearised
 from adjust.linear_algebra.factor import Factor
+from adjust.problem.estimates import Cofactor
 from adjust.problem.problem import Problem, State
+from adjust.quality.run import Run, derivatives_by
 from adjust.rank_defect.datum import free_motion
 
 
@@ -47,15 +51,10 @@ class InnerDatum:
     inner: Array
 
     def part(self, at: Indices) -> Array:
-        """(k, k) term added to the cofactors of some quantities."""
+        """Terms (..., k, k) added to the cofactors of some quantities (..., k)."""
         motion, through = self.motion[at], self.through[at]
-        crossed = motion @ through.T
-        return np.asarray(motion @ self.inner @ motion.T - crossed - crossed.T)
-
-    @property
-    def variances(self) -> Array:
-        """(n,) term added to the variances."""
-        return np.asarray(((self.motion @ self.inner - 2.0 * self.through) * self.motion).sum(axis=1))
+        crossed = motion @ through.swapaxes(-1, -2)
+        return np.asarray(motion @ self.inner @ motion.swapaxes(-1, -2) - crossed - crossed.swapaxes(-1, -2))
 
 
 @dataclass(frozen=True)
@@ -91,21 +90,13 @@ class FactorCofactor:
             numbers = pairs[first[some][:, None] + np.arange(widths[some[0]])] % free
             by = by_unknowns[some][..., : numbers.shape[1]]
             cofactors[some] = by @ self.factor.cofactors(numbers) @ by.swapaxes(1, 2)
-        return cofactors if self.datum is None else cofactors + np.array([self.datum.part(at) for at in groups])
+        return cofactors if self.datum is None else cofactors + self.datum.part(groups)
 
     @cached_property
     def variances(self) -> Array:
         """(n,) diagonal."""
-        plain = self.factor.variances()
-        entries = np.diff(self.by_free.indptr)
-        variances = self.by_free.multiply(self.by_free) @ plain
-        for count in np.unique(entries[entries > 1]):  # functions of `count` unknowns, all of one image
-            rows = np.flatnonzero(entries == count)
-            functions = self.by_free[rows]
-            by_unknowns = functions.data.reshape(-1, 1, count)
-            cofactors = self.factor.cofactors(functions.indices.reshape(-1, count).astype(np.intp))
-            variances[rows] = (by_unknowns @ cofactors @ by_unknowns.swapaxes(1, 2))[:, 0, 0]
-        return np.asarray(variances if self.datum is None else np.maximum(variances + self.datum.variances, 0.0))
+        variances = self.parts(np.arange(self.by_free.shape[0])[:, None])[:, 0, 0]
+        return np.maximum(variances, 0.0)
 
 
 def free_cofactor(numbering: Numbering, state: State, factor: Factor) -> FactorCofactor:
@@ -154,42 +145,31 @@ def _reported(problem: Problem, state: State) -> csr_array:
 FEWEST_IMAGES = 5  # needed to estimate standard deviations, then to about a third
 MOST_SHARED = 300  # shared quantities: with many unknown points the dense matrix would be too large
 LARGEST_SHARE = 0.999  # of one image in the information on some combination of unknowns; above, it rests on that image
+UNDETERMINED = (
+    1e-9  # relative singular value of the equations of an image, below which it does not determine a direction
+)
 RANK = 1e-12  # eigenvalue of a scaled covariance, below which a direction is fixed
 
 
-def shared_positions(numbering: Numbering) -> Indices:
-    """Positions of the free quantities shared by images."""
-    unknowns = numbering.problem.unknowns
-    return np.flatnonzero(unknowns.sigma[: unknowns.shared_count] > 0.0)
-
-
-def cluster_covariance(numbering: Numbering, end: Linearised, cofactor: Array) -> Array | None:
-    """Covariance (k, k) of the quantities at `shared_positions` by a delete-one-image jackknife.
+def cluster_covariance(run: Run, cofactor: Cofactor) -> Array | None:
+    """Covariance (n, n) of the quantities shared by images, 0 of others, by a delete-one-image jackknife.
 
     Each image is left out of the normal equations in turn. With N the normal matrix of the shared unknowns, N_i the
     part of image i, its own unknowns eliminated, and g_i its share of the right side, the shared unknowns change by
     d_i = -(N - N_i)^-1 g_i. The covariance is (m - 1) / m times the sum of (d_i - d)(d_i - d)' (Efron 1982; MacKinnon
     and White 1985, with images as clusters). It holds for any correlation of errors within an image, such as unmodelled
-    distortion causes.
-
-    Parameters
-    ----------
-    numbering, end : the unknowns, and the rows at the solution
-    cofactor : (k, k) of the shared quantities, at sigma0 = 1
-
-    Returns
-    -------
-    None with fewer than FEWEST_IMAGES images, or where some quantity rests on one image.
+    distortion causes. None with fewer than FEWEST_IMAGES images, or where some quantity rests on one image.
     """
-    shares = _shares(numbering, end, cofactor)
-    if len(shares) < FEWEST_IMAGES:
+    if (shares := _shares(run, cofactor)) is None or len(shares.of_images) < FEWEST_IMAGES:
         return None
-    moves = [_move(share.by_shared, share.right) for share in shares]
+    moves = [_move(by_shared, right) for by_shared, right in shares.of_images]
     if any(move is None for move in moves):
         return None
-    spread = np.array(moves) @ np.linalg.cholesky(cofactor).T
+    spread = np.array(moves) @ shares.root.T
     spread -= spread.mean(axis=0)
-    return np.asarray((len(shares) - 1) / len(shares) * spread.T @ spread)
+    covariance = np.zeros((len(run.problem.unknowns),) * 2)
+    covariance[np.ix_(shares.positions, shares.positions)] = (len(moves) - 1) / len(moves) * spread.T @ spread
+    return covariance
 
 
 def larger_covariance(model: Array, clusters: Array) -> Array:
@@ -205,59 +185,63 @@ def larger_covariance(model: Array, clusters: Array) -> Array:
     return np.asarray(spread @ spread.T)
 
 
-def prediction_errors(numbering: Numbering, end: Linearised, cofactor: Array, folds: int) -> Array | None:
+def prediction_errors(run: Run, cofactor: Cofactor, folds: int) -> Array | None:
     """Cross-validation over images: mean square (m,) of the normalised lengths of each image's residuals.
 
     One fold of images at a time is left out and oriented by the camera from the others. Without them the shared
     unknowns change by d, as in `cluster_covariance`, and their residuals r become r - B d (PRESS: Allen 1974, with
-    images in place of observations).
-
-    Parameters
-    ----------
-    numbering, end, cofactor : as for `cluster_covariance`
-    folds : number of folds
-
-    Returns
-    -------
-    None where some quantity rests on the images of one fold.
+    images in place of observations). None where some quantity rests on the images of one fold.
     """
-    shares = _shares(numbering, end, cofactor)
-    errors = np.zeros(len(shares))
-    for fold in (range(first, len(shares), folds) for first in range(min(folds, len(shares)))):
-        equations = (shares[image].by_shared for image in fold), (shares[image].right for image in fold)
-        move = _move(*map(np.concatenate, map(list, equations)))
+    if (shares := _shares(run, cofactor)) is None:
+        return None
+    images = shares.of_images
+    errors = np.zeros(len(images))
+    for fold in (range(first, len(images), folds) for first in range(min(folds, len(images)))):
+        move = _move(*map(np.concatenate, zip(*(images[image] for image in fold), strict=True)))
         if move is None:
             return None
         for image in fold:
-            errors[image] = 2.0 * float(np.mean((shares[image].right - shares[image].by_shared @ move) ** 2))
+            by_shared, right = images[image]
+            errors[image] = 2.0 * float(np.mean((right - by_shared @ move) ** 2))
     return errors
 
 
-@dataclass(frozen=True, eq=False)
-class _Share:
-    """Reduced equations of an image: derivatives (n, k) by the shared unknowns, in units of the root of their cofactor
-    matrix, in which N is the unit matrix; right sides (n,)."""
+class _Shares(NamedTuple):
+    """Positions (k,) of the free quantities shared by images, the root of their cofactor matrix, in units of which N is
+    the unit matrix, and each image's derivatives (n, k) by them and right sides (n,)."""
 
-    by_shared: Array
-    right: Array
+    positions: Indices
+    root: Array
+    of_images: list[tuple[Array, Array]]
 
 
-def _shares(numbering: Numbering, end: Linearised, cofactor: Array) -> list[_Share]:
-    """Reduced equations of each image with marks, in the network's order."""
+def _shares(run: Run, cofactor: Cofactor) -> _Shares | None:
+    unknowns = run.numbering.problem.unknowns
+    positions = np.flatnonzero(unknowns.sigma[: unknowns.shared_count] > 0.0)
+    if len(positions) > MOST_SHARED:
+        return None
+    root = np.asarray(np.linalg.cholesky(cofactor.part(positions)), dtype=np.float64)
+    equations = image_equations(run.numbering, run.end, positions)
+    return _Shares(positions, root, [(by_shared @ root, right) for _, by_shared, right in equations])
+
+
+def image_equations(numbering: Numbering, at: Linearised, positions: Indices) -> Iterator[tuple[int, Array, Array]]:
+    """Yield the equations of each frame with marks, its own unknowns eliminated.
+
+    Number of the frame, derivatives (n, k) by the quantities at some positions, right sides (n,).
+    """
     problem = numbering.problem
-    images, shared = problem.network.frame_numbers[problem.image_numbers], shared_positions(numbering)
-    root = np.asarray(np.linalg.cholesky(cofactor), dtype=np.float64)
-    free = np.append(numbering.problem.unknowns.sigma > 0.0, False)  # the last entry is ABSENT
-    shares = []
-    for image in np.unique(images):
-        rows = images == image
-        columns, matrix, right = problem.columns[rows], end.rows.matrix[rows], end.rows.right[rows].ravel()
-        own = np.setdiff1d(np.unique(columns[free[columns]]), shared)
-        by_shared, by_own = (_by_unknowns(columns, matrix, each, len(free)) for each in (shared, own))
-        basis = np.linalg.qr(by_own)[0]
-        by_shared, right = by_shared - basis @ (basis.T @ by_shared), right - basis @ (basis.T @ right)
-        shares.append(_Share(by_shared @ root, right))
-    return shares
+    frames = problem.network.frame_numbers[problem.image_numbers]
+    order = np.argsort(frames, kind="stable")
+    own = np.append(problem.unknowns.sigma > 0.0, False)  # the last entry is ABSENT
+    own[: problem.unknowns.shared_count] = False
+    for rows in np.split(order, np.flatnonzero(np.diff(frames[order])) + 1):
+        columns, matrix, right = problem.columns[rows], at.rows.matrix[rows], at.rows.right[rows].ravel()
+        groups = positions, np.unique(columns[own[columns]])
+        by, by_own = (derivatives_by(problem, matrix, each, rows).toarray() for each in groups)
+        left, sizes, _ = np.linalg.svd(by_own / np.maximum(np.linalg.norm(by_own, axis=0), 1e-300), full_matrices=False)
+        basis = left[:, sizes > UNDETERMINED * sizes[:1]]
+        yield int(frames[rows[0]]), by - basis @ (basis.T @ by), right - basis @ (basis.T @ right)
 
 
 def _move(by_shared: Array, right: Array) -> Array | None:
@@ -267,12 +251,3 @@ def _move(by_shared: Array, right: Array) -> Array | None:
     if parts.max(initial=0.0) > LARGEST_SHARE:
         return None
     return np.asarray(-axes @ (axes.T @ (by_shared.T @ right) / (1.0 - parts)))
-
-
-def _by_unknowns(columns: Indices, matrix: Array, positions: Indices, count: int) -> Array:
-    """Scatter derivatives (n, 2, j) at columns (n, j) to a matrix (2 n, k) of the quantities at some positions."""
-    place = np.full(count, len(positions), dtype=np.intp)
-    place[positions] = np.arange(len(positions))
-    dense = np.zeros((len(columns), len(positions) + 1, 2))
-    np.add.at(dense, (np.arange(len(columns))[:, None], place[columns]), matrix.transpose(0, 2, 1))
-    return np.asarray(dense[:, :-1].transpose(0, 2, 1).reshape(2 * len(columns), -1))

@@ -8,8 +8,7 @@ the frame with a known covariance.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from scipy.linalg import block_diag, qr
@@ -122,12 +121,16 @@ def compare(
     shared = tuple(id for id in calibrations[0].fiducials if all(id in each.fiducials for each in calibrations))
     across, along = (np.linspace(-half, half, _GRID) for half in half_mm)
     places = np.stack(np.meshgrid(across, along), axis=-1).reshape(-1, 2)
-    views = [_View(each, calibrations[0], places, shared) for each in calibrations]
-    system = _System(views, when, use)
+    views = [_view(each, calibrations[0], places, shared, use) for each in calibrations]
+    same, trend = _tests(views, when, min(each.redundancy for each in calibrations))
+    freeing, count = _freeing(views[0].unseen, len(shared)), len(places)
     one = np.eye(len(views))
-    field, covariance = map(np.array, zip(*(system.freed(each - one[0]) for each in one[1:]), strict=True))
-    count = len(places)
-    trend, trend_covariance = system.freed(system.trend_factors)
+    field, covariance = map(np.array, zip(*(_freed(views, freeing, each - one[0]) for each in one[1:]), strict=True))
+    # the linear change from the first time to the last, by weighted regression
+    variances = np.array([np.square(freeing @ view.root).sum(axis=1).mean() for view in views])
+    weights = 1.0 / (variances + _UNSEEN_UM**2)
+    along = when - np.average(when, weights=weights)
+    change, change_covariance = _freed(views, freeing, weights * along * np.ptp(when) / np.sum(weights * along**2))
     return Comparison(
         calibrations=tuple(calibrations),
         times=when,
@@ -138,10 +141,10 @@ def compare(
         fiducials=shared,
         fiducials_um=field[:, count:],
         fiducials_covariance_um2=covariance[:, count:],
-        same=system.same,
-        trend=system.trend if len(calibrations) > 2 else None,
-        trend_um=trend[:count],
-        trend_covariance_um2=trend_covariance[:count],
+        same=same,
+        trend=trend if len(calibrations) > 2 else None,
+        trend_um=change[:count],
+        trend_covariance_um2=change_covariance[:count],
     )
 
 
@@ -150,61 +153,55 @@ def sigmas(covariance: Array) -> Array:
     return np.asarray(np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1)))
 
 
-class _View:
-    """Rays of the places and positions of the shared fiducials by one calibration, as a value (m + f, 2) in µm, with
-    the square root of its covariance and the changes without effect."""
+class _View(NamedTuple):
+    """Rays of the places and positions of the shared fiducials by one calibration, in the axes of the first one.
 
-    def __init__(
-        self, own: CameraCalibration, first: CameraCalibration, places_mm: Array, shared: tuple[str, ...]
-    ) -> None:
-        self.own, self.c_um = own, 1e3 * first.lens.interior[0]
-        marks = np.array([own.fiducials[id] for id in shared]).reshape(-1, 2)
-        there = np.array([first.fiducials[id] for id in shared]).reshape(-1, 2)
-        turn, shift = _similarity(there, marks)
-        self.points_mm = places_mm @ turn.T + shift
-        ray, found = own.lens.ray_from_observed(self.points_mm)
-        if not found.all():
-            raise AdjustmentError(
-                f"the distortion of {own.name} folds the image over within the frame: it is not known there. "
-                "Compare over a smaller frame."
-            )
-        self.equations = own.lens.equations(self.points_mm, ray)
-        # In the axes of the first calibration; the small remaining rotation is removed with the orientation.
-        self.turn = turn / np.sqrt(np.linalg.det(turn))
-        self.ray = ray @ self.turn
-        self.marks_mm = marks
-        self.value = np.concatenate([self.c_um * self.ray, 1e3 * (marks - shift) @ np.linalg.inv(turn).T])
-        by = self.equations.quantity_jacobian
-        names, width = list(own.fiducials), 2 * len(own.fiducials)
-        rows = [2 * names.index(id) + axis for id in shared for axis in (0, 1)]
-        of_marks = 1e3 * np.eye(width)[rows].reshape(len(rows), width)
-        # (2 (m + f), n) derivatives of the value by the calibration's quantities, at fixed rotation and scale
-        self.jacobian = block_diag(self._field_change(by).reshape(-1, by.shape[2]), of_marks)
+    value (2 (m + f),), µm; root (2 (m + f), n): square root of its covariance; unseen (2 (m + f), q): its changes with
+    the similarity of the frame and with the orientation, which have no effect.
+    """
 
-    def _field_change(self, by: Array) -> Array:
+    value: Array
+    root: Array
+    unseen: Array
+
+
+def _view(own: CameraCalibration, first: CameraCalibration, places_mm: Array, shared: Sequence[str], use: Use) -> _View:
+    c_um = 1e3 * first.lens.interior[0]
+    marks, there = (np.array([each.fiducials[id] for id in shared]).reshape(-1, 2) for each in (own, first))
+    frame, shift = _similarity(there, marks)
+    points_mm = places_mm @ frame.T + shift
+    ray, found = own.lens.ray_from_observed(points_mm)
+    if not found.all():
+        raise AdjustmentError(
+            f"the distortion of {own.name} folds the image over within the frame: it is not known there. "
+            "Compare over a smaller frame."
+        )
+    equations, turn = own.lens.equations(points_mm, ray), frame / np.sqrt(np.linalg.det(frame))
+    ray = ray @ turn  # the small remaining rotation is removed with the orientation
+
+    def field_change(by: Array) -> Array:
         """(m, 2, n) changes of the field, µm, from changes of the equations (m, 2, n)."""
-        return np.asarray(-self.c_um * self.turn.T @ np.linalg.solve(self.equations.ray_jacobian, by))
+        return np.asarray(-c_um * turn.T @ np.linalg.solve(equations.ray_jacobian, by))
 
-    @property
-    def root(self) -> Array:
-        """(2 (m + f), n) square root of the covariance of the value."""
-        sigmas = np.sqrt(np.diag(self.own.covariance))
-        divisors = np.where(sigmas > 0.0, sigmas, 1.0)  # scale: k5 is in mm**-4, c in mm
-        values, vectors = np.linalg.eigh(self.own.covariance / np.outer(divisors, divisors))
-        return np.asarray(self.jacobian @ (sigmas[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))))
+    names, by = list(own.fiducials), equations.quantity_jacobian
+    rows = [2 * names.index(id) + axis for id in shared for axis in (0, 1)]
+    of_marks = 1e3 * np.eye(2 * len(names))[rows].reshape(len(rows), 2 * len(names))
+    jacobian = block_diag(field_change(by).reshape(-1, by.shape[2]), of_marks)
+    sigmas = np.sqrt(np.diag(own.covariance))
+    divisors = np.where(sigmas > 0.0, sigmas, 1.0)  # scale: k5 is in mm**-4, c in mm
+    values, vectors = np.linalg.eigh(own.covariance / np.outer(divisors, divisors))
+    root = jacobian @ (sigmas[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
 
-    def unseen(self, use: Use) -> Array:
-        """(2 (m + f), q) changes of the value with the similarity of the frame and with the orientation."""
-        points = np.concatenate([self.points_mm, self.marks_mm])
-        ones, zeros = np.ones(len(points)), np.zeros(len(points))
-        x, y = points.T
-        moves = np.array([(ones, zeros), (zeros, ones), (-y, x), (x, y)]).transpose(2, 1, 0)
-        field_moves = self._field_change(self.equations.xy_jacobian @ moves[: len(self.ray)])
-        frame = np.concatenate([field_moves, -1e3 * moves[len(self.ray) :]])
-        changes = ray_by_orientation(self.ray, np.ones(len(self.ray)))  # rotations, then shifts over flat ground
-        bundle = self.c_um * (changes if use == "flat" else changes[:, :, :3])
-        orientation = np.concatenate([bundle, np.zeros((len(self.marks_mm), *bundle.shape[1:]))])
-        return np.concatenate([frame, orientation], axis=2).reshape(2 * len(points), -1)
+    points, count = np.concatenate([points_mm, marks]), len(ray)
+    x, y = points.T
+    ones, zeros = np.ones(len(points)), np.zeros(len(points))
+    moves = np.array([(ones, zeros), (zeros, ones), (-y, x), (x, y)]).transpose(2, 1, 0)
+    of_frame = np.concatenate([field_change(equations.xy_jacobian @ moves[:count]), -1e3 * moves[count:]])
+    bundle = c_um * ray_by_orientation(ray, np.ones(count))[:, :, : 6 if use == "flat" else 3]  # rotations, shifts
+    orientation = np.concatenate([bundle, np.zeros((len(marks), *bundle.shape[1:]))])
+    unseen = np.concatenate([of_frame, orientation], axis=2).reshape(2 * len(points), -1)
+    value = np.concatenate([c_um * ray, 1e3 * (marks - shift) @ np.linalg.inv(frame).T])
+    return _View(value.ravel(), root, unseen)
 
 
 def _similarity(first: Array, second: Array) -> tuple[Array, Array]:
@@ -237,72 +234,50 @@ def _freeing(unseen: Array, marks: int) -> Array:
     return np.asarray(by_field @ by_marks)
 
 
-class _System:
-    """Linear model of all views, whitened, in the directions with uncertainty: y = a (+ b t) + changes without effect.
+def _freed(views: Sequence[_View], freeing: Array, factors: Array) -> tuple[Array, Array]:
+    """Linear combination (m + f, 2) of the views without the changes without effect, and its covariance by place."""
+    change = np.sum([k * (view.value - views[0].value) for k, view in zip(factors, views, strict=True)], axis=0)
+    root = np.hstack([k * (freeing @ view.root) for k, view in zip(factors, views, strict=True)])
+    by_place = root.reshape(-1, 2, root.shape[1])
+    return (freeing @ change).reshape(-1, 2), by_place @ by_place.swapaxes(1, 2)
 
-    The changes without effect are those of the first view, in whose axes all views are given.
+
+def _tests(views: Sequence[_View], times: Array, redundancy: float) -> tuple[Test, Test]:
+    """Test equality, and a linear change with time against it.
+
+    Linear model of all views, whitened, in the directions with uncertainty: y = a (+ b t) + changes without effect,
+    those of the first view, in whose axes all views are given.
     """
+    left, sizes, _ = np.linalg.svd(np.concatenate([view.root for view in views], axis=1), full_matrices=False)
+    known = sizes > _UNSEEN_UM * np.sqrt(len(left))
+    if not known.any():
+        raise AdjustmentError("none of the calibrations has standard deviations: there is nothing to compare with.")
+    basis, unseen = left[:, known], views[0].unseen
+    inside = basis.T @ unseen
+    # Drop those outside the basis, such as a rotation of the whole field.
+    inside *= np.linalg.norm(inside, axis=0) > _RANK * np.linalg.norm(unseen, axis=0)
+    right, steady, moving, unseen_rows = list[Array](), list[Array](), list[Array](), list[Array]()
+    for view, time in zip(views, times - times[0], strict=True):
+        covariance = basis.T @ view.root @ view.root.T @ basis + _UNSEEN_UM**2 * np.eye(basis.shape[1])
+        whitening = np.linalg.inv(np.linalg.cholesky(covariance))
+        right.append(whitening @ basis.T @ (view.value - views[0].value))
+        steady.append(whitening)
+        moving.append(whitening * time)
+        unseen_rows.append(whitening @ inside)
+    # The frame and attitude of the first view are the reference.
+    free = np.vstack([np.zeros((len(right[0]), inside.shape[1] * (len(views) - 1))), block_diag(*unseen_rows[1:])])
+    y = np.concatenate(right)
 
-    def __init__(self, views: Sequence[_View], times: Array, use: Use) -> None:
-        self.times, self.roots = times, [view.root for view in views]
-        left, sizes, _ = np.linalg.svd(np.concatenate(self.roots, axis=1), full_matrices=False)
-        known = sizes > _UNSEEN_UM * np.sqrt(len(left))
-        if not known.any():
-            raise AdjustmentError("none of the calibrations has standard deviations: there is nothing to compare with.")
-        basis, unseen = left[:, known], views[0].unseen(use)
-        inside = basis.T @ unseen
-        # Drop those outside the basis, such as a rotation of the whole field.
-        self.unseen = inside * (np.linalg.norm(inside, axis=0) > _RANK * np.linalg.norm(unseen, axis=0))
-        self.freeing = _freeing(unseen, len(views[0].marks_mm))
-        self.changes = [(view.value - views[0].value).ravel() for view in views]
-        self.values = [basis.T @ change for change in self.changes]
-        covariances = [basis.T @ root @ root.T @ basis + _UNSEEN_UM**2 * np.eye(known.sum()) for root in self.roots]
-        self.whitening = [np.linalg.inv(np.linalg.cholesky(covariance)) for covariance in covariances]
-        self.redundancy = min(view.own.redundancy for view in views)
-
-    def _left_over(self, powers: Sequence[int]) -> tuple[float, int]:
-        """v'Pv for a value that is a polynomial in time, and the rank of the design matrix."""
-        (size, width), count = self.unseen.shape, len(self.values)
-        rows = np.zeros((count * size, len(powers) * size + count * width))
-        for k, whitening in enumerate(self.whitening):
-            at = slice(k * size, (k + 1) * size)
-            for p, power in enumerate(powers):
-                rows[at, p * size : (p + 1) * size] = whitening * (self.times[k] - self.times[0]) ** power
-            if k:  # the frame and attitude of the first view are the reference
-                start = len(powers) * size + k * width
-                rows[at, start : start + width] = whitening @ self.unseen
-        right = np.concatenate([w @ value for w, value in zip(self.whitening, self.values, strict=True)])
-        explained = _range(rows)
-        rest = right - explained @ (explained.T @ right)
+    def left_over(*columns: Sequence[Array]) -> tuple[float, int]:
+        """v'Pv with some columns, and the rank of the design matrix."""
+        explained = _range(np.hstack([*map(np.vstack, columns), free]))
+        rest = y - explained @ (explained.T @ y)
         return float(rest @ rest), explained.shape[1]
 
-    @cached_property
-    def same(self) -> Test:
-        chi, rank = self._left_over((0,))
-        return self._test(chi, sum(map(len, self.values)) - rank)
-
-    @cached_property
-    def trend(self) -> Test:
-        (still, fewer), (moving, more) = self._left_over((0,)), self._left_over((0, 1))
-        return self._test(still - moving, more - fewer)
-
-    def _test(self, chi: float, freedom: int) -> Test:
+    def test(chi: float, freedom: int) -> Test:
         """F-test instead of chi-square, since the sigma0 of a calibration may come from few observations."""
-        probability = float(fdtrc(freedom, self.redundancy, chi / freedom)) if freedom and self.redundancy else 1.0
+        probability = float(fdtrc(freedom, redundancy, chi / freedom)) if freedom and redundancy else 1.0
         return Test(chi, freedom, probability)
 
-    @property
-    def trend_factors(self) -> Array:
-        """Factors of the views in the linear change from the first time to the last, by weighted regression."""
-        variances = np.array([np.square(self.freeing @ root).sum(axis=1).mean() for root in self.roots])
-        weights = 1.0 / (variances + _UNSEEN_UM**2)
-        along = self.times - np.average(self.times, weights=weights)
-        return np.asarray(weights * along * np.ptp(self.times) / np.sum(weights * along**2))
-
-    def freed(self, factors: Array) -> tuple[Array, Array]:
-        """Linear combination (m + f, 2) of the views without the changes without effect, and its covariance by
-        place."""
-        change = np.sum([factor * each for factor, each in zip(factors, self.changes, strict=True)], axis=0)
-        root = np.hstack([factor * (self.freeing @ each) for factor, each in zip(factors, self.roots, strict=True)])
-        by_place = root.reshape(-1, 2, root.shape[1])
-        return (self.freeing @ change).reshape(-1, 2), by_place @ by_place.swapaxes(1, 2)
+    (still, fewer), (less, more) = left_over(steady), left_over(steady, moving)
+    return test(still, len(y) - fewer), test(still - less, more - fewer)

@@ -18,6 +18,7 @@ from scipy import special
 
 from adjust.array_types import Array, Indices, Mask
 from adjust.linear_algebra.small_matrices import applied, eigen, product
+from adjust.problem.estimates import VarianceFactor
 from adjust.problem.parameter import Parameter
 from adjust.quality.run import UNCHECKED, GrossError, Run, surplus
 from adjust.quality.tested import Probabilities, Tested, robust_scale
@@ -86,16 +87,16 @@ class Reliability:
         return f"Reliability({len(self.tested)} tested, largest w {worst:.3g}, {len(self.unchecked)} unchecked)"
 
 
-def reliability(run: Run, sigma0: float, redundancy: int, probabilities: Probabilities) -> Reliability:
+def reliability(run: Run, variance: VarianceFactor, probabilities: Probabilities) -> Reliability:
     """Compute the reliability of all observations and given quantities."""
     units, found, tests, own_weights = run.units, run.misfits, run.statistics, run.own_weights
     tested, shift = units.named(), probabilities.noncentrality(1)
-    variance = np.einsum("nii->ni", tests.discrepancy_weight)
-    smallest = _over(shift, variance, tests.checked)
+    weights, sigma0 = np.einsum("nii->ni", tests.discrepancy_weight), variance.sigma0
+    smallest = _over(shift, weights, tests.checked)
     hidden = (found.transform * product(found.hat, found.transform)).sum(axis=1)
     effect = np.where(tests.checked, np.where(tests.checked, smallest, 0.0) * np.sqrt(hidden), np.inf)
     effect[(units.sizes == 1), 1] = 0.0
-    controlled = variance > UNCONTROLLED * own_weights
+    controlled = weights > UNCONTROLLED * own_weights
     uncontrolled = zip(*np.nonzero(~controlled & (np.arange(2) < units.sizes[:, None])), strict=True)
     return Reliability(
         probabilities=probabilities,
@@ -105,7 +106,7 @@ def reliability(run: Run, sigma0: float, redundancy: int, probabilities: Probabi
         redundancy=run.redundancies,
         w=tests.w,
         tau=tests.w / sigma0 if sigma0 > 0.0 else np.zeros_like(tests.w),
-        critical_tau=probabilities.critical_tau(redundancy),
+        critical_tau=probabilities.critical_tau(round(variance.redundancy)),
         smallest=smallest,
         effect=effect,
         statistic=tests.statistic,

@@ -7,11 +7,11 @@ weight, the unit's own part is p I in the given weight.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, vstack
 
 from adjust.array_types import Array, Indices, Mask
 from adjust.least_squares.equations import Numbering, prior_differences
@@ -72,20 +72,6 @@ class Statistics:
 
 
 @dataclass(frozen=True)
-class UnitRows:
-    """Rows T B of tested units in b blocks of equal shape, reduced to the shared unknowns (see `ReducedRows`).
-
-    units (b, u): unit numbers, ABSENT for padding. own (b, u, 2, o), through (b, u, 2, s): one pair of rows for each
-    unit, the second zero for a single coordinate. shared (b, s).
-    """
-
-    units: Indices
-    own: Array
-    shared: Indices
-    through: Array
-
-
-@dataclass(frozen=True)
 class Run:
     """One adjustment with given weights, and its end."""
 
@@ -127,31 +113,25 @@ class Run:
     @cached_property
     def misfits(self) -> Misfits:
         """Residuals and hat matrices of all tested units."""
-        units, observed = self.units, len(self.end.v_mm)
-        transform, back = self._transforms
-        hat = np.zeros((len(units) + 1, 2, 2))  # the last entry is ABSENT
-        for rows in self.unit_rows():
-            through = rows.through @ self.factor.triangle.group_roots(rows.shared)[:, None]
-            roots = np.concatenate([rows.own, through], axis=3)
-            hat[rows.units] = roots @ roots.swapaxes(2, 3)
-        hat = hat[:-1]
-        hat[units.sizes == 1, 1, 1] = 1.0
-        v = np.zeros((len(units), 2))
-        v[:observed] = self.end.v_mm
-        v[observed:] = -self.prior_pairs(prior_differences(self.numbering.problem, self.end.state))
-        transform, hat = laid_out(transform), laid_out(hat)
-        return Misfits(transform, laid_out(back), hat, applied(transform, laid_out(v)))
-
-    @property
-    def _transforms(self) -> tuple[Array, Array]:
-        """T and its inverse (N, 2, 2); both are diagonal for priors."""
-        transform, back = np.zeros((2, len(self.units), 2, 2))
-        count, root, a = len(self.end.v_mm), self.end.rows.root, self.end.by_observation
+        units, factor, end, count = self.units, self.factor, self.end, len(self.end.v_mm)
+        transform, back, hat = np.zeros((3, len(units), 2, 2))
+        root, a = end.rows.root, end.by_observation
         transform[:count], back[:count] = product(inverse(root), a), product(inverse(a), root)
-        weights = self.prior_pairs(self._prior_root_weights)
+        for touched, rows in zip(self.numbering.touched, factor.reduced_rows(end.rows), strict=False):
+            roots = np.concatenate([rows.own, rows.through @ factor.triangle.group_roots(rows.shared)], axis=2)
+            roots = roots.reshape(*touched.rows.shape, 2, roots.shape[2])
+            hat[touched.rows] = roots @ roots.swapaxes(2, 3)
+        weights, given = self._prior_weights, np.arange(count, len(units))
         transform[count:, [0, 1], [0, 1]] = weights
         back[count:, [0, 1], [0, 1]] = np.where(weights > 0.0, 1.0 / np.where(weights > 0.0, weights, 1.0), 0.0)
-        return transform, back
+        for size in (1, 2):
+            some = units.sizes[count:] == size
+            cofactors = factor.cofactors(self.numbering.numbers[units.positions[some, :size]])
+            hat[given[some], :size, :size] = weights[some, :size, None] * cofactors * weights[some, None, :size]
+        hat[units.sizes == 1, 1, 1] = 1.0
+        v = np.concatenate([end.v_mm, -self._prior_pairs(prior_differences(self.numbering.problem, end.state))])
+        transform, back, hat = map(laid_out, (transform, back, hat))
+        return Misfits(transform, back, hat, applied(transform, laid_out(v)))
 
     @cached_property
     def statistics(self) -> Statistics:
@@ -193,58 +173,36 @@ class Run:
     @cached_property
     def unit_functions(self) -> csr_array:
         """(2 N, n) rows T B of all tested units in the free unknowns; 0 for a missing second coordinate."""
-        numbering, matrix = self.numbering, self.end.rows.matrix
-        observed = np.broadcast_to(numbering.numbers[numbering.problem.columns][:, None], matrix.shape)
-        column = np.append(observed.ravel(), numbering.numbers[self.units.positions].ravel())
-        value = np.append(matrix.ravel(), -self.prior_pairs(self._prior_root_weights).ravel())
-        row = np.append(
-            np.arange(2 * len(matrix)).repeat(matrix.shape[2]), np.arange(2 * len(matrix), 2 * len(self.units))
-        )
-        free = column != ABSENT
-        shape = 2 * len(self.units), len(numbering.free)
-        return csr_array((value[free], (row[free], column[free])), shape=shape)
-
-    def unit_rows(self) -> Iterator[UnitRows]:
-        """Yield the rows of all tested units: block by block, each with the priors of its own unknowns; then the priors
-        of the shared unknowns."""
-        numbering, units, factor, observed = self.numbering, self.units, self.factor, len(self.end.v_mm)
-        alone = np.flatnonzero(units.positions[:, 1] == ABSENT)
-        unit_of = np.full(len(numbering.free), ABSENT, dtype=np.intp)  # unit of the single prior of each free unknown
-        unit_of[numbering.numbers[units.positions[alone, 0]]] = observed + alone
-        touched = numbering.touched
-        with_priors = (
-            self._append_priors(block) if i < len(touched) else block for i, block in enumerate(self.end.rows)
-        )
-        for block, rows in zip(touched, factor.reduced_rows(with_priors), strict=False):  # further observations follow
-            own_units = np.concatenate([block.rows, unit_of[block.own]], axis=1)
-            pairs = (*own_units.shape, 2)
-            own = rows.own.reshape(*pairs, rows.own.shape[2])
-            yield UnitRows(own_units, own, rows.shared, rows.through.reshape(*pairs, rows.through.shape[2]))
-        shared = numbering.numbers[units.positions]
-        given = np.flatnonzero(shared[:, 0] < factor.shared_count)
-        shared = np.where(shared[given] == ABSENT, 0, shared[given])
-        weights = -self.prior_pairs(self._prior_root_weights)[given] / factor.scale[shared]
-        through = weights[:, :, None] * np.eye(2)
-        yield UnitRows(observed + given[:, None], np.zeros((len(given), 1, 2, 0)), shared, through[:, None])
-
-    def _append_priors(self, blocks: Blocks) -> Blocks:
-        """Append the priors of their own unknowns to blocks: a pair of rows each, the second zero."""
-        count, width = blocks.own.shape
-        weights = self._prior_root_weights[self.numbering.free]
-        rows = np.zeros((count, width, 2, blocks.matrix.shape[2]))
-        rows[:, np.arange(width), 0, np.arange(width)] = -weights[blocks.own]
-        matrix = np.concatenate([blocks.matrix, rows.reshape(count, 2 * width, blocks.matrix.shape[2])], axis=1)
-        return replace(blocks, matrix=matrix)
+        numbering, pairs = self.numbering, self.units.positions.ravel()
+        given = np.flatnonzero(pairs != ABSENT)
+        entries = -self._prior_weights.ravel()[given], (given, numbering.numbers[pairs[given]])
+        priors = csr_array(entries, shape=(len(pairs), len(numbering.free)))
+        return csr_array(vstack([derivatives_by(numbering.problem, self.end.rows.matrix, numbering.free), priors]))
 
     @property
-    def _prior_root_weights(self) -> Array:
-        """(n,) inverse standard deviations of the priors, 0 without one."""
-        unknowns = self.numbering.problem.unknowns
-        return np.where(unknowns.has_prior, 1.0 / np.where(unknowns.has_prior, unknowns.sigma, 1.0), 0.0)
+    def _prior_weights(self) -> Array:
+        """(m, 2) inverse standard deviations of the tested priors, 0 where absent."""
+        return self._prior_pairs(
+            1.0 / np.where(self.problem.unknowns.has_prior, self.numbering.problem.unknowns.sigma, np.inf)
+        )
 
-    def prior_pairs(self, values: Array) -> Array:
+    def _prior_pairs(self, values: Array) -> Array:
         """Arrange values (n,) of unknowns as the pairs (m, 2) of tested priors, 0 where absent."""
         return np.append(values, 0.0)[self.units.positions]
+
+
+def derivatives_by(problem: Problem, matrix: Array, positions: Indices, rows: Indices | None = None) -> csr_array:
+    """(2 n, k) derivatives of all observations, or of some rows, by some quantities.
+
+    matrix (n, 2, j): derivatives by the quantities at `Problem.columns`.
+    """
+    place = np.full(len(problem.unknowns) + 1, ABSENT, dtype=np.intp)
+    place[positions] = np.arange(len(positions))
+    column = place[problem.columns if rows is None else problem.columns[rows]]
+    row, at = np.nonzero(column != ABSENT)
+    values = matrix[row, :, at].ravel()
+    entries = values, (np.stack([2 * row, 2 * row + 1], axis=1).ravel(), column[row, at].repeat(2))
+    return csr_array(entries, shape=(2 * len(column), len(positions)))
 
 
 UM_PER_MM = 1000.0

@@ -6,8 +6,7 @@ values are left out of sigma0, and sigma0 does not scale them.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
@@ -16,8 +15,6 @@ from scipy.special import fdtr
 
 from adjust.array_types import Array, Indices, Mask
 from adjust.least_squares.equations import prior_differences
-from adjust.linear_algebra.factor import Factor
-from adjust.linear_algebra.sparse_rows import spread_squares
 from adjust.problem.estimates import GivenGroup, VarianceFactor
 from adjust.problem.problem import ABSENT, Problem
 from adjust.quality.run import Run
@@ -31,8 +28,7 @@ ERROR_FREE = 1e-4  # v'Pv over redundancy of simulated observations without erro
 APART = 3.0  # ratio of standard deviations that separates two sources of one camera's marks
 
 
-@dataclass(frozen=True)
-class _Given:
+class _Given(NamedTuple):
     """Given values of one owner: positions of the unknowns, v'Pv, redundancy, and the smallest share of the other
     observations' errors in any combination of the residuals."""
 
@@ -52,10 +48,7 @@ def variance_factor(run: Run, redundancy: int) -> VarianceFactor:
     measuring error (`NO_EVIDENCE`). If the remaining observations have a redundancy below 1, sigma0 is 1 and standard
     deviations are a priori.
 
-    Parameters
-    ----------
-    run : the adjustment; without a solution, sigma0 is that of all observations
-    redundancy : of the whole adjustment
+    redundancy: of the whole adjustment. Without a solution, sigma0 is that of all observations.
 
     Notes
     -----
@@ -90,45 +83,31 @@ def _places_only(problem: Problem, given: _Given, variance: float, redundancy: f
 
 
 def _given_groups(run: Run) -> Iterator[_Given]:
-    numbering = run.numbering
-    sigma = numbering.problem.unknowns.sigma
-    differences = prior_differences(numbering.problem, run.end.state)
-    for group, positions in _given_positions(run):
-        count = len(positions)
-        shape = count, len(numbering.free)
-        entries = np.arange(count), numbering.numbers[positions]
-        q = run.factor.function_cofactor(csr_array((np.ones(count), entries), shape=shape))
-        free = np.eye(len(positions)) - q / np.outer(sigma[positions], sigma[positions])
-        vpv = float(((differences[positions] / sigma[positions]) ** 2).sum())
-        redundancy = float(np.trace(free))
-        evidence = 1.0 - float(np.linalg.eigvalsh(free)[-1])
-        yield _Given(group, positions, vpv, redundancy, evidence)
-
-
-def _given_positions(run: Run) -> Iterator[tuple[GivenGroup, Indices]]:
-    """Given values with weight, by owner; those of fiducials also by the size of their standard deviations."""
-    unknowns = run.problem.unknowns
+    """Given values with weight, by owner; those of fiducials also where their sorted standard deviations jump."""
+    numbering, unknowns = run.numbering, run.problem.unknowns
+    sigma, differences = numbering.problem.unknowns.sigma, prior_differences(numbering.problem, run.end.state)
     used = run.units.positions[run.weighting.used[len(run.end.v_mm) :]]
     takes_part = np.zeros(len(unknowns), dtype=bool)
     takes_part[used[used != ABSENT]] = True
-    fiducials: dict[str, list[int]] = {}
-    for (camera, _), pair in unknowns.fiducial.items():
-        fiducials.setdefault(camera, []).extend(pair[takes_part[pair]].tolist())
-    for camera, members in fiducials.items():
-        positions = np.array(members, dtype=np.intp)
-        for some in _split_sources(positions, run.numbering.problem.unknowns.sigma[positions]):
-            yield GivenGroup("datum", camera), some
-    for name, owned in (("interior", unknowns.camera), ("scanner", unknowns.scanner), ("board", unknowns.board)):
-        for owner, positions in owned.items():
-            if takes_part[positions].any():
-                yield GivenGroup(name, owner), positions[takes_part[positions]]
+    owned = [(GivenGroup("datum", camera), pair) for (camera, _), pair in unknowns.fiducial.items()]
+    for name, owners in (("interior", unknowns.camera), ("scanner", unknowns.scanner), ("board", unknowns.board)):
+        owned += [(GivenGroup(name, owner), positions) for owner, positions in owners.items()]
+    for group in dict.fromkeys(group for group, _ in owned):
+        positions = np.concatenate([each for owner, each in owned if owner == group])
+        positions = positions[takes_part[positions]]
+        parts = [positions]
+        if group.group == "datum":
+            positions = positions[np.argsort(sigma[positions], kind="stable")]
+            parts = np.split(positions, np.flatnonzero(sigma[positions][1:] > APART * sigma[positions][:-1]) + 1)
+        for some in filter(len, parts):
+            q = run.factor.function_cofactor(_unit_rows(numbering.numbers[some], len(numbering.free)))
+            free = np.eye(len(some)) - q / np.outer(sigma[some], sigma[some])
+            vpv = float(((differences[some] / sigma[some]) ** 2).sum())
+            yield _Given(group, some, vpv, float(np.trace(free)), 1.0 - float(np.linalg.eigvalsh(free)[-1]))
 
 
-def _split_sources(positions: Indices, sigma: Array) -> list[Indices]:
-    """Split positions where their sorted standard deviations jump."""
-    order = np.argsort(sigma, kind="stable")
-    leaps = np.flatnonzero(sigma[order][1:] > APART * sigma[order][:-1]) + 1
-    return [part for part in np.split(positions[order], leaps) if len(part)]
+def _unit_rows(columns: Indices, width: int) -> csr_array:
+    return csr_array((np.ones(len(columns)), (np.arange(len(columns)), columns)), shape=(len(columns), width))
 
 
 def added_variance(squares: Array, variances: Array, redundancy: float) -> float | None:
@@ -144,7 +123,7 @@ def added_variance(squares: Array, variances: Array, redundancy: float) -> float
     return float(brentq(excess, 0.0, most)) if most > 0.0 and excess(0.0) > 0.0 else None
 
 
-COLUMNS_AT_ONCE = 500  # columns of the cofactor matrix of the shared unknowns held at a time
+MOST_COLUMNS, SIGNS = 500, 200  # columns of a part of the hat matrix; random sums of more than these
 
 
 def refined_factors(run: Run) -> Weighting:
@@ -184,40 +163,18 @@ def factor_sigmas(run: Run) -> dict[str, float]:
 
 def _traces(run: Run, members: Sequence[Mask]) -> Array:
     """(g, g) squared norms of the parts of the hat matrix between groups."""
-    # Rows of one block share the block's own unknowns. Different blocks are connected only by the shared unknowns, for
-    # which the normal matrices of the groups are summed first.
-    factor = run.factor
-    within = np.zeros((len(members), len(members)))
-    normals = [csr_array((factor.shared_count, factor.shared_count)) for _ in members]
-    is_member = np.append(
-        np.array(members), np.zeros((len(members), 1), dtype=bool), axis=1
-    )  # the last stands for ABSENT
-    for rows in run.unit_rows():
-        count = len(rows.units)
-        masks = is_member[:, rows.units][..., None, None]
-        shape = len(members), count, 2 * rows.units.shape[1]
-        own = (masks * rows.own).reshape(*shape, rows.own.shape[3])
-        through = (masks * rows.through).reshape(*shape, rows.through.shape[3])
-        roots = through @ factor.triangle.group_roots(rows.shared)
-        for i, j in product(range(len(members)), repeat=2):
-            between = roots[i] @ roots[j].swapaxes(1, 2)
-            within[i, j] += ((own[i] @ own[j].swapaxes(1, 2) + between) ** 2).sum() - (between**2).sum()
-        for i, of_group in enumerate(through):
-            normals[i] = normals[i] + spread_squares(
-                rows.shared, of_group.swapaxes(1, 2) @ of_group, factor.shared_count
-            )
-    return within + _shared_traces(factor, normals)
+    # The squares of all columns of a part; of a large one, of sums of its columns with random signs, whose expected
+    # squares these are (Hutchinson 1990).
+    squares = []
+    for of_group in members:
+        functions = run.unit_functions[np.repeat(of_group, 2)]
+        columns = (
+            functions.T.toarray() if functions.shape[0] <= MOST_COLUMNS else functions.T @ _signs(functions.shape[0])
+        )
+        squares.append(((run.unit_functions @ run.factor.cofactor_times(columns)) ** 2).sum(axis=1))
+    return np.asarray(np.repeat(members, 2, axis=1) @ np.array(squares).T)
 
 
-def _shared_traces(factor: Factor, normals: Sequence[csr_array]) -> Array:
-    """(g, g) traces of N_i Q N_j Q, with N (s, s) the reduced normal matrix of a group and Q the cofactor matrix of the
-    shared unknowns. Computed in blocks of columns of Q, which is too large as a whole in a large network."""
-    traces = np.zeros((len(normals), len(normals)))
-    for first in range(0, factor.shared_count, COLUMNS_AT_ONCE):
-        unit = np.eye(factor.shared_count, COLUMNS_AT_ONCE, -first)
-        some = slice(first, first + COLUMNS_AT_ONCE)
-        columns = factor.triangle.cofactor_times(unit)
-        for j, of_group in enumerate(normals):
-            through_group = factor.triangle.cofactor_times(of_group @ columns)
-            traces[:, j] += [np.trace(normal[some] @ through_group) for normal in normals]
-    return traces
+def _signs(count: int) -> Array:
+    """(count, SIGNS) random signs over the root of their number."""
+    return np.asarray(np.random.default_rng(0).choice([-1.0, 1.0], (count, SIGNS)) / np.sqrt(SIGNS))

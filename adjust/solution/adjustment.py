@@ -1,6 +1,6 @@
 """Simultaneous adjustment of cameras, fiducial marks, images and object points (Torlegård's F1 to F9)."""
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,9 +25,8 @@ from adjust.rank_defect.datum import (
     object_datum,
 )
 from adjust.solution.blunder_hypotheses import Trials, blunder_sentence, stations_elsewhere
-from adjust.solution.coordinate_blunders import Slip, coordinate_slips, far_points, few_points, free_points
-from adjust.solution.left_out_images import adopt_lens, contradicting_image, fitting, leave_out
-from adjust.solution.misnumbered_images import misnumbered_images
+from adjust.solution.coordinate_blunders import FarPoint, coordinate_slips, far_points, few_points, free_points
+from adjust.solution.left_out_images import adopt_lens, contradicting_image, fitting, leave_out, misnumbered_images
 from adjust.solution.options import Datum, Method, Options
 from adjust.solution.plausibility import check_plausibility
 from adjust.solution.result import Adjustment, is_fixed, run_result
@@ -55,18 +54,17 @@ def adjust(
     Parameters
     ----------
     network : cameras, images, object points and observations with their priors.
-    approximations : optional; initial values. By default, and where the iteration does not converge from those given,
-        they are computed from the network itself.
-    options : optional; datum, weighting, method and tests.
+    approximations : initial values. By default, and where the iteration does not converge from those given, they are
+        computed from the network itself.
+    options : datum, weighting, method and tests.
 
     Returns
     -------
     Adjustment
-        The result. Images without an orientation are left out, and so are those in which some point has no image at the
-        start, or which keep the iteration from converging; all are tried again once the lens is known
-        (`Adjustment.left_out`). Given points with coordinate
-        blunders are named where the observations do not agree because of them; robust estimation and data snooping
-        start without these points.
+        Images without an orientation are left out, and so are those in which some point has no image at the start, or
+        which keep the iteration from converging; all are tried again once the lens is known (`Adjustment.left_out`).
+        Given points with coordinate blunders are named where the observations do not agree because of them; robust
+        estimation and data snooping start without these points.
 
     Raises
     ------
@@ -111,31 +109,30 @@ class _Solver:
         except AdjustmentError:
             return None
 
+    def without(self, network: Network, reasons: Mapping[str, str]) -> tuple[Network, Approximations] | None:
+        """Leave out some frames; return the rest with its own approximations, None where too little is left."""
+        rest = leave_out(network, reasons) if reasons else None
+        start = None if rest is None else self.own_start(rest)
+        return None if rest is None or start is None else (rest, start)
+
     def orientable(self, network: Network) -> tuple[Network, Approximations | None, dict[str, str]]:
-        """Leave out the images for which no orientation is found.
+        """Leave out the images whose point numbers are off, and those for which no orientation is found.
 
-        Returns the remaining network, its own approximations and the reasons by frame. Returns the whole network
-        without approximations where too little would remain or something else is wrong. Images whose point numbers are
-        off are left out beforehand.
+        Returns the remaining network, its own approximations and the reasons by frame. Approximations are None where
+        too little would remain or something else is wrong.
         """
-        if not (misnumbered := misnumbered_images(network)):
-            return self._orientable(network)
-        if (part := leave_out(network, misnumbered)) is None:
-            raise AdjustmentError(
-                " ".join(f"{each[0].upper()}{each[1:]}" for each in dict.fromkeys(misnumbered.values()))
-            )
-        rest, start, reasons = self._orientable(part)
-        return rest, start, misnumbered | reasons
-
-    def _orientable(self, network: Network) -> tuple[Network, Approximations | None, dict[str, str]]:
+        misnumbered = misnumbered_images(network)
+        part = leave_out(network, misnumbered) if misnumbered else network
+        if part is None:
+            sentences = dict.fromkeys(misnumbered.values())
+            raise AdjustmentError(" ".join(f"{each[0].upper()}{each[1:]}" for each in sentences))
         try:
-            return network, self.initial_values(network), {}
+            return part, self.initial_values(part), misnumbered
         except UnorientedError as error:
-            part, reasons = leave_out(network, error.reasons), error.reasons
+            rest, reasons = self.without(part, error.reasons), error.reasons
         except AdjustmentError:
-            return network, None, {}
-        start = None if part is None else self.own_start(part)
-        return (network, None, {}) if part is None or start is None else (part, start, reasons)
+            return part, None, misnumbered
+        return (part, None, misnumbered) if rest is None else (*rest, misnumbered | reasons)
 
     def leave_out_blind(
         self, part: Network, start: Approximations | None, left_out: dict[str, str]
@@ -149,17 +146,13 @@ class _Solver:
         try:
             result = self.check_whole(part, None, start)
         except NoImageError as error:
-            rest = leave_out(part, error.reasons) if error.reasons else None
-            begun = None if rest is None else self.own_start(rest)
-            if rest is None or begun is None:
+            if (rest := self.without(part, error.reasons)) is None:
                 raise
-            return self.leave_out_blind(rest, begun, left_out | error.reasons)
+            return self.leave_out_blind(*rest, left_out | error.reasons)
         reasons = contradicting_image(result) if result.termination not in ("converged", "singular") else {}
-        rest = leave_out(part, reasons) if reasons else None
-        begun = None if rest is None else self.own_start(rest)
-        if rest is None or begun is None:
+        if (rest := self.without(part, reasons)) is None:
             return result, left_out
-        without, more = self.leave_out_blind(rest, begun, left_out | reasons)
+        without, more = self.leave_out_blind(*rest, left_out | reasons)
         return (without, more) if without.converged else (result, left_out)
 
     def try_again(self, network: Network, rest: Adjustment, left_out: dict[str, str]) -> Adjustment:
@@ -221,14 +214,14 @@ class _Solver:
             result = self._start_robustly(network, start) or self.solve(network, start)
         except NoImageError as error:
             if slips := self._slips(network, start):
-                raise AdjustmentError(" ".join(slip.sentence for slip in slips)) from error
+                raise AdjustmentError(" ".join(sentence for _, sentence in slips)) from error
             raise
         if result.termination not in ("converged", "singular"):
             result = self._begin_anew(network, start, result)
         if result.termination == "singular" or self._agrees(result):
             return result
         if slips := self._slips(network, start):
-            return replace(result, slips=tuple(slip.sentence for slip in slips))
+            return replace(result, slips=tuple(sentence for _, sentence in slips))
         return result if result.converged else replace(result, remarks=(*result.remarks, *few_points(network)))
 
     def solve(
@@ -270,15 +263,15 @@ class _Solver:
         slips = self._slips(network, start) if self.options.robust or self.options.snooping else []
         if not slips:
             return None
-        _, freed = free_points(network, start, [slip.far for slip in slips])
+        _, freed = free_points(network, start, [far for far, _ in slips])
         try:
-            result = self.solve(network, freed, [slip.far.name for slip in slips])
+            result = self.solve(network, freed, [far.name for far, _ in slips])
         except NoImageError:
             return None
         return result if result.converged else None
 
-    def _slips(self, network: Network, start: Approximations) -> list[Slip]:
-        """Find given points that contradict an adjustment without their coordinates significantly."""
+    def _slips(self, network: Network, start: Approximations) -> list[tuple[FarPoint, str]]:
+        """Find given points that contradict an adjustment without their coordinates significantly, with sentences."""
         far = far_points(self._numbered(network, start), self.family)
         if not far:
             return []

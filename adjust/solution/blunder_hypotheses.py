@@ -6,8 +6,9 @@ distance.
 Such a blunder leaves residuals everywhere, and tests of single observations would reject good ones.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import chain, combinations
 
 import numpy as np
@@ -19,7 +20,7 @@ from adjust.problem.camera import Camera
 from adjust.problem.estimates import adjusted_image, adjusted_places
 from adjust.problem.network import Network, ObjectPoint
 from adjust.problem.parameter import Parameter, shortened
-from adjust.solution.misnumbered_images import FEWEST, linear_transformations
+from adjust.solution.left_out_images import FEWEST, linear_transformations
 from adjust.solution.result import Adjustment
 
 TOLERATED = 2.0  # factor on the given standard deviations up to which residuals need no explanation
@@ -60,30 +61,27 @@ class Trials:
 class NetworkHypothesis:
     """Blunder in words, remedy, and the network without the blunder.
 
-    moved (3, 3): transformation from the given points to the corrected ones. distance: camera with a wrong principal
-    distance, and the given value in mm.
+    moved (3, 3): transformation from the given points to the corrected ones. figures: of the adjustment without it.
     """
 
     words: str
     network: Network
     remedy: str = "Correct it."
     moved: Array = field(default_factory=lambda: np.eye(3))
-    distance: tuple[str, float] = ("", 0.0)
+    figures: Callable[[Adjustment], str] = lambda _: ""
 
 
-def network_hypotheses(
-    network: Network, bare: Network, given: Adjustment | None, trials: Trials
-) -> Iterator[list[NetworkHypothesis]]:
+def network_hypotheses(network: Network, bare: Network, given: Adjustment | None) -> Iterator[list[NetworkHypothesis]]:
     """Generate blunder hypotheses; those with identical residuals form one list.
 
-    Parameters
-    ----------
-    network, bare : network with and without the given orientations
-    given : adjustment of the network as given, None where it cannot start
-    trials : adjusts trial networks
+    network, bare: with and without the given orientations; given: its adjustment, None where that cannot start.
     """
-    mirrored = (NetworkHypothesis(words, _move_points(bare, by), moved=by) for words, by in AXES.items())
-    yield [*mirrored, *_y_down(bare, given)]
+    mirrored = [NetworkHypothesis(words, _move_points(bare, by), moved=by) for words, by in AXES.items()]
+    films = [image for image in network.images if image.transformation != "none"]
+    if not films or given is None or all(image.name in given.mirrored for image in films):
+        where = "the y' axis of the camera's fiducial marks" if films else "the y axis of the comparator coordinates"
+        mirrored.append(NetworkHypothesis(f"{where} points down, and it has to point up", reversed_y(bare)))
+    yield mirrored
     for factor in FACTORS if network.distances else ():
         by = factor * np.eye(3)
         remedy = "Give both in the unit that [object] unit names."
@@ -118,14 +116,6 @@ def _move_points(network: Network, by: Array) -> Network:
         moved = (_scaled(given[axis], factor) for axis, factor in zip(axes, factors, strict=True))
         points.append(ObjectPoint(point.id, *moved))
     return replace(network, points=tuple(points))
-
-
-def _y_down(network: Network, given: Adjustment | None) -> Iterator[NetworkHypothesis]:
-    """Hypothesis: y points down, in the camera frame if all films are mirrored, or in comparators of digital images."""
-    films = [image for image in network.images if image.transformation != "none"]
-    if not films or given is None or all(image.name in given.mirrored for image in films):
-        where = "the y' axis of the camera's fiducial marks" if films else "the y axis of the comparator coordinates"
-        yield NetworkHypothesis(f"{where} points down, and it has to point up", reversed_y(network))
 
 
 def reversed_y(network: Network, keeps_given: bool = False) -> Network:
@@ -210,16 +200,23 @@ def _distances(network: Network) -> Iterator[NetworkHypothesis]:
                 f"the principal distance of camera {camera.name} is not the {given.value:g} mm that are given",
                 replace(network, cameras=tuple(free if each is camera else each for each in network.cameras)),
                 "Correct it, or give it with the standard deviation that it has.",
-                distance=(camera.name, given.value),
+                figures=partial(_found_distance, camera.name, given.value),
             )
 
 
 def _exchanged_frames(network: Network, given: Adjustment | None) -> Iterator[NetworkHypothesis]:
     """Hypothesis: the targets of two frames of a camera are exchanged; largest residuals first."""
-    observations, worst = network.observations, _worst_images(network, given, films=True)
-    camera = {image.name: image.camera for image in network.images}
-    pairs = [pair for pair in combinations(worst, 2) if camera[pair[0]] == camera[pair[1]]]
-    for first, second in sorted(pairs, key=lambda pair: -worst[pair[0]] - worst[pair[1]])[:MOST_PAIRS]:
+    observations = network.observations
+    squares = np.zeros(len(observations)) if given is None else (given.residuals.v_mm**2).sum(axis=1)
+    sums = np.bincount(network.image_numbers, squares, len(network.images)).tolist()
+    films = {
+        image.name: (size, image.camera)
+        for image, size in zip(network.images, sums, strict=True)
+        if image.transformation != "none" and image.name not in network.objectless_images
+    }
+    worst = sorted(films, key=lambda name: (-films[name][0], name))
+    pairs = [pair for pair in combinations(worst, 2) if films[pair[0]][1] == films[pair[1]][1]]
+    for first, second in sorted(pairs, key=lambda pair: -films[pair[0]][0] - films[pair[1]][0])[:MOST_PAIRS]:
         other = {first: second, second: first}
         rows = zip(observations.image, observations.is_fiducial, strict=True)
         image = tuple(name if is_fiducial else other.get(name, name) for name, is_fiducial in rows)
@@ -228,18 +225,6 @@ def _exchanged_frames(network: Network, given: Adjustment | None) -> Iterator[Ne
             replace(network, observations=replace(observations, image=image)),
             "Exchange them, or the frames' fiducial marks.",
         )
-
-
-def _worst_images(network: Network, given: Adjustment | None, films: bool) -> dict[str, float]:
-    """Sums of squared residuals by image, largest first, of films or of digital images with object points."""
-    squares = np.zeros(len(network.image_numbers)) if given is None else (given.residuals.v_mm**2).sum(axis=1)
-    sums = np.bincount(network.image_numbers, squares, len(network.images)).tolist()
-    images = {
-        image.name: size
-        for image, size in zip(network.images, sums, strict=True)
-        if (image.transformation != "none") == films and image.name not in network.objectless_images
-    }
-    return dict(sorted(images.items(), key=lambda each: (-each[1], each[0])))
 
 
 CLEARLY = 3.0  # factor by which an explanation must reduce sigma0
@@ -266,7 +251,7 @@ def blunder_sentence(network: Network, given: Adjustment | None, trials: Trials)
         alone = trials.adjust(bare)
         if alone is not None and trials.explains(alone):
             return stations_elsewhere(network, alone)
-    for alike in network_hypotheses(network, bare, given, trials):
+    for alike in network_hypotheses(network, bare, given):
         found = trials.adjust(alike[0].network)
         better = found is not None and (given is None or CLEARLY * found.sigma0 < given.sigma0 or not given.converged)
         if found is not None and better and trials.explains(found):
@@ -278,7 +263,7 @@ def _sentence(slips: Sequence[NetworkHypothesis], found: Adjustment, given: Adju
     words = [each.words for each in slips]
     if len(words) >= len(AXES):  # the mirrored axis cannot be identified
         words = [MIRRORED, *words[len(AXES) :]]
-    what = "; or ".join(words) + _found_distance(*slips[0].distance, found)
+    what = "; or ".join(words) + slips[0].figures(found)
     if given is None:
         stands = "nothing can be adjusted"
     elif not given.converged:
@@ -293,8 +278,6 @@ def _sentence(slips: Sequence[NetworkHypothesis], found: Adjustment, given: Adju
 
 def _found_distance(camera: str, given_mm: float, found: Adjustment) -> str:
     """Describe the estimated principal distance, and whether it is the given one in another unit or pixel pitch."""
-    if not camera:
-        return ""
     c = found.value(Parameter.interior(camera, "c"))
     times = max(c / given_mm, given_mm / c)
     how = "long" if c < given_mm else "short"
@@ -310,8 +293,8 @@ def _as_stations_are_given(
     given = _given_stations(network)
     if len(alike) == 1 or not given:
         return alike
-    stations, depths = _stations(found, given)
-    unmoved, places = stations @ np.linalg.inv(alike[0].moved).T, np.array(list(given.values()))
+    stations, depths, places = _stations(found, given)
+    unmoved = stations @ np.linalg.inv(alike[0].moved).T
     return [each for each in alike if _near(unmoved @ each.moved.T, places, depths).all()] or alike
 
 
@@ -320,16 +303,16 @@ def _given_stations(network: Network) -> dict[str, Array]:
     return {image.name: image.exterior.center for image in images if image.exterior is not None}
 
 
-def _stations(result: Adjustment, images: Iterable[str]) -> tuple[Array, Array]:
-    """Adjusted stations (n, 3) of some images, and their distances (n,) from the centre of the points."""
-    stations = np.array([adjusted_image(result, name).station for name in images])
-    return stations, np.linalg.norm(stations - _points(result).mean(axis=0), axis=1)
+def _stations(result: Adjustment, given: Mapping[str, Array]) -> tuple[Array, Array, Array]:
+    """Adjusted stations (n, 3), their distances (n,) from the centre of the points, and the given stations (n, 3)."""
+    stations = np.array([adjusted_image(result, name).station for name in given])
+    depths = np.linalg.norm(stations - _points(result).mean(axis=0), axis=1)
+    return stations, depths, np.array([*given.values()])
 
 
 def _points(result: Adjustment) -> Array:
-    return adjusted_places(
-        result, [each.id for each in result.network.points if each.id in result.network.observed_points]
-    )
+    shown = result.network.observed_points
+    return adjusted_places(result, [each.id for each in result.network.points if each.id in shown])
 
 
 def _near(stations: Array, given: Array, depths: Array) -> Mask:
@@ -344,8 +327,7 @@ def stations_elsewhere(network: Network, result: Adjustment) -> str:
     given = _given_stations(network)
     if result.termination == "singular" or len(given) < 2 or not network.observed_points:
         return ""
-    names, places = list(given), np.array(list(given.values()))
-    stations, depths = _stations(result, given)
+    names, (stations, depths, places) = list(given), _stations(result, given)
     off = np.flatnonzero(~_near(stations, places, depths))
     if len(off) == 2 and _near(stations[off], places[off[::-1]], depths[off]).all():
         one, other = (names[i] for i in off)

@@ -1,8 +1,7 @@
 """Coordinate blunders of given points, too large for an adjustment that treats the coordinates as observations."""
 
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 from typing import NamedTuple
 
@@ -23,8 +22,7 @@ FEWEST_IMAGES = 2  # images needed for an intersection
 ENOUGH = 5  # points needed to identify a wrong one: the resection without it is still redundant
 
 
-@dataclass(frozen=True)
-class FarPoint:
+class FarPoint(NamedTuple):
     """Given point whose rays meet elsewhere."""
 
     name: str  # id of the point
@@ -46,67 +44,45 @@ def far_points(problem: Problem, family: float) -> list[FarPoint]:
     MOST_FAR of the points are far.
     """
     sights = _sights(problem)
-    rays = _rays_of_given(problem, sights)
+    rays = {name: own for name, own in _rays_of_given(problem, sights).items() if len(own) >= FEWEST_IMAGES}
     if not rays:
         return []
-    miss = {name: float(np.median([ray.distance_mm for ray in own])) for name, own in rays.items()}
+    miss = {name: float(np.median(own[:, -1])) for name, own in rays.items()}
     noise = float(np.median([sight.sigma_mm for sight in sights.values()]))
     falling = sorted(miss, key=lambda name: (-miss[name], name))
     limits = [max(miss[name], noise) / np.sqrt(family) for name in falling]  # for the points before each
     gaps = [k for k in range(1, int(MOST_FAR * len(falling)) + 1) if miss[falling[k - 1]] > limits[k]]
-    if not gaps:
-        return []
-    far, others, limit = falling[: gaps[-1]], miss[falling[gaps[-1]]], limits[gaps[-1]]
-    rows = [(number, ray) for number, name in enumerate(far) for ray in rays[name]]
-    places, _ = intersect(
-        np.array([ray.center for _, ray in rows]),
-        np.array([ray.direction for _, ray in rows]),
-        np.array([number for number, _ in rows], dtype=np.intp),
-        np.full((len(far), 3), np.nan),
-    )
-    return [
-        FarPoint(name, len(rays[name]), place, miss[name], others)
-        for name, place in zip(far, places, strict=True)
-        if max(ray.missed_by_mm(place) for ray in rays[name]) < limit
-    ]
+    found = []
+    for name in falling[: gaps[-1]] if gaps else ():
+        centers, directions, c_mm, _ = np.split(rays[name], [3, 6, 7], axis=1)
+        numbers = np.zeros(len(centers), dtype=np.intp)
+        (place,), _ = intersect(centers, directions, numbers, np.full((1, 3), np.nan))
+        along = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        offsets = place - centers
+        depths = (offsets * along).sum(axis=1)
+        across_mm = c_mm[:, 0] * np.linalg.norm(offsets - depths[:, None] * along, axis=1)
+        if (depths > 0.0).all() and (across_mm < limits[gaps[-1]] * depths).all():
+            found.append(FarPoint(name, len(centers), place, miss[name], miss[falling[gaps[-1]]]))
+    return found
 
 
-@dataclass(frozen=True)
-class _Ray:
-    """Ray from an image to a given point.
-
-    center (3,): station; direction (3,); c_mm: principal distance; distance_mm: distance of the projected point from
-    its mark.
-    """
-
-    center: Array
-    direction: Array
-    c_mm: float
-    distance_mm: float
-
-    def missed_by_mm(self, place: Array) -> float:
-        """Distance in the image of a place (3,) from the mark, measured across the ray; inf behind the camera."""
-        offset, along = place - self.center, self.direction / np.linalg.norm(self.direction)
-        depth = float(offset @ along)
-        return self.c_mm * float(np.linalg.norm(offset - depth * along)) / depth if depth > 0.0 else np.inf
-
-
-def _rays_of_given(problem: Problem, sights: Mapping[str, Sight]) -> dict[str, list[_Ray]]:
-    """Rays of every point given in X, Y and Z, by id, if at least two images show it."""
+def _rays_of_given(problem: Problem, sights: Mapping[str, Sight]) -> dict[str, Array]:
+    """Rays (m, 8) of every point given in X, Y and Z: station, direction, principal distance, and how far the projected
+    point misses its mark."""
     unknowns, start = problem.unknowns, problem.start()
     given = {id_: unknowns.given[at] for id_, at in unknowns.point.items() if np.isfinite(unknowns.sigma[at]).all()}
-    rays = defaultdict(list)
+    rays = dict[str, list[Array]]()
     for image, rotation in zip(problem.network.images, start.rotations, strict=True):
-        sight = sights.get(image.name)
-        if sight is None:
+        if (sight := sights.get(image.name)) is None:
             continue
         center, c = start.values[unknowns.exterior[image.name][:3]], sight.principal_distance_mm
         known = [row for row, name in enumerate(sight.points) if name in given]
         xyz = np.array([given[sight.points[row]] for row in known]).reshape(-1, 3)
         distances = image_distances(Pose(rotation, center), xyz, sight.xy_mm[known], c)
         for row, distance in zip(known, distances, strict=True):
-            rays[sight.points[row]].append(_Ray(center, sight.rays[row] @ rotation, c, float(distance)))
-    return {name: own for name, own in sorted(rays.items()) if len(own) >= FEWEST_IMAGES}
+            ray = np.array([*center, *(sight.rays[row] @ rotation), c, distance])
+            rays.setdefault(sight.points[row], []).append(ray)
+    return {name: np.array(own) for name, own in sorted(rays.items())}
 
 
 def _sights(problem: Problem) -> dict[str, Sight]:
@@ -120,29 +96,6 @@ def _sights(problem: Problem) -> dict[str, Sight]:
     return sights
 
 
-class Slip(NamedTuple):
-    """Given point that contradicts all other information significantly, in words."""
-
-    far: FarPoint
-    sentence: str
-
-
-def _slip(far: FarPoint, place: Array, sigma: float, off: Array, explained: str) -> Slip:
-    """Word a slip by the point's place (3,) without its given coordinates, and their difference (3,) from it."""
-    distance, digits = float(np.linalg.norm(off)), max(0, 1 - int(np.floor(np.log10(sigma))))
-    at = ", ".join(f"{axis} = {value:.{digits}f}" for axis, value in zip("XYZ", place, strict=True))
-    by = ", ".join(f"{axis} by {value:+.{digits}f}" for axis, value in zip("XYZ", off, strict=True))
-    missed = f"{far.miss_mm:.3g} mm from its marks" if np.isfinite(far.miss_mm) else "behind the camera"
-    guess = f" {explained}" if explained else ""
-    return Slip(
-        far,
-        f"Control point {far.name} is not where it is given: its rays from {far.images} images meet at {at}, "
-        f"{distance:.{digits}f} away ({by}). What is given lies {missed} in the images, every other given point "
-        f"within {far.others_mm:.2g} mm.{guess} Correct its coordinates, or its number among the marks; with "
-        f"snooping = true the adjustment does without them.",
-    )
-
-
 def free_points(network: Network, start: Approximations, far: Sequence[FarPoint]) -> tuple[Network, Approximations]:
     """Remove the priors of far points from a network; start them where their rays meet."""
     places = {each.name: each.place for each in far}
@@ -154,19 +107,19 @@ def free_points(network: Network, start: Approximations, far: Sequence[FarPoint]
     return replace(network, points=points), replace(start, points={**start.points, **places})
 
 
-def coordinate_slips(network: Network, far: Sequence[FarPoint], without: Adjustment, options: Options) -> list[Slip]:
-    """Test far points by an adjustment `without` their coordinates; empty where that has no solution.
+def coordinate_slips(
+    network: Network, far: Sequence[FarPoint], without: Adjustment, options: Options
+) -> list[tuple[FarPoint, str]]:
+    """Select the far points that contradict an adjustment `without` their coordinates significantly, with sentences.
 
     The quadratic form of the difference between given and adjusted coordinates is chi-square with 3 degrees of freedom.
     The critical value holds for the maximum over all given points at the level `family`, and is multiplied by sigma0²
-    where that is larger than 1.
+    where that is larger than 1. Empty where that adjustment has no solution.
     """
-    if not without.converged:
-        return []
     given, scale = network.known_places, max(without.sigma0, 1.0)
     critical = float(options.probabilities.critical(np.array([3]), len(given))[0]) * scale**2
     found = []
-    for each in far:
+    for each in far if without.converged else ():
         coordinates, point = [Parameter.point(each.name, axis) for axis in "XYZ"], network.point_by_id[each.name]
         place, cofactor = without.values_of(coordinates), without.cofactor_of(coordinates)
         variances = [prior.sigma**2 for prior in point.priors if prior]
@@ -177,8 +130,34 @@ def coordinate_slips(network: Network, far: Sequence[FarPoint], without: Adjustm
 
         if not passes(given[each.name]):
             sigma = scale * float(np.sqrt(np.diag(cofactor).max()))
-            found.append(_slip(each, place, sigma, given[each.name] - place, _explanation(each.name, given, passes)))
+            found.append((each, _sentence(each, place, sigma, given, passes)))
     return found
+
+
+def _sentence(
+    far: FarPoint, place: Array, sigma: float, given: Mapping[str, Array], passes: Callable[[Array], bool]
+) -> str:
+    """Describe a blunder by the point's place (3,) without its given coordinates, and their difference from it."""
+    own = given[far.name]
+    off, digits = own - place, max(0, 1 - int(np.floor(np.log10(sigma))))
+    at = ", ".join(f"{axis} = {value:.{digits}f}" for axis, value in zip("XYZ", place, strict=True))
+    by = ", ".join(f"{axis} by {value:+.{digits}f}" for axis, value in zip("XYZ", off, strict=True))
+    missed = f"{far.miss_mm:.3g} mm from its marks" if np.isfinite(far.miss_mm) else "behind the camera"
+    # Clerical errors that explain the coordinates; told where there is exactly one.
+    readings = [
+        (own[[j if k == i else i if k == j else k for k in range(3)]], f"{'XYZ'[i]} and {'XYZ'[j]} look exchanged.")
+        for i, j in combinations(range(3), 2)
+    ]
+    readings += [(own * (1.0 - 2.0 * np.eye(3)[i]), f"The sign of {'XYZ'[i]} looks wrong.") for i in range(3)]
+    readings += [(xyz, f"It lies where point {id_} is given.") for id_, xyz in given.items() if id_ != far.name]
+    causes = [cause for xyz, cause in readings if passes(xyz)]
+    guess = f" {causes[0]}" if len(causes) == 1 else ""
+    return (
+        f"Control point {far.name} is not where it is given: its rays from {far.images} images meet at {at}, "
+        f"{np.linalg.norm(off):.{digits}f} away ({by}). What is given lies {missed} in the images, every other given "
+        f"point within {far.others_mm:.2g} mm.{guess} Correct its coordinates, or its number among the marks; with "
+        f"snooping = true the adjustment does without them."
+    )
 
 
 def few_points(network: Network) -> list[str]:
@@ -190,16 +169,3 @@ def few_points(network: Network) -> list[str]:
         f"The points {', '.join(named)} alone are given in X, Y and Z: if the coordinates of one of the {len(named)} "
         f"are wrong, nothing tells which. Check all of them, or give another point."
     ]
-
-
-def _explanation(name: str, given: Mapping[str, Array], passes: Callable[[Array], bool]) -> str:
-    """Find the clerical error that explains the coordinates; empty unless there is exactly one."""
-    own = given[name]
-    readings = [
-        (own[[j if k == i else i if k == j else k for k in range(3)]], f"{'XYZ'[i]} and {'XYZ'[j]} look exchanged.")
-        for i, j in combinations(range(3), 2)
-    ]
-    readings += [(own * (1.0 - 2.0 * np.eye(3)[i]), f"The sign of {'XYZ'[i]} looks wrong.") for i in range(3)]
-    readings += [(xyz, f"It lies where point {id_} is given.") for id_, xyz in given.items() if id_ != name]
-    causes = [cause for xyz, cause in readings if passes(xyz)]
-    return causes[0] if len(causes) == 1 else ""

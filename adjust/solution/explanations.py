@@ -24,6 +24,7 @@ groups of images must be clearer than a normal scatter of the images' interior o
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -38,7 +39,8 @@ from adjust.quality.run import UM_PER_MM, GrossError, Run, residuals
 from adjust.quality.tested import Probabilities
 from adjust.quality.variance_components import added_variance
 from adjust.rank_defect.diagnosis import singular_directions
-from adjust.solution.model_hypotheses import ModelHypothesis, model_hypotheses, separate_lenses
+from adjust.solution.model_hypotheses import ModelHypothesis, camera_hypotheses, estimate, separate_lenses
+from adjust.solution.object_hypotheses import object_hypotheses
 from adjust.solution.reweighting import again
 
 LEVEL = 0.001  # probability of reporting anything where the model is correct
@@ -156,21 +158,21 @@ class _Model:
     @property
     def costs(self) -> float:
         """Cost of the unknowns and the choice of the hypothesis."""
-        return 2.0 * (len(self.hypothesis.added) + self.hypothesis.choices) if self.hypothesis else 0.0
+        return 2.0 * (len(self.hypothesis.added) + self.hypothesis.selection.choices) if self.hypothesis else 0.0
 
     def is_significant(self, hypothesis: ModelHypothesis, fall: float, level: float) -> bool:
         """Whether a decrease of v'Pv is significant, and larger than errors correlated within images cause."""
         share = GROUP_SHARE if hypothesis.name == "group" else LEAST_SHARE
-        is_large = not self.is_noise_fitted or (fall > share * self.vpv and hypothesis.p_scatter() < LEVEL)
+        is_large = not self.is_noise_fitted or (fall > share * self.vpv and hypothesis.selection.p_scatter() < LEVEL)
         return is_large and self.probability(hypothesis, fall) < level
 
     def probability(self, hypothesis: ModelHypothesis, fall: float) -> float:
         """p-value of a decrease of v'Pv by a hypothesis."""
         single = self._fall_probability(fall, len(hypothesis.added))
-        if not hypothesis.contrasts:
+        if not hypothesis.selection.contrasts:
             return single
-        bonferroni = np.exp(min(0.0, np.log(max(single, 1e-300)) + hypothesis.choices))
-        return float(min(bonferroni, self._fall_probability(fall, hypothesis.contrasts)))
+        bonferroni = np.exp(min(0.0, np.log(max(single, 1e-300)) + hypothesis.selection.choices))
+        return float(min(bonferroni, self._fall_probability(fall, hypothesis.selection.contrasts)))
 
     def _fall_probability(self, fall: float, count: int) -> float:
         left = self.redundancy - count
@@ -204,7 +206,9 @@ def _best(model: _Model) -> tuple[list[_Model], bool]:
     # Errors of a real board's points are part of the noise that is fitted: none of them is told but the worst.
     most_points = len(model.run.problem.network.points) if model.exceeds(SUSPECTED) or model.gross_errors else 0
     most_points = 1 if model.is_noise_fitted else most_points
-    falls = [(_first_order_fall(model.run, each.problem), each) for each in model_hypotheses(model.run, most_points)]
+    tested = {board.name for board in model.run.problem.network.boards}
+    rows = chain(camera_hypotheses(model.run), object_hypotheses(model.run, most_points))
+    falls = [(_first_order_fall(model.run, each.problem), each) for each in rows if each.name not in tested]
     level = LEVEL / max(len(falls), 1)
     worth = WORTH * max((fall for fall, _ in falls), default=0.0)
     likely = [(fall, each) for fall, each in falls if fall > worth and model.is_significant(each, fall, level)]
@@ -250,7 +254,7 @@ def _model_explanation(larger: _Model, model: _Model) -> Explanation:
     covariance = model.run.problem.network.observations.covariance_mm2
     sigma_um = UM_PER_MM * float(np.sqrt(np.mean(np.trace(covariance, axis1=1, axis2=2)) / 2.0))
     explained_um = sigma_um * float(np.sqrt(max(model.vpv - larger.vpv, 0.0) / coordinates))
-    words = hypothesis.words(larger.run, hypothesis.added, explained_um)
+    words = hypothesis.words(estimate(larger.run, hypothesis, explained_um))
     return _explanation(hypothesis.kind, words, larger.p, model, larger)
 
 

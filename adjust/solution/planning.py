@@ -9,8 +9,7 @@ from scipy.linalg import qr
 from adjust.array_types import Array
 from adjust.errors import AdjustmentError
 from adjust.least_squares.equations import Numbering
-from adjust.least_squares.iteration import factorise, linearise
-from adjust.linear_algebra.factor import Factor
+from adjust.least_squares.iteration import linearise
 from adjust.problem.condition_equations import blind_marks, computed_observations
 from adjust.problem.estimates import NullDirection
 from adjust.problem.further_observations import error_free
@@ -89,7 +88,11 @@ def plan(network: Network, values: Approximations, options: Options | None = Non
 def _computed_problem(problem: Problem) -> Problem:
     xy_mm = computed_observations(problem, problem.start())
     if xy_mm is None:
-        raise AdjustmentError(_blind(problem))
+        reason, _ = next(iter(blind_marks(problem, problem.start()).values()))
+        raise AdjustmentError(
+            f"The network cannot be planned: {reason}. Turn the camera towards the field, or leave the point out of "
+            "that image."
+        )
     unknowns = problem.unknowns
     network = error_free(problem.network, unknowns, unknowns.start)
     network = replace(network, observations=replace(network.observations, xy_mm=xy_mm))
@@ -104,30 +107,15 @@ def _regularised(problem: Problem) -> tuple[list[int], Array]:
     null = np.zeros((len(problem.unknowns), 0))
     while True:
         numbering = Numbering(replace(problem, unknowns=problem.unknowns.fixed(held)))
-        factor = _factor(numbering)
-        scaled = null_vectors(factor)
+        at = linearise(numbering, problem.network.observations.covariance_mm2, problem.start())
+        assert at is not None  # its observations are computed
+        scaled = null_vectors(at.factor)
         if scaled.shape[1] == 0:
             return held, null
         pivots = qr(scaled.T, mode="r", pivoting=True)[1][: scaled.shape[1]]
         held += [int(position) for position in numbering.free[pivots]]
         still = np.abs(scaled) <= STILL * np.abs(scaled).max(axis=0)
-        by_free = free_cofactor(numbering, problem.start(), factor).by_free
-        vectors = np.where(still, 0.0, scaled) / factor.scale[:, None]
+        by_free = free_cofactor(numbering, problem.start(), at.factor).by_free
+        vectors = np.where(still, 0.0, scaled) / at.factor.scale[:, None]
         moved, could_move = by_free @ vectors, abs(by_free) @ np.abs(vectors)
         null = np.hstack([null, np.where(np.abs(moved) <= STILL * could_move, 0.0, moved)])
-
-
-def _factor(numbering: Numbering) -> Factor:
-    problem = numbering.problem
-    at = linearise(numbering, problem.network.observations.covariance_mm2, problem.start())
-    if at is None:
-        raise AdjustmentError(_blind(problem))
-    return factorise(numbering, at)
-
-
-def _blind(problem: Problem) -> str:
-    reason, _ = next(iter(blind_marks(problem, problem.start()).values()))
-    return (
-        f"The network cannot be planned: {reason}. Turn the camera towards the field, or leave the point out of that "
-        "image."
-    )

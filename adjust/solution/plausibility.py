@@ -32,9 +32,8 @@ def check_plausibility(result: Adjustment, trials: Trials) -> Adjustment:
     if result.termination == "singular" or not result.network.observed_points:
         return result
     views = _views(result)
-    outside = [row for view in views for row in view.outside]
-    remarks = [*_marks_outside(result, sorted(outside), trials)]
-    misread = tuple(_both_sides(result, trials))
+    outside = sorted(row for view in views for row in view.outside)
+    remarks, misread = list(_marks_outside(result, outside, trials)), tuple(_both_sides(result, trials))
     if result.converged and not outside:
         remarks += [each for view in views for each in _principal_point(view, result, trials.family)]
     return replace(result, misread=misread, remarks=(*result.remarks, *remarks))
@@ -90,14 +89,11 @@ def _is_outside(picture: Array, xy_mm: Array) -> Mask:
 
 def _views(result: Adjustment) -> list[_View]:
     """Views of the cameras whose images show object points."""
-    network, run = result.network, result.run
-    xy_mm, views = observed_in_camera(run.problem, run.end.state), []
-    for camera in network.cameras:
-        images = [image for image in network.images if image.camera == camera.name]
-        rows = run.problem.targets_by_camera.get(camera.name)
-        if rows is not None and len(rows):
-            views.append(_View(camera, all(image.transformation == "none" for image in images), rows, xy_mm[rows]))
-    return views
+    xy_mm, images = observed_in_camera(result.run.problem, result.run.end.state), result.network.images
+    films = {image.camera for image in images if image.transformation != "none"}
+    of_camera = result.network.camera_by_name
+    targets = result.run.problem.targets_by_camera.items()
+    return [_View(of_camera[name], name not in films, rows, xy_mm[rows]) for name, rows in targets if len(rows)]
 
 
 def _marks_outside(result: Adjustment, rows: Sequence[int], trials: Trials) -> Iterator[str]:

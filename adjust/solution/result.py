@@ -25,14 +25,12 @@ from adjust.problem.network import Approximations
 from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem
 from adjust.quality.cofactor import (
-    MOST_SHARED,
     NoCofactor,
     cluster_covariance,
     free_cofactor,
     inner_cofactor,
     larger_covariance,
     prediction_errors,
-    shared_positions,
 )
 from adjust.quality.lens_uncertainty import (
     LensReach,
@@ -55,9 +53,8 @@ from adjust.quality.tested import Probabilities
 from adjust.quality.variance_components import factor_sigmas, variance_factor
 from adjust.rank_defect.flat_valleys import held_directions, inseparable
 from adjust.solution.explanations import Explanation, explain
-from adjust.solution.interior_claims import curved_valley_warnings, film_scale_notes, held_decentering_notes
-from adjust.solution.model_hypotheses import diameter_notes
-from adjust.solution.warnings import run_warnings
+from adjust.solution.object_hypotheses import diameter_notes
+from adjust.solution.warnings import curved_valley_warnings, film_scale_notes, held_decentering_notes, run_warnings
 
 
 @dataclass(frozen=True, repr=False)
@@ -66,13 +63,10 @@ class Adjustment(Estimates, PlottedResult):
 
     Attributes
     ----------
-    run : the last adjustment, in reduced coordinates.
-    scaled : the same with the priors used for the cofactor matrix.
-    probabilities : of the tests.
+    run, scaled : the last adjustment, in reduced coordinates; with the priors used for the cofactor matrix.
     iterations, conditions, unknowns, redundancy : counts.
     vpv : v'Pv.
-    singular : null directions of a singular network.
-    history : the iterations.
+    singular, history : null directions of a singular network, and the iterations.
     weights : (n,) factors of robust estimation on the weights of the observations; 1 without it.
     variance_factors : estimated variance factors by group.
     remarks : remarks on how the result was obtained; listed first among the warnings.
@@ -126,13 +120,12 @@ class Adjustment(Estimates, PlottedResult):
     @cached_property
     def variance_sigmas(self) -> Mapping[str, float]:
         """Standard deviations of the variance factors."""
-        has_factors = self._is_tested and self.run.weighting.factors
-        return factor_sigmas(self.run) if has_factors else {}
+        return factor_sigmas(self.run) if self._is_tested and self.run.weighting.factors else {}
 
     @cached_property
     def reliability(self) -> Reliability | None:
         """Baarda's internal and external reliability; None without a solution."""
-        return _reliability(self.run, self.variance, self.probabilities) if self._is_tested else None
+        return reliability(self.run, self.variance, self.probabilities) if self._is_tested else None
 
     @cached_property
     def correlations(self) -> tuple[Correlation, ...]:
@@ -155,15 +148,8 @@ class Adjustment(Estimates, PlottedResult):
         It remains valid where errors within an image are correlated. Fixed quantities have zeros. None without a
         solution or with too few images (`adjust.quality.cofactor`).
         """
-        run, at = self.scaled, shared_positions(self.scaled.numbering)
-        if not self.converged or len(at) > MOST_SHARED:
-            return None
-        found = cluster_covariance(run.numbering, run.end, self.cofactor.part(at))
-        if found is None:
-            return None
-        place = {int(position): number for number, position in enumerate(at)}
-        numbers = [place.get(self.index(each), len(at)) for each in parameters]
-        return np.pad(found, (0, 1))[np.ix_(numbers, numbers)]
+        found = cluster_covariance(self.scaled, self.cofactor) if self.converged else None
+        return None if found is None else found[np.ix_(*2 * [[self.index(each) for each in parameters]])]
 
     def larger_covariance_of(self, parameters: Sequence[Parameter]) -> Array:
         """Return the covariance (k, k) of quantities of cameras.
@@ -180,18 +166,12 @@ class Adjustment(Estimates, PlottedResult):
         Returns the (m,) mean squared standardised length of each image's residuals, each group of images predicted from
         the others (`adjust.quality.cofactor`); None without a solution.
         """
-        run, at = self.scaled, shared_positions(self.scaled.numbering)
-        if not self.converged or len(at) > MOST_SHARED:
-            return None
-        return prediction_errors(run.numbering, run.end, self.cofactor.part(at), folds)
+        return prediction_errors(self.scaled, self.cofactor, folds) if self.converged else None
 
     def lens_reach(self, camera: Camera, frame_mm: tuple[float, float] | None = None) -> LensReach | None:
         """Determine how far out the lens of a camera is known; None without a solution or without targets.
 
-        Parameters
-        ----------
-        camera : camera of the network
-        frame_mm : width and height of the image in mm, None where unknown
+        frame_mm: width and height of the image, None where unknown.
         """
         has_lens = self.converged and camera.name not in self.network.idle_cameras
         return lens_reach(self, camera, frame_mm) if has_lens else None
@@ -207,30 +187,18 @@ class Adjustment(Estimates, PlottedResult):
         distance : distance of the points from the camera in object units; default infinite
         places_mm : (..., 2) image places in the camera frame; default a grid over the image
 
-        Returns
-        -------
-        ProjectionUncertainty
-            See docs/method/reliability.md for the effects that are removed.
-
-        Raises
-        ------
-        AdjustmentError
-            Without a solution, for an unknown camera or for one without targets.
+        Notes
+        -----
+        See docs/method/reliability.md for the effects that are removed. Raises AdjustmentError without a solution, for
+        an unknown camera or for one without targets.
         """
         return projection_uncertainty(self, self.cluster_covariance_of, camera, distance, places_mm)
 
     def plots(self, camera: str = "", pixel_mm: float | None = None) -> CameraPlots:
-        """Collect the data for the plots of a camera.
+        """Collect the data for the plots of a camera, optional where there is one.
 
-        Parameters
-        ----------
-        camera : name; optional where there is one camera
-        pixel_mm : side of a pixel of a digital camera; plots are then in px
-
-        Raises
-        ------
-        AdjustmentError
-            Without a solution, or for an unknown camera.
+        pixel_mm: side of a pixel of a digital camera; plots are then in px. Raises AdjustmentError without a solution,
+        or for an unknown camera.
         """
         shown = only_camera(self, camera)
 
@@ -242,13 +210,7 @@ class Adjustment(Estimates, PlottedResult):
         return adjusted_camera_plots(self, covariance_of, shown, self.residuals.v_mm, uncertainty, pixel_mm)
 
     def to_pandas(self, table: Literal["parameters", "residuals"] = "parameters") -> Any:
-        """Return a table as pandas.DataFrame: one row per quantity or per observation.
-
-        Raises
-        ------
-        ImportError
-            If pandas is not installed.
-        """
+        """Return a table as pandas.DataFrame: one row per quantity or per observation; pandas has to be installed."""
         if table == "residuals":
             return data_frame(residual_columns(self.network.observations, self.residuals))
         return data_frame(parameter_columns(self))
@@ -261,7 +223,7 @@ class Adjustment(Estimates, PlottedResult):
         run, variance, tested = self._explanation_run[1], self.variance, self.reliability
         if run is not self.run:
             variance = variance_factor(run, _redundancy(run, self.cofactor))
-            tested = _reliability(run, variance, self.probabilities)
+            tested = reliability(run, variance, self.probabilities)
         return Snooping(run, self.probabilities).suspects(tested, round(variance.redundancy)) if tested else ()
 
     @cached_property
@@ -340,14 +302,9 @@ def _cofactor(problem: Problem, last: Run, members: Indices | None) -> Cofactor:
 
 
 def run_result(given: Problem, last: Run, members: Indices | None, probabilities: Probabilities) -> Adjustment:
-    """Make the result of the last run.
+    """Make the result of the last run, whose datum was settled in a given problem.
 
-    Parameters
-    ----------
-    given : problem before its datum was settled
-    last : run in that datum
-    members : positions of the coordinates with inner constraints, None without a free datum
-    probabilities : probabilities of the tests
+    members: positions of the coordinates with inner constraints, None without a free datum.
     """
     problem = last.problem
     plain = _cofactor(given, last, members)
@@ -409,7 +366,3 @@ def _redundancy(run: Run, cofactor: Cofactor) -> int:
     further = sum(len(each.observed) for each in problem.further)
     held = held_directions(problem, cofactor.variances) if problem.pseudo_observed else 0
     return int(run.units.sizes[run.weighting.used].sum()) + further + held - len(run.numbering.free)
-
-
-def _reliability(run: Run, variance: VarianceFactor, probabilities: Probabilities) -> Reliability:
-    return reliability(run, variance.sigma0, round(variance.redundancy), probabilities)

@@ -35,12 +35,7 @@ def adjust_unmodelled(network: Network, options: Options | None = None) -> Adjus
     Returns
     -------
     Adjustment
-        The adjustment with the added standard deviations, stored in `unmodelled_mm`.
-
-    Raises
-    ------
-    AdjustmentError
-        As `adjust` does.
+        With the added standard deviations in `unmodelled_mm`. Raises AdjustmentError as `adjust` does.
     """
     diagonal_mm = {each.name: float(np.hypot(*each.frame_mm)) for each in network.cameras}
     sigma_mm = {each: FIRST * diagonal_mm[each] for each in diagonal_mm}

@@ -1,23 +1,34 @@
-"""Warnings about a result, each with its remedy."""
+"""Warnings and notes about a result, each with its remedy.
+
+Some interior orientations depend on what images do not tell. Decentering that is held at 0 is taken up by the principal
+point in straight views of a flat field; where it is free, standard deviations, which are linear, may miss a curved
+valley and other minima. The principal distance of films has the unit of their fiducials.
+"""
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
 from adjust.array_types import Array, Indices, Mask
+from adjust.functional_model.families import family
+from adjust.functional_model.lens import INTERIOR_NAMES
 from adjust.functional_model.transformation import marks_needed
-from adjust.least_squares.iteration import factorise
+from adjust.least_squares.equations import Numbering
+from adjust.least_squares.iteration import factorise, linearise
 from adjust.problem.condition_equations import computed_observations
 from adjust.problem.estimates import Cofactor
 from adjust.problem.observations import Observations
 from adjust.problem.parameter import description, shortened
-from adjust.problem.problem import Problem
+from adjust.problem.problem import Problem, State
+from adjust.quality.cofactor import free_cofactor
 from adjust.quality.run import Residuals, Run
-from adjust.rank_defect.diagnosis import loose_principal_distances, undetermined, weak_directions
+from adjust.rank_defect.diagnosis import loose_principal_distances, singular_directions, undetermined, weak_directions
 from adjust.rank_defect.directions import weak_term_sentences
-from adjust.solution.reweighting import ROUNDS
+from adjust.solution.model_hypotheses import continued_with
+from adjust.solution.reweighting import ROUNDS, again
 
 GROSS = 20.0  # in a-priori standard deviations: a larger residual may come from a confused mark
 NEARER = 0.25  # fraction of the distance of two marks: largest offset of one from the other's expected place
@@ -27,16 +38,13 @@ UNCHECKED = 1e-6  # redundancy of all targets of an image below which its orient
 
 def run_warnings(run: Run, cofactor: Cofactor, residuals: Residuals) -> list[str]:
     """Collect warnings on an adjustment: termination, weak parameters, swapped numbers, unchecked images."""
-    problem, observations = run.problem, run.problem.network.observations
-    unchecked = _unchecked_orientations(observations, residuals) if run.converged else []
     return [
         *_termination(run),
         *_weak_parameters(run, cofactor),
-        *_points_without_image(problem),
-        *_films_by_targets(problem),
+        *_input(run.problem),
         *_swapped_numbers(run, residuals),
-        *_repeated_images(observations),
-        *unchecked,
+        *_repeated_images(run.problem),
+        *(_unchecked_orientations(run.problem, residuals) if run.converged else ()),
     ]
 
 
@@ -81,25 +89,21 @@ def _weak_parameters(run: Run, cofactor: Cofactor) -> Iterator[str]:
         yield from weak_term_sentences(run.numbering, state, run.factor, cofactor)
 
 
-def _points_without_image(problem: Problem) -> list[str]:
-    """Warn of given points without an image."""
-    points = [point.id for point in problem.network.points if point.id not in problem.unknowns.point]
-    return [f"No image shows the object points {shortened(points, 5)}: they take no part."] if points else []
-
-
-def _films_by_targets(problem: Problem) -> list[str]:
-    """Warn of images with too few fiducial marks for their film transformation."""
+def _input(problem: Problem) -> Iterator[str]:
+    """Warn of given points without an image, and of images with too few fiducial marks for their transformation."""
     images = problem.network.images
+    points = [point.id for point in problem.network.points if point.id not in problem.unknowns.point]
+    if points:
+        yield f"No image shows the object points {shortened(points, 5)}: they take no part."
     shown = np.bincount(problem.image_numbers[problem.is_fiducial], minlength=len(images))
     few = [i for i, image in enumerate(images) if shown[i] < marks_needed(image.transformation)]
-    if not few:
-        return []
-    first = images[few[0]]
-    others = f" {len(few) - 1} more images are alike." if len(few) > 1 else ""
-    return [
-        f"Image {first.name} shows {shown[few[0]]} fiducial marks, and its {first.transformation} transformation takes "
-        f"{marks_needed(first.transformation)} of its own: the targets determine the rest of it.{others}"
-    ]
+    if few:
+        first = images[few[0]]
+        others = f" {len(few) - 1} more images are alike." if len(few) > 1 else ""
+        yield (
+            f"Image {first.name} shows {shown[few[0]]} fiducial marks, and its {first.transformation} transformation "
+            f"takes {marks_needed(first.transformation)} of its own: the targets determine the rest of it.{others}"
+        )
 
 
 def _is_gross(observations: Observations, v_mm: Array) -> Mask:
@@ -108,66 +112,68 @@ def _is_gross(observations: Observations, v_mm: Array) -> Mask:
     return np.asarray(np.linalg.norm(v_mm, axis=1) > GROSS * sigma)
 
 
-def _swapped_numbers(run: Run, residuals: Residuals) -> list[str]:
+def _swapped_numbers(run: Run, residuals: Residuals) -> Iterator[str]:
     """Find pairs of marks that each lie where the other is expected, unless most marks of the image do."""
     # The residuals at the start of the adjustment are used, since those orientations follow the majority of the marks.
     # At the end the adjustment has been distorted to fit the wrong ones.
     problem, observations = run.problem, run.problem.network.observations
     if run.converged and not _is_gross(observations, residuals.v_mm).any():
-        return []
+        return
     started = computed_observations(problem, problem.start())
     if started is None:
-        return []
+        return
     found = defaultdict[tuple[bool, str, str], list[str]](list)
     gross = _is_gross(observations, started - observations.xy_mm)
-    for image, rows in _rows_by_image(observations).items():
+    for image, rows in _rows_by_image(problem):
         fiducial = observations.is_fiducial[rows]
         for kind in (False, True):
             marks = rows[fiducial == kind]
             pairs = combinations(marks[gross[marks]].tolist(), 2)
             crossed = [(i, j) for i, j in pairs if _cross(observations.xy_mm, started, i, j)]
             if 2 * len({row for pair in crossed for row in pair}) < len(marks):
-                for i, j in crossed:
-                    first, second = sorted((observations.point[i], observations.point[j]))
+                for pair in crossed:
+                    first, second = sorted(observations.point[i] for i in pair)
                     found[kind, first, second].append(image)
-    return [_swapped(*pair, images) for pair, images in found.items()]
+    for (is_fiducial, first, second), images in found.items():
+        what, several = "fiducial marks" if is_fiducial else "points", len(images) > 1
+        where = f"the images {shortened(images, NAMED)}" if several else f"image {images[0]}"
+        yield (
+            f"The {what} {first} and {second} of {where} each lie where the other is expected: "
+            f"their numbers{', or the coordinates given to them,' if several else ''} may be swapped."
+        )
 
 
-def _unchecked_orientations(observations: Observations, residuals: Residuals) -> list[str]:
+def _unchecked_orientations(problem: Problem, residuals: Residuals) -> Iterator[str]:
     """Warn of images whose orientation no redundant target checks."""
-    found = []
-    for name, rows in _rows_by_image(observations).items():
-        targets = rows[~observations.is_fiducial[rows]]
+    for name, rows in _rows_by_image(problem):
+        targets = rows[~problem.is_fiducial[rows]]
         if len(targets) and residuals.redundancy[targets].sum() < UNCHECKED:
-            found.append(
+            yield (
                 f"Nothing checks the orientation of image {name}: its {len(targets)} targets just determine it, "
                 f"and an error of one of them would not show. Measure more targets in it."
             )
-    return found
 
 
-def _repeated_images(observations: Observations) -> list[str]:
+def _repeated_images(problem: Problem) -> Iterator[str]:
     """Warn of images with the same coordinates of all marks: the same picture under two names."""
-    first, pairs = dict[bytes, str](), []
-    for name, rows in _rows_by_image(observations).items():
+    observations, first, pairs = problem.network.observations, dict[bytes, str](), []
+    for name, rows in _rows_by_image(problem):
         ordered = rows[np.argsort(np.array(observations.point)[rows], kind="stable")]
         other = first.setdefault(observations.xy_mm[ordered].tobytes(), name)
         if other != name:
             pairs.append(f"{name} as {other}")
-    if not pairs:
-        return []
-    return [
-        f"All marks have the same coordinates in {shortened(pairs, NAMED)}: a picture under two names counts twice, "
-        "and standard deviations are too small. Leave one of them out."
-    ]
+    if pairs:
+        yield (
+            f"All marks have the same coordinates in {shortened(pairs, NAMED)}: a picture under two names counts "
+            "twice, and standard deviations are too small. Leave one of them out."
+        )
 
 
-def _rows_by_image(observations: Observations) -> dict[str, Indices]:
-    """Group the rows by image, in order of first appearance."""
-    rows = defaultdict[str, list[int]](list)
-    for row, image in enumerate(observations.image):
-        rows[image].append(row)
-    return {image: np.array(own, dtype=np.intp) for image, own in rows.items()}
+def _rows_by_image(problem: Problem) -> Iterator[tuple[str, Indices]]:
+    """Rows of each image that shows any mark, in order of first appearance."""
+    numbers, first = np.unique(problem.image_numbers, return_index=True)
+    for number in numbers[np.argsort(first)]:
+        yield problem.network.images[number].name, np.flatnonzero(problem.image_numbers == number)
 
 
 def _cross(observed_mm: Array, expected_mm: Array, i: int, j: int) -> bool:
@@ -176,10 +182,97 @@ def _cross(observed_mm: Array, expected_mm: Array, i: int, j: int) -> bool:
     return bool(off.max() < NEARER * np.linalg.norm(observed_mm[i] - observed_mm[j]))
 
 
-def _swapped(is_fiducial: bool, first: str, second: str, images: Sequence[str]) -> str:
-    what, several = "fiducial marks" if is_fiducial else "points", len(images) > 1
-    where = f"the images {shortened(images, NAMED)}" if several else f"image {images[0]}"
-    return (
-        f"The {what} {first} and {second} of {where} each lie where the other is expected: "
-        f"their numbers{', or the coordinates given to them,' if several else ''} may be swapped."
-    )
+WORSE = 2.0  # ratio of standard deviations with decentering free and held at 0 above which it is told
+CORRELATED = 0.9  # correlation of a principal point with a distortion parameter above which its valley is followed
+FAR = 5.0  # standard deviations by which it is moved
+FILM_SCALE = 1.5e-3  # film keeps its size better than that, most scanners too
+CLAIMS = 5.0  # standard deviations of c by which another unit of the fiducials would move it
+CURVED = 0.5  # share of the rise of v'Pv that these promise below which they are too small
+STEPS = 60
+
+
+def held_decentering_notes(run: Run, cofactor: Cofactor) -> Iterator[str]:
+    """Note where the principal point depends on decentering distortion that is held at 0."""
+    for camera in run.problem.network.cameras:
+        of = family(camera.distortion.family)
+        terms = dict(of.groups).get("decentering", ())[:2]
+        positions = run.problem.unknowns.camera.get(camera.name)
+        if positions is None or not terms:
+            continue
+        point, added = positions[1:3], positions[[3 + of.parameters.index(name) for name in terms]]
+        sigma = run.numbering.problem.prior_sigma
+        if sigma[added].any() or not sigma[point].all():
+            continue
+        weighted, covariance = run.weighting.applied(continued_with(run, added))
+        numbering = Numbering(weighted)
+        if (at := linearise(numbering, covariance, weighted.start())) is None:
+            continue
+        variances = np.full(2, np.inf)
+        if not singular_directions(numbering, at.state, at.factor):
+            variances = free_cofactor(numbering, at.state, at.factor).variances[point]
+        ratio = np.sqrt(variances / cofactor.variances[point])
+        if ratio.max() > WORSE:
+            many = f"{ratio.max():.2g} times as large" if np.isfinite(ratio.max()) else "infinite"
+            yield (
+                f"The images of camera {camera.name} hardly tell its principal point from decentering distortion, "
+                f"which is held at 0: with {' and '.join(terms)} free, its standard deviation would be {many}. Free "
+                "them, or add images with other tilts."
+            )
+
+
+def curved_valley_warnings(run: Run, cofactor: Cofactor) -> Iterator[str]:
+    """Warn where a principal point moved by FAR standard deviations, all else adjusted, fits as well."""
+    problem = run.problem
+    for name, positions in problem.unknowns.camera.items():
+        free = positions[run.numbering.problem.prior_sigma[positions] > 0.0]
+        covariance = cofactor.part(free)
+        sigma = np.sqrt(np.diag(covariance))
+        correlation = np.abs(covariance / np.outer(sigma, sigma))
+        of_lens = ~np.isin(free, positions[: len(INTERIOR_NAMES)])
+        for k, position in enumerate(free):
+            is_unknown = position in positions[1 : len(INTERIOR_NAMES)] and np.isinf(problem.unknowns.sigma[position])
+            if not is_unknown or correlation[k, of_lens].max(initial=0.0) < CORRELATED:
+                continue
+            rises = []
+            for sign in (-1.0, 1.0):
+                values = run.end.state.values.copy()
+                values[position] += sign * FAR * sigma[k]
+                held = replace(problem, unknowns=problem.unknowns.fixed([int(position)]))
+                moved = again(replace(run, problem=held), run.weighting, STEPS, State(values, run.end.state.rotations))
+                rises += [(moved.vpv - run.vpv, sign)] if moved.converged else []
+            least, sign = min(rises, default=(np.inf, 0.0))
+            if least < CURVED * FAR**2:
+                what = problem.unknowns.parameters[position].quantity
+                yield (
+                    f"The images hardly tell {what} of camera {name} from its distortion, and its standard deviation "
+                    f"is too small: moved by {sign * FAR * sigma[k]:+.2g} mm, {FAR:g} of them, it fits "
+                    f"{'better' if least < 0.0 else 'nearly as well'} (v'Pv rises by {least:.2g}, not by {FAR**2:g}). "
+                    "Hold the decentering distortion at 0, give principal_point_mm, or add images with other tilts."
+                )
+
+
+def film_scale_notes(run: Run, cofactor: Cofactor) -> Iterator[str]:
+    """Note where the fiducials of all films lie farther apart, or nearer, than given: c changes in that ratio."""
+    problem, observations = run.problem, run.problem.network.observations
+    for camera in problem.network.cameras:
+        given = {id_: np.array([mark.x_mm.value, mark.y_mm.value]) for id_, mark in camera.fiducials.items()}
+        scales = []
+        for number, image in enumerate(problem.network.images):
+            rows = np.flatnonzero(problem.is_fiducial & (problem.image_numbers == number))
+            rows = np.array([row for row in rows if observations.point[row] in given], dtype=np.intp)
+            if image.camera == camera.name and image.transformation != "congruent" and len(rows) > 2:
+                places = np.array([given[observations.point[row]] for row in rows]), observations.xy_mm[rows]
+                expected, found = (np.linalg.norm(each - each.mean(axis=0)) for each in places)
+                scales.append(found / expected)
+        at = problem.unknowns.camera.get(camera.name)
+        if at is None or not scales:
+            continue
+        off, c_mm = float(np.mean(scales)) - 1.0, float(run.end.state.values[at[0]])
+        sigma_mm = float(np.sqrt(cofactor.variances[at[0]]))
+        if abs(off) > FILM_SCALE and 0.0 < CLAIMS * sigma_mm < abs(off) * c_mm:
+            yield (
+                f"The fiducials of camera {camera.name} lie {100.0 * abs(off):.2g} % "
+                f"{'farther apart' if off > 0.0 else 'nearer to each other'} in the scans than given. c counts in the "
+                f"unit of the given coordinates: if these are wrong, not the film or the scanner's pitch, c is "
+                f"{abs(off) * c_mm:.2g} mm off."
+            )

@@ -1,0 +1,262 @@
+"""Hypotheses on errors of the given points: a deformed object, disks of another diameter, wrong coordinates."""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from itertools import combinations, product
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from adjust.array_types import Array
+from adjust.functional_model.board import BoardForm, board_form, disk_directions, strain_directions
+from adjust.least_squares.equations import Numbering
+from adjust.least_squares.iteration import linearise
+from adjust.problem.condition_equations import computed_observations
+from adjust.problem.network import Network
+from adjust.problem.parameter import shortened
+from adjust.problem.problem import State
+from adjust.quality.cofactor import free_cofactor
+from adjust.quality.run import Run
+from adjust.solution.model_hypotheses import Estimate, ModelHypothesis, Words, continued_with, displaced
+from adjust.solution.partitions import Selection, displaced_points
+
+CLEAR = 3.0  # standard deviations above which one of two changes of a board is told
+FEWEST_GIVEN, FEWEST_IMAGES = 5, 2  # given points, and images of one, that tell a wrong one
+NAMED = 5  # points named with their errors
+
+
+def object_hypotheses(run: Run, most_points: int) -> Iterator[ModelHypothesis]:
+    """Hypotheses on the given points; most_points: that may be wrong together."""
+    yield from _deformations(run)
+    if most_points:
+        yield from _wrong_points(run, most_points)
+
+
+INDEPENDENT = "points' unit; ± for independent errors, on real boards up to 5 times as much"
+
+
+def _deformations(run: Run) -> Iterator[ModelHypothesis]:
+    """A strain of the object of all given points; a bend or a twist of a flat one, or another diameter of its disks."""
+    network = run.problem.network
+    if not _is_given(network):
+        return
+
+    def bent(found: Estimate) -> tuple[str, str]:
+        (x, y), (x_sigma, y_sigma) = found.value, found.sigma
+        return (
+            f"The board of the given points is not flat: its middle stands {x:.3g} ± {x_sigma:.1g} off along its first "
+            f"axis and {y:.3g} ± {y_sigma:.1g} along its second ({INDEPENDENT})",
+            'Put it on a flat plate, or let its bend be adjusted: board_bend = "free" under [object] in project.toml.',
+        )
+
+    def twisted(found: Estimate) -> tuple[str, str]:
+        return (
+            f"The board of the given points is twisted: two opposite corners stand {abs(found.value[0]):.3g} ± "
+            f"{found.sigma[0]:.1g} above its plane, the others as much below it ({INDEPENDENT})",
+            "Put it on a flat plate.",
+        )
+
+    form = _flat_form(network)
+    axes = np.eye(3) if form is None else form.axes
+    strain = strain_directions(np.array(list(network.known_places.values())), axes)
+    rows: list[tuple[str, Words, Array]] = [("strain", lambda found: _strain_words(len(axes), found), strain)]
+    if form is not None:
+        is_bent = any(board.by_observation is None for board in network.boards)
+        rows += [] if is_bent else [("bend", bent, form.bend_directions)]
+        rows += [("twist", twisted, form.twist_directions)]
+    for name, words, directions in rows:
+        by_point = dict(zip(network.known_places, directions, strict=True))
+        yield displaced(run, name, "board", words, _of_targets(run, by_point))
+    yield from _disks(run)
+
+
+def _strain_words(count: int, found: Estimate) -> tuple[str, str]:
+    """Describe stretches and shears of a flat board (count 2) or of an object in space (3)."""
+    value, names = found.value, ("X", "Y", "Z") if count > 2 else ("its first axis", "its second")
+    middle = int(np.argsort([*value[: count - 1], 0.0])[(count - 1) // 2 if count > 2 else 1])
+    # Stretches relative to the axis in the middle.
+    stretches = np.vstack([np.eye(len(value))[: count - 1], np.zeros(len(value))])
+    rows = [
+        (stretches[i] - stretches[middle], 100.0, f"% {{}} along {names[i]} than along {names[middle]}")
+        for i in range(count)
+        if i != middle
+    ]
+    rows += [
+        (row, 1000.0, f"mrad off in the angle of {names[i]} and {names[j]}")
+        for row, (i, j) in zip(np.eye(len(value))[count - 1 :], combinations(range(count), 2), strict=True)
+    ]
+    changes = [(float(row @ value), np.sqrt(row @ found.covariance @ row), unit, what) for row, unit, what in rows]
+    significant = [each for each in changes if abs(each[0]) > CLEAR * each[1]] or changes
+    told = " and ".join(
+        f"{abs(unit * v):.3g} ± {unit * s:.1g} {what.format('longer' if v > 0.0 else 'shorter')}"
+        for v, s, unit, what in significant
+    )
+    what = "board" if count == 2 else "object"
+    return (
+        f"The {what} of the given points has another shape than given: it is {told}",
+        f"Measure the {what} and give the coordinates that it has: printers stretch paper in one direction.",
+    )
+
+
+def _is_given(network: Network) -> bool:
+    """Whether all points of an object are given, and enough to test its shape."""
+    return len(network.known_places) >= max(FEWEST_GIVEN, len(network.observed_points))
+
+
+def _flat_form(network: Network) -> BoardForm | None:
+    try:
+        return board_form(np.array(list(network.known_places.values())))
+    except ValueError:
+        return None
+
+
+def _of_targets(run: Run, by_point: Mapping[str, Array]) -> Array:
+    """(n, k, 3) displacements of the points of all targets, of those (k, 3) by name; 0 for others."""
+    none = np.zeros_like(next(iter(by_point.values())))
+    return np.array([by_point.get(name, none) for name in run.problem.network.observations.point])
+
+
+MISMEASURED = 0.1  # relative error of the given diameter of disks whose effect is reported
+
+
+def _possible_radius(run: Run) -> float:
+    """Radius of disks: as given, or where it is not a quarter of the distance of neighbours."""
+    network = run.problem.network
+    if network.disk_radius is not None:
+        return network.disk_radius
+    xyz = np.array(list(network.known_places.values()))
+    nearest, _ = KDTree(xyz).query(xyz, 2)
+    return float(np.median(np.asarray(nearest)[:, 1])) / 4.0
+
+
+def _disks(run: Run) -> Iterator[ModelHypothesis]:
+    """Another squared radius of disks on a board than given, or one where nothing says that the points are disks."""
+    problem, state, network = run.problem, run.end.state, run.problem.network
+    given = network.disk_radius
+    form = _flat_form(network) if _is_given(network) and given != 0.0 else None
+    if form is None:
+        return
+    radius, at = _possible_radius(run), dict[tuple[int, int], Array]()
+    points = np.array([at for id_, at in problem.unknowns.point.items() if id_ in network.known_places])
+    shown = network.observations.has_kind("target")
+    for i, j in product((-1, 0, 1), repeat=2):
+        values = state.values.copy()
+        values[points] += radius * (np.array([i, j]) @ form.axes)
+        if (computed := computed_observations(problem, State(values, state.rotations))) is None:
+            return
+        at[i, j] = computed[shown]
+
+    def words(found: Estimate) -> tuple[str, str]:
+        sigma, diameter = found.sigma[0], 2.0 * np.sqrt(max((given or 0.0) ** 2 + found.value[0], 0.0))
+        told = f"{diameter:.3g} ± {2.0 * sigma / max(diameter, np.sqrt(sigma)):.1g} (points' unit)"
+        if given is None:
+            return (
+                "The points are centres of dots, whose perspective is not corrected: their diameter is found as "
+                f"{told}",
+                'Give their diameter_mm under [targets], kind = "disk".',
+            )
+        return (
+            f"The disks do not have the diameter of {2.0 * given:.4g} that is given, or the points another spacing: by "
+            f"the coordinates it is found as {told}",
+            "Measure a disk, and from one to the next; correct diameter_mm or the coordinates and their unit.",
+        )
+
+    directions = np.zeros((len(shown), 1, 3))
+    directions[shown] = disk_directions(at, form.axes, radius)
+    limits = (-np.inf, np.inf) if given is not None else (0.0, (2.0 * radius) ** 2)
+    yield replace(displaced(run, "disks", "disks", words, directions), limits=limits)
+
+
+def diameter_notes(run: Run) -> Iterator[str]:
+    """Note where a wrong diameter of the disks, or one that is not given, changes c by more than its deviation."""
+    for each in _disks(run) if run.converged else ():
+        unknowns, (radius_squared,) = each.problem.unknowns, each.added
+        weighted, covariance = run.weighting.applied(each.problem)
+        numbering = Numbering(weighted)
+        if (at := linearise(numbering, covariance, weighted.start())) is None:
+            return
+        cofactor = free_cofactor(numbering, at.state, at.factor)
+        given = run.problem.network.disk_radius
+        for camera, (c, *_) in unknowns.camera.items():
+            (own, common), (_, square) = cofactor.part(np.array([c, radius_squared]))
+            squared = _possible_radius(run) ** 2 if given is None else ((1.0 + MISMEASURED) ** 2 - 1.0) * given**2
+            change = squared * common / square
+            if abs(change) <= np.sqrt(own - common**2 / square):
+                continue
+            if given is not None:
+                yield (
+                    f"The diameter of the disks is taken as exact: if it is {100.0 * MISMEASURED:.0f} % larger, c of "
+                    f"camera {camera} changes by {change:+.2g} mm."
+                )
+            elif squared - at.factor.solution[numbering.numbers[radius_squared]] < CLEAR * np.sqrt(square):
+                yield (
+                    "Nothing says whether the points are corners or the centres of dots: if they are dots of a "
+                    f"diameter of {2.0 * np.sqrt(squared):.2g} (points' unit), whose perspective is not corrected, c "
+                    f"of camera {camera} changes by {change:+.2g} mm. Give their diameter_mm under [targets], kind = "
+                    '"disk".'
+                )
+
+
+MOST_NAMED = 10  # points named in a message
+
+
+def _wrong_points(run: Run, most: int) -> Iterator[ModelHypothesis]:
+    """Wrong coordinates of fixed points, each by itself, or of a line or a side of a regular field by one shift.
+
+    Coordinates that are given with a standard deviation are observations, tested by data snooping.
+    """
+    network, unknowns = run.problem.network, run.problem.unknowns
+    images = Counter(name for name, _ in set(zip(network.observations.point, network.observations.image, strict=True)))
+    names = tuple(
+        name
+        for name, at in unknowns.point.items()
+        if not unknowns.sigma[at].any() and images[name] >= FEWEST_IMAGES and name in network.known_places
+    )
+    if len(names) < FEWEST_GIVEN:
+        return
+    form, positions = _flat_form(network), np.concatenate([unknowns.point[name] for name in names])
+    axes = np.eye(3) if form is None else form.axes
+    for selection in displaced_points(run, axes, continued_with(run, positions), names, most):
+        added = np.concatenate([unknowns.point[name] for name in selection.names])
+        words = _point_words(selection, unknowns.given[added])
+        if selection.words:
+            moved = _of_targets(run, dict.fromkeys(selection.names, np.eye(3)))
+            found = displaced(run, "group", "point", words, moved)
+        else:
+            found = ModelHypothesis("point", words, continued_with(run, added), added)
+        yield replace(found, selection=selection)
+
+
+def _point_words(selection: Selection, given: Array) -> Words:
+    """Words on points that lie elsewhere than given (3 k,), or on a group with one shift."""
+    names, remedy = selection.names, "Correct the coordinates of these points, or their numbers among the marks."
+
+    def words(found: Estimate) -> tuple[str, str]:
+        offs = -found.value[None] if selection.words else (given - found.value).reshape(-1, 3)
+        by = [_shift_words(*each) for each in zip(offs, found.sigma.reshape(-1, 3), strict=True)]
+        some = shortened(names, MOST_NAMED)
+        if selection.words:
+            return (
+                f"The points {some} ({selection.words}) are not where they are given: all their coordinates are off, "
+                f"{by[0]} (points' unit)",
+                remedy,
+            )
+        if len(names) == 1:
+            return (
+                f"Point {names[0]} is not where it is given: its coordinates are off, {by[0]} (points' unit)",
+                "Correct the coordinates of this point, or its number among the marks.",
+            )
+        worst = np.argsort(-np.linalg.norm(offs, axis=1), kind="stable")[:NAMED]
+        return (
+            f"{len(names)} points are not where they are given: {some}; the coordinates of the worst are off, "
+            f"{'; '.join(f'{names[k]}: {by[k]}' for k in worst)} (points' unit)",
+            remedy,
+        )
+
+    return words
+
+
+def _shift_words(off: Array, sigma: Array) -> str:
+    digits = [max(0, -int(np.floor(np.log10(max(s, 1e-12))))) for s in sigma]
+    return ", ".join(f"{axis} by {d:+.{n}f} ± {s:.1g}" for axis, d, s, n in zip("XYZ", off, sigma, digits, strict=True))

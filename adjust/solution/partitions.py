@@ -1,0 +1,237 @@
+"""Images and given points that differ from the others, selected by what their changes lower v'Pv to first order.
+
+With all other unknowns eliminated, changes d lower v'Pv by 2 g'd - d'N d, at most by g' N⁻¹ g. Images: the change of
+c, x0' and y0' of each image alone, its own orientation and film eliminated; the best partition is found by weighted
+two-means, started from the best thresholds of these changes in some directions. Points: displacements of single ones,
+or one shift of a line of a regular field or of all points beyond it, with the sums of their rows and columns of N.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+
+import numpy as np
+from scipy.special import chdtri, gammaln
+
+from adjust.array_types import Array, Indices, Mask
+from adjust.functional_model.lens import INTERIOR_NAMES
+from adjust.least_squares.equations import Numbering
+from adjust.least_squares.iteration import linearise
+from adjust.problem.problem import Problem
+from adjust.quality.cofactor import image_equations
+from adjust.quality.run import Run, derivatives_by
+
+FLAT = 1e-9  # fraction of the largest eigenvalue below which a direction is undetermined
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Images or points that a hypothesis was selected for.
+
+    words: of points with one shift, else empty. choices: natural logarithm of the number of selections that it is the
+    best of. contrasts: number of unknowns that all of these would have together. p_scatter: computes the p-value of so
+    clear a partition of images whose interior orientations scatter normally.
+    """
+
+    names: tuple[str, ...] = ()
+    words: str = ""
+    choices: float = 0.0
+    contrasts: int = 0
+    p_scatter: Callable[[], float] = float
+
+
+def freed(problem: Problem, positions: Indices) -> Problem:
+    """Drop the given values of some quantities of a problem."""
+    sigma = problem.unknowns.sigma.copy()
+    sigma[positions] = np.inf
+    return replace(problem, unknowns=replace(problem.unknowns, sigma=sigma))
+
+
+MOST_TURNS = 20  # iterations of two-means
+DRAWS = 4000  # simulated sets of images
+
+
+def two_groups(run: Run, camera: str) -> Selection | None:
+    """Select the smaller part of the best partition of a camera's frames; None with fewer than three frames."""
+    names, normal, right = _interior_equations(run, camera)
+    if len(names) < 3:
+        return None
+    interior = run.end.state.values[run.problem.unknowns.camera[camera][: len(INTERIOR_NAMES)]]
+    along = np.vstack([np.eye(3), interior / np.linalg.norm(interior)])  # c, x0', y0', scale of the whole image
+    single = (right @ along.T) / np.maximum(np.einsum("di,mij,dj->md", along, normal, along), 1e-300)
+    starts = [_threshold(normal, right, change) for change in np.hstack([_solved(normal, right), single]).T]
+
+    def fall(mask: Mask) -> float:
+        return float(sum(quadratic(normal[some].sum(axis=0), right[some].sum(axis=0)) for some in (mask, ~mask)))
+
+    mask = max((_two_means(normal, right, start) for start in starts), key=fall)
+    smaller = mask if 2 * mask.sum() <= len(names) else ~mask
+    contrasts, choices = len(names) - 1, (len(names) - 1) * float(np.log(2.0)) + float(np.log(len(along)))
+    scatter = partial(_scatter_probability, normal, right, mask)
+    return Selection(_some(names, smaller), "", choices, len(INTERIOR_NAMES) * contrasts, scatter)
+
+
+def _some(names: tuple[str, ...], mask: Mask) -> tuple[str, ...]:
+    return tuple(name for name, is_in in zip(names, mask, strict=True) if is_in)
+
+
+def _interior_equations(run: Run, camera: str) -> tuple[tuple[str, ...], Array, Array]:
+    """Names of a camera's frames with targets, and normal equations (m, 3, 3), (m, 3) of c, x0' and y0' of each."""
+    problem, covariance = run.weighting.applied(run.problem)
+    positions = problem.unknowns.camera[camera][: len(INTERIOR_NAMES)]
+    numbering = Numbering(freed(problem, positions))
+    at = linearise(numbering, covariance, run.end.state)
+    network = problem.network
+    frames = tuple(dict.fromkeys(image.frame for image in network.images))
+    shown = {
+        each.frame for each in network.images if each.camera == camera and each.name not in network.objectless_images
+    }
+    names, normal, right = list[str](), list[Array](), list[Array]()
+    for frame, by_interior, discrepancies in image_equations(numbering, at, positions) if at is not None else ():
+        if frames[frame] in shown:
+            names.append(frames[frame])
+            normal.append(by_interior.T @ by_interior)
+            right.append(by_interior.T @ discrepancies)
+    return tuple(names), np.array(normal).reshape(-1, 3, 3), np.array(right).reshape(-1, 3)
+
+
+def _threshold(normal: Array, right: Array, change: Array) -> Mask:
+    """Mask of images whose change (m,) lies above the best threshold."""
+    order = np.argsort(change, kind="stable")
+    below = np.cumsum(normal[order], axis=0)[:-1], np.cumsum(right[order], axis=0)[:-1]
+    above = normal.sum(axis=0) - below[0], right.sum(axis=0) - below[1]
+    mask = np.ones(len(order), dtype=bool)
+    mask[order[: np.argmax(quadratic(*below) + quadratic(*above)) + 1]] = False
+    return mask
+
+
+def _two_means(normal: Array, right: Array, mask: Mask) -> Mask:
+    for _ in range(MOST_TURNS):
+        changes = [_solved(normal[some].sum(axis=0), right[some].sum(axis=0)) for some in (mask, ~mask)]
+        own, other = (right @ change - 0.5 * ((normal @ change) @ change) for change in changes)
+        moved = own > other
+        if (moved == mask).all() or moved.all() or not moved.any():
+            return mask
+        mask = moved
+    return mask
+
+
+def _scatter_probability(normal: Array, right: Array, mask: Mask) -> float:
+    """p-value of the partition's clearness along the difference of its groups, by simulation of normal scatter."""
+    # The variance between images is that of DerSimonian and Laird's method of moments (1986).
+    one, other = (_solved(normal[some].sum(axis=0), right[some].sum(axis=0)) for some in (mask, ~mask))
+    weight = np.einsum("i,mij,j->m", one - other, normal, one - other)
+    known = weight > 0.0
+    weight, change = weight[known], (right @ (one - other))[known] / weight[known]
+    total = weight.sum()
+    scatter = float((weight * (change - (weight * change).sum() / total) ** 2).sum())
+    between = max(0.0, scatter - len(weight) + 1.0) / (total - (weight**2).sum() / total)
+    drawn = np.random.default_rng(0).normal(size=(DRAWS, len(weight))) * np.sqrt(between + 1.0 / weight)
+    return float(np.mean(_clearness(drawn, weight) >= _clearness(change[None], weight)))
+
+
+def _clearness(changes: Array, weight: Array) -> Array:
+    """(n,) fractions of the weighted sums of squares of changes (n, m) that lie between the groups of their best
+    partitions."""
+    order = np.argsort(changes, axis=1)
+    weights, ordered = weight[order], np.take_along_axis(changes, order, axis=1)
+    total = weight.sum()
+    centred = ordered - (weights * ordered).sum(axis=1, keepdims=True) / total
+    below = np.cumsum(weights, axis=1)[:, :-1]
+    between = np.cumsum(weights * centred, axis=1)[:, :-1] ** 2 * (1.0 / below + 1.0 / (total - below))
+    return np.asarray(between.max(axis=1) / (weights * centred**2).sum(axis=1))
+
+
+FEWEST, MOST = 5, 400  # given points: so many tell a wrong one; N is dense
+MOST_WRONG = 1 / 3  # fraction of the points
+SAME_LINE = 1e-3  # fraction of the field's extent by which the points of a line lie off it
+REGULAR = 2.0  # points per line of a regular field, on average, at least
+LEVEL = 0.001  # probability of a point that is not wrong beside those that are
+
+
+def displaced_points(run: Run, axes: Array, problem: Problem, names: tuple[str, ...], most: int) -> Iterator[Selection]:
+    """Select the best single points and the best group with one shift among points.
+
+    axes (m, 3): of the field, along which points form lines; problem: the one in which the points `names` are free;
+    most: single points at most.
+    """
+    system = _point_equations(run, problem, names) if FEWEST <= len(names) <= MOST else None
+    if system is None:
+        return
+    normal, right = system
+    vpv, redundancy = run.group_sums(run.weighting.used)
+    single = _single_points(normal, right, vpv, redundancy)[:most]
+    if len(single):
+        count = len(names)
+        choices = gammaln(count + 1) - gammaln(len(single) + 1) - gammaln(count - len(single) + 1)
+        yield Selection(tuple(names[k] for k in single), "", float(choices), 3 * (count - 1))
+    groups = list(_lines(np.array([run.problem.network.known_places[name] for name in names]), axes))
+    if groups:
+        members = np.array([mask for _, mask in groups], dtype=float)
+        of_groups = np.einsum("li,iajb,lj->lab", members, normal, members, optimize=True)
+        words, mask = groups[int(np.argmax(quadratic(of_groups, members @ right)))]
+        yield Selection(_some(names, mask), words, float(np.log(len(groups))))
+
+
+def _point_equations(run: Run, problem: Problem, names: tuple[str, ...]) -> tuple[Array, Array] | None:
+    """N (p, 3, p, 3) and g (p, 3) of points, the unknowns of the run eliminated."""
+    weighted, covariance = run.weighting.applied(problem)
+    at = linearise(Numbering(weighted), covariance, weighted.start())
+    if at is None:
+        return None
+    positions, count = np.concatenate([weighted.unknowns.point[name] for name in names]), len(names)
+    by_points = derivatives_by(weighted, at.rows.matrix, positions)
+    across = (run.unit_functions[: by_points.shape[0]].T @ by_points).toarray()
+    normal = (by_points.T @ by_points).toarray() - across.T @ run.factor.cofactor_times(across)
+    return normal.reshape(count, 3, count, 3), (by_points.T @ at.rows.right.ravel()).reshape(count, 3)
+
+
+def _single_points(normal: Array, right: Array, vpv: float, redundancy: float) -> list[int]:
+    """Select points by forward selection, as long as one is significant beside those before it."""
+    count = len(right)
+    flat, g = normal.reshape(3 * count, 3 * count).copy(), right.ravel().copy()
+    chosen, left = list[int](), [vpv]
+    for _ in range(min(int(MOST_WRONG * count), int(redundancy / 3.0) - 1)):
+        blocks = flat.reshape(count, 3, count, 3)[range(count), :, range(count)]
+        falls = quadratic(blocks, g.reshape(count, 3))
+        falls[chosen] = 0.0
+        best = int(np.argmax(falls))
+        own = slice(3 * best, 3 * best + 3)
+        through = flat[:, own] @ np.linalg.pinv(flat[own, own], rcond=FLAT, hermitian=True)
+        g, flat = g - through @ g[own], flat - through @ flat[own]
+        chosen.append(best)
+        left.append(left[-1] - float(falls[best]))
+    variance = max(1.0, left[-1] / (redundancy - 3.0 * len(chosen))) if chosen else 1.0
+    costs = np.array(left) / variance + chdtri(3, LEVEL / count) * np.arange(len(left))
+    return chosen[: int(np.argmin(costs))]
+
+
+def _lines(xyz: Array, axes: Array) -> Iterator[tuple[str, Mask]]:
+    """Masks of the lines of a regular field along its axes, and of all points beyond each, with words."""
+    along = (xyz - xyz.mean(axis=0)) @ axes.T
+    extent = float(np.ptp(along, axis=0).max())
+    for axis, what in product(range(len(axes)), ("line", "beyond")):
+        order = np.sort(along[:, axis])
+        ends = np.flatnonzero(np.diff(order) > SAME_LINE * extent)
+        places = [float(part.mean()) for part in np.split(order, ends + 1)]
+        if len(places) < 3 or len(xyz) < REGULAR * len(places):
+            continue
+        halfway = (np.array(places[1:]) + places[:-1]) / 2.0
+        if what == "line":
+            for low, high in zip([-np.inf, *halfway], [*halfway, np.inf], strict=True):
+                yield "a row", (along[:, axis] > low) & (along[:, axis] < high)
+        else:
+            for cut in halfway[1:-1]:
+                below = along[:, axis] < cut
+                yield "all on one side of a line", below if 2 * below.sum() <= len(xyz) else ~below
+
+
+def quadratic(normal: Array, right: Array) -> Array:
+    """g' N⁻¹ g of one system (k, k), (k,) or of many."""
+    return np.asarray((right * _solved(normal, right)).sum(axis=-1))
+
+
+def _solved(normal: Array, right: Array) -> Array:
+    """N⁻¹ g of one system (k, k), (k,) or of many."""
+    return np.asarray((np.linalg.pinv(normal, rcond=FLAT, hermitian=True) @ right[..., None])[..., 0])
