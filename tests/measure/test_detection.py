@@ -13,9 +13,9 @@ from true_marks import KIND, some_mark
 
 from measure import FiducialOptions, MatchOptions, Scan
 from measure.detection.correlation import CLOSE, GRAINY, WIDE, Map, Surroundings, correlation
-from measure.detection.faint_marks import FaintMark, detect_faint
 from measure.detection.localisation import MarkPrediction, localise
 from measure.detection.responses import ByteCache, CorrelationMaps, Responses, Templates
+from measure.fiducials.faint_marks import FaintMark, detect_faint
 from measure.fiducials.mark_fit import detect_mark
 from measure.flags import Cause
 from measure.marks.shapes import Bar, MarkShape, cross, dot, polygon, ring_cross
