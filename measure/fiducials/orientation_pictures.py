@@ -4,7 +4,7 @@ at each place."""
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -32,8 +32,7 @@ _CHANCE_SIGMAS = 3.0  # standard deviations by which noise may enlarge a differe
 SPOILT = 0.01  # probability that writing, dust or an adjacent object imitates or hides a difference between marks
 
 
-@dataclass(frozen=True, eq=False)
-class PosedMark:
+class PosedMark(NamedTuple):
     """Mark that a scan orientation predicts at a site. turn (2, 2): from its x and y to right and up. mark None: plain
     background."""
 
@@ -59,9 +58,20 @@ class View:
     covered: Mask
     noise: float = 0.0
 
-    def replace_pictures(self, change: Callable[[Any], Any]) -> "View":
+    def change(self, change: Callable[[Any], Any]) -> "View":
         """Apply the same change, for example a rotation, to the image and both masks."""
         return replace(self, grey=change(self.grey), known=change(self.known), covered=change(self.covered))
+
+    @property
+    def is_chip(self) -> bool:
+        return not bool(self.covered.all())
+
+    def fit(self, window: Array, used: Mask) -> TukeyFit:
+        """Robust fit to a window in the pixels used. Factors: offset, gain, derivatives with respect to row and
+        column."""
+        slopes = [np.asarray(np.gradient(self.grey, axis=axis))[used] for axis in (0, 1)]
+        columns = np.stack([np.ones(int(used.sum())), self.grey[used], *slopes])
+        return tukey_fit(columns, window[used], _ROUNDS, _LEAST_SCALE)
 
     def align(self, window: Array) -> "View":
         """Shift by a fraction of a cell to match a window (size, size), on which it already lies to within a cell."""
@@ -85,18 +95,6 @@ class View:
         noise = min(robust_scale(residuals), float(np.hypot(self.noise, other.noise)))
         alike = max(_OUTLIER * noise, _ALIKE)
         return float(((residuals**2 - alike**2) * contrast**2).clip(0.0, _OUTLIER**2).sum())
-
-    def fit(self, window: Array, used: Mask) -> TukeyFit:
-        """Robust fit to a window in the pixels used. Factors: offset, gain, derivatives with respect to row and
-        column."""
-        slopes = [np.asarray(np.gradient(self.grey, axis=axis))[used] for axis in (0, 1)]
-        return tukey_fit(
-            np.stack([np.ones(int(used.sum())), self.grey[used], *slopes]), window[used], _ROUNDS, _LEAST_SCALE
-        )
-
-    @property
-    def is_chip(self) -> bool:
-        return not bool(self.covered.all())
 
 
 _EVERYWHERE = np.ones((1, 1), dtype=bool)
@@ -132,33 +130,30 @@ class Drawings:
         half = max(len(each.grey) // 2 for each in drawn) + spare
         turns = [_FLIP @ each.turn @ _FLIP for each in shown]
         return [
-            each.replace_pictures(partial(_turn_and_pad, turn=turn, spare=half - len(each.grey) // 2))
+            each.change(partial(_turn_and_pad, turn=turn, spare=half - len(each.grey) // 2))
             for each, turn in zip(drawn, turns, strict=True)
         ]
 
 
+@dataclass(frozen=True, eq=False)
 class MarkSite:
-    """Place where a mark was found, or predicted but not found; like is then the fit of another mark.
+    """Place where a mark was found, or predicted but not found.
 
-    reach_px: largest shift of a chip in another orientation than the one it was found in. The origin of a drawn mark is
-    its middle in every orientation; the origin of a chip is where the user clicked, and a chip that contains only an
-    edge is found anywhere along it.
+    Attributes
+    ----------
+    like : fit of the mark, or of a typical one where none was found.
+    weights : of the scan's channels.
+    reach_px : largest shift of a chip in another orientation than the one it was found in. The origin of a drawn mark
+        is its middle in every orientation; the origin of a chip is where the user clicked, and a chip that contains
+        only an edge is found anywhere along it.
     """
 
-    def __init__(
-        self,
-        scan: Scan,
-        like: MarkFit,
-        center_px: Array,
-        weights: Sequence[float] | None,
-        drawings: Drawings,
-        reach_px: float,
-    ) -> None:
-        self.scan, self.center_px, self.weights, self.drawings = scan, center_px, weights, drawings
-        self.reach_px = reach_px
-        self.contrast_dn = like.contrast_dn
-        self.sign = np.sign(like.contrast_dn)
-        self.noise_dn = like.noise_dn / drawings.reduction
+    scan: Scan
+    like: MarkFit
+    center_px: Array
+    weights: Sequence[float] | None
+    drawings: Drawings
+    reach_px: float
 
     def likelihoods(self, shown: Sequence[PosedMark]) -> Array:
         """Log-likelihood of the image under each orientation, up to a constant: 0 for the best, at least
@@ -173,7 +168,8 @@ class MarkSite:
         area = _area([view.grey for view in views])
         residuals = [self._residuals(window, view.grey, area & view.known) for view in views]
         # Large residuals of even the best image are not noise, and reduce the significance of the differences.
-        scale = max(self.noise_dn, min(robust_scale(each) for each in residuals), 1e-9)
+        noise_dn = self.like.noise_dn / self.drawings.reduction
+        scale = max(noise_dn, min(robust_scale(each) for each in residuals), 1e-9)
         misfits = np.full((len(views), *window.shape), _OUTLIER**2)  # unknown pixels of a chip count as outliers
         for misfit, view, residual in zip(misfits, views, residuals, strict=True):
             misfit[area & view.known] = np.minimum(np.abs(residual) / scale, _OUTLIER) ** 2
@@ -188,7 +184,7 @@ class MarkSite:
         """Largest excess misfit of a chip over the best one that their difference explains, noise included."""
         if view is best or not view.is_chip:
             return 0.0 if view is best else np.inf
-        squares = view.unlike(best, abs(self.contrast_dn) / scale_dn)
+        squares = view.unlike(best, abs(self.like.contrast_dn) / scale_dn)
         return squares + 2 * _CHANCE_SIGMAS * float(np.sqrt(squares))
 
     def _placed(self, window: Array, view: View, spare: int) -> View:
@@ -198,10 +194,10 @@ class MarkSite:
         core = slice(spare, len(window) - spare)
         grey, known = (np.asarray(each[core, core], np.float32) for each in (view.grey, view.known))
         likeness = cv2.matchTemplate(np.asarray(window, np.float32), grey, cv2.TM_CCOEFF_NORMED, mask=known)
-        likeness = np.where(np.isfinite(likeness), self.sign * likeness, -1.0)
+        likeness = np.where(np.isfinite(likeness), np.sign(self.like.contrast_dn) * likeness, -1.0)
         row, col = np.unravel_index(int(likeness.argmax()), likeness.shape)
         shift = int(row) - spare, int(col) - spare
-        return view.replace_pictures(partial(np.roll, shift=shift, axis=(0, 1))).align(window)
+        return view.change(partial(np.roll, shift=shift, axis=(0, 1))).align(window)
 
     def _window(self, size: int) -> Array:
         """(size, size) grey values of the scan on the drawings' grid, centred on the site."""
@@ -227,7 +223,7 @@ class MarkSite:
             by_row, by_col = (np.asarray(np.gradient(shown, axis=axis)) for axis in (0, 1))
             columns = [*ground, shown[area], by_row[area], by_col[area]]
             fit = tukey_fit(np.stack(columns), grey, _ROUNDS, _LEAST_SCALE)
-            if fit.factors[len(ground)] * self.sign > 0:
+            if fit.factors[len(ground)] * self.like.contrast_dn > 0:
                 return fit.residuals
         return tukey_fit(np.stack(ground), grey, _ROUNDS, _LEAST_SCALE).residuals
 

@@ -13,7 +13,6 @@ import numpy as np
 
 from measure.annotations.lines import Line, line_score, main_pose, writing_likelihoods
 from measure.array_types import Array
-from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
 from measure.fiducials.interior_orientation import fit_frame
 from measure.fiducials.options import SCATTER_DEGREES
@@ -55,38 +54,6 @@ class _Hypothesis:
     by_chance: float = -np.inf
     writing: float = 0.0
 
-    @classmethod
-    def from_placement(
-        cls, placement: Placement, frame: Frame, fits: Sequence[MarkFit], missed: Array
-    ) -> "_Hypothesis | None":
-        """Name each site after the nearest predicted mark, and fit the frame. Returns None if a name is assigned twice,
-        or fewer than two of two or more marks found are named."""
-        marks, options, pitch = frame.layout.marks, frame.options, frame.pitch_mm
-        centers = np.array([*(fit.center_px for fit in fits), *missed])
-        predicted = placement.places_px(frame.camera_mm)
-        distance = np.hypot(*np.moveaxis((predicted[:, None] - centers[None]) * pitch, -1, 0))
-        near = distance.min(axis=0) < _NAMED * options.gate_mm
-        names = np.where(near, distance.argmin(axis=0), -1)
-        found = near[: len(fits)]
-        if len(np.unique(names[near])) < near.sum() or (found.sum() < 2 <= len(fits)):
-            return None
-        hypothesis = cls(placement.pose, tuple(names.tolist()))
-        if len(fits) < 2:
-            return hypothesis
-        own = names[: len(fits)][found]
-        given = np.array([_given_sigma_mm(marks[name]) for name in own])
-        measured = np.array([fit.sigma_px for fit in fits])[found] * pitch.mean()
-        sigma = np.sqrt(given**2 + measured**2 + options.film_sigma_mm**2)
-        up = frame.up_mm(centers[: len(fits)][found])
-        fit = fit_frame(frame.camera_mm[own], up, sigma, up_from_camera(placement.pose), options.film_model)
-        degrees = SCATTER_DEGREES + max(fit.redundancy, 0)
-        coordinates = -degrees / 2 * float(np.log1p(fit.chi_square / SCATTER_DEGREES))
-        return replace(hypothesis, coordinates=coordinates, chi_square=fit.chi_square)
-
-    def posed_mark(self, site: int, layout: FiducialLayout) -> PosedMark:
-        name = self.names[site]
-        return PosedMark(None if name < 0 else layout.marks[name].mark, up_from_camera(self.pose))
-
     @property
     def pictures_total(self) -> float:
         return float(np.logaddexp(self.pictures.sum(), self.by_chance))
@@ -114,8 +81,7 @@ def decide_pose(frame: Frame, lines: Sequence[Line] = (), poses: Sequence[str] =
     layout, fits = frame.layout, list(frame.inlier_fits.values())
     inside = np.array([detection.inside for detection in frame.detections])
     missed = frame.predicted_px[inside & ~frame.inliers]
-    placements = (frame.fitted_placement.posed(pose, frame.camera_mm) for pose in poses)
-    every = (_Hypothesis.from_placement(placement, frame, fits, missed) for placement in placements)
+    every = (_name_sites(frame, pose, fits, missed) for pose in poses)
     hypotheses = [each for each in every if each is not None]
     if not hypotheses:
         return _decision([], layout, len(fits))
@@ -125,15 +91,22 @@ def decide_pose(frame: Frame, lines: Sequence[Line] = (), poses: Sequence[str] =
     # Sites without a mark take contrast and noise from a typical one: another orientation may predict a mark there.
     usual = sorted(fits, key=lambda fit: abs(fit.contrast_dn))[len(fits) // 2]
     places = [*((fit, fit.center_px) for fit in fits), *((usual, place) for place in missed)]
-    sites = [MarkSite(frame.scan, *each, frame.weights, drawings, frame.first_search_px()) for each in places]
+    reach_px = frame.first_search_px()
 
     def site_likelihoods(index: int) -> Array:
-        return sites[index].likelihoods([each.posed_mark(index, layout) for each in hypotheses])
+        """(hypotheses,) log-likelihoods of the image at a site."""
+        names = [(each.names[index], up_from_camera(each.pose)) for each in hypotheses]
+        shown = [PosedMark(None if name < 0 else layout.marks[name].mark, turn) for name, turn in names]
+        return MarkSite(frame.scan, *places[index], frame.weights, drawings, reach_px).likelihoods(shown)
 
-    pictures = np.array(map_in_threads(site_likelihoods, range(len(sites)))).reshape(len(sites), len(hypotheses))
-    by_chance = _chance_likelihood(pictures) if any(_is_bare_chip(mark.mark) for mark in layout.marks) else -np.inf
-    written = np.zeros(len(hypotheses))
+    pictures = np.array(map_in_threads(site_likelihoods, range(len(places)))).reshape(len(places), len(hypotheses))
+    by_chance = -np.inf
+    if any(isinstance(mark.mark, MarkTemplate) and mark.mark.steadiness is None for mark in layout.marks):
+        # A chip cut from a single scan cannot be separated from background or writing: its images may favour
+        # orientations at random.
+        by_chance = float((np.logaddexp.reduce(pictures, axis=1) - np.log(pictures.shape[1])).sum())
     lines = lines if frame.accepted else ()
+    written = np.zeros(len(hypotheses))
     if lines:
         written = writing_likelihoods(lines, layout.writing, [each.pose for each in hypotheses])
     likelihoods = zip(hypotheses, pictures.T, written.tolist(), strict=True)
@@ -141,14 +114,30 @@ def decide_pose(frame: Frame, lines: Sequence[Line] = (), poses: Sequence[str] =
     return _decision(hypotheses, layout, len(fits), lines)
 
 
-def _is_bare_chip(mark: Mark) -> bool:
-    """Whether a mark is a chip cut from a single scan: its mark cannot be separated from background or writing."""
-    return isinstance(mark, MarkTemplate) and mark.steadiness is None
-
-
-def _chance_likelihood(pictures: Array) -> float:
-    """Log-likelihood of images (sites, poses) that favour orientations at random."""
-    return float((np.logaddexp.reduce(pictures, axis=1) - np.log(pictures.shape[1])).sum())
+def _name_sites(frame: Frame, pose: str, fits: Sequence[MarkFit], missed: Array) -> _Hypothesis | None:
+    """Name each site after the nearest mark that an orientation predicts, and fit the frame. Returns None if a name is
+    assigned twice, or fewer than two of two or more marks found are named."""
+    options, pitch = frame.options, frame.pitch_mm
+    centers = np.array([*(fit.center_px for fit in fits), *missed])
+    predicted = frame.fitted_placement.posed(pose, frame.camera_mm).places_px(frame.camera_mm)
+    distance = np.hypot(*np.moveaxis((predicted[:, None] - centers[None]) * pitch, -1, 0))
+    near = distance.min(axis=0) < _NAMED * options.gate_mm
+    names = np.where(near, distance.argmin(axis=0), -1)
+    found = near[: len(fits)]
+    if len(np.unique(names[near])) < near.sum() or (found.sum() < 2 <= len(fits)):
+        return None
+    hypothesis = _Hypothesis(pose, tuple(names.tolist()))
+    if len(fits) < 2:
+        return hypothesis
+    own = names[: len(fits)][found]
+    given = np.array([_given_sigma_mm(frame.layout.marks[name]) for name in own])
+    measured = np.array([fit.sigma_px for fit in fits])[found] * pitch.mean()
+    sigma = np.sqrt(given**2 + measured**2 + options.film_sigma_mm**2)
+    up = frame.up_mm(centers[: len(fits)][found])
+    fit = fit_frame(frame.camera_mm[own], up, sigma, up_from_camera(pose), options.film_model)
+    degrees = SCATTER_DEGREES + max(fit.redundancy, 0)
+    coordinates = -degrees / 2 * float(np.log1p(fit.chi_square / SCATTER_DEGREES))
+    return replace(hypothesis, coordinates=coordinates, chi_square=fit.chi_square)
 
 
 def _given_sigma_mm(mark: LayoutMark) -> float:
@@ -157,41 +146,41 @@ def _given_sigma_mm(mark: LayoutMark) -> float:
     return float(np.hypot(min(max(mark.sigma_mm), _FREE_MM), origin_mm))
 
 
-def _decision(verdicts: Sequence[_Hypothesis], layout: FiducialLayout, found: int, lines: Sequence[Line] = ()) -> Pose:
+def _decision(
+    hypotheses: Sequence[_Hypothesis], layout: FiducialLayout, found: int, lines: Sequence[Line] = ()
+) -> Pose:
     """Select the most likely orientation, with the evidence in sentences. found: number of marks found."""
-    if not verdicts:
+    if not hypotheses:
         return Pose("0", False, ("no pose names the marks that were found.",))
-    best_likelihood = max(verdict.likelihood for verdict in verdicts)
-    alike = [verdict for verdict in verdicts if best_likelihood - verdict.likelihood < DECIDED]
-    best = max(alike, key=lambda verdict: verdict.total)
-    others = sorted((v for v in verdicts if v not in alike), key=lambda verdict: -verdict.total)
-    against = _against(best, others[0], layout, lines) if others else ()
-    written = {verdict.pose: verdict.writing for verdict in verdicts} if lines else {}
-    main = main_pose(lines)
+    best_likelihood = max(each.likelihood for each in hypotheses)
+    alike = [each for each in hypotheses if best_likelihood - each.likelihood < DECIDED]
+    best = max(alike, key=lambda each: each.total)
+    others = [each for each in hypotheses if each not in alike]
+    against = _against(best, max(others, key=lambda each: each.total), layout, lines) if others else ()
+    written, main = {each.pose: each.writing for each in hypotheses} if lines else {}, main_pose(lines)
     if len(alike) == 1:
         reasons = against or (f"no other pose explains the {found} marks found.",)
         return Pose(best.pose, True, reasons, written, main)
-    names = ", ".join(verdict.pose for verdict in alike)
-    lead = best.total - alike[0].total
-    near = [verdict for verdict in alike if best.total - verdict.total < TOLD]
+    first, lead = alike[0].pose, best.total - alike[0].total
+    near = [each.pose for each in alike if best.total - each.total < TOLD]
     # Among equal ones: that in which most of the writing is upright, so that the frames of a roll agree.
-    upright = next((verdict.pose for verdict in near if main and pose_in_camera(main, verdict.pose) == "0"), "")
-    like_writing = ", in which most of what is written is upright" if upright else ""
+    upright = next((pose for pose in near if main and pose_in_camera(main, pose) == "0"), "")
+    assumed = upright or (best.pose if lead > TOLD else first)
+    names = ", ".join(each.pose for each in alike)
+    chosen = f"{assumed} is assumed{', in which most of what is written is upright' if upright else ''}"
     if lead > TOLD:
-        assumed = upright or best.pose
-        equal = [verdict.pose for verdict in near if verdict.pose != assumed]
+        equal = [pose for pose in near if pose != assumed]
         as_likely = f"as likely as {', '.join(equal)} and " if equal else ""
         sentence = (
-            f"the {found} marks found do not separate the poses {names} significantly: {assumed} is assumed"
-            f"{like_writing}, {as_likely}likelier than {alike[0].pose} by log-odds of only {lead:.1f}."
+            f"the {found} marks found do not separate the poses {names} significantly: {chosen}, "
+            f"{as_likely}likelier than {first} by log-odds of only {lead:.1f}."
         )
     else:
-        assumed = upright or alike[0].pose
         sentence = (
             f"nothing in the {found} marks found separates the poses {names}: their pictures and given coordinates are "
-            f"alike; {assumed} is assumed{like_writing}."
+            f"alike; {chosen}."
         )
-    rivals = tuple(pose_in_camera(verdict.pose, assumed) for verdict in alike if verdict.pose != assumed)
+    rivals = tuple(pose_in_camera(each.pose, assumed) for each in alike if each.pose != assumed)
     return Pose(assumed, False, (sentence, *against), written, main, rivals=rivals)
 
 
