@@ -17,7 +17,7 @@ from measure.array_types import Array
 from measure.fiducials.consistency import NAMED, FrameMarks, Hypothesis
 from measure.fiducials.frame import may_be_wrong
 from measure.fiducials.mark_comparison import check_own_figures
-from measure.fiducials.misfits import Explanation, FrameMisfit, Frames, explain, explain_by_pattern
+from measure.fiducials.misfits import Explanation, FrameMisfit, Frames, Pattern, explain, explain_by_pattern
 from measure.fiducials.options import ANY_FILM, BelievedFilm
 from measure.flags import FALSE_DOUBT, NO_REASON, Cause, Code, Reason, Status
 from measure.geometry import up_from_camera
@@ -28,34 +28,25 @@ from measure.results import FrameMeasurement, MarkMeasurement
 _SAME_SITE = 1 / 3  # fraction of the least distance of two marks: closer marks of two frames share a site of the scan
 _AXES = 2
 _BELIEVED_DEGREES = 4.0  # degrees of freedom of the prior of the variance factor: on real film the edges differ by 1.4
+_SIGMAS = "second_method_sigmas"
 _NAMED_MARKS = 4  # largest number of marks named in a sentence
 
 
-@dataclass(frozen=True)
-class Doubt:
-    """Variance along an axis that a check adds to a mark, and its cause. reason: why the mark becomes weak, empty if it
-    does not."""
-
-    variance_px2: float
-    cause: Cause
-    reason: Reason = NO_REASON
-
-
-def observed_fiducials(frame: FrameMeasurement) -> list[MarkMeasurement]:
-    """Fiducials of a frame that are observations."""
+def _observed_fiducials(frame: FrameMeasurement) -> list[MarkMeasurement]:
     return [mark for mark in frame.marks if mark.kind == "fiducial" and mark.status.is_observation]
 
 
-def add_doubts(frame: FrameMeasurement, doubts: Mapping[str, Doubt]) -> FrameMeasurement:
-    """Add doubts, by name, to the fiducials of a frame: their variance, and the status weak if they have a reason."""
-    marks = list(frame.marks)
-    for number, mark in enumerate(marks):
-        doubt = doubts.get(mark.point) if mark.kind == "fiducial" else None
-        if doubt is None or mark.covariance is None:
-            continue
-        status, reason = (Status.WEAK if doubt.reason else mark.status), Reason.combine((mark.reason, doubt.reason))
-        covariance = mark.covariance.plus(doubt.cause, doubt.variance_px2 * np.eye(2))
-        marks[number] = replace(mark, covariance=covariance, status=status, reason=reason)
+def _doubt(mark: MarkMeasurement, cause: Cause, variance_px2: float, reason: Reason = NO_REASON) -> MarkMeasurement:
+    """Add a variance along an axis to an observed mark; it becomes weak if there is a reason."""
+    assert mark.covariance is not None
+    status, reasons = (Status.WEAK if reason else mark.status), Reason.combine((mark.reason, reason))
+    covariance = mark.covariance.plus(cause, variance_px2 * np.eye(2))
+    return replace(mark, covariance=covariance, status=status, reason=reasons)
+
+
+def _replace_marks(frame: FrameMeasurement, changed: Mapping[str, MarkMeasurement]) -> FrameMeasurement:
+    """Replace some fiducials, by name."""
+    marks = (changed.get(mark.point, mark) if mark.kind == "fiducial" else mark for mark in frame.marks)
     return replace(frame, marks=tuple(marks))
 
 
@@ -95,8 +86,8 @@ def check_frames(
         shared, problem = _explain_together(misfits, layout, film.sigma_mm)
         common = [each for each in (problem, _scattering_film(shared, film)) if each]
         for place, own in shared.frames.items():
-            names = [layout.marks[index].id for index in own.sites]
-            checked[place], films[place] = _add_findings(checked[place], own, shared, names, film)
+            names = [layout.marks[index].id for index in misfits[place].sites]
+            checked[place], films[place] = _add_findings(checked[place], place, shared, names, film)
             if own.marks.redundancy:
                 checked[place] = replace(checked[place], problems=(*checked[place].problems, *common))
     return CheckedFrames(tuple(checked), tuple(films))
@@ -107,7 +98,7 @@ def _misfit(
 ) -> FrameMisfit | None:
     """Misfit of a frame; None for fewer than three marks, or collinear ones."""
     number = {mark.id: place for place, mark in enumerate(layout.marks)}
-    marks = [mark for mark in observed_fiducials(frame) if mark.point in number]
+    marks = [mark for mark in _observed_fiducials(frame) if mark.point in number]
     sites = np.array([number[mark.point] for mark in marks], dtype=np.intp)
     given = np.array([layout.marks[place].xy_mm for place in sites]).reshape(-1, 2)
     if frame.pixel_from_camera is None or np.linalg.matrix_rank(given - given.mean(axis=0)) < 2:
@@ -118,17 +109,17 @@ def _misfit(
     covariances = np.array([mm @ np.asarray(mark.covariance_px2) @ mm.T for mark in marks])
     pose = frame.pose.name if frame.pose else "0"
     weak = np.array([mark.status is Status.WEAK for mark in marks])
-    return FrameMisfit(FrameMarks.from_places(given, measured, covariances, film.model), sites, pose, weak=weak)
+    return FrameMisfit.from_marks(FrameMarks.from_places(given, measured, covariances, film.model), sites, pose, weak)
 
 
 def _explain_together(frames: Frames, layout: FiducialLayout, film_mm: float) -> tuple[Explanation, Reason]:
     """Explain the misfits by film and marks alone, wrong given coordinates or the scanner, with the problem."""
-    places = np.array([mark.xy_mm for mark in layout.marks])
     given_mm = np.array([min(max(mark.sigma_mm), MOST_GIVEN_SIGMA_MM) for mark in layout.marks])
-    by_given = explain(frames, places, given_mm, 0.0, film_mm)
+    given = Pattern(np.array([mark.xy_mm for mark in layout.marks]), given_mm)
+    by_given = explain(frames, given, film_mm)
     if by_given.is_lone:
         return by_given, NO_REASON
-    by_places = explain_by_pattern(frames, places, given_mm, film_mm)
+    by_places = explain_by_pattern(frames, given, film_mm)
     is_clear, rest = (
         by_places.pattern.p_value >= FALSE_DOUBT,
         " The scanner may do the same: all frames lie alike in it.",
@@ -137,11 +128,10 @@ def _explain_together(frames: Frames, layout: FiducialLayout, film_mm: float) ->
     if not lie_alike and not (is_clear and by_places.is_quiet):
         sites = _scan_sites(frames)
         turned = {place: _in_scan_axes(each, sites, given_mm) for place, each in frames.items()}
-        by_scanner = explain_by_pattern(turned, sites, np.zeros(len(sites)), film_mm)
+        by_scanner = explain_by_pattern(turned, Pattern(sites, np.zeros(len(sites))), film_mm)
         lead = by_scanner.log_evidence - by_places.log_evidence
         if lead > NAMED and by_scanner.pattern.p_value < FALSE_DOUBT:
-            kept = {place: replace(each, sites=frames[place].sites) for place, each in by_scanner.frames.items()}
-            return replace(by_scanner, frames=kept), _bent_scans(by_scanner)
+            return by_scanner, _bent_scans(by_scanner)
         rest = "" if lead < -NAMED else " The scanner may do the same."
     if is_clear:
         return by_given, NO_REASON
@@ -167,9 +157,10 @@ def _in_scan_axes(frame: FrameMisfit, sites: Array, given_mm: Array) -> FrameMis
 
 
 def _add_findings(
-    frame: FrameMeasurement, own: FrameMisfit, shared: Explanation, names: Sequence[str], film: BelievedFilm
+    frame: FrameMeasurement, place: int, shared: Explanation, names: Sequence[str], film: BelievedFilm
 ) -> tuple[FrameMeasurement, float]:
     """Add the findings to a frame: covariances, statuses and problems. Returns also the film's standard deviation."""
+    own = shared.frames[place]
     film_mm = own.film_mm or (shared.film.sigma if shared.film_is_more else film.sigma_mm)
     px_per_mm = frame.px_per_mm or 1.0
     code, cause = Code.OFF_FRAMES, Cause.OTHER_FRAMES
@@ -177,31 +168,28 @@ def _add_findings(
     if shared.is_lone:
         code, cause = Code.OFF_GIVEN, Cause.GIVEN_PLACES
         has_it = "the other marks have it, more than film and given places explain"
-    for mark, off in own.off_mm.items():
-        reason = Reason(f"it lies {off:.3f} mm from where {has_it}", code)
-        frame = add_doubts(frame, {names[mark]: Doubt((off * px_per_mm) ** 2 / 2, cause, reason)})
     added = film_mm**2 - film.added_later_mm**2 if film_mm > film.sigma_mm else 0.0
-    variances = np.maximum(added, own.suspect_mm2 * np.ones(len(names)))
-    bent = {
-        name: Doubt(variance * px_per_mm**2, Cause.FILM)
-        for name, variance in zip(names, variances.tolist(), strict=True)
-        if variance > 0
-    }
+    variances = np.maximum(added, own.suspect_mm2)
+    changed = {mark.point: mark for mark in _observed_fiducials(frame)}
+    for name, off, variance, is_weak in zip(names, own.off_mm.tolist(), variances.tolist(), own.weak, strict=True):
+        reason = Reason(f"it lies {off:.3f} mm from where {has_it}", code) if off else NO_REASON
+        mark = _doubt(changed[name], cause, (off**2 / 2 + own.weak_mm2 * is_weak) * px_per_mm**2, reason)
+        changed[name] = _doubt(mark, Cause.FILM, variance * px_per_mm**2)
     known_um = 1000 * float(np.sqrt(max(variances.max(), film_mm**2)))  # including what the adjustment adds later
-    moved = {names[mark]: Doubt(own.weak_mm2 * px_per_mm**2, cause) for mark in np.flatnonzero(own.weak).tolist()}
-    problem = _problem(own, shared, names, known_um)
+    problem = _problem(place, shared, names, known_um)
     is_known = own.hypothesis is Hypothesis.PITCH and any(Code.PITCH in each.codes for each in frame.problems)
     other_problems = [each for each in frame.problems if not {*each.codes} & {*problem.codes} & {Code.PERSPECTIVE}]
     problems = (*other_problems, problem) if problem and not is_known else frame.problems
-    return replace(add_doubts(add_doubts(frame, bent), moved), problems=problems), film_mm
+    return replace(_replace_marks(frame, changed), problems=problems), film_mm
 
 
-def _problem(own: FrameMisfit, shared: Explanation, names: Sequence[str], known_um: float) -> Reason:
+def _problem(place: int, shared: Explanation, names: Sequence[str], known_um: float) -> Reason:
     """Problem of an outlying frame, empty for any other. known_um: standard deviation that its marks are given."""
+    own = shared.frames[place]
     if own.film_mm is None:
         return NO_REASON
     alone = shared.is_lone
-    most_mm = float(shared.pattern.expected_marks(own, own.film_mm).distances_mm().max())
+    most_mm = float(shared.pattern.expected_marks(place).distances_mm().max())
     than = "the given coordinates" if alone else "what the camera's frames have in common"
     p_value = f"p = {own.p_value:.1g} for film deformation alone"
     widened = f"The standard deviation of its marks is set to {known_um:.0f} µm."
@@ -290,18 +278,17 @@ def _distances(names: Sequence[str], off_mm: Array) -> str:
 
 
 def check_second_places(frames: Sequence[FrameMeasurement]) -> list[FrameMeasurement]:
-    """Test the second places of all frames of a camera, and add doubts where they differ significantly from the
+    """Test the second places of all frames of a camera, and doubt marks where they differ significantly from the
     matched places."""
-    tested = [[mark for mark in observed_fiducials(each) if "second_method_sigmas" in mark.quality] for each in frames]
-    squares = np.array([mark.quality["second_method_sigmas"] ** 2 for own in tested for mark in own])
-    by_noise = iter(chdtrc(_AXES, squares) * len(squares))
-    among_others = iter(_p_values_among_others(squares) * len(squares))
-    checked = []
-    for frame, own in zip(frames, tested, strict=True):
-        p_values = [(mark, next(by_noise), next(among_others)) for mark in own]
-        doubts = {mark.point: _edge_doubt(mark, rest < FALSE_DOUBT) for mark, p, rest in p_values if p < FALSE_DOUBT}
-        checked.append(add_doubts(frame, doubts))
-    return checked
+    tested = [(n, m) for n, each in enumerate(frames) for m in _observed_fiducials(each) if _SIGMAS in m.quality]
+    squares = np.array([mark.quality[_SIGMAS] ** 2 for _, mark in tested])
+    changed: list[dict[str, MarkMeasurement]] = [{} for _ in frames]
+    is_odd = chdtrc(_AXES, squares) * len(squares) < FALSE_DOUBT
+    is_alone = _p_values_among_others(squares) * len(squares) < FALSE_DOUBT
+    for index in np.flatnonzero(is_odd).tolist():
+        number, mark = tested[index]
+        changed[number][mark.point] = _doubt_edges(mark, bool(is_alone[index]))
+    return [_replace_marks(*each) for each in zip(frames, changed, strict=True)]
 
 
 def _p_values_among_others(squares: Array) -> Array:
@@ -313,13 +300,13 @@ def _p_values_among_others(squares: Array) -> Array:
     return np.asarray(fdtrc(_AXES, _BELIEVED_DEGREES + degrees, squares / _AXES / np.maximum(factor, 1.0)))
 
 
-def _edge_doubt(mark: MarkMeasurement, is_alone: bool) -> Doubt:
+def _doubt_edges(mark: MarkMeasurement, is_alone: bool) -> MarkMeasurement:
     before = np.asarray(mark.covariance_px2)
     off_px = float(np.hypot(mark.quality["second_method_col_px"], mark.quality["second_method_row_px"]))
     is_weak = is_alone or (may_be_wrong(before + off_px**2 / 2 * np.eye(2)) and not may_be_wrong(before))
     reason = Reason(
-        f"its edges put it {off_px:#.2g} px elsewhere, {mark.quality['second_method_sigmas']:.1f} standard "
-        "deviations of the difference: it is damaged, or not as drawn",
+        f"its edges put it {off_px:#.2g} px elsewhere, {mark.quality[_SIGMAS]:.1f} standard deviations of the "
+        "difference: it is damaged, or not as drawn",
         Code.EDGES,
     )
-    return Doubt(off_px**2 / 2, Cause.SECOND_METHOD, reason if is_weak else NO_REASON)
+    return _doubt(mark, Cause.SECOND_METHOD, off_px**2 / 2, reason if is_weak else NO_REASON)

@@ -16,10 +16,12 @@ or photographed obliquely; under each of these nothing else is wrong, or one mar
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
+from scipy.sparse import bsr_array, csr_array
 from scipy.spatial.distance import pdist
 from scipy.special import chdtrc, chdtri, fdtrc, logsumexp
 
@@ -32,6 +34,7 @@ _SUSPECT = -float(np.log(10.0))  # log-odds above which a mark may have the gros
 _RANK = 1e-9  # fraction of the largest singular value, below which a direction is a null direction
 _LEAST_MM = 1e-6  # smallest standard deviation of a mark
 _KNOWN = 1e6  # degrees of freedom of a known variance
+_DENSE = 100  # marks up to which free parameters are eliminated once, by eigenvectors of the covariance of all marks
 _MOST_OFF_MM = 0.5  # largest standard deviation of a gross error: marks are not searched farther off than some 1 mm
 _APART = 1 / 3  # fraction of the least distance of two marks: a jump is sought between columns of marks at least so far
 _FEWEST_BEYOND = 2  # marks on either side of a jump: of one mark alone it is a gross error
@@ -90,16 +93,18 @@ class FrameMarks:
     ----------
     given_mm : (n, 2) given places, relative to their centroid.
     off_mm : (n, 2) measured less given places, in the camera's axes, after a rotation and shift onto the given ones.
-    covariance_mm2 : (2n, 2n) covariance without the scatter of the film.
+    covariances_mm2 : (n, 2, 2) covariance of each mark without the scatter of the film.
     scan_mm : (n, 2) measured places in the scan's axes.
     model : film deformation model of the project.
+    shared_mm2 : (2n, 2n) covariance of what is subtracted from all marks in common; None without it.
     """
 
     given_mm: Array
     off_mm: Array
-    covariance_mm2: Array
+    covariances_mm2: Array
     scan_mm: Array
     model: str = "affine"
+    shared_mm2: Array | None = None
 
     @classmethod
     def from_places(
@@ -110,11 +115,9 @@ class FrameMarks:
         centers = given_mm.mean(axis=0), measured_mm.mean(axis=0)
         left, _, right = np.linalg.svd((given_mm - centers[0]).T @ (measured_mm - centers[1]))
         turn = left @ right
-        n = len(given_mm)
-        covariance = np.zeros((n, 2, n, 2))
-        covariance[np.arange(n), :, np.arange(n)] = turn @ covariances_mm2 @ turn.T + _LEAST_MM**2 * np.eye(2)
         off = (measured_mm - centers[1]) @ turn.T - (given_mm - centers[0])
-        return cls(given_mm - centers[0], off, covariance.reshape(2 * n, 2 * n), measured_mm, model)
+        covariances = turn @ covariances_mm2 @ turn.T + _LEAST_MM**2 * np.eye(2)
+        return cls(given_mm - centers[0], off, covariances, measured_mm, model)
 
     @property
     def radius_mm(self) -> float:
@@ -141,12 +144,6 @@ class FrameMarks:
         kept = [each for each in sides if _FEWEST_BEYOND <= each.sum() <= len(each) - _FEWEST_BEYOND]
         return np.array(kept, dtype=bool).reshape(-1, len(self.scan_mm)).T
 
-    def scatter_degrees(self, film: Scatter) -> float:
-        """Degrees of freedom of the variance of a residual, of which only the film's part is estimated (Welch and
-        Satterthwaite)."""
-        total_mm2 = 1 / np.mean(1 / (self._beyond_affine.variances + film.sigma**2))
-        return float(film.degrees * (total_mm2 / film.sigma**2) ** 2)
-
     @cached_property
     def _beyond_affine(self) -> "_Reduced":
         return _Reduced.from_free(self, self.affine)
@@ -158,12 +155,11 @@ class FrameMarks:
     @property
     def redundancy(self) -> int:
         """Redundancy with size, stretch and shear free."""
-        return len(self._beyond_affine.variances)
+        return self._beyond_affine.redundancy
 
     def chi_square(self, film_mm: float) -> float:
         """Chi-square of the misfit with size, stretch and shear free, for a film scatter of film_mm."""
-        reduced = self._beyond_affine
-        return float((reduced.residuals**2 / (reduced.variances + film_mm**2)).sum())
+        return float(self._beyond_affine.chi_squares(np.array([film_mm**2]))[0])
 
     def film_variance_mm2(self) -> float:
         """Variance of the film's scatter with which chi-square equals the redundancy (Paule and Mandel, 1982).
@@ -182,15 +178,15 @@ class FrameMarks:
         size that is not free, are random as in the affinity.
         """
         first = int(affinity.size_is_free)
-        strain = affinity.scatter.sigma * self.affine[:, first:]
-        spread = strain @ strain.T + film_mm**2 * np.eye(len(strain))
-        expected = self.expecting((self.affine @ affinity.mean).reshape(-1, 2), spread)
-        reduced = _Reduced.from_free(expected, self.affine[:, :first])
-        whitened = reduced.basis[np.repeat(among, 2)] / np.sqrt(reduced.variances)
-        shares, axes = np.linalg.eigh(whitened.T @ whitened)  # 0: misfit of the other marks alone
-        residuals = axes.T @ (reduced.residuals / np.sqrt(reduced.variances))
+        reduced = _Reduced.from_free(self, self.affine[:, :first])
+        scatter = np.full((1, 3 - first), affinity.scatter.sigma)
+        weight = reduced.weigh(np.array([film_mm**2]), self.affine[:, first:], scatter)
+        residuals = reduced.principal(self.off_mm.ravel() - self.affine @ affinity.mean)
+        images = np.column_stack([reduced.axes.T @ np.eye(2 * len(among))[:, np.repeat(among, 2)], residuals])
+        products = weight.products(images)[0]
+        shares, axes = np.linalg.eigh(products[:-1, :-1])  # 0: misfit of the other marks alone
         affected = shares > _RANK * shares[-1]
-        squares, shares = residuals[affected] ** 2, shares[affected]
+        squares, shares = (products[-1, :-1] @ axes)[affected] ** 2 / shares[affected], shares[affected]
         if squares.sum() <= len(squares):
             return 0.0
         most = float((squares / shares).max())
@@ -198,63 +194,60 @@ class FrameMarks:
 
     def log_density(self, film_mm: float) -> float:
         """Log density of the misfit up to a constant, size, stretch and shear free."""
-        return -0.5 * (float(np.log(self._beyond_affine.variances + film_mm**2).sum()) + self.chi_square(film_mm))
+        weight = self._beyond_affine.weigh(np.array([film_mm**2]))
+        return -0.5 * (float(weight.log_determinant[0]) + self.chi_square(film_mm))
 
     def precision(self, film_mm: float) -> Array:
         """(2n, 2n) weight matrix of off_mm for a film scatter of film_mm, after elimination of all free parameters,
         size, stretch and shear included."""
         reduced = self._beyond_affine
-        return np.asarray(reduced.weighted(film_mm) @ reduced.basis.T)
+        return np.asarray(reduced.weigh(np.array([film_mm**2])).products(reduced.axes.T @ np.eye(self.off_mm.size))[0])
 
     def affinity(self, film_mm: float) -> tuple[Array, Array]:
         """Least-squares estimate (3,) of size, stretch and shear, and its covariance (3, 3)."""
         reduced = self._beyond_congruent
-        moved = reduced.weighted(film_mm) @ (reduced.basis.T @ self.affine)
-        covariance = np.asarray(np.linalg.pinv(self.affine.T @ moved, hermitian=True), dtype=np.float64)
-        return covariance @ (moved.T @ self.off_mm.ravel()), covariance
+        images = np.column_stack([reduced.axes.T @ self.affine, reduced.residuals])
+        products = reduced.weigh(np.array([film_mm**2])).products(images)[0]
+        covariance = np.asarray(np.linalg.pinv(products[:3, :3], hermitian=True), dtype=np.float64)
+        return covariance @ products[:3, 3], covariance
 
     def distances_mm(self) -> Array:
         """(n,) residual lengths of an unweighted least-squares fit of all free parameters, size, stretch and shear
         included."""
         reduced = self._beyond_affine
-        return np.asarray(np.hypot(*(reduced.basis @ reduced.residuals).reshape(-1, 2).T))
+        return np.asarray(np.hypot(*(reduced.axes @ reduced.residuals).reshape(-1, 2).T))
 
     def expecting(self, off_mm: Array, covariance_mm2: Array) -> "FrameMarks":
-        """Subtract an expected misfit off_mm (n, 2), and add its covariance (2n, 2n)."""
-        return replace(self, off_mm=self.off_mm - off_mm, covariance_mm2=self.covariance_mm2 + covariance_mm2)
+        """Subtract an expected misfit off_mm (n, 2) with its covariance (2n, 2n)."""
+        return replace(self, off_mm=self.off_mm - off_mm, shared_mm2=covariance_mm2)
 
     def widen(self, variances_mm2: Array) -> "FrameMarks":
         """Add variances (n,) to both coordinates of each mark."""
-        return replace(self, covariance_mm2=self.covariance_mm2 + np.diag(np.repeat(variances_mm2, 2)))
+        return replace(self, covariances_mm2=self.covariances_mm2 + variances_mm2[:, None, None] * np.eye(2))
 
     def select(self, index: NDArray[np.intp]) -> "FrameMarks":
-        """Keep the marks of the given indices."""
-        both = (2 * index[:, None] + np.arange(2)).ravel()
-        covariance = self.covariance_mm2[np.ix_(both, both)]
-        given, off, scan = self.given_mm[index], self.off_mm[index], self.scan_mm[index]
-        return replace(self, given_mm=given, off_mm=off, covariance_mm2=covariance, scan_mm=scan)
+        """Keep the marks of the given indices, of a frame without a shared covariance."""
+        given, off = self.given_mm[index], self.off_mm[index]
+        return FrameMarks(given, off, self.covariances_mm2[index], self.scan_mm[index], self.model)
 
     def rotate(self, turn: Array) -> "FrameMarks":
-        """Transform to axes that are rotated, or mirrored, by turn (2, 2)."""
-        every = np.kron(np.eye(len(self.given_mm)), turn)
-        return replace(
-            self,
-            given_mm=self.given_mm @ turn.T,
-            off_mm=self.off_mm @ turn.T,
-            covariance_mm2=every @ self.covariance_mm2 @ every.T,
-        )
+        """Transform to axes that are rotated, or mirrored, by turn (2, 2), without a shared covariance."""
+        covariances = turn @ self.covariances_mm2 @ turn.T
+        return FrameMarks(self.given_mm @ turn.T, self.off_mm @ turn.T, covariances, self.scan_mm, self.model)
 
 
 @dataclass(frozen=True, eq=False)
 class _Reduced:
-    """Misfit of a frame projected on the complement of its free parameters.
+    """Misfit of a frame in principal axes of its covariance, where any scatter of the film adds to the variances alone.
 
-    basis: (2n, m) orthonormal, diagonalises the covariance; variances (m,) and residuals (m,) in this basis, mm.
+    axes (2n, m): orthonormal; variances (m,), residuals (m,). Of few marks the axes are orthogonal to the free
+    parameters. Of many marks, each has its own two, as a sparse matrix, and basis (m, f) spans the free parameters.
     """
 
-    basis: Array
+    axes: Any
     variances: Array
     residuals: Array
+    basis: Array
 
     @classmethod
     def from_free(cls, marks: FrameMarks, also: Array) -> "_Reduced":
@@ -265,20 +258,87 @@ class _Reduced:
         more = film_terms(marks.model, marks.given_mm / marks.radius_mm, measured)
         free = np.hstack([interleaved((one, none), (none, one), (-y, x)), also, more])
         free = np.hstack([free, marks.affine]) if more.shape[1] else free
-        left, sizes, _ = np.linalg.svd(free / np.linalg.norm(free, axis=0))
-        basis = left[:, int((sizes > _RANK * sizes[0]).sum()) :]
-        variances, vectors = np.linalg.eigh(basis.T @ marks.covariance_mm2 @ basis)
-        basis = basis @ vectors
-        return cls(basis, np.maximum(variances, _LEAST_MM**2), basis.T @ marks.off_mm.ravel())
+        is_sparse = len(x) > _DENSE and marks.shared_mm2 is None
+        left, sizes, _ = np.linalg.svd(free / np.linalg.norm(free, axis=0), full_matrices=not is_sparse)
+        rank = int((sizes > _RANK * sizes[0]).sum())
+        if is_sparse:
+            own, vectors = np.linalg.eigh(marks.covariances_mm2)
+            axes = csr_array(bsr_array((vectors, np.arange(len(x)), np.arange(len(x) + 1))))
+            basis, variances = axes.T @ left[:, :rank], own.ravel()
+        else:
+            covariance = np.zeros((len(x), 2, len(x), 2))
+            covariance[np.arange(len(x)), :, np.arange(len(x))] = marks.covariances_mm2
+            whole = covariance.reshape(2 * len(x), -1)
+            whole = whole if marks.shared_mm2 is None else whole + marks.shared_mm2
+            variances, vectors = np.linalg.eigh(left[:, rank:].T @ whole @ left[:, rank:])
+            axes, basis = left[:, rank:] @ vectors, np.zeros((len(variances), 0))
+        reduced = cls(axes, np.maximum(variances, _LEAST_MM**2), np.zeros(0), basis)
+        return replace(reduced, residuals=reduced.principal(marks.off_mm.ravel()))
 
-    def shifted(self, beyond: Mask) -> Array:
-        """(m, n + j, 2) derivatives of the residuals by a shift of each mark, and of those beyond each jump."""
-        basis = self.basis.reshape(len(beyond), 2, -1)
-        return np.concatenate([basis, np.einsum("naj,ng->gaj", basis, beyond)]).transpose(2, 0, 1)
+    @property
+    def redundancy(self) -> int:
+        return int(len(self.variances) - self.basis.shape[1])
 
-    def weighted(self, film_mm: float) -> Array:
-        """(2n, m) basis over the variances, for a film scatter of film_mm."""
-        return np.asarray(self.basis / (self.variances + film_mm**2))
+    def principal(self, off_mm: Array) -> Array:
+        """(m,) misfit off_mm (2n,) in the principal axes, less its unweighted fit by the free parameters."""
+        off = np.asarray(self.axes.T @ off_mm)
+        return np.asarray(off - self.basis @ (self.basis.T @ off))
+
+    def chi_squares(self, films_mm2: Array) -> Array:
+        """(s,) chi-squares of the misfit for variances films_mm2 (s,) of the film's scatter."""
+        if self.basis.size:
+            return np.asarray(self.weigh(films_mm2).products(self.residuals[:, None])[:, 0, 0])
+        return np.asarray((self.residuals**2 / (self.variances + films_mm2[:, None])).sum(axis=1))
+
+    def weigh(self, films_mm2: Array, effects: Array | None = None, sigmas: Array | None = None) -> "_Weight":
+        """Weight matrices for variances films_mm2 (s,) of the film's scatter, and random effects, if any, with the
+        derivatives effects (2n, e) and standard deviations sigmas (s, e)."""
+        weights, free = 1 / (self.variances + films_mm2[:, None]), self.basis.shape[1]
+        columns, scale = self.basis, np.ones((len(weights), free))
+        if effects is not None and sigmas is not None:
+            columns, scale = np.hstack([columns, self.axes.T @ effects]), np.hstack([scale, sigmas])
+        weighted = scale[:, :, None] * columns.T * weights[:, None]
+        normal = weighted @ columns * scale[:, None]
+        normal += np.diag(np.arange(columns.shape[1]) >= free)
+        factor = np.linalg.cholesky(normal)
+        determinant = 2 * np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1) - np.log(weights).sum(axis=1)
+        return _Weight(weights, np.linalg.solve(factor, weighted), np.asarray(determinant))
+
+
+@dataclass(frozen=True, eq=False)
+class _Weight:
+    """Weight matrices of s states in the principal axes: diag(weights) - taken' taken, with weights (s, m), taken
+    (s, a, m) by free parameters and random effects; log_determinant: (s,) of the covariance."""
+
+    weights: Array
+    taken: Array
+    log_determinant: Array
+
+    def products(self, images: Array) -> Array:
+        """(s, c, c) products of images (m, c) with the weight matrix between them."""
+        taken = self.taken @ images
+        return np.asarray((images.T * self.weights[:, None]) @ images - taken.swapaxes(1, 2) @ taken)
+
+    def shifts(self, residuals: Array, columns: Any, rows: Any) -> tuple[Array, Array]:
+        """Weighted misfits (s, g, 2) and weight matrices (s, g, 2, 2) of shifts of g groups of marks; columns, rows
+        (g, m): their derivatives along x and y."""
+        weighted = self.weights * residuals - ((self.taken @ residuals)[:, None] @ self.taken)[:, 0]
+        images, count = self.taken.reshape(-1, self.taken.shape[-1]), self.taken.shape[:2]
+        taken = [(each @ images.T).reshape(each.shape[0], *count) for each in (columns, rows)]
+        pairs = ((0, 0), (0, 1), (1, 1))
+        xx, xy, yy = (
+            ((columns, rows)[i] * (columns, rows)[j]) @ self.weights.T - (taken[i] * taken[j]).sum(axis=2)
+            for i, j in pairs
+        )
+        pulls = np.stack([each @ weighted.T for each in (columns, rows)], axis=-1)
+        blocks = np.stack([xx, xy, xy, yy], axis=-1).reshape(*xx.shape, 2, 2)
+        return pulls.swapaxes(0, 1), blocks.swapaxes(0, 1)
+
+
+def _derivatives(marks: FrameMarks, reduced: _Reduced) -> tuple[Any, Any]:
+    """(n + j, m) derivatives of the misfit by a shift along x and y of each mark, and of those beyond each jump."""
+    groups = csr_array(np.vstack([np.eye(len(marks.given_mm)), marks.beyond_jumps.T]))
+    return groups @ reduced.axes[::2], groups @ reduced.axes[1::2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,39 +350,43 @@ class FrameConsistency:
     log_evidence : (4, 1 + n + j) log evidence of the hypotheses with nothing else wrong (first column), with a gross
         error in each mark, and with each jump, given that something is wrong.
     off_mm : (n + j, 2) estimated gross error of each mark, and size of each jump, if it is the only one.
-    beyond_jumps : (n, j) marks beyond each jump.
+    marks : n marks.
     """
 
     log_evidence: Array
     off_mm: Array
-    beyond_jumps: Mask
+    marks: int
+
+    @cached_property
+    def _whole(self) -> Array:
+        """(1 + n + j,) log evidence over all hypotheses on the film."""
+        return np.asarray(logsumexp(self.log_evidence, axis=0))
 
     @property
     def log_odds(self) -> Array:
         """(n + 1,) log-odds of a gross error in each mark, and of any jump, against all other explanations."""
-        whole, n = logsumexp(self.log_evidence, axis=0), len(self.beyond_jumps)
-        causes = np.append(whole[: n + 1], logsumexp(np.append(whole[n + 1 :], -np.inf)))
-        others = np.where(np.eye(n + 2)[1:], -np.inf, causes)
+        causes = np.append(self._whole[: self.marks + 1], logsumexp(np.append(self._whole[self.marks + 1 :], -np.inf)))
+        others = np.where(np.eye(self.marks + 2)[1:], -np.inf, causes)
         return np.asarray(causes[1:] - logsumexp(others, axis=1))
 
     @property
     def log_gain(self) -> Array:
         """(n,) log-odds of a gross error in each mark against none, with or without a jump."""
-        whole, n = logsumexp(self.log_evidence, axis=0), len(self.beyond_jumps)
+        whole, n = self._whole, self.marks
         return np.asarray(whole[1 : n + 1] - logsumexp([whole[0], *whole[n + 1 :]]))
 
     @property
     def wrong_mark(self) -> int | None:
         """Mark whose gross error is accepted; None if there is none."""
         odds, best = self.log_odds, int(self.log_odds.argmax())
-        return best if odds[best] > NAMED and best < len(self.beyond_jumps) else None
+        return best if odds[best] > NAMED and best < self.marks else None
 
     @property
     def jump_mm(self) -> float | None:
         """Size of the likeliest jump, if there is one; None otherwise. Its place may be ambiguous."""
-        n = len(self.beyond_jumps)
-        likeliest = int(logsumexp(self.log_evidence, axis=0)[n + 1 :].argmax()) if self.beyond_jumps.size else 0
-        return float(np.hypot(*self.off_mm[n + likeliest])) if self.log_odds[-1] > NAMED else None
+        if self.log_odds[-1] <= NAMED:
+            return None
+        return float(np.hypot(*self.off_mm[self.marks + int(self._whole[self.marks + 1 :].argmax())]))
 
     @property
     def suspects(self) -> Mask:
@@ -344,28 +408,27 @@ def frame_p_value(marks: FrameMarks, film: Scatter = LONE_FILM, affinity: Affini
     The smallest p-value, corrected for the number of tests, of: the misfit beyond an affine transformation; the
     affinity; and the largest misfit of a single mark, or of the marks beyond a jump.
     """
-    chi_square, degrees, reduced = marks.chi_square(film.sigma), marks.redundancy, marks._beyond_affine
-    p_values = [1.0]
+    degrees, reduced, p_values = marks.redundancy, marks._beyond_affine, [1.0]
     if degrees:
-        spread = reduced.variances + film.variances(_AVERAGED)[:, None]
-        p_values.append(float(chdtrc(degrees, (reduced.residuals**2 / spread).sum(axis=1)).mean()))
-    fitted, covariance = marks.affinity(film.sigma)
-    if np.linalg.matrix_rank(covariance, tol=_RANK * np.trace(covariance)) == len(fitted):
+        p_values.append(float(chdtrc(degrees, reduced.chi_squares(film.variances(_AVERAGED))).mean()))
+    if marks._beyond_congruent.redundancy == degrees + len(affinity.mean):  # size, stretch and shear are not free
+        fitted, covariance = marks.affinity(film.sigma)
         apart, spread = fitted - affinity.mean, covariance + affinity.scatter.sigma**2 * np.eye(3)
         first = int(affinity.size_is_free)
         apart, spread, tested = apart[first:], spread[first:, first:], len(apart) - first
         p_values.append(float(fdtrc(tested, affinity.scatter.degrees, apart @ np.linalg.solve(spread, apart) / tested)))
     if degrees > 2:
-        shifts, weight = reduced.shifted(marks.beyond_jumps), 1 / (reduced.variances + film.sigma**2)
-        pulls = np.einsum("m,mga->ga", weight * reduced.residuals, shifts)
-        blocks = np.einsum("m,mga,mgb->gab", weight, shifts, shifts, optimize=True)
+        weight = reduced.weigh(np.array([film.sigma**2]))
+        (pulls,), (blocks,) = weight.shifts(reduced.residuals, *_derivatives(marks, reduced))
         known = np.linalg.eigvalsh(blocks)[:, 0] > _RANK * np.trace(blocks, axis1=1, axis2=2).max()
         solved = np.linalg.solve(blocks[known], pulls[known][..., None])[..., 0]
         share = float((pulls[known] * solved).sum(axis=1).max(initial=0.0))
-        scatter_degrees = marks.scatter_degrees(film)
+        # Only the film's part of a residual's variance is estimated: degrees of freedom by Welch and Satterthwaite.
+        total_mm2 = degrees / float(np.trace(blocks[: len(marks.given_mm)], axis1=1, axis2=2).sum())
+        scatter_degrees = film.degrees * (total_mm2 / film.sigma**2) ** 2
         others = scatter_degrees + degrees - 2
-        ratio = share / 2 * others / (scatter_degrees + max(chi_square - share, 0.0))
-        p_values.append(len(shifts[0]) * float(fdtrc(2, others, ratio)))
+        ratio = share / 2 * others / (scatter_degrees + max(marks.chi_square(film.sigma) - share, 0.0))
+        p_values.append(len(blocks) * float(fdtrc(2, others, ratio)))
     return min(1.0, _TESTS * min(p_values))
 
 
@@ -392,30 +455,13 @@ def frame_consistency(
     whether something is wrong; the evidence compares only the alternatives. Random effects of low rank are added by the
     matrix determinant lemma (Harville 1997, 18.1).
     """
-    states = _states(marks, film, affinity)
+    hypotheses, films_mm2, effects_mm2, log_prior = _states(marks, film, affinity)
     reduced = marks._beyond_congruent
-    moved = reduced.shifted(marks.beyond_jumps)
-    groups = moved.shape[1]
-    residual = marks.off_mm.ravel() - marks.affine @ affinity.mean
-    effects = reduced.basis.T @ np.column_stack([marks.affine, marks.perspective])
-    shifts = np.column_stack([reduced.basis.T @ residual, moved.reshape(len(moved), -1)])
-    spread = reduced.variances + states.film[:, None]
-    known = states.log_prior - 0.5 * np.log(spread).sum(axis=1)
-    width = np.sqrt(states.effects)
-    weighted = width[:, :, None] * effects.T / spread[:, None]
-    inner = np.eye(5) + weighted @ effects * width[:, None, :]
-    cross = weighted @ shifts
-    taken = np.linalg.solve(inner, cross)
-    chi_square = (shifts[:, 0] ** 2 / spread).sum(axis=1) - (cross[:, :, 0] * taken[:, :, 0]).sum(axis=1)
-    known = known - 0.5 * (np.linalg.slogdet(inner)[1] + chi_square)
-    pulls = (shifts[:, 0] / spread) @ shifts[:, 1:] - np.einsum("sp,spj->sj", cross[:, :, 0], taken[:, :, 1:])
-    pulls = pulls.reshape(-1, groups, 2)
-    # Only the diagonal 2 x 2 blocks of the weight matrix are needed: the whole one of many marks would take minutes.
-    by_mark = (len(spread), 5, groups, 2)
-    blocks = (1 / spread) @ (moved[..., :, None] * moved[..., None, :]).reshape(len(moved), -1)
-    blocks = blocks.reshape(-1, groups, 2, 2) - np.einsum(
-        "spka,spkb->skab", cross[:, :, 1:].reshape(by_mark), taken[:, :, 1:].reshape(by_mark)
-    )
+    residuals = reduced.principal(marks.off_mm.ravel() - marks.affine @ affinity.mean)
+    weight = reduced.weigh(films_mm2, np.column_stack([marks.affine, marks.perspective]), np.sqrt(effects_mm2))
+    chi_square = weight.products(residuals[:, None])[:, 0, 0]
+    known = log_prior - 0.5 * (weight.log_determinant + chi_square)
+    pulls, blocks = weight.shifts(residuals, *_derivatives(marks, reduced))
     # An error of variance s in mark k, or in all marks beyond jump k, changes the evidence by |I + s B| and p' d, where
     # d = (I / s + B)^-1 p is the estimated error. B: weight matrix of the mark; p: weighted misfit. All are written out
     # for 2 x 2 matrices.
@@ -428,11 +474,11 @@ def frame_consistency(
     gain = 0.5 * (off_x * x + off_y * y - np.log(wider))
     with_mark = logsumexp(gain, axis=0) - np.log(_WIDTHS) + _PRIOR
     every = known[:, None] + np.column_stack([np.zeros(len(known)), with_mark])
-    evidence = np.array([logsumexp(every[states.hypothesis == each], axis=0) for each in Hypothesis])
+    evidence = np.array([logsumexp(every[hypotheses == each], axis=0) for each in Hypothesis])
     evidence[Hypothesis.SOUND, 0] = -np.inf
     weights = np.exp(every - logsumexp(every, axis=0))
     off_mm = np.stack([(weights[:, 1:] * off[-1]).sum(axis=0) for off in (off_x, off_y)], axis=1)
-    return FrameConsistency(evidence, off_mm, marks.beyond_jumps)
+    return FrameConsistency(evidence, off_mm, len(marks.given_mm))
 
 
 def gross_errors(marks: FrameMarks, film: Scatter, gate_mm: float) -> NDArray[np.bool_]:
@@ -470,25 +516,14 @@ def gross_errors(marks: FrameMarks, film: Scatter, gate_mm: float) -> NDArray[np
     return out
 
 
-@dataclass(frozen=True, eq=False)
-class _States:
+def _states(marks: FrameMarks, film: Scatter, affinity: Affinity) -> tuple[NDArray[np.intp], Array, Array, Array]:
     """Grid of s states of film and scan, over which the evidence is summed.
 
-    Attributes
-    ----------
-    hypothesis : (s,) `Hypothesis`.
-    film : (s,) variance of the film's scatter, mm2.
-    effects : (s, 5) variances of affinity (3) and perspective (2).
-    log_prior : (s,) log prior probability.
+    Returns
+    -------
+    (s,) `Hypothesis`; (s,) variance of the film's scatter, mm2; (s, 5) variances of affinity (3) and perspective (2);
+    (s,) log prior probability.
     """
-
-    hypothesis: NDArray[np.intp]
-    film: Array
-    effects: Array
-    log_prior: Array
-
-
-def _states(marks: FrameMarks, film: Scatter, affinity: Affinity) -> _States:
     films, stretches, bends = film.variances(), affinity.scatter.variances(), _widths(MOST_BENT_MM)
     bent = (films.mean() + bends**2, stretches, np.zeros(1))
     pitch = (films, np.geomspace(AFFINITY_SIGMA / 10, MOST_STRETCHED, _WIDTHS) ** 2, np.zeros(1))
@@ -507,7 +542,7 @@ def _states(marks: FrameMarks, film: Scatter, affinity: Affinity) -> _States:
     is_pitch = hypothesis == Hypothesis.PITCH
     effects[is_pitch, :3] = stretches.mean() + stretch[is_pitch, None] * (1.0, 1.0, _TURNED**2)
     effects[:, 0] += (MOST_STRETCHED * affinity.size_is_free) ** 2
-    return _States(hypothesis.astype(np.intp), film_mm2, effects, prior)
+    return hypothesis.astype(np.intp), film_mm2, effects, prior
 
 
 def _widths(most_mm: float) -> Array:

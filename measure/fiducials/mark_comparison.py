@@ -13,14 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import ndtr
 
-from measure.array_types import Array
+from measure.array_types import Array, Mask
 from measure.flags import FALSE_DOUBT, MARK_UNLIKE_THE_OTHERS, NO_REASON, Code, Reason, Status
 from measure.matching.models import PIXEL_VARIANCE_PX2
 from measure.results import FrameMeasurement, MarkFit, MarkMeasurement
-
-# Standard deviation of a figure from mark to mark: from the variance between marks in excess of their own variances,
-# and the number of marks.
-_Spread = Callable[[float, int], float]
 
 _FEWEST_BLURS = 3  # other marks needed to estimate their scatter in blur
 _FEWEST_SHAPES = 2  # other marks needed: the scatter in size has a prior, but of two marks either may be the outlier
@@ -44,7 +40,69 @@ _WIDTH_SIGMA = 0.15  # standard deviation of the logarithm of the width of a fra
 _LEAST_WIDTH, _LONGEST_WIDTH = 0.03, 0.2  # of the same: a smaller change is ignored, a larger one is not linear
 _SHORTEST = 0.1  # lower bound of ratios: an arm shorter than this counts as missing
 _ARM, _SHAPE, _BLUR = "arm", "shape", "blur"
-Key = tuple[str, str]  # a mark and its figure: size, turn, blur, arm1, arm2, ...
+
+
+def blur_spread(shown: Array, marks: Array) -> Array:
+    """Standard deviation of the log blur from mark to mark. shown: observed variance in excess of the marks' own."""
+    return np.sqrt(shown + _BLUR_SPREAD**2)
+
+
+def size_spread(shown: Array, marks: Array) -> Array:
+    """Standard deviation of log size or rotation from mark to mark, combined with the prior. shown: variance that the
+    marks show in excess of their own; marks: their number."""
+    return np.asarray(np.sqrt((_BEFORE * _SIZE_SPREAD**2 + (marks - 1) * shown) / (_BEFORE + marks - 1)))
+
+
+_Spread = Callable[[Array, Array], Array]
+
+
+def mean_of_unlike(values: Array, sigmas: Array, among: Mask, spread: _Spread) -> tuple[Array, Array, Array]:
+    """Random-effects means of values that scatter by more than their standard deviations.
+
+    Parameters
+    ----------
+    values, sigmas : (n,)
+    among : (..., n) the values, two or more, of each mean.
+    spread : standard deviation between the values from their variance in excess of their own, and their number.
+
+    Returns
+    -------
+    Weighted means (...), their standard deviations, and the standard deviations between the values.
+
+    Notes
+    -----
+    The variance between the values is the moment estimator of DerSimonian and Laird (1986).
+    """
+    weights, count = among / sigmas**2, among.sum(axis=-1)
+    total = weights.sum(axis=-1)
+    rest = values - (weights @ values / total)[..., None]
+    excess = (weights * rest**2).sum(axis=-1) - (count - 1)
+    apart = spread(np.maximum(excess / (total - (weights**2).sum(axis=-1) / total), 0.0), count)
+    weights = among / (sigmas**2 + apart[..., None] ** 2)
+    total = weights.sum(axis=-1)
+    return weights @ values / total, 1 / np.sqrt(total), apart
+
+
+@dataclass(frozen=True, eq=False)
+class _Expected:
+    """Figures (n,) predicted from the other marks, nan where these are too few. sigma: standard deviations of the
+    predictions for one more mark; off: deviations from them; differs: whether these are significant."""
+
+    value: Array
+    sigma: Array
+    off: Array
+    differs: Mask
+
+    @classmethod
+    def from_others(cls, own: Array, sigmas: Array, spread: _Spread, fewest: int) -> "_Expected":
+        """Predict figures from at least so many others. sigmas (n,): inf where not estimated."""
+        among = np.isfinite(sigmas) & ~np.eye(len(own), dtype=bool)
+        enough = among.sum(axis=1) >= fewest
+        value, sigma = np.full((2, len(own)), np.nan)
+        value[enough], mean_sigma, apart = mean_of_unlike(own, sigmas, among[enough], spread)
+        sigma[enough] = np.hypot(mean_sigma, apart)
+        p_values = 2 * ndtr(-np.abs(own - value) / np.hypot(sigma, sigmas)) * len(own)
+        return cls(value, sigma, own - value, p_values < MARK_UNLIKE_THE_OTHERS)
 
 
 @dataclass(frozen=True)
@@ -71,14 +129,33 @@ def shared_blurs(fits: Sequence[MarkFit]) -> list[SharedBlur | None]:
     """Predict the blur of each mark from the others. None if these are too few, or if the mark's own blur is well
     determined and agrees with theirs."""
     own = np.array([_log_total_px(fit.blur_px) for fit in fits])
-    sigma = np.array([fit.blur_sigma for fit in fits])
-    expected_blurs = _expect_from_others(own, sigma, blur_spread, _FEWEST_BLURS)
-    return [
-        None
-        if expected is None or not (expected.differs or own_sigma > _TELLING)
-        else SharedBlur(_remove_pixel(expected.value), expected.sigma, expected.differs)
-        for expected, own_sigma in zip(expected_blurs, sigma.tolist(), strict=True)
-    ]
+    sigmas = np.array([fit.blur_sigma for fit in fits])
+    found = _Expected.from_others(own, sigmas, blur_spread, _FEWEST_BLURS)
+    needed = ~np.isnan(found.value) & (found.differs | (sigmas > _TELLING))
+    blurs_px = np.sqrt(np.maximum(np.exp(2 * found.value) - PIXEL_VARIANCE_PX2, 0.0))
+    blurs = map(SharedBlur, blurs_px.tolist(), found.sigma.tolist(), found.differs.tolist())
+    return [blur if is_needed else None for blur, is_needed in zip(blurs, needed, strict=True)]
+
+
+def _log_total_px(blur_px: float) -> float:
+    """Logarithm of the total blur, pixel included."""
+    return float(np.log(blur_px**2 + PIXEL_VARIANCE_PX2) / 2)
+
+
+def shared_line_width(widths: Sequence[tuple[float, float] | None]) -> float:
+    """Ratio of the width of the lines of crosses of one drawing to the drawn width; 1 if not significant.
+
+    widths: logarithm of each cross's own ratio and its standard deviation; None where the blur explains its lines.
+    """
+    found = [width for width in widths if width is not None]
+    if len(found) < max(_FEWEST_BLURS, len(widths) / 2):
+        return 1.0
+    values, sigmas = np.array(found).T
+    off = np.abs(values - np.median(values))
+    mean, sigma, _ = mean_of_unlike(values, sigmas, off <= _NEAR * np.hypot(sigmas, np.median(off)), size_spread)
+    known = float(mean / (1 + (sigma / _WIDTH_SIGMA) ** 2))
+    is_clear = abs(known) > max(_NEAR * float(sigma), _LEAST_WIDTH)
+    return float(np.exp(np.clip(known, -_LONGEST_WIDTH, _LONGEST_WIDTH))) if is_clear else 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,21 +179,34 @@ class SharedShape:
         return max(touched / max(touched + untouched, 1e-300) - share, 0.0)
 
 
-def shared_line_width(widths: Sequence[tuple[float, float] | None]) -> float:
-    """Ratio of the width of the lines of crosses of one drawing to the drawn width; 1 if not significant.
+def _density(off: Array, sigma: Array) -> float:
+    """Density of independent normal deviations."""
+    return float(np.prod(np.exp(-0.5 * (off / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)))
 
-    widths: logarithm of each cross's own ratio and its standard deviation; None where the blur explains its lines.
+
+def shared_shapes(own: Array, sigmas: Array) -> list[SharedShape | None]:
+    """Compare the shapes of marks of one drawing, or of all marks held by the frame.
+
+    Parameters
+    ----------
+    own, sigmas : (n, k) logarithm of the size of each mark, and its rotation (rad) if the frame gave it, and their
+        standard deviations, inf where not estimated.
+
+    Returns
+    -------
+    Shape of each mark relative to the others, None where these are too few.
     """
-    found = [width for width in widths if width is not None]
-    if len(found) < max(_FEWEST_BLURS, len(widths) / 2):
-        return 1.0
-    values, sigmas = np.array(found).T
-    off = np.abs(values - np.median(values))
-    near = off <= _NEAR * np.hypot(sigmas, np.median(off))
-    mean, sigma, _ = mean_of_unlike(values[near], sigmas[near], size_spread)
-    known = float(mean / (1 + (sigma / _WIDTH_SIGMA) ** 2))
-    is_clear = abs(known) > max(_NEAR * sigma, _LEAST_WIDTH)
-    return float(np.exp(np.clip(known, -_LONGEST_WIDTH, _LONGEST_WIDTH))) if is_clear else 1.0
+    off, off_sigma, differs = np.zeros(own.shape), np.zeros(own.shape), np.zeros(own.shape, dtype=bool)
+    for column, (values, sigma) in enumerate(zip(own.T, sigmas.T, strict=True)):
+        every = _Expected.from_others(values, sigma, size_spread, _FEWEST_SHAPES)
+        sound = _Expected.from_others(values, np.where(every.differs, np.inf, sigma), size_spread, _FEWEST_SHAPES)
+        # Outliers do not count where enough marks remain.
+        by_all = every.differs | np.isnan(sound.value)
+        off[:, column] = np.where(by_all, every.off, sound.off)
+        off_sigma[:, column] = np.hypot(sigma, np.where(by_all, every.sigma, sound.sigma))
+        differs[:, column] = np.where(by_all, every.differs, sound.differs)
+    shapes = map(SharedShape, off, off_sigma, map(any, differs.tolist()))
+    return [None if np.isnan(shape.off).any() else shape for shape in shapes]
 
 
 def unlike_others(size_ratio: float, turn_rad: float | None) -> Reason:
@@ -132,11 +222,6 @@ def unlike_others(size_ratio: float, turn_rad: float | None) -> Reason:
 def unlike_blur(ratio: float) -> Reason:
     """Reason why a mark is weak: its blur differs from the others."""
     return Reason(f"its blur is {ratio:.2f} times that of the other marks", Code.BLUR)
-
-
-def _density(off: Array, sigma: Array) -> float:
-    """Density of independent normal deviations."""
-    return float(np.prod(np.exp(-0.5 * (off / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)))
 
 
 @dataclass(frozen=True)
@@ -177,155 +262,65 @@ def touch_of_edges(shape: SharedShape, on_place: Array, middle_px: float, is_dam
     return Touch(shape.touched(_TOUCHED_PX / middle_px, is_damaged), float(np.hypot(*(on_place @ shape.off))), 0.0)
 
 
-def shared_shapes(own: Array, sigma: Array) -> list[SharedShape | None]:
-    """Compare the shapes of marks of one drawing, or of all marks held by the frame.
-
-    Parameters
-    ----------
-    own, sigma : (n, k) logarithm of the size of each mark, and its rotation (rad) if the frame gave it, and their
-        standard deviations, inf where not estimated.
-
-    Returns
-    -------
-    Shape of each mark relative to the others, None where these are too few.
-    """
-    columns = [_expect_from_sound(*pair) for pair in zip(own.T, sigma.T, strict=True)]
-    result: list[SharedShape | None] = []
-    for figures, sigmas, each in zip(own, sigma, zip(*columns, strict=True), strict=True):
-        expected = [one for one in each if one is not None]
-        if len(expected) < len(figures):
-            result.append(None)
-            continue
-        off = figures - [one.value for one in expected]
-        off_sigma = np.hypot(sigmas, [one.sigma for one in expected])
-        result.append(SharedShape(off, off_sigma, any(one.differs for one in expected)))
-    return result
-
-
-def _expect_from_sound(own: Array, sigma: Array) -> "list[_Expected | None]":
-    """Predict one figure of each mark's shape from the others, without outliers if enough marks remain."""
-    every = _expect_from_others(own, sigma, size_spread, _FEWEST_SHAPES)
-    odd = np.array([each is not None and each.differs for each in every])
-    sound = _expect_from_others(own, np.where(odd, np.inf, sigma), size_spread, _FEWEST_SHAPES)
-    return [first if is_odd else again or first for first, again, is_odd in zip(every, sound, odd, strict=True)]
-
-
-def blur_spread(shown: float, marks: int) -> float:
-    """Standard deviation of the log blur from mark to mark. shown: observed variance in excess of the marks' own."""
-    return float(np.hypot(np.sqrt(shown), _BLUR_SPREAD))
-
-
-def size_spread(shown: float, marks: int) -> float:
-    """Standard deviation of log size or rotation from mark to mark, combined with the prior. shown: variance that the
-    marks show in excess of their own."""
-    return float(np.sqrt((_BEFORE * _SIZE_SPREAD**2 + (marks - 1) * shown) / (_BEFORE + marks - 1)))
-
-
-def _log_total_px(blur_px: float) -> float:
-    """Logarithm of the total blur, pixel included."""
-    return float(np.log(blur_px**2 + PIXEL_VARIANCE_PX2) / 2)
-
-
-def _remove_pixel(log_seen_px: float) -> float:
-    return float(np.sqrt(max(np.exp(2 * log_seen_px) - PIXEL_VARIANCE_PX2, 0.0)))
-
-
-@dataclass(frozen=True)
-class _Expected:
-    """Figure predicted from the other marks. sigma: standard deviation of the prediction for one more mark; differs:
-    whether the mark's own figure differs significantly."""
-
-    value: float
-    sigma: float
-    differs: bool
-
-
-def _expect_from_others(own: Array, sigma: Array, spread: _Spread, fewest: int) -> "list[_Expected | None]":
-    """Predict figures (n,) from at least so many others. sigma (n,): inf where not estimated."""
-    result: list[_Expected | None] = []
-    for index in range(len(own)):
-        others = np.isfinite(sigma) & (np.arange(len(own)) != index)
-        if others.sum() < fewest:
-            result.append(None)
-            continue
-        mean, mean_sigma, apart = mean_of_unlike(own[others], sigma[others], spread)
-        predicted = float(np.hypot(mean_sigma, apart))
-        off = abs(own[index] - mean) / np.hypot(predicted, sigma[index])
-        result.append(_Expected(mean, predicted, bool(2 * ndtr(-off) * len(own) < MARK_UNLIKE_THE_OTHERS)))
-    return result
-
-
-def mean_of_unlike(values: Array, sigma: Array, spread: _Spread) -> tuple[float, float, float]:
-    """Random-effects mean of values that scatter by more than their standard deviations.
-
-    Returns
-    -------
-    Weighted mean, its standard deviation, and the standard deviation between the values, as spread gives it.
-
-    Notes
-    -----
-    The variance between the values is the moment estimator of DerSimonian and Laird (1986).
-    """
-    weights = 1 / sigma**2
-    rest = values - weights @ values / weights.sum()
-    exceedance = weights @ rest**2 - (len(values) - 1)
-    between = max(exceedance / (weights.sum() - (weights**2).sum() / weights.sum()), 0.0)
-    apart = spread(float(between), len(values))
-    weights = 1 / (sigma**2 + apart**2)
-    return float(weights @ values / weights.sum()), float(1 / np.sqrt(weights.sum())), apart
-
-
-@dataclass(frozen=True, eq=False)
-class OwnFigure:
-    """Figure of a mark, estimated from the frames that agree: logarithm of a ratio, or rotation (rad).
-
-    Attributes
-    ----------
-    value, sigma : mean and its standard deviation.
-    off, off_sigma : (n,) deviation of each frame from the mean of the other agreeing ones, and its standard deviation.
-    """
-
-    value: float
-    sigma: float
-    off: Array
-    off_sigma: Array
-
-    @classmethod
-    def from_frames(cls, values: Array, sigmas: Array, is_blur: bool) -> "OwnFigure | None":
-        """Estimate the figure from its values (n,) in the frames. Returns None for fewer than three frames, or if no
-        more than half of them agree."""
-        spread_of = blur_spread if is_blur else size_spread
-        near = _NEAR * np.hypot(sigmas, spread_of(0.0, 1))
-        agrees = np.abs(values - np.median(values)) <= near
-        if len(values) < _FEWEST_FRAMES or 2 * agrees.sum() <= len(values):
-            return None
-        value, sigma, spread = mean_of_unlike(values[agrees], sigmas[agrees], spread_of)
-        weights = agrees / (sigmas**2 + spread**2)
-        others = weights.sum() - weights
-        off = values - (weights.sum() * value - weights * values) / others
-        return cls(value, sigma, off, np.sqrt(1 / others + sigmas**2 + spread**2))
-
-
-def own_figures(frames: Sequence[FrameMeasurement]) -> dict[Key, tuple[list[int], OwnFigure]]:
-    """For each mark and figure on which enough frames agree: indices of the frames that contain it, and its
-    estimate."""
-    figures = defaultdict[Key, list[tuple[int, float, float]]](list)
+def check_own_figures(frames: Sequence[FrameMeasurement]) -> list[FrameMeasurement]:
+    """Set marks to weak whose figures differ in one frame only, and back to measured where all frames share the
+    deviation."""
+    figures = defaultdict[tuple[str, str], list[tuple[int, float, float]]](list)
     for place, frame in enumerate(frames):
         for key, (value, sigma) in _figures(frame).items():
             figures[key].append((place, value, sigma))
-    pooled = {}
+    compared = {}
     for key, each in figures.items():
-        places, values, sigmas = zip(*each, strict=True)
-        own = OwnFigure.from_frames(np.array(values), np.array(sigmas), key[1] == _BLUR)
-        if own is not None:
-            pooled[key] = list(places), own
-    return pooled
+        _, values, sigmas = np.array(each).T
+        compared[key] = compare_frames(values, sigmas, key[1])
+    tests = sum(len(figures[key]) for key, own in compared.items() if own is not None)
+    findings: list[dict[str, dict[str, Reason]]] = [defaultdict(dict) for _ in frames]
+    arms = defaultdict[str, list[float]](list)
+    for (point, kind), own in compared.items():
+        if own is None:
+            continue
+        value, off, off_sigmas = own
+        p_values = 2 * ndtr(-np.abs(off / off_sigmas)) * tests
+        speaks_for = _BLUR if kind == _BLUR else _SHAPE
+        arms[point] += [value] if kind.startswith(_ARM) else []
+        for (place, *_), one, p_value in zip(figures[point, kind], off.tolist(), p_values.tolist(), strict=True):
+            finding, reason = findings[place][point], _unlike_frames(kind, one) if p_value < FALSE_DOUBT else NO_REASON
+            finding[speaks_for] = finding.get(speaks_for) or reason
+    return [
+        replace(frame, marks=tuple(_assess(mark, found.get(mark.point, {}), arms[mark.point]) for mark in frame.marks))
+        for frame, found in zip(frames, findings, strict=True)
+    ]
 
 
-def _figures(frame: FrameMeasurement) -> dict[Key, tuple[float, float]]:
+def compare_frames(values: Array, sigmas: Array, kind: str) -> tuple[float, Array, Array] | None:
+    """Compare a figure of a mark, logarithm of a ratio or rotation (rad), with that in the other frames that agree.
+
+    Parameters
+    ----------
+    values, sigmas : (n,) in the frames, with standard deviations.
+    kind : of the figure: size, turn, blur, arm1, arm2, ...
+
+    Returns
+    -------
+    Mean; (n,) deviation of each frame from the mean of the others, and its standard deviation. None for fewer than
+    three frames, or if no more than half of them agree.
+    """
+    spread = blur_spread if kind == _BLUR else size_spread
+    near = _NEAR * np.hypot(sigmas, spread(np.zeros(1), np.ones(1)))
+    agrees = np.abs(values - np.median(values)) <= near
+    if len(values) < _FEWEST_FRAMES or 2 * agrees.sum() <= len(values):
+        return None
+    value, _, apart = mean_of_unlike(values, sigmas, agrees, spread)
+    weights = agrees / (sigmas**2 + apart**2)
+    others = weights.sum() - weights
+    off = values - (weights @ values - weights * values) / others
+    return float(value), off, np.sqrt(1 / others + sigmas**2 + apart**2)
+
+
+def _figures(frame: FrameMeasurement) -> dict[tuple[str, str], tuple[float, float]]:
     """Figures of a frame's marks, as in an unmirrored scan and with arms relative to the frame's, and their sigmas."""
     mirrored = -1.0 if frame.pose and frame.pose.name.endswith("m") else 1.0
-    figures: dict[Key, tuple[float, float]] = {}
+    figures: dict[tuple[str, str], tuple[float, float]] = {}
     for mark in frame.marks:
         if mark.status.is_observation:
             own = {name: value for name, value in mark.quality.items() if name.endswith("_ratio")}
@@ -341,28 +336,6 @@ def _figures(frame: FrameMeasurement) -> dict[Key, tuple[float, float]]:
     return figures | {key: (figures[key][0] - usual, figures[key][1]) for key in arms}
 
 
-def check_own_figures(frames: Sequence[FrameMeasurement]) -> list[FrameMeasurement]:
-    """Set marks to weak whose figures differ in one frame only, and back to measured where all frames share the
-    deviation."""
-    figures = own_figures(frames)
-    tests = sum(len(places) for places, _ in figures.values())
-    findings: list[dict[str, dict[str, Reason]]] = [defaultdict(dict) for _ in frames]
-    arms = defaultdict[str, list[float]](list)
-    for (point, kind), (places, own) in figures.items():
-        p_values = 2 * ndtr(-np.abs(own.off / own.off_sigma)) * tests
-        speaks_for = _BLUR if kind == _BLUR else _SHAPE
-        arms[point] += [own.value] if kind.startswith(_ARM) else []
-        for place, off, p_value in zip(places, own.off.tolist(), p_values.tolist(), strict=True):
-            finding, reason = findings[place][point], _unlike_frames(kind, off) if p_value < FALSE_DOUBT else NO_REASON
-            finding[speaks_for] = finding.get(speaks_for) or reason
-    return [
-        replace(
-            frame, marks=tuple(_assess_mark(mark, found.get(mark.point, {}), arms[mark.point]) for mark in frame.marks)
-        )
-        for frame, found in zip(frames, findings, strict=True)
-    ]
-
-
 def _unlike_frames(kind: str, off: float) -> Reason:
     """Reason why a mark is weak: the figure differs from that in the other frames."""
     there, covered = "in the camera's other frames", "something may cover or touch it"
@@ -376,7 +349,7 @@ def _unlike_frames(kind: str, off: float) -> Reason:
     return Reason(f"{figure}: {covered}", Code.SIZE, Code.COVERED)
 
 
-def _assess_mark(mark: MarkMeasurement, findings: Mapping[str, Reason], arms: Sequence[float]) -> MarkMeasurement:
+def _assess(mark: MarkMeasurement, findings: Mapping[str, Reason], arms: Sequence[float]) -> MarkMeasurement:
     """Update the status of a mark. findings: reasons by kind, empty if frames agree; arms: log lengths on the plate."""
     quality, unlike = mark.quality, findings.get(_SHAPE, NO_REASON)
     if unlike and Code.SIZE not in mark.reason.codes:
@@ -393,5 +366,5 @@ def _assess_mark(mark: MarkMeasurement, findings: Mapping[str, Reason], arms: Se
 def _explains(arms: Sequence[float], quality: Mapping[str, float]) -> bool:
     """Whether the arms of a cross, if it has any, explain its size: a match yields a size between those of its arms."""
     size = float(np.log(quality["size_ratio"]))
-    near = _NEAR * float(np.hypot(quality["size_sigma"], size_spread(0.0, 1)))
+    near = _NEAR * float(np.hypot(quality["size_sigma"], _SIZE_SPREAD))
     return not arms or min(arms) - near <= size <= max(arms) + near

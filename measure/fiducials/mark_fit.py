@@ -64,18 +64,25 @@ def detect_mark(
         from a frame fitted to all marks.
     before : an earlier fit at that place, from which the new one starts.
     """
-    predicted = expected.center_px.copy()
-    inside = bool(np.all(predicted >= -0.5) and np.all(predicted < np.array([scan.width_px, scan.height_px]) - 0.5))
-    if not inside:
+    predicted, mark = expected.center_px.copy(), expected.mark
+    if not (np.all(predicted >= -0.5) and np.all(predicted < np.array([scan.width_px, scan.height_px]) - 0.5)):
         return Detection(predicted, False, None, Reason("its place is outside of the scan", Code.OUTSIDE))
-    fit, false_alarms = _localise_and_fit(scan, expected, options, frame_sigma, before)
-    if lost := _lost(scan, expected if fit is None or not fit.converged else expected.shift_to(fit.center_px)):
+    fit: MarkFit | None = None
+    false_alarms = 1.0
+    if isinstance(mark, FrameCorner):
+        fit = fit_frame_corner(
+            scan, mark, expected.pixel_from_mark, expected.search_px, expected.polarity, expected.weights
+        )
+    elif peak := localise(scan, expected) if expected.search_px > 0 else (predicted, 0.0):
+        false_alarms = peak[1]
+        fit = _match(scan, expected.shift_to(peak[0]), options_for(mark, options, frame_sigma), before)
+    place = expected.shift_to(fit.center_px) if fit is not None and fit.converged else expected
+    if why := scan.loss_reason(*mark_window(mark, place.pixel_from_mark, 0.0)):
+        lost = Reason(f"the scan's file is damaged at its place: {why}", Code.DAMAGED_FILE)
         return Detection(predicted, False, None, lost)
     if fit is None:
         return Detection(predicted, True, None, not_found(expected.search_px))
-    if not fit.converged:
-        return Detection(predicted, True, None, fit.reason)
-    reason = _unlike(fit, expected, scan.full_scale_dn)
+    reason = _unlike(fit, expected, scan.full_scale_dn) if fit.converged else fit.reason
     if reason:
         return Detection(predicted, True, None, reason)
     loss = covariance_of_compression(scan.rounding_step_dn, fit.stored_contrast_dn)
@@ -86,15 +93,20 @@ def detect_mark(
     return Detection(predicted, True, fit, false_alarms=false_alarms)
 
 
+def _match(scan: Scan, expected: MarkPrediction, options: MatchOptions, before: MarkFit | None) -> MarkFit:
+    """Match the mark from its predicted place."""
+    mark, start = expected.mark, expected.pixel_from_mark
+    coded = scan.replace_tone(LINEAR) if isinstance(mark, MarkTemplate) else scan  # stored values
+    window = read_window(coded, mark_window(mark, start, options.margin_px + BESIDE_PX), expected.weights)
+    if expected.surroundings.robust and isinstance(mark, MarkShape):
+        inner = np.column_stack([start[:, :2], start[:, 2] - window.origin_px])
+        window = window.exclude(pixels_beyond_edge(window.grey, mark, inner))
+    return match(window, mark, start, options, before)
+
+
 def not_found(search_px: float) -> Reason:
     """Reason for a mark that was not found."""
     return Reason(f"nothing within {search_px:.0f} px of its place matches its drawing", Code.NOT_FOUND)
-
-
-def _lost(scan: Scan, expected: MarkPrediction) -> Reason:
-    """Reason if pixels of the mark cannot be read from the file; empty otherwise."""
-    why = scan.loss_reason(*mark_window(expected.mark, expected.pixel_from_mark, 0.0))
-    return Reason(f"the scan's file is damaged at its place: {why}", Code.DAMAGED_FILE) if why else NO_REASON
 
 
 def _unlike(fit: MarkFit, expected: MarkPrediction, full_scale_dn: float) -> Reason:
@@ -116,35 +128,6 @@ def _unlike(fit: MarkFit, expected: MarkPrediction, full_scale_dn: float) -> Rea
     if fit.contrast_dn * expected.polarity <= 0:
         return Reason("what lies there has the other polarity", Code.POLARITY)
     return NO_REASON
-
-
-def _localise_and_fit(
-    scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sigma: float | None, before: MarkFit | None
-) -> tuple[MarkFit | None, float]:
-    """Match the mark at the highest correlation peak. Returns the fit, None without a peak, and its false alarms."""
-    mark = expected.mark
-    if isinstance(mark, FrameCorner):
-        return fit_frame_corner(
-            scan, mark, expected.pixel_from_mark, expected.search_px, expected.polarity, expected.weights
-        ), 1.0
-    peak = localise(scan, expected) if expected.search_px > 0 else (expected.center_px, 0.0)
-    if peak is None:
-        return None, 1.0
-    center_px, false_alarms = peak
-    return _fit_from(scan, expected, center_px, options_for(expected.mark, options, frame_sigma), before), false_alarms
-
-
-def _fit_from(
-    scan: Scan, expected: MarkPrediction, center_px: Array, options: MatchOptions, before: MarkFit | None
-) -> MarkFit:
-    """Match the mark from an initial place."""
-    mark, start = expected.mark, expected.shift_to(center_px).pixel_from_mark
-    coded = scan.replace_tone(LINEAR) if isinstance(mark, MarkTemplate) else scan  # stored values
-    window = read_window(coded, mark_window(mark, start, options.margin_px + BESIDE_PX), expected.weights)
-    if expected.surroundings.robust and isinstance(mark, MarkShape):
-        inner = np.column_stack([start[:, :2], start[:, 2] - window.origin_px])
-        window = window.exclude(pixels_beyond_edge(window.grey, mark, inner))
-    return match(window, mark, start, options, before)
 
 
 def options_for(mark: Mark, options: MatchOptions, frame_sigma: float | None) -> MatchOptions:

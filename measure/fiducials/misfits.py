@@ -46,27 +46,32 @@ class FrameMisfit:
     marks : n marks.
     sites : (n,) their sites in the pattern.
     pose : scan orientation.
+    weak : (n,) marks with the status weak.
     p_value : p-value of an outlying frame.
     film_mm : own scatter of its film; None for an ordinary frame.
     hypothesis : accepted hypothesis.
-    off_mm : size of the gross errors, by mark.
+    off_mm : (n,) size of the gross errors; 0 for other marks.
     jump_mm : size of a jump within the scan; None without one.
     suspect_mm2 : (n,) variances of marks that may have a gross error.
-    weak : (n,) marks with the status weak.
     weak_mm2 : variance along an axis that the weak marks have in addition.
     """
 
     marks: FrameMarks
     sites: NDArray[np.intp]
     pose: str
+    weak: Mask
+    off_mm: Array
+    suspect_mm2: Array
     p_value: float = 1.0
     film_mm: float | None = None
     hypothesis: Hypothesis = Hypothesis.SOUND
-    off_mm: Mapping[int, float] = field(default_factory=dict)
     jump_mm: float | None = None
-    suspect_mm2: Array = field(default_factory=lambda: np.zeros(1))
-    weak: Mask = field(default_factory=lambda: np.zeros(1, dtype=bool))
     weak_mm2: float = 0.0
+
+    @classmethod
+    def from_marks(cls, marks: FrameMarks, sites: NDArray[np.intp], pose: str, weak: Mask) -> "FrameMisfit":
+        """Start with no explanation."""
+        return cls(marks, sites, pose, weak, np.zeros(len(sites)), np.zeros(len(sites)))
 
     @property
     def places(self) -> NDArray[np.intp]:
@@ -76,9 +81,7 @@ class FrameMisfit:
     @cached_property
     def enlarged_marks(self) -> FrameMarks:
         """Marks with variances enlarged by their gross errors."""
-        off = np.zeros(len(self.sites))
-        off[list(self.off_mm)] = list(self.off_mm.values())
-        return self.marks.widen(off**2)
+        return self.marks.widen(self.off_mm**2)
 
 
 Frames = Mapping[int, FrameMisfit]  # by index among the camera's frames
@@ -91,34 +94,26 @@ class Pattern:
     Attributes
     ----------
     places_mm, sigma_mm : (m, 2) places of the sites, (m,) their standard deviations.
-    free_mm : standard deviation of the pattern in addition to sigma_mm.
-    information, right : (2m, 2m) and (2m,) normal equations, summed over the frames with given film scatters.
+    free_mm : prior standard deviation of the pattern in addition to sigma_mm.
+    frames, films_mm : frames from which it is estimated, and the film scatter of each.
     """
 
     places_mm: Array
     sigma_mm: Array
-    free_mm: float
-    information: Array
-    right: Array
+    free_mm: float = 0.0
+    frames: Frames = field(default_factory=dict)
+    films_mm: Mapping[int, float] = field(default_factory=dict)
 
-    @classmethod
-    def from_frames(
-        cls, frames: Frames, films_mm: Mapping[int, float], places_mm: Array, sigma_mm: Array, free_mm: float
-    ) -> "Pattern":
-        information, right = np.zeros((2 * len(sigma_mm),) * 2), np.zeros(2 * len(sigma_mm))
-        for place, frame in frames.items():
-            weight = frame.enlarged_marks.precision(films_mm[place])
-            information[np.ix_(frame.places, frame.places)] += weight
-            right[frame.places] += weight @ frame.marks.off_mm.ravel()
-        return cls(places_mm, sigma_mm, free_mm, information, right)
-
-    def expected_marks(self, frame: FrameMisfit, film_mm: float, is_pooled: bool = False) -> FrameMarks:
+    def expected_marks(self, place: int, is_pooled: bool = False) -> FrameMarks:
         """Marks of a frame less the pattern of all other frames. is_pooled: remove the affinity from the pattern; it
         cannot be separated from the mean affinity of the frames, and is counted there."""
-        weight, own = frame.enlarged_marks.precision(film_mm), np.ix_(frame.places, frame.places)
-        information, right = self._posterior.copy(), self.right.copy()
-        information[own] -= weight
-        right[frame.places] -= weight @ frame.marks.off_mm.ravel()
+        frame = self.frames[place]
+        if len(self.frames) == 1:  # many marks keep separate covariances
+            return frame.enlarged_marks.widen(1 / self._prior_information[frame.places[::2]])
+        own, (weights, _, right) = np.ix_(frame.places, frame.places), self._normal
+        information, right = self._posterior.copy(), right.copy()
+        information[own] -= weights[place]
+        right[frame.places] -= weights[place] @ frame.marks.off_mm.ravel()
         covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
         if is_pooled:
             covariance = self._beyond_affine @ covariance @ self._beyond_affine
@@ -127,20 +122,32 @@ class Pattern:
     @cached_property
     def mm(self) -> Array:
         """(m, 2) estimated pattern, mm."""
-        return np.asarray(np.linalg.solve(self._posterior, self.right)).reshape(-1, 2)
+        return np.asarray(np.linalg.solve(self._posterior, self._normal[2])).reshape(-1, 2)
 
     @property
     def p_value(self) -> float:
         """p-value of the pattern under the null hypothesis that the sites deviate by sigma_mm only."""
-        spread = self.information + self.information @ np.diag(np.repeat(self.sigma_mm**2, 2)) @ self.information
-        chi_square = float(self.right @ np.linalg.pinv(spread, hermitian=True) @ self.right)
-        return float(chdtrc(max(int(np.linalg.matrix_rank(self.information, hermitian=True)), 1), chi_square))
+        _, information, right = self._normal
+        spread = information + information @ np.diag(np.repeat(self.sigma_mm**2, 2)) @ information
+        chi_square = float(right @ np.linalg.pinv(spread, hermitian=True) @ right)
+        return float(chdtrc(max(int(np.linalg.matrix_rank(information, hermitian=True)), 1), chi_square))
 
     @property
     def log_density(self) -> float:
         """Log density of all frames with the pattern, relative to that without."""
         shared = np.log(self._prior_information).sum() - np.linalg.slogdet(self._posterior)[1]
-        return float(shared + self.right @ self.mm.ravel()) / 2
+        return float(shared + self._normal[2] @ self.mm.ravel()) / 2
+
+    @cached_property
+    def _normal(self) -> tuple[dict[int, Array], Array, Array]:
+        """Weight matrices (2n, 2n) of the frames' marks; their sum (2m, 2m) and the right side (2m,)."""
+        weights, size = dict[int, Array](), 2 * len(self.sigma_mm)
+        information, right = np.zeros((size, size)), np.zeros(size)
+        for place, frame in self.frames.items():
+            weights[place] = frame.enlarged_marks.precision(self.films_mm[place])
+            information[np.ix_(frame.places, frame.places)] += weights[place]
+            right[frame.places] += weights[place] @ frame.marks.off_mm.ravel()
+        return weights, information, right
 
     @cached_property
     def _beyond_affine(self) -> Array:
@@ -154,7 +161,7 @@ class Pattern:
 
     @cached_property
     def _posterior(self) -> Array:
-        return self.information + np.diag(self._prior_information)
+        return self._normal[1] + np.diag(self._prior_information)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,10 +169,13 @@ class Explanation:
     """Explanation of all frames of a camera, with their common pattern. film_is_more: whether the film scatters
     significantly more than its prior."""
 
-    frames: Frames
     pattern: Pattern
     film: Scatter
     film_is_more: bool
+
+    @property
+    def frames(self) -> Frames:
+        return self.pattern.frames
 
     @property
     def is_lone(self) -> bool:
@@ -176,56 +186,56 @@ class Explanation:
     @property
     def is_quiet(self) -> bool:
         """Whether there is no outlier."""
-        return not (self.film_is_more or any(each.film_mm or each.off_mm for each in self.frames.values()))
+        return not (self.film_is_more or any(each.film_mm or each.off_mm.any() for each in self.frames.values()))
 
     @property
     def log_evidence(self) -> float:
         """Log evidence of the explanation. Each outlying frame or mark has the prior probability `FALSE_DOUBT`."""
-        odd = sum((each.film_mm is not None) + len(each.off_mm) for each in self.frames.values())
+        odd = sum((each.film_mm is not None) + np.count_nonzero(each.off_mm) for each in self.frames.values())
         alone = sum(each.enlarged_marks.log_density(each.film_mm or self.film.sigma) for each in self.frames.values())
-        return alone + self.pattern.log_density + odd * float(np.log(FALSE_DOUBT))
+        return float(alone + self.pattern.log_density + odd * np.log(FALSE_DOUBT))
 
 
-def explain_by_pattern(frames: Frames, places_mm: Array, sigma_mm: Array, believed_mm: float) -> Explanation:
+def explain_by_pattern(frames: Frames, sites: Pattern, believed_mm: float) -> Explanation:
     """Explain the frames with a pattern larger than the standard deviations of its sites.
 
     Its prior standard deviation is set to its estimated size, since a wider prior lowers the evidence of the
     hypothesis.
     """
-    wide = explain(frames, places_mm, sigma_mm, _UNKNOWN_MM, believed_mm)
+    wide = explain(frames, replace(sites, free_mm=_UNKNOWN_MM), believed_mm)
     size_mm = float(np.sqrt(np.mean(wide.pattern.mm**2)))
-    return explain(frames, places_mm, sigma_mm, max(size_mm, believed_mm), believed_mm)
+    return explain(frames, replace(sites, free_mm=max(size_mm, believed_mm)), believed_mm)
 
 
-def explain(frames: Frames, places_mm: Array, sigma_mm: Array, free_mm: float, believed_mm: float) -> Explanation:
+def explain(frames: Frames, sites: Pattern, believed_mm: float) -> Explanation:
     """Explain outlying frames, the worst first, each by a gross error in one of its marks or by its film.
 
     Parameters
     ----------
     frames : frames, by index.
-    places_mm, sigma_mm : (m, 2) places of the pattern's sites, (m,) their standard deviations.
-    free_mm : prior standard deviation of the pattern in addition to sigma_mm.
+    sites : pattern without frames, with the prior of its sites.
     believed_mm : prior standard deviation of the film's scatter.
     """
-    frames, sites = dict(frames), (places_mm, sigma_mm, free_mm)
-    film, is_more = Scatter(believed_mm, SCATTER_DEGREES), False
+    frames, film, is_more = dict(frames), Scatter(believed_mm, SCATTER_DEGREES), False
     while True:
         ordinary = [place for place, each in frames.items() if each.film_mm is None]
         alike = Counter(frames[place].pose for place in ordinary)
         films_mm = {place: each.film_mm or film.sigma for place, each in frames.items()}
         for _ in range(_ROUNDS):  # the film scatter weights the pattern; the residuals of the pattern give the scatter
-            pattern = Pattern.from_frames(frames, films_mm, *sites)
+            pattern = replace(sites, frames=frames, films_mm=films_mm)
             expected = {
-                place: pattern.expected_marks(each, films_mm[place], alike[each.pose] >= _FEWEST_ALIKE)
+                place: pattern.expected_marks(place, alike[each.pose] >= _FEWEST_ALIKE)
                 for place, each in frames.items()
             }
             film, is_more = _film([expected[place] for place in ordinary], believed_mm)
-            films_mm |= {place: _own_film_mm(expected[place], film) for place in ordinary}
+            films_mm = films_mm | {place: _own_film_mm(expected[place], film) for place in ordinary}
         affinities = _affinities({place: (expected[place], frames[place].pose) for place in ordinary}, film.sigma)
-        tests = {
-            place: (_widen_weak(frames[place], expected[place], film, affinities[place]), film, affinities[place])
-            for place in ordinary
-        }
+        tests = {}
+        for place in ordinary:
+            variance = _weak_mm2(frames[place], expected[place], film.sigma, affinities[place])
+            # Weak marks are no evidence on the frame.
+            widened = expected[place].widen(np.where(frames[place].weak, variance, 0.0))
+            tests[place] = widened, film, affinities[place]
         p_values = {place: frame_p_value(*test) for place, test in tests.items()}
         least = min(p_values.values(), default=1.0)
         if least * len(frames) >= FALSE_DOUBT:
@@ -233,7 +243,7 @@ def explain(frames: Frames, places_mm: Array, sigma_mm: Array, free_mm: float, b
             for place, each in frames.items():
                 variance = _weak_mm2(each, expected[place], films_mm[place], affinities.get(place, LONE_AFFINITY))
                 frames[place] = replace(each, weak_mm2=variance)
-            return Explanation(frames, Pattern.from_frames(frames, films_mm, *sites), film, is_more)
+            return Explanation(replace(sites, frames=frames, films_mm=films_mm), film, is_more)
         limit = min(FALSE_DOUBT / len(frames), max(least, 1e-300) ** _AS_ODD)
         for place, p_value in p_values.items():
             if p_value < limit or p_value == least:
@@ -243,20 +253,15 @@ def explain(frames: Frames, places_mm: Array, sigma_mm: Array, free_mm: float, b
 def _explain_alone(frame: FrameMisfit, marks: FrameMarks, film: Scatter, affinity: Affinity) -> FrameMisfit:
     """Explain an outlying frame by a gross error in one mark, or else by a jump, film, pitch or perspective."""
     found = frame_consistency(marks, film, affinity)
-    off_mm, mark = np.hypot(*found.off_mm.T), found.wrong_mark
-    if mark is not None and mark not in frame.off_mm:
-        return replace(frame, off_mm={**frame.off_mm, mark: float(off_mm[mark])})
+    off_mm, mark = np.hypot(*found.off_mm.T)[: len(frame.sites)], found.wrong_mark
+    if mark is not None and not frame.off_mm[mark]:
+        return replace(frame, off_mm=np.where(np.arange(len(off_mm)) == mark, off_mm, frame.off_mm))
     hypothesis = found.best_hypothesis
     if hypothesis is Hypothesis.PITCH:
         return replace(frame, film_mm=film.sigma, hypothesis=hypothesis)
     film_mm = float(np.sqrt(film.sigma**2 + marks.film_variance_mm2()))
-    suspect = np.where(found.suspects, off_mm[: len(found.suspects)] ** 2 / 2, 0.0)
+    suspect = np.where(found.suspects, off_mm**2 / 2, 0.0)
     return replace(frame, film_mm=film_mm, hypothesis=hypothesis, suspect_mm2=suspect, jump_mm=found.jump_mm)
-
-
-def _widen_weak(frame: FrameMisfit, marks: FrameMarks, film: Scatter, affinity: Affinity) -> FrameMarks:
-    """Marks of a frame with the variance that its weak ones have in addition: these are no evidence on the frame."""
-    return marks.widen(np.where(frame.weak, _weak_mm2(frame, marks, film.sigma, affinity), 0.0))
 
 
 def _weak_mm2(frame: FrameMisfit, marks: FrameMarks, film_mm: float, affinity: Affinity) -> float:
@@ -265,8 +270,7 @@ def _weak_mm2(frame: FrameMisfit, marks: FrameMarks, film_mm: float, affinity: A
         return 0.0
     if frame.hypothesis is Hypothesis.PITCH:
         affinity = replace(affinity, scatter=Scatter(MOST_STRETCHED))
-    marks = marks.widen(frame.suspect_mm2 * np.ones(len(frame.sites)))
-    return marks.added_variance_mm2(frame.weak, film_mm, affinity)
+    return marks.widen(frame.suspect_mm2).added_variance_mm2(frame.weak, film_mm, affinity)
 
 
 def _own_film_mm(marks: FrameMarks, film: Scatter) -> float:

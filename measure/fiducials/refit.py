@@ -54,7 +54,7 @@ def refit_frame(frame: Frame) -> Frame:
     """
     if len(frame.inlier_fits) >= 2:
         frame = _refit_with_blur(_refit_with_tone(frame))
-    return _compare_shapes(_add_lens_covariance(_add_tone_covariance(frame)))
+    return _compare_shapes(_add_common_covariances(frame))
 
 
 def fit_lines_and_sharpening(frame: Frame, fewest: int = 0) -> Frame:
@@ -105,48 +105,46 @@ def _sharpened(frame: Frame, sharpening: Sharpening) -> Frame:
 
 def _refit_with_tone(frame: Frame) -> Frame:
     """Refit the marks with the tone curve estimated from the telling ones; if these disagree, from further curves."""
-    prior, begun = frame.scan.tone.prior, frame.scan.tone
+    prior, begun, options = frame.scan.tone.prior, frame.scan.tone, frame.options.match
     pending = {index for index, fit in frame.clear_fits.items() if _needs_frame(frame, index, fit)}
     telling = {*_by_significance(frame)[:_TELLING]}
-    best = _refit_from_curve(frame, prior, begun, telling, pending & telling)
-    is_open = best.tone.disagreement > _AGREED and _depends_on_tone(best)
+    best = _settle_tone(frame, prior, telling, pending & telling)
+    is_open = best.tone.disagreement > _AGREED and any(
+        tone.sensitivity_px > best.clear_fits[index].sigma_px for index, tone in _mark_tones(best).items()
+    )
     for power in _OTHER_STARTS if is_open else ():
-        other = _refit_from_curve(best, prior, prior.shift_to_power(power), telling)
+        start = replace(best, scan=best.scan.replace_tone(prior.shift_to_power(power)))
+        start = _refit(start, dict.fromkeys(telling & _mark_tones(best).keys(), options))
+        other = _settle_tone(start, prior, telling, frozenset())
         is_better = not other.tone.is_doubted and other.tone.disagreement < best.tone.disagreement
         best = other if is_better else best
     rest = pending if best.scan.tone is begun else pending | {*_mark_tones(best)}
     if rest <= telling:
         return best
-    best = _refit(best, dict.fromkeys(rest - telling, frame.options.match))
+    best = _refit(best, dict.fromkeys(rest - telling, options))
     every = FrameTone.from_marks(prior, _mark_tones(best), best.scan.tone)
     return best if best.tone.is_doubted else replace(best, tone=every)
 
 
-def _refit_from_curve(
-    frame: Frame, prior: Tone, start: Tone, telling: Set[int], pending: Set[int] = frozenset()
-) -> Frame:
-    """Refit marks and estimate the tone curve from them in turn.
+def _settle_tone(frame: Frame, prior: Tone, telling: Set[int], pending: Set[int]) -> Frame:
+    """Refit marks and estimate the tone curve from the telling ones in turn.
 
-    prior: curve known before; start: initial curve; pending: telling marks to be refitted with any curve.
+    prior: curve known before; pending: telling marks to be refitted with any curve.
     """
-    if start is not frame.scan.tone:
-        begun = replace(frame, scan=frame.scan.replace_tone(start))
-        frame = _refit(begun, dict.fromkeys(telling & _mark_tones(frame).keys(), frame.options.match))
-        estimate = FrameTone.from_marks(prior, _mark_tones(frame, telling), start)
-        if estimate.is_doubted:
-            return replace(frame, tone=estimate)
-    for _ in range(_TONE_ROUNDS):
-        estimate = FrameTone.from_marks(prior, _mark_tones(frame, telling), frame.scan.tone)
-        moved = _moved_by_tone(frame, estimate, telling)
-        if moved:
-            frame = replace(frame, scan=frame.scan.replace_tone(estimate.next_curve(frame.scan.tone)))
-        if not pending | moved:
+    for rounds_left in range(_TONE_ROUNDS, -1, -1):
+        tones, fits = _mark_tones(frame, telling), frame.clear_fits
+        estimate = FrameTone.from_marks(prior, tones, frame.scan.tone)
+        frame = replace(frame, tone=estimate)
+        moves = [estimate.shift_px(each, frame.scan.tone) > _MOVED * fits[n].sigma_px for n, each in tones.items()]
+        changed = pending | tones.keys() if any(moves) else pending
+        if not (changed and rounds_left):
             break
-        frame = _refit(frame, dict.fromkeys(pending | moved, frame.options.match))
-        pending = frozenset()
+        if any(moves):
+            frame = replace(frame, scan=frame.scan.replace_tone(estimate.next_curve(frame.scan.tone)))
+        frame, pending = _refit(frame, dict.fromkeys(changed, frame.options.match)), frozenset()
         if estimate.is_doubted:  # by the prior curve again, the marks would only lead to the same estimate
-            return replace(frame, tone=estimate)
-    return replace(frame, tone=FrameTone.from_marks(prior, _mark_tones(frame, telling), frame.scan.tone))
+            break
+    return frame
 
 
 def _needs_frame(frame: Frame, index: int, fit: MarkFit) -> bool:
@@ -156,19 +154,6 @@ def _needs_frame(frame: Frame, index: int, fit: MarkFit) -> bool:
     mark, linear = frame.layout.marks[index].mark, frame.linear(index)
     error_px = strain_error_px(mark, fit.pixel_from_mark[:, :2], linear, _linear_sigma(frame))
     return is_held_by_frame(mark) or error_px > _STRAINED * fit.sigma_px
-
-
-def _moved_by_tone(frame: Frame, estimate: FrameTone, telling: Set[int]) -> Set[int]:
-    """Telling marks with information on the tone curve, if the estimated curve displaces any of them."""
-    fits, tones = frame.clear_fits, _mark_tones(frame, telling)
-    moves = (estimate.shift_px(tone, frame.scan.tone) > _MOVED * fits[index].sigma_px for index, tone in tones.items())
-    return tones.keys() if any(moves) else frozenset()
-
-
-def _depends_on_tone(frame: Frame) -> bool:
-    """Whether the prior uncertainty of a tone curve displaces any mark by more than its standard deviation."""
-    fits = frame.clear_fits
-    return any(tone.sensitivity_px > fits[index].sigma_px for index, tone in _mark_tones(frame).items())
 
 
 def _mark_tones(frame: Frame, among: Set[int] | None = None) -> dict[int, MarkTone]:
@@ -182,22 +167,25 @@ def _by_significance(frame: Frame) -> list[int]:
     return sorted(frame.clear_fits, key=lambda index: -frame.clear_fits[index].significance)
 
 
-def _add_tone_covariance(frame: Frame) -> Frame:
-    """Add the uncertainty of tone curve and sharpening to the covariance of each mark."""
-    sharpening = frame.scan.tone.sharpening
-    for index, detection in enumerate(frame.detections):
-        tone, score = (None, None) if detection.fit is None else (detection.fit.tone, detection.fit.sharpening)
-        parts = {} if tone is None else {Cause.TONE: frame.tone.covariance_px2(tone)}
-        parts |= {Cause.SHARPENING: score.covariance_px2(sharpening)} if score is not None and sharpening else {}
+def _add_common_covariances(frame: Frame) -> Frame:
+    """Add the uncertainties of tone curve, sharpening and taking lens to the covariance of each mark."""
+    sharpening, by_lens = frame.scan.tone.sharpening, _lens_covariances(frame)
+    for index, fit in enumerate(detection.fit for detection in frame.detections):
+        parts = {Cause.LENS: by_lens[index]} if index in by_lens else {}
+        if fit is not None and fit.tone is not None:
+            parts[Cause.TONE] = frame.tone.covariance_px2(fit.tone)
+        if fit is not None and fit.sharpening is not None and sharpening:
+            parts[Cause.SHARPENING] = fit.sharpening.covariance_px2(sharpening)
         frame = frame.amend(index, parts=parts)
     return frame
 
 
-def _add_lens_covariance(frame: Frame) -> Frame:
-    """Add the uncertainty of the taking lens, as far as affine transformation and film model leave it."""
+def _lens_covariances(frame: Frame) -> dict[int, Array]:
+    """Covariances (2, 2) of the inliers by the taking lens, as far as affine transformation and film model leave
+    them."""
     fits, lens = frame.inlier_fits, frame.options.lens
     if lens is None or not fits:
-        return frame
+        return {}
     covariance = lens.covariance_px2(np.array([fit.center_px for fit in fits.values()]))
     given = frame.camera_mm[list(fits)] / np.abs(frame.camera_mm).max()
     (x, y), one, none = given.T, np.ones(len(given)), np.zeros(len(given))
@@ -205,9 +193,7 @@ def _add_lens_covariance(frame: Frame) -> Frame:
     free = np.hstack([affine, film_terms(frame.options.film_model, given)])
     left = np.eye(len(free)) - free @ np.linalg.pinv(free)
     parts = (left @ covariance @ left).reshape(len(fits), 2, len(fits), 2)
-    for number, index in enumerate(fits):
-        frame = frame.amend(index, parts={Cause.LENS: parts[number, :, number]})
-    return frame
+    return {index: parts[number, :, number] for number, index in enumerate(fits)}
 
 
 def _refit_with_blur(frame: Frame) -> Frame:

@@ -6,12 +6,14 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import ndtri
 
+from measure.array_types import Array
 from measure.fiducials.frame import Frame
+from measure.fiducials.mark_fit import Detection
 from measure.fiducials.options import AFFINITY_SIGMA
 from measure.flags import NO_REASON, RIGHT_PITCH_REFUSED, Code, Reason, Status
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkTemplate, finest_detail_mm
 from measure.matching.covariance import honest_covariance
-from measure.results import FrameMeasurement, MarkMeasurement, Pose, SecondPlace
+from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.scans.scan import Scan
 
 _LEAST_MARKS = 3  # with two, a false one yields a wrong pitch
@@ -26,9 +28,11 @@ _OWN = Reason("its template is its own picture: nothing checks its place", Code.
 
 def lost_frame(scan: Scan, layout: FiducialLayout) -> FrameMeasurement:
     """Return the result for a scan none of whose pixels can be read."""
-    reason = Reason(f"not found: {scan.damage}", Code.DAMAGED_FILE)
-    marks = tuple(MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, reason) for mark in layout.marks)
-    return FrameMeasurement(scan.name, marks)
+    return FrameMeasurement(scan.name, _absent_marks(layout, Reason(f"not found: {scan.damage}", Code.DAMAGED_FILE)))
+
+
+def _absent_marks(layout: FiducialLayout, reason: Reason) -> tuple[MarkMeasurement, ...]:
+    return tuple(MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, reason) for mark in layout.marks)
 
 
 def absent_frame(
@@ -48,8 +52,7 @@ def absent_frame(
     """
     also = "; parts of the scan's file are damaged" if scan.damage else ""
     codes = dict.fromkeys((Code.NO_FRAME, *reason.codes, *([Code.DAMAGED_FILE] if scan.damage else [])))
-    why = Reason(f"not found: {reason}{also}", *codes)
-    marks = tuple(MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, why) for mark in layout.marks)
+    marks = _absent_marks(layout, Reason(f"not found: {reason}{also}", *codes))
     remedy = (
         "check whether the camera is that of the scan, the pitch right, and the film laid within "
         f"{rotation_deg:g} degrees of upright or of a quarter turn"
@@ -97,15 +100,12 @@ def present_frame(
     the search for faint marks. If the frame is more likely a false alarm than not, no mark is an observation.
     """
     if Code.NO_FRAME in chance.codes:
-        return replace(_predicted_frame(frame, chance), pose=pose, problems=tuple(problems))
-    marks = tuple(_row(mark, index, frame) for index, mark in enumerate(frame.layout.marks))
-    marks = tuple(_weaken_assumed_name(row, mark, pose) for row, mark in zip(marks, frame.layout.marks, strict=True))
+        places = zip(frame.layout.marks, frame.detections, frame.predicted_px, strict=True)
+        marks = tuple(_unmeasured(mark.id, each, place, chance) for mark, each, place in places)
+        return FrameMeasurement(frame.scan.name, marks, pose, problems=tuple(problems), weights=frame.weights)
     unnamed = next((problem for problem in problems if Code.AMBIGUOUS in problem.codes), NO_REASON)
     weak = chance or unnamed or (_FAINT if frame.placement.surroundings.robust else NO_REASON)
-    if weak:
-        marks = tuple(
-            replace(mark, status=Status.WEAK, reason=weak) if mark.status is Status.MEASURED else mark for mark in marks
-        )
+    marks = tuple(_row(mark, index, frame, pose, weak) for index, mark in enumerate(frame.layout.marks))
     problems = (*problems, *_problems(frame, pitch_um))
     tone = replace(frame.tone, tone=frame.tone.tone.without_priors)
     notes = (frame.channel_note,) if frame.channel_note else ()
@@ -113,15 +113,11 @@ def present_frame(
     return FrameMeasurement(frame.scan.name, marks, pose, orientation, problems, frame.weights, tone, notes=notes)
 
 
-def _predicted_frame(frame: Frame, why: Reason) -> FrameMeasurement:
-    """Return the predicted places of the marks of a frame that is probably a false alarm."""
-    marks = tuple(
-        MarkMeasurement(mark.id, "fiducial", place, None, Status.PREDICTED, why)
-        if detection.inside
-        else MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, detection.reason)
-        for mark, detection, place in zip(frame.layout.marks, frame.detections, frame.predicted_px, strict=True)
-    )
-    return FrameMeasurement(frame.scan.name, marks, weights=frame.weights)
+def _unmeasured(point: str, detection: Detection, place_px: Array, why: Reason) -> MarkMeasurement:
+    """Row of a mark without a measurement: predicted, or absent outside of the scan."""
+    if detection.inside:
+        return MarkMeasurement(point, "fiducial", place_px, None, Status.PREDICTED, why)
+    return MarkMeasurement(point, "fiducial", None, None, Status.ABSENT, detection.reason)
 
 
 def _problems(frame: Frame, pitch_um: tuple[float, float] | None) -> list[Reason]:
@@ -156,52 +152,28 @@ def _stretch(scan: Scan, wide_um: float, tall_um: float, pitch_um: tuple[float, 
     )
 
 
-def _row(mark: LayoutMark, index: int, frame: Frame) -> MarkMeasurement:
+def _row(mark: LayoutMark, index: int, frame: Frame, pose: Pose, weak: Reason) -> MarkMeasurement:
+    """Row of a mark. weak: why no mark of the frame counts as measured; empty if they may."""
     detection = frame.detections[index]
     fit = detection.fit
-    if not detection.inside:
-        return MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, detection.reason)
     if fit is None:
-        return MarkMeasurement(mark.id, "fiducial", detection.predicted_px, None, Status.PREDICTED, detection.reason)
-    quality = {
-        "snr": fit.snr,
-        "contrast_dn": fit.contrast_dn,
-        "noise_dn": fit.noise_dn,
-        "blur_px": fit.blur_px,
-        "damaged_fraction": fit.damaged_fraction,
-        "likeness": fit.likeness,
-        "significance": fit.significance,
-        "redundancy": float(fit.redundancy),
-        "neighbour_correlation": fit.neighbour_correlation,
-        **_edge_figures(fit.edges),
-        **fit.figures,
-    }
+        return _unmeasured(mark.id, detection, detection.predicted_px, detection.reason)
+    names = "snr", "contrast_dn", "noise_dn", "blur_px", "damaged_fraction", "likeness", "significance"
+    quality = {name: float(getattr(fit, name)) for name in (*names, "redundancy", "neighbour_correlation")}
+    if fit.edges is not None:  # offset of the second method's place from the matched one, and in standard deviations
+        col, row = fit.edges.offset_px.tolist()
+        quality |= {"second_method_col_px": col, "second_method_row_px": row, "second_method_sigmas": fit.edges.sigmas}
     status, reason = frame.verdict(index)
-    covariance = fit.place_covariance
+    covariance, name = fit.place_covariance, frame.scan.name
     if isinstance(mark.mark, MarkTemplate):
-        covariance = honest_covariance(mark.mark, frame.scan.name, fit)
-        if status is Status.MEASURED and frame.scan.name in mark.mark.shares and len(mark.mark.shares) == 1:
-            status, reason = Status.WEAK, _OWN
-    return MarkMeasurement(mark.id, "fiducial", fit.center_px, covariance, status, reason, quality)
-
-
-def _weaken_assumed_name(row: MarkMeasurement, mark: LayoutMark, pose: Pose) -> MarkMeasurement:
-    """Make a measured learned mark weak if the pose is assumed: under another name its origin lies elsewhere."""
-    if (
-        not isinstance(mark.mark, MarkTemplate)
-        or mark.mark.learned_mm == 0
-        or pose.is_unambiguous_up_to(mark.mark.alike)
-    ):
-        return row
-    return replace(row, status=Status.WEAK, reason=_ASSUMED) if row.status is Status.MEASURED else row
-
-
-def _edge_figures(edges: SecondPlace | None) -> dict[str, float]:
-    """Offset of the second method's place from the matched one, px, and in its standard deviations."""
-    if edges is None:
-        return {}
-    col, row = edges.offset_px.tolist()
-    return {"second_method_col_px": col, "second_method_row_px": row, "second_method_sigmas": edges.sigmas}
+        covariance = honest_covariance(mark.mark, name, fit)
+        if set(mark.mark.shares) == {name}:
+            weak = _OWN
+        elif mark.mark.learned_mm and not pose.is_unambiguous_up_to(mark.mark.alike):
+            weak = _ASSUMED  # under another name its origin lies elsewhere
+    if status is Status.MEASURED and weak:
+        status, reason = Status.WEAK, weak
+    return MarkMeasurement(mark.id, "fiducial", fit.center_px, covariance, status, reason, {**quality, **fit.figures})
 
 
 def pitch_problem(
@@ -247,26 +219,23 @@ def pitch_problem(
 
 def without_lost(scan: Scan, marks: Sequence[MarkMeasurement]) -> tuple[MarkMeasurement, ...]:
     """Set marks on damaged parts of the scan's file to `predicted`, with this reason."""
-    return tuple(_check_loss(scan, mark) for mark in marks)
+    kept = []
+    for mark in marks:
+        why = ""
+        if mark.center_px is not None and mark.status.is_observation:
+            half = int(np.ceil(mark.quality.get("size_px", 2 * _REACH_PX) / 2))
+            col, row = np.rint(mark.center_px).astype(int)
+            why = scan.loss_reason(int(col) - half, int(row) - half, 2 * half + 1, 2 * half + 1)
+        reason = Reason(f"the scan's file is damaged at its place: {why}", Code.DAMAGED_FILE)
+        kept.append(replace(mark, covariance=None, status=Status.PREDICTED, reason=reason) if why else mark)
+    return tuple(kept)
 
 
 def with_damage(scan: Scan, frame: FrameMeasurement) -> FrameMeasurement:
     """Remove the observations on damaged parts of the scan's file, and put the damage first among the problems."""
     if not scan.damage:
         return frame
-    marks = without_lost(scan, frame.marks)
     sentence = f"{scan.damage[0].upper()}{scan.damage[1:]}. No mark is measured there: copy the file again, or rescan."
     problem = Reason(sentence, Code.DAMAGED_FILE)
-    return replace(frame, marks=marks, problems=(problem, *(each for each in frame.problems if each != problem)))
-
-
-def _check_loss(scan: Scan, mark: MarkMeasurement) -> MarkMeasurement:
-    if mark.center_px is None or not mark.status.is_observation:
-        return mark
-    half = int(np.ceil(mark.quality.get("size_px", 2 * _REACH_PX) / 2))
-    col, row = np.rint(mark.center_px).astype(int)
-    why = scan.loss_reason(int(col) - half, int(row) - half, 2 * half + 1, 2 * half + 1)
-    if not why:
-        return mark
-    reason = Reason(f"the scan's file is damaged at its place: {why}", Code.DAMAGED_FILE)
-    return replace(mark, covariance=None, status=Status.PREDICTED, reason=reason)
+    problems = (problem, *(each for each in frame.problems if each != problem))
+    return replace(frame, marks=without_lost(scan, frame.marks), problems=problems)

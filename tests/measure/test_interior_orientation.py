@@ -9,8 +9,16 @@ from drawn import Array, brute_picture, lay_out, make_scan, paint
 from numpy.typing import NDArray
 
 from measure import Scan, Status
+from measure.fiducials import consistency
 from measure.fiducials.across_frames import check_frames
-from measure.fiducials.consistency import FrameMarks, Scatter, gross_errors
+from measure.fiducials.consistency import (
+    LONE_AFFINITY,
+    FrameMarks,
+    Scatter,
+    frame_consistency,
+    frame_p_value,
+    gross_errors,
+)
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
 from measure.fiducials.interior_orientation import fit_frame
@@ -102,6 +110,30 @@ def test_gross_errors_are_found_and_no_others(camera: Array, off_mm: dict[int, t
     for mark, by in off_mm.items():
         up[mark] += by
     assert outlying(camera, up) == list(off_mm)
+
+
+@pytest.mark.parametrize("model", ["affine", "projective"])
+def test_many_marks_are_tested_without_a_matrix_of_all_of_them_as_by_one(
+    model: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng, results = np.random.default_rng(5), []
+    grid = np.array([(10.0 * i, 10.0 * j) for i in range(11) for j in range(11)])
+    covariances = rng.uniform(1e-6, 4e-5, (121, 1, 1)) * np.array([[1.0, 0.4], [0.4, 0.7]])
+    up = view_marks(grid, up_from_camera("90")) + rng.normal(0.0, 0.006, grid.shape)
+    up[7] += 0.05
+    for dense in (100, 1000):
+        monkeypatch.setattr(consistency, "_DENSE", dense)
+        marks = FrameMarks.from_places(grid, up, covariances, model)
+        found, among = frame_consistency(marks), np.arange(121) < 9
+        assert found.wrong_mark == 7
+        results.append(
+            [
+                *(marks.chi_square(0.004), marks.log_density(0.004), 1e6 * marks.film_variance_mm2()),
+                *(1e6 * marks.added_variance_mm2(among, 0.005, LONE_AFFINITY), np.log(frame_p_value(marks))),
+                *(found.log_odds.max(), 1e3 * found.off_mm[7, 0], 1e-6 * marks.precision(0.004)[3, 8]),
+            ]
+        )
+    np.testing.assert_allclose(results[0], results[1], rtol=1e-6)
 
 
 def test_of_four_marks_on_one_frame_none_is_called_wrong_where_film_may_be_bent() -> None:
