@@ -8,6 +8,7 @@ mark. It weights the last steps and gives the covariance (generalised least squa
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +27,16 @@ from measure.matching.covariance import (
     sloping_place,
 )
 from measure.matching.gauss_newton import EDGE_BLURS, PictureFit
-from measure.matching.models import GREY, MatchOptions, PictureModel, State, background_planes, background_px, is_round
+from measure.matching.models import (
+    GREY,
+    MatchOptions,
+    PictureModel,
+    State,
+    background_planes,
+    background_px,
+    is_round,
+    smoothed_px2,
+)
 from measure.matching.tone_information import (
     mark_tone_information,
     sharpening_score,
@@ -71,19 +81,22 @@ def match(
         In pixels of the scan. Not converged, with a reason, if the fit failed.
     """
     options, start = options or MatchOptions(), np.array(pixel_from_mark, dtype=float)
-    grey = np.where(window.usable, np.asarray(window.grey, float), 0.0)
-    window = replace(window, grey=grey, valid=window.usable)
-    begun = None if before is None or before.covariance is None else before
-    fit = _fit_part(window, mark, start, options, begun=begun)
+    usable = window.usable
+    window = replace(window, grey=np.where(usable, np.asarray(window.grey, float), 0.0), valid=usable)
+    begun = None
+    if before is not None and before.covariance is not None:
+        begun = State(before.pixel_from_mark, before.blur_px**2 + smoothed_px2(mark), np.zeros(GREY))
+    fit = _fit(window, mark, start, options, begun=begun)
     if begun is not None and fit.reason:
-        fit = _fit_part(window, mark, start, options)
+        fit = _fit(window, mark, start, options)
     if not _is_right(fit):
-        detail = _fit_part(window, mark, start, options, background_px(mark, start))
+        detail = _fit(window, mark, start, options, background_px(mark, start))
         if not detail.reason:
             # A large speck can carry the first steps, plain least squares, away from the mark. Its detail resists that.
-            whole = _continued(window, mark, start, detail) if fit.reason else fit
+            begun = detail.state.shifted(np.asarray(detail.window.origin_px))
+            whole = _fit(window, mark, start, options, begun=begun) if fit.reason else fit
             fit = whole if _is_right(whole) else detail
-    return _mark_fit(fit, window, grey)
+    return _mark_fit(fit, window)
 
 
 def mark_window(mark: Mark, pixel_from_mark: Array, margin_px: float) -> tuple[int, int, int, int]:
@@ -94,22 +107,21 @@ def mark_window(mark: Mark, pixel_from_mark: Array, margin_px: float) -> tuple[i
     return int(col0), int(row0), int(col1 - col0 + 1), int(row1 - row0 + 1)
 
 
-def _fit_part(
+def _fit(
     window: ScanWindow,
     mark: Mark,
     start: Array,
     options: MatchOptions,
     coarse_px: float | None = None,
-    begun: MarkFit | None = None,
+    begun: State | None = None,
 ) -> PictureFit:
     """Fit the mark in the part of the window around it. coarse_px: blur (px) whose result is subtracted as background;
-    None: the background is modelled. begun: nearly the result."""
+    None: the background is modelled. begun: state in the scan, nearly the result."""
     fit = _start_fit(window, mark, start, options, coarse_px)
     if begun is None:
         fit.approach()
     else:
-        variance_px2 = begun.blur_px**2 + fit.model.smoothed_px2
-        fit.state = State(begun.pixel_from_mark, variance_px2, np.zeros(GREY)).shifted(-np.array(fit.window.origin_px))
+        fit.state = begun.shifted(-np.array(fit.window.origin_px))
         fit.choose_area()
     reach_px = options.margin_blurs * fit.model.blur_px
     if not fit.reason and reach_px > options.margin_px:  # the blur spreads the mark beyond the margin
@@ -117,15 +129,6 @@ def _fit_part(
         wide.state = fit.state.shifted(np.subtract(fit.window.origin_px, wide.window.origin_px))
         wide.choose_area()
         fit = wide
-    fit.refine()
-    return fit
-
-
-def _continued(window: ScanWindow, mark: Mark, start: Array, detail: PictureFit) -> PictureFit:
-    """Fit the mark together with its background, starting from the fit of its detail."""
-    fit = _start_fit(window, mark, start, detail.options, None)
-    fit.state = detail.state.shifted(np.zeros(2))
-    fit.choose_area()
     fit.refine()
     return fit
 
@@ -153,73 +156,64 @@ def _is_right(fit: PictureFit) -> bool:
     return not fit.reason and not is_textured(fit.model.residuals, fit.telling, fit.floor_dn)
 
 
-def _mark_fit(fit: PictureFit, window: ScanWindow, grey: Array) -> MarkFit:
-    """Convert the fit of a part of a window, with its grey values, to a result in pixels of the scan."""
+def _mark_fit(fit: PictureFit, window: ScanWindow) -> MarkFit:
+    """Convert the fit of a part of a window to a result in pixels of the scan."""
     model, used = fit.model, fit.telling
     information = float(model.information[fit.used].sum())
     noise, is_white = as_if_white(model.scores, fit.used, len(model.design), information)
     noise = noise.floored(fit.rounding_variance_dn2)
     unknown = np.full((len(model.design),) * 2, np.inf)
-    result = MarkFit(
-        converged=not fit.reason,
-        reason=fit.reason,
-        center_px=fit.state.pixel_from_mark[:, 2],
-        place_covariance=Covariance.from_noise(unknown[:2, :2]),
-        pixel_from_mark=fit.state.pixel_from_mark,
-        covariance=unknown,
-        noise_dn=float(np.sqrt(noise.variance_dn2)),
-        lost_fraction=1.0,
-        neighbour_correlation=noise.neighbour_correlation,
-        covariance_is_white=noise.is_white,
-    )
+    precision = {
+        "place_covariance": Covariance.from_noise(unknown[:2, :2]),
+        "covariance": unknown,
+        "lost_fraction": 1.0,
+    }
     if not fit.reason:
         free, frame = _surroundings(fit, window)
-        patches = blank_patches(grey, free, noise.variance_dn2)
+        patches = blank_patches(window.grey, free, noise.variance_dn2)
         if not is_white or is_coloured(patches):
             noise = grain_model(model.residuals, used, model.design, noise.neighbour_correlation, patches)
-        result = _add_precision(result, fit, noise, (grey, frame))
+        precision = _precision(fit, noise, Landscape(window.grey, frame, model.design[-GREY]))
     # The grain's weights may have moved the mark.
     place = fit.state.shifted(np.asarray(fit.window.origin_px)).pixel_from_mark
-    ground_dn, stored = float(fit.state.greys[1]), fit.window.coding.stored_contrast_dn
-    return replace(
-        result,
+    stored_dn = fit.window.coding.stored_contrast_dn(float(fit.state.greys[1]), model.contrast_dn)
+    return MarkFit(
+        converged=not fit.reason,
+        reason=fit.reason,
         center_px=place[:, 2],
         pixel_from_mark=place,
         contrast_dn=model.contrast_dn,
-        stored_contrast_dn=stored(ground_dn, model.contrast_dn),
+        stored_contrast_dn=stored_dn,
+        noise_dn=float(np.sqrt(noise.variance_dn2)),
         # The blur of the scan; for a chip, only the blur in addition to the chip's own.
         blur_px=float(np.sqrt(max(fit.state.variance_px2 - model.smoothed_px2, 0.0))),
         damaged_fraction=fit.damaged_fraction,
         redundancy=int(used.sum()) - len(model.design),
+        neighbour_correlation=noise.neighbour_correlation,
+        covariance_is_white=noise.is_white,
         likeness=_likeness(fit),
+        **precision,
     )
 
 
 def _surroundings(fit: PictureFit, window: ScanWindow) -> tuple[Mask, Mask]:
     """Masks of the whole window: pixels that may be blank film like that under the mark, and pixels of the exposed
     frame, for a mark that is cut into it."""
-    offset, (height, width), mark = (
-        np.subtract(fit.window.origin_px, window.origin_px),
-        window.grey.shape,
-        fit.model.mark,
-    )
+    offset, (height, width) = np.subtract(fit.window.origin_px, window.origin_px), window.grey.shape
     where = fit.state.shifted(offset).pixel_from_mark, width, height, EDGE_BLURS * fit.model.total_blur_px
-    free = window.usable & (window.sides == 0) & known_mask(mark, *where)
+    free = window.usable & (window.sides == 0) & known_mask(fit.model.mark, *where)
     # A chip's window is smoothed for the fit, the blank film around it is not.
     free &= not (window.is_lossy or fit.model.is_chip)
     col, row = np.rint(offset).astype(int)
     free[row : row + fit.area.shape[0], col : col + fit.area.shape[1]] &= ~fit.area
-    return free, window.usable & frame_pixel_mask(mark, *where)
+    return free, window.usable & frame_pixel_mask(fit.model.mark, *where)
 
 
-def _add_precision(result: MarkFit, fit: PictureFit, noise: NoiseModel, about: tuple[Array, Mask]) -> MarkFit:
-    """Finish the fit with the weights of its noise and add covariances and derived estimates to the result.
-
-    about: grey values around the mark, and the mask of those that belong to the exposed frame.
-    """
+def _precision(fit: PictureFit, noise: NoiseModel, landscape: Landscape) -> dict[str, Any]:
+    """Finish the fit with the weights of its noise. Returns its covariances and derived estimates, attributes of a
+    `MarkFit`."""
     model, used = fit.model, fit.telling
     covariance, by_grey = fit.weigh(noise)
-    landscape = Landscape(*about, model.design[-GREY])
     priors_dn2 = model.prior_weights * noise.variance_dn2
     more = second_order(model.design, model.slopes, fit.used, covariance, priors_dn2)
     by_noise = covariance[:2, :2]
@@ -240,27 +234,24 @@ def _add_precision(result: MarkFit, fit: PictureFit, noise: NoiseModel, about: t
     tells_shape = freedom in ("similarity", "affine") and not is_round(model.mark)
     shape, strain = slice(2, 4), slice(4, model.linear.stop)
     by_width = _by_line_width(fit)
+    width = None
+    if by_width is not None and model.blur is not None and model.blur_is_at_limit:
+        width = line_width(linear, by_width, model.blur)
     sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    return replace(
-        result,
-        place_covariance=place,
-        covariance=covariance,
-        noise_dn=float(np.sqrt(noise.variance_dn2)),
-        lost_fraction=fit.lost_fraction,
-        neighbour_correlation=noise.neighbour_correlation,
-        covariance_is_white=noise.is_white,
-        significance=fit.contrast_dn / max(float(sigmas[-GREY]), 1e-6),
-        blur_sigma=float(sigmas[model.blur]) / (2 * model.total_blur_px**2) if has_blur else np.inf,
-        size_sigma=float(sigmas[2]) if len(model.generators) else np.inf,
-        edges=edge_place(linear, model.blur_px),
-        sloping=sloping_place(linear) if freedom == "ellipse" and model.background_px is None else None,
-        line_width=None
-        if by_width is None or model.blur is None or not model.blur_is_at_limit
-        else line_width(linear, by_width, model.blur),
-        own_shape=own_shape(linear, shape, strain, model.departures) if tells_shape else None,
-        tone=_mark_tone(fit, linear, priors_dn2, landscape, by_width),
-        sharpening=_sharpening_score(fit, linear, priors_dn2, by_width),
-    )
+    return {
+        "place_covariance": place,
+        "covariance": covariance,
+        "lost_fraction": fit.lost_fraction,
+        "significance": fit.contrast_dn / max(float(sigmas[-GREY]), 1e-6),
+        "blur_sigma": float(sigmas[model.blur]) / (2 * model.total_blur_px**2) if has_blur else np.inf,
+        "size_sigma": float(sigmas[2]) if len(model.generators) else np.inf,
+        "edges": edge_place(linear, model.blur_px),
+        "sloping": sloping_place(linear) if freedom == "ellipse" and model.background_px is None else None,
+        "line_width": width,
+        "own_shape": own_shape(linear, shape, strain, model.departures) if tells_shape else None,
+        "tone": _mark_tone(fit, linear, priors_dn2, landscape, by_width),
+        "sharpening": _sharpening_score(fit, linear, priors_dn2, by_width),
+    }
 
 
 def _by_line_width(fit: PictureFit) -> Array | None:

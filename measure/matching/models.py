@@ -104,6 +104,11 @@ def is_round(mark: Mark) -> bool:
     return centred and not any(mark.perspective)
 
 
+def smoothed_px2(mark: Mark) -> float:
+    """Variance (px²) of the Gaussian by which the window of a mark is smoothed: that of a chip, 0 for a drawing."""
+    return _CHIP_SMOOTHED_PX**2 if isinstance(mark, MarkTemplate) else 0.0
+
+
 def background_px(mark: Mark, pixel_from_mark: Array) -> float:
     """Standard deviation (px) of a blur that removes the mark's lines, for background subtraction."""
     return max(1.5 * linear_scale(pixel_from_mark) * thinnest_mm(mark), 1.0) + 1.0
@@ -167,7 +172,7 @@ class PictureModel:
         self.half_tones: Array = zeros[1]
         self.residuals: Array = zeros[2]
         self.is_chip = isinstance(mark, MarkTemplate)
-        self.smoothed_px2 = _CHIP_SMOOTHED_PX**2 if self.is_chip else 0.0
+        self.smoothed_px2 = smoothed_px2(mark)
         self.light = np.asarray(cv2.GaussianBlur(grey, (0, 0), _CHIP_SMOOTHED_PX), float) if self.is_chip else grey
         self.grey = self.detail(self.light)
         names = [name for name in _FREEDOMS[options.freedom] if name != "turn" or not is_round(mark)]
