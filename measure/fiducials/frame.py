@@ -14,7 +14,7 @@ from measure.fiducials.constellation import Placement, mark_sign
 from measure.fiducials.interior_orientation import FilmFit, fit_frame
 from measure.fiducials.mark_fit import Detection
 from measure.fiducials.options import CLICK_SIGMA_PX, SCATTER_DEGREES, SCATTER_MM, FiducialOptions
-from measure.flags import LARGE_ERROR, NO_REASON, Cause, Code, Reason, Status
+from measure.flags import LARGE_ERROR, NO_REASON, Code, Reason, Status
 from measure.geometry import up_from_camera
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
 from measure.results import MarkFit
@@ -156,23 +156,6 @@ class Frame:
         return self.replace_detections(
             {index: replace(self.detections[index], fit=each) for index, each in changed.items()}
         )
-
-    def amend(
-        self,
-        index: int,
-        *reasons: Reason,
-        parts: Mapping[Cause, Array] | None = None,
-        figures: Mapping[str, float] | None = None,
-    ) -> "Frame":
-        """Return the frame with more reasons why a mark may be wrong, parts (2, 2) of its covariance, and figures."""
-        detection = self.detections[index]
-        fit, reason = detection.fit, Reason.combine((detection.reason, *reasons))
-        if fit is not None:
-            covariance = fit.place_covariance
-            for cause, px2 in (parts or {}).items():
-                covariance = covariance.plus(cause, px2)
-            fit = replace(fit, place_covariance=covariance, figures={**fit.figures, **(figures or {})})
-        return self.replace_detections({index: replace(detection, fit=fit, reason=reason)})
 
     @property
     def fits(self) -> list[MarkFit | None]:

@@ -1,5 +1,6 @@
 """Detection and least-squares matching of one mark around its predicted place, at full resolution."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -46,6 +47,21 @@ class Detection:
     reason: Reason = NO_REASON
     false_alarms: float = 1.0
     closer: bool = False
+
+    def amend(
+        self,
+        *reasons: Reason,
+        parts: Mapping[Cause, Array] | None = None,
+        figures: Mapping[str, float] | None = None,
+    ) -> "Detection":
+        """Add reasons why the fit may be wrong, parts (2, 2) of its covariance, and figures."""
+        fit, reason = self.fit, Reason.combine((self.reason, *reasons))
+        if fit is not None:
+            covariance = fit.place_covariance
+            for cause, px2 in (parts or {}).items():
+                covariance = covariance.plus(cause, px2)
+            fit = replace(fit, place_covariance=covariance, figures={**fit.figures, **(figures or {})})
+        return replace(self, fit=fit, reason=reason)
 
 
 def detect_mark(

@@ -20,7 +20,7 @@ from measure.fiducials.mark_comparison import (
     unlike_blur,
     unlike_others,
 )
-from measure.fiducials.mark_fit import detect_mark, is_held_by_frame, strain_error_px
+from measure.fiducials.mark_fit import Detection, detect_mark, is_held_by_frame, strain_error_px
 from measure.fiducials.options import film_terms, interleaved
 from measure.flags import LARGE_ERROR, Cause
 from measure.geometry import linear_scale
@@ -106,7 +106,8 @@ def _sharpened(frame: Frame, sharpening: Sharpening) -> Frame:
 def _refit_with_tone(frame: Frame) -> Frame:
     """Refit the marks with the tone curve estimated from the telling ones; if these disagree, from further curves."""
     prior, begun, options = frame.scan.tone.prior, frame.scan.tone, frame.options.match
-    pending = {index for index, fit in frame.clear_fits.items() if _needs_frame(frame, index, fit)}
+    sigma = _linear_sigma(frame)
+    pending = {index for index, fit in frame.clear_fits.items() if _needs_frame(frame, index, fit, sigma)}
     telling = {*_by_significance(frame)[:_TELLING]}
     best = _settle_tone(frame, prior, telling, pending & telling)
     is_open = best.tone.disagreement > _AGREED and any(
@@ -147,12 +148,12 @@ def _settle_tone(frame: Frame, prior: Tone, telling: Set[int], pending: Set[int]
     return frame
 
 
-def _needs_frame(frame: Frame, index: int, fit: MarkFit) -> bool:
+def _needs_frame(frame: Frame, index: int, fit: MarkFit, linear_sigma: float) -> bool:
     """Whether a fit depends on rotation, scale, stretch or shear of the frame; with a film model or lens all do."""
     if frame.film is not None or frame.options.lens is not None:
         return True
     mark, linear = frame.layout.marks[index].mark, frame.linear(index)
-    error_px = strain_error_px(mark, fit.pixel_from_mark[:, :2], linear, _linear_sigma(frame))
+    error_px = strain_error_px(mark, fit.pixel_from_mark[:, :2], linear, linear_sigma)
     return is_held_by_frame(mark) or error_px > _STRAINED * fit.sigma_px
 
 
@@ -170,14 +171,15 @@ def _by_significance(frame: Frame) -> list[int]:
 def _add_common_covariances(frame: Frame) -> Frame:
     """Add the uncertainties of tone curve, sharpening and taking lens to the covariance of each mark."""
     sharpening, by_lens = frame.scan.tone.sharpening, _lens_covariances(frame)
-    for index, fit in enumerate(detection.fit for detection in frame.detections):
-        parts = {Cause.LENS: by_lens[index]} if index in by_lens else {}
+    detections = list(frame.detections)
+    for index, detection in enumerate(detections):
+        fit, parts = detection.fit, {Cause.LENS: by_lens[index]} if index in by_lens else {}
         if fit is not None and fit.tone is not None:
             parts[Cause.TONE] = frame.tone.covariance_px2(fit.tone)
         if fit is not None and fit.sharpening is not None and sharpening:
             parts[Cause.SHARPENING] = fit.sharpening.covariance_px2(sharpening)
-        frame = frame.amend(index, parts=parts)
-    return frame
+        detections[index] = detection.amend(parts=parts)
+    return replace(frame, detections=tuple(detections))
 
 
 def _lens_covariances(frame: Frame) -> dict[int, Array]:
@@ -208,17 +210,18 @@ def _refit_with_blur(frame: Frame) -> Frame:
         if blur is not None
     }
     matched = _refit(frame, {index: each for index, each in options.items() if index not in faint}, orient=False)
-    for index, before in faint.items():
-        fit = _fit_again(frame, index, options.get(index, frame.options.match))
-        if fit is not None and _is_better(before, fit, shared[index]):
-            matched = matched.replace_fits({index: fit})
+    sigma = _linear_sigma(frame)
+    again = {index: _fit_again(frame, index, options.get(index, frame.options.match), sigma) for index in faint}
+    better = {index: fit for index, fit in again.items() if fit and _is_better(faint[index], fit, shared[index])}
+    matched, amended = matched.replace_fits(better), {}
     total_px = {index: float(np.sqrt(fit.blur_px**2 + PIXEL_VARIANCE_PX2)) for index, fit in fits.items()}
+    usual_px = float(np.median(list(total_px.values()))) if total_px else 1.0
     for index, blur in shared.items():
-        ratio, sigma = total_px[index] / float(np.median(list(total_px.values()))), fits[index].blur_sigma
-        figures = {"blur_ratio": ratio, "blur_sigma": sigma} if np.isfinite(sigma) else {}
+        ratio, blur_sigma = total_px[index] / usual_px, fits[index].blur_sigma
+        figures = {"blur_ratio": ratio, "blur_sigma": blur_sigma} if np.isfinite(blur_sigma) else {}
         is_unlike = blur is not None and blur.differs and index not in faint
-        matched = matched.amend(index, *([unlike_blur(ratio)] if is_unlike else []), figures=figures)
-    return orient_frame(matched)
+        amended[index] = matched.detections[index].amend(*[unlike_blur(ratio)] * is_unlike, figures=figures)
+    return orient_frame(matched.replace_detections(amended))
 
 
 def _is_better(before: MarkFit, fit: MarkFit, blur: SharedBlur | None) -> bool:
@@ -239,13 +242,14 @@ def _compare_shapes(frame: Frame) -> Frame:
             groups[mark].append(index)
         elif _is_drawn(frame, index) and fit.own_shape is not None:
             groups[None].append(index)
+    changed = {}
     for drawn, indices in groups.items():
         figures = [_shape_figures(fits[index], frame.linear(index), drawn is None) for index in indices]
         own, sigmas = (np.array(each) for each in zip(*figures, strict=True))
         for index, shape, sigma in zip(indices, shared_shapes(own, sigmas), sigmas, strict=True):
             if shape is not None:
-                frame = _doubt_shape(frame, index, fits[index], shape, sigma)
-    return frame
+                changed[index] = _doubt_shape(frame, index, fits[index], shape, sigma)
+    return frame.replace_detections(changed)
 
 
 def _shape_figures(fit: MarkFit, linear: Array, is_held: bool) -> tuple[Array, Array]:
@@ -255,7 +259,7 @@ def _shape_figures(fit: MarkFit, linear: Array, is_held: bool) -> tuple[Array, A
     return np.array([np.log(linear_scale(fit.pixel_from_mark) / linear_scale(linear))]), np.array([fit.size_sigma])
 
 
-def _doubt_shape(frame: Frame, index: int, fit: MarkFit, shape: SharedShape, sigma: Array) -> Frame:
+def _doubt_shape(frame: Frame, index: int, fit: MarkFit, shape: SharedShape, sigma: Array) -> Detection:
     """Store the shape of a mark relative to the others, and doubt an outlier. sigma (k,): of the mark's own figures."""
     mark, is_damaged, touch = frame.layout.marks[index].mark, fit.damaged_fraction > 0, None
     figures = dict(
@@ -279,7 +283,7 @@ def _doubt_shape(frame: Frame, index: int, fit: MarkFit, shape: SharedShape, sig
         near = f"and the picture next to it is damaged: something may touch it; error over {WRONG_PX} px"
         reasons = [unlike.reword(f"{unlike.split(':')[0]}, {near}")]
     parts = {} if touch is None else {Cause.TOUCHED: touch.variance_px2 * np.eye(2)}
-    return frame.amend(index, *reasons, parts=parts, figures=figures)
+    return frame.detections[index].amend(*reasons, parts=parts, figures=figures)
 
 
 def _radius_mm(mark: Mark) -> float:
@@ -307,7 +311,8 @@ def _linear_sigma(frame: Frame) -> float:
 
 def _refit(frame: Frame, options: Mapping[int, MatchOptions], orient: bool = True) -> Frame:
     """Refit marks at their places, with options by index. A clear fit stays if the new one is not clear."""
-    fits = {index: _fit_again(frame, index, each) for index, each in sorted(options.items())}
+    sigma = _linear_sigma(frame) if options else np.inf
+    fits = {index: _fit_again(frame, index, each, sigma) for index, each in sorted(options.items())}
     kept = {
         index: fit
         for index, fit in fits.items()
@@ -317,7 +322,7 @@ def _refit(frame: Frame, options: Mapping[int, MatchOptions], orient: bool = Tru
     return orient_frame(frame) if orient else frame
 
 
-def _fit_again(frame: Frame, index: int, options: MatchOptions) -> MarkFit | None:
+def _fit_again(frame: Frame, index: int, options: MatchOptions, linear_sigma: float) -> MarkFit | None:
     """Refit a mark at its measured place, with the frame's rotation and scale if it is held by them."""
     before = frame.detections[index].fit
     if before is None:
@@ -325,4 +330,4 @@ def _fit_again(frame: Frame, index: int, options: MatchOptions) -> MarkFit | Non
     expected = frame.prediction(index, _REFIT_PX).shift_to(before.center_px)
     # Marks whose size, place and blur are less separate begin anew: they have further minima.
     begun = before if isinstance(expected.mark, MarkShape) and is_cross(expected.mark) else None
-    return detect_mark(frame.scan, expected, options, _linear_sigma(frame), begun).fit
+    return detect_mark(frame.scan, expected, options, linear_sigma, begun).fit

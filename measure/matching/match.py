@@ -163,17 +163,18 @@ def _mark_fit(fit: PictureFit, window: ScanWindow) -> MarkFit:
     noise, is_white = as_if_white(model.scores, fit.used, len(model.design), information)
     noise = noise.floored(fit.rounding_variance_dn2)
     unknown = np.full((len(model.design),) * 2, np.inf)
-    precision = {
+    grey = np.asarray(window.grey, float)
+    precision: dict[str, Any] = {
         "place_covariance": Covariance.from_noise(unknown[:2, :2]),
         "covariance": unknown,
         "lost_fraction": 1.0,
     }
     if not fit.reason:
         free, frame = _surroundings(fit, window)
-        patches = blank_patches(window.grey, free, noise.variance_dn2)
+        patches = blank_patches(grey, free, noise.variance_dn2)
         if not is_white or is_coloured(patches):
             noise = grain_model(model.residuals, used, model.design, noise.neighbour_correlation, patches)
-        precision = _precision(fit, noise, Landscape(window.grey, frame, model.design[-GREY]))
+        precision = _precision(fit, noise, Landscape(grey, frame, model.design[-GREY]))
     # The grain's weights may have moved the mark.
     place = fit.state.shifted(np.asarray(fit.window.origin_px)).pixel_from_mark
     stored_dn = fit.window.coding.stored_contrast_dn(float(fit.state.greys[1]), model.contrast_dn)

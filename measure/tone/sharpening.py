@@ -157,22 +157,6 @@ class SharpeningScore:
             return np.outer(moved, moved)
         return np.asarray(self.on_place @ sharpening.covariance @ self.on_place.T)
 
-    def information(self, among: Sequence[int]) -> tuple[Array, Array]:
-        """Normal equations of some of the parameters."""
-        chosen = np.ix_(among, among)
-        weighted = np.linalg.solve(self.covariance[chosen], self.normal[chosen]).T
-        matrix = weighted @ self.normal[chosen]
-        return (matrix + matrix.T) / 2, weighted @ self.value[list(among)]
-
-
-@dataclass(frozen=True, eq=False)
-class _Estimate:
-    """Estimate of a step. step (m,) from the parameters of the fit; covariance (m, m); log_odds: that it is real."""
-
-    step: Array
-    covariance: Array
-    log_odds: float
-
 
 def estimate_sharpening(before: Sharpening, scores: Sequence[SharpeningScore], departures: int) -> Sharpening | None:
     """Estimate the sharpening from marks.
@@ -192,45 +176,49 @@ def estimate_sharpening(before: Sharpening, scores: Sequence[SharpeningScore], d
         return None
     tone, count = list(range(departures)), len(scores[0].value) - departures
     if before:
-        found = _estimate(scores, tone, [departures, departures + 1], before)
-        after = before.apply_step(found.step, found.covariance)
+        step, covariance, _ = _estimate_step(scores, tone, [departures, departures + 1], before)
+        after = before.apply_step(step, covariance)
         return after if after.amount > _LEAST_AMOUNT else None
-    each = [_estimate(scores, tone, [departures + radius], before) for radius in range(count)]
-    best = int(np.argmax([one.log_odds for one in each]))
-    if each[best].log_odds < _EVIDENCE or each[best].step[0] < _LEAST_AMOUNT:
+    each = [_estimate_step(scores, tone, [departures + radius], before) for radius in range(count)]
+    best = int(np.argmax([log_odds for _, _, log_odds in each]))
+    (amount,), covariance, log_odds = each[best]
+    if log_odds < _EVIDENCE or amount < _LEAST_AMOUNT:
         return None
-    start, variance = Sharpening(0.0, RADII_PX[best]), each[best].covariance[0, 0]
-    return start.apply_step(np.array([each[best].step[0], 0.0]), np.diag([variance, _SIGMAS[1] ** 2]))
+    start = Sharpening(0.0, RADII_PX[best])
+    return start.apply_step(np.array([amount, 0.0]), np.diag([covariance[0, 0], _SIGMAS[1] ** 2]))
 
 
-def _estimate(
+def _estimate_step(
     scores: Sequence[SharpeningScore], tone: Sequence[int], among: Sequence[int], before: Sharpening
-) -> _Estimate:
-    """Estimate some parameters of the sharpening together with the tone curve, excluding outlying marks."""
-    prior, pull = np.eye(len(tone) + len(among)), np.zeros(len(tone) + len(among))
+) -> tuple[Array, Array, float]:
+    """Estimate a step of some parameters together with the tone curve, excluding outlying marks.
+
+    Returns
+    -------
+    Step (m,) from the parameters of the fits, its covariance (m, m), and the log-odds that it is real.
+    """
+    count, first = len(tone) + len(among), len(tone)
+    prior, pull = np.eye(count), np.zeros(count)
     weight = np.diag(_SIGMAS**-2) if before.prior is None else np.linalg.inv(before.prior.covariance)
     off = (_USUAL if before.prior is None else before.prior.values) - before.values
-    prior[len(tone) :, len(tone) :] = weight[: len(among), : len(among)]
-    pull[len(tone) :] = (weight @ off)[: len(among)] if before else 0.0
-    own = [score.information([*tone, *among]) for score in scores]
-    each = [_solved(*one, prior, np.zeros_like(pull), len(tone)) for one in own]
-    steps, variances = (np.array(values)[:, 0] for values in zip(*((s, np.diag(c)) for s, c in each), strict=True))
+    prior[first:, first:] = weight[: len(among), : len(among)]
+    pull[first:] = (weight @ off)[: len(among)] if before else 0.0
+    chosen = np.ix_([*tone, *among], [*tone, *among])
+    normals = np.array([score.normal[chosen] for score in scores])
+    values = np.array([score.value[[*tone, *among]] for score in scores])
+    weighted = np.linalg.solve(np.array([score.covariance[chosen] for score in scores]), normals).swapaxes(1, 2)
+    matrices, rights = weighted @ normals, (weighted @ values[..., None])[..., 0]
+    matrices = (matrices + matrices.swapaxes(1, 2)) / 2
+    own = np.linalg.inv(matrices + prior)  # by each mark alone, without the prior's pull
+    steps, variances = (own[:, first] * rights).sum(axis=1), own[:, first, first]
     middle = float(np.median(steps))
     kept = np.abs(steps - middle) <= _ODD * np.sqrt(variances + np.median((steps - middle) ** 2))
-    matrix, right = (
-        np.sum([part for part, ok in zip(parts, kept, strict=True) if ok], axis=0) for parts in zip(*own, strict=True)
-    )
-    step, covariance = _solved(matrix, right, prior, pull, len(tone))
+    matrix, right = matrices[kept].sum(axis=0), rights[kept].sum(axis=0)
+    covariance = np.linalg.inv(matrix + prior)[first:]
+    step, covariance = covariance @ (right + pull), covariance[:, first:]
     spread = float(np.sum((steps - step[0])[kept] ** 2 / variances[kept])) / max(int(kept.sum()) - 1, 1)
     covariance = covariance * max(spread, 1.0)
     explained = right @ np.linalg.solve(matrix + prior, right)
-    curve = slice(None, len(tone))
-    explained -= right[curve] @ np.linalg.solve((matrix + prior)[curve, curve], right[curve])
+    explained -= right[:first] @ np.linalg.solve((matrix + prior)[:first, :first], right[:first])
     shrunk = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(prior)[1]
-    return _Estimate(step, covariance, float(explained / max(spread, 1.0) + shrunk) / 2)
-
-
-def _solved(matrix: Array, right: Array, prior: Array, pull: Array, first: int) -> tuple[Array, Array]:
-    """Solve the normal equations. Returns the unknowns from the index first on, and their covariance."""
-    covariance: Array = np.asarray(np.linalg.inv(matrix + prior), float)
-    return (covariance @ (right + pull))[first:], covariance[first:, first:]
+    return step, covariance, float(explained / max(spread, 1.0) + shrunk) / 2

@@ -241,8 +241,8 @@ def test_what_widens_a_mark_is_added_to_its_covariance_under_its_cause() -> None
     frame, _ = make_frame(np.random.default_rng(3), 1.0, 1.0)
     before, added = frame.detections[2].fit, np.array([[4e-3, 1e-3], [1e-3, 2e-3]])
     assert before is not None
-    widened = frame.amend(2, parts={Cause.TOUCHED: added}).amend(2, parts={Cause.TOUCHED: added})
-    after = widened.detections[2].fit
+    widened = frame.detections[2].amend(parts={Cause.TOUCHED: added}).amend(parts={Cause.TOUCHED: added})
+    after = widened.fit
     assert after is not None
     np.testing.assert_allclose(after.covariance_px2 - before.covariance_px2, 2 * added, atol=1e-12)
     np.testing.assert_allclose(after.place_covariance.parts[Cause.TOUCHED], 2 * added, atol=1e-12)
