@@ -117,14 +117,6 @@ class ToneInformation:
         return replace(ToneInformation.pooled([self], self.common_variance), common_variance=0.0)
 
 
-@dataclass(frozen=True, eq=False)
-class ToneEstimate:
-    """Tone curve estimated from images. scatter: variance of each departure of their own curves around it."""
-
-    tone: "Tone"
-    scatter: float = 0.0
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Tone:
     """Tone curve of a scan, with its uncertainty.
@@ -225,50 +217,54 @@ class Tone:
         if not others:
             return self
         sharpening = Sharpening.pooled([one.sharpening for one in others])
-        return replace(self.estimate(others).tone, other_scans=(self, tuple(others)), sharpening=sharpening)
+        return replace(self.estimate(others)[0], other_scans=(self, tuple(others)), sharpening=sharpening)
 
-    def estimate(self, each: Sequence[ToneInformation]) -> ToneEstimate:
+    def estimate(self, each: Sequence[ToneInformation]) -> tuple["Tone", float]:
         """Update the curve by information from images.
 
         Parameters
         ----------
         each : information of each image. Images that agree may overrule the declared curve.
+
+        Returns
+        -------
+        Estimated curve, and the variance of each departure of the images' own curves around it.
         """
         if self.other_scans is not None:
             before, others = self.other_scans
             return before.estimate([*others, *each])
         if self.is_known or not each:
-            return ToneEstimate(self)
-        declared, log_likelihood = self._most_likely(each)
+            return self, 0.0
+        tone, scatter, log_likelihood = self._most_likely(each)
         if not self.is_declared:
-            return declared
-        free, free_log_likelihood = self.vague_prior()._most_likely(each)
+            return tone, scatter
+        free, free_scatter, free_log_likelihood = self.vague_prior()._most_likely(each)
         if free_log_likelihood - log_likelihood < _CONTRADICTED:
-            return declared
+            return tone, scatter
         source = f"{self.source}, but the pictures contradict it"
-        return replace(free, tone=replace(free.tone, source=source, is_declared=False))
+        return replace(free, source=source, is_declared=False), free_scatter
 
-    def _most_likely(self, each: Sequence[ToneInformation]) -> tuple[ToneEstimate, float]:
-        """Estimate with the most likely scatter, and the logarithm of its marginal likelihood.
+    def _most_likely(self, each: Sequence[ToneInformation]) -> tuple["Tone", float, float]:
+        """Estimate with the most likely scatter; returns curve, scatter and logarithm of its marginal likelihood.
 
         Images that contradict one another or the prior significantly have edges that are not as drawn, for example by
         sharpening or uneven development. Each image therefore has its own curve, and the scatter of these curves around
         the scanner's is estimated as the variance of random effects. The prior of its root is half-Cauchy (Gelman,
         2006, Prior distributions for variance parameters).
         """
-        return max((self._scatter_estimate(each, scatter) for scatter in _SCATTERS), key=itemgetter(1))
-
-    def _scatter_estimate(self, each: Sequence[ToneInformation], scatter: float) -> tuple[ToneEstimate, float]:
-        pooled = ToneInformation.pooled(each, scatter)
-        information, prior = pooled.scanner_information, np.linalg.inv(self.covariance)
-        covariance = np.linalg.inv(prior + information.matrix)
-        right_side = prior @ self.mean + information.right_side
-        mean = covariance @ right_side
-        log_likelihood = np.linalg.slogdet(prior @ covariance)[1] + right_side @ mean - self.mean @ prior @ self.mean
-        log_likelihood -= information.sum_of_squares + 2 * np.log1p(scatter)
-        log_likelihood -= _log_determinant(scatter, each) + _log_determinant(pooled.common_variance, [pooled])
-        tone = replace(self, mean=mean, covariance=(covariance + covariance.T) / 2)
-        return ToneEstimate(tone, scatter), log_likelihood / 2
+        estimates = []
+        for scatter in _SCATTERS:
+            pooled = ToneInformation.pooled(each, scatter)
+            information, prior = pooled.scanner_information, np.linalg.inv(self.covariance)
+            covariance = np.linalg.inv(prior + information.matrix)
+            right_side = prior @ self.mean + information.right_side
+            mean = covariance @ right_side
+            log_likelihood = np.linalg.slogdet(prior @ covariance)[1] + right_side @ mean
+            log_likelihood -= self.mean @ prior @ self.mean + information.sum_of_squares + 2 * np.log1p(scatter)
+            log_likelihood -= _log_determinant(scatter, each) + _log_determinant(pooled.common_variance, [pooled])
+            tone = replace(self, mean=mean, covariance=(covariance + covariance.T) / 2)
+            estimates.append((tone, scatter, float(log_likelihood / 2)))
+        return max(estimates, key=itemgetter(2))
 
     def light(self, code: NDArray[np.floating] | NDArray[np.integer], full_scale: float) -> Single:
         """Convert grey values to light on the same scale, 0 to full_scale; both ends are fixed."""

@@ -57,20 +57,18 @@ class FrameTone:
         if not marks:
             return cls(prior)
         each = [mark.information for mark in marks.values()]
-        estimate = prior.estimate(each)
-        least, greatest = min(mark.least for mark in marks.values()), max(mark.greatest for mark in marks.values())
-        step = estimate.tone.mean - matched_by.mean
-        information = replace(ToneInformation.pooled(each, estimate.scatter), sharpening=matched_by.sharpening)
+        tone, scatter = prior.estimate(each)
+        ends = min(mark.least for mark in marks.values()), max(mark.greatest for mark in marks.values())
+        step, sharpening = tone.mean - matched_by.mean, matched_by.sharpening
         if prior.is_known:
-            return cls(prior, None, least, greatest, estimate.scatter, float(step @ step))
-        value = estimate.tone.equivalent_power(least, greatest)[0]
-        sharpening = matched_by.sharpening
+            return cls(prior, None, *ends, scatter, float(step @ step))
+        value = tone.equivalent_power(*ends)[0]
         if not _POWERS[0] <= value <= _POWERS[1]:
-            off = estimate.tone.mean - prior.mean
-            doubted = prior.doubted(estimate.tone, value).sharpened(sharpening)
-            return cls(doubted, None, least, greatest, 0.0, float(off @ off))
-        tone = replace(estimate.tone, before=prior).sharpened(sharpening)
-        return cls(tone, information, least, greatest, estimate.scatter, float(step @ step))
+            off = tone.mean - prior.mean
+            return cls(prior.doubted(tone, value).sharpened(sharpening), None, *ends, 0.0, float(off @ off))
+        information = replace(ToneInformation.pooled(each, scatter), sharpening=sharpening)
+        tone = replace(tone, before=prior).sharpened(sharpening)
+        return cls(tone, information, *ends, scatter, float(step @ step))
 
     @property
     def is_doubted(self) -> bool:

@@ -168,15 +168,18 @@ def test_given_coordinates_that_are_known_make_a_frame_no_vaguer(off_px: float, 
     assert all(np.sqrt(each) > off_px / 2 for each in variances)
 
 
-@pytest.mark.parametrize("sigma_mm", [0.001, 0.005, 0.02])
-def test_an_ordinary_frame_is_flagged_as_often_as_stated(sigma_mm: float) -> None:
-    """Film that scatters as its prior says, with four degrees of freedom."""
+@pytest.mark.parametrize(
+    ("sigma_mm", "model"),
+    [(0.001, "affine"), (0.005, "affine"), (0.02, "affine"), (0.005, "projective"), (0.005, "bilinear")],
+)
+def test_an_ordinary_frame_is_flagged_as_often_as_stated(sigma_mm: float, model: str) -> None:
+    """Film that scatters as its prior says, with four degrees of freedom; affinities are free in the other models."""
     rng, given, frames = np.random.default_rng(11), np.array(EIGHT), 300
     flagged = 0
     for _ in range(frames):
         film_mm = 0.005 * np.sqrt(4.0 / rng.chisquare(4.0))
         places = given + rng.normal(0.0, np.hypot(film_mm, sigma_mm), given.shape)
-        marks = FrameMarks.from_places(given, places, np.tile(sigma_mm**2 * np.eye(2), (len(given), 1, 1)))
+        marks = FrameMarks.from_places(given, places, np.tile(sigma_mm**2 * np.eye(2), (len(given), 1, 1)), model)
         flagged += frame_p_value(marks) < FALSE_DOUBT
     assert flagged < 3 * FALSE_DOUBT * frames
 

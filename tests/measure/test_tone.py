@@ -120,10 +120,10 @@ def test_a_declared_curve_holds_until_pictures_contradict_it() -> None:
     assert declared.equivalent_power(0.1, 0.9)[0] == pytest.approx(2.2, abs=0.01)
     linear = -1.2 / 0.6 * np.eye(5)[0]  # departures that make a power of 1 of it
     strong, faint = (tone_information(linear, w) for w in (400.0, 0.1))
-    believed = declared.estimate([faint]).tone
+    believed = declared.estimate([faint])[0]
     assert believed.equivalent_power(0.1, 0.9)[0] == pytest.approx(2.2, abs=0.05)
     assert "contradict" not in believed.source
-    believed = declared.estimate([strong] * 3).tone
+    believed = declared.estimate([strong] * 3)[0]
     assert believed.equivalent_power(0.1, 0.9)[0] == pytest.approx(1.0, abs=0.1)
     assert "contradict" in believed.source
 
@@ -184,11 +184,11 @@ def test_what_the_marks_contradict_one_another_by_is_in_the_covariance_of_each()
 def test_a_picture_that_contradicts_the_others_hardly_moves_the_curve() -> None:
     agreed = [mark_tone(np.eye(5)[0]).information] * 4
     alone, prior = mark_tone(-3 * np.ones(5)).information, Tone.unknown()
-    together, without = prior.estimate([*agreed, alone]), prior.estimate(agreed)
-    assert without.scatter == 0.0
-    assert together.scatter > 0.3
-    off = together.tone.mean - np.eye(5)[0]
-    assert np.sqrt(off @ np.linalg.solve(together.tone.covariance, off)) < 3
+    tone, scatter = prior.estimate([*agreed, alone])
+    assert prior.estimate(agreed)[1] == 0.0
+    assert scatter > 0.3
+    off = tone.mean - np.eye(5)[0]
+    assert np.sqrt(off @ np.linalg.solve(tone.covariance, off)) < 3
 
 
 def test_many_scans_in_jpeg_tell_the_curve_no_better_than_rounding_lets_them() -> None:
@@ -221,7 +221,7 @@ def test_noise_that_is_cut_off_at_black_feigns_no_curve() -> None:
         light = 0.02 + 0.5 * (mark.picture + rng.standard_normal(mark.picture.shape) / 12)
         estimate = fit_mark(mark, FULL * np.clip(light, 0.0, 1.0), linear).tone
         assert estimate is not None
-        found = linear.estimate([estimate.information]).tone
+        found = linear.estimate([estimate.information])[0]
         moved.append(float(mark.place[:, 1] @ estimate.on_place @ found.mean / np.hypot(*mark.place[:, 1])))
     assert abs(np.mean(moved)) < 4 * np.std(moved) / np.sqrt(len(moved))
 
