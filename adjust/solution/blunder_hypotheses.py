@@ -9,7 +9,7 @@ Such a blunder leaves residuals everywhere, and tests of single observations wou
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import chain, combinations
+from itertools import chain, combinations, product
 
 import numpy as np
 from scipy.special import chdtrc
@@ -27,8 +27,8 @@ TOLERATED = 2.0  # factor on the given standard deviations up to which residuals
 CHECKED = 10  # smallest redundancy for an explanation
 NAMED = 5  # images named in a message
 MOST_PAIRS = 15  # pairs of frames tried as exchanged, largest residuals first
-HEIGHTS = 10.0  # sigma0 that heights in another unit leave at least
-UNITS = (1000.0, 100.0, 10.0, 0.3048)  # ratios of length units: m, dm, cm, mm, feet
+ONE_AXIS = 10.0  # sigma0 that one axis in another unit leaves at least
+UNITS = (1000.0, 100.0, 10.0, 0.3048, 25.4)  # ratios of length units: m, dm, cm, mm, feet, inches
 FACTORS = (*UNITS, *(1.0 / each for each in UNITS))
 
 AXES = {  # blunders that mirror the points, and the matrices that correct them
@@ -86,13 +86,21 @@ def network_hypotheses(network: Network, bare: Network, given: Adjustment | None
         by = factor * np.eye(3)
         remedy = "Give both in the unit that [object] unit names."
         yield [NetworkHypothesis(unit_words(factor), _move_points(network, by), remedy, by)]
-    has_relief = len({place[2] for place in network.known_places.values()}) > 1
-    for factor in FACTORS if has_relief and (given is None or not given.converged or given.sigma0 > HEIGHTS) else ():
-        by, how = np.diag([1.0, 1.0, factor]), "large" if factor < 1.0 else "small"
-        words = f"Z of all points is {max(factor, 1.0 / factor):.4g} times too {how} for X and Y: another unit"
-        yield [NetworkHypothesis(words, _move_points(network, by), moved=by)]
+    is_far = given is None or not given.converged or given.sigma0 > ONE_AXIS
     alone = _exchanged_frames(network, given), _mirrored_images(network), _distances(network)
-    yield from ([each] for each in chain(*alone))
+    heights, plane = (_one_axis(network, axes) if is_far else () for axes in ((2,), (0, 1)))
+    yield from ([each] for each in chain(heights, *alone, plane))
+
+
+def _one_axis(network: Network, axes: Sequence[int]) -> Iterator[NetworkHypothesis]:
+    """Hypothesis: one of some axes is in another unit than the others."""
+    extents = np.ptp(list(network.known_places.values()) or np.zeros((1, 3)), axis=0)
+    for axis, factor in product((axis for axis in axes if extents[axis]), FACTORS):
+        name, others = "XYZ"[axis], " and ".join("XYZ".replace("XYZ"[axis], ""))
+        times, how = max(factor, 1.0 / factor), "large" if factor < 1.0 else "small"
+        by = np.diag(np.where(np.arange(3) == axis, factor, 1.0))
+        words = f"{name} of all points is {times:.4g} times too {how} for {others}: another unit"
+        yield NetworkHypothesis(words, _move_points(network, by), moved=by)
 
 
 def unit_words(factor: float) -> str:

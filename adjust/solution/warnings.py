@@ -44,6 +44,7 @@ def run_warnings(run: Run, cofactor: Cofactor, residuals: Residuals) -> list[str
         *_input(run.problem),
         *_swapped_numbers(run, residuals),
         *_repeated_images(run.problem),
+        *_repeated_marks(run.problem.network.observations),
         *(_unchecked_orientations(run.problem, residuals) if run.converged else ()),
     ]
 
@@ -166,6 +167,21 @@ def _repeated_images(problem: Problem) -> Iterator[str]:
         yield (
             f"All marks have the same coordinates in {shortened(pairs, NAMED)}: a picture under two names counts "
             "twice, and standard deviations are too small. Leave one of them out."
+        )
+
+
+def _repeated_marks(observations: Observations) -> Iterator[str]:
+    """Warn of marks of one kind with the same coordinates in an image: the same mark under two names."""
+    first, pairs = dict[tuple[str, str, bytes], str](), dict[str, None]()
+    rows = zip(observations.image, observations.kind, observations.point, observations.xy_mm, strict=True)
+    for image, kind, point, xy_mm in rows:
+        other = first.setdefault((image, kind, xy_mm.tobytes()), point)
+        if other != point:
+            pairs[f"{point} and {other}"] = None
+    if pairs:
+        yield (
+            f"Marks of two names have the same coordinates in an image, {shortened(list(pairs), NAMED)}: a mark under "
+            "two names counts twice, and standard deviations are too small. Leave one of them out."
         )
 
 

@@ -23,7 +23,7 @@ METASHAPE = Convention(
     "calibrateFiducials(resolution in mm), Marker.Type.Fiducial",
 )
 _MOST_REASONS = 3  # largest number in a message
-NAMES = ("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "b1", "b2")
+NAMES = ("f", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "b1", "b2")
 
 
 def write_metashape(block: Block, options: ExportOptions) -> Written:
@@ -129,18 +129,30 @@ def _read_camera(path: Path, options: ImportOptions) -> CameraFile:
     projection = (root.findtext("projection") or "frame").strip()
     if projection != "frame":
         raise InputError(f"{path}: is of a {projection} camera; only frame cameras are read.")
-    names = ("width", "height", "f", *NAMES[1:])
+    names = ("width", "height", *NAMES)
     given = {name: child_numbers(root, name, 1, path)[0] for name in names if root.find(name) is not None}
     missing = [name for name in ("width", "height", "f") if not given.get(name, 0.0) > 0.0]
     if missing:
         raise InputError(f"{path}: has no positive {missing[0]}. Export the calibration again.")
-    if given.get("k4", 0.0) != 0.0:
+    lost = [
+        f"{child.tag} is {(child.text or '').strip()}"
+        for child in root
+        if child.tag not in names and _is_set(child.text)
+    ]
+    if lost:
         raise InputError(
-            f"{path}: k4 is {given['k4']:g}, and no family of distortion here has it. Calibrate again with it held at "
-            "0."
+            f"{path}: {lost[0]}, and no family of distortion here has it. Calibrate again with it held at 0."
         )
     values = {name: given.get(name, 0.0) for name in NAMES}
     f, b1, b2, size = values["f"], values["b1"], values["b2"], (given["width"], given["height"])
     interior = (f + b1, f, size[0] / 2 + values["cx"], size[1] / 2 + values["cy"])
     lens = {name: values[name] for name in ("k1", "k2", "k3")} | {"p1": values["p2"], "p2": values["p1"], "b2": b2 / f}
     return opencv_camera(path, path.stem, interior, lens, size, options, METASHAPE)
+
+
+def _is_set(text: str | None) -> bool:
+    """Whether the text of an element is a number other than 0."""
+    try:
+        return float(text or "") != 0.0
+    except ValueError:
+        return False

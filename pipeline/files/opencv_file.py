@@ -19,6 +19,8 @@ from pipeline.types import Array
 FISHEYE = "fisheye"  # model of cv2.fisheye, also called "equidistant", and the key that ROS and others use
 COVARIANCE = "intrinsics_covariance"  # key in camera.yaml: covariance of fx, fy, cx, cy and the distortion coefficients
 MOST_MB = 4
+_FISHEYES = (FISHEYE, "equidistant", "kannala_brandt")  # values of distortion_model
+_OPENCV = ("plumb_bob", "rational_polynomial", "radtan", "brown_conrady", "pinhole", "opencv", "")
 _MATRIX = ("camera_matrix", "K", "Camera_Matrix", "cameraMatrix", "M1")
 _LENS = ("distortion_coefficients", "D", "Distortion_Coefficients", "distCoeffs", "D1")
 _WIDTH, _HEIGHT = ("image_width", "image_Width"), ("image_height", "image_Height")
@@ -69,7 +71,13 @@ def _pixel_camera(path: Path, storage: Any) -> PixelCamera:
         raise InputError(f"{path}: has no 3 x 3 matrix {_MATRIX[0]} (or {', '.join(_MATRIX[1:])}).")
     k = np.array(matrix.mat(), dtype=float)
     values = np.zeros(0) if lens is None else np.ravel(lens.mat()).astype(float)
-    is_fisheye = storage.getNode("distortion_model").string() in (FISHEYE, "equidistant")
+    model = storage.getNode("distortion_model").string()
+    is_fisheye = model in _FISHEYES or storage.getNode("fisheye_model").real() > 0.0  # flag of OpenCV's own program
+    if not storage.getNode("xi").empty() or not (is_fisheye or model in _OPENCV):
+        raise InputError(
+            f"{path}: its distortion model, {model or 'omnidirectional (xi)'}, is none of OpenCV's two that are read "
+            f"({_OPENCV[0]} and {_FISHEYES[0]}). Calibrate again with one of them."
+        )
     family = "opencv_fisheye" if is_fisheye else "opencv"
     names = parameter_names(family)[:-2]  # b1 and b2 are part of the matrix
     if values.size > len(names) or not (np.isfinite([*values, *k.ravel()]).all() and k[0, 0] > 0.0):

@@ -718,6 +718,10 @@ MISFITS = {
         lambda e: Effects(height=1.0 / 3.2808 - 1.0), ("Z of all points is 3.281 times", "along Z than"),
         sized=False, boards=False,
     ),
+    "Y in another unit": Misfit(
+        lambda e: Effects(stretch=-0.9), ("Y of all points is 10 times", "X of all points is 10 times"),
+        sized=False
+    ),
     "lens: no radial term": Misfit(
         lambda e: Effects(radial=0.01 * e), ("have a radial pattern",), free=(), lens={}, size=2
     ),

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 from dense_adjustment import solve_densely
-from networks import Truth, field_points, join_networks, rename_network, set_covariance, simulated
+from networks import Truth, field_points, join_networks, join_observations, rename_network, set_covariance, simulated
 from numpy.typing import NDArray
 from reference_cases import CAMERA, Case, case_approximations, case_network, load, own_name
 from studies import parametrize_with_studies
@@ -105,6 +105,20 @@ def test_an_iteration_limit_is_reported() -> None:
     assert result.termination == "iteration limit"
     assert not result.converged
     assert "not final" in " ".join(result.warnings)
+
+
+def test_a_mark_and_a_picture_under_two_names_are_named() -> None:
+    network, start = simulated(np.random.default_rng(1), Truth())
+    assert not any("two names" in each for each in adjust(network, start).warnings)
+    rows, known = network.observations, network.point_by_id["3"]
+    is_target = [kind == "target" for kind in rows.kind]
+    own = [row for row, point in enumerate(rows.point) if point == "3" and is_target[row]]
+    other = replace(rows.only(np.array(own)), point=("3 again",) * len(own))
+    twice = replace(network, points=(*network.points, replace(known, id="3 again")))
+    twice = replace(twice, observations=join_observations(rows, other))
+    assert any("3 again and 3: a mark under two names" in each for each in adjust(twice, start).warnings)
+    copied = join_networks((network, start), rename_network(network, start, "K", str, "{} again".format, str))
+    assert any("f0 again as f0" in each for each in adjust(*copied).warnings)
 
 
 def set_distortion(network: Network, distortion: Distortion) -> Network:

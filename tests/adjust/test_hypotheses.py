@@ -48,6 +48,7 @@ QUICK = (
     "numbers of a third of the images one off",
     "principal point held wrong",
     "sizes: cropped and enlarged",
+    "Y in another unit",
     "Z in feet",
     "a point is elsewhere",
     "mm for m, stations in m",

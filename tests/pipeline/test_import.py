@@ -142,6 +142,7 @@ def test_a_lens_comes_back_as_it_went(project: Path, tmp_path: Path) -> None:
 
 MARK = "<OneMesureAF1I><NamePt>1</NamePt><PtIm>{}</PtIm></OneMesureAF1I>"
 MARKS = f"<MesureAppuiFlottant1Im><NameIm>a</NameIm>{MARK}</MesureAppuiFlottant1Im>"
+PIXELS = "%YAML:1.0\n---\nK: !!opencv-matrix {{rows: 3, cols: 3, dt: d, data: [9, 0, 5, 0, 9, 5, 0, 0, 1]}}\n{}\n"
 ENTITIES = '<!DOCTYPE a [<!ENTITY b "bbbbbbbb"><!ENTITY c "&b;&b;&b;&b;">]><a>&c;</a>'
 
 
@@ -161,7 +162,10 @@ ENTITIES = '<!DOCTYPE a [<!ENTITY b "bbbbbbbb"><!ENTITY c "&b;&b;&b;&b;">]><a>&c
         ("opencv", "no yaml \x01 at all", "cv2.FileStorage"),
         ("metashape", "<calibration><width>10</width><height>9</height><f>-3</f></calibration>", "no positive f"),
         ("metashape", "<calibration><width>9</width><height>9</height><f>3</f><k4>1</k4></calibration>", "k4 is 1"),
+        ("metashape", "<calibration><width>9</width><height>9</height><f>3</f><p3>2</p3></calibration>", "p3 is 2"),
         ("metashape", "<calibration><projection>fisheye</projection></calibration>", "only frame cameras"),
+        ("opencv", PIXELS.format("distortion_model: inverse_brown_conrady"), "inverse_brown_conrady, is none of"),
+        ("opencv", PIXELS.format("xi: 0.8"), "omnidirectional (xi), is none of"),
         ("colmap", "", "is no reconstruction"),
         ("certificate", "radial_um = [1.0]", "calibrated principal distance"),
     ],
@@ -172,6 +176,13 @@ def test_wrong_files_are_refused(format: str, text: str, words: str, tmp_path: P
     assert run(["import", format, str(file), str(tmp_path / "o"), *PITCH, "--sigma-px", "1"]) == WRONG_INPUT
     assert words in capfd.readouterr().err
     assert not (tmp_path / "o").exists()
+
+
+def test_a_fisheye_of_opencv_s_own_program_is_one(tmp_path: Path) -> None:
+    """Its calibration program tells the model by a flag."""
+    (tmp_path / "fish.yml").write_text(PIXELS.format("fisheye_model: 1"), encoding="utf-8")
+    camera = read_camera(imported("opencv", [tmp_path / "fish.yml"], tmp_path, *PITCH) / "camera.toml")
+    assert camera.distortion.family == "opencv_fisheye"
 
 
 # A certificate
