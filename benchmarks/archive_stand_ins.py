@@ -82,7 +82,7 @@ def keep_results(project: Project) -> None:
     with Store(project.measurement_path) as store:
         store.set_project_folder(home)
         judging = judge(store, measured_from(project), "kept", _frames(project, store, home))
-        write_comparator(project.comparator, judging.marks(), judging.pitches_um(), judging.digest)
+        write_comparator(project.comparator, judging.points(), judging.pitches_um(), judging.digest)
         judging.remember_written(project.comparator)
 
 

@@ -64,11 +64,10 @@ def followed() -> Followed:
     from projects import write_project
 
     from pipeline.archive import measure_archive
-    from pipeline.archive.checked_results import read_measurement
     from pipeline.archive.results_database import Store
     from pipeline.files.project_file import read_project
     from pipeline.progress import Reporter
-    from pipeline.results.comparator_file import mark_rows, write_comparator
+    from pipeline.results.comparator_file import write_comparator
     from pipeline.workers import WorkOptions
 
     with TemporaryDirectory() as place:
@@ -81,10 +80,10 @@ def followed() -> Followed:
         sys.setprofile(calls)
         try:
             with Store(project.measurement_path) as store:
-                measure_archive.measure_archive(project, store, Path(place) / "learned", Reporter(), WorkOptions())
-            scans = read_measurement(project.measurement_path)
-            pitch_um = {scan.frame.image: scan.pitch_um for scan in scans}
-            write_comparator(project.comparator, mark_rows([scan.frame for scan in scans]), pitch_um)
+                learned = Path(place) / "learned"
+                judging = measure_archive.measure_archive(project, store, learned, Reporter(), WorkOptions())
+                assert judging is not None
+                write_comparator(project.comparator, judging.points(), judging.pitches_um())
         finally:
             sys.setprofile(None)
     return calls

@@ -270,7 +270,7 @@ class _Run:
                 who = camera.path.name, camera.clicks.who
                 decisions[who] = decisions.get(who, 0) + 1
         place = new.place(project.comparator)
-        write_comparator(place, judging.marks(), judging.pitches_um(), judging.digest, decisions)
+        write_comparator(place, judging.points(), judging.pitches_um(), judging.digest, decisions)
         if not write_frames(new.place(project.frames_path), judging.written_scans()):
             new.remove(project.frames_path)
 

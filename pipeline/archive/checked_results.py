@@ -15,33 +15,28 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, get_args
 
-from measure.flags import Code, Reason
+import numpy as np
+
+from adjust.problem.observations import ObservationKind
+from measure.flags import Code, Reason, Status
 from measure.results import FrameMeasurement
-from pipeline.archive.results_database import Store, places
+from pipeline.archive.results_database import Store
 from pipeline.archive.schema import (
     FRAMES_DIGEST,
     MARKS,
     check_judging,
-    check_judgings,
     checked_marks_digest,
     damaged_frames,
     damaged_judging,
     damaged_result,
     is_sound,
-    row_digest,
 )
 from pipeline.archive.verdicts import Verdict, scan_doubt, scan_verdict
 from pipeline.errors import InputError
 from pipeline.provenance import hash_file
-from pipeline.results.comparator_file import (
-    CameraPerson,
-    ComparatorPoint,
-    MarkRow,
-    comparator_points,
-    read_measurement_hash,
-)
+from pipeline.results.comparator_file import CameraPerson, ComparatorPoint, read_measurement_hash
 from pipeline.results.measured_record import (
     Failure,
     FailureCode,
@@ -84,6 +79,11 @@ class Judging:
         query = f"select {columns} from checked_frame where judging = ?"
         return self.store.connection.execute(query, (self.row,)).fetchall()
 
+    @cached_property
+    def names(self) -> frozenset[str]:
+        """Names of all frames."""
+        return frozenset(name for (name,) in self.values("name"))
+
     def pitches_um(self) -> dict[str, tuple[float, float]]:
         """{image: pixel pitch across and down}; NaN where it is unknown."""
         unknown = (math.nan, math.nan)
@@ -104,8 +104,7 @@ class Judging:
 
     def fingerprints(self, images: Collection[str]) -> dict[str, str]:
         """{image: fingerprint of its result}, for those of some images that it holds."""
-        found = dict(self.values("name, fingerprint"))
-        return {image: found[image] for image in images if image in found}
+        return {name: key for name, key in self.values("name, fingerprint") if name in images}
 
     def written_scans(self) -> Iterator[MeasuredScan]:
         """Scans on which writing was found."""
@@ -118,7 +117,7 @@ class Judging:
         images: only these; None for all. Raises DamagedError where the list of frames is damaged.
         """
         folder = self.store.project_folder
-        for name, (uri, measured, changed), rows in self._frames(images):
+        for name, (uri, measured, changed), rows in self._frames("uri, measured, changed", images):
             try:
                 if rows is None:
                     raise ValueError
@@ -129,38 +128,52 @@ class Judging:
                 frame = FrameMeasurement(name, (), problems=(Reason(sentence, Code.FAILED_SCAN),))
                 yield MeasuredScan.failed("", frame, Failure(FailureCode.DAMAGED, sentence))
 
-    def marks(self, images: Collection[str] | None = None) -> Iterator[MarkRow]:
-        """Yield the marks of every frame after the checks, sorted by frame name.
+    def points(self, images: Collection[str] | None = None) -> Iterator[ComparatorPoint]:
+        """Yield the marks of every frame after the checks as in comparator.csv, sorted by frame name.
 
         images: only these; None for all. Raises DamagedError where a frame is damaged.
         """
-        for name, _, rows in self._frames(images):
+        for name, (across_um, down_um), rows in self._frames("pitch_x_um, pitch_y_um", images):
             if rows is None:
                 raise damaged_result(name, self.store.path)
             for point, kind, col, row, *spread, causes, status, _, reason, _ in rows:
-                center = None if col is None else (col, row)
-                yield MarkRow(name, point, kind, center, _covariance(spread, causes), status, reason)
+                xy_mm = sigma_mm = None
+                rho = 0.0
+                if col is not None:
+                    xy_mm = np.array([col * across_um, -row * down_um]) / 1000.0
+                if (px2 := _covariance(spread, causes)) is not None:
+                    sigma_mm = np.sqrt(px2[:2]) * (across_um, down_um) / 1000.0
+                    rho = -px2[2] / math.sqrt(px2[0] * px2[1])
+                yield ComparatorPoint(name, point, _KINDS[kind], xy_mm, sigma_mm, rho, Status(status), reason)
 
     def _frames(
-        self, images: Collection[str] | None
-    ) -> Iterator[tuple[str, tuple[str, str, str | None], list[Sequence[Any]] | None]]:
-        """Yield name, (uri, JSON of the raw result and of what the checks changed) and marks, None where damaged."""
-        db = self.store.connection
+        self, columns: str, images: Collection[str] | None
+    ) -> Iterator[tuple[str, Sequence[Any], list[Sequence[Any]] | None]]:
+        """Yield name, columns of checked_frame and marks, None where these or the frame are damaged."""
         if images is None:
             self.check()
-        wanted = "" if images is None else "and name in (select value from json_each(?))"
-        found = db.execute(
-            f"select scan from judged_frame where judging = ? {wanted} order by name",
-            (self.row, *([] if images is None else [json.dumps(sorted(images))])),
-        ).fetchall()
-        columns = "name, uri, measured, changed, marks_digest, is_sound"
-        frame = f"select {columns} from checked_frame where judging = ? and scan = ?"
-        marks = f"select number, {MARKS} from checked_mark where judging = ? and scan = ? order by number"
-        for (scan,) in found:
-            rows = db.execute(marks, (self.row, scan)).fetchall()
-            name, *result, digest, is_whole = db.execute(frame, (self.row, scan)).fetchone()
-            is_whole = is_whole and row_digest(*rows) == digest
-            yield name, tuple(result), [row[1:] for row in rows] if is_whole else None
+        names = self.names if images is None else self.names.intersection(images)
+        connection, own = self.store.connection, "where judging = ? and scan = ?"
+        scans = self.values("name, scan")
+        for name, scan in sorted(row for row in scans if row[0] in names):
+            query = f"select is_whole, {columns} from checked_frame {own}"
+            is_whole, *values = connection.execute(query, (self.row, scan)).fetchone()
+            marks = connection.execute(f"select {MARKS} from checked_mark {own} order by number", (self.row, scan))
+            yield name, values, [row[1:] for row in marks] if is_whole else None
+
+    @cached_property
+    def plain(self) -> tuple[tuple[str, str, int], ...]:
+        """Image, scan's file and row of the result of the frames that are reported only in totals: good ones in which,
+        if they have targets, at least one is observed."""
+        rows = self.store.connection.execute(_PLAIN, (self.row, str(Verdict.GOOD)))
+        return tuple((name, uri, result) for name, uri, result in rows)
+
+    def plain_marks(self) -> Iterator[tuple[int, str, str, float | None, float | None]]:
+        """Row of the result, kind, status, column and row of each mark of the plain frames."""
+        plain = {result for _, _, result in self.plain}
+        query = "select result, kind, status, col_px, row_px from checked_mark where judging = ? and verdict = ?"
+        marks = self.store.connection.execute(query, (self.row, str(Verdict.GOOD)))
+        return (mark for mark in marks if mark[0] in plain)
 
     def remember_written(self, comparator: Path) -> None:
         """Record that the file now holds the marks."""
@@ -188,6 +201,25 @@ class Judging:
             for result, decisions in [rows[scan.frame.image]]
         )
         return judge(self.store, self.made_from, f"second pass {self.input}", frames)
+
+
+_KINDS: dict[str, ObservationKind] = {kind: kind for kind in get_args(ObservationKind)}
+_PLAIN = """
+select name, uri, result from checked_frame where judging = ?1 and verdict = ?2 and result not in (
+    select result from checked_mark where judging = ?1 and kind <> 'fiducial'
+    group by result having not sum(status in ('measured', 'weak'))
+) order by name
+"""
+
+
+def _covariance(spread: Sequence[float | None], causes: str | None) -> Sequence[float] | None:
+    """(col², row², col·row) elements of the covariance."""
+    # Values that are not finite are stored only in the JSON of the causes.
+    finite = [value for value in spread if value is not None]
+    if len(finite) == len(spread) or causes is None:
+        return finite or None
+    (first, second), (_, third) = json.loads(causes)["sum"]
+    return float(first), float(third), float(second)
 
 
 @dataclass(frozen=True)
@@ -227,29 +259,29 @@ def judge_lots(store: Store, made_from: Mapping[str, str], input_hash: str, lots
     A lot whose input is unchanged is copied from an earlier judging. Of each frame only differences from the raw result
     are stored.
     """
-    hasher = hashlib.sha256(json.dumps([dict(made_from), input_hash], sort_keys=True).encode())
-    db = store.connection
+    made = dict(made_from)
+    hasher = hashlib.sha256(json.dumps([made, input_hash], sort_keys=True).encode())
+    begun = {"digest": f"unfinished {input_hash}", "made_from": json.dumps(made), "input": input_hash}
     with store.writing():
-        db.execute(f"delete from judging where {_UNFINISHED}")
-        values = (f"unfinished {input_hash}", json.dumps(dict(made_from)), input_hash)
-        row = db.execute("insert into judging (digest, made_from, input) values (?, ?, ?)", values).lastrowid
-        assert row is not None
+        store.connection.execute(f"delete from judging where {_UNFINISHED}")
+        row = store.insert("judging", begun)
     for number, lot in enumerate(lots):
         output = _copy_lot(store, row, number, lot) or _write_lot(store, row, number, lot.frames())
         hasher.update(output.encode())
         with store.writing():
-            db.execute("insert into judged_lot values (?, ?, ?, ?)", (row, number, lot.input, output))
+            store.insert("judged_lot", {"judging": row, "lot": number, "input": lot.input, "output": output})
     digest = hasher.hexdigest()
     with store.writing():
-        db.execute("delete from judging where digest = ?", (digest,))
-        db.execute(f"update judging set digest = ?, frames_digest = {FRAMES_DIGEST} where id = ?", (digest, row))
-    return Judging(store, row, digest, dict(made_from), input_hash)
+        store.connection.execute("delete from judging where digest = ?", (digest,))
+        update = f"update judging set digest = ?, frames_digest = {FRAMES_DIGEST} where id = ?"
+        store.connection.execute(update, (digest, row))
+    return Judging(store, row, digest, made, input_hash)
 
 
 def _copy_lot(store: Store, judging: int, number: int, lot: Lot) -> str:
     """Copy a sound lot from a judging with the same input and return the hash of its content; "" if there is none."""
-    db, of_lot = store.connection, "from judged_frame where judging = ? and lot = ?"
-    found = db.execute(
+    own = "from judged_frame where judging = ? and lot = ?"
+    found = store.connection.execute(
         "select judging, lot, output from judged_lot join judging on judging.id = judging "
         f"where judged_lot.input = ? and not {_UNFINISHED} order by judging desc limit 1",
         (lot.input,),
@@ -258,17 +290,17 @@ def _copy_lot(store: Store, judging: int, number: int, lot: Lot) -> str:
         return ""
     before, old, output = found
     is_whole = f"{is_sound('judged_frame')} and (not own_marks or marks_digest is {checked_marks_digest()})"
-    if db.execute(f"select exists (select 1 {of_lot} and not ({is_whole}))", (before, old)).fetchone()[0]:
+    if store.first(f"select exists (select 1 {own} and not ({is_whole}))", before, old):
         return ""
     frame = "scan, result, name, verdict, why, own_marks, detail, decisions, marks_digest"
     with store.writing():
-        db.execute(
-            f"insert into judged_frame (judging, lot, {frame}) select ?, ?, {frame} {of_lot}",
+        store.connection.execute(
+            f"insert into judged_frame (judging, lot, {frame}) select ?, ?, {frame} {own}",
             (judging, number, before, old),
         )
-        db.execute(
-            f"insert into judged (judging, result, number, {MARKS}) select ?, result, number, {MARKS} "
-            f"from judged where judging = ? and result in (select result {of_lot} and own_marks)",
+        store.connection.execute(
+            f"insert into judged (judging, result, {MARKS}) select ?, result, {MARKS} "
+            f"from judged where judging = ? and result in (select result {own} and own_marks)",
             (judging, before, before, old),
         )
     return str(output)
@@ -282,6 +314,30 @@ def _write_lot(store: Store, judging: int, number: int, frames: Iterable[Checked
             for frame in some:
                 hasher.update(_write_frame(store, judging, number, frame))
     return hasher.hexdigest()
+
+
+def _write_frame(store: Store, judging: int, lot: int, frame: CheckedResult) -> bytes:
+    """Store the differences of a checked frame from its raw result, and return the stored content for hashing."""
+    measured = json.loads(store.detail(frame.result))
+    now = scan_detail(frame.scan, measured["scan"])
+    changed = {key: value for key, value in now.items() if value != measured.get(key)}
+    detail = json.dumps(changed, ensure_ascii=False) if changed else None
+    rows = [mark_row(mark) for mark in frame.scan.frame.marks]
+    own_marks = rows != store.mark_rows(frame.result)
+    rows = rows if own_marks else []
+    scan, key = store.connection.execute(
+        "select scan, fingerprint from result where id = ?", (frame.result,)
+    ).fetchone()
+    keys = {"judging": judging, "result": frame.result}
+    checked = {"lot": lot, "scan": scan, "name": frame.scan.frame.image, "decisions": frame.decisions}
+    checked |= {"verdict": str(scan_verdict(frame.scan)), "why": scan_doubt(frame.scan)}
+    store.insert("judged_frame", keys | checked | {"own_marks": own_marks, "detail": detail})
+    store.insert_marks("judged", keys, rows)
+    store.connection.execute(
+        f"update judged_frame set marks_digest = {checked_marks_digest()} where judging = ? and scan = ?",
+        (judging, scan),
+    )
+    return json.dumps([frame.scan.frame.image, key, detail, rows]).encode()
 
 
 def find_judging(store: Store, digest: str) -> Judging | None:
@@ -298,14 +354,13 @@ def find_judging(store: Store, digest: str) -> Judging | None:
 
 def latest(store: Store) -> Judging | None:
     """Latest judging, None if there is none. Raises DamagedError where one is missing or damaged."""
-    check_judgings(store.connection, store.path)
-    found = store.connection.execute(
-        f"select digest from judging where not {_UNFINISHED} order by id desc limit 1"
-    ).fetchone()
-    if found is None:
-        return None
-    judging = find_judging(store, found[0])
-    if judging is None:  # the row exists, but the index of digests used for the lookup lacks it
+    is_lost = store.first(
+        f"select exists (select 1 from judging where seal is not null and not {is_sound('judging')}) or "
+        "exists (select 1 from judged_frame where judging not in (select id from judging))"
+    )
+    digest = store.first(f"select digest from judging where not {_UNFINISHED} order by id desc limit 1")
+    judging = None if is_lost or digest is None else find_judging(store, digest)
+    if is_lost or (judging is None and digest is not None):  # the index of digests used for the lookup lacks the row
         raise damaged_judging(store.path)
     return judging
 
@@ -318,6 +373,18 @@ def stored_judging(path: Path, digest: str) -> Iterator[Judging | None]:
         return
     with Store(path) as store:
         yield find_judging(store, digest)
+
+
+@contextmanager
+def written_judging(path: Path, comparator: Path) -> Iterator[Judging | None]:
+    """Judging of a store from which comparator.csv was written; None where the file holds other marks, or either was
+    changed since."""
+    with stored_judging(path, read_measurement_hash(comparator) if comparator.exists() else "") as judging:
+        if judging is None or not judging.is_written(comparator):
+            yield None
+            return
+        judging.check()
+        yield None if damaged_frames(judging.store.connection, judging.row) else judging
 
 
 def read_measurement(path: Path, digest: str = "") -> tuple[MeasuredScan, ...]:
@@ -339,113 +406,3 @@ def measured_scans(path: Path, digest: str = "", images: Collection[str] | None 
                 f"{path}: its scans have not passed the cross-scan checks. Run `reseau measure`, which continues."
             )
         yield from judging.scans(images)
-
-
-def _covariance(spread: Sequence[float | None], causes: str | None) -> tuple[float, float, float] | None:
-    """(col², row², col·row) elements of the covariance."""
-    # Values that are not finite are stored only in the JSON of the causes.
-    of_col, of_row, both = spread
-    if of_col is not None and of_row is not None and both is not None:
-        return of_col, of_row, both
-    if causes is None:
-        return None
-    (first, second), (_, third) = json.loads(causes)["sum"]
-    return float(first), float(third), float(second)
-
-
-def _write_frame(store: Store, judging: int, lot: int, frame: CheckedResult) -> bytes:
-    """Store the differences of a checked frame from its raw result, and return the stored content for hashing."""
-    db, measured = store.connection, json.loads(store.detail(frame.result))
-    now = scan_detail(frame.scan, measured["scan"])
-    changed = {key: value for key, value in now.items() if value != measured.get(key)}
-    detail = json.dumps(changed, ensure_ascii=False) if changed else None
-    rows = [mark_row(mark) for mark in frame.scan.frame.marks]
-    own_marks = rows != store.mark_rows(frame.result)
-    rows = rows if own_marks else []
-    scan, key = db.execute("select scan, fingerprint from result where id = ?", (frame.result,)).fetchone()
-    name, verdict, why = frame.scan.frame.image, str(scan_verdict(frame.scan)), scan_doubt(frame.scan)
-    db.execute(
-        "insert into judged_frame (judging, lot, scan, result, name, verdict, why, own_marks, detail, decisions) "
-        f"values ({places(10)})",
-        (judging, lot, scan, frame.result, name, verdict, why, own_marks, detail, frame.decisions),
-    )
-    db.executemany(
-        f"insert into judged (judging, result, number, {MARKS}) values ({places(15)})",
-        ((judging, frame.result, number, *row) for number, row in enumerate(rows)),
-    )
-    db.execute(
-        f"update judged_frame set marks_digest = {checked_marks_digest()} where judging = ? and scan = ?",
-        (judging, scan),
-    )
-    return json.dumps([name, key, detail, rows]).encode()
-
-
-class StoredFrame(NamedTuple):
-    """Frame that needs no look: its name, its scan's file and the row of its result."""
-
-    image: str
-    scan: str
-    result: int
-
-
-class StoredMarks:
-    """Marks of comparator.csv, unchanged since it was written from the store."""
-
-    def __init__(self, path: Path, digest: str) -> None:
-        self._path, self._digest = path, digest
-
-    @classmethod
-    def open(cls, path: Path, comparator: Path) -> "StoredMarks | None":
-        """Marks of a store. None where the file holds other marks, or either was changed since."""
-        with stored_judging(path, read_measurement_hash(comparator) if comparator.exists() else "") as judging:
-            if judging is None or not judging.is_written(comparator):
-                return None
-            judging.check()
-            is_whole = not damaged_frames(judging.store.connection, judging.row)
-            return cls(path, judging.digest) if is_whole else None
-
-    @contextmanager
-    def _judging(self) -> Iterator[Judging]:
-        with stored_judging(self._path, self._digest) as judging:
-            assert judging is not None
-            yield judging
-
-    @cached_property
-    def names(self) -> frozenset[str]:
-        """Names of all frames."""
-        with self._judging() as judging:
-            return frozenset(name for (name,) in judging.values("name"))
-
-    def rows(self, images: Collection[str]) -> list[ComparatorPoint]:
-        """Marks of some images, as in comparator.csv."""
-        with self._judging() as judging:
-            return list(comparator_points(judging.marks(images), judging.pitches_um()))
-
-    def scans(self, images: Collection[str]) -> Iterator[MeasuredScan]:
-        return measured_scans(self._path, self._digest, images)
-
-    @cached_property
-    def plain(self) -> tuple[StoredFrame, ...]:
-        """Frames that are reported only in totals: good ones in which, if they have targets, at least one is
-        observed."""
-        with self._judging() as judging:
-            rows = judging.store.connection.execute(_PLAIN, (judging.row, str(Verdict.GOOD)))
-            return tuple(StoredFrame(*row) for row in rows)
-
-    def plain_marks(self) -> Iterator[tuple[int, str, str, float | None, float | None]]:
-        """Row of the result, kind, status, column and row of each mark of the plain frames."""
-        plain = {frame.result for frame in self.plain}
-        with self._judging() as judging:
-            marks = judging.store.connection.execute(_MARKS, (judging.row, str(Verdict.GOOD)))
-            yield from (mark for mark in marks if mark[0] in plain)
-
-
-_PLAIN = """
-select name, uri, result from checked_frame where judging = ?1 and verdict = ?2 and result not in (
-    select result from checked_mark where judging = ?1 and kind <> 'fiducial'
-    group by result having not sum(status in ('measured', 'weak'))
-) order by name
-"""
-_MARKS = """
-select result, kind, status, col_px, row_px from checked_mark where judging = ? and verdict = ?
-"""

@@ -7,8 +7,7 @@ every machine, so databases of shards can be merged.
 import json
 import os
 import platform
-import sqlite3
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
@@ -23,11 +22,9 @@ from pipeline.archive.schema import (
     DamagedError,
     Database,
     damaged_result,
-    forget,
     is_result_sound,
     is_sound,
     measured_marks_digest,
-    row_digest,
 )
 from pipeline.archive.verdicts import Verdict, scan_doubt, scan_verdict
 from pipeline.errors import InputError
@@ -42,12 +39,9 @@ from pipeline.results.measured_record import (
     scan_location,
 )
 
-_SCAN = [name for name in COLUMNS["scan"][2:] if name not in ("result", "is_current", "duplicate_of", "asked")]
-_RESULT = COLUMNS["result"][5:-1]
-_MARK = f"number, {MARKS}"
-_SOUND = is_result_sound("r", "other.mark")
 _PLACE = "project folder"
 _LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "tifffile", "imagecodecs")
+_PROGRAM = "version, measure_revision, python, libraries"
 
 
 @dataclass(frozen=True)
@@ -75,35 +69,31 @@ class Store(Database):
 
     def identities(self) -> dict[str, Identity]:
         """{uri: identity at its last measurement} of every scan ever measured."""
-        rows = self.connection.execute(
-            f"select uri, bytes, mtime_ns, etag, identity_hash from scan where {is_sound('scan')}"
-        )
-        return {uri: Identity(FileState(uri, *state), parts) for uri, *state, parts in rows}
+        query = f"select uri, bytes, mtime_ns, etag, identity_hash from scan where {is_sound('scan')}"
+        return {uri: Identity(FileState(uri, *state), parts) for uri, *state, parts in self.connection.execute(query)}
 
     def fingerprints(self) -> dict[str, int]:
         """{fingerprint: row} of every sound result, read from the table itself and not from an index, which may be
         damaged."""
-        return dict(
-            self.connection.execute(f"select fingerprint, id from result not indexed where {is_sound('result')}")
-        )
+        query = f"select fingerprint, id from result not indexed where {is_sound('result')}"
+        return dict(self.connection.execute(query))
 
     def set_project(self, names: Mapping[str, str]) -> None:
         """Set the project's current images. names: {uri: image}. No scan counts as current until `set_current`."""
         with self.writing():
             self.connection.execute("update scan set name = null, is_current = 0")
-            self.connection.executemany(
-                "update scan set name = ? where uri = ?", ((n, uri) for uri, n in names.items())
-            )
+            self.connection.executemany("update scan set name = ?2 where uri = ?1", names.items())
 
     def set_current(self, results: Mapping[int, str]) -> None:
         """Mark results as current: they match their scans' present file and options. results: {row: hash of the
         request}."""
         with self.writing():
-            self.connection.executemany(
-                "update scan set result = ?1, is_current = 1, asked = ?2 "
-                "where id = (select scan from result where id = ?1)",
-                results.items(),
-            )
+            self._set_current(results)
+
+    def _set_current(self, results: Mapping[int, str | None]) -> None:
+        own = "id = (select scan from result where id = ?1)"
+        update = f"update scan set result = ?1, is_current = 1, asked = ?2 where {own}"
+        self.connection.executemany(update, results.items())
 
     # --- results
 
@@ -118,10 +108,10 @@ class Store(Database):
         """
         with self.writing():
             scan = self._scan(kept, name)
-            result = self._result(kept, scan)
+            known = self.first("select id from result where fingerprint = ?", kept.fingerprint)
+            result = self._result(kept, scan) if known is None else int(known)
             if name is not None:
-                values = (result, asked, scan)
-                self.connection.execute("update scan set result = ?, is_current = 1, asked = ? where id = ?", values)
+                self._set_current({result: asked})
             return result
 
     def scan(self, result: int, image: str, folder: Path, with_marks: bool = True) -> MeasuredScan:
@@ -136,54 +126,59 @@ class Store(Database):
 
     def mark_rows(self, result: int) -> list[tuple[Any, ...]]:
         """Rows of the marks of a result. Raises DamagedError where they are damaged."""
-        rows = self.connection.execute(f"select number, {MARKS} from mark where result = ? order by number", (result,))
-        numbered = rows.fetchall()
-        digest = self.connection.execute(
-            f"select marks_digest from result where id = ? and {is_sound('result')}", (result,)
-        ).fetchone()
-        if digest is None or row_digest(*numbered) != digest[0]:
+        if not self.first(f"select {is_result_sound()} from result where id = ?", result):
             raise self._damaged(result)
-        return [tuple(row) for _, *row in numbered]
+        rows = self.connection.execute(f"select {MARKS} from mark where result = ? order by number", (result,))
+        return [tuple(row) for _, *row in rows]
 
     def detail(self, result: int) -> str:
         """JSON of the remaining content of a result. Raises DamagedError where it is damaged."""
-        query = f"select detail from result where id = ? and {is_sound('result')}"
-        found = self.connection.execute(query, (result,)).fetchone()
+        found = self.first(f"select detail from result where id = ? and {is_sound('result')}", result)
         if found is None:
             raise self._damaged(result)
-        return str(found[0])
+        return str(found)
 
     def _damaged(self, result: int) -> DamagedError:
-        found = self.connection.execute(
-            "select coalesce(name, uri) from scan where result = ?1 or id = (select scan from result where id = ?1)",
-            (result,),
-        ).fetchone()
-        return damaged_result(str(found[0]) if found else "(unknown)", self.path)
+        own = "result = ?1 or id = (select scan from result where id = ?1)"
+        image = self.first(f"select coalesce(name, uri) from scan where {own}", result)
+        return damaged_result(image or "(unknown)", self.path)
 
     def has_damaged_rows(self) -> bool:
         """Whether a row of a scan, result, judging or value kept for other scans is damaged; marks are not checked."""
-        tables = ("scan", "result", "kept", "judging")
-        found = [f"exists (select 1 from {table} not indexed where not {is_sound(table)})" for table in tables]
-        found[-1] = found[-1].replace("where", "where digest not like 'unfinished%' and")
-        return bool(self.connection.execute(f"select {' or '.join(found)}").fetchone()[0])
+        tables = {"scan": "", "result": "", "kept": "", "judging": "and digest not like 'unfinished%'"}
+        query = "select exists (select 1 from {0} not indexed where not {1} {2})"
+        return any(self.first(query.format(table, is_sound(table), end)) for table, end in tables.items())
 
     def forget_damaged(self) -> int:
         """Delete damaged results and scans and everything derived from them, so that they are measured again; return
         their number. Raises sqlite3.Error where the file itself is damaged."""
         with self.writing():
             self.connection.execute(f"delete from kept where not {is_sound('kept')}")
-            results = self._rows(f"select id from result not indexed where not {is_result_sound()}")
-            return forget(self.connection, results, self._rows(f"select id from scan where not {is_sound('scan')}"))
-
-    def written(self) -> set[int]:
-        """Rows of results of scans on which writing was found."""
-        return {*self._rows("select id from result where coalesce(detail ->> '$.writing', '[]') <> '[]'")}
+            results = self.column(f"select id from result not indexed where not {is_result_sound()}")
+            return self._forget(results, self.column(f"select id from scan where not {is_sound('scan')}"))
 
     def forget_failed(self) -> int:
         """Delete failed results, so that the scans are measured again; return their number."""
         with self.writing():
-            failed = self._rows("select id from result where verdict = ?", str(Verdict.FAILED))
-            return forget(self.connection, failed)
+            return self._forget(self.column("select id from result where verdict = ?", str(Verdict.FAILED)))
+
+    def _forget(self, results: Collection[int], scans: Collection[int] = ()) -> int:
+        """Delete results, scans with all of theirs, and all judgings; return the number of results."""
+        listed, own = "in (select value from json_each(?))", json.dumps(list(scans))
+        lost = {*results, *self.column(f"select id from result where scan {listed}", own)}
+        rows, delete = json.dumps(list(lost)), self.connection.execute
+        for table in ("judged", "judged_frame", "judged_lot", "judging"):  # including those of a missing judging
+            delete(f"delete from {table}")
+        delete(f"delete from mark where result {listed}", (rows,))
+        delete(f"update scan set result = null, is_current = 0 where result {listed}", (rows,))
+        delete(f"delete from result where id {listed}", (rows,))
+        delete(f"update scan set duplicate_of = null where duplicate_of {listed}", (own,))
+        delete(f"delete from scan where id {listed}", (own,))
+        return len(lost)
+
+    def written(self) -> set[int]:
+        """Rows of results of scans on which writing was found."""
+        return {*self.column("select id from result where coalesce(detail ->> '$.writing', '[]') <> '[]'")}
 
     def failures(self) -> list[tuple[str, str, str]] | None:
         """(name, file, reason) of every scan of the project if all failed; None where one was measured."""
@@ -207,18 +202,14 @@ class Store(Database):
 
     def set_content_hashes(self, hashes: Mapping[str, str]) -> None:
         with self.writing():
-            self.connection.executemany(
-                "update scan set content_hash = ? where uri = ?", ((hash, uri) for uri, hash in hashes.items())
-            )
+            self.connection.executemany("update scan set content_hash = ?2 where uri = ?1", hashes.items())
 
     def set_copies(self, copies: Mapping[str, str]) -> None:
         """Set which scans are copies. copies: {uri: image whose file it is a copy of}; no other scan is a copy."""
         with self.writing():
             self.connection.execute("update scan set duplicate_of = null where duplicate_of is not null")
-            self.connection.executemany(
-                "update scan set duplicate_of = (select id from scan where name = ?) where uri = ?",
-                ((name, uri) for uri, name in copies.items()),
-            )
+            original = "(select id from scan where name = ?2)"
+            self.connection.executemany(f"update scan set duplicate_of = {original} where uri = ?1", copies.items())
 
     def move(self, uri: str, identity: Identity) -> dict[str, str]:
         """Re-key the results of a scan whose file was moved or touched with unchanged content; return {old fingerprint:
@@ -226,10 +217,10 @@ class Store(Database):
         state = identity.state
         with self.writing():
             if uri != state.uri:  # the earlier scan at that place is gone, and its results cannot be requested any more
-                forget(self.connection, (), self._rows("select id from scan where uri = ?", state.uri))
+                self._forget((), self.column("select id from scan where uri = ?", state.uri))
             self.connection.execute(
                 "update scan set uri = ?, bytes = ?, mtime_ns = ?, etag = ?, identity_hash = ? where uri = ?",
-                (state.uri, state.bytes, state.mtime_ns, state.etag, identity.parts_hash, uri),
+                (*state, identity.parts_hash, uri),
             )
             results = self.connection.execute(
                 "select result.fingerprint, hash, measure_revision from result join scan on scan.id = result.scan "
@@ -238,10 +229,7 @@ class Store(Database):
                 (state.uri,),
             ).fetchall()
             keys = {before: result_key(identity, hashed, revision) for before, hashed, revision in results}
-            self.connection.executemany(
-                "update result set fingerprint = ? where fingerprint = ?",
-                ((now, before) for before, now in keys.items()),
-            )
+            self.connection.executemany("update result set fingerprint = ?2 where fingerprint = ?1", keys.items())
         return keys
 
     # --- what scans of a project contribute to others
@@ -274,79 +262,65 @@ class Store(Database):
 
     def pose_name(self, result: int) -> str | None:
         """Name of the pose under which the marks of a result are named."""
-        found = self.connection.execute("select pose from result where id = ?", (result,)).fetchone()
-        return None if found is None else found[0]
+        found: str | None = self.first("select pose from result where id = ?", result)
+        return found
 
     # --- implementation
 
-    def _rows(self, query: str, *parameters: object) -> list[int]:
-        return [row for (row,) in self.connection.execute(query, parameters)]
-
     def _scan(self, kept: Kept, name: str | None) -> int:
-        state, scan = kept.identity.state, kept.scan
+        """Insert or update the row of a scan, and return its number."""
+        state, pitch_um = kept.identity.state, tuple(map(finite_or_none, kept.scan.pitch_um))
         if name is not None:  # another scan may have had the name
             self.connection.execute("update scan set name = null where name = ? and uri <> ?", (name, state.uri))
-        values = (
-            name, state.uri, state.bytes, state.mtime_ns, state.etag, kept.identity.parts_hash,
-            scan.width_px, scan.height_px, *map(finite_or_none, scan.pitch_um), kept.camera,
-        )  # fmt: skip
-        columns = (
-            "bytes", "mtime_ns", "etag", "identity_hash", "width_px", "height_px", "pitch_x_um", "pitch_y_um", "camera",
-        )  # fmt: skip
-        names = ", ".join(columns)
-        updates = ", ".join(f"{column} = excluded.{column}" for column in columns)
-        row = self.connection.execute(
-            f"insert into scan (name, uri, {names}) values ({places(len(values))}) on conflict (uri) do update set "
-            "name = coalesce(excluded.name, name), content_hash = case when (bytes, mtime_ns, etag, identity_hash) = "
-            "(excluded.bytes, excluded.mtime_ns, excluded.etag, excluded.identity_hash) then content_hash else '' end, "
-            f"{updates} returning id",
-            values,
-        ).fetchone()
-        return int(row[0])
+        own = {"mtime_ns": state.mtime_ns, "etag": state.etag, "identity_hash": kept.identity.parts_hash}
+        own |= {"bytes": state.bytes, "width_px": kept.scan.width_px, "height_px": kept.scan.height_px}
+        own |= {"pitch_x_um": pitch_um[0], "pitch_y_um": pitch_um[1], "camera": kept.camera}
+        updates = ", ".join(f"{column} = excluded.{column}" for column in own)
+        self.insert(
+            "scan",
+            {"name": name, "uri": state.uri, **own},
+            "on conflict (uri) do update set name = coalesce(excluded.name, name), content_hash = case when "
+            "(bytes, mtime_ns, etag, identity_hash) = (excluded.bytes, excluded.mtime_ns, excluded.etag, "
+            f"excluded.identity_hash) then content_hash else '' end, {updates}",
+        )
+        return int(self.first("select id from scan where uri = ?", state.uri))
 
     def _result(self, kept: Kept, scan: int) -> int:
-        known = self.connection.execute("select id from result where fingerprint = ?", (kept.fingerprint,)).fetchone()
-        if known is not None:
-            return int(known[0])
-        measured, pose = kept.scan, kept.scan.frame.pose
-        matrix = measured.frame.pixel_from_camera
-        uri = kept.identity.state.uri if measured.scan else ""
-        values = (
-            scan, kept.fingerprint, self._program, self._options(kept.options_json),
-            pose and pose.name, pose and pose.decided,
-            *([None] * 6 if matrix is None else map(finite_or_none, matrix.ravel().tolist())),
-            *map(finite_or_none, measured.pitch_um), str(scan_verdict(measured)), scan_doubt(measured),
-            measured.seconds, kept.bytes_read, datetime.now(UTC).isoformat(timespec="seconds"),
-            json.dumps(scan_detail(measured, uri), ensure_ascii=False),
-        )  # fmt: skip
-        result = self.connection.execute(
-            "insert into result (scan, fingerprint, program, options, pose, pose_decided, a, b, c, d, e, f, "
-            f"pitch_x_um, pitch_y_um, verdict, why, seconds, bytes_read, finished, detail) values ({places(20)})",
-            values,
-        ).lastrowid
-        assert result is not None
-        rows = ((result, number, *mark_row(mark)) for number, mark in enumerate(measured.frame.marks))
-        self.connection.executemany(f"insert into mark (result, number, {MARKS}) values ({places(14)})", rows)
+        measured, pose, matrix = kept.scan, kept.scan.frame.pose, kept.scan.frame.pixel_from_camera
+        uri, pitch_um = kept.identity.state.uri if measured.scan else "", map(finite_or_none, measured.pitch_um)
+        elements = [None] * 6 if matrix is None else map(finite_or_none, matrix.ravel().tolist())
+        row: dict[str, object] = {
+            "scan": scan,
+            "fingerprint": kept.fingerprint,
+            "program": self._program,
+            "options": self._number("options", "hash, json", hash_text(kept.options_json), kept.options_json),
+            "pose": pose and pose.name,
+            "pose_decided": pose and pose.decided,
+            **dict(zip("abcdef", elements, strict=True)),
+            **dict(zip(("pitch_x_um", "pitch_y_um"), pitch_um, strict=True)),
+            "verdict": str(scan_verdict(measured)),
+            "why": scan_doubt(measured),
+            "seconds": measured.seconds,
+            "bytes_read": kept.bytes_read,
+            "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+            "detail": json.dumps(scan_detail(measured, uri), ensure_ascii=False),
+        }
+        result = self.insert("result", row)
+        self.insert_marks("mark", {"result": result}, map(mark_row, measured.frame.marks))
         self.connection.execute(f"update result set marks_digest = {measured_marks_digest()} where id = ?", (result,))
         return result
 
-    def _options(self, options_json: str) -> int:
-        hashed = hash_text(options_json)
-        self.connection.execute("insert or ignore into options (hash, json) values (?, ?)", (hashed, options_json))
-        return int(self.connection.execute("select id from options where hash = ?", (hashed,)).fetchone()[0])
+    def _number(self, table: str, columns: str, *values: object) -> int:
+        """Number of a row, inserted where there is none."""
+        row = f"({', '.join('?' * len(values))})"
+        self.connection.execute(f"insert or ignore into {table} ({columns}) values {row}", values)
+        return int(self.first(f"select id from {table} where ({columns}) = {row}", *values))
 
     @cached_property
     def _program(self) -> int:
         libraries = ", ".join(f"{name} {version(name)}" for name in _LIBRARIES)
-        versions = (version("reseau"), MEASURE_REVISION, platform.python_version(), libraries)
-        columns = "version, measure_revision, python, libraries"
-        self.connection.execute(f"insert or ignore into program ({columns}) values (?, ?, ?, ?)", versions)
-        query = f"select id from program where ({columns}) = (?, ?, ?, ?)"
-        return int(self.connection.execute(query, versions).fetchone()[0])
-
-
-def places(count: int) -> str:
-    return ", ".join("?" * count)
+        python = platform.python_version()
+        return self._number("program", _PROGRAM, version("reseau"), MEASURE_REVISION, python, libraries)
 
 
 class Merged(NamedTuple):
@@ -373,47 +347,49 @@ def merge(store: Store, others: Sequence[Path]) -> list[Merged]:
         if path.resolve() == store.path.resolve():
             raise InputError(f"{path}: is the results database that the others are joined into. Name the others only.")
         Store(path).close()
-    db, merged = store.connection, []
+    merged = []
     for path in others:
-        db.execute("attach ? as other", (str(path),))
+        store.connection.execute("attach ? as other", (str(path),))
         try:
-            results, sound = db.execute(f"select count(*), total({_SOUND}) from other.result r").fetchone()
+            results = int(store.first("select count(*) from other.result"))
+            sound = store.first(f"select total({is_result_sound('r', 'other.mark')}) from other.result r")
             with store.writing():
-                merged.append(Merged(path, results, _insert(db), results - int(sound)))
+                merged.append(Merged(path, results, _insert(store), results - int(sound)))
         finally:
-            db.execute("detach other")
+            store.connection.execute("detach other")
     return merged
 
 
-def _insert(db: sqlite3.Connection) -> int:
+def _insert(store: Store) -> int:
     """Insert the rows of all tables in the order of their references; existing rows stay."""
-    before = db.execute("select coalesce(max(id), 0) from main.result").fetchone()[0]
-    columns = ", ".join(_SCAN)
-    db.execute(
+    insert = store.connection.execute
+    before = store.first("select coalesce(max(id), 0) from main.result")
+    columns = ", ".join(COLUMNS["scan"][2:14])  # of the file and its content
+    insert(
         f"insert into main.scan ({columns}, name) select {columns}, null from other.scan where {is_sound('scan')} "
         "on conflict (uri) do update set bytes = excluded.bytes, mtime_ns = excluded.mtime_ns, etag = excluded.etag, "
         "identity_hash = excluded.identity_hash, content_hash = excluded.content_hash "
         "where excluded.mtime_ns > mtime_ns"  # a file that was changed in between
     )
-    for table, columns in (("program", "version, measure_revision, python, libraries"), ("options", "hash, json")):
-        db.execute(f"insert or ignore into main.{table} ({columns}) select {columns} from other.{table}")
-    db.execute(
-        f"insert or ignore into main.result (scan, fingerprint, program, options, {', '.join(_RESULT)}) "
-        f"select scan.id, r.fingerprint, program.id, options.id, {', '.join(f'r.{name}' for name in _RESULT)} "
+    for table, columns in (("program", _PROGRAM), ("options", "hash, json")):
+        insert(f"insert or ignore into main.{table} ({columns}) select {columns} from other.{table}")
+    own = COLUMNS["result"][5:-1]
+    insert(
+        f"insert or ignore into main.result (scan, fingerprint, program, options, {', '.join(own)}) "
+        f"select scan.id, r.fingerprint, program.id, options.id, {', '.join(f'r.{name}' for name in own)} "
         "from other.result r join other.scan s on s.id = r.scan join main.scan scan on scan.uri = s.uri "
         "join other.program p on p.id = r.program join main.program program on (program.version, "
         "program.measure_revision, program.python, program.libraries) = "
         "(p.version, p.measure_revision, p.python, p.libraries) "
         "join other.options o on o.id = r.options join main.options options on options.hash = o.hash "
-        f"where {_SOUND} and {is_sound('scan', 's')} order by r.id"
+        f"where {is_result_sound('r', 'other.mark')} and {is_sound('scan', 's')} order by r.id"
     )
-    db.execute(
-        f"insert into main.mark (result, {_MARK}) select result.id, {_MARK} from main.result result "
+    insert(
+        f"insert into main.mark (result, {MARKS}) select result.id, {MARKS} from main.result result "
         "join other.result r on r.fingerprint = result.fingerprint join other.mark m on m.result = r.id "
         "where result.id > ?",
         (before,),
     )
-    new = f"update main.result set marks_digest = {measured_marks_digest(marks='main.mark')} where id > ?"
-    sound = f"from other.kept where {is_sound('kept')}"
-    db.execute(f"insert or ignore into main.kept (key, value) select key, value {sound}")
-    return db.execute(new, (before,)).rowcount
+    insert(f"insert or ignore into main.kept (key, value) select key, value from other.kept where {is_sound('kept')}")
+    digest = measured_marks_digest(marks="main.mark")
+    return insert(f"update main.result set marks_digest = {digest} where id > ?", (before,)).rowcount

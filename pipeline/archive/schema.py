@@ -1,16 +1,16 @@
 """Tables of the project's SQLite files, digests of their rows, and migrations from earlier versions: forward only.
 
-The file holds its version number (`pragma user_version`). A change of the tables is appended to MIGRATIONS; existing
-entries are never changed. Each row has a digest, and a row that does not match it is not used. Triggers set the
-digests. They are temporary, so that a change by any other program is noticed."""
+The file holds its version number (`pragma user_version`). A change of the tables is appended to the migrations;
+existing entries are never changed. Each row has a digest, and a row that does not match it is not used. Triggers set
+the digests. They are temporary, so that a change by any other program is noticed."""
 
 import hashlib
 import json
 import math
 import os
 import sqlite3
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -18,150 +18,10 @@ from typing import Any, Self
 from pipeline.errors import InputError, what_to_do_about_store
 from pipeline.results.measured_record import MARK_COLUMNS
 
-_BYTES = 16
-MARKS = ", ".join(MARK_COLUMNS)
-COLUMNS = {
-    "scan": (
-        "id", "name", "uri", "bytes", "mtime_ns", "etag", "identity_hash", "content_hash", "width_px", "height_px",
-        "bits", "pitch_x_um", "pitch_y_um", "camera", "result", "is_current", "duplicate_of", "asked",
-    ),
-    "result": (
-        "id", "scan", "fingerprint", "program", "options", "pose", "pose_decided", "a", "b", "c", "d", "e", "f",
-        "pitch_x_um", "pitch_y_um", "verdict", "why", "seconds", "bytes_read", "finished", "detail", "marks_digest",
-    ),
-    "judged_frame": (
-        "scan", "result", "name", "verdict", "why", "own_marks", "detail", "lot", "decisions", "marks_digest",
-    ),
-    "judging": ("id", "digest", "made_from", "input", "frames_digest"),
-    "kept": ("key", "value"),
-}  # fmt: skip
-_KEYS = {"judged_frame": ("judging", "scan"), "kept": ("key",)}  # primary keys other than id
-
-
-def row_digest(*values: Any) -> str:
-    """BLAKE2b (hexadecimal) of a row's values as JSON, numbers with all their digits."""
-    text = json.dumps(values, separators=(",", ":"), default=lambda data: {"bytes": data.hex()})
-    return hashlib.blake2b(text.encode("ascii"), digest_size=_BYTES).hexdigest()
-
-
-class _RowsDigest:
-    """SQL aggregate: digest of rows in their order."""
-
-    def __init__(self) -> None:
-        self._rows: list[tuple[Any, ...]] = []
-
-    def step(self, *row: Any) -> None:
-        self._rows.append(row)
-
-    def finalize(self) -> Any:  # typeshed expects a number
-        return row_digest(*self._rows)
-
-
-def _rows_digest(columns: str, source: str, order: str) -> str:
-    """SQL expression for the digest of rows."""
-    rows = f"select {columns} from {source} order by {order}"
-    return f"(select coalesce(rows_digest({columns}), '{row_digest()}') from ({rows}))"
-
-
-def measured_marks_digest(result: str = "result", marks: str = "mark") -> str:
-    """SQL expression for the digest of the marks of a result. result, marks: names or aliases."""
-    return _rows_digest(f"number, {MARKS}", f"{marks} m where m.result = {result}.id", "number")
-
-
-def checked_marks_digest(frame: str = "judged_frame") -> str:
-    """SQL expression for the digest of the marks that the checks of a frame have stored. frame: name or alias."""
-    own = f"m.judging = {frame}.judging and m.result = {frame}.result"
-    return _rows_digest(f"number, {MARKS}", f"judged m where {own}", "number")
-
-
-FRAMES_DIGEST = _rows_digest("scan, result, digest", "judged_frame f where f.judging = judging.id", "scan")
-
-
-def is_sound(table: str, alias: str = "") -> str:
-    """SQL expression: whether a row matches its digest. alias: of the table in the query."""
-    name = alias or table
-    return f"({name}.{_digest_column(table)} is {_digest(table, name)})"
-
-
-def _digest_column(table: str) -> str:
-    return "seal" if table == "judging" else "digest"
-
-
-def _digest(table: str, name: str) -> str:
-    return f"row_digest({', '.join(f'{name}.{column}' for column in COLUMNS[table])})"
-
-
-def _seal(table: str) -> str:
-    return f"update {table} set {_digest_column(table)} = {_digest(table, table)}"
-
-
-def add_functions(db: sqlite3.Connection) -> None:
-    """Add the digests as SQL functions."""
-    db.create_function("row_digest", -1, row_digest, deterministic=True)
-    db.create_aggregate("rows_digest", -1, _RowsDigest)
-
-
-def add_triggers(db: sqlite3.Connection) -> None:
-    """Let this connection set the digest of every row that it writes."""
-    for table, columns in COLUMNS.items():
-        row = " and ".join(f"{key} = new.{key}" for key in _KEYS.get(table, ("id",)))
-        for name, event in (("new", "insert"), ("changed", f"update of {', '.join(columns)}")):
-            sealed = f"begin {_seal(table)} where {row}; end"
-            db.execute(f"create temp trigger seal_{name}_{table} after {event} on {table} {sealed}")
-
-
-class DamagedError(InputError):
-    """Stored content does not match its digest."""
-
-
-def damaged_result(image: str, path: object) -> DamagedError:
-    return DamagedError(
-        f"{path}: what is stored of image {image!r} is not what was measured: the file was changed or is damaged. "
-        "This result is not used. Run `reseau measure --retry`, which measures the image again."
-    )
-
-
-def damaged_judging(path: object) -> DamagedError:
-    return DamagedError(
-        f"{path}: the list of checked images is not as it was written: the file was changed or is damaged. "
-        "Run `reseau measure --retry`, which checks all images again."
-    )
-
-
-def check_judging(db: sqlite3.Connection, judging: int, path: object) -> None:
-    """Raise DamagedError where a judging is damaged or lacks frames."""
-    query = f"select 1 from judging where id = ? and {is_sound('judging')} and frames_digest is {FRAMES_DIGEST}"
-    if db.execute(query, (judging,)).fetchone() is None:
-        raise damaged_judging(path)
-
-
-def check_judgings(db: sqlite3.Connection, path: object) -> None:
-    """Raise DamagedError where any finished judging is damaged or missing."""
-    lost = db.execute(
-        f"select exists (select 1 from judging where seal is not null and not {is_sound('judging')}) or "
-        "exists (select 1 from judged_frame where judging not in (select id from judging))"
-    ).fetchone()[0]
-    if lost:
-        raise damaged_judging(path)
-
-
-def is_result_sound(result: str = "result", marks: str = "mark") -> str:
-    """SQL expression: whether a result and its marks match their digests. result, marks: names or aliases."""
-    return f"({is_sound('result', result)} and {result}.marks_digest is {measured_marks_digest(result, marks)})"
-
-
-def damaged_frames(db: sqlite3.Connection, judging: int) -> dict[int, str]:
-    """{result: image} of the frames of a judging whose raw result, scan or checked marks are damaged."""
-    query = (
-        "select f.result, f.name from judged_frame f left join scan on scan.id = f.scan "
-        f"left join result on result.id = f.result where f.judging = ? and not ({is_sound('judged_frame', 'f')} and "
-        f"{is_sound('scan')} and {is_result_sound()} and f.marks_digest is {checked_marks_digest('f')})"
-    )
-    return {result: str(name) for result, name in db.execute(query, (judging,))}
-
-
 STORE_ERRORS = (sqlite3.Error, UnicodeDecodeError)  # damaged files: even SQLite's message may be undecodable
 APPLICATION = 0x52455345  # "RESE": identifies the file for `file` and this program
+MARKS = ", ".join(("number", *MARK_COLUMNS))
+_BYTES = 16
 
 _FIRST = """
 create table scan (
@@ -256,16 +116,137 @@ where judging = (select max(id) from judging where digest not like 'unfinished%'
 """
 
 
-# Frames of every judging with their scan and raw result. marks_digest: of the marks that checked_mark shows.
+def row_digest(*values: Any) -> str:
+    """BLAKE2b (hexadecimal) of a row's values as JSON, numbers with all their digits."""
+    text = json.dumps(values, separators=(",", ":"), default=lambda data: {"bytes": data.hex()})
+    return hashlib.blake2b(text.encode("ascii"), digest_size=_BYTES).hexdigest()
+
+
+class _RowsDigest:
+    """SQL aggregate: digest of rows in their order."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[Any, ...]] = []
+
+    def step(self, *row: Any) -> None:
+        self._rows.append(row)
+
+    def finalize(self) -> Any:  # typeshed expects a number
+        return row_digest(*self._rows)
+
+
+def _digested_columns() -> dict[str, tuple[str, ...]]:
+    """Columns of the rows that have a digest, by table; of checked frames without the judging, so that they can be
+    copied to another."""
+    with closing(sqlite3.connect(":memory:")) as db:
+        db.executescript(_FIRST)
+        tables = [name for (name,) in db.execute("select name from sqlite_master where type = 'table'")]
+        columns = {table: [row[1] for row in db.execute(f"pragma table_info({table})")] for table in tables}
+    return {
+        table: tuple(name for name in own[:-1] if name != "judging")
+        for table, own in columns.items()
+        if own[-1] in ("digest", "seal")
+    }
+
+
+COLUMNS = _digested_columns()
+
+
+# The following return SQL expressions; their arguments are tables or aliases of them in the query.
+
+
+def _rows_digest(columns: str, source: str, order: str) -> str:
+    rows = f"select {columns} from {source} order by {order}"
+    return f"(select coalesce(rows_digest({columns}), '{row_digest()}') from ({rows}))"
+
+
+def measured_marks_digest(result: str = "result", marks: str = "mark") -> str:
+    """Digest of the marks of a result."""
+    return _rows_digest(MARKS, f"{marks} m where m.result = {result}.id", "number")
+
+
+def checked_marks_digest(frame: str = "judged_frame") -> str:
+    """Digest of the marks that the checks of a frame have stored."""
+    own = f"m.judging = {frame}.judging and m.result = {frame}.result"
+    return _rows_digest(MARKS, f"judged m where {own}", "number")
+
+
+FRAMES_DIGEST = _rows_digest("scan, result, digest", "judged_frame f where f.judging = judging.id", "scan")
+
+
+def is_sound(table: str, alias: str = "") -> str:
+    """Whether a row matches its digest."""
+    return f"({alias or table}.{_digest_column(table)} is {_digest(table, alias or table)})"
+
+
+def is_result_sound(result: str = "result", marks: str = "mark") -> str:
+    """Whether a result and its marks match their digests."""
+    return f"({is_sound('result', result)} and {result}.marks_digest is {measured_marks_digest(result, marks)})"
+
+
+def _digest_column(table: str) -> str:
+    return "seal" if table == "judging" else "digest"
+
+
+def _digest(table: str, name: str) -> str:
+    return f"row_digest({', '.join(f'{name}.{column}' for column in COLUMNS[table])})"
+
+
+# Frames of every judging with their scan and raw result. is_sound: whether the rows match their digests; is_whole:
+# whether their marks do, too.
 _CHECKED_FRAMES = f"""
 create temp view checked_frame as
 select f.judging, judging.digest, f.lot, f.name, f.verdict, f.decisions, f.detail as changed, f.scan, scan.uri,
     scan.width_px, scan.height_px, scan.camera, scan.duplicate_of, f.result, result.fingerprint, result.pitch_x_um,
-    result.pitch_y_um, result.detail as measured, iif(f.own_marks, f.marks_digest, result.marks_digest) as marks_digest,
-    {is_sound("judged_frame", "f")} and {is_sound("result")} and {is_sound("scan")} as is_sound
+    result.pitch_y_um, result.detail as measured,
+    {is_sound("judged_frame", "f")} and {is_sound("result")} and {is_sound("scan")} as is_sound,
+    {is_sound("judged_frame", "f")} and {is_result_sound()} and {is_sound("scan")}
+        and f.marks_digest is {checked_marks_digest("f")} as is_whole
 from judged_frame f join judging on judging.id = f.judging
 left join result on result.id = f.result left join scan on scan.id = f.scan
 """
+
+
+def _add_triggers(db: sqlite3.Connection) -> None:
+    """Let this connection set the digest of every row that it writes."""
+    for table, columns in COLUMNS.items():
+        for name, event in (("new", "insert"), ("changed", f"update of {', '.join(columns)}")):
+            update = f"update {table} set {_digest_column(table)} = {_digest(table, table)}"
+            row = {"judged_frame": "(judging, scan) = (new.judging, new.scan)", "kept": "key = new.key"}
+            where = row.get(table, "id = new.id")
+            db.execute(
+                f"create temp trigger seal_{name}_{table} after {event} on {table} begin {update} where {where}; end"
+            )
+
+
+class DamagedError(InputError):
+    """Stored content does not match its digest."""
+
+
+def damaged_result(image: str, path: object) -> DamagedError:
+    return DamagedError(
+        f"{path}: what is stored of image {image!r} is not what was measured: the file was changed or is damaged. "
+        "This result is not used. Run `reseau measure --retry`, which measures the image again."
+    )
+
+
+def damaged_judging(path: object) -> DamagedError:
+    return DamagedError(
+        f"{path}: the list of checked images is not as it was written: the file was changed or is damaged. "
+        "Run `reseau measure --retry`, which checks all images again."
+    )
+
+
+def check_judging(db: sqlite3.Connection, judging: int, path: object) -> None:
+    """Raise DamagedError where a judging is damaged or lacks frames."""
+    query = f"select 1 from judging where id = ? and {is_sound('judging')} and frames_digest is {FRAMES_DIGEST}"
+    if db.execute(query, (judging,)).fetchone() is None:
+        raise damaged_judging(path)
+
+
+def damaged_frames(db: sqlite3.Connection, judging: int) -> dict[int, str]:
+    """{result: image} of the frames of a judging whose raw result, scan or checked marks are damaged."""
+    return dict(db.execute("select result, name from checked_frame where judging = ? and not is_whole", (judging,)))
 
 
 @dataclass(frozen=True)
@@ -304,7 +285,7 @@ class Database:
         cause one."""
         self.close()
         if isinstance(error, STORE_ERRORS):
-            raise store_error(self.path, self.schema, error) from error
+            raise _store_error(self.path, self.schema, error) from error
 
     def close(self) -> None:
         self.connection.close()
@@ -321,9 +302,32 @@ class Database:
                 self.connection.execute("rollback")
             raise
 
+    def first(self, query: str, *values: object) -> Any:
+        """First column of the first row; None where there is none."""
+        row = self.connection.execute(query, values).fetchone()
+        return None if row is None else row[0]
+
+    def column(self, query: str, *values: object) -> list[Any]:
+        """First column of all rows."""
+        return [row[0] for row in self.connection.execute(query, values)]
+
+    def insert(self, table: str, row: Mapping[str, object], end: str = "") -> int:
+        """Insert a row, given by columns, and return its number. end: of the statement."""
+        places = ", ".join("?" * len(row))
+        statement = f"insert into {table} ({', '.join(row)}) values ({places}) {end}"
+        return self.connection.execute(statement, tuple(row.values())).lastrowid or 0
+
+    def insert_marks(self, table: str, keys: Mapping[str, int], rows: Iterable[Sequence[object]]) -> None:
+        """Insert marks of MARK_COLUMNS, in their order. keys: their other columns."""
+        places = ", ".join("?" * (len(keys) + 1 + len(MARK_COLUMNS)))
+        self.connection.executemany(
+            f"insert into {table} ({', '.join(keys)}, {MARKS}) values ({places})",
+            ((*keys.values(), number, *row) for number, row in enumerate(rows)),
+        )
+
 
 def opened(path: Path, schema: Schema = MEASUREMENTS) -> sqlite3.Connection:
-    """Open a file and migrate it to this version; create it where there is none.
+    """Open a file and migrate it to this version, each step completely or not at all; create it where there is none.
 
     Raises InputError for a file of another kind or of a later version.
     """
@@ -332,18 +336,22 @@ def opened(path: Path, schema: Schema = MEASUREMENTS) -> sqlite3.Connection:
     try:
         _check(connection, path, schema)
         connection.create_function("sqrt", 1, _sqrt, deterministic=True)  # not every SQLite is built with it
-        add_functions(connection)
-        connection.execute("pragma journal_mode = wal")
-        connection.execute("pragma synchronous = normal")
-        connection.execute("pragma foreign_keys = on")
-        migrate(connection, schema)
+        connection.create_function("row_digest", -1, row_digest, deterministic=True)
+        connection.create_aggregate("rows_digest", -1, _RowsDigest)
+        for pragma in ("journal_mode = wal", "synchronous = normal", "foreign_keys = on"):
+            connection.execute(f"pragma {pragma}")
+        version = connection.execute("pragma user_version").fetchone()[0]
+        for number, script in enumerate(schema.migrations, schema.first):
+            marks = f"pragma application_id = {schema.application}; pragma user_version = {number}"
+            if number > version:
+                connection.executescript(f"begin immediate; {script}; {marks}; commit;")
         if schema.application == APPLICATION:
-            add_triggers(connection)
+            _add_triggers(connection)
             connection.execute(_CHECKED_FRAMES)
     except BaseException as error:
-        connection.close()
+        connection.close()  # which rolls back an unfinished step
         if isinstance(error, STORE_ERRORS):
-            raise store_error(path, schema, error) from error
+            raise _store_error(path, schema, error) from error
         raise
     return connection
 
@@ -358,38 +366,7 @@ def _connection(path: Path) -> sqlite3.Connection:
     return sqlite3.connect(name, timeout=60.0, isolation_level=None, uri=is_address)
 
 
-def migrate(connection: sqlite3.Connection, schema: Schema) -> None:
-    """Migrate from any earlier version to this one, each step completely or not at all."""
-    version = connection.execute("pragma user_version").fetchone()[0]
-    for number, script in enumerate(schema.migrations, schema.first):
-        marks = f"pragma application_id = {schema.application}; pragma user_version = {number}"
-        try:
-            if number > version:
-                connection.executescript(f"begin immediate; {script}; {marks}; commit;")
-        except STORE_ERRORS:
-            if connection.in_transaction:
-                connection.execute("rollback")
-            raise
-
-
-def forget(connection: sqlite3.Connection, results: Collection[int], scans: Collection[int] = ()) -> int:
-    """Delete results, scans with all of theirs, and all judgings; return the number of results."""
-    listed, own = "in (select value from json_each(?))", (json.dumps(list(scans)),)
-    of_scans = connection.execute(f"select id from result where scan {listed}", own)
-    lost = {*results, *(row for (row,) in of_scans)}
-    for table in ("judged", "judged_frame", "judged_lot", "judging"):  # including those of a missing judging
-        connection.execute(f"delete from {table}")
-    rows = (json.dumps(list(lost)),)
-    connection.execute(f"delete from mark where result {listed}", rows)
-    connection.execute(f"update scan set result = null, is_current = 0 where result {listed}", rows)
-    connection.execute(f"delete from result where id {listed}", rows)
-    connection.execute(f"update scan set duplicate_of = null where duplicate_of {listed}", own)
-    connection.execute(f"delete from scan where id {listed}", own)
-    return len(lost)
-
-
-def store_error(path: Path, schema: Schema, error: Exception) -> InputError:
-    """Error for a file that cannot be read or written as a store."""
+def _store_error(path: Path, schema: Schema, error: Exception) -> InputError:
     next_step = what_to_do_about_store(error) or _MOVE
     return InputError(f"{path}: cannot be used as a database of {schema.what} ({error}). {next_step}")
 
@@ -398,10 +375,12 @@ _MOVE = "Move it away, and run `reseau measure` again."
 
 
 def _check(connection: sqlite3.Connection, path: Path, schema: Schema) -> None:
-    version = connection.execute("pragma user_version").fetchone()[0]
-    application = connection.execute("pragma application_id").fetchone()[0]
-    tables = connection.execute("select count(*) from sqlite_master").fetchone()[0]
-    if tables and application != schema.application:
+    """Raise InputError for a file that this version cannot read."""
+    version, application = (
+        connection.execute(f"pragma {name}").fetchone()[0] for name in ("user_version", "application_id")
+    )
+    has_tables = connection.execute("select count(*) from sqlite_master").fetchone()[0] > 0
+    if has_tables and application != schema.application:
         raise InputError(f"{path}: is an SQLite file that was not written by reseau for {schema.what}. {_MOVE}")
     if version > schema.version:
         raise InputError(

@@ -38,9 +38,9 @@ from pipeline.results.comparator_file import (
     ComparatorPoint,
     comparator_from_pixel,
     pixel_from_comparator,
-    points_text,
     read_comparator,
     read_pitches,
+    write_comparator,
 )
 from pipeline.text.csv_table import csv_line
 from pipeline.text.files import write_atomically
@@ -279,7 +279,7 @@ def written_block(
     pitches, given = read_pitches(project.comparator), project.given_images or GivenImages({}, {})
     frames = {mark.image: project.image_frame(mark.image) for mark in marks}
     kept = [mark for mark in marks if mark.kind != "target" or frames[mark.image] in poses]
-    write_atomically(folder / "comparator.csv", points_text(kept, pitches))
+    write_comparator(folder / "comparator.csv", kept, pitches)
     exterior: dict[str, Exterior | None] = {}
     lines = [
         "# orientations by COLMAP, as approximations",

@@ -24,8 +24,8 @@ from pipeline.files.project_file import Project
 from pipeline.results.comparator_file import (
     ComparatorPoint,
     comparator_from_pixel,
+    comparator_lines,
     describe_decisions,
-    points_text,
     read_decision_counts,
 )
 from pipeline.text.csv_table import csv_line
@@ -160,7 +160,7 @@ def _comparator(marks: Sequence[ForeignMark], options: ImportOptions) -> str:
     if most > 1:
         raise InputError(f"{kind} {point!r} of image {image!r} is given twice in the files. Name one of them.")
     pitches = dict.fromkeys(sorted({mark.image for mark in marks}), pitch)
-    return points_text([_mark(mark, options, pitch) for mark in marks], pitches)
+    return "".join(comparator_lines((_mark(mark, options, pitch) for mark in marks), pitches))
 
 
 def _mark(mark: ForeignMark, options: ImportOptions, pitch_um: tuple[float, float]) -> ComparatorPoint:

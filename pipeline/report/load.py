@@ -3,6 +3,7 @@
 from array import array
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from heapq import nsmallest
@@ -12,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from measure.flags import Status
-from pipeline.archive.checked_results import StoredMarks, measured_scans, stored_judging
+from pipeline.archive.checked_results import Judging, measured_scans, stored_judging, written_judging
 from pipeline.archive.made_from import (
     CAMERA,
     DECISIONS,
@@ -98,9 +99,9 @@ class FrameTotals:
         for center in centers_px(frame):
             self.centers_px.extend(center.tolist())
 
-    def add_plain(self, stored: StoredMarks, camera_of: Callable[[str], str]) -> None:
+    def add_plain(self, stored: Judging, camera_of: Callable[[str], str]) -> None:
         """Add the stored frames without problems."""
-        counts = {frame.result: Counter[str]() for frame in stored.plain}
+        counts = {result: Counter[str]() for _, _, result in stored.plain}
         for result, kind, status, col_px, row_px in stored.plain_marks():
             counts[result][status] += 1
             if kind != "fiducial":
@@ -108,17 +109,17 @@ class FrameTotals:
             if status in _OBSERVED and col_px is not None and row_px is not None:
                 self.centers_px.extend((col_px, row_px))
         alike = dict[frozenset[tuple[str, int]], Counter[str]]()  # one object for all frames with equal counts
-        for frame in stored.plain:
-            self.verdicts[camera_of(frame.image), _ending(frame.scan)][Verdict.GOOD] += 1
-            count = counts[frame.result]
-            self.marks[frame.image] = alike.setdefault(frozenset(count.items()), count)
+        for image, uri, result in stored.plain:
+            self.verdicts[camera_of(image), _ending(uri)][Verdict.GOOD] += 1
+            count = counts[result]
+            self.marks[image] = alike.setdefault(frozenset(count.items()), count)
 
 
 def reduced(
     data: ReportData,
     scans: Iterable[MeasuredScan],
     camera_of: Callable[[str], str],
-    stored: StoredMarks | None = None,
+    stored: Judging | None = None,
 ) -> ReportData:
     """Reduce the data to the totals of all frames and the worst of the frames that need a look.
 
@@ -306,10 +307,11 @@ def report_data(project: Project, at: At, most_frames: int = MOST_FRAMES) -> Rep
     def camera_of(image: str) -> str:
         return project.image_camera(image).name
 
-    stored = _stored(project, at)
-    if stored is not None and len(stored.names) > most_frames:
-        needed = stored.names - {frame.image for frame in stored.plain}
-        return reduced(measured_data(project, at, rows=stored.rows(needed)), stored.scans(needed), camera_of, stored)
+    with _stored(project, at) as stored:
+        if stored is not None and len(stored.names) > most_frames:
+            needed = stored.names - {image for image, _, _ in stored.plain}
+            data = measured_data(project, at, rows=list(stored.points(needed)))
+            return reduced(data, stored.scans(needed), camera_of, stored)
     data = adjusted_data(project, at, most_frames)
     return (
         data
@@ -320,9 +322,12 @@ def report_data(project: Project, at: At, most_frames: int = MOST_FRAMES) -> Rep
 
 def frame_data(project: Project, at: At, images: Collection[str]) -> ReportData:
     """Load all data of some images. Raises InputError for an unknown image."""
-    stored = _stored(project, at)
-    data = adjusted_data(project, at, 0) if stored is None else measured_data(project, at, rows=stored.rows(images))
-    known = {row.image for row in data.comparator} if stored is None else stored.names
+    with _stored(project, at) as stored:
+        if stored is None:
+            data = adjusted_data(project, at, 0)
+        else:
+            data = measured_data(project, at, rows=list(stored.points(images)))
+        known = {row.image for row in data.comparator} if stored is None else stored.names
     for image in images:
         if image not in known:
             raise InputError(f"{project.comparator}: has no image {image!r}.{did_you_mean(image, known)}")
@@ -330,11 +335,11 @@ def frame_data(project: Project, at: At, images: Collection[str]) -> ReportData:
     return replace(data, comparator=[row for row in data.comparator if row.image in images], measurement=scans)
 
 
-def _stored(project: Project, at: At) -> StoredMarks | None:
+def _stored(project: Project, at: At) -> AbstractContextManager[Judging | None]:
     """Stored marks, not all of which need be read, if comparator.csv is unchanged and nothing is adjusted."""
     if not project.scans or at(project.adjustment_path).exists():
-        return None
-    return StoredMarks.open(project.measurement_path, at(project.comparator))
+        return nullcontext()
+    return written_judging(project.measurement_path, at(project.comparator))
 
 
 def adjusted_data(project: Project, at: At, most_frames: int | None = None) -> ReportData:

@@ -3,21 +3,18 @@
 import math
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from importlib.metadata import version
-from itertools import chain, takewhile
+from itertools import takewhile
 from pathlib import Path
 from sys import intern
-from types import MappingProxyType
-from typing import NamedTuple, get_args
+from typing import get_args
 
 import numpy as np
 
 from adjust.problem.observations import ObservationKind
 from measure.flags import Status
-from measure.results import FrameMeasurement
 from pipeline.errors import InputError
 from pipeline.text.csv_table import Row, csv_line, read_csv
 from pipeline.text.files import atomic_path, image_name, read_bytes
@@ -30,7 +27,6 @@ PIXEL_SIGMAS = ("scol_px", "srow_px")  # columns of files in pixels only; rho th
 _KINDS: dict[str, ObservationKind] = {kind: kind for kind in get_args(ObservationKind)}
 
 CameraPerson = tuple[str, str]  # camera and name of the reviewer
-_NOBODY: Mapping[CameraPerson, int] = MappingProxyType({})
 _DECISIONS = re.compile(r'^"?# (\d+) decisions of (.+), camera (.+?)"?$', re.MULTILINE)
 _HEAD = 4096
 _PITCH = re.compile(r'^"?# pitch of (.+): ([0-9.e+-]+) um across, ([0-9.e+-]+) um down"?$', re.MULTILINE)
@@ -58,37 +54,28 @@ class ComparatorPoint:
     line: int = 0
 
 
-class MarkRow(NamedTuple):
-    """Mark in an image as measured. center_px: column and row; covariance_px2: variances of column and row, and their
-    covariance; both None if unknown."""
-
-    image: str
-    point: str
-    kind: str
-    center_px: tuple[float, float] | None
-    covariance_px2: tuple[float, float, float] | None
-    status: str
-    reason: str
-
-
-def mark_rows(frames: Iterable[FrameMeasurement]) -> Iterator[MarkRow]:
-    """Yield all marks of all frames, sorted by frame."""
-    for frame in sorted(frames, key=lambda frame: frame.image):
-        for mark in frame.marks:
-            center = None if mark.center_px is None else (float(mark.center_px[0]), float(mark.center_px[1]))
-            px2 = mark.covariance_px2
-            spread = None if px2 is None else (float(px2[0, 0]), float(px2[1, 1]), float(px2[0, 1]))
-            yield MarkRow(frame.image, mark.point, mark.kind, center, spread, str(mark.status), str(mark.reason))
-
-
 def write_comparator(
     path: Path,
-    marks: Iterable[MarkRow],
+    points: Iterable[ComparatorPoint],
     pitch_um: Mapping[str, tuple[float, float]],
     measurement: str = "",
     decided: Mapping[CameraPerson, int] | None = None,
 ) -> None:
-    """Write comparator.csv, marks in the given order. Raises InputError if the file cannot be written.
+    """Write comparator.csv, marks in the given order, line by line: an archive has many. Parameters as in
+    `comparator_lines`. Raises InputError if the file cannot be written."""
+    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
+        file.writelines(comparator_lines(points, pitch_um, measurement, decided))
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def comparator_lines(
+    points: Iterable[ComparatorPoint],
+    pitch_um: Mapping[str, tuple[float, float]],
+    measurement: str = "",
+    decided: Mapping[CameraPerson, int] | None = None,
+) -> Iterator[str]:
+    """Yield the lines of comparator.csv; pixel coordinates stay empty if the pitch is unknown.
 
     Parameters
     ----------
@@ -96,47 +83,31 @@ def write_comparator(
     measurement : digest of the checked results in measurement.db with the same marks.
     decided : number of review decisions by camera and reviewer.
     """
-    rows = (_line(mark, *pitch_um[mark.image]) for mark in marks)
-    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
-        file.writelines(
-            f"{line}\n" for line in chain(_head(pitch_um, measurement, decided or {}), rows)
-        )  # streamed: an archive has many marks
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def points_text(points: Sequence[ComparatorPoint], pitch_um: Mapping[str, tuple[float, float]]) -> str:
-    """Text of comparator.csv for points; pixel coordinates stay empty if the pitch is unknown."""
-    lines = _head(pitch_um)
-    return "\n".join([*lines, *(_point_line(point, pitch_um.get(point.image)) for point in points)]) + "\n"
-
-
-def _point_line(point: ComparatorPoint, pitch_um: tuple[float, float] | None) -> str:
-    place = [None, None] if point.xy_mm is None else point.xy_mm.tolist()
-    sigma = [None, None] if point.sigma_mm is None else point.sigma_mm.tolist()
-    pixel = [None, None] if point.xy_mm is None or pitch_um is None else pixel_from_comparator(point.xy_mm, pitch_um)
-    numbers = [*place, *sigma, point.rho, *pixel]
-    cells = ["" if number is None else f"{number:.7f}" for number in numbers]
-    return csv_line([point.image, point.point, point.kind, *cells, str(point.status), point.reason])
-
-
-def _head(
-    pitch_um: Mapping[str, tuple[float, float]], measurement: str = "", decided: Mapping[CameraPerson, int] = _NOBODY
-) -> list[str]:
-    known_pitches = [(image, pitch) for image, pitch in sorted(pitch_um.items()) if math.isfinite(pitch[0])]
-    return [
-        f"# comparator coordinates, reseau {version('reseau')}",
-        *([f"# measurement {measurement}"] if measurement else []),
-        *(
-            f"# {count} decisions of {_single_line(who)}, camera {_single_line(by)}"
-            for (by, who), count in decided.items()
-        ),
-        "# x_mm to the right, y_mm UP, origin at the centre of the scan's top-left pixel; sx_mm, sy_mm their sigmas",
-        "# col_px to the right, row_px down; the CENTRE of the top-left pixel is (0, 0)",
-        *(f"# pitch of {image}: {x:.10g} um across, {y:.10g} um down" for image, (x, y) in known_pitches),
-        "# status: only measured and weak are observations",
-        ",".join(COLUMNS),
-    ]
+    yield f"# comparator coordinates, reseau {version('reseau')}\n"
+    if measurement:
+        yield f"# measurement {measurement}\n"
+    for (by, who), count in (decided or {}).items():
+        yield f"# {count} decisions of {_single_line(who)}, camera {_single_line(by)}\n"
+    yield "# x_mm to the right, y_mm UP, origin at the centre of the scan's top-left pixel; sx_mm, sy_mm their sigmas\n"
+    yield "# col_px to the right, row_px down; the CENTRE of the top-left pixel is (0, 0)\n"
+    for image, (x, y) in sorted(pitch_um.items()):
+        if math.isfinite(x):
+            yield f"# pitch of {image}: {x:.10g} um across, {y:.10g} um down\n"
+    yield "# status: only measured and weak are observations\n"
+    yield f"{','.join(COLUMNS)}\n"
+    for point in points:
+        place, pixel, sigma_rho = ("", ""), ("", ""), ("", "", "")
+        if point.xy_mm is not None:
+            x, y = point.xy_mm.tolist()
+            across, down = pitch_um.get(point.image, (math.nan, math.nan))
+            place = f"{x:.7f}", f"{y:.7f}"
+            if math.isfinite(across):
+                pixel = f"{1000.0 * x / across:.4f}", f"{-1000.0 * y / down:.4f}"
+        if point.sigma_mm is not None:
+            sx, sy = point.sigma_mm.tolist()
+            sigma_rho = f"{sx:.7f}", f"{sy:.7f}", f"{point.rho:.4f}"
+        names, ends = csv_line((point.image, point.point, point.kind)), csv_line((point.status, point.reason))
+        yield f"{','.join((names, *place, *sigma_rho, *pixel, ends))}\n"
 
 
 def _single_line(name: str) -> str:
@@ -151,45 +122,6 @@ def comparator_from_pixel(center_px: Array, pitch_um: tuple[float, float]) -> Ar
 def pixel_from_comparator(xy_mm: Array, pitch_um: tuple[float, float]) -> Array:
     """Convert (..., 2) x (right) and y (up), mm, to column and row."""
     return np.divide(xy_mm, np.array([pitch_um[0], -pitch_um[1]]) / 1000.0)
-
-
-def _line(mark: MarkRow, across_um: float, down_um: float) -> str:
-    """Line of a mark; equivalent to `comparator_from_pixel`, but faster for single marks."""
-    place = pixel = ","
-    sigma_rho = ",,"
-    x_mm, y_mm = across_um / 1000.0, -down_um / 1000.0
-    if mark.center_px is not None:
-        col, row = mark.center_px
-        place, pixel = f"{col * x_mm:.7f},{row * y_mm:.7f}", f"{col:.4f},{row:.4f}"
-    if mark.covariance_px2 is not None:
-        of_col, of_row, both = mark.covariance_px2
-        sx, sy = math.sqrt(of_col * x_mm * x_mm), math.sqrt(of_row * y_mm * y_mm)
-        sigma_rho = f"{sx:.7f},{sy:.7f},{both * x_mm * y_mm / (sx * sy):.4f}"
-    name = _start(mark.image, mark.point, mark.kind)
-    return f"{name},{place},{sigma_rho},{pixel},{csv_line([mark.status, mark.reason])}"
-
-
-@lru_cache(maxsize=4096)
-def _start(image: str, point: str, kind: str) -> str:
-    return csv_line([image, point, kind])
-
-
-def comparator_points(
-    marks: Iterable[MarkRow], pitch_um: Mapping[str, tuple[float, float]]
-) -> Iterator[ComparatorPoint]:
-    """Yield the points that `read_comparator` would read from the written marks, unrounded and without line numbers."""
-    for mark in marks:
-        x_mm, y_mm = pitch_um[mark.image][0] / 1000.0, -pitch_um[mark.image][1] / 1000.0
-        xy = sigma = None
-        rho = 0.0
-        if mark.center_px is not None:
-            xy = np.array([mark.center_px[0] * x_mm, mark.center_px[1] * y_mm])
-        if mark.covariance_px2 is not None:
-            of_col, of_row, both = mark.covariance_px2
-            sigma = np.array([math.sqrt(of_col) * x_mm, -math.sqrt(of_row) * y_mm])
-            rho = both * x_mm * y_mm / float(sigma[0] * sigma[1])
-        kind, status = _KINDS[mark.kind], Status(mark.status)
-        yield ComparatorPoint(mark.image, mark.point, kind, xy, sigma, rho, status, mark.reason)
 
 
 def read_measurement_hash(path: Path) -> str:

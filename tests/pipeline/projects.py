@@ -5,7 +5,7 @@ import json
 import math
 import random
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from pipeline.files.project_file import Project
 from pipeline.measuring.scan_measurement import measured_scan
 from pipeline.measuring.scan_task import scan_tasks
 from pipeline.provenance import FileState, Identity, file_state, parts_hash
-from pipeline.results.comparator_file import read_measurement_hash
+from pipeline.results.comparator_file import ComparatorPoint, read_measurement_hash
 from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan, mark_row, scan_detail
 
 Capture = pytest.CaptureFixture[str]
@@ -387,6 +387,23 @@ def keep_scans(path: Path, scans: Sequence[MeasuredScan], made_from: Mapping[str
             row = store.keep(Kept(identity, "{}", scan), scan.frame.image)
             frames.append(CheckedResult(row, scan))
         return judge(store, made_from or {}, "kept", frames).digest
+
+
+def comparator_points(
+    frames: Iterable[FrameMeasurement], pitch_um: Mapping[str, tuple[float, float]]
+) -> Iterator[ComparatorPoint]:
+    """Marks of frames, as in comparator.csv."""
+    for frame in sorted(frames, key=lambda frame: frame.image):
+        mm_from_px = np.diag([1.0, -1.0] * np.array(pitch_um[frame.image])) / 1000.0
+        for mark in frame.marks:
+            xy_mm = None if mark.center_px is None else mm_from_px @ mark.center_px
+            sigma_mm, rho = None, 0.0
+            if mark.covariance_px2 is not None:
+                (xx, xy), (_, yy) = mm_from_px @ mark.covariance_px2 @ mm_from_px
+                sigma_mm, rho = np.sqrt([xx, yy]), float(xy / np.sqrt(xx * yy))
+            yield ComparatorPoint(
+                frame.image, mark.point, mark.kind, xy_mm, sigma_mm, rho, mark.status, str(mark.reason)
+            )
 
 
 def scan_content(file: Path) -> bytes:

@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from projects import Capture, write_project
+from projects import Capture, comparator_points, write_project
 
 from measure.fiducials.options import Click, FiducialOptions
 from measure.flags import Cause, Code, Reason, Status
@@ -23,7 +23,6 @@ from pipeline.files.decisions_file import Choice, Decision, append_decisions, re
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
 from pipeline.results.comparator_file import (
     describe_decisions,
-    mark_rows,
     read_comparator,
     read_decision_counts,
     write_comparator,
@@ -351,9 +350,9 @@ def test_what_is_settled_is_not_open_and_every_command_says_who_settled(tmp_path
 def test_whose_decisions_stand_behind_a_file_is_read_from_its_head(tmp_path: Path) -> None:
     apply_decisions = {("a.toml", "ann, the second"): 2, ("b.toml", "bob"): 1, ("b.toml", "line\nend"): 3}
     path = tmp_path / "comparator.csv"
-    write_comparator(
-        path, mark_rows([FrameMeasurement("f", (weak("1"),))]), {"f": (20.0, 20.0)}, decided=apply_decisions
-    )
+    pitch_um = {"f": (20.0, 20.0)}
+    points = comparator_points([FrameMeasurement("f", (weak("1"),))], pitch_um)
+    write_comparator(path, points, pitch_um, decided=apply_decisions)
     read = read_decision_counts(path)
     assert read == {("a.toml", "ann, the second"): 2, ("b.toml", "bob"): 1, ("b.toml", "line end"): 3}
     text = "a.toml: 2 of ann, the second; b.toml: 1 of bob, 3 of line end"

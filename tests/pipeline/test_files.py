@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-from projects import keep_scans, write_tables
+from projects import comparator_points, keep_scans, write_tables
 
 from measure.fiducials.options import SCATTER_MM, BelievedFilm
 from measure.flags import Cause, Code, Reason, Status
@@ -22,7 +22,6 @@ from pipeline.files.mark_table import picture_writer
 from pipeline.files.project_file import Project, read_project, read_undrawn
 from pipeline.results.comparator_file import (
     comparator_from_pixel,
-    mark_rows,
     pixel_from_comparator,
     read_comparator,
     write_comparator,
@@ -241,7 +240,8 @@ def test_comparator_coordinates_have_y_up_and_survive_writing(tmp_path: Path) ->
         MarkMeasurement("7", "target", None, None, Status.ABSENT, Reason('outside, "far" off', Code.OUTSIDE)),
     )
     path = tmp_path / "comparator.csv"
-    write_comparator(path, mark_rows([FrameMeasurement("#1", marks)]), {"#1": (20.0, 10.0)})
+    pitch_um = {"#1": (20.0, 10.0)}
+    write_comparator(path, comparator_points([FrameMeasurement("#1", marks)], pitch_um), pitch_um)
     first, second = read_comparator(path)
     assert first.image == "#1"  # a line that begins with # would be a comment
     np.testing.assert_allclose(np.asarray(first.xy_mm), [2.005, -2.005], atol=1e-9)

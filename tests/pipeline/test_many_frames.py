@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from projects import fiducial_tables, keep_scans, write_project, write_tables
+from projects import comparator_points, fiducial_tables, keep_scans, write_project, write_tables
 
 from measure import open_scan
 from measure.flags import Cause, Code, Reason, Status
@@ -26,7 +26,7 @@ from pipeline.report import ReportData, Thumbnail, judge, render_report
 from pipeline.report.frame_views import MOST_CARDS
 from pipeline.report.load import MOST_FRAMES, frame_counts, reduced, report_data
 from pipeline.report.page import render_frame_page
-from pipeline.results.comparator_file import ComparatorPoint, mark_rows, read_measurement_hash, write_comparator
+from pipeline.results.comparator_file import ComparatorPoint, read_measurement_hash, write_comparator
 from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan
 from pipeline.results.thumbnail import cut
 from pipeline.review.session import Filters, Session
@@ -154,7 +154,9 @@ def stored(folder: Path) -> tuple[Path, list[MeasuredScan]]:
         scans.append(replace(one, scan=str(file), frame=replace(one.frame, image=file.stem, marks=marks)))
     digest = keep_scans(folder / "out" / "measurement.db", scans)
     pitches = {each.frame.image: each.pitch_um for each in scans}
-    write_comparator(folder / "comparator.csv", mark_rows([each.frame for each in scans]), pitches, digest)
+    write_comparator(
+        folder / "comparator.csv", comparator_points([each.frame for each in scans], pitches), pitches, digest
+    )
     return project, scans
 
 
@@ -164,7 +166,8 @@ def test_natural_points_are_no_questions_to_a_reviewer(tmp_path: Path) -> None:
     marks = (doubtful, replace(doubtful, point="tie1", kind="tie"), *first.frame.marks[2:-2])
     digest = keep_scans(tmp_path / "out" / "measurement.db", [replace(first, frame=replace(first.frame, marks=marks))])
     frames = {first.frame.image: first.pitch_um}
-    write_comparator(tmp_path / "comparator.csv", mark_rows([replace(first.frame, marks=marks)]), frames, digest)
+    points = comparator_points([replace(first.frame, marks=marks)], frames)
+    write_comparator(tmp_path / "comparator.csv", points, frames, digest)
     entries = Session(read_project(project), "bob").page(Filters())["entries"]
     assert [(one["point"], one["kind"]) for one in entries] == [("m1", "fiducial")]
 

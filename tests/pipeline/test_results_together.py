@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from in_process import Loses
-from projects import Capture, Refusal, Spoil, change_camera, change_project, keep_scans, replace_text
+from projects import Capture, Refusal, Spoil, change_camera, change_project, comparator_points, keep_scans, replace_text
 from test_command_line import results, rewritten_scans
 
 from adjust import Prior
@@ -24,7 +24,7 @@ from pipeline.archive.made_from import measured_from
 from pipeline.cli import run
 from pipeline.provenance import fingerprint, parts_hash
 from pipeline.report.load import adjusted_data
-from pipeline.results.comparator_file import mark_rows, write_comparator
+from pipeline.results.comparator_file import write_comparator
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.summary import summarise
 
@@ -51,7 +51,7 @@ def measured_as(folder: Path, scans: tuple[MeasuredScan, ...]) -> None:
     project = read_project(folder / "project.toml")
     digest = keep_scans(project.measurement_path, scans, measured_from(project))
     frames, pitch_um = [scan.frame for scan in scans], {scan.frame.image: scan.pitch_um for scan in scans}
-    write_comparator(project.comparator, mark_rows(frames), pitch_um, digest)
+    write_comparator(project.comparator, comparator_points(frames, pitch_um), pitch_um, digest)
 
 
 def one_scan_more(folder: Path) -> MeasuredScan:

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from projects import FOLDER, changed, content, failed, kept_result, made_record, stored
+from projects import FOLDER, changed, comparator_points, content, failed, kept_result, made_record, stored
 
 from measure import Code, Reason, Status
 from pipeline import InputError
@@ -22,7 +22,7 @@ from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_verdict
 from pipeline.provenance import content_hash, file_state, hash_text, parts_hash, result_key, shard_number
 from pipeline.report.data import ReportData, frames
 from pipeline.report.frame_problems import single_frame_problems
-from pipeline.results.comparator_file import mark_rows
+from pipeline.results.comparator_file import comparator_lines
 from pipeline.results.measured_record import MeasuredScan
 
 LOOK = Reason("look", Code.PITCH)
@@ -100,13 +100,14 @@ def test_a_lot_whose_input_was_tested_is_not_tested_again(path: Path) -> None:
         again = judge_lots(store, {}, "2", [lot("a", 1, 2), lot("c", 3, 4)])
         assert again.digest == second.digest
         anew = contents(again)
-        rows = list(again.marks())
+        rows = list(comparator_lines(again.points(), {}))
     with Store(path) as store:
         judging = find_judging(store, second.digest)
         assert judging is not None
         assert contents(judging) == anew
-        assert list(judging.marks()) == rows
-        assert list(mark_rows(scan.frame for scan in judging.scans())) == rows
+        assert list(comparator_lines(judging.points(), {})) == rows
+        points = comparator_points([scan.frame for scan in judging.scans()], judging.pitches_um())
+        assert list(comparator_lines(points, {})) == rows
 
 
 def test_one_judging_takes_the_place_of_another(path: Path) -> None:

@@ -35,7 +35,7 @@ from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.tie_stage import check_tie_names
 from pipeline.resampling.canvas import FrameChain
 from pipeline.resampling.resample_stage import FAST, FrameScan, ResampleTask, resampled
-from pipeline.results.comparator_file import ComparatorPoint, points_text, read_comparator
+from pipeline.results.comparator_file import ComparatorPoint, read_comparator, write_comparator
 from synthetic_images.film import FrameGeometry
 from synthetic_images.render import render_scene
 from synthetic_images.scene import DiskField, Distortion, Film, Scanner, Scene, SceneCamera, SceneImage
@@ -286,7 +286,7 @@ def test_control_in_either_scan_of_a_frame_places_the_block(tmp_path: Path) -> N
         'camera = "camera.toml"\n[object]\nimages = "images.csv"\n', encoding="utf-8"
     )
     cut += [replace(cut[0], image=f"f{i}{half}", point="1", kind="fiducial") for i in IMAGES for half in "lr"]
-    (tmp_path / "comparator.csv").write_text(points_text(cut, {}), encoding="utf-8")
+    write_comparator(tmp_path / "comparator.csv", cut, {})
     own = written_block(read_project(tmp_path / "project.toml"), tmp_path / "block", cut, {"f1": placed["f1"]})
     again = read_images(tmp_path / "block" / "images.csv")
     assert again.part_of == {f"f{i}{half}": f"f{i}" for i in IMAGES for half in "lr"}
