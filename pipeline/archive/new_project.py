@@ -25,7 +25,6 @@ from pipeline.archive.scan_groups import (
 from pipeline.errors import InputError
 from pipeline.files.camera_file import read_camera
 from pipeline.files.library import PREFIX, camera_words, library_path, read_library
-from pipeline.measuring.camera_identification import is_solid
 from pipeline.progress import Reporter
 from pipeline.text.csv_table import csv_line
 from pipeline.text.files import image_name, names_below, write_atomically
@@ -112,7 +111,7 @@ class NewProject:
         yield (
             "are named by the form of solid marks alone, which a camera that the library lacks may share: compare the "
             "drawing with a scan",
-            [f"{_place(group)}: {group.camera}" for group in self.named if _rests_on_form(group)],
+            [f"{_place(group)}: {group.camera}" for group in self.named if group.rests_on_form],
         )
         yield (
             "are no scans of film, and are left out",
@@ -379,12 +378,6 @@ def _place(group: ScanGroup) -> str:
     if len(group.paths) == 1:
         return str(group.paths[0])
     return f"{group.folder}, {counted(len(group.paths), 'scan')}, {_form(group.head)}"
-
-
-def _rests_on_form(group: ScanGroup) -> bool:
-    """Whether the camera was identified by solid marks (wings, notches, arrows) alone."""
-    marks = read_camera(library_path(group.camera)).layout().marks
-    return not group.has_telling_plate and all(map(is_solid, marks))
 
 
 def _candidate_lines(names: Sequence[str]) -> list[str]:

@@ -19,8 +19,8 @@ from measure.scans.opening import ScanHead, open_scan, read_head
 from measure.scans.parallel import map_items
 from measure.scans.remote import Address, list_addresses
 from pipeline.errors import InputError
-from pipeline.files.camera_file import CameraFile
-from pipeline.files.library import read_library
+from pipeline.files.camera_file import CameraFile, read_camera
+from pipeline.files.library import library_names, library_path
 from pipeline.files.scan_files import folders_below
 from pipeline.measuring.camera_identification import Identification, is_solid
 from pipeline.measuring.camera_trials import identify
@@ -101,10 +101,11 @@ class ScanGroup:
     def camera(self) -> str:
         """The identified camera; among cameras with the same marks, the one with the most calibration reports.
 
-        "" where none is identified, or solid marks alone identify it although another camera has similar ones: the true
-        camera may then be missing from the library.
+        "" where none is identified, or solid marks alone identify it although another camera has similar ones, or the
+        file gives another pitch: the true camera may then be missing from the library.
         """
-        if self.much_alike or self.digital or self._is_form_against_pitch:
+        is_against_pitch = any(sample.against_pitch() for sample in self.samples)  # likely a false alarm of such marks
+        if self.much_alike or self.digital or (is_against_pitch and self.rests_on_form):
             return ""
         return max(self.cameras, key=lambda name: self._reports.get(name, 0), default="")
 
@@ -117,13 +118,11 @@ class ScanGroup:
         return tuple(others) if self.cameras else ()
 
     @property
-    def _is_form_against_pitch(self) -> bool:
-        """Whether solid marks alone identify the camera, at another pitch than the file's: likely a false alarm."""
-        if self.has_telling_plate or not any(sample.against_pitch() for sample in self.samples):
-            return False
-        library = read_library()
-        layouts = [library[name].layout() for name in self.cameras if name in library]
-        return bool(layouts) and all(is_solid(mark) for layout in layouts for mark in layout.marks)
+    def rests_on_form(self) -> bool:
+        """Whether solid marks (wings, notches, arrows) alone identify the camera."""
+        known = [] if self.has_telling_plate else [name for name in self.cameras if name in library_names()]
+        marks = [mark for name in known for mark in read_camera(library_path(name)).layout().marks]
+        return bool(marks) and all(map(is_solid, marks))
 
     @property
     def has_telling_plate(self) -> bool:

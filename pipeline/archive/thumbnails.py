@@ -18,7 +18,7 @@ from measure.scans.scan import Scan
 from pipeline.archive.schema import STORE_ERRORS, Database, Schema
 from pipeline.errors import InputError
 from pipeline.results.measured_record import MeasuredScan
-from pipeline.results.thumbnail import StoredThumbnail, Thumbnail, cut
+from pipeline.results.thumbnail import WHOLE, Thumbnail, ThumbnailRow, cut
 
 _FIRST = """
 create table thumbnail (
@@ -31,8 +31,8 @@ create table thumbnail (
     primary key (fingerprint, point, kind)
 );
 """
-_DIGEST = "row_digest(point, kind, col_px, row_px, step_px, jpeg)"
 _COLUMNS = "point, kind, col_px, row_px, step_px, jpeg"
+_DIGEST = f"row_digest({_COLUMNS})"
 _OFF_MIDDLE = 0.25  # fraction of a thumbnail's width: a mark farther off its middle was measured again since
 
 
@@ -45,16 +45,16 @@ class ThumbnailStore(Database):
         """Open the thumbnails of a results database."""
         super().__init__(thumbnails_path(measurement))
 
-    def keep(self, fingerprint: str, thumbnails: Sequence[StoredThumbnail]) -> None:
+    def keep(self, fingerprint: str, thumbnails: Sequence[ThumbnailRow]) -> None:
         """Store the thumbnails of one result, all or none."""
         with self.writing():
             self.connection.executemany(
                 f"insert or replace into thumbnail (fingerprint, {_COLUMNS}) values (?, ?, ?, ?, ?, ?, ?)",
-                ((fingerprint, one.point, one.kind, *one.origin_px, one.step_px, one.jpeg) for one in thumbnails),
+                ((fingerprint, *row) for row in thumbnails),
             )
             self.connection.execute(f"update thumbnail set digest = {_DIGEST} where fingerprint = ?", (fingerprint,))
 
-    def get(self, fingerprint: str, point: str = "", kind: str = "frame") -> StoredThumbnail | None:
+    def get(self, fingerprint: str, point: str = WHOLE[0], kind: str = WHOLE[1]) -> Thumbnail | None:
         """Thumbnail of a mark, or of the whole scan; None where it is missing or damaged."""
         where = f"fingerprint = ? and point = ? and kind = ? and digest is {_DIGEST}"
         try:
@@ -63,18 +63,13 @@ class ThumbnailStore(Database):
             ).fetchone()
         except STORE_ERRORS:  # fall back to the scan itself
             return None
-        if found is None:
-            return None
-        point, kind, col_px, row_px, step_px, jpeg = found
-        return StoredThumbnail(point, kind, (col_px, row_px), step_px, jpeg)
+        return None if found is None else Thumbnail.from_row(found)
 
     def rekey(self, keys: Mapping[str, str]) -> None:
         """Replace fingerprints of results. keys: {old: new}."""
         with self.writing():
-            self.connection.executemany(
-                "update or ignore thumbnail set fingerprint = ? where fingerprint = ?",
-                ((new, old) for old, new in keys.items()),
-            )
+            update = "update or ignore thumbnail set fingerprint = ?2 where fingerprint = ?1"
+            self.connection.executemany(update, keys.items())
 
     def take(self, measurements: Sequence[Path]) -> None:
         """Import the thumbnails of other results databases that have some."""
@@ -142,10 +137,9 @@ class Thumbnails:
             return None
 
     def _get_stored(self, image: str, mark: MarkMeasurement) -> Thumbnail | None:
-        stored = self._kept and self._kept.get(self._fingerprints.get(image, ""), mark.point, mark.kind)
-        if not stored or mark.center_px is None:
+        thumbnail = self._kept and self._kept.get(self._fingerprints.get(image, ""), mark.point, mark.kind)
+        if not thumbnail or mark.center_px is None:
             return None
-        thumbnail = stored.thumbnail
         width_px = np.array(thumbnail.pixels.shape[::-1]) * thumbnail.step_px
         middle_px = thumbnail.origin_px + (width_px - thumbnail.step_px) / 2.0
         return thumbnail if (np.abs(mark.center_px - middle_px) < _OFF_MIDDLE * width_px).all() else None

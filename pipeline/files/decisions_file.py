@@ -1,7 +1,7 @@
 """decisions.jsonl: a person's decisions about marks and poses, one JSON object per line, the oldest first.
 
-The last line about a mark applies; an `undo` cancels the last one before it. Lines are only appended, never changed, so
-that the file keeps a record of who decided what, and when.
+The last line about a mark applies; an `undo` cancels the last one before it. Lines are only added, never changed, so
+that the file keeps a record of who decided what, and when. With the new lines it replaces the earlier file at once.
 """
 
 import json
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, Any
 
 from pydantic import AfterValidator, ConfigDict, Field, Strict, TypeAdapter, ValidationError, with_config
 
@@ -30,7 +30,6 @@ except ImportError:  # not available on every system
     fcntl = None  # type: ignore[assignment]
 
 FILE = "decisions.jsonl"
-_LONGEST_LINE = 4_000_000  # bytes
 _MOST_MB = 2000
 KINDS = ("fiducial", "target", "tie")
 LEARNED = "learned"  # kind of decisions about the appearance of a camera's marks, not about their places
@@ -222,11 +221,9 @@ def read_decisions(path: Path) -> tuple[Decision, ...]:
 
 
 def decisions_bytes(path: Path) -> bytes:
-    """Content of the file without lines of an unfinished write; empty where there is no file. Raises InputError for a
-    folder."""
+    """Content of the file; empty where there is no file. Raises InputError for a folder."""
     try:
-        with _locked(path):
-            return read_bytes(path, _MOST_MB)[: _confirmed_bytes(path)]
+        return read_bytes(path, _MOST_MB)
     except FileNotFoundError:
         return b""
     except IsADirectoryError:
@@ -258,28 +255,43 @@ def append_decisions(path: Path, decisions: Iterable[Decision]) -> None:
     Raises
     ------
     InputError
-        A decision could not be read again; nothing is written.
+        A decision could not be read again, or the last line there cannot be; nothing is written.
     WriteError
         The lines cannot be written; the file is unchanged.
     """
     text = "".join(decision_line(decision) for decision in decisions)
-    with writing(path), path.open("a+b") as file, _locked(path, exclusive=True):
-        confirmed = _confirmed_bytes(path)
-        if confirmed is not None:  # an earlier process ended before it had written all its lines
-            file.truncate(confirmed)
-        _end_last_line(file, path)
-        size, journal = file.seek(0, os.SEEK_END), _journal_path(path)
-        write_atomically(journal, str(size))
-        try:
-            file.write(text.encode())
-            file.flush()
-            os.fsync(file.fileno())
-        except BaseException:
-            with suppress(OSError):  # buffered data is not written: that would fail again
-                os.truncate(path, size)
-            raise
-        finally:
-            journal.unlink(missing_ok=True)
+    with _locked(path.parent):
+        write_atomically(path.resolve(), _whole_lines(path) + text.encode())
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Lock a folder against other processes that append; no lock where the file system has none."""
+    if fcntl is None:
+        yield
+        return
+    with writing(folder):
+        place = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(place, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(place)
+
+
+def _whole_lines(path: Path) -> bytes:
+    """Content of the file with a missing line end, without a last line that was cut short. Raises InputError for any
+    other invalid last line."""
+    data = decisions_bytes(path)
+    before, last = data[: (start := data.rfind(b"\n") + 1)], data[start:]
+    if not last.strip() or is_cut_short(last):
+        return before
+    try:
+        parse_decision(last)
+    except LineError as error:
+        raise InputError(f"{path}, its last line{error} Nothing was written.") from None
+    return data + b"\n"
 
 
 def standing(decisions: Sequence[Decision]) -> Mapping[About, Decision]:
@@ -304,44 +316,3 @@ def learned_from(decisions: Sequence[Decision], images: Collection[str]) -> Deci
     own = [one for one in decisions if one.subject[2] == LEARNED and one.image in images]
     left = standing(own).values()
     return max(left, key=own.index, default=None)
-
-
-# --- writing: the file's size before the new lines is kept in a file beside it until all lines are on the disk
-
-
-def _journal_path(path: Path) -> Path:
-    return path.with_name(f".{path.name}.size")
-
-
-def _confirmed_bytes(path: Path) -> int | None:
-    """Number of valid bytes after an unfinished write; None: all."""
-    try:
-        return int(_journal_path(path).read_bytes())
-    except (OSError, ValueError):
-        return None
-
-
-@contextmanager
-def _locked(path: Path, exclusive: bool = False) -> Iterator[None]:
-    """Lock the file; no lock where the file system has none."""
-    with path.open("rb") as file:
-        if fcntl is not None:
-            with suppress(OSError):
-                fcntl.flock(file, fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH)
-        yield
-
-
-def _end_last_line(file: BinaryIO, path: Path) -> None:
-    """Add a missing line end, or drop a line that was cut short. Raises InputError for any other invalid line."""
-    size = file.seek(0, os.SEEK_END)
-    file.seek(max(0, size - _LONGEST_LINE))
-    data = file.read()
-    last = data[data.rfind(b"\n") + 1 :]
-    if is_cut_short(last):
-        file.truncate(size - len(last))
-    elif last.strip():
-        try:
-            parse_decision(last)
-        except LineError as error:
-            raise InputError(f"{path}, its last line{error} Nothing was written.") from None
-        file.write(b"\n")

@@ -441,27 +441,16 @@ def _part(table: Table) -> shapes.Part:
     return plain(**{field.name: getattr(given, field.name) for field in dataclasses.fields(plain)})
 
 
-def scaled_mark(mark: MarkJson, factor: float) -> MarkJson:
-    """Scale all lengths of a mark by a factor."""
+def scaled_mark(mark: MarkJson, factor: float = 1.0) -> MarkJson:
+    """Scale all lengths of a mark by a factor, and round its numbers to 0.1 µm."""
 
     def scaled(key: str, value: Any) -> Any:
         if isinstance(value, Mapping):
             return {name: scaled(name, one) for name, one in value.items()}
         if isinstance(value, list):
             return [scaled(key, one) for one in value]
-        return value * factor if key.endswith("_mm") else value
+        if isinstance(value, float | int):
+            return round(float(value) * (factor if key.endswith("_mm") else 1.0), _DECIMALS)
+        return value
 
-    return rounded_mark({key: scaled(key, value) for key, value in mark.items()})
-
-
-def rounded_mark(mark: MarkJson) -> MarkJson:
-    """Round all numbers of a mark to 0.1 µm."""
-
-    def rounded(value: Any) -> Any:
-        if isinstance(value, Mapping):
-            return {name: rounded(one) for name, one in value.items()}
-        if isinstance(value, list):
-            return [rounded(one) for one in value]
-        return round(float(value), _DECIMALS) if isinstance(value, float | int) else value
-
-    return {key: rounded(value) for key, value in mark.items()}
+    return {key: scaled(key, value) for key, value in mark.items()}

@@ -1,7 +1,7 @@
 """Identification of the camera of a scan: every camera with drawn marks is tried, at reduced size."""
 
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -275,35 +275,35 @@ def _first_that_stand_out(
     pitch_um: tuple[float, float] | None,
     count: Count,
 ) -> tuple[list[Trial], Mapping[Names, Tried]]:
-    """Try likely layouts, all at the given pitch, with non-square pixels, at any pitch, until one stands out."""
-    if likely:
-        trials, tries = _try_pitch(search, likely, pitch_um, count)
-        if any(trial.stands_out and trial.expected <= CAMERA_BY_CHANCE for trial in trials):
-            return trials, tries
+    """Trials of the first attempt in which a layout stands out, else of the last one."""
+    trials, tries = list[Trial](), dict[Names, Tried]()
+    for tries, most in _attempts(search, layouts, likely, pitch_um, count):
+        trials = _trials(search, tries, count)
+        if any(trial.stands_out and trial.expected <= most for trial in trials):
+            break
+    return trials, tries
+
+
+def _attempts(
+    search: LayoutSearch,
+    layouts: Mapping[Names, FiducialLayout],
+    likely: Mapping[Names, FiducialLayout],
+    pitch_um: tuple[float, float] | None,
+    count: Count,
+) -> Iterator[tuple[dict[Names, Tried], float]]:
+    """Yield tries of likely layouts, then of all at the given pitch, with non-square pixels and at any pitch; with the
+    largest expected number of false alarms for which one of them ends the search."""
+    if likely and pitch_um is None:
+        yield _at_any_pitch(search, likely, count), CAMERA_BY_CHANCE
     if pitch_um is not None:
-        trials, given = _try_pitch(search, layouts, pitch_um, count)
-        if any(trial.stands_out for trial in trials):
-            return trials, given
+        for some, most in ((likely, CAMERA_BY_CHANCE), (layouts, np.inf)):
+            given = _each(some, partial(search.try_pitch, pitch_um=pitch_um), count)
+            if any(each.answer.expected <= CAMERA_BY_CHANCE for each in given.values()):
+                yield given, most
         longer = _each(layouts, partial(search.longer_one_way, pitch_um=pitch_um), count)
-        likelier = {
-            names: longer[names] if longer[names].answer.expected < each.answer.expected else each
-            for names, each in given.items()
-        }
-        trials = _trials(search, likelier, count)
-        if any(trial.stands_out for trial in trials):
-            return trials, likelier
-    return _try_any_pitch(search, layouts, count)
-
-
-def _try_pitch(
-    search: LayoutSearch, layouts: Mapping[Names, FiducialLayout], pitch_um: tuple[float, float] | None, count: Count
-) -> tuple[list[Trial], Mapping[Names, Tried]]:
-    """Trials at the given pitch, or any; none where all expected numbers of false alarms exceed the limit."""
-    if pitch_um is None:
-        return _try_any_pitch(search, layouts, count)
-    given = _each(layouts, partial(search.try_pitch, pitch_um=pitch_um), count)
-    is_beyond_chance = any(each.answer.expected <= CAMERA_BY_CHANCE for each in given.values())
-    return _trials(search, given, count) if is_beyond_chance else [], given
+        pairs = {names: (each, longer[names]) for names, each in given.items()}
+        yield {names: min(pair, key=lambda each: each.answer.expected) for names, pair in pairs.items()}, np.inf
+    yield _at_any_pitch(search, layouts, count), np.inf
 
 
 def _each(
@@ -316,14 +316,12 @@ def _each(
     return tries
 
 
-def _try_any_pitch(
-    search: LayoutSearch, layouts: Mapping[Names, FiducialLayout], count: Count
-) -> tuple[list[Trial], Mapping[Names, Tried]]:
-    """Trials without a pitch: each layout determines its own, and the best ones are refined at it."""
+def _at_any_pitch(search: LayoutSearch, layouts: Mapping[Names, FiducialLayout], count: Count) -> dict[Names, Tried]:
+    """Tries without a pitch: each layout determines its own, and the best ones are refined at it."""
     tries = _each(layouts, search.try_any_pitch, count)
     least = sorted({each.answer.expected for each in tries.values()})[:_FEW]
     best = {names: search.refined(each) for names, each in tries.items() if each.answer.expected in least}
-    return _trials(search, tries | best, count), tries | best
+    return tries | best
 
 
 def _trials(search: LayoutSearch, tries: Mapping[Names, Tried], count: Count) -> list[Trial]:

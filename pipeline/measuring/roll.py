@@ -15,7 +15,7 @@ from measure.fiducials.scan_orientation import DECIDED, TOLD
 from measure.flags import Code, Reason, Status
 from measure.geometry import POSES, pose_in_camera, up_from_camera
 from measure.marks.shapes import WrittenPlace
-from measure.results import FrameMeasurement, Pose
+from measure.results import FrameMeasurement, Kind, Pose
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.scan_task import Measure, ScanOptions, ScanTask, sample_names
 from pipeline.progress import Reporter
@@ -245,34 +245,31 @@ def check_repeated_views(scans: Sequence[MeasuredScan], is_board: bool) -> list[
         if apart_px.min(initial=np.inf) < (_SAME_VIEW * sides_px[row] if is_board else _SAME_SCAN_PX):
             nearest, least_px = kept[int(apart_px.argmin())], max(float(apart_px.min()), 0.1)
             has_targets = bool((is_known[nearest] & is_known[row])[is_target].any())
-            as_repeated = _repeated_view if is_board else _stored_twice if has_targets else _same_places
-            repeated[row] = as_repeated(scans[row], scans[nearest], least_px)
+            repeated[row] = _repeated(scans[row], scans[nearest], least_px, is_board, has_targets)
         else:
             kept.append(row)
     return [repeated.get(row, scan) for row, scan in enumerate(scans)]
 
 
-def _same_places(scan: MeasuredScan, original: MeasuredScan, apart_px: float) -> MeasuredScan:
-    sentence = (
-        f"its marks lie where those of {original.frame.image} do, to within {apart_px:.1f} px: both are the same scan "
-        "(or rectified to the same places), and its marks count twice. Name one of both in `exclude`."
-    )
+def _repeated(
+    scan: MeasuredScan, original: MeasuredScan, apart_px: float, is_board: bool, is_sure: bool
+) -> MeasuredScan:
+    """Scan that repeats another one; its marks, of a board its points, are rejected if that is sure."""
+    first, within = original.frame.image, f"to within {apart_px:.1f} px"
+    if is_board:
+        what = f"it shows the board where {first} does {within}"
+        sentence = f"{what}: its points count once. Move the board or the camera from picture to picture."
+    elif is_sure:
+        what = f"its marks, targets too, lie where those of {first} do, {within}: both are the same scan"
+        sentence = f"{what}, and its marks count once. To use this one, name {first} in `exclude`."
+    else:
+        what = f"its marks lie where those of {first} do, {within}: both are the same scan"
+        twice = "its marks count twice. Name one of both in `exclude`."
+        sentence = f"{what} (or rectified to the same places), and {twice}"
+    if is_board or is_sure:
+        kind: Kind | None = "target" if is_board else None
+        scan = scan.restated(kind, Status.REJECTED, Reason(f"{what}, which counts", Code.COPY))
     return scan.changed(problems=[Reason(sentence, Code.COPY)])
-
-
-def _stored_twice(scan: MeasuredScan, original: MeasuredScan, apart_px: float) -> MeasuredScan:
-    first = original.frame.image
-    what = f"its marks, targets too, lie where those of {first} do, to within {apart_px:.1f} px: both are the same scan"
-    sentence = f"{what}, and its marks count once. To use this one, name {first} in `exclude`."
-    rejected = scan.restated(None, Status.REJECTED, Reason(f"{what}, which counts", Code.COPY))
-    return rejected.changed(problems=[Reason(sentence, Code.COPY)])
-
-
-def _repeated_view(scan: MeasuredScan, original: MeasuredScan, apart_px: float) -> MeasuredScan:
-    what = f"it shows the board where {original.frame.image} does to within {apart_px:.1f} px"
-    remedy = "its points count once. Move the board or the camera from picture to picture."
-    rejected = scan.restated("target", Status.REJECTED, Reason(f"{what}, which counts", Code.COPY))
-    return rejected.changed(problems=[Reason(f"{what}: {remedy}", Code.COPY)])
 
 
 def note_same_frames(scans: Sequence[MeasuredScan], part_of: Callable[[str], str]) -> list[MeasuredScan]:

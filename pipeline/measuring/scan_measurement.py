@@ -29,7 +29,7 @@ from pipeline.measuring.target_identification import misplaced_principal_point
 from pipeline.measuring.target_stage import measure_targets
 from pipeline.provenance import parts_hash
 from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan
-from pipeline.results.thumbnail import StoredThumbnail, TakenThumbnails
+from pipeline.results.thumbnail import ThumbnailRow, thumbnail_rows
 from pipeline.text.wording import capitalised
 
 SecondPass = Callable[[Scan, MeasuredScan], None]
@@ -241,14 +241,14 @@ class MeasuredFile:
     scan: MeasuredScan
     parts_hash: str
     bytes_read: int
-    thumbnails: tuple[StoredThumbnail, ...] = ()
+    thumbnails: tuple[ThumbnailRow, ...] = ()
 
 
 def measure_file(task: ScanTask) -> MeasuredFile:
     """Measure the scan of a task. Raises nothing but interrupts, like `measured_scan`."""
     before = _bytes_read()
-    thumbnails = TakenThumbnails()
-    scan = measured_scan(task, thumbnails.take)
+    thumbnails = list[ThumbnailRow]()
+    scan = measured_scan(task, lambda opened, measured: thumbnails.extend(thumbnail_rows(opened, measured)))
     bytes_read = _bytes_read() - before if before >= 0 else -1
     parts = parts_hash(scan_path(task.scan)) if task.scan else ""
     return MeasuredFile(scan, parts, bytes_read, tuple(thumbnails))

@@ -2,9 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
+import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from adjust.functional_model.lens import Lens
@@ -19,14 +20,11 @@ from pipeline.results.comparator_file import comparator_from_pixel, pixel_from_c
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.types import Array, Indices, Mask
 
-ComplexArray = NDArray[np.complex128]  # places in the plane: x + iy
-
 _SCALE, _TURN_RAD = 0.15, 0.15  # tolerances of a predicted pattern: relative change of scale, rotation
 _DISTORTION = 0.03  # residuals after these, due to tilt and relief, as a fraction of the pattern's size
 _AS_GOOD = 0.95  # of the most targets: of such placements of a regular grid, the nearest to the prediction is taken
 _NEAREST = 0.35  # fraction of them that an affine transformation leaves
-_PAIRS = 60  # distant pairs of targets that generate hypotheses on the placement
-_TESTED, _REFINED = 400, 8  # hypotheses that are tested on all targets, and that are refined
+_STEPS = 7  # scales and rotations tried within the tolerances
 _SIGMA_PX = 0.5  # px, of a candidate, including locally varying effects of eccentricity and lens
 _FOUND_WITHIN_PX = 2.0  # px, largest shift of the fit from the candidate
 _STRAYS = 1.5  # candidates per target, the strongest: dust and texture are weaker than painted targets
@@ -40,7 +38,8 @@ _IN_THE_PICTURE = 0.4  # of the scan's size: largest offset of the principal poi
 def recognise(predicted_px: Array, found_px: Array, shift_px: float) -> dict[int, int]:
     """Lay a predicted pattern (n, 2) on candidates (m, 2), most places on candidates, false alarm or not.
 
-    Similarities that map distant pairs of targets onto pairs of candidates are refined to affine transformations.
+    The pattern is scaled and turned in steps; the shifts from its places to candidates vote. Of the shifts with about
+    the most votes, the smallest is refined to an affine transformation.
 
     Returns
     -------
@@ -49,94 +48,43 @@ def recognise(predicted_px: Array, found_px: Array, shift_px: float) -> dict[int
     """
     if min(len(predicted_px), len(found_px)) < 3:
         return {}
-    scales, shifts = _similarities(_complex(predicted_px), _complex(found_px), shift_px)
-    if not len(scales):
+    middle, gate_px = predicted_px.mean(axis=0), _DISTORTION * float(np.linalg.norm(np.ptp(predicted_px, axis=0)))
+    edges = np.arange(-shift_px - gate_px, shift_px + 2.0 * gate_px, gate_px / 2.0)
+    placements, votes = list[Array](), list[float]()
+    for scale, turn in product(np.linspace(-_SCALE, _SCALE, _STEPS), np.linspace(-_TURN_RAD, _TURN_RAD, _STEPS)):
+        cosine, sine = (1.0 + scale) * np.cos(turn), (1.0 + scale) * np.sin(turn)
+        places = (predicted_px - middle) @ np.array([[cosine, sine], [-sine, cosine]]) + middle
+        shifts = (found_px[None] - places[:, None]).reshape(-1, 2)
+        counts = cv2.blur(
+            np.histogram2d(shifts[:, 0], shifts[:, 1], bins=[edges, edges])[0], (3, 3), borderType=cv2.BORDER_CONSTANT
+        )
+        for column, row in np.argwhere(counts >= _AS_GOOD * counts.max()):
+            shift = np.array([edges[column], edges[row]]) + gate_px / 4.0
+            if np.hypot(*shift) <= shift_px:
+                placements.append(places + shift)
+                votes.append(float(counts[column, row]))
+    if not placements:
         return {}
-    tree, gate_px = cKDTree(found_px), _DISTORTION * float(np.linalg.norm(np.ptp(predicted_px, axis=0)))
-    placements = _plane(scales[:, None] * _complex(predicted_px) + shifts[:, None])
-    counts = np.array([_hits(places, tree, gate_px)[0].sum() for places in placements])
-    order = np.lexsort((_off_px(placements, predicted_px), -np.minimum(counts, _AS_GOOD * counts.max())))
-    refined = [_tightened(places, predicted_px, found_px, tree, gate_px) for places in placements[order[:_REFINED]]]
-    scores = np.array([_score(places, tree, gate_px) for places in refined])
-    as_good = np.array(refined)[scores >= _AS_GOOD * scores.max()]
-    chosen = as_good[_off_px(as_good, predicted_px).argmin()]
-    hit, _, nearest = _hits(chosen, tree, _NEAREST * gate_px)
+    as_good = np.array(placements)[np.array(votes) >= _AS_GOOD * max(votes)]
+    off_px = np.median(np.linalg.norm(as_good - predicted_px, axis=2), axis=1)
+    places, tree = as_good[off_px.argmin()], cKDTree(found_px)
+    design = np.column_stack([predicted_px, np.ones(len(predicted_px))])
+    for share in (1.0, 0.7, 0.5, _NEAREST, _NEAREST):
+        hit, nearest = _hits(places, tree, share * gate_px)
+        if hit.sum() < 4:
+            break
+        places = design @ np.linalg.lstsq(design[hit], found_px[nearest[hit]], rcond=None)[0]
+    hit, nearest = _hits(places, tree, _NEAREST * gate_px)
     return dict(zip(nearest[hit].tolist(), np.flatnonzero(hit).tolist(), strict=True))
 
 
-def _off_px(placements: Array, predicted_px: Array) -> Array:
-    """(k,) median distances of placements (k, n, 2) from the predicted places."""
-    return np.asarray(np.median(np.linalg.norm(placements - predicted_px, axis=2), axis=1))
-
-
-def _similarities(predicted: ComplexArray, found: ComplexArray, shift_px: float) -> tuple[ComplexArray, ComplexArray]:
-    """Scales (with rotation) and shifts that map a distant pair of targets onto a pair of candidates."""
-    # Of many, those with the most similar ones, in terms of the places of the pattern's corners, are returned.
-    first, second = _long_pairs(predicted)
-    start, end = np.nonzero(~np.eye(len(found), dtype=bool))
-    across, between = predicted[second] - predicted[first], found[end] - found[start]
-    pairs = cKDTree(_plane(between))
-    near = pairs.query_ball_point(_plane(across), np.abs(across) * np.hypot(_SCALE, _TURN_RAD))
-    row, pair = np.repeat(np.arange(len(near)), list(map(len, near))), np.concatenate(near).astype(np.intp)
-    scales = between[pair] / across[row]
-    shifts = found[start[pair]] - scales * predicted[first[row]]
-    allowed = np.abs(scales * predicted.mean() + shifts - predicted.mean()) <= shift_px
-    scales, shifts = scales[allowed], shifts[allowed]
-    if len(scales) > _TESTED:
-        x, y = predicted.real, predicted.imag
-        corners = np.array([x.min() + 1j * y.min(), x.max() + 1j * y.max()])
-        places = _plane(scales[:, None] * corners + shifts[:, None]).reshape(-1, 4)
-        tolerance = 0.02 * float(np.linalg.norm(np.ptp(_plane(found), axis=0)))
-        votes = cKDTree(places).query_ball_point(places, tolerance, return_length=True)
-        chosen = np.argsort(-votes, kind="stable")[:_TESTED]
-        scales, shifts = scales[chosen], shifts[chosen]
-    return scales, shifts
-
-
-def _complex(places: Array) -> ComplexArray:
-    return np.asarray(places[:, 0] + 1j * places[:, 1], dtype=np.complex128)
-
-
-def _plane(points: ComplexArray) -> Array:
-    """(..., 2) real and imaginary parts."""
-    return np.stack([points.real, points.imag], axis=-1)
-
-
-def _long_pairs(points: ComplexArray) -> tuple[Indices, Indices]:
-    """The longest pairs, with a limited number per point."""
-    first, second = np.triu_indices(len(points), 1)
-    uses, chosen = np.zeros(len(points), dtype=int), list[int]()
-    for k in np.argsort(-np.abs(points[second] - points[first]), kind="stable"):
-        if uses[first[k]] < 6 and uses[second[k]] < 6 and len(chosen) < _PAIRS:
-            uses[[first[k], second[k]]] += 1
-            chosen.append(k)
-    return first[chosen], second[chosen]
-
-
-def _hits(places: Array, tree: cKDTree, gate_px: float) -> tuple[Mask, Array, Indices]:
-    """Mask of the targets with a candidate within the gate, each candidate once; distance and index of the nearest."""
+def _hits(places: Array, tree: cKDTree, gate_px: float) -> tuple[Mask, Indices]:
+    """Mask of the targets with a candidate within the gate, each candidate once; index of the nearest candidate."""
     distances, nearest = (np.ravel(each) for each in tree.query(places))
     order = np.argsort(distances, kind="stable")
     once = np.zeros(len(places), dtype=bool)
     once[order[np.unique(nearest[order], return_index=True)[1]]] = True
-    return once & (distances <= gate_px), distances, nearest
-
-
-def _tightened(places: Array, predicted: Array, found: Array, tree: cKDTree, gate_px: float) -> Array:
-    """Places after affine fits with a decreasing gate."""
-    design = np.column_stack([predicted, np.ones(len(predicted))])
-    for share in (1.0, 0.7, 0.5, _NEAREST, _NEAREST):
-        hit, _, nearest = _hits(places, tree, share * gate_px)
-        if hit.sum() < 4:
-            break
-        places = design @ np.linalg.lstsq(design[hit], found[nearest[hit]], rcond=None)[0]
-    return places
-
-
-def _score(places: Array, tree: cKDTree, gate_px: float) -> float:
-    """Number of targets explained, with weights that decrease with distance."""
-    hit, distances, _ = _hits(places, tree, gate_px)
-    return float(np.sum(1.0 - (distances[hit] / gate_px) ** 2))
+    return once & (distances <= gate_px), nearest
 
 
 def likely_diameters_px(field: Field, measured: MeasuredScan) -> tuple[float, float]:

@@ -13,11 +13,10 @@ from adjust.functional_model.lens import Prior
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.problem.camera import Camera
 from adjust.problem.estimates import adjusted_image
-from adjust.problem.network import EXTERIOR_NAMES, Image, Network, ObjectPoint
+from adjust.problem.network import EXTERIOR_NAMES, Image, ObjectPoint
 from adjust.problem.parameter import Kind, Parameter
 from adjust.quality.lens_uncertainty import projection_uncertainty
 from adjust.quality.reliability import Reliability, Suspect
-from adjust.quality.run import FurtherResidual
 from adjust.quality.significance import CalibrationTest, SignificanceTest
 from adjust.quality.tested import Tested
 from adjust.solution.result import Adjustment
@@ -61,9 +60,12 @@ from pipeline.results.assessment_record import (
 )
 from pipeline.results.covariance_file import covariance_note
 from pipeline.results.record_json import record_from
-from pipeline.types import Array, Indices
+from pipeline.types import Array
 
-_UM_PER_MM = 1000.0
+ANGLES = ("omega", "phi", "kappa", "angle")
+DEG_PER_RAD = 180.0 / math.pi
+UM_PER_MM = 1e3
+MOST_IMAGES = 500  # in larger networks projection_uncertainty takes too long to run with every adjustment
 
 
 def joined_frames(adjustment: Adjustment) -> dict[str, JoinedFrameRecord]:
@@ -81,81 +83,52 @@ def joined_frames(adjustment: Adjustment) -> dict[str, JoinedFrameRecord]:
 
 
 def _frame(adjustment: Adjustment, frame: str, parts: list[Image]) -> JoinedFrameRecord:
-    network = adjustment.network
-    scans = {part.name: _Part(adjustment, part) for part in parts}
-    marks = [row for scan in scans.values() for row in scan.marks()]
+    network, records = adjustment.network, dict[str, PartRecord]()
+    marks, camera_mm = list[PartMarkRecord](), dict[int, Array]()
+    for part in parts:
+        records[part.name], own = _part(adjustment, part, camera_mm)
+        marks += own
     joins = []
     for (owner, point), rows in network.joins.items():
         if owner == frame:
-            names = [network.observations.image[row] for row in rows]
-            places = [scans[name].camera_mm([row])[0] for name, row in zip(names, rows.tolist(), strict=True)]
-            apart_um = _UM_PER_MM * (places[1] - places[0])
-            middle = np.mean(places, axis=0)
-            joins.append(JoinRecord(point, tuple(names), *middle.tolist(), *apart_um.tolist()))
-    known = {name: PartRecord(scan.corner_sigma_um()) for name, scan in scans.items()}
-    return JoinedFrameRecord(known, tuple(joins), tuple(marks))
+            names = tuple(network.observations.image[row] for row in rows)
+            first, second = (camera_mm[row] for row in rows.tolist())
+            apart_um, middle = UM_PER_MM * (second - first), (first + second) / 2.0
+            joins.append(JoinRecord(point, names, *middle.tolist(), *apart_um.tolist()))
+    return JoinedFrameRecord(records, tuple(joins), tuple(marks))
 
 
-class _Part:
-    """Adjusted partial scan of a frame."""
+def _part(adjustment: Adjustment, image: Image, camera_mm: dict[int, Array]) -> tuple[PartRecord, list[PartMarkRecord]]:
+    """Records of a partial scan and its marks, whose camera coordinates by the film transformation are added by row.
 
-    def __init__(self, adjustment: Adjustment, image: Image) -> None:
-        self.adjustment, self.image = adjustment, image
-        self.model = adjusted_image(adjustment, image.name)
-        film = [Parameter.film(image.name, name) for name in film_parameter_names(image.transformation)]
-        self.film_covariance = adjustment.sigma0**2 * adjustment.cofactor_of(film)
-
-    def camera_mm(self, rows: list[int] | Indices) -> Array:
-        """(n, 2) camera coordinates of observations by the film transformation."""
-        return np.asarray(self.model.camera_from_comparator(self.adjustment.network.observations.xy_mm[rows]))
-
-    def marks(self) -> list[PartMarkRecord]:
-        """Marks that are observations. Tie points and fiducials have adjusted coordinates. Targets have measured ones;
-        their covariance is that of the measurement plus that of the film transformation, taken as independent."""
-        network = self.adjustment.network
-        rows = np.flatnonzero(network.image_numbers == network.images.index(self.image))
-        observations = network.observations
-        measured, film = self.camera_mm(rows), self._film_covariances(observations.xy_mm[rows])
-        gradient = self.model.camera_by_comparator(observations.xy_mm[rows])
-        noise = gradient @ observations.covariance_mm2[rows] @ gradient.swapaxes(1, 2)
-        found = []
-        for k, row in enumerate(rows.tolist()):
-            place, covariance = measured[k], self.adjustment.sigma0**2 * noise[k] + film[k]
-            if own := _own_unknowns(network, self.image, row):
-                place = self.adjustment.values_of(own)
-                covariance = self.adjustment.sigma0**2 * self.adjustment.cofactor_of(own)
-            sx, sy = np.sqrt(np.diag(covariance))
-            rho = float(covariance[0, 1] / (sx * sy)) if sx * sy > 0.0 else 0.0
-            named = self.image.name, observations.point[row], observations.kind[row]
-            found.append(PartMarkRecord(*named, float(place[0]), float(place[1]), float(sx), float(sy), rho))
-        return found
-
-    def corner_sigma_um(self) -> float:
-        """Largest standard deviation of the film transformation at the corners of the observations' bounding box."""
-        xy_mm = self.adjustment.network.observations.xy_mm
-        rows = self.adjustment.network.image_numbers == self.adjustment.network.images.index(self.image)
-        low, high = xy_mm[rows].min(axis=0), xy_mm[rows].max(axis=0)
-        corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])])
-        return float(_UM_PER_MM * np.sqrt(np.linalg.eigvalsh(self._film_covariances(corners))[:, -1].max()))
-
-    def _film_covariances(self, xy_mm: Array) -> Array:
-        """(n, 2, 2) covariances of camera coordinates at (n, 2), propagated from the film transformation."""
-        by_parameters = self.model.film.design(xy_mm)
-        return np.asarray(by_parameters @ self.film_covariance @ by_parameters.swapaxes(1, 2))
-
-
-def _own_unknowns(network: Network, image: Image, row: int) -> list[Parameter]:
-    """Unknowns that are the camera coordinates of an observation; empty for a target."""
-    kind, point = network.observations.kind[row], network.observations.point[row]
-    if kind == "join":
-        return [Parameter.join(image.frame, point, axis) for axis in "xy"]
-    return [Parameter.fiducial(image.camera, point, axis) for axis in "xy"] if kind == "fiducial" else []
-
-
-ANGLES = ("omega", "phi", "kappa", "angle")
-DEG_PER_RAD = 180.0 / math.pi
-UM_PER_MM = 1e3
-MOST_IMAGES = 500  # in larger networks projection_uncertainty takes too long to run with every adjustment
+    Tie points and fiducials have adjusted coordinates. Targets have measured ones; their covariance is that of the
+    measurement plus that of the film transformation, taken as independent.
+    """
+    network, model = adjustment.network, adjusted_image(adjustment, image.name)
+    observations, variance = network.observations, adjustment.sigma0**2
+    rows = np.flatnonzero(network.image_numbers == network.images.index(image))
+    xy_mm = observations.xy_mm[rows]
+    limits = np.array([xy_mm.min(axis=0), xy_mm.max(axis=0)])
+    corners = np.array([[x, y] for x in limits[:, 0] for y in limits[:, 1]])
+    film = [Parameter.film(image.name, name) for name in film_parameter_names(image.transformation)]
+    by_film = model.film.design(np.vstack([xy_mm, corners]))
+    of_film = by_film @ (variance * adjustment.cofactor_of(film)) @ by_film.swapaxes(1, 2)
+    gradient = model.camera_by_comparator(xy_mm)
+    noise = variance * (gradient @ observations.covariance_mm2[rows] @ gradient.swapaxes(1, 2))
+    camera_mm |= dict(zip(rows.tolist(), model.camera_from_comparator(xy_mm), strict=True))
+    marks = []
+    for row, covariance in zip(rows.tolist(), noise + of_film[:-4], strict=True):
+        place, kind, point = camera_mm[row], observations.kind[row], observations.point[row]
+        own = {
+            "join": [Parameter.join(image.frame, point, axis) for axis in "xy"],
+            "fiducial": [Parameter.fiducial(image.camera, point, axis) for axis in "xy"],
+        }.get(kind)
+        if own:
+            place, covariance = adjustment.values_of(own), variance * adjustment.cofactor_of(own)
+        sx, sy = np.sqrt(np.diag(covariance)).tolist()
+        rho = float(covariance[0, 1] / (sx * sy)) if sx * sy > 0.0 else 0.0
+        marks.append(PartMarkRecord(image.name, point, kind, float(place[0]), float(place[1]), sx, sy, rho))
+    return PartRecord(float(UM_PER_MM * np.sqrt(np.linalg.eigvalsh(of_film[-4:])[:, -1].max()))), marks
 
 
 def adjustment_record(
@@ -167,7 +140,7 @@ def adjustment_record(
     network, variance = adjustment.network, adjustment.variance
     used = {image.camera for image in network.images}
     sizes_mm = frames_mm or {}
-    reliability = adjustment.reliability
+    reliability, further = adjustment.reliability, _further(adjustment)
     return record_from(
         AdjustmentRecord,
         adjustment,
@@ -210,11 +183,19 @@ def adjustment_record(
         residuals=_residuals(adjustment),
         refraction=network.line_of_sight.refraction,
         earth_curvature=network.line_of_sight.curvature,
-        distances=_distances(adjustment),
-        fiducial_distances=_fiducial_distances(adjustment),
-        calibrations=_observed(adjustment, "calibration"),
+        distances=tuple(
+            DistanceRecord(each.start, each.end, *numbers)
+            for each, (_, numbers) in zip(network.distances, further["distance"], strict=True)
+        ),
+        fiducial_distances=tuple(
+            FiducialDistanceRecord(camera, each.start, each.end, *numbers)
+            for (camera, each), (_, numbers) in zip(
+                network.observed_distances, further["fiducial distance"], strict=True
+            )
+        ),
+        calibrations=tuple(ObservedQuantity(name, *numbers) for name, numbers in further["calibration"]),
         calibration_tests=tuple(map(_contradiction, adjustment.contradictions)),
-        antennas=_observed(adjustment, "antenna"),
+        antennas=tuple(ObservedQuantity(name, *numbers) for name, numbers in further["antenna"]),
     )
 
 
@@ -395,29 +376,14 @@ def _larger(w: Array) -> float:
     return float(known[np.argmax(np.abs(known))]) if known.size else math.nan
 
 
-def _distances(adjustment: Adjustment) -> tuple[DistanceRecord, ...]:
-    rows = (row for row in adjustment.further if row.group == "distance")
-    return tuple(
-        DistanceRecord(given.start, given.end, *_numbers(row))
-        for given, row in zip(adjustment.network.distances, rows, strict=True)
-    )
-
-
-def _fiducial_distances(adjustment: Adjustment) -> tuple[FiducialDistanceRecord, ...]:
-    rows = (row for row in adjustment.further if row.group == "fiducial distance")
-    in_um = (replace(row, v=UM_PER_MM * row.v, detectable=UM_PER_MM * row.detectable) for row in rows)
-    return tuple(
-        FiducialDistanceRecord(camera, each.start, each.end, *_numbers(row))
-        for (camera, each), row in zip(adjustment.network.observed_distances, in_um, strict=True)
-    )
-
-
-def _observed(adjustment: Adjustment, group: str) -> tuple[ObservedQuantity, ...]:
-    return tuple(ObservedQuantity(row.name, *_numbers(row)) for row in adjustment.further if row.group == group)
-
-
-def _numbers(row: FurtherResidual) -> tuple[float, ...]:
-    return row.observed, row.sigma, row.v, row.redundancy, row.w, row.detectable
+def _further(adjustment: Adjustment) -> dict[str, list[tuple[str, tuple[float, ...]]]]:
+    """Names and numbers of the observations that are no marks, by group; fiducial distances in mm and µm."""
+    rows = defaultdict[str, list[tuple[str, tuple[float, ...]]]](list)
+    for row in adjustment.further:
+        scale = UM_PER_MM if row.group == "fiducial distance" else 1.0
+        numbers = row.observed, row.sigma, scale * row.v, row.redundancy, row.w, scale * row.detectable
+        rows[row.group].append((row.name, numbers))
+    return rows
 
 
 def _contradiction(test: CalibrationTest) -> ContradictionRecord:

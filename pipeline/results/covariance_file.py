@@ -82,10 +82,9 @@ def covariance_arrays(adjustment: Adjustment) -> dict[str, NDArray[np.generic]]:
     diagonal blocks, without covariances between them: point_names (p, 3), point_values (p, 3), point_matrices
     (p, 3, 3), image_names (i, k) and so on, padded with empty names and zeros for images with fewer than k quantities.
     """
-    parts = _parts(adjustment)
-    whole = _named(adjustment, parts.whole)
-    arrays = whole | {"matrix": adjustment.sigma0**2 * adjustment.cofactor.part(parts.whole)}
-    for kind, groups in parts.groups.items():
+    whole, blocks = _parts(adjustment)
+    arrays = _named(adjustment, whole) | {"matrix": adjustment.sigma0**2 * adjustment.cofactor.part(whole)}
+    for kind, groups in blocks.items():
         padded = np.full((len(groups), max(map(len, groups))), -1, dtype=np.intp)
         for row, group in zip(padded, groups, strict=True):
             row[: len(group)] = group
@@ -110,7 +109,7 @@ def _cluster_arrays(adjustment: Adjustment) -> dict[str, NDArray[np.generic]]:
 
 def covariance_note(adjustment: Adjustment) -> str:
     """State which parts of the covariance the file holds."""
-    count, alone = len(adjustment.parameters), " and every ".join(_parts(adjustment).groups)
+    count, alone = len(adjustment.parameters), " and every ".join(_parts(adjustment)[1])
     if not alone:
         return "adjustment.npz holds the covariance of all quantities."
     whole = "cameras" if "image" in alone else "cameras and images"
@@ -120,15 +119,8 @@ def covariance_note(adjustment: Adjustment) -> str:
     )
 
 
-@dataclass(frozen=True)
-class _Parts:
-    """Positions of quantities. whole: those in the matrix; groups: by kind, those of each diagonal block."""
-
-    whole: Indices
-    groups: dict[str, list[Indices]]
-
-
-def _parts(adjustment: Adjustment) -> _Parts:
+def _parts(adjustment: Adjustment) -> tuple[Indices, dict[str, list[Indices]]]:
+    """Positions of the quantities in the matrix, and by kind of those in each diagonal block."""
     parameters = adjustment.parameters
     whole = np.arange(len(parameters))
     groups: dict[str, list[Indices]] = {}
@@ -141,7 +133,7 @@ def _parts(adjustment: Adjustment) -> _Parts:
         begins = [j for j, i in enumerate(positions) if parameters[i].quantity == first]
         groups[kind] = np.split(positions, begins[1:])
         whole = whole[~members]
-    return _Parts(whole, groups)
+    return whole, groups
 
 
 def _named(adjustment: Adjustment, positions: Indices) -> dict[str, NDArray[np.generic]]:

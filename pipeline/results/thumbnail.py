@@ -1,6 +1,5 @@
 """Thumbnails of a scan, cut while it is decoded for measurement: a window around each mark, and the whole scan."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -16,7 +15,7 @@ _FIDUCIAL_PX, _TARGET_PX = 81, 41  # px, smallest width of a window
 _SHOWN_PX = 96  # px, larger windows are reduced to about this width
 _REACH_SIZES = 2.0  # width of a window in widths of the mark
 _WHOLE_PX = 480  # px, largest side of the thumbnail of the whole scan
-_WHOLE = ("", "frame")  # point and kind of the thumbnail of the whole scan
+WHOLE: tuple[str, str] = ("", "frame")  # point and kind of the thumbnail of the whole scan
 _CLIPPED = 0.1  # per cent of the pixels clipped at each end of the grey values
 _QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 75]
 
@@ -45,36 +44,29 @@ class Thumbnail:
         if not self.step_px > 0.0:
             raise ValueError(f"step_px must be positive, not {self.step_px}")
 
-    @property
-    def jpeg(self) -> bytes:
-        """JPEG in 8 bits, with stretched grey values."""
-        return bytes(cv2.imencode(".jpg", np.rint(stretch(self.pixels)).astype(np.uint8), _QUALITY)[1])
+    def row(self, point: str, kind: str) -> "ThumbnailRow":
+        """Stored form: a JPEG in 8 bits, with stretched grey values. point, kind: of the mark."""
+        jpeg = cv2.imencode(".jpg", np.rint(stretch(self.pixels)).astype(np.uint8), _QUALITY)[1]
+        return point, kind, *self.origin_px, self.step_px, bytes(jpeg)
+
+    @classmethod
+    def from_row(cls, row: "ThumbnailRow") -> "Thumbnail":
+        """Inverse of `row`."""
+        _, _, col_px, row_px, step_px, jpeg = row
+        pixels = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+        return cls(np.asarray(pixels), (col_px, row_px), step_px)
 
 
-@dataclass(frozen=True)
-class StoredThumbnail:
-    """Encoded thumbnail. point, kind: of the mark; "" and "frame" for the whole scan."""
-
-    point: str
-    kind: str
-    origin_px: tuple[float, float]
-    step_px: float
-    jpeg: bytes
-
-    @property
-    def thumbnail(self) -> Thumbnail:
-        pixels = cv2.imdecode(np.frombuffer(self.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
-        return Thumbnail(np.asarray(pixels), self.origin_px, self.step_px)
+ThumbnailRow = tuple[str, str, float, float, float, bytes]  # point, kind, column and row of the origin, step, JPEG
 
 
-class TakenThumbnails(list[StoredThumbnail]):
-    """Collector of the thumbnails of scans while they are open."""
-
-    def take(self, scan: Scan, measured: MeasuredScan) -> None:
-        """Take those of the marks, and of the whole scan if a reduced image was decoded."""
-        taken: list[tuple[tuple[str, str], Thumbnail | None]] = [(_WHOLE, whole) for whole in _whole(scan)]
-        taken += [((mark.point, mark.kind), cut(scan, mark)) for mark in measured.frame.marks]
-        self += (StoredThumbnail(*name, each.origin_px, each.step_px, each.jpeg) for name, each in taken if each)
+def thumbnail_rows(scan: Scan, measured: MeasuredScan) -> list[ThumbnailRow]:
+    """Thumbnails of the marks of an open scan, and of the whole scan if a reduced image was decoded."""
+    cuts: list[tuple[tuple[str, str], Thumbnail | None]]
+    cuts = [((mark.point, mark.kind), cut(scan, mark)) for mark in measured.frame.marks]
+    if scan.last_reduction is not None:
+        cuts.insert(0, (WHOLE, _reduced(*scan.last_reduction)))
+    return [each.row(*name) for name, each in cuts if each]
 
 
 def cut(scan: Scan, mark: MarkMeasurement) -> Thumbnail | None:
@@ -96,11 +88,9 @@ def cut(scan: Scan, mark: MarkMeasurement) -> Thumbnail | None:
     return Thumbnail(np.asarray(pixels), (col0 + middle, row0 + middle), float(step))
 
 
-def _whole(scan: Scan) -> Iterator[Thumbnail]:
-    reduction = scan.last_reduction
-    if reduction is not None:
-        factor, grey = reduction
-        step = max(1, -(-max(grey.shape) // _WHOLE_PX))
-        size = grey.shape[1] // step, grey.shape[0] // step
-        pixels = cv2.resize(grey[: size[1] * step, : size[0] * step], size, interpolation=cv2.INTER_AREA)
-        yield Thumbnail(np.asarray(pixels), ((factor * step - 1) / 2.0,) * 2, float(factor * step))
+def _reduced(factor: int, grey: NDArray[np.float32]) -> Thumbnail:
+    """Thumbnail of a whole scan, of which each pixel of `grey` covers `factor` pixels a side."""
+    step = max(1, -(-max(grey.shape) // _WHOLE_PX))
+    size = grey.shape[1] // step, grey.shape[0] // step
+    pixels = cv2.resize(grey[: size[1] * step, : size[0] * step], size, interpolation=cv2.INTER_AREA)
+    return Thumbnail(np.asarray(pixels), ((factor * step - 1) / 2.0,) * 2, float(factor * step))

@@ -14,7 +14,7 @@ import numpy as np
 
 from measure.marks.shapes import Point
 from pipeline.errors import InputError
-from pipeline.files.mark_table import MarkJson, rounded_mark
+from pipeline.files.mark_table import MarkJson, scaled_mark
 from pipeline.types import Array
 
 _LEAST_MM = 1e-3
@@ -89,7 +89,7 @@ def first_drawing(kind: str, size_mm: float) -> MarkJson:
     }
     if kind not in starts:
         raise InputError(f"{kind!r} is no kind of mark; {', '.join(starts)} are.")
-    return rounded_mark({"kind": kind, **starts[kind]})
+    return scaled_mark({"kind": kind, **starts[kind]})
 
 
 def first_part(shape: str, size_mm: float) -> MarkJson:
@@ -103,7 +103,7 @@ def first_part(shape: str, size_mm: float) -> MarkJson:
     }
     if shape not in parts:
         raise InputError(f"{shape!r} is no shape of a part; {', '.join(parts)} are.")
-    return rounded_mark({"shape": shape, **parts[shape]})
+    return scaled_mark({"shape": shape, **parts[shape]})
 
 
 def add_vertex(mark: MarkJson, place_mm: Array) -> MarkJson:
@@ -116,7 +116,7 @@ def add_vertex(mark: MarkJson, place_mm: Array) -> MarkJson:
         along = np.sum((place_mm - starts) * sides, axis=1) / np.maximum(np.sum(sides**2, axis=1), 1e-12)
         nearest = starts + np.clip(along, 0.0, 1.0)[:, None] * sides
         at = int(np.hypot(*(place_mm - nearest).T).argmin()) + 1
-    return rounded_mark({**mark, "vertices_mm": [*vertices[:at], place_mm.tolist(), *vertices[at:]]})
+    return scaled_mark({**mark, "vertices_mm": [*vertices[:at], place_mm.tolist(), *vertices[at:]]})
 
 
 def remove_part(mark: MarkJson, key: str) -> MarkJson:
@@ -163,7 +163,7 @@ def _place(mark: MarkJson, key: str) -> Handle:
 
 
 def _changed(mark: MarkJson, key: str, value: Any) -> MarkJson:
-    return rounded_mark({**mark, key: value})
+    return scaled_mark({**mark, key: value})
 
 
 def _drag_item(mark: MarkJson, key: str, at: int, dragged: Callable[[Array], Any], place: Array) -> MarkJson:

@@ -89,24 +89,10 @@ def test_a_full_disk_takes_all_lines_back(path: Path, tmp_path: Path, monkeypatc
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as broken:
-        broken.setattr("pipeline.files.decisions_file.os.fsync", full)
-        broken.setattr("pipeline.files.decisions_file.write_atomically", lambda file, text: file.write_text(text))
+        broken.setattr("pipeline.text.files.os.fsync", full)
         with pytest.raises(WriteError, match="Nothing was changed there"):
             append_decisions(path, [Decision(f"f{k}", Choice.POSE, pose="90") for k in range(120)])
     assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_lines_that_a_process_was_ended_over_do_not_count(path: Path, tmp_path: Path) -> None:
-    """What stands beside the file then tells where the lines that count end."""
-    append_decisions(path, [mark_decision(Choice.ACCEPT)])
-    size = path.stat().st_size
-    append_decisions(path, [Decision(f"f{k}", Choice.POSE, pose="90") for k in range(120)])
-    path.write_bytes(path.read_bytes()[:5000])  # 74 lines, say, and half of one
-    path.with_name(".decisions.jsonl.size").write_text(str(size))
-    assert read_decisions(path) == (mark_decision(Choice.ACCEPT),)
-    append_decisions(path, [mark_decision(Choice.REJECT)])
-    assert [one.decision for one in read_decisions(path)] == [Choice.ACCEPT, Choice.REJECT]
     assert list(tmp_path.iterdir()) == [path]
 
 

@@ -115,11 +115,9 @@ def test_a_camera_is_known_by_most_samples_and_by_what_its_plate_does_not_contra
     assert "compare the drawings" in kind(group, form).sentence()
     plate = {"camera_type": "Zeiss"}
     assert kind(group, replace(form, plate=plate)).camera == "zeiss-rmk-a-153"
-    solid, lines = (
-        new_project._rests_on_form(kind(group, identify_camera(path, name))) for name in ("arrow-153", "park-153")
-    )
+    solid, lines = (kind(group, identify_camera(path, name)).rests_on_form for name in ("arrow-153", "park-153"))
     assert (solid, lines) == (True, False)
-    assert not new_project._rests_on_form(kind(group, replace(identify_camera(path, "arrow-153"), plate=plate)))
+    assert not kind(group, replace(identify_camera(path, "arrow-153"), plate=plate)).rests_on_form
     both = kind(group, identify_camera(path, "wild-rc30-153", "wild-rc10-153"))
     assert both.camera == "wild-rc10-153"  # by far the more reports
 
