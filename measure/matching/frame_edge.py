@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.special import erf
 
@@ -46,28 +45,38 @@ _DRAWN = 0.005  # fraction of the step: smaller residuals may be errors of the m
 _ROUNDED = 0.1  # fraction of the reach excluded at every corner, since few corners are sharp
 
 
-@dataclass(frozen=True, eq=False)
-class _Edge:
-    """Straight edge: across = offset + slope * along, in px from the start.
+def fit_frame_corner(
+    scan: Scan,
+    mark: FrameCorner,
+    pixel_from_mark: Array,
+    search_px: float,
+    polarity: int,
+    weights: Sequence[float] | None = None,
+) -> MarkFit:
+    """Fit a corner of the exposed frame as the intersection of its two straight edges, excluding the rounded part.
 
-    Attributes
-    ----------
-    line : (2,) offset and slope.
-    covariance : (2, 2) of the line.
-    share, count : fraction and number of the profiles on the line.
-    contrast_dn, noise_dn, blur_px, likeness : medians over these profiles.
-    tone : information on the tone curve, with derivatives of the line in place of a point; None where it is known.
+    pixel_from_mark: predicted place, at most search_px off; polarity: 1 if the frame is lighter than its border, -1 if
+    darker; weights: of the scan's channels.
+
+    Returns
+    -------
+    MarkFit
+        Not converged, with a reason, if either edge is not found.
     """
-
-    line: Array
-    covariance: Array
-    share: float
-    count: int
-    contrast_dn: float
-    noise_dn: float
-    blur_px: float
-    likeness: float
-    tone: MarkTone | None
+    inward = pixel_from_mark[:, :2] * np.array(mark.toward)  # columns: along x', y' into the frame, px per mm
+    per_mm = np.hypot(*inward)
+    unit, reach = inward / per_mm, mark.reach_mm * per_mm
+    first = np.maximum(mark.radius_mm * per_mm, _ROUNDED * reach)
+    edges = []
+    for side in (0, 1):
+        course = _Course(scan, pixel_from_mark[:, 2], unit[:, side], unit[:, 1 - side], weights)
+        edge = _find_edge(course, (float(first[side]), float(reach[side])), search_px, polarity)
+        if edge is None:
+            unseen = Reason("an edge of the frame is not visible there as one line", Code.NOT_FOUND)
+            nothing = Covariance.from_noise(np.full((2, 2), np.inf))
+            return MarkFit(False, unseen, pixel_from_mark[:, 2], nothing, pixel_from_mark)
+        edges.append(edge)
+    return _intersect_edges(edges, unit, pixel_from_mark)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,25 +108,6 @@ class _Course:
         return np.asarray(np.median(grey, axis=1), dtype=float), np.asarray(inside.all(axis=(1, 2, 3)))
 
 
-def _edge_along(course: _Course, extent: tuple[float, float], search_px: float, polarity: int) -> _Edge | None:
-    """Measure the edge of the frame within search_px of a course, between two distances from its start; None if there
-    is no straight one."""
-    share = (extent[1] - extent[0]) / _PROFILES
-    middle: Array = np.asarray(extent[0] + share * (np.arange(_PROFILES) + 0.5), dtype=float)
-    half = round(search_px + _ABOUT_PX)
-    near, inside = course.profiles(middle, np.zeros(_PROFILES), share, half)
-    near, middle = near[inside], middle[inside]
-    if len(middle) < _LEAST_SHARE * _PROFILES:
-        return None
-    offset, slope = _straightest(near * polarity, middle, half)
-    steps = _fit_steps(course.profiles(middle, offset + slope * middle, share, _ABOUT_PX)[0])
-    good = steps.good & (steps.contrast * polarity > FAINT * course.scan.full_scale_dn)
-    good &= np.abs(steps.contrast) > _LEAST_SNR * steps.noise
-    if good.sum() < _LEAST_SHARE * _PROFILES:
-        return None
-    return _fit_line(course.scan, middle, offset + slope * middle + steps.place, steps, good)
-
-
 def _straightest(grey: Array, along: Array, half: float) -> tuple[float, float]:
     """Offset and slope of the straight line on which most profiles step up (Hough transform). Gradients are limited to
     their median maximum, so that a strong edge in a few profiles does not outweigh the frame's."""
@@ -136,41 +126,45 @@ def _straightest(grey: Array, along: Array, half: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class _Steps:
-    """Steps fitted to n profiles. place (px), contrast, blur, noise, likeness, good: (n,) each; drawn, residuals:
-    (n, samples) model and residuals; design: (n, 4, samples) derivatives."""
+    """Steps level + contrast * Phi((s - place) / blur) fitted to n profiles.
+
+    place (px), contrast, blur, noise, likeness: (n,) each; drawn, residuals: (n, samples) model and residuals; design:
+    (n, 4, samples) derivatives.
+    """
 
     place: Array
     contrast: Array
     blur: Array
     noise: Array
     likeness: Array
-    good: Mask
     drawn: Array
     residuals: Array
     design: Array
 
+    @classmethod
+    def fitted(cls, grey: Array) -> "_Steps":
+        """Fit a step to every profile (n, samples) by Gauss-Newton."""
+        s = _samples(grey)
+        place, blur = np.zeros((len(grey), 1)), np.full((len(grey), 1), _START_BLUR_PX)
+        for rounds_left in range(_ITERATIONS, -1, -1):
+            z = (s - place) / blur
+            step = (1 + erf(z / np.sqrt(2))) / 2
+            slope = np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) / blur
+            centred = step - step.mean(axis=1, keepdims=True)
+            squares = np.maximum((centred**2).sum(axis=1, keepdims=True), 1e-12)
+            contrast = (centred * grey).sum(axis=1, keepdims=True) / squares
+            residuals = grey - grey.mean(axis=1, keepdims=True) - contrast * centred
+            design = np.stack([-contrast * slope, -contrast * slope * z, step, np.ones_like(step)], axis=1)
+            if rounds_left:
+                change = gauss_newton_step(design, residuals, np.ones_like(residuals), _DAMPING)
+                place = place + np.clip(change[:, :1], -1.0, 1.0)
+                blur = np.clip(blur + np.clip(change[:, 1:2], -0.5, 0.5), *_BLUR_RANGE_PX)
+        noise = np.sqrt((residuals**2).mean(axis=1))
+        likeness = np.sqrt(np.clip(1 - (noise / np.maximum(grey.std(axis=1), 1e-12)) ** 2, 0.0, 1.0))
+        return cls(place[:, 0], contrast[:, 0], blur[:, 0], noise, likeness, grey - residuals, residuals, design)
 
-def _fit_steps(grey: Array) -> _Steps:
-    """Fit the step level + contrast * Phi((s - place) / blur) to every profile by Gauss-Newton."""
-    s = _samples(grey)
-    place, blur = np.zeros((len(grey), 1)), np.full((len(grey), 1), _START_BLUR_PX)
-    for rounds_left in range(_ITERATIONS, -1, -1):
-        z = (s - place) / blur
-        step = (1 + erf(z / np.sqrt(2))) / 2
-        slope = np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) / blur
-        centred = step - step.mean(axis=1, keepdims=True)
-        squares = np.maximum((centred**2).sum(axis=1, keepdims=True), 1e-12)
-        contrast = (centred * grey).sum(axis=1, keepdims=True) / squares
-        residuals = grey - grey.mean(axis=1, keepdims=True) - contrast * centred
-        design = np.stack([-contrast * slope, -contrast * slope * z, step, np.ones_like(step)], axis=1)
-        if rounds_left:
-            change = gauss_newton_step(design, residuals, np.ones_like(residuals), _DAMPING)
-            place = place + np.clip(change[:, :1], -1.0, 1.0)
-            blur = np.clip(blur + np.clip(change[:, 1:2], -0.5, 0.5), *_BLUR_RANGE_PX)
-    noise = np.sqrt((residuals**2).mean(axis=1))
-    likeness = np.sqrt(np.clip(1 - (noise / np.maximum(grey.std(axis=1), 1e-12)) ** 2, 0.0, 1.0))
-    good = np.abs(place[:, 0]) < s[-1] - _RIM_PX
-    return _Steps(place[:, 0], contrast[:, 0], blur[:, 0], noise, likeness, good, grey - residuals, residuals, design)
+    def select(self, kept: Mask) -> "_Steps":
+        return _Steps(*(each[kept] for each in vars(self).values()))
 
 
 def _samples(profiles: Array) -> Array:
@@ -178,31 +172,52 @@ def _samples(profiles: Array) -> Array:
     return np.asarray((np.arange(profiles.shape[1]) - (profiles.shape[1] - 1) / 2) * _STEP_PX)
 
 
-def _fit_line(scan: Scan, along: Array, across: Array, steps: _Steps, good: Mask) -> _Edge | None:
-    """Fit a robust line (Tukey) through the good profiles. Its covariance comes from the scatter around it and the
-    correlation of that along the edge."""
-    design = np.stack([np.ones_like(along), along])[:, good]
-    line = tukey_fit(design, across[good], _ROUNDS, _SCATTER_FLOOR_PX)
-    residuals, on, share = line.residuals, line.weights > 0, float((line.weights > 0).sum() / len(along))
-    if share < _LEAST_SHARE:
+@dataclass(frozen=True, eq=False)
+class _Edge:
+    """Straight edge: across = offset + slope * along, in px from the start.
+
+    line (2,): offset and slope; covariance (2, 2); steps: of the profiles on the line; share: of all profiles; tone:
+    information on the tone curve, with derivatives of the line in place of a point, None where it is known.
+    """
+
+    line: Array
+    covariance: Array
+    steps: _Steps
+    share: float
+    tone: MarkTone | None
+
+
+def _find_edge(course: _Course, extent: tuple[float, float], search_px: float, polarity: int) -> _Edge | None:
+    """Measure the edge of the frame within search_px of a course, between two distances from its start; None if there
+    is no straight one."""
+    share = (extent[1] - extent[0]) / _PROFILES
+    middle: Array = np.asarray(extent[0] + share * (np.arange(_PROFILES) + 0.5), dtype=float)
+    half = round(search_px + _ABOUT_PX)
+    near, inside = course.profiles(middle, np.zeros(_PROFILES), share, half)
+    near, middle = near[inside], middle[inside]
+    if len(middle) < _LEAST_SHARE * _PROFILES:
         return None
-    weighted, kept, count = design * line.weights, np.flatnonzero(good)[on], int(on.sum())
+    offset, slope = _straightest(near * polarity, middle, half)
+    profiles, _ = course.profiles(middle, offset + slope * middle, share, _ABOUT_PX)
+    steps = _Steps.fitted(profiles)
+    good = np.abs(steps.place) < _samples(profiles)[-1] - _RIM_PX
+    good &= steps.contrast * polarity > FAINT * course.scan.full_scale_dn
+    good &= np.abs(steps.contrast) > _LEAST_SNR * steps.noise
+    if good.sum() < _LEAST_SHARE * _PROFILES:
+        return None
+    across, steps = (offset + slope * middle + steps.place)[good], steps.select(good)
+    # The covariance of the robust line comes from the scatter around it and the correlation of that along the edge.
+    design = np.stack([np.ones_like(across), middle[good]])
+    line = tukey_fit(design, across, _ROUNDS, _SCATTER_FLOOR_PX)
+    residuals, on, weighted = line.residuals, line.weights > 0, design * line.weights
+    if on.sum() < _LEAST_SHARE * len(middle):
+        return None
     inverse = np.linalg.inv(weighted @ design.T)
-    variance = float((residuals[on] ** 2).sum() / max(count - 2, 1)) + _SCATTER_FLOOR_PX**2
-    contrast, noise, blur, likeness = (
-        float(np.median(each[kept])) for each in (steps.contrast, steps.noise, steps.blur, steps.likeness)
-    )
-    return _Edge(
-        line.factors,
-        np.asarray(inverse * variance * _alike(residuals, on), dtype=float),
-        share,
-        count,
-        contrast,
-        noise,
-        blur,
-        likeness,
-        None if scan.tone.is_known else _edge_tone(scan, steps, kept, np.asarray(inverse @ weighted)[:, on]),
-    )
+    variance = float((residuals[on] ** 2).sum() / max(int(on.sum()) - 2, 1)) + _SCATTER_FLOOR_PX**2
+    covariance = np.asarray(inverse * variance * _alike(residuals, on), dtype=float)
+    steps, by_place = steps.select(on), np.asarray(inverse @ weighted)[:, on]
+    tone = None if course.scan.tone.is_known else _edge_tone(course.scan, steps, by_place)
+    return _Edge(line.factors, covariance, steps, float(on.sum() / len(middle)), tone)
 
 
 def _alike(residuals: Array, on: Mask) -> float:
@@ -215,65 +230,23 @@ def _alike(residuals: Array, on: Mask) -> float:
     return (1 + alike) / (1 - alike)
 
 
-def _edge_tone(scan: Scan, steps: _Steps, kept: NDArray[np.intp], by_place: Array) -> MarkTone:
-    """Information of the profiles kept (n,) on the tone curve. by_place (2, n): derivatives of the line by places."""
+def _edge_tone(scan: Scan, steps: _Steps, by_place: Array) -> MarkTone:
+    """Information of n profiles on the tone curve. by_place (2, n): derivatives of the line by their places."""
     # Uneven light on either side and the symmetric part of the blur's shape are eliminated as further unknowns: pixels
     # and their interpolation make the blur non-Gaussian.
-    drawn, design = steps.drawn[kept], steps.design[kept]
-    z = (_samples(drawn) - steps.place[kept, None]) / steps.blur[kept, None]
+    drawn, design, residuals = steps.drawn, steps.design, steps.residuals
+    z = (_samples(drawn) - steps.place[:, None]) / steps.blur[:, None]
     changes = np.moveaxis(scan.tone.derivatives(drawn, scan.full_scale_dn), 0, 1)
-    s, step, slope = np.linspace(-1.0, 1.0, drawn.shape[1]), design[:, 2], design[:, 0]
-    uneven = [
-        slope * z**3,
-        slope * z**5,
-        step * s,
-        step * s**2,
-        np.broadcast_to(s, z.shape),
-        np.broadcast_to(s**2, z.shape),
-    ]
-    score = tone_score(np.concatenate([design, np.stack(uneven, axis=1)], axis=1), changes, steps.residuals[kept])
-    own = score.left * (_DRAWN * steps.contrast[kept, None, None])
+    s, step, slope = np.broadcast_to(np.linspace(-1.0, 1.0, drawn.shape[1]), z.shape), design[:, 2], design[:, 0]
+    uneven = np.stack([slope * z**3, slope * z**5, step * s, step * s**2, s, s**2], axis=1)
+    score = tone_score(np.concatenate([design, uneven], axis=1), changes, residuals)
+    own = score.left * (_DRAWN * steps.contrast[:, None, None])
     least = np.mean(own @ own.swapaxes(1, 2), axis=0)
     by_profile = np.cov(score.value.T) + least + _LEAST * np.trace(least) * np.eye(len(least))
-    moved = tone_score(design, changes, steps.residuals[kept]).by_unknown[:, 0]
+    moved = tone_score(design, changes, residuals).by_unknown[:, 0]
     codes = scan.tone.code(np.quantile(drawn, (0.0, 1.0)), scan.full_scale_dn) / scan.full_scale_dn
-    information = score.information(len(kept) * by_profile, scan.tone)
+    information = score.information(len(drawn) * by_profile, scan.tone)
     return MarkTone(information, by_place @ moved, float(codes[0]), float(codes[1]))
-
-
-def fit_frame_corner(
-    scan: Scan,
-    mark: FrameCorner,
-    pixel_from_mark: Array,
-    search_px: float,
-    polarity: int,
-    weights: Sequence[float] | None = None,
-) -> MarkFit:
-    """Fit a corner of the exposed frame as the intersection of its two straight edges, excluding the rounded part.
-
-    pixel_from_mark: predicted place, at most search_px off; polarity: 1 if the frame is lighter than its border, -1 if
-    darker; weights: of the scan's channels.
-
-    Returns
-    -------
-    MarkFit
-        Not converged, with a reason, if either edge is not found.
-    """
-    inward = pixel_from_mark[:, :2] * np.array(mark.toward)  # columns: along x', y' into the frame, px per mm
-    per_mm = np.hypot(*inward)
-    unit = inward / per_mm
-    edges = []
-    for side in (0, 1):
-        reach = mark.reach_mm * per_mm[side]
-        first = max(mark.radius_mm * per_mm[side], _ROUNDED * reach)
-        course = _Course(scan, pixel_from_mark[:, 2], unit[:, side], unit[:, 1 - side], weights)
-        edge = _edge_along(course, (first, reach), search_px, polarity)
-        if edge is None:
-            unseen = Reason("an edge of the frame is not visible there as one line", Code.NOT_FOUND)
-            nothing = Covariance.from_noise(np.full((2, 2), np.inf))
-            return MarkFit(False, unseen, pixel_from_mark[:, 2], nothing, pixel_from_mark)
-        edges.append(edge)
-    return _intersect_edges(edges, unit, pixel_from_mark)
 
 
 def _intersect_edges(edges: Sequence[_Edge], unit: Array, pixel_from_mark: Array) -> MarkFit:
@@ -284,9 +257,12 @@ def _intersect_edges(edges: Sequence[_Edge], unit: Array, pixel_from_mark: Array
     # Derivatives of column and row with respect to each edge's offset and slope.
     by_lines = [unit @ (scale * np.array(by)) for by in ([[d, d * x], [1.0, x]], [[1.0, y], [b, b * y]])]
     covariance = sum(by @ edge.covariance @ by.T for by, edge in zip(by_lines, edges, strict=True))
-    center = pixel_from_mark[:, 2] + unit @ (x, y)
-    noise, least = max(edge.noise_dn for edge in edges), min(edge.count for edge in edges)
-    contrast = min((edge.contrast_dn for edge in edges), key=abs)
+    center, counts = pixel_from_mark[:, 2] + unit @ (x, y), [len(edge.steps.place) for edge in edges]
+    contrasts, noises, blurs, likenesses = (
+        [float(np.median(getattr(edge.steps, name))) for edge in edges]
+        for name in ("contrast", "noise", "blur", "likeness")
+    )
+    contrast, noise = min(contrasts, key=abs), max(noises)
     tones = [edge.tone for edge in edges if edge.tone is not None]
     return MarkFit(
         converged=True,
@@ -297,11 +273,11 @@ def _intersect_edges(edges: Sequence[_Edge], unit: Array, pixel_from_mark: Array
         contrast_dn=contrast,
         stored_contrast_dn=contrast,
         noise_dn=noise,
-        blur_px=max(edge.blur_px for edge in edges),
+        blur_px=max(blurs),
         damaged_fraction=1.0 - min(edge.share for edge in edges),
-        redundancy=sum(edge.count for edge in edges) - 4,
-        likeness=min(edge.likeness for edge in edges),
-        significance=abs(contrast) / max(noise, 1e-12) * float(np.sqrt(least)),
+        redundancy=sum(counts) - 4,
+        likeness=min(likenesses),
+        significance=abs(contrast) / max(noise, 1e-12) * float(np.sqrt(min(counts))),
         tone=None if len(tones) < len(edges) else _corner_tone(tones, by_lines),
     )
 
