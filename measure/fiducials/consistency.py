@@ -337,7 +337,8 @@ class _Weight:
 
 def _derivatives(marks: FrameMarks, reduced: _Reduced) -> tuple[Any, Any]:
     """(n + j, m) derivatives of the misfit by a shift along x and y of each mark, and of those beyond each jump."""
-    groups = csr_array(np.vstack([np.eye(len(marks.given_mm)), marks.beyond_jumps.T]))
+    groups: Any = np.vstack([np.eye(len(marks.given_mm)), marks.beyond_jumps.T])
+    groups = groups if isinstance(reduced.axes, np.ndarray) else csr_array(groups)
     return groups @ reduced.axes[::2], groups @ reduced.axes[1::2]
 
 
