@@ -7,11 +7,13 @@ change of k5 is beyond what k3 takes up.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from test_lens_comparison import contradicted
+from test_lens_comparison import make_calibration, noisy, set_calibration, two_networks
 
+from adjust import Parameter, adjust
 from adjust.functional_model.lens import Distortion, Lens
 from adjust.quality.lens_comparison import CameraCalibration, compare
 from benchmarks.harness import Row
@@ -28,6 +30,22 @@ MARK_SIGMA_MM = 0.002
 TIED = {(3, 4): -0.9, (1, 5): 0.6}  # correlations of k3 and k5, x0 and p1, as in most calibrations
 LEVEL = 0.05
 YEARS = np.array([1952.0, 1958.0, 1961.0, 1970.0])
+
+
+def contradicted(sigmas: float, draws: int, level: float = 0.05) -> float:
+    """The share of calibrations that are told to be contradicted, of cameras whose c has changed by so many sigmas."""
+    (a, start_a), (b, start_b), _ = two_networks("none", 1e-6)
+    rng = np.random.default_rng(4)
+    result = []
+    for _ in range(draws):
+        calibration = make_calibration(adjust(noisy(a, rng, 1e6), start_a), False)
+        c = calibration.parameters.index(Parameter.interior("K", "c"))
+        values = calibration.values.copy()
+        values[c] += sigmas * np.sqrt(2.0 * calibration.covariance[c, c])
+        network = set_calibration(noisy(b, rng, 1e6), replace(calibration, values=values))
+        (found,) = adjust(network, start_b).contradictions
+        result.append(found.probability < level)
+    return float(np.mean(result))
 
 
 def covariance() -> Array:

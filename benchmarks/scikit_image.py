@@ -19,7 +19,7 @@ from skimage.transform import AffineTransform, PiecewiseAffineTransform, Polynom
 from test_corners import NOISE as CORNER_NOISE
 from test_corners import SIZE as CORNER_PX
 from test_corners import board_steps, square_picture
-from test_disks import field
+from test_targets import field
 from true_marks import KIND, TrueMark, some_mark
 
 from adjust.functional_model.transformation import film_kind

@@ -21,8 +21,12 @@ from networks import (
     digital_network,
     field_points,
     give_values,
+    keep_rows,
     map_priors,
+    orient,
     quarters,
+    set_camera,
+    set_observations,
     simulated,
     vertical,
 )
@@ -39,6 +43,12 @@ POINT = ("principal point's x0'", "principal point's y0'")
 DISTANCE = ("principal distance of camera K can change",)
 
 
+QUARTER_TURNS = "images turned by 90 degrees about their axes"
+HALF_TURNS = "images turned by 180 degrees about their axes"
+OTHER_TILTS = "tilted in different directions"
+KNOWN_HEIGHTS = "known points (X, Y, Z) at different heights"
+
+
 @dataclass(frozen=True)
 class Failure:
     """A network, what it is in words, the words of its null directions in order, and what mends which of them."""
@@ -47,11 +57,7 @@ class Failure:
     setup: Setup
     words: tuple[str, ...]
     mended: Mapping[str, tuple[Setup, tuple[str, ...]]]
-    datum: str = "minimal"
-
-    @property
-    def options(self) -> Options:
-        return Options(datum="minimal" if self.datum == "minimal" else "control")
+    options: Options = field(default_factory=lambda: Options(datum="minimal"))
 
 
 def _more(setup: Setup, *attitudes: Triple) -> Setup:
@@ -89,11 +95,8 @@ CATALOGUE: dict[str, Failure] = {
         _tilted,
         (*AXES, *DEFORMATIONS, *DISTANCE),
         {
-            "images turned by 90 degrees about their axes": (
-                replace(_tilted, attitudes=quarters(*TILTED)),
-                DEFORMATIONS + DISTANCE,
-            ),
-            "tilted in different directions": (_more(_tilted, *TILTS), DEFORMATIONS + DISTANCE),
+            QUARTER_TURNS: (replace(_tilted, attitudes=quarters(*TILTED)), DEFORMATIONS + DISTANCE),
+            OTHER_TILTS: (_more(_tilted, *TILTS), DEFORMATIONS + DISTANCE),
             "points at other heights": (replace(_tilted, relief=200.0), DISTANCE),
         },
     ),
@@ -102,7 +105,7 @@ CATALOGUE: dict[str, Failure] = {
         _two,
         (*AXES, "Affinity"),
         {
-            "images turned by 90 degrees about their axes": (_more(_two, (-0.05, 0.35, 0.1 + pi / 2)), DEFORMATIONS),
+            QUARTER_TURNS: (_more(_two, (-0.05, 0.35, 0.1 + pi / 2)), DEFORMATIONS),
             "tilted in other directions": (_more(_two, TILTS[0]), DEFORMATIONS),
         },
     ),
@@ -118,19 +121,10 @@ CATALOGUE: dict[str, Failure] = {
         _parallel,
         (*AXES, *DEFORMATIONS, *POINT, *DISTANCE),
         {
-            "images turned by 180 degrees about their axes": (
-                replace(_parallel, attitudes=vertical(0, pi, 0, 0)),
-                POINT,
-            ),
-            "images turned by 90 degrees about their axes": (
-                replace(_parallel, attitudes=vertical(0, pi / 2, 0, 0)),
-                DEFORMATIONS,
-            ),
-            "tilted in different directions": (_more(_parallel, *TILTS), DEFORMATIONS + POINT + DISTANCE),
-            "known points (X, Y, Z) at different heights": (
-                replace(_parallel, sigma=KNOWN),
-                DEFORMATIONS + POINT + DISTANCE,
-            ),
+            HALF_TURNS: (replace(_parallel, attitudes=vertical(0, pi, 0, 0)), POINT),
+            QUARTER_TURNS: (replace(_parallel, attitudes=vertical(0, pi / 2, 0, 0)), DEFORMATIONS),
+            OTHER_TILTS: (_more(_parallel, *TILTS), DEFORMATIONS + POINT + DISTANCE),
+            KNOWN_HEIGHTS: (replace(_parallel, sigma=KNOWN), DEFORMATIONS + POINT + DISTANCE),
         },
     ),
     "unknown-half-turned": Failure(
@@ -138,11 +132,8 @@ CATALOGUE: dict[str, Failure] = {
         _half_turned,
         (*AXES, *DEFORMATIONS, *DISTANCE),
         {
-            "images turned by 90 degrees about their axes": (
-                replace(_half_turned, attitudes=vertical(0, pi, pi / 2, pi)),
-                DEFORMATIONS,
-            ),
-            "tilted in different directions": (_more(_half_turned, *TILTS), DEFORMATIONS + DISTANCE),
+            QUARTER_TURNS: (replace(_half_turned, attitudes=vertical(0, pi, pi / 2, pi)), DEFORMATIONS),
+            OTHER_TILTS: (_more(_half_turned, *TILTS), DEFORMATIONS + DISTANCE),
         },
     ),
     "unknown-turned": Failure(
@@ -150,8 +141,8 @@ CATALOGUE: dict[str, Failure] = {
         _turned,
         (*AXES, *DISTANCE),
         {
-            "tilted in different directions": (_more(_turned, *TILTS), DISTANCE),
-            "known points (X, Y, Z) at different heights": (replace(_turned, sigma=KNOWN), DISTANCE),
+            OTHER_TILTS: (_more(_turned, *TILTS), DISTANCE),
+            KNOWN_HEIGHTS: (replace(_turned, sigma=KNOWN), DISTANCE),
         },
     ),
     "heights-flat-crosswise": Failure(
@@ -159,11 +150,8 @@ CATALOGUE: dict[str, Failure] = {
         _crosswise,
         (*AXES, *POINT, *DISTANCE),
         {
-            "tilted in different directions": (_more(_crosswise, *TILTS), POINT + DISTANCE),
-            "known points (X, Y, Z) at different heights": (
-                replace(_crosswise, sigma=KNOWN, relief=200.0),
-                POINT + DISTANCE,
-            ),
+            OTHER_TILTS: (_more(_crosswise, *TILTS), POINT + DISTANCE),
+            KNOWN_HEIGHTS: (replace(_crosswise, sigma=KNOWN, relief=200.0), POINT + DISTANCE),
         },
     ),
     "heights-flat-parallel": Failure(
@@ -171,11 +159,8 @@ CATALOGUE: dict[str, Failure] = {
         _heights_parallel,
         (*AXES, *DEFORMATIONS, *POINT, *DISTANCE),
         {
-            "images turned by 90 degrees about their axes": (
-                replace(_heights_parallel, attitudes=vertical(0, pi / 2, 0, 0)),
-                DEFORMATIONS,
-            ),
-            "tilted in different directions": (_more(_heights_parallel, *TILTS), POINT + DISTANCE),
+            QUARTER_TURNS: (replace(_heights_parallel, attitudes=vertical(0, pi / 2, 0, 0)), DEFORMATIONS),
+            OTHER_TILTS: (_more(_heights_parallel, *TILTS), POINT + DISTANCE),
         },
     ),
     "heights-relief-crosswise": Failure(
@@ -183,8 +168,8 @@ CATALOGUE: dict[str, Failure] = {
         _heights_relief,
         (*AXES, *DISTANCE),
         {
-            "tilted in different directions": (_more(_heights_relief, *TILTS), DISTANCE),
-            "known points (X, Y, Z) at different heights": (replace(_heights_relief, sigma=KNOWN), DISTANCE),
+            OTHER_TILTS: (_more(_heights_relief, *TILTS), DISTANCE),
+            KNOWN_HEIGHTS: (replace(_heights_relief, sigma=KNOWN), DISTANCE),
         },
     ),
     "unknown-plane": Failure(
@@ -197,7 +182,7 @@ CATALOGUE: dict[str, Failure] = {
         "Unknown points, one convergent pair",
         _pair,
         (*AXES, *DEFORMATIONS, *DISTANCE),
-        {"tilted in different directions": (_more(_pair, TILTS[0]), DEFORMATIONS + DISTANCE)},
+        {OTHER_TILTS: (_more(_pair, TILTS[0]), DEFORMATIONS + DISTANCE)},
     ),
 }
 
@@ -246,12 +231,12 @@ def _collinear_stations() -> tuple[Network, Approximations]:
     """All targets of image f3 on a line, those of the others not."""
     points = np.vstack([field_points(np.random.default_rng(1), 9), _line])
     network, start = replace(_good, points=points).network()
-    return _keep(network, lambda image, point, kind: not (image == "f3" and kind == "target" and int(point) < 9)), start
+    return keep_rows(network, lambda image, point, kind: image != "f3" or kind != "target" or int(point) >= 9), start
 
 
 def _one_ray() -> tuple[Network, Approximations]:
     network, start = _all_unknown.network()
-    return _keep(network, lambda image, point, kind: point != "3" or kind == "fiducial" or image == "f1"), start
+    return keep_rows(network, lambda image, point, kind: point != "3" or kind == "fiducial" or image == "f1"), start
 
 
 def _line_of_sight() -> tuple[Network, Approximations]:
@@ -262,14 +247,12 @@ def _line_of_sight() -> tuple[Network, Approximations]:
     setup = replace(_all_unknown, points=points, stations=(STATIONS[0], tuple(second), *STATIONS[2:]), noise=False)
     setup = replace(setup, attitudes=((0.0, 0.0, 0.1), (0.0, 0.0, 1.6), *CONVERGENT[2:]))
     network, start = setup.network()
-    return _keep(network, lambda image, point, kind: point != "0" or kind == "fiducial" or image < "f2"), start
+    return keep_rows(network, lambda image, point, kind: point != "0" or kind == "fiducial" or image < "f2"), start
 
 
 def _three_targets() -> tuple[Network, Approximations]:
     network, start = _good.network()
-    return _keep(
-        network, lambda image, point, kind: not (image == "f3" and kind == "target" and point not in ("0", "1", "2"))
-    ), start
+    return keep_rows(network, lambda image, point, kind: image != "f3" or kind != "target" or int(point) < 3), start
 
 
 def _swapped() -> tuple[Network, Approximations]:
@@ -280,31 +263,16 @@ def _swapped() -> tuple[Network, Approximations]:
         other.get(point, point) if image == "f1" and kind == "target" else point
         for image, point, kind in zip(rows.image, rows.point, rows.kind, strict=True)
     )
-    return replace(network, observations=replace(rows, point=points)), start
-
-
-def _keep(network: Network, keep: Callable[[str, str, str], bool]) -> Network:
-    """The network with some of its observations."""
-    rows = network.observations
-    kept = [i for i, row in enumerate(zip(rows.image, rows.point, rows.kind, strict=True)) if keep(*row)]
-    return replace(network, observations=rows.only(np.array(kept)))
+    return set_observations(network, point=points), start
 
 
 MISHAPS: dict[str, Mishap] = {
     "no-datum": Mishap(
         "All points unknown, and nothing that fixes the object space",
         _all_unknown.network,
-        tuple(
-            f"The object space can {motion}"
-            for motion in (
-                "shift in X",
-                "shift in Y",
-                "shift in Z",
-                "turn about X",
-                "turn about Y",
-                "turn about Z",
-                "grow",
-            )
+        (
+            *(f"The object space can {motion} {axis}" for motion in ("shift in", "turn about") for axis in "XYZ"),
+            "The object space can grow",
         ),
     ),
     "congruent": Mishap(
@@ -389,17 +357,12 @@ def blunder_network(seed: int, oriented: Array | None = None, relief: float = 20
     truth = replace(truth, stations=moved, attitudes=tilted, distortion={"k3": 2e-8, "p1": 2e-8})
     points = field_points(rng, int(rng.integers(14, 31)), relief)
     made, _ = simulated(rng, truth, points=points, fiducial_sigma=0.01, point_sigma=0.05)
-    camera = replace(made.cameras[0], principal_distance_mm=Prior(truth.c, 0.0))
-    made = replace(made, cameras=(camera,))
+    made = set_camera(made, principal_distance_mm=Prior(truth.c, 0.0))
     if oriented is None:
         return made
     errors = np.where(np.isfinite(oriented), oriented, [20.0, 20.0, 20.0, 0.03, 0.03, 0.03])
-    exteriors = [
-        Exterior(np.array([*station, *attitude]) + errors * rng.normal(size=6), oriented)
-        for station, attitude in zip(truth.stations, truth.attitudes, strict=True)
-    ]
-    images = zip(made.images, exteriors, strict=True)
-    return replace(made, images=tuple(replace(image, exterior=each) for image, each in images))
+    exteriors = [Exterior(exterior + errors * rng.normal(size=6), oriented) for exterior in truth.exteriors]
+    return orient(made, {f"f{i}": exterior for i, exterior in enumerate(exteriors)})
 
 
 def change_points(given: Network, changed: Callable[[Array], Array], sigma: float = 1.0) -> Network:
@@ -416,8 +379,8 @@ def y_down(given: Network) -> Network:
     return map_priors(given, lambda name, prior: replace(prior, value=-prior.value) if name.endswith(".y") else prior)
 
 
-def other_c(given: Network, off_mm: float = 10.0) -> Network:
-    return shift_given(given, "IO.K.c", off_mm)
+def other_c(given: Network) -> Network:
+    return shift_given(given, "IO.K.c", 10.0)
 
 
 def shift_given(given: Network, name: str, off: float) -> Network:
@@ -430,7 +393,7 @@ def exchanged(given: Network, with_fiducials: bool = False) -> Network:
     observations = given.observations
     rows = zip(observations.image, observations.kind, strict=True)
     image = tuple(other.get(name, name) if with_fiducials or kind == "target" else name for name, kind in rows)
-    return replace(given, observations=replace(observations, image=image))
+    return set_observations(given, image=image)
 
 
 def one_point(given: Network) -> Network:
@@ -626,8 +589,7 @@ def misfit_network(made: Scene, effects: Effects, kind: Misfit, rng: np.random.G
     rows = [(*name, xy) for name, xy in zip(names, xy_mm, strict=True)]
     points = {f"p{k}": effects.object_unit * xyz for k, xyz in enumerate(made.points)}
     given_network = digital_network(camera, rows, points, effects.pitch * kind.sigma * SIGMA_MM)
-    images = tuple(replace(image, exterior=exterior.get(image.name)) for image in given_network.images)
-    return replace(given_network, images=images, disk_radius=kind.disk_radius)
+    return replace(orient(given_network, exterior), disk_radius=kind.disk_radius)
 
 
 def _exteriors(made: Scene) -> dict[str, Exterior]:

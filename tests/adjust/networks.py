@@ -1,6 +1,6 @@
 """Networks simulated with formulas of their own or projected by OpenCV: nothing comes from the code under test."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from math import pi
@@ -16,7 +16,7 @@ from adjust import Adjustment, Camera, Fiducial
 from adjust.functional_model.lens import Decentering, Distortion, Prior
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.transformation import Film, film_parameter_names
-from adjust.problem.network import Approximations, Image, Network, ObjectPoint, Scanner, Transformation
+from adjust.problem.network import Approximations, Exterior, Image, Network, ObjectPoint, Scanner, Transformation
 from adjust.problem.observations import ObservationKind, Observations
 from synthetic_images.projection import camera_from_object
 from synthetic_images.scene import Distortion as SceneDistortion
@@ -48,6 +48,11 @@ class Truth:
     attitudes: tuple[tuple[float, float, float], ...] = ATTITUDES
     mirrored: tuple[bool, ...] = (False, False, False, False)
     middle_mm: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def exteriors(self) -> Array:
+        """(images, 6): stations and attitudes."""
+        return np.hstack([self.stations, self.attitudes])
 
 
 def rotation(omega: float, phi: float, kappa: float) -> Array:
@@ -193,16 +198,46 @@ def add_errors(network: Network, errors: dict[int, Array]) -> Network:
     xy_mm = network.observations.xy_mm.copy()
     for row, error in errors.items():
         xy_mm[row] += error
-    return replace(network, observations=replace(network.observations, xy_mm=xy_mm))
+    return set_observations(network, xy_mm=xy_mm)
 
 
-def set_covariance(network: Network, covariance_mm2: Array) -> Network:
-    return replace(network, observations=replace(network.observations, covariance_mm2=covariance_mm2))
+def set_observations(network: Network, **changes: Any) -> Network:
+    """With other coordinates, covariances, images or points of its observations."""
+    return replace(network, observations=replace(network.observations, **changes))
 
 
 def drop_rows(network: Network, rows: list[int]) -> Network:
     kept = np.setdiff1d(np.arange(len(network.observations)), rows)
     return replace(network, observations=network.observations.only(kept))
+
+
+def keep_rows(network: Network, keep: Callable[[str, str, str], bool]) -> Network:
+    """With those of its observations that are wanted by image, point and kind."""
+    rows = network.observations
+    kept = [i for i, row in enumerate(zip(rows.image, rows.point, rows.kind, strict=True)) if keep(*row)]
+    return replace(network, observations=rows.only(np.array(kept, dtype=np.intp)))
+
+
+def set_camera(network: Network, **changes: Any) -> Network:
+    """With other values of its first camera."""
+    return replace(network, cameras=(replace(network.cameras[0], **changes), *network.cameras[1:]))
+
+
+def set_images(network: Network, **changes: Any) -> Network:
+    return replace(network, images=tuple(replace(image, **changes) for image in network.images))
+
+
+def orient(network: Network, exteriors: Mapping[str, Exterior]) -> Network:
+    """With exterior orientations of some images."""
+    images = (replace(image, exterior=exteriors.get(image.name, image.exterior)) for image in network.images)
+    return replace(network, images=tuple(images))
+
+
+def free_points(network: Network, names: Container[str], axes: str = "XYZ") -> Network:
+    """With some points unknown, and without approximations, along some axes."""
+    unknown: dict[str, Any] = dict.fromkeys(axes)
+    points = (replace(point, **unknown) if point.id in names else point for point in network.points)
+    return replace(network, points=tuple(points))
 
 
 def digital_network(
@@ -342,21 +377,14 @@ class Setup:
     def network(self) -> tuple[Network, Approximations]:
         """The network, and the truth as its approximations."""
         parameters = dict.fromkeys(self.distortion, 0.0)
-        truth = Truth(
-            stations=self.stations,
-            attitudes=self.attitudes,
-            mirrored=(False,) * len(self.stations),
-            distortion=parameters,
-        )
+        mirrored = (False,) * len(self.stations)
+        truth = Truth(stations=self.stations, attitudes=self.attitudes, mirrored=mirrored, distortion=parameters)
         points = self.points
         if points is None:
             points = field_points(np.random.default_rng(1), 14, relief=1.0) * [1.0, 1.0, self.relief]
         rng = np.random.default_rng(0)
         network, start = simulated(rng, truth, self.kind, points, 0.0, dict(self.distortion), self.noise)
-        exact = {
-            f"f{i}": np.array([*station, *attitude])
-            for i, (station, attitude) in enumerate(zip(self.stations, self.attitudes, strict=True))
-        }
+        exact = {f"f{i}": exterior for i, exterior in enumerate(truth.exteriors)}
         network = replace(network, points=tuple(set_sigma(point, self.sigma) for point in network.points))
         return set_prior(network, self.prior), replace(start, exterior=exact)
 
@@ -425,24 +453,6 @@ def quarters(omega: float = 0.0, phi: float = 0.0, kappa: float = 0.0) -> tuple[
 
 
 Name = Callable[[str], str]
-
-
-def two_cameras(
-    cameras: tuple[str, str], marks: tuple[Name, Name], image: Name, point: Name
-) -> tuple[Network, Approximations]:
-    """Four images of each; marks: what is made of the first and of the second camera's fiducial ids."""
-    rng = np.random.default_rng(17)
-    points = field_points(rng, 12)
-
-    def numbered(number: int) -> Name:
-        return lambda name: image(f"{number}{name}")
-
-    truths = (Truth(), Truth(c=120.0, x0=-0.2, y0=0.1))
-    first, second = (
-        rename_network(*simulated(rng, truth, points=points), name, mark, numbered(number), point)
-        for number, (truth, name, mark) in enumerate(zip(truths, cameras, marks, strict=True))
-    )
-    return join_networks(first, second)
 
 
 def join_networks(
@@ -555,12 +565,6 @@ def halves(
     return Halves(Network((camera,), images, targets_xyz, make_observations(rows)), films, joins, truth)
 
 
-def drop_images(network: Network, drop: str) -> Network:
-    """The network without the observations of a kind."""
-    kept = np.flatnonzero([kind != drop for kind in network.observations.kind])
-    return replace(network, observations=network.observations.only(kept))
-
-
 SCAN_MIDDLE_MM, SCAN_HALF_MM = (125.0, -120.0), (118.0, 122.0)  # of the scan, which is longer than it is wide
 EIGHT_MARKS_MM = {
     "1": (106.0, -106.0), "2": (-106.0, -106.0), "3": (-106.0, 106.0), "4": (106.0, 106.0),
@@ -615,10 +619,8 @@ def bent(terms: Mapping[str, float], xy_mm: Array) -> Array:
 
 def bend_in_scanner(network: Network, truth: Mapping[str, float], terms: Mapping[str, Prior]) -> Network:
     """A network of straight scans as a scanner S that bends them would have it, which is to find some terms."""
-    observations = replace(network.observations, xy_mm=bent(truth, network.observations.xy_mm))
-    images = tuple(replace(image, scanner="S") for image in network.images)
-    scanner = Scanner("S", terms, SCAN_MIDDLE_MM, SCAN_HALF_MM)
-    return replace(network, observations=observations, images=images, scanners=(scanner,))
+    scanned = set_images(set_observations(network, xy_mm=bent(truth, network.observations.xy_mm)), scanner="S")
+    return replace(scanned, scanners=(Scanner("S", terms, SCAN_MIDDLE_MM, SCAN_HALF_MM),))
 
 
 def bent_films(
@@ -652,8 +654,7 @@ def bent_films(
     if rng is None:
         return network
     straight_mm = network.observations.xy_mm
-    noise = rng.normal(0.0, FILM_SIGMA_MM, straight_mm.shape)
-    return replace(network, observations=replace(network.observations, xy_mm=straight_mm + noise))
+    return set_observations(network, xy_mm=straight_mm + rng.normal(0.0, FILM_SIGMA_MM, straight_mm.shape))
 
 
 def film_network(

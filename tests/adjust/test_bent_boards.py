@@ -103,9 +103,6 @@ def test_the_centre_of_gravity_of_an_imaged_disk() -> None:
 
 
 def test_what_is_no_board_is_refused() -> None:
-    line = {str(k): np.array([float(k), 0.0, 0.0]) for k in range(5)}
-    with pytest.raises(ValueError, match="at least four points about in a plane"):
-        Board("b", line)
     network = make_network(None)
     unknown = replace(network, points=(ObjectPoint("p0", None, None, None), *network.points[1:]))
     with pytest.raises(AdjustmentError, match="point p0 of board board is not known"):

@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 import matplotlib as mpl
+import matplotlib.figure
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
@@ -77,9 +78,7 @@ def test_coverage_counts_targets_alone(film: Adjustment) -> None:
 
 
 def test_plots_go_into_axes_that_are_given(board: Adjustment) -> None:
-    import matplotlib.pyplot as plt
-
-    _, axes = plt.subplots()
+    axes = mpl.figure.Figure().subplots()
     assert board.plot_coverage(axes=axes) is axes
 
 
@@ -95,28 +94,28 @@ def test_contours_have_round_levels(values: list[float], levels: list[float]) ->
     assert contour_levels(np.array([*values, np.nan])) == levels
 
 
-def test_a_camera_of_which_nothing_was_estimated_has_no_contours() -> None:
+def test_a_camera_of_which_nothing_was_estimated_has_no_contours_and_a_distance_no_exponent() -> None:
     with pytest.raises(AdjustmentError, match="nothing was estimated"):
         contour_levels(np.zeros((3, 3)))
-
-
-def test_a_distance_has_no_exponent() -> None:
     assert [distance_text(each) for each in (1500.0, 0.3456789, 12345.6)] == ["1500", "0.3457", "12350"]
 
 
-@pytest.mark.parametrize("method", ["plot_residuals", "plot_distortion", "plot_uncertainty", "plot_coverage"])
-def test_without_matplotlib_one_message_says_what_to_install(
-    board: Adjustment, method: str, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("missing", "method", "words"),
+    [
+        *(
+            ("matplotlib.pyplot", f"plot_{kind}", r'"reseau\[plots\]"\.')
+            for kind in ("residuals", "distortion", "uncertainty", "coverage")
+        ),
+        ("pandas", "to_pandas", "pandas"),
+    ],
+)
+def test_without_a_package_one_message_says_what_to_install(
+    board: Adjustment, missing: str, method: str, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
-    with pytest.raises(ImportError, match=r'Install: pip install "reseau\[plots\]"\.'):
+    monkeypatch.setitem(sys.modules, missing, None)
+    with pytest.raises(ImportError, match=f"Install: pip install {words}"):
         getattr(board, method)()
-
-
-def test_without_pandas_one_message_says_what_to_install(board: Adjustment, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(ImportError, match="Install: pip install pandas"):
-        board.to_pandas()
 
 
 def test_tables_have_every_quantity_and_every_observation(board: Adjustment) -> None:

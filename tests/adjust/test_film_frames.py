@@ -10,15 +10,20 @@ from networks import (
     FRAME_NOISE_MM,
     JOIN_SIGMA,
     NOMINAL_MM,
+    UNKNOWN,
     DrawnFrames,
     Halves,
+    add_errors,
     draw_frames,
-    drop_images,
+    give_values,
     halves,
+    keep_rows,
+    observation_row,
+    set_camera,
+    set_sigma,
 )
 from numpy.typing import NDArray
 from scipy.optimize import approx_fprime
-from studies import parametrize_with_studies
 
 from adjust import Adjustment, AdjustmentError, Network, Options, Parameter, Prior, adjust
 from adjust.problem.camera import Fiducial, FiducialDistance
@@ -32,7 +37,6 @@ def observe_distances(
     drawn: DrawnFrames, rng: np.random.Generator, noise: float = 1.0, sigma_mm: float = np.inf
 ) -> DrawnFrames:
     """Frames whose marks are given with a standard deviation, and all distances between them."""
-    camera = drawn.network.cameras[0]
     pairs = combinations(range(len(drawn.places_mm)), 2)
     distances = tuple(
         FiducialDistance(
@@ -43,12 +47,8 @@ def observe_distances(
         )
         for i, j in pairs
     )
-    marks = {
-        id_: Fiducial(Prior(mark.x_mm.value, sigma_mm), Prior(mark.y_mm.value, sigma_mm))
-        for id_, mark in camera.fiducials.items()
-    }
-    cameras = (replace(camera, fiducials=marks, distances=distances),)
-    return replace(drawn, network=replace(drawn.network, cameras=cameras))
+    network = give_values(drawn.network, {"x": sigma_mm, "y": sigma_mm})
+    return replace(drawn, network=set_camera(network, distances=distances))
 
 
 def hold_marks(marks: int) -> list[int]:
@@ -122,36 +122,6 @@ def test_places_by_distances_are_those_of_the_adjustment_written_out(marks: int,
     )
 
 
-def shift_datum(true: Array) -> Array:
-    """True places (m, 2) moved to where the held coordinates have them."""
-    first, last = hold_marks(len(true))[0] // 2, hold_marks(len(true))[2] // 2
-    axis = hold_marks(len(true))[2] % 2
-    off = true - true[first]
-    radius, wanted = np.linalg.norm(off[last]), (NOMINAL_MM[last] - NOMINAL_MM[first])[axis]
-    direction = np.arcsin(wanted / radius) if axis else np.arccos(wanted / radius)
-    now = np.arctan2(off[last, 1], off[last, 0])
-    near = min((direction, np.pi - direction, -direction), key=lambda a: abs(np.angle(np.exp(1j * (a - now)))))
-    c, s = np.cos(near - now), np.sin(near - now)
-    return np.asarray(NOMINAL_MM[first] + off @ np.array([[c, s], [-s, c]]))
-
-
-@parametrize_with_studies("count", (16, 1000))
-def test_claimed_standard_deviations_hold(count: int) -> None:
-    rng = np.random.default_rng(5)
-    normalised, sigma0 = [], []
-    for _ in range(count):
-        drawn = observe_distances(draw_frames("affine", 2, 4, 1.0, 0.05, rng), rng)
-        result = adjust(drawn.network, drawn.start)
-        values, claimed = places(result, 4)
-        free = claimed > 0.0
-        errors = (values - shift_datum(drawn.places_mm))[free]
-        normalised += list(errors / claimed[free] * result.sigma0)
-        sigma0.append(result.sigma0**2)
-    chance = 3.0 / np.sqrt(2.0 * count)  # the coordinates of one network are correlated
-    assert np.sqrt(np.mean(np.square(normalised))) == pytest.approx(1.0, abs=chance)
-    assert np.mean(sigma0) == pytest.approx(1.0, abs=chance)
-
-
 def test_a_plan_expects_the_form_of_the_distances_and_the_datum_of_the_coordinates() -> None:
     rng = np.random.default_rng(10)
     drawn = observe_distances(draw_frames("affine", 3, 4, 1.0, 0.0, rng, 0.0), rng, 0.0, sigma_mm=1.0)
@@ -165,45 +135,16 @@ def test_a_plan_expects_the_form_of_the_distances_and_the_datum_of_the_coordinat
     np.testing.assert_allclose(list(redundancy.values()), [row.redundancy for row in result.further], atol=1e-4)
 
 
-def test_a_wrong_distance_is_reported() -> None:
-    rng = np.random.default_rng(7)
-    drawn = observe_distances(draw_frames("affine", 3, 8, 1.0, 0.05, rng), rng)
-    camera = drawn.network.cameras[0]
-    wrong = replace(camera.distances[5], value_mm=camera.distances[5].value_mm + 0.05)
-    distances = (*camera.distances[:5], wrong, *camera.distances[6:])
-    result = adjust(replace(drawn.network, cameras=(replace(camera, distances=distances),)), drawn.start)
-    rows = [row for row in result.further if row.group == "fiducial distance"]
-    worst = max(rows, key=lambda row: abs(row.w))
-    assert worst.name == f"{wrong.name} of camera {FILM_CAMERA}"
-    assert worst.v == pytest.approx(-0.05 * worst.redundancy, abs=3.0 * SIGMA_MM)
-    assert worst.detectable < 0.05
-
-
 def test_a_distance_to_a_mark_that_no_image_shows_says_nothing() -> None:
     rng = np.random.default_rng(8)
     drawn = observe_distances(draw_frames("affine", 2, 4, 1.0, 0.05, rng), rng)
     camera = drawn.network.cameras[0]
-    unseen = replace(camera, fiducials={**camera.fiducials, "5": Fiducial(Prior(0.0, np.inf), Prior(112.0, np.inf))})
-    farther = replace(unseen, distances=(*camera.distances, FiducialDistance("1", "5", 100.0, SIGMA_MM)))
-    alone, result = (adjust(replace(drawn.network, cameras=(one,)), drawn.start) for one in (camera, farther))
+    unseen = {**camera.fiducials, "5": Fiducial(Prior(0.0, np.inf), Prior(112.0, np.inf))}
+    distances = (*camera.distances, FiducialDistance("1", "5", 100.0, SIGMA_MM))
+    farther = set_camera(drawn.network, fiducials=unseen, distances=distances)
+    alone, result = (adjust(network, drawn.start) for network in (drawn.network, farther))
     np.testing.assert_allclose(places(result, 4)[0], places(alone, 4)[0], atol=1e-9)
     assert len(result.further) == len(alone.further)
-
-
-@pytest.mark.parametrize(
-    ("distance", "words"),
-    [
-        (FiducialDistance("1", "9", 150.0, 0.01), "has no fiducial 9"),
-        (FiducialDistance("1", "1", 150.0, 0.01), "same point at both ends"),
-        (FiducialDistance("1", "2", -150.0, 0.01), "must be a positive number"),
-        (FiducialDistance("1", "2", 150.0, 0.0), "needs a positive standard deviation"),
-    ],
-)
-def test_what_is_no_distance_is_refused(distance: FiducialDistance, words: str) -> None:
-    drawn = draw_frames("affine", 1, 4, 1.0, 0.05, np.random.default_rng(9))
-    camera = replace(drawn.network.cameras[0], distances=(distance,))
-    with pytest.raises(AdjustmentError, match=words):
-        adjust(replace(drawn.network, cameras=(camera,)), drawn.start)
 
 
 def errors(halves: Halves, adjustment: Adjustment) -> dict[str, np.ndarray]:
@@ -222,35 +163,13 @@ def errors(halves: Halves, adjustment: Adjustment) -> dict[str, np.ndarray]:
     return {name: np.array(each) for name, each in found.items() if each}
 
 
-def test_half_the_marks_in_each_scan_suffice_where_joins_say_how_they_lie() -> None:
-    """Two corner marks in either half determine no affine film by themselves."""
-    simulated = halves(np.random.default_rng(3), join_count=25)
-    shown = {
-        image.name: sum(
-            name == image.name and kind == "fiducial"
-            for name, kind in zip(
-                simulated.network.observations.image, simulated.network.observations.kind, strict=True
-            )
-        )
-        for image in simulated.network.images
-    }
-    assert set(shown.values()) == {3}  # two corners, and the mark in the middle of a side that both show
-    adjustment = adjust(simulated.network)
-    for image in simulated.network.images:
-        for id_, mark in simulated.network.camera_by_name["K"].fiducials.items():
-            film, true = (
-                np.array([adjustment.value(f"T.{image.name}.{name}") for name in ("a1", "a2", "a3", "b1", "b2", "b3")]),
-                simulated.films[image.name],
-            )
-            xy = np.array([mark.x_mm.value, mark.y_mm.value])
-            place = np.linalg.solve(np.array([true[1:3], true[4:]]), xy - true[[0, 3]])
-            off = np.array([film[1:3], film[4:]]) @ place + film[[0, 3]] - xy
-            assert np.linalg.norm(off) < 0.05, (image.name, id_)
+def drop_targets(network: Network) -> Network:
+    return keep_rows(network, lambda image, point, kind: kind != "target")
 
 
 def test_frames_without_any_target_are_joined_too() -> None:
     simulated = halves(np.random.default_rng(4))
-    adjustment = adjust(replace(drop_images(simulated.network, "target"), points=()))
+    adjustment = adjust(replace(drop_targets(simulated.network), points=()))
     assert adjustment.converged
     assert adjustment.groups["join"].redundancy > 50.0
     assert 0.8 < np.sqrt(np.mean(errors(simulated, adjustment)["joins"] ** 2)) < 1.2
@@ -259,74 +178,25 @@ def test_frames_without_any_target_are_joined_too() -> None:
 def test_points_as_blocks_give_what_frames_as_blocks_give() -> None:
     """With many unknown points these are eliminated first, and the frames' unknowns are what they share."""
     simulated = halves(np.random.default_rng(5), join_count=5, targets=120)
-    points = tuple(
-        point if i < 6 else replace(point, **{axis: replace(getattr(point, axis), sigma=np.inf) for axis in "XYZ"})
-        for i, point in enumerate(simulated.network.points)
-    )
-    network = replace(simulated.network, points=points)
-    adjustment = adjust(network)
+    points = tuple(point if int(point.id) < 6 else set_sigma(point, UNKNOWN) for point in simulated.network.points)
+    adjustment = adjust(replace(simulated.network, points=points))
     assert 0.9 < np.sqrt(np.mean(errors(simulated, adjustment)["joins"] ** 2)) < 1.25
     assert 0.9 < adjustment.sigma0 < 1.1
-    # A weight that hardly binds leaves known points what they are, and frames are the blocks.
-    loose = replace(
-        network,
-        points=tuple(
-            replace(p, **{a: replace(getattr(p, a), sigma=0.0) for a in "XYZ"}) if i < 6 else p
-            for i, p in enumerate(points)
-        ),
-    )
-    assert adjust(loose).value("T.f0.left.a2") == pytest.approx(adjustment.value("T.f0.left.a2"), abs=1e-9)
 
 
 def test_a_gross_error_of_a_join_is_found_and_named() -> None:
-    simulated = halves(np.random.default_rng(7))
-    network = simulated.network
-    xy_mm = network.observations.xy_mm.copy()
-    row = next(
-        row
-        for row, key in enumerate(zip(network.observations.image, network.observations.point, strict=True))
-        if key == ("f1.right", "j4")
-    )
-    xy_mm[row] += 20.0 * JOIN_SIGMA
-    adjustment = adjust(
-        replace(network, observations=replace(network.observations, xy_mm=xy_mm)), options=Options(snooping=True)
-    )
-    (found,) = adjustment.suspects
+    network = halves(np.random.default_rng(7)).network
+    error = {observation_row(network, "join", "f1.right", "j4"): np.full(2, 20.0 * JOIN_SIGMA)}
+    (found,) = adjust(add_errors(network, error), options=Options(snooping=True)).suspects
     assert found.tested.name in ("join j4 in image f1.right", "join j4 in image f1.left")
 
 
-def test_joins_have_a_variance_component_of_their_own() -> None:
-    simulated = halves(np.random.default_rng(8), join_count=40)
-    observations = simulated.network.observations
-    loose = np.array([16.0 if kind == "join" else 1.0 for kind in observations.kind])[:, None, None]
-    network = replace(
-        simulated.network, observations=replace(observations, covariance_mm2=observations.covariance_mm2 * loose)
-    )
-    factors = adjust(network, options=Options(variance_components=True)).variance_factors
-    assert factors["join"] == pytest.approx(1.0 / 16.0, rel=0.3)
-
-
-def part(network: Network, keep: "np.ndarray[tuple[int], np.dtype[np.bool_]]") -> Network:
-    return replace(network, observations=network.observations.only(np.flatnonzero(keep)))
-
-
-def test_scans_without_anything_in_common_are_refused() -> None:
-    network = drop_images(halves(np.random.default_rng(9)).network, "join")
-    shared = np.array([point == "5" for point in network.observations.point])  # the mark that both halves show
-    targets = np.array([kind == "target" for kind in network.observations.kind])
-    with pytest.raises(AdjustmentError, match=r"frame f0: its scan f0.right has 0 points in common with f0.left"):
-        adjust(part(network, ~shared & ~targets))
-
-
-def test_a_join_of_one_scan_is_refused() -> None:
+def test_scans_that_cannot_be_joined_are_refused() -> None:
     network = halves(np.random.default_rng(10)).network
-    keys = zip(network.observations.image, network.observations.point, strict=True)
+    with pytest.raises(AdjustmentError, match=r"frame f0: its scan f0.right has 0 points in common with f0.left"):
+        adjust(keep_rows(network, lambda _, point, kind: kind == "fiducial" and point != "5"))  # which both halves show
     with pytest.raises(AdjustmentError, match=r"join j3 is observed in one scan of frame f0 only"):
-        adjust(part(network, np.array([key != ("f0.left", "j3") for key in keys])))
-
-
-def test_halves_of_different_cameras_are_refused() -> None:
-    network = halves(np.random.default_rng(11)).network
+        adjust(keep_rows(network, lambda image, point, _: (image, point) != ("f0.left", "j3")))
     images = (replace(network.images[0], transformation="projective"), *network.images[1:])
     with pytest.raises(AdjustmentError, match=r"frame f0: its scans f0.left and f0.right differ"):
         adjust(replace(network, images=images))
@@ -335,10 +205,7 @@ def test_halves_of_different_cameras_are_refused() -> None:
 def test_a_film_that_nothing_determines_is_named_with_its_frame() -> None:
     """All joins on one line, no mark in the right half: it can stretch across the line."""
     simulated = halves(np.random.default_rng(13), join_count=8, overlap_mm=1e-12, join_sigma=1e-12)
-    network = drop_images(simulated.network, "target")
-    observations = network.observations
-    rows = zip(observations.image, observations.kind, strict=True)
-    few = part(network, np.array([not (kind == "fiducial" and image == "f0.right") for image, kind in rows]))
-    adjustment = adjust(replace(few, points=()))
+    network = replace(drop_targets(simulated.network), points=())
+    adjustment = adjust(keep_rows(network, lambda image, _, kind: (image, kind) != ("f0.right", "fiducial")))
     assert not adjustment.converged
     assert any("f0" in each.cause and "scans" in each.cause for each in adjustment.singular), adjustment.singular

@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from faults import AXES
-from networks import Truth, field_points, simulated
+from networks import Truth, field_points, keep_rows, set_prior, simulated
 from numpy.typing import NDArray
 from row_roots import row_roots
 from scipy.sparse import csc_array, csr_array, eye_array, vstack
 from scipy.sparse.linalg import splu
 
-from adjust import Approximations, Fiducial, Network, ObjectPoint, Prior, adjust
+from adjust import Approximations, Network, ObjectPoint, Prior, adjust
 from adjust.least_squares.equations import Numbering, WhitenedRows, prior_root_weights
 from adjust.least_squares.iteration import Linearised, factorise, linearise
 from adjust.linear_algebra import elimination, fronts, sparse_factor
@@ -102,26 +102,6 @@ def test_the_condition_is_not_squared() -> None:
     np.testing.assert_allclose(factor.solution, truth[[2, 3, 0, 1]], atol=1e-4)
 
 
-@pytest.mark.parametrize(("count", "own"), [(18, {0, 3}), (9, {12})])
-def test_points_or_images_are_eliminated_first(count: int, own: set[int]) -> None:
-    """Whichever has more unknowns; either way the cofactors are the inverse of the dense normal equations."""
-    rng = np.random.default_rng(12)
-    network, start = simulated(rng, points=field_points(rng, count), point_sigma=0.05, free={"k3": np.inf})
-    problem = number(network, start)
-    numbering = Numbering(problem)
-    assert {touched.own.shape[1] for touched in numbering.touched} == own
-    at = linearise(numbering, network.observations.covariance_mm2, problem.start())
-    assert at is not None
-    weights = prior_root_weights(numbering)
-    matrix, _ = dense(at.rows, weights, np.zeros(len(weights)))
-    assert matrix.shape == (2 * len(network.observations) + len(weights), len(numbering.free))
-    normal = matrix.T @ matrix
-    scale = np.sqrt(np.diag(normal))
-    expected = np.linalg.inv(normal / np.outer(scale, scale))
-    cofactor = whole(factorise(numbering, at)) * np.outer(scale, scale)
-    np.testing.assert_allclose(cofactor, expected, atol=1e-6 * np.abs(expected).max())
-
-
 def linearised(count: int, point_sigma: float = 0.05) -> tuple[Numbering, Linearised]:
     """A network with unknown points, where it starts."""
     rng = np.random.default_rng(12)
@@ -177,7 +157,9 @@ def test_large_networks_are_adjusted_alike_whatever_the_order(monkeypatch: pytes
 
     rows = network.observations
     order = rng.permutation(len(rows))
-    other = adjust(replace(network, images=network.images[::-1], observations=rows.only(order)), start)
+    other = adjust(
+        replace(network, images=network.images[::-1], points=network.points[::-1], observations=rows.only(order)), start
+    )
     sigmas = np.sqrt(first.cofactor.variances)
     for i, name in enumerate(first.names):
         assert abs(other.value(name) - first.values[i]) <= 1e-7 * sigmas[i]
@@ -207,13 +189,11 @@ def strip(sigma: float) -> tuple[Network, Approximations]:
     along = np.linspace(-200.0, 500.0 * LENGTH - 300.0, count)
     points = np.column_stack([along, rng.uniform(-600.0, 600.0, count), rng.uniform(-150.0, 150.0, count)])
     network, start = simulated(rng, truth, points=points, point_sigma=sigma, free={"k3": np.inf})
-    observed = network.observations
-    stations = {f"f{i}": 500.0 * i for i in range(LENGTH)}
-    near = [
-        kind == "fiducial" or abs(points[int(point), 0] - stations[image]) < 600.0
-        for image, point, kind in zip(observed.image, observed.point, observed.kind, strict=True)
-    ]
-    return replace(network, observations=observed.only(np.flatnonzero(near))), start
+
+    def is_near(image: str, point: str, kind: str) -> bool:
+        return kind == "fiducial" or abs(points[int(point), 0] - 500.0 * int(image[1:])) < 600.0
+
+    return keep_rows(network, is_near), start
 
 
 def sparse_rows(rows: WhitenedRows, weights: Array) -> csc_array:
@@ -274,12 +254,7 @@ def test_a_strip_in_fronts_has_the_inverse_of_its_sparse_normal_equations(
 def test_null_directions_of_a_strip_in_fronts_are_named() -> None:
     """No datum in object space, none for the fiducials, four points in one image each: all are told, one by one."""
     network, start = strip(np.inf)
-    free = {
-        id_: Fiducial(*(Prior(prior.value, np.inf) for prior in (mark.x_mm, mark.y_mm)))
-        for id_, mark in network.cameras[0].fiducials.items()
-    }
-    camera = replace(network.cameras[0], principal_distance_mm=None, x0_mm=None, y0_mm=None, fiducials=free)
-    result = adjust(replace(network, cameras=(camera,)), start)
+    result = adjust(set_prior(network, np.inf), start)
     of_points, motions, axes = np.split(np.array(result.singular, dtype=object), [4, 11])
     assert all("one ray" in each.cause for each in of_points)
     assert all("object space" in each.cause for each in motions)

@@ -6,12 +6,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-import tifffile
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.sparse import csr_array
 
-from measure import FiducialOptions, FrameMeasurement, Scan, Status, measure_fiducials, open_scan
+from measure import FiducialOptions, FrameMeasurement, MarkFit, MarkMeasurement, Scan, Status, measure_fiducials
 from measure.boards.measure import BoardMeasurement
 from measure.boards.specs import (
     AprilGridSpec,
@@ -23,6 +22,7 @@ from measure.boards.specs import (
     aruco_dictionary,
 )
 from measure.marks.shapes import Bar, Disk, FiducialLayout, LayoutMark, Mark, MarkShape, Part, Ring, ring_cross
+from measure.results import Covariance
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS, Samples
 
@@ -31,8 +31,8 @@ STRIP = 10_000  # samples that are asked together
 
 
 def make_scan(grey: Array, full_scale: int = 65535, rounding_step_dn: float = 0.0) -> Scan:
-    """Grey values (height, width), rounded and cut off, as a scan of 16 or 8 bits in memory."""
-    rounded = np.clip(np.rint(grey), 0, full_scale)[..., None]
+    """Grey values (height, width), or those of channels, rounded and cut off, as a scan of 16 or 8 bits in memory."""
+    rounded = np.clip(np.rint(grey if grey.ndim == 3 else grey[..., None]), 0, full_scale)
     stored: Samples = rounded.astype(np.uint16) if full_scale > 255 else rounded.astype(np.uint8)
     return Scan(Path("drawn.tif"), WholePicture(stored, rounding_step_dn), NO_TAGS)
 
@@ -178,13 +178,6 @@ def placed(px_per_mm: float, center_px: tuple[float, float], turn_rad: float = 0
     return np.column_stack([px_per_mm * np.array([[c, -s], [-s, -c]]), center_px])
 
 
-def written_scan(grey: Array, folder: Path, name: str = "scan.tif") -> Scan:
-    """The grey values, rounded to 16 bits (8 where they are bytes), written to a file and opened."""
-    stored = grey if grey.dtype == np.uint8 else np.clip(np.rint(grey), 0, 65535).astype(np.uint16)
-    tifffile.imwrite(folder / name, stored)
-    return open_scan(folder / name)
-
-
 PITCH_UM, PX_PER_MM = 50.0, 20.0
 FRAME_PX = 400
 CORNERS = ((7.0, -7.0), (-7.0, -7.0), (-7.0, 7.0), (7.0, 7.0))
@@ -258,10 +251,9 @@ def paint(
 
 
 def measure_grey(
-    grey: Array, layout: FiducialLayout, folder: Path, options: FiducialOptions | None = None, pitch: bool = True
+    grey: Array, layout: FiducialLayout, options: FiducialOptions | None = None, pitch: bool = True
 ) -> FrameMeasurement:
-    with written_scan(grey, folder) as scan:
-        result = measure_fiducials(scan, layout, (PITCH_UM, PITCH_UM) if pitch else None, options)
+    result = measure_fiducials(make_scan(grey), layout, (PITCH_UM, PITCH_UM) if pitch else None, options)
     assert [mark.point for mark in result.marks] == [mark.id for mark in layout.marks]
     return result
 
@@ -272,14 +264,30 @@ def found_pose(frame: FrameMeasurement) -> tuple[str, bool]:
     return frame.pose.name, frame.pose.decided
 
 
+def measured_mark(point: str, center_px: Array, sigma_px: float) -> MarkMeasurement:
+    known = Covariance.from_noise(sigma_px**2 * np.eye(2))
+    return MarkMeasurement(point, "fiducial", center_px, known, Status.MEASURED)
+
+
+def center(mark: MarkFit | MarkMeasurement | None) -> Array:
+    assert mark is not None
+    assert mark.center_px is not None
+    return mark.center_px
+
+
+def chi_square(mark: MarkFit | MarkMeasurement | None, true_px: Array) -> float:
+    """The squared error of a place in its standard deviations: 13.8 of two coordinates once in a thousand."""
+    error = center(mark) - true_px
+    assert mark is not None
+    assert mark.covariance_px2 is not None
+    return float(error @ np.linalg.solve(mark.covariance_px2, error))
+
+
 def assert_right(result: FrameMeasurement, layout: FiducialLayout, matrix: Array) -> None:
     """All marks measured, with the right names, within their standard deviations."""
     for mark, given in zip(result.marks, layout.marks, strict=True):
         assert mark.status is Status.MEASURED, mark.reason
-        assert mark.center_px is not None
-        assert mark.covariance_px2 is not None
-        error = mark.center_px - matrix @ (*given.xy_mm, 1.0)
-        assert error @ np.linalg.solve(mark.covariance_px2, error) < 20
+        assert chi_square(mark, matrix @ (*given.xy_mm, 1.0)) < 20
 
 
 WIDTH, HEIGHT = 320, 260  # px

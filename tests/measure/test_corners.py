@@ -96,16 +96,6 @@ def test_the_junction_lies_where_the_squares_meet(blur_px: float) -> None:
         assert np.abs(corner.junction_px - center).max() < 0.03
 
 
-def test_trap_pixel_locking() -> None:
-    """Without noise the error stays below 0.004 px wherever the corner lies in its pixel: no grid of any kind."""
-    rng = np.random.default_rng(3)
-    steps = board_steps(rng)
-    for phase in np.linspace(-0.5, 0.5, 9):
-        center = SIZE // 2 + np.array([phase, -phase / 2])
-        corner = fit_mark(square_picture(center, steps, 0.7, False), center + 0.2, steps, False)
-        assert np.abs(corner.center_px - center).max() < 0.004
-
-
 def test_a_bent_tone_curve_and_sharpening_do_not_move_a_crossing() -> None:
     rng = np.random.default_rng(4)
     for _ in range(4):
@@ -114,14 +104,6 @@ def test_a_bent_tone_curve_and_sharpening_do_not_move_a_crossing() -> None:
         bent = 255 * (np.clip(linear - 45, 0, None) / 255) ** 0.45
         corner = fit_mark(bent, center + rng.normal(0, 0.3, 2), steps, False)
         assert np.abs(corner.center_px - center).max() < 0.01
-
-
-def test_contrast_says_which_square_is_light() -> None:
-    steps = np.diag([14.0, 14.0])
-    center = np.array([12.2, 12.3])
-    light = square_picture(center, steps, 0.8, False)
-    assert fit_mark(light, center, steps, False).contrast_dn == pytest.approx(CONTRAST, rel=0.05)
-    assert fit_mark(200 - light, center, steps, False).contrast_dn == pytest.approx(-CONTRAST, rel=0.05)
 
 
 def test_a_stain_is_left_out() -> None:

@@ -34,14 +34,6 @@ def test_coverage_equals_brute_force(name: str) -> None:
     assert exact.sum() == pytest.approx(brute.sum(), rel=0.01)
 
 
-@pytest.mark.parametrize("phase", [0.0, 0.17, 0.5, 0.83])
-def test_a_blurred_disks_centroid_and_area_are_exact(phase: float) -> None:
-    """Blurred, for pixels alias the centroid of a sharp one."""
-    shown = picture(MarkShape(dot(0.5)), placed(10.0, (15 + phase, 14 - phase)), 31, 31, 0.8)
-    np.testing.assert_allclose(_centroid(shown), [15 + phase, 14 - phase], atol=0.001)
-    assert shown.sum() == pytest.approx(np.pi * 25, rel=5e-4)
-
-
 @pytest.mark.parametrize("blur_px", [0.4, 0.8, 1.7])
 def test_the_blurred_picture_equals_brute_force(blur_px: float) -> None:
     mark = MarkShape(MARKS["ring-cross"])
@@ -74,16 +66,6 @@ def test_a_picture_bent_by_a_series_is_that_of_the_mark_drawn_anew(name: str) ->
         np.testing.assert_allclose(bent.value, anew.value, atol=0.002)
         np.testing.assert_allclose(bent.by_col, anew.by_col, atol=0.01)
         np.testing.assert_allclose(bent.by_row, anew.by_row, atol=0.01)
-
-
-@pytest.mark.parametrize("phase", [(0.0, 0.0), (0.31, 0.77), (0.5, 0.125)])
-def test_moving_drawn_cells_is_drawing_the_mark_elsewhere(phase: tuple[float, float]) -> None:
-    """Trap: a fraction of a pixel lost between cells. The ends of straight edges upright to the cells tell the most."""
-    mark = MarkShape(MARKS["cross"])
-    place = placed(9.0, (20 + phase[0], 20 + phase[1]))
-    shown = picture(mark, place, 41, 41, 0.8)
-    np.testing.assert_allclose(_centroid(shown), place[:, 2], atol=1e-4)
-    np.testing.assert_allclose(shown, picture(mark, place, 41, 41, 0.8, cells=16), atol=0.002)
 
 
 def test_a_chip_is_shown_at_its_own_pixels_from_0_to_1() -> None:

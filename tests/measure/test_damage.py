@@ -3,10 +3,8 @@
 import multiprocessing
 import resource
 import time
-from collections import Counter
-from collections.abc import Iterator
+from functools import cache
 from io import BytesIO
-from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +13,7 @@ import tifffile
 from damaged_files import DAMAGES, measure_file, outcome, stored
 from numpy.typing import NDArray
 
-from measure import MeasurementError, Status, open_scan
+from measure import FrameMeasurement, MeasurementError, Status, open_scan
 from measure.fiducials.rows import with_damage
 from measure.noise.robust_estimation import damage
 
@@ -100,60 +98,31 @@ def test_a_mark_in_a_damaged_tile_is_absent_and_the_others_are_measured(tmp_path
 
 @pytest.mark.study
 def test_damaged_files_by_the_thousand(tmp_path: Path) -> None:
-    """In a process of its own, which has so much memory and no more. (python -m pytest -m study -s says the counts.)"""
-    counts: dict[str, Counter[str]] = {name: Counter() for name in stored()}
-    bad = []
-    for name, kind, case, own_outcome in _outcomes(tmp_path):
-        counts[name][own_outcome.split(":")[0]] += 1
-        if own_outcome not in ("message", "right"):
-            bad.append((name, kind, case, own_outcome))
-            print(*bad[-1], flush=True)
-    for name, counted in counts.items():
-        print(f"{name:25} {dict(counted)}")
-    assert sum(counted.total() for counted in counts.values()) == CASES * len(DAMAGES) * len(stored()) >= 2000
-    assert not bad
-
-
-def _outcomes(folder: Path) -> Iterator[tuple[str, str, int, str]]:
-    """Of every case, from processes that are ended where one hangs."""
+    """In a process that has so much memory and no more; one that hangs or dies ends the test."""
     cases = [(name, kind, case) for name in stored() for kind in DAMAGES for case in range(CASES)]
-    first = 0
-    while first < len(cases):
-        here, there = multiprocessing.Pipe()
-        worker = multiprocessing.get_context("spawn").Process(target=_work, args=(there, folder, cases[first:]))
-        worker.start()
-        there.close()
-        for each in cases[first:]:
-            first += 1
-            try:
-                result = here.recv() if here.poll(WAITED_S) else "hang"
-            except EOFError:
-                result = "died"
-            yield *each, result
-            if result in ("hang", "died"):
-                break
-        worker.kill()
-        worker.join()
+    assert len(cases) >= 2000
+    with multiprocessing.get_context("spawn").Pool(1, limit_memory) as worker:
+        found = {each: worker.apply_async(damaged_outcome, (tmp_path, *each)).get(WAITED_S) for each in cases}
+    assert not {each: result for each, result in found.items() if result not in ("message", "right")}
 
 
-def _work(out: Connection, folder: Path, cases: list[tuple[str, str, int]]) -> None:
-    whole = {}
-    path = folder / "s"
-    for name in dict.fromkeys(name for name, _, _ in cases):
-        path.write_bytes(stored()[name])
-        whole[name] = measure_file(path)
+def limit_memory() -> None:
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     most = pages * resource.getpagesize() + MOST_BYTES
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
-    for name, kind, case in cases:
-        path.write_bytes(damaged(name, kind, case))
-        start = time.process_time()
-        try:
-            own_outcome = outcome(path, whole[name])
-        except Exception as error:
-            own_outcome = f"traceback: {error!r}"
-        took_s = time.process_time() - start
-        out.send(own_outcome if took_s < LONGEST_S else f"hang: {took_s:.0f} s")
+
+
+@cache
+def measured_whole(folder: Path, name: str) -> FrameMeasurement:
+    (folder / "whole").write_bytes(stored()[name])
+    return measure_file(folder / "whole")
+
+
+def damaged_outcome(folder: Path, name: str, kind: str, case: int) -> str:
+    (folder / "damaged").write_bytes(damaged(name, kind, case))
+    right, start = measured_whole(folder, name), time.process_time()
+    found = outcome(folder / "damaged", right)
+    return found if time.process_time() - start < LONGEST_S else "hang"
 
 
 def test_damage_lies_about_its_speck_on_all_sides_alike() -> None:

@@ -66,15 +66,6 @@ def test_a_truncated_tiff_is_found_when_it_is_opened(tmp_path: Path, kept: float
         open_scan(tmp_path / "s.tif")
 
 
-@pytest.mark.parametrize("ending", [".png", ".jpg"])
-def test_a_truncated_picture(tmp_path: Path, ending: str) -> None:
-    cv2.imwrite(str(tmp_path / f"s{ending}"), picture(np.uint8))
-    data = (tmp_path / f"s{ending}").read_bytes()
-    (tmp_path / f"s{ending}").write_bytes(data[: len(data) // 2])
-    with pytest.raises(MeasurementError, match="damaged or truncated"):
-        open_scan(tmp_path / f"s{ending}")
-
-
 @pytest.mark.parametrize("compression", ["zstd", "zlib", "lzw", "packbits"])
 def test_a_damaged_tile_is_unknown_and_costs_none_of_the_others(tmp_path: Path, compression: str) -> None:
     tifffile.imwrite(tmp_path / "s.tif", picture(), tile=(64, 64), compression=compression)

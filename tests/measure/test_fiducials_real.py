@@ -4,12 +4,11 @@ import csv
 
 import numpy as np
 import pytest
-from drawn import make_scan
 from numpy.typing import NDArray
 from real_data import DATA, needs
 
 from measure import FiducialOptions, FrameMeasurement, Scan, Status, measure_fiducials, open_scan
-from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross, ring_cross
+from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
 from measure.tone.curve import Tone
@@ -17,7 +16,6 @@ from measure.tone.curve import Tone
 SCANS = DATA / "film_scans"
 pytestmark = needs("film_scans")
 
-WILD = MarkShape(ring_cross(0.80, 0.17, 1.75, 0.10, 0.08, 45.0), "light")
 RESEAU = MarkShape(cross(0.97, 0.05), "dark")
 RESEAU_PITCH_UM = 27.4
 MIDDLE_PX = 1072  # a step of the lattice is 356
@@ -115,25 +113,6 @@ def test_a_reseau_is_not_detected_in_a_frame_of_another_camera() -> None:
         result = measure_fiducials(scan, lattice(), (RESEAU_PITCH_UM, RESEAU_PITCH_UM))
     assert not any(mark.status.is_observation for mark in result.marks)
     assert "no fiducial was measured" in result.problems[0]
-
-
-@pytest.mark.study
-@pytest.mark.parametrize("exponent", [0.3, 1.0, 2.0])
-def test_the_curve_by_which_a_scan_stores_light_does_not_decide_whether_its_frame_exists(exponent: float) -> None:
-    """Squared grey values are light to a power of 0.47: far from the one that is tried first."""
-    ring_cross_corners = square(WILD)
-    with open_scan(SCANS / "aerial" / "08320661.jpeg") as scan:
-        grey, full, pitch_um = scan.window(0, 0, scan.width_px, scan.height_px), scan.full_scale_dn, scan.pitch_um
-        at_first = measure_fiducials(scan.replace_tone(Tone.unknown()), ring_cross_corners, pitch_um)
-    bent = make_scan(65535 * (grey.astype(float) / full) ** exponent).replace_tone(Tone.unknown())
-    result = measure_fiducials(bent, ring_cross_corners, pitch_um)
-    first, then = (
-        {mark.point: mark.center_px for mark in each.marks if mark.center_px is not None and mark.status.is_observation}
-        for each in (at_first, result)
-    )
-    off = [np.hypot(*(place - first[point])) for point, place in then.items()]
-    assert len(off) >= 3
-    assert max(off) < 0.1
 
 
 @pytest.mark.study

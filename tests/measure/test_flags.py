@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[2]
 
 def test_every_code_has_a_meaning_and_is_short() -> None:
     assert all(re.fullmatch(r"[a-z]+(-[a-z]+)?", code) for code in Code)
-    assert all(code.meaning.endswith(".") for code in Code)
+    assert all(each.meaning.endswith(".") for each in (*Code, *Cause))
 
 
 def test_the_page_has_the_table() -> None:
@@ -103,15 +103,12 @@ def test_every_limit_is_used_and_none_stands_elsewhere() -> None:
 QUARTER = Affine(np.array([[0.0, -2.0, 5.0], [2.0, 0.0, 1.0]]))  # a quarter turn at twice the size, then (5, 1) farther
 
 
-def test_an_affine_transformation_takes_points_there_and_back() -> None:
+def test_an_affine_transformation_takes_points_there_and_back_and_of_two_the_first_first() -> None:
     points = np.array([[[1.0, 0.0], [0.0, 3.0]]])
     np.testing.assert_allclose(QUARTER.apply(points), [[[5.0, 3.0], [-1.0, 1.0]]])
     np.testing.assert_allclose(QUARTER.inverse.apply(QUARTER.apply(points)), points)
     assert QUARTER.scale == pytest.approx(2.0)
     assert Affine.from_linear(np.diag([4.0, -1.0])).scale == pytest.approx(2.0)
-
-
-def test_of_two_in_turn_the_first_is_taken_first() -> None:
     stretch, point = Affine.from_linear(np.diag([3.0, 1.0]), (0.0, 1.0)), np.array([1.0, 1.0])
     np.testing.assert_allclose(QUARTER.compose(stretch).apply(point), [1.0, 7.0])
     np.testing.assert_allclose(stretch.compose(QUARTER).apply(point), [9.0, 4.0])

@@ -1,18 +1,21 @@
-"""Corners, wings and notches of the exposed frame, drawn pixel by pixel."""
+"""Corners, wings and notches of the exposed frame, and crossings of lines that run on: drawn pixel by pixel."""
 
+from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
-from drawn import Array, draw, lay_out, make_scan, pixel_from_camera, transformed, written_scan
+from drawn import Array, center, chi_square, draw, lay_out, make_scan, pixel_from_camera, transformed
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
+from scipy.special import ndtr
 from studies import parametrize_with_studies
 
 from measure import FiducialOptions, MarkFit, Status, measure_fiducials
 from measure.marks.shapes import (
+    Bar,
+    Disk,
     FiducialLayout,
     LayoutMark,
     MarkShape,
@@ -20,11 +23,12 @@ from measure.marks.shapes import (
     Polygon,
     frame_corner,
     known_outline_mm,
+    limit_to_crossings,
     limit_to_frame,
     turned_part,
 )
 from measure.matching.frame_edge import fit_frame_corner
-from measure.tone.curve import Tone, power
+from measure.tone.curve import LINEAR, Tone, power
 
 HALF_MM, WEDGE_MM, SIDES = 8.0, 7.0, ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 PIXEL_FROM_CAMERA = pixel_from_camera("90", turn_rad=0.03)
@@ -86,11 +90,10 @@ def measure_picture(camera: FiducialLayout, picture: Array) -> list[Measured]:
     found = []
     for mark, given in zip(result.marks, camera.marks, strict=True):
         assert mark.status is Status.MEASURED, mark.reason
-        assert mark.center_px is not None
+        true_px = PIXEL_FROM_CAMERA @ (*given.xy_mm, 1.0)
         assert mark.covariance_px2 is not None
-        off = mark.center_px - PIXEL_FROM_CAMERA @ (*given.xy_mm, 1.0)
-        chi2 = float(off @ np.linalg.solve(mark.covariance_px2, off))
-        found.append(Measured(float(np.hypot(*off)), float(np.sqrt(np.trace(mark.covariance_px2) / 2)), chi2))
+        sigma_px = float(np.sqrt(np.trace(mark.covariance_px2) / 2))
+        found.append(Measured(float(np.hypot(*(center(mark) - true_px))), sigma_px, chi_square(mark, true_px)))
     return found
 
 
@@ -183,29 +186,25 @@ def layout_frame_corner(radius_mm: float = 0.0) -> FiducialLayout:
 @parametrize_with_studies(
     ("radius_mm", "neighbour", "negative"), [(0.0, False, True), (1.0, False, False), (0.0, True, False)]
 )
-def test_corners_of_the_frame_are_where_its_edges_meet(
-    tmp_path: Path, radius_mm: float, neighbour: bool, negative: bool
-) -> None:
+def test_corners_of_the_frame_are_where_its_edges_meet(radius_mm: float, neighbour: bool, negative: bool) -> None:
     grey = picture(1, radius_mm, neighbour, negative)
-    with written_scan(grey, tmp_path) as scan:
-        frame = measure_fiducials(scan, layout_frame_corner(radius_mm), (50.0, 50.0), FiducialOptions(pose="0"))
+    scan = make_scan(grey)
+    frame = measure_fiducials(scan, layout_frame_corner(radius_mm), (50.0, 50.0), FiducialOptions(pose="0"))
     scores = []
     for mark in frame.marks:
         true = MATRIX @ (*CORNERS[mark.point], 1.0)
         assert mark.status in (Status.MEASURED, Status.WEAK), mark.reason
-        assert mark.center_px is not None
-        assert mark.covariance_px2 is not None
-        assert np.hypot(*(mark.center_px - true)) < 0.6
-        scores += list((mark.center_px - true) / np.sqrt(np.diag(mark.covariance_px2)))
-    assert np.sqrt(np.mean(np.square(scores))) < 2.0
+        assert np.hypot(*(center(mark) - true)) < 0.6
+        scores.append(chi_square(mark, true) / 2)
+    assert np.sqrt(np.mean(scores)) < 2.0
 
 
-def test_no_corner_is_visible_in_a_landscape(tmp_path: Path) -> None:
+def test_no_corner_is_visible_in_a_landscape() -> None:
     land = 15000 + 3000 * gaussian_filter(np.random.default_rng(3).normal(0, 1, (400, 400)), 3.0) / 0.09
     start = np.column_stack([MATRIX[:, :2], (200.0, 200.0)])
-    with written_scan(np.asarray(land), tmp_path) as scan:
-        corner = frame_corner((-10.0, 10.0), 5.0)
-        fit = fit_frame_corner(scan, corner, start, 10.0, 1)
+    scan = make_scan(np.asarray(land))
+    corner = frame_corner((-10.0, 10.0), 5.0)
+    fit = fit_frame_corner(scan, corner, start, 10.0, 1)
     assert not fit.converged
     assert "edge of the frame" in fit.reason
 
@@ -230,3 +229,68 @@ def test_a_corner_moves_with_the_tone_curve_as_its_edges_say(gamma: float) -> No
     assert np.hypot(*estimate.on_place[:, 0]) > 0.15
     assert estimate.information.sum_of_squares < 25  # of 5 figures, by the true curve
     assert fit_mark(Tone(power(gamma))).tone is None
+
+
+LINES_PX_PER_MM, LINE_MM, SIZE_PX, BLUR_PX = 20.0, 0.2, 640, 0.9
+STEPS_MM = np.arange(-2, 3) * 5.0
+MIDDLE_PX, LINES_TURN = np.array([322.3, 317.8]), np.deg2rad(0.4)
+BRIGHT = {"0-0": (0.05, -0.1), "3-1": (-0.1, 0.05)}  # stars on crossings, mm beside them
+
+
+def line_layout(arm_mm: float = 2.5) -> FiducialLayout:
+    cross = MarkShape(
+        (Bar((-arm_mm, 0.0), (arm_mm, 0.0), LINE_MM), Bar((0.0, -arm_mm), (0.0, arm_mm), LINE_MM)), "dark"
+    )
+    marks = (LayoutMark(name, xy, (0.002, 0.002), cross) for name, xy in places_mm().items())
+    return FiducialLayout(tuple(marks), (30.0, 30.0))
+
+
+def places_mm() -> dict[str, tuple[float, float]]:
+    return {f"{i}-{j}": (float(x), float(y)) for i, x in enumerate(STEPS_MM) for j, y in enumerate(STEPS_MM)}
+
+
+def to_px(xy_mm: Array) -> Array:
+    c, s = np.cos(LINES_TURN), np.sin(LINES_TURN)
+    return np.asarray(xy_mm @ np.array([[c, s], [-s, c]]) * (LINES_PX_PER_MM, -LINES_PX_PER_MM) + MIDDLE_PX)
+
+
+def plate() -> Array:
+    """Grey values of a negative."""
+    rng, (rows, cols) = np.random.default_rng(5), np.mgrid[:SIZE_PX, :SIZE_PX]
+    right, up = (cols - MIDDLE_PX[0]) / LINES_PX_PER_MM, (MIDDLE_PX[1] - rows) / LINES_PX_PER_MM
+    x, y = np.cos(LINES_TURN) * right + np.sin(LINES_TURN) * up, np.cos(LINES_TURN) * up - np.sin(LINES_TURN) * right
+    covered, blur_mm = np.zeros(rows.shape), BLUR_PX / LINES_PX_PER_MM
+    for across, along in ((x, y), (y, x)):
+        for step in STEPS_MM:
+            line = ndtr((LINE_MM / 2 - across + step) / blur_mm) - ndtr((-LINE_MM / 2 - across + step) / blur_mm)
+            covered = np.maximum(covered, line * ndtr((11.5 - np.abs(along)) / blur_mm))
+    stars = [(place, 1.0, 0.1) for place in rng.uniform(-14, 14, (120, 2))]
+    stars += [(np.add(places_mm()[name], off), 20.0, 0.3) for name, off in BRIGHT.items()]
+    density = sum(h * np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / 2 / sigma**2) for at, h, sigma in stars)
+    ground = 45000.0 - 9000.0 * covered
+    return np.asarray(ground - (ground - 6000.0) * (1 - np.exp(-density)) + rng.normal(0, 300, rows.shape))
+
+
+def test_crossings_are_measured_with_claims_that_hold_and_those_under_stars_are_not() -> None:
+    scan = make_scan(plate()).replace_tone(LINEAR)
+    frame = measure_fiducials(scan, line_layout(), (1000 / LINES_PX_PER_MM,) * 2, FiducialOptions("0"))
+    good = [mark for mark in frame.marks if mark.status is Status.MEASURED]
+    assert len(good) >= 20
+    assert not {mark.point for mark in good} & {*BRIGHT}
+    places = np.array([mark.center_px for mark in good], dtype=float)
+    errors = places - to_px(np.array([places_mm()[mark.point] for mark in good]))
+    sigmas = np.sqrt([np.diag(mark.covariance.px2) for mark in good if mark.covariance is not None])
+    assert np.abs(errors).max() < 0.05
+    assert 0.7 < np.sqrt((errors**2).mean() / (sigmas**2).mean()) < 1.3
+
+
+def test_lines_that_run_on_are_known_about_their_crossings_only() -> None:
+    (limited, *_) = limit_to_crossings(line_layout()).marks
+    assert isinstance(limited.mark, MarkShape)
+    assert limited.mark.known_mm == ((-1.0, -1.0), (1.0, 1.0))
+    assert np.abs(known_outline_mm(limited.mark)).max() <= 1.0
+    assert limit_to_crossings(line_layout(2.0)) == line_layout(2.0)  # crosses with gaps between them
+    dots = replace(
+        line_layout(), marks=tuple(replace(m, mark=MarkShape((Disk((0.0, 0.0), 2.4),))) for m in line_layout().marks)
+    )
+    assert limit_to_crossings(dots) == dots

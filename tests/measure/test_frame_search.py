@@ -6,10 +6,10 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from drawn import ALIKE, lay_out, make_scan, paint, placed
+from drawn import ALIKE, make_scan, measured_mark
 from numpy.typing import NDArray
 
-from measure import FiducialOptions, Scan, measure_fiducials
+from measure import FiducialOptions, Scan
 from measure.detection.responses import ByteCache, Responses
 from measure.fiducials import stages
 from measure.fiducials.constellation import Bounds, Placement, PlacementSearch, same_picture
@@ -19,10 +19,10 @@ from measure.fiducials.refit import fit_lines_and_sharpening
 from measure.fiducials.rows import pitch_problem
 from measure.fiducials.search import PitchHypothesis, SearchResult
 from measure.fiducials.stages import Found, Kind, Stage, find_frame
-from measure.flags import FRAMES_BY_CHANCE, NO_REASON, Reason, Status
+from measure.flags import FRAMES_BY_CHANCE, NO_REASON, Reason
 from measure.geometry import POSES, up_from_camera
-from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, dot, polygon, turned_part
-from measure.results import Covariance, FrameMeasurement, MarkMeasurement
+from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, dot
+from measure.results import FrameMeasurement
 from measure.tone.curve import Tone
 from measure.tone.sharpening import Sharpening
 
@@ -223,43 +223,6 @@ def test_where_nothing_was_detected_the_reason_says_so(monkeypatch: pytest.Monke
     assert found.misfit == "no two of the camera's marks were found in the scan"
 
 
-PX_PER_MM = 20.0
-HALF_MM = 5.5
-AT_MM = 4.4
-MIDDLE_PX = 150.3
-WING = polygon(((0.0, 0.0), (0.8, 0.35), (0.8, -0.35)))
-CLOSER_LOOK_PLACES = [(x, y) for x in (-AT_MM, AT_MM) for y in (-AT_MM, AT_MM)]
-
-
-def wing(x: float, y: float) -> MarkShape:
-    """It points away from the frame's middle."""
-    return MarkShape(tuple(turned_part(part, float(np.degrees(np.arctan2(y, x)))) for part in WING))
-
-
-@pytest.mark.study
-@pytest.mark.parametrize("contrast", [4500.0, 0.0])
-def test_wings_are_found_next_to_an_edge_that_is_nine_times_as_strong(contrast: float) -> None:
-    rng = np.random.default_rng(3)
-    grey = np.full((300, 300), 55000.0)
-    edge = slice(round(MIDDLE_PX - HALF_MM * PX_PER_MM), round(MIDDLE_PX + HALF_MM * PX_PER_MM))
-    grey[edge, edge] = 13000.0
-    matrix = placed(PX_PER_MM, (MIDDLE_PX, MIDDLE_PX))
-    layout = lay_out([wing(*place) for place in CLOSER_LOOK_PLACES], CLOSER_LOOK_PLACES, (2 * HALF_MM, 2 * HALF_MM))
-    for mark in layout.marks:
-        paint(grey, mark.mark, mark.xy_mm, matrix, -contrast, blur_px=0.9)
-    grey += rng.normal(0.0, 900.0, grey.shape)
-    result = measure_fiducials(
-        make_scan(grey), layout, (1000 / PX_PER_MM,) * 2, FiducialOptions(pose="0", pitch_is_right=True)
-    )
-    if not contrast:
-        assert {mark.status for mark in result.marks} == {Status.ABSENT}
-        return
-    for found, given in zip(result.marks, layout.marks, strict=True):
-        assert found.status is Status.WEAK, found
-        assert found.center_px is not None
-        assert np.hypot(*(found.center_px - matrix @ (*given.xy_mm, 1.0))) < 0.5
-
-
 def layout(sigma_mm: float) -> FiducialLayout:
     places = [(-106.0, -106.0), (106.0, 106.0), (-106.0, 106.0), (106.0, -106.0)]
     marks = [LayoutMark(str(k), place, (sigma_mm, sigma_mm), MarkShape(dot(0.1))) for k, place in enumerate(places)]
@@ -269,12 +232,7 @@ def layout(sigma_mm: float) -> FiducialLayout:
 def frame(across_um: float, down_um: float) -> FrameMeasurement:
     """A frame turned by 90 degrees."""
     matrix = np.array([[0.0, 1000.0 / across_um, 5000.0], [1000.0 / down_um, 0.0, 5000.0]])
-    marks = [
-        MarkMeasurement(
-            mark.id, "fiducial", matrix @ (*mark.xy_mm, 1.0), Covariance.from_noise(np.eye(2)), Status.MEASURED
-        )
-        for mark in layout(1.0).marks
-    ]
+    marks = [measured_mark(mark.id, matrix @ (*mark.xy_mm, 1.0), 1.0) for mark in layout(1.0).marks]
     return FrameMeasurement("a", tuple(marks), None, matrix)
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drawn import Array, brute_picture, lay_out, make_scan, paint
+from drawn import Array, brute_picture, lay_out, make_scan, measured_mark, paint
 from numpy.typing import NDArray
 
 from measure import Scan, Status
@@ -32,7 +32,7 @@ from measure.fiducials.significance import doubt_frame
 from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, cross, dot
 from measure.marks.templates import cut, learn_template
-from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
+from measure.results import FrameMeasurement, Pose
 
 SQUARE = np.array([(100.0, -100.0), (-100.0, -100.0), (-100.0, 100.0), (100.0, 100.0)])
 EIGHT = np.array([*SQUARE, (100.0, 0.0), (-100.0, 0.0), (0.0, 100.0), (0.0, -100.0)])
@@ -79,11 +79,6 @@ def test_chi_square_is_that_of_its_redundancy() -> None:
     ]
     # Two of the twelve are the affinity's pseudo-observations, here exactly at their expectation.
     assert np.mean([fit.chi_square for fit in values]) == pytest.approx(10.3, abs=1.2)
-
-
-def test_one_mark_does_not_determine_a_frame() -> None:
-    with pytest.raises(ValueError, match="two or more"):
-        fit_frame(EIGHT[:1], EIGHT[:1], np.ones(1), np.eye(2))
 
 
 def outlying(camera: Array, up: Array) -> list[int]:
@@ -224,20 +219,8 @@ def make_frame(
     marks = []
     for point, place in THREE.items():
         center = linear @ (np.array(place) + (off_mm or {}).get(point, (0.0, 0.0))) + 700.0
-        noisy = center + rng.normal(0.0, SIGMA_PX, 2)
-        marks.append(
-            MarkMeasurement(point, "fiducial", noisy, Covariance.from_noise(SIGMA_PX**2 * np.eye(2)), Status.MEASURED)
-        )
+        marks.append(measured_mark(point, center + rng.normal(0.0, SIGMA_PX, 2), SIGMA_PX))
     return FrameMeasurement(name, tuple(marks), None, np.column_stack([linear, [700.0, 700.0]]))
-
-
-def weak(frames: list[FrameMeasurement], sigma_mm: float = 0.02, pitch_mm: float = MM) -> dict[str, set[str]]:
-    """The weak marks by frame, checked as scans of pitch_mm."""
-    checked = check_frames(
-        frames, make_layout(THREE, sigma_mm), [(1000 * pitch_mm, 1000 * pitch_mm)] * len(frames)
-    ).frames
-    found = {frame.image: {mark.point for mark in frame.marks if mark.status is Status.WEAK} for frame in checked}
-    return {image: points for image, points in found.items() if points}
 
 
 @pytest.mark.parametrize("mirror", [False, True])

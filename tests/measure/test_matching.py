@@ -10,9 +10,15 @@ from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 
 from measure import MarkFit, MatchOptions, ScanWindow, match
+from measure.fiducials.interior_orientation import fit_frame
+from measure.fiducials.options import FiducialOptions
 from measure.marks.shapes import Mark, MarkShape, cross, dot, polygon, ring_cross, ring_dot
+from measure.marks.templates import learn_template
 from measure.matching.window import read_window
-from measure.tone.curve import Tone
+from measure.targets.detection import DiskSearch
+from measure.targets.identification import TargetPrediction
+from measure.targets.ring_codes import RingCode
+from measure.tone.curve import Tone, sampled_curve
 
 SIZE, SCALE, CONTRAST, GROUND = 41, 10.0, 500.0, 1000.0
 MARKS = {
@@ -215,25 +221,32 @@ def test_nothing_is_not_a_mark() -> None:
     assert not noise.converged or noise.likeness < 0.35
     outside = match(ScanWindow(np.zeros((SIZE, SIZE)), (500, 500)), MARKS["cross"], place)
     assert "outside" in outside.reason
-
-
-def test_half_of_a_mark_outside_of_the_scan_is_stated() -> None:
     shown, place = draw_mark("ring-cross", 1.0)[0]
     valid = np.zeros(shown.shape, dtype=bool)
     valid[:, 24:] = True
-    fit = match(ScanWindow(shown, valid=valid), MARKS["ring-cross"], place)
-    assert "outside of the scan" in fit.reason
+    half = match(ScanWindow(shown, valid=valid), MARKS["ring-cross"], place)
+    assert "outside of the scan" in half.reason
 
 
 @pytest.mark.parametrize(
-    "make",
+    ("make", "words"),
     [
-        lambda: MatchOptions(blur_px=0.0),
-        lambda: MatchOptions(margin_px=-1.0),
-        lambda: MatchOptions(linear_sigma=float("nan")),
-        lambda: MatchOptions(damage_rounds=-1),
+        (lambda: MatchOptions(blur_px=0.0), "is right"),
+        (lambda: MatchOptions(margin_px=-1.0), "is right"),
+        (lambda: MatchOptions(linear_sigma=float("nan")), "is right"),
+        (lambda: MatchOptions(damage_rounds=-1), "is right"),
+        (lambda: FiducialOptions(pose="45"), "auto or one of 0, 90"),
+        (lambda: DiskSearch((1.0, 5.0)), "the smallest first"),
+        (lambda: DiskSearch((9.0, 5.0)), "the smallest first"),
+        (lambda: RingCode(2), "bits are 2"),
+        (lambda: RingCode(12, (3.0, 2.0)), "inner one first"),
+        (lambda: TargetPrediction("a", np.zeros(2), np.eye(2), 0.0), "a positive number is right"),
+        (lambda: TargetPrediction("a", np.zeros(2), np.zeros((2, 3)), 5.0), r"pixel_from_disk \(2, 2\)"),
+        (lambda: sampled_curve(np.array([0.0, 0.5, 0.4, 1.0])), "grows"),
+        (lambda: learn_template([], 3.0), "needs a picture"),
+        (lambda: fit_frame(np.zeros((1, 2)), np.zeros((1, 2)), np.ones(1), np.eye(2)), "two or more"),
     ],
 )
-def test_bad_options_are_refused(make: Callable[[], MatchOptions]) -> None:
-    with pytest.raises(ValueError, match="is right"):
+def test_what_cannot_be_is_refused(make: Callable[[], object], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
         make()

@@ -9,10 +9,8 @@ import tifffile
 from drawn import brute_picture, placed
 from numpy.typing import NDArray
 
-from measure import MarkShape, Scan, ScanWindow, match, open_scan, ring_cross
-from measure.scans.cache import WholePicture
+from measure import MarkShape, ScanWindow, match, open_scan, ring_cross
 from measure.scans.jpeg import covariance_of_compression, rounding_step_dn
-from measure.scans.metadata import NO_TAGS
 
 # Annex K of ITU-T T.81, luminance, the first 15 in zigzag order: what "quality 50" is.
 COARSE = (16, 11, 12, 14, 12, 10, 16, 14, 13, 14, 18, 17, 16, 19, 24)
@@ -95,7 +93,6 @@ def test_faint_marks_that_jpeg_rounds_are_as_far_off_as_is_stated() -> None:
         grey = np.clip(np.rint(60 + contrast_dn * picture + noise), 0, 255).astype(np.uint8)
         start = placed(10.0, tuple(place[:, 2] + rng.uniform(-0.5, 0.5, 2)))
         fit = match(ScanWindow(stored_after_jpeg(grey, 30).astype(float), is_lossy=True), mark, start)
-        scan = Scan(Path("lossy.tif"), WholePicture(even[..., None], rounding_step_dn=step_dn), NO_TAGS)
-        variance = np.trace(fit.covariance_px2 + covariance_of_compression(scan.rounding_step_dn, fit.contrast_dn)) / 2
+        variance = np.trace(fit.covariance_px2 + covariance_of_compression(step_dn, fit.contrast_dn)) / 2
         ratios.append((fit.center_px - place[:, 2]) / np.sqrt(variance))
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.25

@@ -206,17 +206,13 @@ def test_what_goes_on_failing_is_reported_and_is_no_damage(
 
 
 @pytest.mark.usefixtures("quick")
-def test_missing_forbidden_and_silent_addresses(tmp_path: Path, server: RangeServer) -> None:
+def test_missing_forbidden_and_silent_addresses_and_servers_without_ranges(tmp_path: Path, server: RangeServer) -> None:
     with pytest.raises(MissingError, match=r"there is no http.*nowhere\.tif"):
         open_scan(f"{server.url}/nowhere.tif")
     with pytest.raises(UnreachableError, match="forbids"):
         open_scan(f"{server.url}/closed/s.tif")
     with pytest.raises(UnreachableError, match="cannot be reached"):
         open_scan("http://127.0.0.1:9/s.tif")
-
-
-@pytest.mark.usefixtures("quick")
-def test_a_server_without_ranges_is_reported(tmp_path: Path, server: RangeServer) -> None:
     tifffile.imwrite(tmp_path / "s.tif", noise(), **LAYOUTS["tiles"])
     server.by_ranges = False
     with pytest.raises(UnreachableError, match="no parts of files"):

@@ -6,7 +6,6 @@ Afterwards `python tests/measure/test_revision.py` writes the table anew, revisi
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 from drawn import NUMBERED, draw, ellipse, frame_picture, lay_out, make_scan, measure_grey, pixel_from_camera
@@ -26,12 +25,12 @@ WEDGES = lay_out([MarkShape((turned_part(WEDGE[0], turn),)) for turn in (135.0, 
 Row = tuple[str, tuple[float, ...]]  # status; column, row and their standard deviations
 
 
-def results(folder: Path) -> dict[str, Row]:
+def results() -> dict[str, Row]:
     """What measuring gives of a few small pictures, by their kind and the mark."""
     turned, wedges = frame_picture(NUMBERED, pixel_from_camera("90m")), frame_picture(WEDGES, pixel_from_camera("0"))
     frames = {
-        "ring-crosses in a pose that is not known": measure_grey(turned, NUMBERED, folder),
-        "wedges in coarse steps": measure_grey(np.rint(wedges / 800) * 800, WEDGES, folder, FiducialOptions("0")),
+        "ring-crosses in a pose that is not known": measure_grey(turned, NUMBERED),
+        "wedges in coarse steps": measure_grey(np.rint(wedges / 800) * 800, WEDGES, FiducialOptions("0")),
     }
     marks = {f"{kind}: {mark.point}": mark for kind, frame in frames.items() for mark in frame.marks}
     poses = {f"{kind}: pose {frame.pose.name}": ("", ()) for kind, frame in frames.items() if frame.pose}
@@ -79,9 +78,9 @@ def _alike(before: Row | None, now: Row | None) -> bool:
     return is_near and np.allclose(numbers[2:], others[2:], rtol=SIGMA, atol=2e-6)
 
 
-def test_what_measuring_gives_is_that_of_its_revision(tmp_path: Path) -> None:
+def test_what_measuring_gives_is_that_of_its_revision() -> None:
     table = json.loads(TABLE.read_text(encoding="utf-8"))
-    changed = differing(table["results"], results(tmp_path))
+    changed = differing(table["results"], results())
     then = "and run python tests/measure/test_revision.py"
     result = f"{len(changed)} marks, such as {', '.join(changed[:3])}, are measured otherwise"
     assert not changed or table["revision"] != MEASURE_REVISION, f"raise MEASURE_REVISION, {then}: {result}"
@@ -104,6 +103,5 @@ def test_another_place_or_status_or_sigma_is_noticed() -> None:
 
 
 if __name__ == "__main__":
-    with TemporaryDirectory() as place:
-        written = {"revision": MEASURE_REVISION, "results": results(Path(place))}
+    written = {"revision": MEASURE_REVISION, "results": results()}
     TABLE.write_text(json.dumps(written, indent=0, ensure_ascii=False) + "\n", encoding="utf-8")

@@ -28,14 +28,13 @@ from measure.marks.shapes import (
     turned,
 )
 from measure.matching.covariance import LinearFit, across_edges
-from measure.noise.noise_model import NoiseModel, combined, correlated, products, weighted
+from measure.noise.noise_model import NoiseModel, combined, products
 from measure.results import MarkFit, SecondPlace
 from measure.targets.disks import UNIT_DISK, fit_disk
 from measure.tone.curve import Tone
 
 SIZE, CONTRAST = 41, 500.0
 RING_CROSS = MarkShape(ring_cross(1.0, 0.2, 1.6, 0.15))
-WING = MarkShape(polygon(((0.0, 0.0), (1.5, 0.7), (1.5, -0.7))))
 OPTIONS = MatchOptions(linear_sigma=0.05)
 DISK_SIZE, RADIUS = 31, 3.0
 DISK_PLACE = np.array([15.2, 14.7])
@@ -117,27 +116,6 @@ def test_the_sums_are_of_second_derivatives_across_the_edges() -> None:
         across = np.einsum("irc,ij,jrc->rc", slopes, hessian, slopes) / np.maximum((slopes**2).sum(axis=0), 1e-300)
         expected = (slopes * across).sum(axis=(1, 2))
         np.testing.assert_allclose((weights * picture).sum(axis=(1, 2)), expected, rtol=0.01, atol=0.02)
-
-
-@pytest.mark.parametrize("is_grain", [False, True])
-def test_noise_alone_hardly_is_hardly_taken_for_it(is_grain: bool) -> None:
-    """Of a line's place under noise that is alike everywhere, white or grain of 1.5 px."""
-    rng, shares = np.random.default_rng(2), []
-    cols = np.mgrid[0:40, 0:40][1] - 19.5
-    lags = np.arange(-8, 9)
-    grain = np.exp(-(lags[:, None] ** 2 + lags**2) / (4 * 1.5**2)) + 0.1 * np.outer(lags == 0, lags == 0)
-    noise = NoiseModel(1.1, grain, 0.9, is_grain=True) if is_grain else NoiseModel(1.0, np.ones((1, 1)), 0.0)
-    line = -np.gradient(np.exp(-(cols**2) / 2), axis=1)
-    design, used = np.stack([line, line.T, np.ones_like(line)]), np.ones(line.shape, dtype=bool)
-    weights = weighted(design, used, noise, 0.0)[0] if is_grain else design
-    by_grey = combined(np.asarray(np.linalg.inv(products(weights, design)), np.float64), weights)
-    for _ in range(30):
-        white = rng.standard_normal(line.shape)
-        left = correlated(white[None], noise, 0.5)[0] if is_grain else white
-        fit = LinearFit(left, used, design, by_grey, noise, np.ones_like(line))
-        by_noise = fit.covariance(by_grey[:2])
-        shares.append(np.trace(fit.unlike_drawing_px2(by_noise)) / np.trace(by_noise))
-    assert np.mean(shares) < 0.1
 
 
 def test_ragged_lines_are_known_as_badly_as_they_are() -> None:
@@ -296,18 +274,6 @@ def test_what_compression_hides_of_a_faint_mark_is_added_to_its_sigma() -> None:
     assert np.trace(film.covariance_px2) / 2 < 0.006**2
     assert np.trace(fine.covariance_px2) / 2 < 0.012**2
     assert 0.02**2 < np.trace(coarse.covariance_px2) / 2 < 0.03**2
-
-
-def test_a_notch_in_a_soft_scan_is_matched_with_enough_of_its_ground() -> None:
-    rng = np.random.default_rng(6)
-    shares = []
-    for _ in range(3):
-        mark = some_mark(KIND["notch"], 1.6, rng)
-        fit = sighted(
-            mark, GROUND + PRECISION_CONTRAST * (mark.picture + rng.standard_normal((mark.size, mark.size)) / SNR), rng
-        )
-        shares.append(np.trace(fit.place_covariance.parts[Cause.NOISE]) / np.trace(mark.bound(1 / SNR)))
-    assert np.sqrt(np.mean(shares)) < 1.08  # with four standard deviations of the blur: 1.11 and more
 
 
 def test_lines_far_wider_than_the_mark_s_are_not_the_mark() -> None:

@@ -1,11 +1,9 @@
 """Writing on a scan: found, read, and what its lines say."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
-from drawn import Array, written_scan
+from drawn import Array, make_scan
 from studies import parametrize_with_studies
 
 from measure.annotations import text as networks_module
@@ -41,14 +39,14 @@ def posed(grey: Array, pose: str) -> Array:
     return np.ascontiguousarray(np.rot90(mirrored, int(pose.rstrip("m")) // 90))
 
 
-def read(grey: Array, folder: Path, frame_px: Array | None = None) -> tuple[Line, ...]:
-    with written_scan(grey, folder) as scan:
-        return read_writing(scan, required(), frame_px)
+def read(grey: Array, frame_px: Array | None = None) -> tuple[Line, ...]:
+    scan = make_scan(grey)
+    return read_writing(scan, required(), frame_px)
 
 
 @parametrize_with_studies("pose", ["0", "90", "270", "180m"], quick=(3,))
-def test_title_and_plate_are_read_whichever_way_the_scan_lies(pose: str, tmp_path: Path) -> None:
-    title, plate = read(posed(written_film(), pose), tmp_path)
+def test_title_and_plate_are_read_whichever_way_the_scan_lies(pose: str) -> None:
+    title, plate = read(posed(written_film(), pose))
     assert (title.text.replace(" ", ""), title.pose) == (TITLE.replace(" ", ""), pose)
     assert plate.text.replace(" ", "") == PLATE.replace(" ", "")
     mirrored = "m" if pose.endswith("m") else ""
@@ -61,20 +59,20 @@ def test_title_and_plate_are_read_whichever_way_the_scan_lies(pose: str, tmp_pat
         assert line.legible > 2 * sorted(way.legible for way in line.ways.values())[-2]
 
 
-def test_dark_letters_on_light_film_are_read_as_well(tmp_path: Path) -> None:
-    title, _ = read(written_film(dark=60000.0, light=30000.0), tmp_path)
+def test_dark_letters_on_light_film_are_read_as_well() -> None:
+    title, _ = read(written_film(dark=60000.0, light=30000.0))
     assert (title.text.replace(" ", ""), title.pose) == (TITLE.replace(" ", ""), "0")
 
 
-def test_no_other_side_is_read_where_the_lines_of_some_are_enough(tmp_path: Path) -> None:
-    with written_scan(written_film(), tmp_path) as scan:
-        lines = read_writing(scan, required(), enough=lambda lines: len(lines) == 1)
+def test_no_other_side_is_read_where_the_lines_of_some_are_enough() -> None:
+    scan = make_scan(written_film())
+    lines = read_writing(scan, required(), enough=lambda lines: len(lines) == 1)
     assert len(lines) == 1
 
 
-def test_the_outline_lies_about_the_letters(tmp_path: Path) -> None:
+def test_the_outline_lies_about_the_letters() -> None:
     film = written_film()
-    title, plate = read(film, tmp_path)
+    title, plate = read(film)
     film[90:-70, 70:-70] = 0.0
     for line, first_row in ((title, 0), (plate, SIZE_PX // 2)):
         row, col = np.nonzero(film[first_row : first_row + SIZE_PX // 2] > 8000)
@@ -84,30 +82,30 @@ def test_the_outline_lies_about_the_letters(tmp_path: Path) -> None:
         assert line.center_px == pytest.approx(drawn.mean(axis=0), abs=5)
 
 
-def test_a_number_that_is_the_same_upside_down_does_not_tell_its_turn(tmp_path: Path) -> None:
+def test_a_number_that_is_the_same_upside_down_does_not_tell_its_turn() -> None:
     letters = np.zeros((60, SIZE_PX), np.uint8)
     (half, _), _ = cv2.getTextSize("608", cv2.FONT_HERSHEY_SIMPLEX, 0.9, 2)
     cv2.putText(letters, "608", (SIZE_PX // 2 - half, 41), cv2.FONT_HERSHEY_SIMPLEX, 0.9, 255, 2, cv2.LINE_AA)
     grey = np.full((SIZE_PX, SIZE_PX), 3000.0)
     grey[10:70] += 40.0 * np.maximum(letters, letters[::-1, ::-1])
-    (number,) = read(grey, tmp_path)
+    (number,) = read(grey)
     assert [number.ways[way].text.replace(" ", "") for way in ("0", "180")] == ["608809"] * 2
     assert number.ways["180"].legible == pytest.approx(number.ways["0"].legible, rel=0.15)
 
 
-def test_only_the_frames_surroundings_are_read(tmp_path: Path) -> None:
+def test_only_the_frames_surroundings_are_read() -> None:
     """What the ground shows within the frame is no writing on the film."""
     corners = np.array([[70.0, 90.0], [570.0, 90.0], [570.0, 570.0], [70.0, 570.0]])
     letters = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
     cv2.putText(letters, "HELLO", (250, 150), cv2.FONT_HERSHEY_SIMPLEX, 0.9, 255, 2, cv2.LINE_AA)
     grey = written_film() + letters * 30.0
-    assert sorted(line.text.replace(" ", "") for line in read(grey, tmp_path, corners)) == ["Nr13043", "RUN20CST7300"]
-    assert "HELLO" in {line.text for line in read(grey[80:], tmp_path)}
+    assert sorted(line.text.replace(" ", "") for line in read(grey, corners)) == ["Nr13043", "RUN20CST7300"]
+    assert "HELLO" in {line.text for line in read(grey[80:])}
 
 
-def test_film_without_writing_says_nothing(tmp_path: Path) -> None:
+def test_film_without_writing_says_nothing() -> None:
     grey = written_film(dark=3000.0, light=3000.0)
-    assert read(grey, tmp_path) == ()
+    assert read(grey) == ()
 
 
 def test_without_the_package_there_are_no_networks(monkeypatch: pytest.MonkeyPatch) -> None:

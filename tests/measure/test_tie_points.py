@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
+from drawn import center
 from in_process import Loses
 from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
-from measure.flags import Cause, Status
+from measure.flags import Cause
 from measure.tie_points.features import Features, TieFrame
 from measure.tie_points.joins import Joins, measure_joins
 from measure.tie_points.multi_image import RADIUS_PX, SPARE_PX, Piece, match_pieces
@@ -82,13 +83,6 @@ def test_errors_are_as_large_as_their_covariances_say(radius_px: int, limit_px: 
             normalised.append(error @ np.linalg.solve(covariance, error) / 2)
     assert np.sqrt(np.mean(np.square(errors))) < limit_px
     assert np.sqrt(np.mean(normalised)) == pytest.approx(1.0, abs=0.15)
-
-
-def test_clean_pictures_leave_next_to_no_error() -> None:
-    matched = match_pieces(pieces(np.random.default_rng(2), 0.0), 0)
-    for each, matrix in zip(matched, MAPS, strict=True):
-        assert np.abs(each.center_px - matrix[:, 2]).max() < 0.005
-        assert np.abs(each.scan_from_patch[:, :2] - matrix[:, :2]).max() < 0.001
 
 
 def test_bent_ground_moves_the_place_as_its_bending_says() -> None:
@@ -250,26 +244,11 @@ def off_and_sigma(joins: Joins, move: Array) -> tuple[Array, Array]:
     pairs = zip(joins.marks["a"], joins.marks["b"], strict=True)
     off, variance = [], []
     for one, other in pairs:
-        assert one.center_px is not None
-        assert other.center_px is not None
         assert one.covariance_px2 is not None
         assert other.covariance_px2 is not None
-        off.append(other.center_px - one.center_px - move)
+        off.append(center(other) - center(one) - move)
         variance.append(np.trace(one.covariance_px2 + other.covariance_px2) / 2.0)
     return np.array(off), np.sqrt(np.array(variance))[:, None]
-
-
-@pytest.mark.study
-def test_without_noise_what_lies_between_pixels_is_left(tmp_path: Path) -> None:
-    """A hundredth of a pixel, and no less is claimed."""
-    parts, move = scanned(tmp_path, 1.0)
-    joins = measure_joins(parts, 30)
-    off, sigma = off_and_sigma(joins, move)
-    assert np.sqrt(np.mean((off / sigma) ** 2)) < 1.2
-    first = joins.marks["a"][0]
-    assert first.status is Status.MEASURED
-    assert first.covariance is not None
-    assert first.covariance.sigmas_px[Cause.INTERPOLATION] == 0.01
 
 
 def test_marks_that_are_known_are_no_joins(tmp_path: Path) -> None:
@@ -280,8 +259,9 @@ def test_marks_that_are_known_are_no_joins(tmp_path: Path) -> None:
     assert len(off) == 8
     assert (np.abs(off) < 3.5 * sigma).all()
     for mark in joins.marks["a"]:
-        assert mark.center_px is not None
-        assert np.hypot(*(mark.center_px - (300.0, 110.0))) > 60.0
+        assert mark.covariance
+        assert mark.covariance.sigmas_px[Cause.INTERPOLATION] == 0.01
+        assert np.hypot(*(center(mark) - (300.0, 110.0))) > 60.0
 
 
 def test_a_worker_that_is_ended_over_a_place_costs_no_other_join(tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """Tone curves: what is believed of them, what pictures say of them, and marks measured through them."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from drawn import ALIKE, frame_picture, make_scan, pixel_from_camera
@@ -13,10 +11,7 @@ from measure.detection.localisation import MarkPrediction
 from measure.fiducials.constellation import Placement
 from measure.fiducials.mark_fit import detect_mark, options_for
 from measure.fiducials.measure_frame import measure_frame
-from measure.matching.covariance import Landscape, LinearFit
-from measure.matching.tone_information import mark_tone_information
-from measure.matching.window import Coding, read_window
-from measure.noise.noise_model import NoiseModel
+from measure.matching.window import read_window
 from measure.tone.curve import LINEAR, Tone, ToneInformation, power, sampled_curve, srgb
 from measure.tone.estimate import FrameTone, MarkTone, tone_score
 from synthetic_images.tone_curve import coded
@@ -65,27 +60,6 @@ def settled_from(
     return fits, found
 
 
-def test_pixels_that_the_pictures_own_unknowns_take_up_whole_tell_nothing_of_the_curve() -> None:
-    """All but a few pixels of the mark lie at the ends of the scanner's range: what they leave is rounding."""
-    rng, shape = np.random.default_rng(3), (24, 24)
-    row, col = np.indices(shape) / 24.0
-    design = np.stack([np.cos(7 * col), np.sin(7 * row), np.exp(-col), col * row + 0.5, np.ones(shape), col, row])
-    noise = NoiseModel(1.0, np.ones((1, 1)), 0.0)
-    drawn, clear = 30000.0 * (0.1 + 0.8 * col), np.zeros(shape, bool)
-    clear[5, 6:9] = True
-    used, landscape = np.ones(shape, bool), Landscape(drawn, np.zeros(shape, bool), design[3])
-    fit = LinearFit(rng.normal(size=shape), used, design, design / 576.0, noise, np.ones(shape))
-    information = mark_tone_information(
-        fit, drawn, drawn, clear, np.zeros(7), np.zeros(7), Coding(None, Tone.unknown(), FULL), landscape
-    ).information
-    assert np.abs(information.matrix).max() < 1e-3
-    blank = replace(fit, residuals=np.zeros(shape), noise=NoiseModel(4e-35, np.full((1, 1), 4e-35), 0.0))
-    even = np.full(shape, 87.8)
-    assert not mark_tone_information(
-        blank, even, even, used, np.zeros(7), np.zeros(7), Coding(None, Tone.unknown(), FULL), landscape
-    ).information.matrix.any()
-
-
 @pytest.mark.parametrize(("tone", "code", "light"), [
     (LINEAR, 1000.0, 1000.0),
     (Tone(power(2.2)), FULL / 2, FULL * 0.5**2.2),
@@ -95,11 +69,6 @@ def test_pixels_that_the_pictures_own_unknowns_take_up_whole_tell_nothing_of_the
 def test_light_of_a_code_and_back(tone: Tone, code: float, light: float) -> None:
     assert tone.light(np.array([code]), FULL)[0] == pytest.approx(light, rel=1e-3)
     assert tone.code(np.array([light]), FULL)[0] == pytest.approx(code, rel=1e-3)
-
-
-def test_a_curve_that_does_not_grow_is_refused() -> None:
-    with pytest.raises(ValueError, match="grows"):
-        sampled_curve(np.array([0.0, 0.5, 0.4, 1.0]))
 
 
 def test_departures_change_light_as_their_derivatives_say() -> None:
@@ -145,16 +114,6 @@ def test_the_tip_of_a_wedge_is_where_it_was_drawn_whatever_the_curve(curve: floa
             assert np.hypot(*errors[-1]) < 5 * np.sqrt(np.linalg.eigvalsh(covariances[-1])[-1])
     assert abs(np.mean(off)) < 0.15  # taken as light: 0.5 to 1 px
     assert whitened_rms(errors, covariances) < 2.2  # of three scans, in fact: the tips of one are off together
-
-
-def test_a_mark_says_no_more_of_the_curve_where_its_frame_is_known_without_error() -> None:
-    rng = np.random.default_rng(3)
-    mark = some_mark(TIP, 1.0, rng)
-    code = encode_mark(mark, 2.2, 80.0, rng)
-    alike = [replace(mark, kind=replace(TIP, known=known)) for known in (1e-4, 1e-6)]
-    estimate = [fit_mark(each, code, Tone.unknown().shift_to_power(2.2)).tone for each in alike]
-    information = [one.information.matrix for one in estimate if one is not None]
-    np.testing.assert_allclose(information[1], information[0], rtol=0.1, atol=0.1)
 
 
 def test_the_linearised_effect_of_a_curve_is_that_of_a_fit_at_another_one() -> None:
@@ -248,25 +207,6 @@ def test_a_mark_whose_detail_alone_was_fitted_moves_with_the_curve_and_says_noth
     assert found.scatter == 0.0
     assert np.array_equal(found.tone.covariance, prior.covariance)
     assert 0.005 < np.sqrt(np.trace(found.covariance_px2(estimate))) < 0.1
-
-
-def test_what_a_mark_says_of_the_curve_is_the_same_however_closely_the_fit_held_the_frame() -> None:
-    """Only the residuals, and how far the unknowns lie from where the frame has them, together say it."""
-    rng, shape = np.random.default_rng(4), (24, 24)
-    row, col = np.indices(shape) / 24.0
-    design = np.stack([np.cos(7 * col), np.sin(7 * row), np.exp(-col), col * row + 0.5, np.ones(shape), col, row])
-    by_grey, noise = np.linalg.pinv(design.reshape(7, -1)).T.reshape(design.shape), NoiseModel(1.0, np.ones((1, 1)), 0)
-    drawn, everywhere = 30000.0 * (0.1 + 0.8 * col), np.ones(shape, bool)
-    residuals, landscape = 0.01 * rng.normal(size=shape), Landscape(drawn, np.zeros(shape, bool), design[3])
-    rights = []
-    for change in (0.0, 0.003):
-        fit = LinearFit(residuals - change * design[2], everywhere, design, by_grey, noise, np.ones(shape))
-        priors, departures = np.array([0, 0, 50.0, 0, 0, 0, 0]), np.array([0, 0, 0.002 + change, 0, 0, 0, 0])
-        estimate = mark_tone_information(
-            fit, drawn, drawn, everywhere, priors, departures, Coding(None, Tone.unknown(), FULL), landscape
-        )
-        rights.append(estimate.information.right_side)
-    np.testing.assert_allclose(rights[1], rights[0], rtol=1e-6)
 
 
 def test_a_score_is_what_unknowns_and_priors_leave_of_the_departures() -> None:
