@@ -5,11 +5,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from faults import MISHAPS, sentences
 from networks import (
     CONVERGENT,
     FREE,
-    STATIONS,
     Setup,
     Truth,
     digital_network,
@@ -47,26 +45,6 @@ def test_flying_height_and_principal_distance_are_reported() -> None:
         q = result.cofactor_of(["IO.K.c", f"EO.f{i}.Z0"])
         rho.append(q[0, 1] / np.sqrt(q[0, 0] * q[1, 1]))
     assert first.rho == pytest.approx(max(rho, key=abs), rel=1e-9)
-
-
-def test_a_wider_field_tells_the_principal_point_from_tilts_and_decentering() -> None:
-    text = " ".join(sentences(adjust(*MISHAPS["narrow-field"].network())))
-    assert "x0' and p1 of camera K are correlated by" in text
-    assert "Targets out to the corners of the frame" in text
-    points = np.random.default_rng(4).uniform(-1.0, 1.0, (20, 3)) * [1100.0, 1100.0, 300.0]
-    free = {"k3": FREE, "p1": FREE, "p2": FREE}
-    wide = Setup(vertical(0.0, 0.0, 0.0, 0.0), prior=10.0, points=points, distortion=free)
-    assert adjust(*wide.network()).correlations == ()
-
-
-def test_a_turn_of_the_camera_about_its_axis_changes_nothing() -> None:
-    """Directions are those of the camera: kappa of 90 degrees takes X0 for Y0 and leaves the correlation."""
-    one, other = (
-        list(adjust(*Setup(vertical(k), STATIONS[:1], 20.0, prior=1.0).network()).correlations)
-        for k in (0.0, np.pi / 2)
-    )
-    by_x0 = [next(each for each in found if each.parameters[0].text == "IO.K.x0") for found in (one, other)]
-    assert [each.parameters[1].text for each in by_x0] == ["EO.f0.X0", "EO.f0.Y0"]
 
 
 def test_powers_of_the_radius_and_decentering_are_reported() -> None:

@@ -303,24 +303,6 @@ def test_another_r0_is_another_principal_distance() -> None:
     assert found.by_source[3, 3] == pytest.approx(1 / s - k3 * r0**2 / s**2, rel=1e-6)
 
 
-@pytest.mark.parametrize("name", ["torlegard", "opencv"])
-def test_parameters_of_a_lens_without_distortion_are_zero(name: str) -> None:
-    source = Lens(Distortion("none"), np.array([GIVEN_MM[0], 0.0, 0.0]), np.zeros(0))
-    target = Distortion(name, r0_mm=9.0 if family(name).needs == "r0_mm" else 0.0)
-    found = convert_lens(source, target, CORNERS_MM, parameter_names(name))
-    assert found.lens.values[0] == pytest.approx(GIVEN_MM[0], rel=1e-12)
-    assert not found.lens.values[1:].any()
-
-
-def test_what_is_0_and_uncertain_has_its_counterpart() -> None:
-    """A lens that is yet to be found: k3 and p1 free at 0 are k1 and p1, and nothing else."""
-    lens = Lens(Distortion("torlegard"), GIVEN_MM, np.zeros(7))
-    found = convert_lens(lens, Distortion("brown"), CORNERS_MM, None, ("k3", "p1"))
-    assert found.is_same
-    assert found.estimated == ("k1", "p1")
-    assert convert_lens(lens, Distortion("brown"), CORNERS_MM).estimated == ()
-
-
 def test_covariance_is_that_of_the_same_data_adjusted_in_the_other_family() -> None:
     """Values to a millionth of their sigmas, the covariance to a millionth: aicon with r0 as OpenCV's."""
     rng = np.random.default_rng(2)

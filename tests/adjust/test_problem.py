@@ -7,11 +7,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from networks import (
-    Truth,
     add_errors,
     drop_rows,
     keep_rows,
-    orient,
     set_camera,
     set_images,
     set_observations,
@@ -25,7 +23,6 @@ from adjust.problem.network import Board, Scanner
 from adjust.problem.observations import Distance
 from adjust.problem.parameter import (
     Parameter,
-    description,
     object_coordinate,
     parameter_from_text,
     parameters_from_texts,
@@ -152,12 +149,6 @@ def test_approximations_that_are_missing_or_turned_away() -> None:
         adjust(network, replace(start, transformation=dict(start.transformation) | {"f1": np.zeros(4)}))
 
 
-def test_an_image_with_two_targets_and_a_known_orientation_is_adjusted() -> None:
-    network, start = simulated(np.random.default_rng(1))
-    known = orient(network, {"f1": Exterior(Truth().exteriors[1], np.full(6, 0.01))})
-    assert adjust(drop_observations(known, "f1", "target", 2), start).converged
-
-
 @pytest.mark.parametrize(
     ("make", "words"),
     [
@@ -242,16 +233,6 @@ def test_fiducials_of_earlier_files_are_known_by_their_camera() -> None:
     texts = ["IO.K.c", "IO.W.1.c", "FID.K.7.1.x", "FID.K.7.y", "FID.W.1.3.x", "FID.K.8%2E1.x"]
     marks = [(each.owner, each.id) for each in parameters_from_texts(texts)[2:]]
     assert marks == [("K", "7.1"), ("K", "7"), ("W.1", "3"), ("K", "8.1")]
-
-
-def test_messages_name_quantities_in_words() -> None:
-    mark = Parameter.fiducial("Wild RC8", "3", "x")
-    assert mark.label == "x of fiducial 3, camera Wild RC8"
-    assert Parameter.interior("Wild RC8", "k3").label == "k3 of camera Wild RC8"
-    assert Parameter.exterior("f.1", "omega").label == "omega of image f.1"
-    assert Parameter.film("f1", "a2").label == "a2 of the film transformation of image f1"
-    moved = [Parameter.interior("K", "c"), mark, mark._replace(quantity="y"), Parameter.exterior("*", "Z0")]
-    assert description(moved) == "c of camera K; x and y of fiducial 3, camera Wild RC8; Z0 of several images"
 
 
 def test_a_coordinate_is_called_by_its_point() -> None:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from adjust import Adjustment, Calibration, Options, Parameter, Prior, adjust
 from adjust.problem.network import Approximations, Exterior, Network, ObjectPoint
 from adjust.quality.reliability import Reliability
-from adjust.quality.tested import Probabilities, WeightFunction
+from adjust.quality.tested import Probabilities
 
 Array = NDArray[np.float64]
 
@@ -214,14 +214,6 @@ def test_two_rays_of_a_point_cannot_be_distinguished() -> None:
     rays = {row_name(network, of_point[0]), row_name(network, of_point[1])}
     assert len(result.suspects) == 1
     assert {result.suspects[0].tested.name, *result.suspects[0].alike} == rays
-
-
-@pytest.mark.parametrize("function", ["huber", "igg3"])
-def test_robust_weights_leave_clean_observations_alone(function: WeightFunction) -> None:
-    network, start = checkable(7)
-    plain, robust = adjust(network, start), adjust(network, start, Options(robust=function))
-    assert (robust.weights == 1.0).mean() > 0.85
-    assert abs(robust.value("IO.K.c") - plain.value("IO.K.c")) < plain.sigma("IO.K.c") / plain.sigma0
 
 
 def test_over_flat_ground_of_known_height_no_principal_distance_is_wrong_by_metres() -> None:

@@ -223,15 +223,6 @@ def corrections_covariance(result: Adjustment) -> Array:
     return np.asarray(found.by_unknowns @ (result.sigma0**2 * result.cofactor_of(names)) @ found.by_unknowns.T)
 
 
-def test_a_certificate_tells_sigma0_of_a_single_frame() -> None:
-    """Marks and certificate of the same sigma: v'Pv of the affine fit over its redundancy of 10."""
-    truth = draw_frames("affine", 1, 8, FRAME_NOISE_MM, FRAME_NOISE_MM, np.random.default_rng(4))
-    result = adjust_network(truth)
-    assert not result.variance.left_out
-    assert result.variance.redundancy == result.redundancy == 10
-    assert result.sigma0 == pytest.approx(np.sqrt(result.vpv / 10))
-
-
 def test_given_values_that_are_too_good_are_left_out_of_a_whole_network_too() -> None:
     """Five images with targets: given fiducials right to a hundredth of their sigma; drawn from it, they take part."""
     case = exact(load("i_five_images_affine_reduced"))

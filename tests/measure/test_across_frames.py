@@ -118,18 +118,6 @@ def test_one_frame_names_the_mark_that_alone_is_off() -> None:
     assert known.sigmas_px[Cause.GIVEN_PLACES] == pytest.approx(3.0 / np.sqrt(2), rel=0.1)
 
 
-@pytest.mark.parametrize("count", [1, 4])
-def test_a_bent_frame_is_a_problem_of_the_frame(count: int) -> None:
-    rng, layout = np.random.default_rng(7), make_layout(EIGHT)
-    frames = make_frames(layout, count, rng)
-    frames[0] = make_frames(layout, 1, rng, film_mm=0.08)[0]
-    result = check_frames(frames, layout, [(20.0, 20.0)] * count)
-    assert weak(result.frames) == set()
-    assert [len(frame.problems) for frame in result.frames] == [1] + [0] * (count - 1)
-    assert ("one frame does not tell" in result.frames[0].problems[0]) == (count == 1)
-    assert 0.04 < result.film_sigma_mm[0] < 0.14
-
-
 @pytest.mark.parametrize("step_px", [(4.5, 0.0), (0.0, -4.5)])
 def test_a_jump_within_a_scan_is_a_problem_of_the_frame(step_px: tuple[float, float]) -> None:
     """By 90 µm, which each mark shows by a part only: an affine transformation takes up most of it."""
@@ -350,12 +338,3 @@ def test_weak_marks_of_sound_frames_keep_their_covariances() -> None:
     added = [max(added_px(checked_together([frame], layout)[0])) for frame in frames]
     assert np.mean(np.array(added) > 0) < 0.4
     assert max(added) < 4 * np.hypot(SIGMA_PX, 0.005 * PX_PER_MM)
-
-
-def test_other_frames_tell_how_well_a_weak_mark_is_known() -> None:
-    layout = make_layout(EIGHT, sigma_mm=1.0)
-    frames = make_frames(layout, 6, np.random.default_rng(6), camera_mm=0.5)
-    frames[2] = weaken(shift_mark(frames[2], 3, (0.6, 0.0)), 3)
-    added = [added_px(frame, Cause.OTHER_FRAMES) for frame in checked_together(frames, layout)]
-    assert 0.2 < added[2][3] < 0.9
-    assert sum(map(sum, added)) == added[2][3]

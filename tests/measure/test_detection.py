@@ -18,7 +18,6 @@ from measure.fiducials.faint_marks import FaintMark, detect_faint
 from measure.fiducials.mark_fit import detect_mark
 from measure.flags import Cause
 from measure.marks.shapes import Bar, MarkShape, cross, dot, polygon, ring_cross
-from measure.matching.window import pixels_beyond_edge
 from measure.tone.curve import Tone, power
 
 CROSS = MarkShape(cross(0.5, 0.05), "dark")
@@ -223,14 +222,6 @@ def test_a_faint_light_cross_is_measured_whose_dark_pad_ends_next_to_it_in_a_lig
     assert np.hypot(*(detection.fit.center_px - place[:, 2])) < 0.3
 
 
-def test_the_marks_own_ground_is_never_beyond_an_edge() -> None:
-    place = placed(PX_PER_MM, (60.3, 59.7))
-    mark = brute_picture(WING, place, 121, 121, 1.0)
-    for contrast in (30000.0, -30000.0):  # the mark itself is the strongest edge of its window
-        grey = 30000.0 + contrast * mark + np.random.default_rng(2).normal(0.0, NOISE, mark.shape)
-        assert not pixels_beyond_edge(grey, WING, place).any()
-
-
 MAP = np.random.default_rng(5).normal(size=(40, 50)).astype(np.float32)
 
 
@@ -259,22 +250,11 @@ SCAN = make_scan(RNG.integers(0, 65535, (90, 110, 3)).astype(float))
 CHIPS = RNG.normal(size=(2, 9, 9))
 TURNED = [np.rot90(chip, turn) for turn in range(4) for chip in CHIPS]  # in one pose after another
 SET = Templates(TURNED, [2.0, 3.0] * 4, (), 1)
-MAP_BYTES = 4 * 90 * 110
 
 
 def maps(cache: ByteCache) -> CorrelationMaps:
     channels = [SCAN.window(-4, -4, 118, 98, weights) for weights in np.eye(3).tolist()]
     return CorrelationMaps(channels, SET, (1, -1), WIDE, 100.0, cache)
-
-
-def test_a_map_is_the_strongest_correlation_of_all_channels() -> None:
-    given, inner = maps(ByteCache(100 * MAP_BYTES)), (slice(20, 60), slice(20, 80))
-    for (kind, sign), map_ in given.items():
-        whole = [SCAN.window(-4, -4, 118, 98, weights) for weights in np.eye(3).tolist()]
-        detail = SET.details_px[kind]
-        answers = [responses_to(WIDE, each, TURNED[kind], detail, 100.0) for each in whole]
-        assert map_.shape == (90, 110)
-        np.testing.assert_array_equal(map_[inner], np.max([sign * each[inner] for each in answers], axis=0))
 
 
 def test_a_faint_mark_next_to_the_frames_edge_is_what_answers_most() -> None:

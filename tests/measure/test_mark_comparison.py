@@ -85,20 +85,6 @@ def test_marks_of_one_blur_are_rarely_doubted_and_another_blur_is() -> None:
     assert found > 270
 
 
-def test_how_much_blurs_differ_from_mark_to_mark_comes_out_as_it_was_drawn() -> None:
-    """By the moments of marks that tell their blurs unequally well: the square is unbiased."""
-    rng, between, squares = np.random.default_rng(6), 0.25, []
-    sigmas = np.array([0.03, 0.05, 0.08, 0.12, 0.2, 0.2, 0.1])
-    for _ in range(400):
-        own = 1.1 * np.exp(rng.normal(0, np.hypot(sigmas, between)))
-        shared = shared_blurs(fits(np.append(own, 1.1), [*sigmas, 0.3]))[-1]
-        assert shared is not None
-        squares.append(shared.sigma**2)
-    of_mean = 1 / np.sum(1 / (sigmas**2 + between**2 + 0.05**2))
-    expected = between**2 + 0.05**2 + of_mean
-    assert np.mean(squares) == pytest.approx(expected, rel=0.08)
-
-
 def test_a_match_with_the_others_blur_rarely_contradicts_it_unless_its_own_is_another() -> None:
     rng, others_sigma, own_sigma = np.random.default_rng(3), 0.06, 0.1
     result, weight = SharedBlur(np.sqrt(1.1**2 - PIXEL), others_sigma, False), others_sigma**2 / (0.06**2 + 0.1**2)
@@ -143,15 +129,6 @@ def test_what_touches_one_side_of_a_dot_widens_its_variance_and_chance_hardly_do
     assert np.mean(np.array(off) > 0.5) > 0.2
     assert sigmas[np.array(off) > 0.5].max() < 5.0
     assert np.mean([each.variance_px2 for each in chance]) < 0.05 * known_px**2
-
-
-def test_how_likely_a_touched_dot_is_far_off_is_what_drawing_at_random_finds() -> None:
-    rng, radius_px, sigma = np.random.default_rng(4), 5.3, 0.022
-    changes = rng.normal(0.0, 0.00125 * 36.0**2 / radius_px**2, 400_000)
-    alike = np.abs(changes + rng.normal(0.0, sigma, len(changes)) + 0.054) < 0.002  # of those that look so small
-    one = touch(np.exp(-0.054), sigma, radius_px)
-    expected = float(np.mean(np.abs(2 * radius_px * changes[alike]) > 0.5))
-    assert one.exceedance(0.5) / one.probability == pytest.approx(expected, abs=0.02)
 
 
 def touch(ratio: float, sigma: float, radius_px: float, px_per_mm: float = 36.0) -> Touch:

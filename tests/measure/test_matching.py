@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from drawn import Array, brute_picture, make_scan, placed
+from drawn import Array, brute_picture, placed
 from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 
@@ -14,11 +14,10 @@ from measure.fiducials.interior_orientation import fit_frame
 from measure.fiducials.options import FiducialOptions
 from measure.marks.shapes import Mark, MarkShape, cross, dot, polygon, ring_cross, ring_dot
 from measure.marks.templates import learn_template
-from measure.matching.window import read_window
 from measure.targets.detection import DiskSearch
 from measure.targets.identification import TargetPrediction
 from measure.targets.ring_codes import RingCode
-from measure.tone.curve import Tone, sampled_curve
+from measure.tone.curve import sampled_curve
 
 SIZE, SCALE, CONTRAST, GROUND = 41, 10.0, 500.0, 1000.0
 MARKS = {
@@ -130,46 +129,6 @@ def test_dust_is_cut_out() -> None:
     assert 0.02 < np.mean(fractions) < 0.25
 
 
-def test_lines_that_a_scanner_sharpened_are_no_damage() -> None:
-    """Thinner than a pixel and than drawn, on ground with hardly any noise: they differ from the drawing throughout."""
-    rng, drawing = np.random.default_rng(29), MarkShape(ring_cross(1.0, 0.08, 1.6, 0.08, angle_deg=45.0))
-    film = MarkShape(ring_cross(1.0, 0.05, 1.6, 0.05, angle_deg=45.0))
-    for _ in range(6):
-        place = placed(SCALE, tuple((SIZE - 1) / 2 + rng.uniform(-0.5, 0.5, 2)), rng.uniform(0.02, 0.05))
-        shown = brute_picture(film, place, SIZE, SIZE, 0.3)
-        shown += 3.5 * (shown - gaussian_filter(shown, 1.0))
-        grey = GROUND + CONTRAST * shown + rng.normal(0, CONTRAST / 500, shown.shape)
-        fit = measure_picture(grey, drawing, place, rng)
-        assert fit.damaged_fraction < 0.02
-        assert np.hypot(*(fit.center_px - place[:, 2])) < 0.02
-
-
-def test_clipped_grey_values_are_like_a_drawing_beyond_the_range() -> None:
-    """A light mark whose lines are cut off, and half of its ground, under an unknown tone curve."""
-    rng = np.random.default_rng(31)
-    for shown, place in draw_mark("ring-cross", 1.0):
-        grey = 100 + 150 * shown + rng.normal(0, 10, shown.shape)
-        scan = make_scan((grey - 100) * 255 / 60, full_scale=255).replace_tone(Tone.unknown())
-        start = placed(SCALE, tuple(place[:, 2] + rng.uniform(-0.5, 0.5, 2)))
-        fit = match(read_window(scan, (0, 0, SIZE, SIZE)), MARKS["ring-cross"], start)
-        assert fit.likeness > 0.2
-        assert np.hypot(*(fit.center_px - place[:, 2])) < 0.1
-
-
-def test_a_large_speck_costs_what_it_covers() -> None:
-    """Even where it carries plain least squares away from the mark."""
-    rng = np.random.default_rng(31)
-    for index in range(12):
-        shown, place = draw_mark("cross", 1.0)[index % PHASES]
-        speck = brute_picture(MarkShape(dot(0.4)), placed(SCALE, tuple(rng.uniform(6, 35, 2))), SIZE, SIZE, 1.0)
-        clean = GROUND + CONTRAST * shown + rng.normal(0, CONTRAST / 20, shown.shape)
-        grey = clean + 2 * CONTRAST * speck
-        found = match(ScanWindow(grey), MARKS["cross"], place + np.array([0, 0, 0.5]))
-        result = match(ScanWindow(grey, valid=speck < 0.01), MARKS["cross"], place)
-        assert found.sigma_px < 1.1 * result.sigma_px
-        assert np.hypot(*(found.center_px - result.center_px)) < result.sigma_px
-
-
 @parametrize_with_studies("grain_px", [0.8, 1.3])
 def test_sigmas_hold_in_correlated_grain(grain_px: float) -> None:
     rng = np.random.default_rng(17)
@@ -183,18 +142,6 @@ def test_sigmas_hold_in_correlated_grain(grain_px: float) -> None:
         error = fit.center_px - place[:, 2]
         ratios.append(error / np.sqrt(np.diag(fit.covariance_px2)))
     assert 0.85 < np.sqrt(np.mean(np.square(ratios))) < 1.25  # 72 numbers: 8.3 % standard deviation
-
-
-def test_an_ellipse_takes_five_parameters() -> None:
-    stretched = np.column_stack([np.array([[12.0, 1.5], [-1.5, -9.0]]), (20.3, 19.8)])
-    shown = brute_picture(MarkShape(dot(0.5)), stretched, SIZE, SIZE, 0.8)
-    rng = np.random.default_rng(23)
-    grey = GROUND + CONTRAST * shown + rng.normal(0, 5, shown.shape)
-    fit = match(ScanWindow(grey), MARKS["dot"], placed(SCALE, (20.0, 20.0)), MatchOptions(freedom="ellipse"))
-    assert fit.converged, fit.reason
-    assert np.abs(fit.center_px - stretched[:, 2]).max() < 0.01
-    found, true = (m[:, :2] @ m[:, :2].T for m in (fit.pixel_from_mark, stretched))
-    np.testing.assert_allclose(found, true, rtol=0.02, atol=0.7)
 
 
 def test_a_drawing_is_fitted_where_it_is_true() -> None:

@@ -13,23 +13,8 @@ from measure.fiducials.mark_fit import detect_mark
 from measure.matching.covariance import second_order
 from measure.matching.window import clipped_sides, noise_scale, read_window
 from measure.noise.grain import _KERNELS, GRAIN_PX, PATCH_PX, PLANE, grain_model
-from measure.noise.noise_model import influence_covariances, noise_model, steadiness
-from measure.targets.disks import fit_disk
+from measure.noise.noise_model import noise_model, steadiness
 from measure.tone.curve import Tone, power
-
-
-def test_the_variance_of_noise_is_that_before_the_fit_took_its_share() -> None:
-    """Twelve unknowns of 64 pixels: a fit leaves less than there was, by as many."""
-    rng, sigma, unknowns, variances = np.random.default_rng(4), 5.0, 12, []
-    design = np.linalg.qr(rng.normal(size=(64, unknowns)))[0]
-    for _ in range(400):
-        noise = rng.normal(0, sigma, 64)
-        left = (noise - design @ (design.T @ noise)).reshape(8, 8)
-        used = np.ones((8, 8), bool)
-        of_many = influence_covariances(np.ones((1, 1, 8, 8)), left[None], used[None], unknowns)[1]
-        variances.append((noise_model(left, used, unknowns).variance_dn2, of_many.item()))
-    np.testing.assert_allclose(np.mean(variances, axis=0), sigma**2, rtol=0.03)
-
 
 FULL = 65535.0
 
@@ -135,19 +120,6 @@ def test_coarse_grain_is_distinguished_from_a_landscape(grain_px: float, is_grai
     if is_grain:  # blank film that holds more pixels than the window alone tells how strong it is
         assert model.variance_dn2 == pytest.approx(1.0, rel=0.1)
         assert grain_model(3.0 * window, used, design, neighbours, patches).variance_dn2 == model.variance_dn2
-
-
-def test_disks_in_whole_grey_values_are_as_far_off_as_they_say() -> None:
-    rng = np.random.default_rng(3)
-    errors, covariances = [], []
-    for _ in range(20):
-        mark = some_mark(KIND["ellipse"], 1.0, rng)
-        ground = 60 + rng.uniform(-0.5, 0.5) + 1.5 * rng.uniform() * np.arange(mark.size) / mark.size
-        disk = fit_disk(make_scan(ground + 120 * mark.picture, 255), mark.place[:, 2] + 0.3, mark.place[:, :2])
-        errors.append(disk.center_px - mark.place[:, 2])
-        covariances.append(disk.covariance_px2)
-    assert np.sqrt(np.mean(np.square(errors))) < 0.0025
-    assert 0.7 < whitened_rms(errors, covariances) < 1.3
 
 
 @pytest.mark.parametrize("noise_dn", [1.0, 10.0])

@@ -104,11 +104,6 @@ def test_the_films_own_name_and_lines_without_a_known_place_tell_the_mirror_alon
     assert of_all[:4].max() < -DECIDED
 
 
-def test_what_reads_the_same_in_all_ways_says_nothing() -> None:
-    assert writing_likelihoods([line("808808808808", "0", "top", share=1.0)], (), POSES) == pytest.approx([0.0] * 8)
-    assert writing_likelihoods([], WILD, POSES) == pytest.approx([0.0] * 8)
-
-
 def test_lines_are_read_from_the_face_that_most_reads_from() -> None:
     odd = line("E.S.T.", "180m", "top", share=0.95)
     right = line("DEVELOPMENT", "180", "top")
