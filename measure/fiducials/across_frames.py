@@ -14,9 +14,10 @@ from scipy.spatial.distance import pdist
 from scipy.special import chdtrc, chdtri, fdtrc
 
 from measure.array_types import Array
-from measure.fiducials.consistency import NAMED, FrameMarks, Hypothesis
+from measure.fiducials.consistency import NAMED, Hypothesis
 from measure.fiducials.frame import may_be_wrong
 from measure.fiducials.mark_comparison import check_own_figures
+from measure.fiducials.misfit_model import FrameMarks
 from measure.fiducials.misfits import Explanation, FrameMisfit, Frames, Pattern, explain, explain_by_pattern
 from measure.fiducials.options import ANY_FILM, BelievedFilm
 from measure.flags import FALSE_DOUBT, NO_REASON, Cause, Code, Reason, Status

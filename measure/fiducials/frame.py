@@ -9,10 +9,11 @@ from scipy.special import chdtrc
 
 from measure.array_types import Array, Mask
 from measure.detection.localisation import MarkPrediction
-from measure.fiducials.consistency import FrameMarks, Scatter, gross_errors
+from measure.fiducials.consistency import gross_errors
 from measure.fiducials.constellation import Placement, mark_sign
 from measure.fiducials.interior_orientation import FilmFit, fit_frame
 from measure.fiducials.mark_fit import Detection
+from measure.fiducials.misfit_model import FrameMarks, Scatter
 from measure.fiducials.options import CLICK_SIGMA_PX, SCATTER_DEGREES, SCATTER_MM, FiducialOptions
 from measure.flags import LARGE_ERROR, NO_REASON, Code, Reason, Status
 from measure.geometry import up_from_camera

@@ -11,7 +11,8 @@ from studies import parametrize_with_studies
 
 from measure import FiducialLayout, LayoutMark, MarkShape, cross
 from measure.fiducials.across_frames import CheckedFrames, check_frames
-from measure.fiducials.consistency import FrameMarks, frame_p_value
+from measure.fiducials.consistency import frame_p_value
+from measure.fiducials.misfit_model import FrameMarks
 from measure.fiducials.options import BelievedFilm
 from measure.flags import FALSE_DOUBT, Cause, Code, Reason, Status
 from measure.geometry import up_from_camera

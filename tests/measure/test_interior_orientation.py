@@ -9,20 +9,14 @@ from drawn import Array, brute_picture, lay_out, make_scan, measured_mark, paint
 from numpy.typing import NDArray
 
 from measure import Scan, Status
-from measure.fiducials import consistency
+from measure.fiducials import misfit_model
 from measure.fiducials.across_frames import check_frames
-from measure.fiducials.consistency import (
-    LONE_AFFINITY,
-    FrameMarks,
-    Scatter,
-    frame_consistency,
-    frame_p_value,
-    gross_errors,
-)
+from measure.fiducials.consistency import frame_consistency, frame_p_value, gross_errors
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
 from measure.fiducials.interior_orientation import fit_frame
 from measure.fiducials.measure_frame import measure_frame
+from measure.fiducials.misfit_model import LONE_AFFINITY, FrameMarks, Scatter
 from measure.fiducials.options import AFFINITY_SIGMA, FiducialOptions
 from measure.fiducials.orientation_pictures import SPOILT, MarkSite, PosedMark
 from measure.fiducials.rows import present_frame
@@ -95,7 +89,7 @@ def test_many_marks_are_tested_without_a_matrix_of_all_of_them_as_by_one(
     up = view_marks(grid, up_from_camera("90")) + rng.normal(0.0, 0.006, grid.shape)
     up[7] += 0.05
     for dense in (100, 1000):
-        monkeypatch.setattr(consistency, "_DENSE", dense)
+        monkeypatch.setattr(misfit_model, "_DENSE", dense)
         marks = FrameMarks.from_places(grid, up, covariances, model)
         found, among = frame_consistency(marks), np.arange(121) < 9
         assert found.wrong_mark == 7
