@@ -258,9 +258,10 @@ def _scattering_film(shared: Explanation, film: BelievedFilm) -> Reason:
     if not shared.film_is_more:
         return NO_REASON
     return Reason(
-        f"in this camera's frames film or scanner displaces the marks by {1000 * shared.film.sigma:.0f} µm along an "
-        f"axis, where {1000 * film.sigma_mm:.0f} µm are expected: a mark that is wrong by several times as much is not "
-        "seen. Their standard deviations are set to it. If it is right, state film_sigma_um under [adjust].",
+        "in the frames of its camera film or scanner displaces the marks by "
+        f"{1000 * shared.film.sigma:.0f} µm along an axis, where {1000 * film.sigma_mm:.0f} µm are expected: a mark "
+        "that is wrong by several times as much is not seen. Their standard deviations are set to it. If it is right, "
+        "state film_sigma_um under [adjust].",
         Code.BENT_FRAME,
     )
 
