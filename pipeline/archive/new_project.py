@@ -267,7 +267,11 @@ def print_new_project(new: NewProject, console: Console) -> None:
         console.print(text, style=style, highlight=False, soft_wrap=True, markup=False)
 
     say(f"{counted(new.found.files, 'file')} examined: {new.sentence}.")
-    for camera, (scans, folders) in sorted(_totals(new).items()):
+    of_camera = defaultdict[str, list[ScanGroup]](list)
+    for group in new.found.groups:
+        of_camera[group.camera or ("digital camera" if group.digital else "camera unknown")].append(group)
+    for camera, groups in sorted(of_camera.items()):
+        scans, folders = sum(len(group.paths) for group in groups), len({group.folder for group in groups})
         say(f"{camera}: {counted(scans, 'scan')} in {counted(folders, 'folder')}", "bold")
     for what, cases in new.remarks():
         if cases:
@@ -361,17 +365,6 @@ def _exclude_lines(new: NewProject) -> list[str]:
 
 def _relative_name(folder: Path, path: Path) -> str:
     return path.location if isinstance(path, Address) else Path(os.path.relpath(path, folder)).as_posix()
-
-
-def _totals(new: NewProject) -> dict[str, tuple[int, int]]:
-    """{camera: (number of scans, number of folders)}."""
-    of_camera = defaultdict[str, list[ScanGroup]](list)
-    for group in new.found.groups:
-        of_camera[group.camera or ("digital camera" if group.digital else "camera unknown")].append(group)
-    return {
-        camera: (sum(len(group.paths) for group in groups), len({group.folder for group in groups}))
-        for camera, groups in of_camera.items()
-    }
 
 
 def _place(group: ScanGroup) -> str:

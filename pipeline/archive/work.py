@@ -61,22 +61,14 @@ class Work:
     def measure(self, tasks: Iterable[ScanTask]) -> Iterator[MeasuredScan]:
         """Yield the scan of each task, measured or stored, with all decisions applied except acceptance
         (`before_checks`): a `Measure`."""
-        missing = []
-        for task in map(self._reviewed_task, tasks):
-            if (row := self._row(task)) is None:
-                missing.append(task)
-            else:
-                self.results[task.name] = row
-                yield self.read(task.name)
+        known, missing = self._stored_rows(tasks)
+        yield from map(self.read, known)
         for task, _ in self._measure(missing):
             yield self.read(task.name)
 
     def complete(self, tasks: Sequence[ScanTask], reporter: Reporter) -> None:
         """Measure the missing scans of the project and report how many there are. The scans are not held in memory."""
-        tasks = [self._reviewed_task(task) for task in tasks]
-        known = {task.name: row for task in tasks if (row := self._row(task)) is not None}
-        missing = [task for task in tasks if task.name not in known]
-        self.results |= known
+        known, missing = self._stored_rows(tasks)
         now = sum(row in self._now for row in known.values())  # measured for other scans in the steps before
         self._store.set_current({row: self._asked(name) for name, row in known.items()})
         if known or len(missing) > 1:
@@ -170,10 +162,19 @@ class Work:
         )
         return task
 
-    def _row(self, task: ScanTask) -> int | None:
-        """Row of the stored result for the task's present file and options; None if there is none."""
-        known = self._identity(task)
-        return None if known is None else self._rows.get(result_key(known, _hash_of(_options_json(task))))
+    def _stored_rows(self, tasks: Iterable[ScanTask]) -> tuple[dict[str, int], list[ScanTask]]:
+        """Rows of the stored results for the tasks' present files and options, by image; tasks that have none."""
+        known, missing = dict[str, int](), list[ScanTask]()
+        for task in map(self._reviewed_task, tasks):
+            identity = self._identity(task)
+            key = "" if identity is None else result_key(identity, _hash_of(_options_json(task)))
+            row = self._rows.get(key)
+            if row is None:
+                missing.append(task)
+            else:
+                known[task.name] = row
+        self.results |= known
+        return known, missing
 
     def _measure(self, tasks: Sequence[ScanTask], as_scans: bool = False) -> Iterator[tuple[ScanTask, MeasuredScan]]:
         """Measure tasks, and store each result at once. as_scans: as results of the project's own scans."""

@@ -269,7 +269,7 @@ def _fiducials(
         if other is not None:
             raise entry.error("xy_mm", f"fiducial {other.id!r} has the same place. Every mark has one of its own.")
         drawing = drawings.get(one.mark or "")
-        drawn = None if drawing is None else _placed(drawing.mark, drawing.is_radial, one.xy_mm)
+        drawn = None if drawing is None else _placed(*drawing, one.xy_mm)
         fiducials[one.id] = GivenFiducial(
             one.id, one.xy_mm, one.sigma_mm, drawn, one.mark == NO_MARK and drawn is None, one.seen_mm
         )

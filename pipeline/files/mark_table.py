@@ -33,6 +33,7 @@ from pipeline.types import Array
 
 Picture = NDArray[np.uint16]
 SavePicture = Callable[[str, Picture], str]
+Drawing = tuple[shapes.Mark | shapes.LearnedMark, bool]
 MarkJson = Mapping[str, Any]  # content of a table [mark.NAME]
 
 _FULL = 65535
@@ -100,14 +101,6 @@ class LearnedFrom:
     alike: tuple[str, ...] = ()
 
 
-@dataclasses.dataclass(frozen=True)
-class Drawing:
-    """Drawn mark. is_radial: whether it is rotated with its place."""
-
-    mark: shapes.Mark | shapes.LearnedMark
-    is_radial: bool
-
-
 # Template of a mark in a camera file, with its images in files beside it: `[mark.NAME]` of kind "template".
 #
 # `[mark.NAME.learned]` holds what was learned from scans; a manually cut chip has no such table.
@@ -165,12 +158,13 @@ def _picture(shares: NDArray[np.float64] | NDArray[np.bool_]) -> Picture:
 
 
 def read_marks(table: Table) -> dict[str, Drawing]:
-    """Read all drawn marks by name. Raises InputError with the key that is wrong."""
+    """Read all drawn marks by name, and whether they are rotated with their places. Raises InputError with the key that
+    is wrong."""
     marks = {}
     for name in table.values:
         entry = table.table(name)
         given = read_kind(entry, MARK_TABLES)
-        marks[name] = Drawing(given.mark(entry), given.rotate == "radial")
+        marks[name] = given.mark(entry), given.rotate == "radial"
     return marks
 
 

@@ -28,7 +28,7 @@ from pipeline.files.object_files import (
 )
 from pipeline.files.project_tables import UNITS_MM, AdjustSettings, ProjectTable
 from pipeline.files.scan_files import FoundScans, add_cuts, as_named, find_scans
-from pipeline.files.target_table import TargetSettings, TieSettings, read_targets, read_ties
+from pipeline.files.target_table import TargetSettings, TieSettings, read_targets
 from pipeline.provenance import hash_content
 from pipeline.results.covariance_file import covariance_path
 from pipeline.text.files import path_below
@@ -301,7 +301,7 @@ def _read_tables(table: Table, needs_camera: bool = True) -> Project:
         pose=given.measure.pose,
         tone=given.measure.tone,
         targets=None if given.targets is None else read_targets(table.table("targets")),
-        ties=None if given.ties is None else read_ties(table.table("ties")),
+        ties=given.ties,
         given_points=read_points(named["points"]) if "points" in named else None,
         given_images=images,
         given_distances=read_distances(named["distances"]) if "distances" in named else (),

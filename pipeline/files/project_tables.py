@@ -12,7 +12,7 @@ from measure.fiducials.options import Reads
 from measure.geometry import POSES
 from pipeline.files.camera_tables import CameraTable, DistortionTable, FiducialTable, SigmaTable, Source
 from pipeline.files.mark_table import MARK_TABLES
-from pipeline.files.target_table import TARGET_TABLES, TieTable
+from pipeline.files.target_table import TARGET_TABLES, TieSettings
 from pipeline.text.files import FINEST_PITCH_UM
 from pipeline.text.table_models import (
     FilePath,
@@ -224,7 +224,7 @@ class ProjectTable:
     measure: Annotated[MeasureTable, "How to measure."] = MeasureTable()
     scanner: Annotated[ScannerTable, "What took the scans."] = ScannerTable()
     targets: Annotated[Values | None, "What the targets are; absent: only fiducials are measured."] = None
-    ties: Annotated[Values | None, "Natural points; absent: none are sought."] = None
+    ties: Annotated[TieSettings | None, "Natural points; absent: none are sought."] = None
     object: Annotated[ObjectTable, "Object space."] = ObjectTable()
     adjust: Annotated[AdjustSettings, "How to adjust."] = AdjustSettings()
 
@@ -237,7 +237,7 @@ def keys_text() -> str:
         ("[scanner]", ScannerTable),
         ("[object]", ObjectTable),
         *((f'[targets], kind = "{kind}"', model) for kind, model in TARGET_TABLES.items()),
-        ("[ties]", TieTable),
+        ("[ties]", TieSettings),
         ("[adjust]", AdjustSettings),
         ("camera.toml", CameraTable),
         ("[sigma]", SigmaTable),

@@ -11,7 +11,7 @@ from measure.boards.specs import BoardSpec
 from measure.marks.shapes import Polarity
 from measure.targets.ring_codes import RingCode
 from measure.tie_points.find_points import TieOptions
-from pipeline.text.table_models import NotNegative, Positive, WrongKey, read_kind, read_model, table_model, whole
+from pipeline.text.table_models import NotNegative, Positive, WrongKey, read_kind, table_model, whole
 from pipeline.text.tables import Table
 
 _MOST_OF_A_BOARD = 500  # limit of columns and of rows
@@ -225,7 +225,7 @@ def read_targets(table: Table) -> TargetSettings:
 
 
 @table_model
-class TieTable:
+class TieSettings:
     """The table [ties]."""
 
     wanted: Annotated[int | None, "Natural points of an image; absent: 300."] = None
@@ -234,31 +234,21 @@ class TieTable:
     height_sigma: Annotated[NotNegative | None, "Its standard deviation, object units; goes with height."] = None
 
     def __post_init__(self) -> None:
-        """Raises WrongKey for a height without its standard deviation, or the reverse."""
+        """Raises WrongKey for a height without its standard deviation, or the reverse, and for impossible points."""
         for key, other in (("height", "height_sigma"), ("height_sigma", "height")):
             if getattr(self, key) is None and getattr(self, other) is not None:
                 raise WrongKey(key, "is missing. Add it.")
+        try:
+            _ = self.options
+        except ValueError as error:
+            raise WrongKey("wanted", f"these natural points are impossible: {error}.") from None
 
-
-@dataclasses.dataclass(frozen=True)
-class TieSettings:
-    """Settings of the natural points. height: of the ground on which they lie, with its standard deviation, object
-    units; None if unknown."""
-
-    options: TieOptions
-    height: Prior | None = None
+    @property
+    def options(self) -> TieOptions:
+        given = {"wanted": self.wanted, "images": self.images}
+        return TieOptions(**{key: value for key, value in given.items() if value is not None})
 
     def point(self, id: str) -> ObjectPoint:
         """Natural point as an object point: unknown except for its height, where that is given."""
-        return ObjectPoint(id, None, None, self.height)
-
-
-def read_ties(table: Table) -> TieSettings:
-    """Read the table. Raises InputError with the key that is wrong."""
-    given = read_model(table, TieTable)
-    try:
-        options = TieOptions(**{key: getattr(given, key) for key in ("wanted", "images") if key in table})
-    except ValueError as error:
-        raise table.error("wanted", f"these natural points are impossible: {error}.") from None
-    known = None if given.height is None else Prior(given.height, given.height_sigma or 0.0)
-    return TieSettings(options, known)
+        height = None if self.height is None else Prior(self.height, self.height_sigma or 0.0)
+        return ObjectPoint(id, None, None, height)

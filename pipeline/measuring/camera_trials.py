@@ -294,7 +294,7 @@ def _attempts(
     """Yield tries of likely layouts, then of all at the given pitch, with non-square pixels and at any pitch; with the
     largest expected number of false alarms for which one of them ends the search."""
     if likely and pitch_um is None:
-        yield _at_any_pitch(search, likely, count), CAMERA_BY_CHANCE
+        yield _any_pitch_tries(search, likely, count), CAMERA_BY_CHANCE
     if pitch_um is not None:
         for some, most in ((likely, CAMERA_BY_CHANCE), (layouts, np.inf)):
             given = _each(some, partial(search.try_pitch, pitch_um=pitch_um), count)
@@ -303,7 +303,7 @@ def _attempts(
         longer = _each(layouts, partial(search.longer_one_way, pitch_um=pitch_um), count)
         pairs = {names: (each, longer[names]) for names, each in given.items()}
         yield {names: min(pair, key=lambda each: each.answer.expected) for names, pair in pairs.items()}, np.inf
-    yield _at_any_pitch(search, layouts, count), np.inf
+    yield _any_pitch_tries(search, layouts, count), np.inf
 
 
 def _each(
@@ -316,7 +316,7 @@ def _each(
     return tries
 
 
-def _at_any_pitch(search: LayoutSearch, layouts: Mapping[Names, FiducialLayout], count: Count) -> dict[Names, Tried]:
+def _any_pitch_tries(search: LayoutSearch, layouts: Mapping[Names, FiducialLayout], count: Count) -> dict[Names, Tried]:
     """Tries without a pitch: each layout determines its own, and the best ones are refined at it."""
     tries = _each(layouts, search.try_any_pitch, count)
     least = sorted({each.answer.expected for each in tries.values()})[:_FEW]
