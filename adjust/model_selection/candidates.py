@@ -11,6 +11,7 @@ testing in linear models, 1999, chapter 4.2; K. P. Burnham and D. R. Anderson, M
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from scipy.special import chdtri
@@ -119,13 +120,11 @@ def remaining_bends(film: Transformation, bends: Bends) -> Bends:
 
 def transformations(network: Network) -> tuple[Transformation, ...]:
     """Film transformations for which every image has enough fiducial marks; "none" for images without films."""
-    filmed = {image.name for image in network.images if image.transformation != "none"}
+    filmed = [i for i, image in enumerate(network.images) if image.transformation != "none"]
     if not filmed:
         return ("none",)
-    observations = network.observations
-    rows = zip(observations.image, observations.kind, strict=True)
-    shown = [image for image, kind in rows if kind == "fiducial" and image in filmed]
-    fewest = min(shown.count(image) for image in filmed)
+    marks = network.image_numbers[network.observations.has_kind("fiducial")]
+    fewest = np.bincount(marks, minlength=len(network.images))[filmed].min()
     return tuple(kind for kind in TRANSFORMATIONS if marks_needed(kind) <= fewest)
 
 
@@ -215,7 +214,8 @@ class Nested:
 def simplest_sufficient(candidates: Sequence[Candidate]) -> Candidate | None:
     """Select the simplest candidate that no richer one improves significantly; None without a solution."""
     chosen = None
-    for candidate in sorted(_solved(candidates), key=lambda each: (each.unknowns, each.vpv)):
+    solved = [each for each in candidates if not each.problem]
+    for candidate in sorted(solved, key=lambda each: (each.unknowns, each.vpv)):
         if chosen is None or _is_better(candidate, chosen):
             chosen = candidate
     return chosen
@@ -243,20 +243,14 @@ def f_test(simpler: Candidate, richer: Candidate) -> Nested:
 
 def nested_tests(candidates: Sequence[Candidate]) -> tuple[Nested, ...]:
     """Test all neighbouring pairs: one contains the other, with no candidate between them."""
-    solved = _solved(candidates)
-    models = [each.model for each in solved]
+    solved = [each for each in candidates if not each.problem]
     return tuple(
         f_test(simpler, richer)
-        for richer in solved
-        for simpler in solved
+        for richer, simpler in product(solved, repeat=2)
         if richer.model.contains(simpler.model)
         and richer.unknowns > simpler.unknowns
-        and not any(richer.model.contains(each) and each.contains(simpler.model) for each in models)
+        and not any(richer.model.contains(each.model) and each.model.contains(simpler.model) for each in solved)
     )
-
-
-def _solved(candidates: Sequence[Candidate]) -> list[Candidate]:
-    return [each for each in candidates if not each.problem]
 
 
 def verdict(given: Model, chosen: Candidate | None) -> str:
@@ -281,13 +275,13 @@ def reasons(candidates: Sequence[Candidate], chosen: Candidate | None) -> tuple[
     """
     if chosen is None:
         return tuple(f"{each.model.name}: {each.problem}" for each in candidates)
-    own, near = chosen.model, []
-    for each in candidates:
-        model = each.model
-        lens = (model.family, model.parameters) != (own.family, own.parameters)
-        if lens + (model.transformation != own.transformation) + (model.bends != own.bends) == 1:
-            near.append(each)
-    return tuple(_reason(each, chosen) for each in near)
+
+    def respects(model: Model) -> tuple[object, ...]:
+        return (model.family, model.parameters), model.transformation, model.bends
+
+    own = respects(chosen.model)
+    differences = (sum(a != b for a, b in zip(respects(each.model), own, strict=True)) for each in candidates)
+    return tuple(_reason(each, chosen) for each, count in zip(candidates, differences, strict=True) if count == 1)
 
 
 def _reason(other: Candidate, chosen: Candidate) -> str:

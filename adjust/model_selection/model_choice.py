@@ -5,7 +5,7 @@ criterion, and all by their prediction of points that were left out (`cross_vali
 richer one improves significantly is chosen.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -48,15 +48,9 @@ Progress = Callable[[str, int], None]
 
 @dataclass(frozen=True)
 class Choice:
-    """Result of a model selection.
+    """Result of a model selection: F-tests of neighbours, and sentences on the choice and the rejected candidates.
 
-    Attributes
-    ----------
-    given : model of the network as given.
-    candidates : all candidates.
-    tests : F-tests of neighbours.
-    chosen : chosen candidate, None without a solution.
-    verdict, reasons : sentences on the choice and on the rejected candidates.
+    chosen: None without a solution.
     """
 
     given: Model
@@ -87,18 +81,11 @@ def choose(
     options = options or Options()
     half_mm = half_mm or {}
     given = given_model(own.network)
-    held = replace(options, robust=False, variance_components=False, snooping=False)
-    fits = _Fits(weighted_network(own), held, half_mm, progress, {given.transformation: own})
+    fits = _Fits(weighted_network(own), options.plain, half_mm, progress, {given.transformation: own})
     chosen, untold = _chosen(fits, given, with_sets=all(camera.name in half_mm for camera in own.network.cameras))
     candidates = tuple(fits.done.values())
-    return Choice(
-        given=given,
-        candidates=candidates,
-        tests=nested_tests(candidates),
-        chosen=chosen,
-        verdict=verdict(given, chosen),
-        reasons=(*reasons(candidates, chosen), *untold),
-    )
+    sentences = (*reasons(candidates, chosen), *untold)
+    return Choice(given, candidates, nested_tests(candidates), chosen, verdict(given, chosen), sentences)
 
 
 def _chosen(fits: "_Fits", given: Model, with_sets: bool) -> tuple[Candidate | None, tuple[str, ...]]:
@@ -109,20 +96,16 @@ def _chosen(fits: "_Fits", given: Model, with_sets: bool) -> tuple[Candidate | N
     chosen: Candidate | None = None
     untold: tuple[str, ...] = ()
     for _ in range(ROUNDS):
-        models = [replace(each, bends=bends) for each in lenses(fits.network, film, with_sets)]
-        chosen = simplest_sufficient([fits.candidate(model) for model in models])
+        chosen = fits.simplest(replace(each, bends=bends) for each in lenses(fits.network, film, with_sets))
         if chosen is None:
-            return None, untold
+            break
         needed, untold = fits.needed_bends(replace(chosen.model, bends=()))
         possible = dict.fromkeys(((), needed, remaining_bends(film, given.bends)))
-        bent = simplest_sufficient([fits.candidate(replace(chosen.model, bends=each)) for each in possible])
-        if bent is None:
-            return None, untold
-        films = [
+        bent = fits.simplest(replace(chosen.model, bends=each) for each in possible)
+        chosen = bent and fits.simplest(
             replace(bent.model, transformation=each, bends=remaining_bends(each, bent.model.bends))
             for each in transformations(fits.network)
-        ]
-        chosen = simplest_sufficient([fits.candidate(model) for model in films])
+        )
         if chosen is None or (chosen.model.transformation, chosen.model.bends) == (film, bends):
             break
         film, bends = chosen.model.transformation, chosen.model.bends
@@ -155,6 +138,9 @@ class _Fits:
             self.progress(model.name, len(self.done))
             self.done[model] = self._candidate(model)
         return self.done[model]
+
+    def simplest(self, models: Iterable[Model]) -> Candidate | None:
+        return simplest_sufficient([self.candidate(model) for model in models])
 
     def needed_bends(self, model: Model) -> tuple[Bends, tuple[str, ...]]:
         """Select significant scanner terms for a model without any; also return remarks on terms not estimable."""

@@ -13,7 +13,6 @@ from scipy.sparse import csr_array
 
 from adjust.array_types import Array, Indices
 from adjust.functional_model.rotation import vector_by_angles
-from adjust.least_squares.equations import Numbering
 from adjust.least_squares.iteration import Linearised
 from adjust.linear_algebra.factor import Factor
 from adjust.problem.estimates import Cofactor
@@ -99,26 +98,25 @@ class FactorCofactor:
         return np.maximum(variances, 0.0)
 
 
-def free_cofactor(numbering: Numbering, state: State, factor: Factor) -> FactorCofactor:
-    """Cofactor matrix in the datum of the numbering."""
-    return FactorCofactor(factor, _reported(numbering.problem, state)[:, numbering.free])
+def free_cofactor(at: Linearised) -> FactorCofactor:
+    """Cofactor matrix in the datum of the equations."""
+    numbering = at.rows.numbering
+    return FactorCofactor(at.factor, _reported(numbering.problem, at.state)[:, numbering.free])
 
 
-def inner_cofactor(
-    problem: Problem, numbering: Numbering, state: State, factor: Factor, members: Indices
-) -> FactorCofactor:
-    """Cofactor matrix transformed from the numbering's minimum constraints to inner constraints over some coordinates.
+def inner_cofactor(problem: Problem, at: Linearised, members: Indices) -> FactorCofactor:
+    """Cofactor matrix of a problem transformed from the equations' minimum constraints to inner constraints over some
+    coordinates.
 
     With G the motions of the free datum and G_p their rows of these coordinates, P = (G_p' G_p)^-1 G_p'.
     """
-    reported = _reported(problem, state)
-    by_free = reported[:, numbering.free]
-    motion = free_motion(problem, state)
+    reported, free = _reported(problem, at.state), at.rows.numbering.free
+    by_free, motion = reported[:, free], free_motion(problem, at.state)
     part = np.zeros((len(problem.unknowns), motion.shape[1]))
     part[members] = np.linalg.pinv(motion[members]).T
-    through = factor.cofactor_times(part[numbering.free])
-    datum = InnerDatum(reported @ motion, by_free @ through, part[numbering.free].T @ through)
-    return FactorCofactor(factor, by_free, datum)
+    through = at.factor.cofactor_times(part[free])
+    datum = InnerDatum(reported @ motion, by_free @ through, part[free].T @ through)
+    return FactorCofactor(at.factor, by_free, datum)
 
 
 def _reported(problem: Problem, state: State) -> csr_array:
@@ -221,16 +219,16 @@ def _shares(run: Run, cofactor: Cofactor) -> _Shares | None:
     if len(positions) > MOST_SHARED:
         return None
     root = np.asarray(np.linalg.cholesky(cofactor.part(positions)), dtype=np.float64)
-    equations = image_equations(run.numbering, run.end, positions)
+    equations = image_equations(run.end, positions)
     return _Shares(positions, root, [(by_shared @ root, right) for _, by_shared, right in equations])
 
 
-def image_equations(numbering: Numbering, at: Linearised, positions: Indices) -> Iterator[tuple[int, Array, Array]]:
+def image_equations(at: Linearised, positions: Indices) -> Iterator[tuple[int, Array, Array]]:
     """Yield the equations of each frame with marks, its own unknowns eliminated.
 
     Number of the frame, derivatives (n, k) by the quantities at some positions, right sides (n,).
     """
-    problem = numbering.problem
+    problem = at.rows.numbering.problem
     frames = problem.network.frame_numbers[problem.image_numbers]
     order = np.argsort(frames, kind="stable")
     own = np.append(problem.unknowns.sigma > 0.0, False)  # the last entry is ABSENT

@@ -267,24 +267,23 @@ class Snooping:
             figures = float(tests.statistic[unit]), float(limits[unit]), tests.error[unit]
             entries[unit] = GrossError(unit, *figures, alike.get(unit, ()))
         critical_tau = self.probabilities.critical_tau(redundancy, int((tests.sizes > 0).sum()))
-        worst_first = sorted(entries.values(), key=lambda each: -each.statistic / each.limit)
-        return tuple(self._suspect(entry, result, critical_tau) for entry in worst_first)
-
-    def _suspect(self, entry: GrossError, result: Reliability, critical_tau: float) -> Suspect:
-        unit, tested = entry.unit, result.tested[entry.unit]
-        worst = int(np.abs(result.w[unit]).argmax())
-        return Suspect(
-            tested=tested,
-            size=int(result.sizes[unit]),
-            statistic=entry.statistic,
-            critical=entry.limit,
-            w=float(result.w[unit, worst]),
-            tau=float(result.tau[unit, worst]),
-            critical_tau=critical_tau,
-            error=tuple(float(value) for value in entry.error[: len(tested.coordinates)]),
-            alike=tuple(result.tested[other].name for other in entry.alike[:ALIKE_SHOWN]),
-            removed=not bool(self.run.weighting.used[unit]),
-        )
+        found = []
+        for each in sorted(entries.values(), key=lambda each: -each.statistic / each.limit):
+            tested, worst = result.tested[each.unit], int(np.abs(result.w[each.unit]).argmax())
+            suspect = Suspect(
+                tested=tested,
+                size=int(result.sizes[each.unit]),
+                statistic=each.statistic,
+                critical=each.limit,
+                w=float(result.w[each.unit, worst]),
+                tau=float(result.tau[each.unit, worst]),
+                critical_tau=critical_tau,
+                error=tuple(each.error[: len(tested.coordinates)].tolist()),
+                alike=tuple(result.tested[other].name for other in each.alike[:ALIKE_SHOWN]),
+                removed=not bool(weighting.used[each.unit]),
+            )
+            found.append(suspect)
+        return tuple(found)
 
     def _significant_scale(self, units: Sequence[int]) -> float:
         """Root of v'Pv over redundancy without some units if it is significantly above 1, else 1."""
@@ -346,22 +345,18 @@ class Snooping:
 
     def _cofactor_columns(self, units: Sequence[int]) -> Array:
         """(N, 2, 2 k) columns of V of some units."""
-        missing = [unit for unit in units if unit not in self._columns]
-        if missing:
-            worst = np.argsort(-self.run.statistics.statistic / self.critical)[:AT_ONCE]  # likely to be needed next
-            self._prepare([*missing, *(int(unit) for unit in worst if unit not in missing)])
+        if any(unit not in self._columns for unit in units):
+            # Those likely to be needed next are computed in the same pass.
+            worst = np.argsort(-self.run.statistics.statistic / self.critical)[:AT_ONCE].tolist()
+            new = [unit for unit in dict.fromkeys([*units, *worst]) if unit not in self._columns]
+            functions, hat = self.run.unit_functions, self.run.misfits.hat
+            rows = (2 * np.array(new)[:, None] + np.arange(2)).ravel()
+            columns = -(functions @ self.run.factor.cofactor_times(functions[rows].T.toarray()))
+            for k, unit in enumerate(new):
+                self._columns[unit] = columns[:, 2 * k : 2 * k + 2].reshape(-1, 2, 2)
+                self._columns[unit][unit] = np.eye(2) - hat[unit]
         nothing = np.zeros((len(self.critical), 2, 0))
         return np.concatenate([nothing, *(self._columns[unit] for unit in units)], axis=2)
-
-    def _prepare(self, units: list[int]) -> None:
-        """Compute the columns (N, 2, 2) of some units in one pass."""
-        units = [unit for unit in units if unit not in self._columns]
-        rows = (2 * np.array(units)[:, None] + np.arange(2)).ravel()
-        functions = self.run.unit_functions
-        columns = -(functions @ self.run.factor.cofactor_times(functions[rows].T.toarray()))
-        for unit, own in zip(units, columns.reshape(len(self.critical), 2, len(units), 2).swapaxes(0, 2), strict=True):
-            self._columns[unit] = own.swapaxes(0, 1)
-            self._columns[unit][unit] = np.eye(2) - self.run.misfits.hat[unit]
 
 
 def _square_sums(variance: Array, along: Array) -> Array:

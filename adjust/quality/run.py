@@ -7,7 +7,7 @@ weight, the unit's own part is p I in the given weight.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,12 +15,12 @@ from scipy.sparse import csr_array, vstack
 
 from adjust.array_types import Array, Indices, Mask
 from adjust.least_squares.equations import Numbering, prior_differences
-from adjust.least_squares.iteration import Linearised, Solution
+from adjust.least_squares.iteration import Linearised, Solution, linearise
 from adjust.linear_algebra.factor import Blocks, Factor
 from adjust.linear_algebra.small_matrices import applied, eigen, inverse, laid_out, product
 from adjust.problem.estimates import NullDirection
 from adjust.problem.further_observations import square_sum
-from adjust.problem.problem import ABSENT, Problem
+from adjust.problem.problem import ABSENT, Problem, State
 from adjust.quality.tested import TestedUnits, Weighting
 from adjust.rank_defect.flat_valleys import pseudo_square_sum
 
@@ -76,17 +76,35 @@ class Run:
     """One adjustment with given weights, and its end."""
 
     problem: Problem  # as given; `numbering` holds it with the weights applied to the priors
-    numbering: Numbering
     weighting: Weighting
     solution: Solution
     singular: tuple[NullDirection, ...]  # null directions at the end, with or without a solution
-    factor: Factor
     settled: bool = True  # whether reweighting has converged
     removed: tuple[GrossError, ...] = ()  # gross errors removed by data snooping
 
     @property
     def end(self) -> Linearised:
         return self.solution.end
+
+    @property
+    def numbering(self) -> Numbering:
+        return self.end.rows.numbering
+
+    @property
+    def factor(self) -> Factor:
+        """Square root of the normal equations at the end, with or without a solution."""
+        return self.end.factor
+
+    def linearised(
+        self, problem: Problem, state: State | None = None, free: Indices | None = None
+    ) -> Linearised | None:
+        """Linearise another problem with the same weights, at its start by default; None if some point has no image.
+
+        free: positions of quantities without their given values.
+        """
+        weighted, covariance = self.weighting.applied(problem)
+        at = state or weighted.start()
+        return linearise(Numbering(weighted if free is None else freed(weighted, free)), covariance, at)
 
     @property
     def vpv(self) -> float:
@@ -189,6 +207,13 @@ class Run:
     def _prior_pairs(self, values: Array) -> Array:
         """Arrange values (n,) of unknowns as the pairs (m, 2) of tested priors, 0 where absent."""
         return np.append(values, 0.0)[self.units.positions]
+
+
+def freed(problem: Problem, positions: Indices) -> Problem:
+    """Drop the given values of some quantities of a problem."""
+    sigma = problem.unknowns.sigma.copy()
+    sigma[positions] = np.inf
+    return replace(problem, unknowns=replace(problem.unknowns, sigma=sigma))
 
 
 def derivatives_by(problem: Problem, matrix: Array, positions: Indices, rows: Indices | None = None) -> csr_array:

@@ -31,8 +31,6 @@ from scipy.spatial import KDTree
 from scipy.special import chdtr, chdtrc, fdtrc, ndtr
 
 from adjust.array_types import Array, Indices, Mask
-from adjust.least_squares.equations import Numbering
-from adjust.least_squares.iteration import linearise
 from adjust.problem.problem import Problem
 from adjust.quality.reliability import TOLD_APART, Snooping
 from adjust.quality.run import UM_PER_MM, GrossError, Run, residuals
@@ -228,12 +226,9 @@ def _best(model: _Model) -> tuple[list[_Model], bool]:
 
 def _first_order_fall(run: Run, problem: Problem) -> float:
     """First-order decrease of v'Pv in a larger problem; 0 where it is singular."""
-    weighted, covariance = run.weighting.applied(problem)
-    numbering = Numbering(weighted)
-    at = linearise(numbering, covariance, weighted.start())
-    if at is None or singular_directions(numbering, at.state, at.factor):
-        return 0.0
-    return at.factor.length() ** 2
+    at = run.linearised(problem)
+    is_regular = at is not None and not singular_directions(at.rows.numbering, at.state, at.factor)
+    return at.factor.length() ** 2 if at is not None and is_regular else 0.0
 
 
 def _following(model: _Model) -> _Model | None:

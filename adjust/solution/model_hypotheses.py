@@ -22,8 +22,8 @@ from adjust.problem.network import Approximations, Board, Network, Scanner
 from adjust.problem.parameter import shortened
 from adjust.problem.problem import Problem, number
 from adjust.quality.cofactor import free_cofactor
-from adjust.quality.run import UM_PER_MM, Run
-from adjust.solution.partitions import Selection, freed, two_groups
+from adjust.quality.run import UM_PER_MM, Run, freed
+from adjust.solution.partitions import Selection, two_groups
 
 FREE = Prior(0.0, np.inf)
 NONE = Selection()
@@ -62,7 +62,7 @@ def estimate(run: Run, hypothesis: ModelHypothesis, rms_um: float) -> Estimate:
     positions = hypothesis.added if hypothesis.shown is None else hypothesis.shown
     vpv, redundancy = run.group_sums(run.weighting.used)
     variance = max(vpv / redundancy, 1.0) if redundancy >= 1.0 else 1.0
-    covariance = variance * free_cofactor(run.numbering, run.end.state, run.factor).part(positions)
+    covariance = variance * free_cofactor(run.end).part(positions)
     return Estimate(run.end.state.values[positions], np.sqrt(np.diag(covariance)), covariance, rms_um)
 
 

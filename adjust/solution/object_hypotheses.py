@@ -10,8 +10,6 @@ from scipy.spatial import KDTree
 
 from adjust.array_types import Array
 from adjust.functional_model.board import BoardForm, board_form, disk_directions, strain_directions
-from adjust.least_squares.equations import Numbering
-from adjust.least_squares.iteration import linearise
 from adjust.problem.condition_equations import computed_observations
 from adjust.problem.network import Network
 from adjust.problem.parameter import shortened
@@ -172,11 +170,9 @@ def diameter_notes(run: Run) -> Iterator[str]:
     """Note where a wrong diameter of the disks, or one that is not given, changes c by more than its deviation."""
     for each in _disks(run) if run.converged else ():
         unknowns, (radius_squared,) = each.problem.unknowns, each.added
-        weighted, covariance = run.weighting.applied(each.problem)
-        numbering = Numbering(weighted)
-        if (at := linearise(numbering, covariance, weighted.start())) is None:
+        if (at := run.linearised(each.problem)) is None:
             return
-        cofactor = free_cofactor(numbering, at.state, at.factor)
+        cofactor = free_cofactor(at)
         given = run.problem.network.disk_radius
         for camera, (c, *_) in unknowns.camera.items():
             (own, common), (_, square) = cofactor.part(np.array([c, radius_squared]))
@@ -189,7 +185,7 @@ def diameter_notes(run: Run) -> Iterator[str]:
                     f"The diameter of the disks is taken as exact: if it is {100.0 * MISMEASURED:.0f} % larger, c of "
                     f"camera {camera} changes by {change:+.2g} mm."
                 )
-            elif squared - at.factor.solution[numbering.numbers[radius_squared]] < CLEAR * np.sqrt(square):
+            elif squared - at.factor.solution[at.rows.numbering.numbers[radius_squared]] < CLEAR * np.sqrt(square):
                 yield (
                     "Nothing says whether the points are corners or the centres of dots: if they are dots of a "
                     f"diameter of {2.0 * np.sqrt(squared):.2g} (points' unit), whose perspective is not corrected, c "

@@ -7,17 +7,15 @@ or one shift of a line of a regular field or of all points beyond it, with the s
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import product
 
 import numpy as np
 from scipy.special import chdtri, gammaln
 
-from adjust.array_types import Array, Indices, Mask
+from adjust.array_types import Array, Mask
 from adjust.functional_model.lens import INTERIOR_NAMES
-from adjust.least_squares.equations import Numbering
-from adjust.least_squares.iteration import linearise
 from adjust.problem.problem import Problem
 from adjust.quality.cofactor import image_equations
 from adjust.quality.run import Run, derivatives_by
@@ -39,13 +37,6 @@ class Selection:
     choices: float = 0.0
     contrasts: int = 0
     p_scatter: Callable[[], float] = float
-
-
-def freed(problem: Problem, positions: Indices) -> Problem:
-    """Drop the given values of some quantities of a problem."""
-    sigma = problem.unknowns.sigma.copy()
-    sigma[positions] = np.inf
-    return replace(problem, unknowns=replace(problem.unknowns, sigma=sigma))
 
 
 MOST_TURNS = 20  # iterations of two-means
@@ -78,17 +69,14 @@ def _some(names: tuple[str, ...], mask: Mask) -> tuple[str, ...]:
 
 def _interior_equations(run: Run, camera: str) -> tuple[tuple[str, ...], Array, Array]:
     """Names of a camera's frames with targets, and normal equations (m, 3, 3), (m, 3) of c, x0' and y0' of each."""
-    problem, covariance = run.weighting.applied(run.problem)
-    positions = problem.unknowns.camera[camera][: len(INTERIOR_NAMES)]
-    numbering = Numbering(freed(problem, positions))
-    at = linearise(numbering, covariance, run.end.state)
-    network = problem.network
+    network, positions = run.problem.network, run.problem.unknowns.camera[camera][: len(INTERIOR_NAMES)]
+    at = run.linearised(run.problem, run.end.state, positions)
     frames = tuple(dict.fromkeys(image.frame for image in network.images))
     shown = {
         each.frame for each in network.images if each.camera == camera and each.name not in network.objectless_images
     }
     names, normal, right = list[str](), list[Array](), list[Array]()
-    for frame, by_interior, discrepancies in image_equations(numbering, at, positions) if at is not None else ():
+    for frame, by_interior, discrepancies in image_equations(at, positions) if at is not None else ():
         if frames[frame] in shown:
             names.append(frames[frame])
             normal.append(by_interior.T @ by_interior)
@@ -176,12 +164,10 @@ def displaced_points(run: Run, axes: Array, problem: Problem, names: tuple[str, 
 
 def _point_equations(run: Run, problem: Problem, names: tuple[str, ...]) -> tuple[Array, Array] | None:
     """N (p, 3, p, 3) and g (p, 3) of points, the unknowns of the run eliminated."""
-    weighted, covariance = run.weighting.applied(problem)
-    at = linearise(Numbering(weighted), covariance, weighted.start())
-    if at is None:
+    if (at := run.linearised(problem)) is None:
         return None
-    positions, count = np.concatenate([weighted.unknowns.point[name] for name in names]), len(names)
-    by_points = derivatives_by(weighted, at.rows.matrix, positions)
+    positions, count = np.concatenate([problem.unknowns.point[name] for name in names]), len(names)
+    by_points = derivatives_by(problem, at.rows.matrix, positions)
     across = (run.unit_functions[: by_points.shape[0]].T @ by_points).toarray()
     normal = (by_points.T @ by_points).toarray() - across.T @ run.factor.cofactor_times(across)
     return normal.reshape(count, 3, count, 3), (by_points.T @ at.rows.right.ravel()).reshape(count, 3)

@@ -115,7 +115,7 @@ def _regularised(problem: Problem) -> tuple[list[int], Array]:
         pivots = qr(scaled.T, mode="r", pivoting=True)[1][: scaled.shape[1]]
         held += [int(position) for position in numbering.free[pivots]]
         still = np.abs(scaled) <= STILL * np.abs(scaled).max(axis=0)
-        by_free = free_cofactor(numbering, problem.start(), at.factor).by_free
+        by_free = free_cofactor(at).by_free
         vectors = np.where(still, 0.0, scaled) / at.factor.scale[:, None]
         moved, could_move = by_free @ vectors, abs(by_free) @ np.abs(vectors)
         null = np.hstack([null, np.where(np.abs(moved) <= STILL * could_move, 0.0, moved)])

@@ -18,7 +18,7 @@ from adjust.display import (
     residual_columns,
 )
 from adjust.least_squares.equations import Numbering
-from adjust.least_squares.iteration import Iteration, factorise
+from adjust.least_squares.iteration import Iteration
 from adjust.problem.camera import Camera
 from adjust.problem.estimates import Cofactor, Estimates, NullDirection, VarianceFactor
 from adjust.problem.network import Approximations
@@ -293,12 +293,11 @@ def is_fixed(problem: Problem, last: Run) -> bool:
 
 def _cofactor(problem: Problem, last: Run, members: Indices | None) -> Cofactor:
     """Compute the cofactor matrix in the datum of a run, or with inner constraints over the coordinates `members`."""
-    state, factor = last.end.state, last.solution.factor
-    if factor is None:
+    if not last.has_solution:
         return NoCofactor(len(problem.unknowns))
     if members is None or not (last.converged and is_fixed(problem, last)):
-        return free_cofactor(last.numbering, state, factor)
-    return inner_cofactor(problem, last.numbering, state, factor, members)
+        return free_cofactor(last.end)
+    return inner_cofactor(problem, last.end, members)
 
 
 def run_result(given: Problem, last: Run, members: Indices | None, probabilities: Probabilities) -> Adjustment:
@@ -343,8 +342,8 @@ def _scaled_run(last: Run, variance: VarianceFactor) -> Run:
     sigma = unknowns.sigma.copy()
     sigma[variance.positions] /= variance.sigma0
     numbering = Numbering(replace(last.numbering.problem, unknowns=replace(unknowns, sigma=sigma)))
-    factor = factorise(numbering, last.end)
-    return replace(last, numbering=numbering, solution=replace(last.solution, factor=factor), factor=factor)
+    end = replace(last.end, rows=replace(last.end.rows, numbering=numbering))
+    return replace(last, solution=replace(last.solution, end=end))
 
 
 def _meaningless(problem: Problem) -> Mask:

@@ -8,7 +8,7 @@ import numpy as np
 from adjust.errors import NoImageError
 from adjust.functional_model.families import family
 from adjust.least_squares.equations import Numbering
-from adjust.least_squares.iteration import Linearised, iterate, linearise
+from adjust.least_squares.iteration import Linearised, iterate
 from adjust.problem.condition_equations import blind_marks
 from adjust.problem.estimates import NullDirection, Termination
 from adjust.problem.problem import Problem, State
@@ -133,15 +133,12 @@ def _release_cameras(problem: Problem, weighting: Weighting, begun: Run, limit: 
     """Release all parameters, starting from the end of a run that held some."""
     # Where the observations do not separate distortion parameters, these get pseudo-observations, as weak as possible.
     state, start = begun.end.state, _apart(problem, begun.end.state)
-    at = _linearise(problem, weighting, state)
+    at = begun.linearised(problem, state)
     motions = edge_motions(problem, at) if at is not None else {}
     for reach in REACHES if motions else ():
         held = replace(problem, pseudo_observed={i: reach * motion for i, motion in motions.items()})
-        at = _linearise(held, weighting, start)
-        if at is None:
-            break
-        variances = free_cofactor(at.rows.numbering, start, at.factor).variances
-        if not unresolved(held.pseudo_observed, variances):
+        at = begun.linearised(held, start)
+        if at is None or not unresolved(held.pseudo_observed, free_cofactor(at).variances):
             break
         last = _iterate(held, weighting, state, limit)
         if last.converged and not is_contradicted(held, last.end.state):
@@ -149,11 +146,6 @@ def _release_cameras(problem: Problem, weighting: Weighting, begun: Run, limit: 
         if last.converged:
             state = start = last.end.state
     return _iterate(problem, weighting, start, limit)
-
-
-def _linearise(problem: Problem, weighting: Weighting, state: State) -> Linearised | None:
-    weighted, covariance = weighting.applied(problem)
-    return linearise(Numbering(weighted), covariance, state)
 
 
 def _alike_at_zero(problem: Problem, state: State, with_others: bool = False) -> dict[str, list[int]]:
@@ -197,4 +189,4 @@ def _iterate(problem: Problem, weighting: Weighting, state: State, limit: int) -
     if singular:
         ended: Termination = "singular" if solution.termination in ("converged", "singular") else "diverged"
         solution = replace(solution, factor=None, termination=ended)
-    return Run(problem, numbering, weighting, solution, singular, solution.end.factor)
+    return Run(problem, weighting, solution, singular)

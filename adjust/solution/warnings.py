@@ -16,8 +16,7 @@ from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.families import family
 from adjust.functional_model.lens import INTERIOR_NAMES
 from adjust.functional_model.transformation import marks_needed
-from adjust.least_squares.equations import Numbering
-from adjust.least_squares.iteration import factorise, linearise
+from adjust.least_squares.iteration import factorise
 from adjust.problem.condition_equations import computed_observations
 from adjust.problem.estimates import Cofactor
 from adjust.problem.observations import Observations
@@ -219,13 +218,11 @@ def held_decentering_notes(run: Run, cofactor: Cofactor) -> Iterator[str]:
         sigma = run.numbering.problem.prior_sigma
         if sigma[added].any() or not sigma[point].all():
             continue
-        weighted, covariance = run.weighting.applied(continued_with(run, added))
-        numbering = Numbering(weighted)
-        if (at := linearise(numbering, covariance, weighted.start())) is None:
+        if (at := run.linearised(continued_with(run, added))) is None:
             continue
         variances = np.full(2, np.inf)
-        if not singular_directions(numbering, at.state, at.factor):
-            variances = free_cofactor(numbering, at.state, at.factor).variances[point]
+        if not singular_directions(at.rows.numbering, at.state, at.factor):
+            variances = free_cofactor(at).variances[point]
         ratio = np.sqrt(variances / cofactor.variances[point])
         if ratio.max() > WORSE:
             many = f"{ratio.max():.2g} times as large" if np.isfinite(ratio.max()) else "infinite"
