@@ -1,40 +1,37 @@
-"""Simultaneous adjustment of cameras, fiducial marks, images and object points (Torlegård's F1 to F9)."""
+"""Simultaneous adjustment of cameras, fiducial marks, images and object points (Torlegård's F1 to F9).
 
-from collections.abc import Collection, Iterable, Mapping
+Blunders of the whole network are refused. Images that keep it from a solution are left out, and so, at the start of
+robust methods, are given points whose blunders are too large for coordinates as observations.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtrc
 
-from adjust.array_types import Indices
+from adjust.array_types import Array
 from adjust.errors import AdjustmentError, DatumError, NoImageError, UnorientedError
+from adjust.functional_model.lens import Lens, Prior
 from adjust.initial_values.approximations import initial_values
+from adjust.initial_values.frames import camera_frames
+from adjust.initial_values.pose import Pose, Sight, image_distances, intersect
 from adjust.least_squares.malloc_tuning import keep_freed_memory, pause_cycle_search
-from adjust.problem.network import STRAIGHT, Approximations, Network
+from adjust.problem.network import Approximations, Network, ObjectPoint
+from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem, number
 from adjust.problem.unknowns import Reduction
-from adjust.quality.run import Run
-from adjust.rank_defect.datum import (
-    CENTERINGS,
-    EXACT,
-    centered,
-    chosen_coordinates,
-    chosen_points,
-    held_as_known,
-    minimal_datum,
-    object_datum,
-)
+from adjust.rank_defect.datum import held_as_known
 from adjust.solution.blunder_hypotheses import Trials, blunder_sentence, stations_elsewhere
-from adjust.solution.coordinate_blunders import FarPoint, coordinate_slips, far_points, few_points, free_points
 from adjust.solution.left_out_images import adopt_lens, contradicting_image, fitting, leave_out, misnumbered_images
 from adjust.solution.options import Datum, Method, Options
 from adjust.solution.plausibility import check_plausibility
-from adjust.solution.result import Adjustment, is_fixed, run_result
-from adjust.solution.reweighting import again, run
+from adjust.solution.result import Adjustment, adjust_problem
 from adjust.validation import validate
 
-__all__ = ["Datum", "Method", "Options", "adjust", "adjust_problem", "settle_datum"]
-
+__all__ = ["Datum", "Method", "Options", "adjust"]
 
 GUESSED = 0.1  # relative standard deviation of a principal distance above which the value is a guess
 TRIAL_STEPS = 6  # iterations of a trial adjustment, enough to test v'Pv, which decreases with each
@@ -214,15 +211,16 @@ class _Solver:
             result = self._start_robustly(network, start) or self.solve(network, start)
         except NoImageError as error:
             if slips := self._slips(network, start):
-                raise AdjustmentError(" ".join(sentence for _, sentence in slips)) from error
+                raise AdjustmentError(" ".join(slip.sentence for slip in slips)) from error
             raise
         if result.termination not in ("converged", "singular"):
             result = self._begin_anew(network, start, result)
-        if result.termination == "singular" or self._agrees(result):
+        agrees = result.redundancy < 1 or chdtrc(result.redundancy, result.vpv) > self.family
+        if result.termination == "singular" or (result.converged and agrees):
             return result
         if slips := self._slips(network, start):
-            return replace(result, slips=tuple(sentence for _, sentence in slips))
-        return result if result.converged else replace(result, remarks=(*result.remarks, *few_points(network)))
+            return replace(result, slips=tuple(slip.sentence for slip in slips))
+        return result if result.converged else replace(result, remarks=(*result.remarks, *_few_points(network)))
 
     def solve(
         self, network: Network, start: Approximations, doubted_points: Iterable[str] = (), plain: bool = False
@@ -232,7 +230,7 @@ class _Solver:
         doubted_points: points whose given coordinates are left out at first. plain: with the weights as given.
         """
         reduction = Reduction.to_centroid(network)
-        problem = self._numbered(reduction.network(network), reduction.approximations(start))
+        problem = number(reduction.network(network), reduction.approximations(start), self.options.method == "elements")
         unknowns = problem.unknowns
         doubted = [int(position) for name in doubted_points for position in unknowns.point[name]]
         result = adjust_problem(problem, self.options.plain if plain else self.options, doubted=doubted)
@@ -248,14 +246,6 @@ class _Solver:
         except AdjustmentError:
             return None
 
-    def _numbered(self, network: Network, start: Approximations) -> Problem:
-        return number(network, start, self.options.method == "elements")
-
-    def _agrees(self, result: Adjustment) -> bool:
-        """Whether v'Pv agrees with the redundancy (chi-square test)."""
-        chance = result.redundancy < 1 or chdtrc(result.redundancy, result.vpv) > self.family
-        return result.converged and bool(chance)
-
     def _start_robustly(self, network: Network, start: Approximations) -> Adjustment | None:
         """Start robust estimation or data snooping without the given points that are blunders."""
         # Returns None without such points or without convergence. From an adjustment that includes a blunder neither
@@ -263,22 +253,21 @@ class _Solver:
         slips = self._slips(network, start) if self.options.robust or self.options.snooping else []
         if not slips:
             return None
-        _, freed = free_points(network, start, [far for far, _ in slips])
+        _, freed = _free_points(network, start, slips)
         try:
-            result = self.solve(network, freed, [far.name for far, _ in slips])
+            result = self.solve(network, freed, [slip.name for slip in slips])
         except NoImageError:
             return None
         return result if result.converged else None
 
-    def _slips(self, network: Network, start: Approximations) -> list[tuple[FarPoint, str]]:
+    def _slips(self, network: Network, start: Approximations) -> "list[_FarPoint]":
         """Find given points that contradict an adjustment without their coordinates significantly, with sentences."""
-        far = far_points(self._numbered(network, start), self.family)
+        far = _far_points(number(network, start), self.family)
         if not far:
             return []
         try:
-            return coordinate_slips(
-                network, far, self.solve(*free_points(network, start, far), plain=True), self.options
-            )
+            without = self.solve(*_free_points(network, start, far), plain=True)
+            return _coordinate_slips(network, far, without, self.options)
         except AdjustmentError:  # the adjustment cannot start without these points
             return []
 
@@ -309,54 +298,156 @@ class _Solver:
         return stopped
 
 
-def adjust_problem(
-    problem: Problem, options: Options, held: Iterable[int] = (), doubted: Collection[int] = ()
-) -> Adjustment:
-    """Adjust a network whose quantities are numbered.
+MOST_FAR = 0.25  # fraction of the given points: if more are far off, the correct ones cannot be identified
+FEWEST_IMAGES = 2  # images needed for an intersection
+ENOUGH = 5  # points needed to identify a wrong one: the resection without it is still redundant
 
-    held: positions of quantities that stay at their start. doubted: positions of quantities whose given values are left
-    out at first (see `run`).
+
+class _FarPoint(NamedTuple):
+    """Given point whose rays meet elsewhere."""
+
+    name: str  # id of the point
+    images: int  # number of images that show it
+    place: Array  # (3,) intersection of its rays, in object units
+    # median distance in the images of its marks from the projected given coordinates; inf behind the cameras
+    miss_mm: float
+    others_mm: float  # largest such distance of the other given points
+    sentence: str = ""  # where the point contradicts the observations significantly
+
+
+def _far_points(problem: Problem, family: float) -> list[_FarPoint]:
+    """Find given points that miss their marks by far more than all others, farthest first.
+
+    The orientations at the start of the adjustment are used: resections without the distortion, which is not known yet.
+    Therefore only a finite variance of the misses of good points is assumed. The largest of many is then more than
+    family^(-1/2) times as large as the next (10 times with 0.01) with the probability `family` at most, as holds for a
+    tail that falls with the square of the distance (the spacings of Pareto's distribution: B. C. Arnold, Pareto
+    Distributions, 1983). All points before the last such gap are far, if their rays meet. Empty where more than
+    MOST_FAR of the points are far.
     """
-    members = chosen_points(problem, options.datum_points)
-    solved = settle_datum(problem, options)
-    solution = run(replace(solved, unknowns=solved.unknowns.fixed(held)), options, doubted)
-    if options.datum == "free":
-        solution = _center_datum(problem, solution, members, options)
-    result = run_result(problem, solution, members if options.datum == "free" else None, options.probabilities)
-    return replace(result, network=problem.network)
+    sights = _sights(problem)
+    rays = {name: own for name, own in _rays_of_given(problem, sights).items() if len(own) >= FEWEST_IMAGES}
+    if not rays:
+        return []
+    miss = {name: float(np.median(own[:, -1])) for name, own in rays.items()}
+    noise = float(np.median([sight.sigma_mm for sight in sights.values()]))
+    falling = sorted(miss, key=lambda name: (-miss[name], name))
+    limits = [max(miss[name], noise) / np.sqrt(family) for name in falling]  # for the points before each
+    gaps = [k for k in range(1, int(MOST_FAR * len(falling)) + 1) if miss[falling[k - 1]] > limits[k]]
+    found = []
+    for name in falling[: gaps[-1]] if gaps else ():
+        centers, directions, c_mm, _ = np.split(rays[name], [3, 6, 7], axis=1)
+        numbers = np.zeros(len(centers), dtype=np.intp)
+        (place,), _ = intersect(centers, directions, numbers, np.full((1, 3), np.nan))
+        along = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        offsets = place - centers
+        depths = (offsets * along).sum(axis=1)
+        across_mm = c_mm[:, 0] * np.linalg.norm(offsets - depths[:, None] * along, axis=1)
+        if (depths > 0.0).all() and (across_mm < limits[gaps[-1]] * depths).all():
+            found.append(_FarPoint(name, len(centers), place, miss[name], miss[falling[gaps[-1]]]))
+    return found
 
 
-def settle_datum(problem: Problem, options: Options) -> Problem:
-    """Fix a minimal datum in a problem, unless the given values are to define the datum."""
-    unknowns = problem.unknowns
-    if options.datum_coordinates:
-        unknowns = unknowns.fixed_as_given(chosen_coordinates(problem, options.datum_coordinates))
-    elif options.datum != "control":
-        unknowns = unknowns.fixed(minimal_datum(problem))
-    settled = replace(problem, unknowns=unknowns)
-    is_bent = not problem.network.line_of_sight.is_straight
-    if is_bent and object_datum(settled, settled.start()).free.shape[1] > 0:
-        # Bent lines of sight would determine the datum, but hardly.
-        return replace(settled, network=replace(problem.network, line_of_sight=STRAIGHT))
-    return settled
+def _rays_of_given(problem: Problem, sights: Mapping[str, Sight]) -> dict[str, Array]:
+    """Rays (m, 8) of every point given in X, Y and Z: station, direction, principal distance, and how far the projected
+    point misses its mark."""
+    unknowns, start = problem.unknowns, problem.start()
+    given = {id_: unknowns.given[at] for id_, at in unknowns.point.items() if np.isfinite(unknowns.sigma[at]).all()}
+    rays = dict[str, list[Array]]()
+    for image, rotation in zip(problem.network.images, start.rotations, strict=True):
+        if (sight := sights.get(image.name)) is None:
+            continue
+        center, c = start.values[unknowns.exterior[image.name][:3]], sight.principal_distance_mm
+        known = [row for row, name in enumerate(sight.points) if name in given]
+        xyz = np.array([given[sight.points[row]] for row in known]).reshape(-1, 3)
+        distances = image_distances(Pose(rotation, center), xyz, sight.xy_mm[known], c)
+        for row, distance in zip(known, distances, strict=True):
+            ray = np.array([*center, *(sight.rays[row] @ rotation), c, distance])
+            rays.setdefault(sight.points[row], []).append(ray)
+    return {name: np.array(own) for name, own in sorted(rays.items())}
 
 
-def _center_datum(problem: Problem, last: Run, members: Indices, options: Options) -> Run:
-    """Transform a run with minimal datum to inner constraints over some coordinates; unchanged where nothing was fixed.
+def _sights(problem: Problem) -> dict[str, Sight]:
+    """Image points by image name, for images with object points, corrected for the distortion known beforehand."""
+    network, unknowns = problem.network, problem.unknowns
+    transformation = {name: unknowns.start[at] for name, at in unknowns.transformation.items()}
+    frames, sights = camera_frames(network, transformation, problem.mirrored), dict[str, Sight]()
+    for name, at in unknowns.camera.items():
+        interior, known = np.split(unknowns.start[at], [3])
+        sights |= frames.sights(name, Lens(network.camera_by_name[name].distortion, interior, known))
+    return sights
 
-    Where priors leave only some of the similarity transformations free, these are free to first order only: the network
-    is adjusted again after each transformation.
+
+def _free_points(network: Network, start: Approximations, far: Sequence[_FarPoint]) -> tuple[Network, Approximations]:
+    """Remove the priors of far points from a network; start them where their rays meet."""
+    places = {each.name: each.place for each in far}
+
+    def freed(point: ObjectPoint) -> ObjectPoint:
+        return ObjectPoint(point.id, *(Prior(each.value, np.inf) for each in point.priors if each))
+
+    points = tuple(freed(point) if point.id in places else point for point in network.points)
+    return replace(network, points=points), replace(start, points={**start.points, **places})
+
+
+def _coordinate_slips(
+    network: Network, far: Sequence[_FarPoint], without: Adjustment, options: Options
+) -> list[_FarPoint]:
+    """Select the far points that contradict an adjustment `without` their coordinates significantly, with sentences.
+
+    The quadratic form of the difference between given and adjusted coordinates is chi-square with 3 degrees of freedom.
+    The critical value holds for the maximum over all given points at the level `family`, and is multiplied by sigma0²
+    where that is larger than 1. Empty where that adjustment has no solution.
     """
-    if not is_fixed(problem, last):
-        return last
-    extent = object_datum(problem, last.end.state).extent
-    for _ in range(CENTERINGS):
-        if not last.converged:
-            return last
-        state, before = centered(problem, last.end.state, members), last
-        if np.abs(state.values - before.end.state.values)[members].max(initial=0.0) <= EXACT * extent:
-            break
-        last = again(before, before.weighting, options.iteration_limit, state)
-        history = before.solution.history + last.solution.history
-        last = replace(last, settled=before.settled, solution=replace(last.solution, history=history))
-    return last
+    given, scale = network.known_places, max(without.sigma0, 1.0)
+    critical = float(options.probabilities.critical(np.array([3]), len(given))[0]) * scale**2
+    found = []
+    for each in far if without.converged else ():
+        coordinates, point = [Parameter.point(each.name, axis) for axis in "XYZ"], network.point_by_id[each.name]
+        place, cofactor = without.values_of(coordinates), without.cofactor_of(coordinates)
+        variances = [prior.sigma**2 for prior in point.priors if prior]
+        weight: Array = np.asarray(np.linalg.inv(cofactor + np.diag(variances)), dtype=np.float64)
+
+        def passes(xyz: Array, place: Array = place, weight: Array = weight) -> bool:
+            return bool((xyz - place) @ weight @ (xyz - place) <= critical)
+
+        if not passes(given[each.name]):
+            sigma = scale * float(np.sqrt(np.diag(cofactor).max()))
+            found.append(each._replace(sentence=_sentence(each, place, sigma, given, passes)))
+    return found
+
+
+def _sentence(
+    far: _FarPoint, place: Array, sigma: float, given: Mapping[str, Array], passes: Callable[[Array], bool]
+) -> str:
+    """Describe a blunder by the point's place (3,) without its given coordinates, and their difference from it."""
+    own = given[far.name]
+    off, digits = own - place, max(0, 1 - int(np.floor(np.log10(sigma))))
+    at = ", ".join(f"{axis} = {value:.{digits}f}" for axis, value in zip("XYZ", place, strict=True))
+    by = ", ".join(f"{axis} by {value:+.{digits}f}" for axis, value in zip("XYZ", off, strict=True))
+    missed = f"{far.miss_mm:.3g} mm from its marks" if np.isfinite(far.miss_mm) else "behind the camera"
+    # Clerical errors that explain the coordinates; told where there is exactly one.
+    readings = [
+        (own[[j if k == i else i if k == j else k for k in range(3)]], f"{'XYZ'[i]} and {'XYZ'[j]} look exchanged.")
+        for i, j in combinations(range(3), 2)
+    ]
+    readings += [(own * (1.0 - 2.0 * np.eye(3)[i]), f"The sign of {'XYZ'[i]} looks wrong.") for i in range(3)]
+    readings += [(xyz, f"It lies where point {id_} is given.") for id_, xyz in given.items() if id_ != far.name]
+    causes = [cause for xyz, cause in readings if passes(xyz)]
+    guess = f" {causes[0]}" if len(causes) == 1 else ""
+    return (
+        f"Control point {far.name} is not where it is given: its rays from {far.images} images meet at {at}, "
+        f"{np.linalg.norm(off):.{digits}f} away ({by}). What is given lies {missed} in the images, every other given "
+        f"point within {far.others_mm:.2g} mm.{guess} Correct its coordinates, or its number among the marks; with "
+        f"snooping = true the adjustment does without them."
+    )
+
+
+def _few_points(network: Network) -> list[str]:
+    """Remark on an adjustment without a solution where too few points are given to check each other."""
+    named = sorted(name for name in network.known_places if name in network.observed_points)
+    if len(named) != ENOUGH - 1:
+        return []
+    return [
+        f"The points {', '.join(named)} alone are given in X, Y and Z: if the coordinates of one of the {len(named)} "
+        f"are wrong, nothing tells which. Check all of them, or give another point."
+    ]

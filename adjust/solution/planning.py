@@ -19,8 +19,8 @@ from adjust.problem.problem import Problem, number
 from adjust.problem.unknowns import Reduction
 from adjust.quality.cofactor import free_cofactor
 from adjust.rank_defect.diagnosis import null_vectors
-from adjust.solution.adjustment import Options, adjust_problem, settle_datum
-from adjust.solution.result import Adjustment
+from adjust.solution.options import Options
+from adjust.solution.result import Adjustment, adjust_problem, settle_datum
 from adjust.validation import validate_plan
 
 STILL = 1e-6  # fraction of a null direction's motion that is rounding: quantities that move less are determined

@@ -1,6 +1,6 @@
-"""Result of an adjustment: estimates, residuals, tests and messages, each computed on demand."""
+"""Adjustment of a numbered problem, and its result: estimates, residuals, tests and messages, computed on demand."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from html import escape
@@ -21,7 +21,7 @@ from adjust.least_squares.equations import Numbering
 from adjust.least_squares.iteration import Iteration
 from adjust.problem.camera import Camera
 from adjust.problem.estimates import Cofactor, Estimates, NullDirection, VarianceFactor
-from adjust.problem.network import Approximations
+from adjust.problem.network import STRAIGHT, Approximations
 from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem
 from adjust.quality.cofactor import (
@@ -51,9 +51,20 @@ from adjust.quality.significance import (
 )
 from adjust.quality.tested import Probabilities
 from adjust.quality.variance_components import factor_sigmas, variance_factor
+from adjust.rank_defect.datum import (
+    CENTERINGS,
+    EXACT,
+    centered,
+    chosen_coordinates,
+    chosen_points,
+    minimal_datum,
+    object_datum,
+)
 from adjust.rank_defect.flat_valleys import held_directions, inseparable
 from adjust.solution.explanations import Explanation, explain
 from adjust.solution.object_hypotheses import diameter_notes
+from adjust.solution.options import Options
+from adjust.solution.reweighting import again, run
 from adjust.solution.warnings import curved_valley_warnings, film_scale_notes, held_decentering_notes, run_warnings
 
 
@@ -286,7 +297,7 @@ class Adjustment(Estimates, PlottedResult):
         return f"<p>{escape(repr(self))}</p><table>{head}{rows}</table>"
 
 
-def is_fixed(problem: Problem, last: Run) -> bool:
+def _is_fixed(problem: Problem, last: Run) -> bool:
     """Whether a datum was held fixed in a run of a problem."""
     return bool((last.problem.unknowns.sigma != problem.unknowns.sigma).any())
 
@@ -295,12 +306,12 @@ def _cofactor(problem: Problem, last: Run, members: Indices | None) -> Cofactor:
     """Compute the cofactor matrix in the datum of a run, or with inner constraints over the coordinates `members`."""
     if not last.has_solution:
         return NoCofactor(len(problem.unknowns))
-    if members is None or not (last.converged and is_fixed(problem, last)):
+    if members is None or not (last.converged and _is_fixed(problem, last)):
         return free_cofactor(last.end)
     return inner_cofactor(problem, last.end, members)
 
 
-def run_result(given: Problem, last: Run, members: Indices | None, probabilities: Probabilities) -> Adjustment:
+def _result(given: Problem, last: Run, members: Indices | None, probabilities: Probabilities) -> Adjustment:
     """Make the result of the last run, whose datum was settled in a given problem.
 
     members: positions of the coordinates with inner constraints, None without a free datum.
@@ -365,3 +376,56 @@ def _redundancy(run: Run, cofactor: Cofactor) -> int:
     further = sum(len(each.observed) for each in problem.further)
     held = held_directions(problem, cofactor.variances) if problem.pseudo_observed else 0
     return int(run.units.sizes[run.weighting.used].sum()) + further + held - len(run.numbering.free)
+
+
+def adjust_problem(
+    problem: Problem, options: Options, held: Iterable[int] = (), doubted: Collection[int] = ()
+) -> Adjustment:
+    """Adjust a network whose quantities are numbered.
+
+    held: positions of quantities that stay at their start. doubted: positions of quantities whose given values are left
+    out at first (see `run`).
+    """
+    members = chosen_points(problem, options.datum_points)
+    solved = settle_datum(problem, options)
+    solution = run(replace(solved, unknowns=solved.unknowns.fixed(held)), options, doubted)
+    if options.datum == "free":
+        solution = _center_datum(problem, solution, members, options)
+    result = _result(problem, solution, members if options.datum == "free" else None, options.probabilities)
+    return replace(result, network=problem.network)
+
+
+def settle_datum(problem: Problem, options: Options) -> Problem:
+    """Fix a minimal datum in a problem, unless the given values are to define the datum."""
+    unknowns = problem.unknowns
+    if options.datum_coordinates:
+        unknowns = unknowns.fixed_as_given(chosen_coordinates(problem, options.datum_coordinates))
+    elif options.datum != "control":
+        unknowns = unknowns.fixed(minimal_datum(problem))
+    settled = replace(problem, unknowns=unknowns)
+    is_bent = not problem.network.line_of_sight.is_straight
+    if is_bent and object_datum(settled, settled.start()).free.shape[1] > 0:
+        # Bent lines of sight would determine the datum, but hardly.
+        return replace(settled, network=replace(problem.network, line_of_sight=STRAIGHT))
+    return settled
+
+
+def _center_datum(problem: Problem, last: Run, members: Indices, options: Options) -> Run:
+    """Transform a run with minimal datum to inner constraints over some coordinates; unchanged where nothing was fixed.
+
+    Where priors leave only some of the similarity transformations free, these are free to first order only: the network
+    is adjusted again after each transformation.
+    """
+    if not _is_fixed(problem, last):
+        return last
+    extent = object_datum(problem, last.end.state).extent
+    for _ in range(CENTERINGS):
+        if not last.converged:
+            return last
+        state, before = centered(problem, last.end.state, members), last
+        if np.abs(state.values - before.end.state.values)[members].max(initial=0.0) <= EXACT * extent:
+            break
+        last = again(before, before.weighting, options.iteration_limit, state)
+        history = before.solution.history + last.solution.history
+        last = replace(last, settled=before.settled, solution=replace(last.solution, history=history))
+    return last
