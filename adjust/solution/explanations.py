@@ -10,9 +10,9 @@ Scheffé's, with the unknowns of all contrasts, and Bonferroni's, over all parti
 the level LEVEL. Hypotheses are compared with each other, and with gross errors of single observations, by v'Pv plus
 twice the unknowns and the logarithm of the choices (Akaike); those within TOLD_APART of the best are reported with it.
 
-What is left may be noise that is larger than given: residuals that are normally distributed, of equal variance in all
-images, and independent of their neighbours, where a standard deviation added to that of all marks, of targets alone or
-of fiducials alone makes every group of observations agree.
+What is left may be noise that is larger than given: residuals of equal variance in all images and independent of their
+neighbours, where a standard deviation added to that of all marks, of targets alone or of fiducials alone makes every
+group of observations agree.
 
 Nothing is reported unless all that is reported removes more than half of the excess of v'Pv over its redundancy.
 
@@ -185,13 +185,10 @@ class _Model:
         return larger if larger.converged and larger.is_tested else None
 
     def extended(self, hypothesis: ModelHypothesis) -> "_Model | None":
-        """Add a hypothesis to the model; None without a solution."""
+        """Add a hypothesis to the model; None without a solution within its limits."""
         run, (low, high) = self.adjusted(hypothesis.problem), hypothesis.limits
-        if (
-            run is None
-            or not ((values := run.end.state.values[hypothesis.added]) >= low).all()
-            or (values > high).any()
-        ):
+        values = None if run is None else run.end.state.values[hypothesis.added]
+        if run is None or values is None or not ((values >= low) & (values <= high)).all():
             return None
         p = self.probability(hypothesis, self.vpv - run.end.vpv)
         left, has_suspects = self.redundancy - len(hypothesis.added), bool(self.gross_errors)
@@ -306,21 +303,15 @@ def _noise_words(marks: str, added_um: float, covariance_mm2: Array) -> tuple[st
 
 
 def _is_noise(run: Run) -> bool:
-    """Whether standardised residuals are normal, homogeneous over images and independent of neighbours."""
+    """Whether standardised residuals are homogeneous over images and independent of neighbours."""
     v = residuals(run)
     checked: Mask = np.asarray((v.redundancy > UNCHECKED).all(axis=1))
     if 2 * checked.sum() < FEWEST:
         return False
     w, images = v.w[checked], run.problem.image_numbers[checked]
-    if not (_is_normal(w) and _is_alike(w, v.redundancy[checked], images)):
-        return False
-    return not any(_is_positive(products) for products in _neighbour_products(run, checked, w, images))
-
-
-def _is_normal(w: Array) -> bool:
-    """Test the kurtosis of all coordinates, with its standard deviation √(24 / n)."""
-    kurtosis = np.mean(w**4) / np.mean(w**2) ** 2 - 3.0
-    return bool(ndtr(-abs(kurtosis) / np.sqrt(24.0 / w.size)) > 0.5 * CHANCE)
+    return _is_alike(w, v.redundancy[checked], images) and not any(
+        _is_positive(products) for products in _neighbour_products(run, checked, w, images)
+    )
 
 
 def _is_alike(w: Array, redundancy: Array, images: Indices) -> bool:
