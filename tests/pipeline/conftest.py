@@ -2,7 +2,7 @@
 processes."""
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import nullcontext
 from importlib import resources
 from pathlib import Path
@@ -13,9 +13,9 @@ import pytest
 from browser import started_browser
 from in_process import Here, pools
 from playwright.sync_api import Browser
-from projects import FEWER_TARGETS, FRAMES
+from projects import FEWER_TARGETS, FRAMES, Printed, Refusal, command
 
-from pipeline.cli import WRONG_INPUT, run
+from pipeline.cli import DONE, WRONG_INPUT, run
 from pipeline.rendered.scene_file import render_project
 from pipeline.report import ReportData
 from pipeline.workers import worker_pool
@@ -78,15 +78,33 @@ def project(finished: tuple[Path, int], tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def refusal(capsys: pytest.CaptureFixture[str]) -> Callable[[list[str]], str]:
+def refusal(capsys: pytest.CaptureFixture[str]) -> Refusal:
     """The message with which a command refuses its input, in one line."""
 
-    def message(arguments: list[str]) -> str:
+    def message(*arguments: object) -> str:
         capsys.readouterr()
-        assert run(arguments) == WRONG_INPUT
+        assert command(*arguments) == WRONG_INPUT
         return " ".join(capsys.readouterr().err.split())
 
     return message
+
+
+@pytest.fixture
+def printed(capsys: pytest.CaptureFixture[str]) -> Printed:
+    """What a command prints that ends with a code."""
+
+    def output(*arguments: object, code: int = DONE) -> str:
+        capsys.readouterr()
+        assert command(*arguments) == code
+        return capsys.readouterr().out
+
+    return output
+
+
+@pytest.fixture
+def printed_line(printed: Printed) -> Printed:
+    """The same in one line."""
+    return lambda *arguments, code=DONE: " ".join(printed(*arguments, code=code).split())
 
 
 @pytest.fixture

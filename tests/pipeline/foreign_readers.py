@@ -14,11 +14,9 @@ Array = NDArray[np.float64]
 
 def opencv_px(folder: Path, image: str, points: Array) -> Array:
     """OpenCV reads and projects itself."""
-    storage = cv2.FileStorage(str(folder / f"{image}.yml"), cv2.FILE_STORAGE_READ)
-    matrix, lens, turn, shift = (
-        storage.getNode(n).mat() for n in ("camera_matrix", "distortion_coefficients", "R", "t")
-    )
-    if storage.getNode("distortion_model").string() == "fisheye":
+    file = cv2.FileStorage(str(folder / f"{image}.yml"), cv2.FILE_STORAGE_READ)
+    matrix, lens, turn, shift = (file.getNode(n).mat() for n in ("camera_matrix", "distortion_coefficients", "R", "t"))
+    if file.getNode("distortion_model").string() == "fisheye":
         wide, _ = cv2.fisheye.projectPoints(points[:, None], cv2.Rodrigues(turn)[0], shift, matrix, lens)
         return np.asarray(wide.reshape(-1, 2), dtype=float)
     pixels, _ = cv2.projectPoints(points, cv2.Rodrigues(turn)[0], shift, matrix, lens)

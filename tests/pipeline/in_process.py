@@ -1,6 +1,7 @@
-"""Work without processes."""
+"""Work without processes, and waiting for some."""
 
 import pickle
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
 from contextlib import AbstractContextManager, contextmanager
@@ -51,3 +52,13 @@ class Loses(Here):
         future: Future[Any] = Future()
         future.set_exception(WorkerKilled())
         return future
+
+
+def wait_until(holds: Callable[[], bool], most_s: float) -> bool:
+    """Whether it came to hold within so many seconds."""
+    end = time.monotonic() + most_s
+    while not holds():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.02)
+    return True

@@ -11,10 +11,12 @@ from typing import Any, cast
 import numpy as np
 from networks import ObservedRow, given_interior, given_marks, make_observations
 from numpy.typing import NDArray
+from projects import present
 
 from adjust import Adjustment, Camera, Distortion, Exterior, Image, Network, ObjectPoint, Parameter, Prior
 from adjust.least_squares.iteration import Iteration
 from adjust.problem.estimates import NullDirection, VarianceFactor
+from adjust.problem.network import EXTERIOR_NAMES
 from adjust.quality.run import Group, Residuals
 from adjust.quality.tested import Probabilities
 from measure.flags import Cause, Reason, Status
@@ -53,9 +55,6 @@ LENS = {
     "p3": (0.0, 0.0),
     "p4": (0.0, 0.0),
 }
-AFFINE = ("a1", "a2", "a3", "b1", "b2", "b3")
-EXTERIOR = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
-EXTERIOR_SIGMAS = (0.05, 0.05, 0.05, 3e-5, 3e-5, 3e-5)
 CHECKED = (("fx", "px", 7683.2, 0.21), ("cx", "px", 5701.3, 0.19), ("k1", "", -4.11e-3, 7.3e-5))
 POINTS = 24
 SIGMA_MM = 0.004
@@ -146,9 +145,9 @@ def _unknowns(points: tuple[str, ...], rng: np.random.Generator) -> tuple[tuple[
     for image in FRAMES:
         affine = (0.1, -1.0, 0.02, 0.2, 0.02, 1.0) if image == "f2" else (0.1, 1.0, 0.02, 0.2, -0.02, 1.0)
         station = (*rng.uniform(-500.0, 500.0, 2), 1500.0, *rng.uniform(-0.1, 0.1, 3))
-        for name, value in zip(AFFINE, affine, strict=True):
+        for name, value in zip(("a1", "a2", "a3", "b1", "b2", "b3"), affine, strict=True):
             quantities[Parameter.film(image, name)] = (value, 1e-4)
-        for name, value, sigma in zip(EXTERIOR, station, EXTERIOR_SIGMAS, strict=True):
+        for name, value, sigma in zip(EXTERIOR_NAMES, station, [0.05] * 3 + [3e-5] * 3, strict=True):
             quantities[Parameter.exterior(image, name)] = (float(value), sigma)
     for point in points:
         quantities |= {Parameter.point(point, axis): (float(rng.uniform(-900.0, 900.0)), 0.0) for axis in "XYZ"}
@@ -184,14 +183,12 @@ def _network(points: tuple[str, ...], targets_mm: Array, rng: np.random.Generato
 
 def set_adjustment(data: ReportData, **values: Any) -> ReportData:
     """With other values in the adjustment's record."""
-    assert data.adjustment is not None
-    return replace(data, adjustment=replace(data.adjustment, **values))
+    return replace(data, adjustment=replace(present(data.adjustment), **values))
 
 
 def set_frames(data: ReportData, change: Callable[[FrameMeasurement], FrameMeasurement]) -> ReportData:
     """With every scan's frame changed."""
-    assert data.measurement is not None
-    scans = {name: replace(scan, frame=change(scan.frame)) for name, scan in data.measurement.items()}
+    scans = {name: replace(scan, frame=change(scan.frame)) for name, scan in present(data.measurement).items()}
     return replace(data, measurement=scans)
 
 
@@ -246,7 +243,7 @@ def measured_report() -> ReportData:
         mark = MarkMeasurement(point, kind, pixels[i], known, Status.MEASURED, quality={"snr": 31.0})
         marks.setdefault(image, []).append(mark)
     scans = {image: _scan(image, own) for image, own in marks.items()}
-    return ReportData("Five frames", rows, scans, thumbnail=_Crosses(marks), frame_mm={"RC 20": (228.0, 228.0)})
+    return ReportData("Five frames", rows, scans, thumbnail=_crosses(marks), frame_mm={"RC 20": (228.0, 228.0)})
 
 
 def _scan(image: str, marks: Sequence[MarkMeasurement]) -> MeasuredScan:
@@ -256,24 +253,19 @@ def _scan(image: str, marks: Sequence[MarkMeasurement]) -> MeasuredScan:
     return MeasuredScan(f"scans/{image}.tif", 12000, 12000, (PITCH_UM, PITCH_UM), frame)
 
 
-class _Crosses:
+def _crosses(marks: Mapping[str, Sequence[MarkMeasurement]]) -> Callable[[str, str, str], Thumbnail]:
     """Pictures of a light cross about the measured centre, in noise."""
+    centers = {(image, mark.point, str(mark.kind)): mark.center_px for image, own in marks.items() for mark in own}
 
-    def __init__(self, marks: Mapping[str, Sequence[MarkMeasurement]]) -> None:
-        self._centers = {
-            (name, mark.point, str(mark.kind)): mark.center_px
-            for name, own in marks.items()
-            for mark in own
-            if mark.center_px is not None
-        }
-
-    def __call__(self, image: str, point: str, kind: str) -> Thumbnail | None:
-        col, row = self._centers[image, point, kind].tolist()
+    def cut(image: str, point: str, kind: str) -> Thumbnail:
+        col, row = np.asarray(centers[image, point, kind]).tolist()
         corner = round(col) - 20, round(row) - 20
         x, y = np.arange(41) + corner[0] - col, np.arange(41) + corner[1] - row
         arms = np.maximum(np.exp(-(x**2) / 6.0)[None, :], np.exp(-(y**2) / 6.0)[:, None])
         noise = np.random.default_rng(round(col)).normal(0.0, 600.0, arms.shape)
         return Thumbnail(20000.0 + 15000.0 * arms + noise, (float(corner[0]), float(corner[1])))
+
+    return cut
 
 
 @cache
@@ -291,66 +283,42 @@ def _replace(result: Adjustment) -> ReportData:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "adjustment.json"
         write_adjustment(result, path)
-        stored, covariance = read_adjustment(path), read_covariance(path)
+        stored, known = read_adjustment(path), read_covariance(path)
     rows = tuple(
         Row.from_numbers(name, unit, Estimate(value, sigma), Estimate(value + 0.1 * sigma, sigma))
         for name, unit, value, sigma in CHECKED
     )
     camera = CameraCheck("agrees", "All parameters agree within 0.1 sigma.", 5, 120, 4.61, 4.60, 0.012, rows)
-    return replace(
-        measured_report(), adjustment=stored, covariance=covariance, check=Check.from_cameras({CAMERA: camera})
-    )
+    return replace(measured_report(), adjustment=stored, covariance=known, check=Check.from_cameras({CAMERA: camera}))
+
+
+def _only(data: ReportData, kind: str, **values: Any) -> ReportData:
+    """With the marks of one kind and other values in the adjustment's record."""
+    residuals = tuple(row for row in present(data.adjustment).residuals if row.kind == kind)
+    data = set_frames(data, lambda frame: replace(frame, marks=tuple(m for m in frame.marks if m.kind == kind)))
+    rows = [row for row in data.comparator if row.kind == kind]
+    return set_adjustment(replace(data, comparator=rows, check=None), residuals=residuals, **values)
 
 
 @cache
 def digital() -> ReportData:
     """The same by a digital camera: no film, no fiducials, pixels of PITCH_UM."""
-    data = adjusted_report()
-    assert data.adjustment is not None
-    assert data.measurement is not None
-    stored = data.adjustment
+    stored = present(adjusted_report().adjustment)
     cameras = {name: replace(camera, fiducials={}) for name, camera in stored.cameras.items()}
     images = {name: replace(image, transformation=FilmRecord(kind="none")) for name, image in stored.images.items()}
-    scans = {
-        name: replace(
-            scan, frame=replace(scan.frame, marks=tuple(m for m in scan.frame.marks if m.kind == "target"), pose=None)
-        )
-        for name, scan in data.measurement.items()
-    }
-    targets = tuple(row for row in stored.residuals if row.kind == "target")
     groups = {name: group for name, group in stored.groups.items() if name != "fiducial"}
-    return replace(
-        data,
-        comparator=[row for row in data.comparator if row.kind == "target"],
-        measurement=scans,
-        adjustment=replace(stored, cameras=cameras, images=images, residuals=targets, groups=groups),
-        pitch_um=dict.fromkeys(FRAMES, (PITCH_UM, PITCH_UM)),
-        check=None,
-    )
+    data = _only(adjusted_report(), "target", cameras=cameras, images=images, groups=groups)
+    data = set_frames(data, lambda frame: replace(frame, pose=None))
+    return replace(data, pitch_um=dict.fromkeys(FRAMES, (PITCH_UM, PITCH_UM)))
 
 
 @cache
 def film_alone() -> ReportData:
     """The fiducials alone: no frame is oriented, and no camera calibrated."""
-    data = adjusted_report()
-    assert data.adjustment is not None
-    assert data.measurement is not None
-    stored, unknown = data.adjustment, math.nan
     cameras = {
         name: replace(
-            camera, principal_distance_mm=replace(camera.principal_distance_mm, sigma=unknown), lens_known=None
+            camera, principal_distance_mm=replace(camera.principal_distance_mm, sigma=math.nan), lens_known=None
         )
-        for name, camera in stored.cameras.items()
+        for name, camera in present(adjusted_report().adjustment).cameras.items()
     }
-    scans = {
-        name: replace(scan, frame=replace(scan.frame, marks=tuple(m for m in scan.frame.marks if m.kind == "fiducial")))
-        for name, scan in data.measurement.items()
-    }
-    residuals = tuple(row for row in stored.residuals if row.kind == "fiducial")
-    return replace(
-        data,
-        comparator=[row for row in data.comparator if row.kind == "fiducial"],
-        measurement=scans,
-        adjustment=replace(stored, cameras=cameras, residuals=residuals, reliability=None),
-        check=None,
-    )
+    return _only(adjusted_report(), "fiducial", cameras=cameras, reliability=None)

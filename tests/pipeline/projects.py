@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
@@ -32,8 +32,23 @@ from pipeline.results.comparator_file import ComparatorPoint, read_measurement_h
 from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan, mark_row, scan_detail
 
 Capture = pytest.CaptureFixture[str]
-Refusal = Callable[[list[str]], str]
-Spoil = Callable[[Path], None]
+Refusal = Callable[..., str]
+Printed = Callable[..., str]
+Spoil = Callable[[Path], object]
+
+
+T = TypeVar("T")
+
+
+def present(value: T | None) -> T:
+    """The value, which is there."""
+    assert value is not None
+    return value
+
+
+def command(*arguments: object) -> int:
+    """The exit code of a command."""
+    return run([*map(str, arguments)])
 
 
 def fiducial_tables(places: Mapping[str, Iterable[float]], more: str = "", table: str = "fiducial") -> str:
@@ -73,10 +88,7 @@ def write_project(folder: Path, names: Sequence[str], project: str = PROJECT, la
 def write_network_project(network: Network, folder: Path, frame_mm: str = "frame_mm = [228.0, 228.0]") -> Path:
     """camera.toml, points.csv, comparator.csv and project.toml; the path of the last."""
     camera, points, observed = network.cameras[0], network.points, network.observations
-    c, x0, y0 = camera.principal_distance_mm, camera.x0_mm, camera.y0_mm
-    assert c is not None
-    assert x0 is not None
-    assert y0 is not None
+    c, x0, y0 = map(present, (camera.principal_distance_mm, camera.x0_mm, camera.y0_mm))
     parameters = camera.distortion.parameters
     lines = [
         f'name = "{camera.name}"',
@@ -157,7 +169,7 @@ def make_project(network: Network, folder: Path, crs: str = "") -> Path:
     for image in network.images:
         empty = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
         tifffile.imwrite(folder / "scans" / f"{image.name}.tif", empty, compression="deflate")
-    assert run(["adjust", str(path)]) in (DONE, LOOK)  # a network may show points beyond its frame
+    assert command("adjust", path) in (DONE, LOOK)  # a network may show points beyond its frame
     return path
 
 
@@ -197,45 +209,10 @@ def frame_px(image: int, places_mm: Array, ideal: bool = False, truth: Truth = T
     return np.asarray((places_mm - (left, top)) * (1.0, -1.0) / PITCH_MM)
 
 
-FILES = ("project.toml", "camera.toml", "points.csv", "images.csv", "distances.csv", "comparator.csv",
-         "earlier/adjustment.json", "earlier/adjustment.npz")  # fmt: skip
-HOSTILE = (
-    "9" * 5000, "-1", "0", "1e999", "nan", "-inf", "0x" + "f" * 5000, "10000000000", "1e-320", '""', '"\\u0000"',
-    "\x00", '"' + "n" * 5000 + '"', "[" * 5000, "{a=" * 2000, "a." * 3000 + "b", '"/dev/zero"', '"\x1b[31mred"',
-    "=cmd|' /C calc'!A0", "true", "null", "[]", "{}", "{", '"', "'", ",", "\n", "\n\n[x]\n", "#", "é", "\ufeff",
-    "\u202e", "x" * 200_000,
-)  # fmt: skip
-
-
-def make_table_project(folder: Path) -> Path:
-    """A project that names every kind of table, adjusted once, with that as the camera's earlier calibration."""
-    truth = Truth()
-    network, _ = simulated(np.random.default_rng(5), truth, free={"k3": np.inf, "p1": np.inf})
-    project = write_network_project(network, folder)
-    assert run(["adjust", str(project)]) in (0, 1)
-    (folder / "out").rename(folder / "earlier")
-    replace_text(folder / "camera.toml", "[sigma]\n", '[sigma]\ncalibration = "earlier/adjustment.json"\n')
-    replace_text(project, "[object]\n", '[object]\nimages = "images.csv"\ndistances = "distances.csv"\n')
-    rows = ["image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg"]
-    for i, (station, angles) in enumerate(zip(truth.stations, truth.attitudes, strict=True)):
-        rows.append(",".join([f"f{i}", *(f"{value:.1f}" for value in (*station, *np.degrees(angles)))]))
-    (folder / "images.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
-    length = float(np.linalg.norm(np.array(_place(network, "0")) - np.array(_place(network, "1"))))
-    (folder / "distances.csv").write_text(f"from,to,distance,sigma\n0,1,{length:.3f},0.01\n", encoding="utf-8")
-    return project
-
-
-MESSAGE, RESULT, LONGEST_MESSAGE = "message", "result", 4000
-
-
-def command_ending(arguments: list[str], capsys: Capture, trial: str) -> str:
-    """How a command ended: MESSAGE, RESULT, or what was wrong in a trial of this name."""
-    code, captured = run(arguments), capsys.readouterr()
-    if code not in (0, 1, 2) or "Traceback" in captured.err or (code == 2) != (captured.err.count("reseau: ") == 1):
-        return f"code {code}: {trial}: {captured.err[-2000:]}"
-    if len(captured.err) > LONGEST_MESSAGE or "\x1b" in captured.out + captured.err:
-        return f"too long, or an escape sequence: {trial}: {captured.err[:500]}"
-    return MESSAGE if code == 2 else RESULT
+def stated_misfit_px(folder: Path) -> float:
+    """The residual that the README tells."""
+    text = (folder / "README.txt").read_text(encoding="utf-8")
+    return float(text[text.index("off by ") + 7 :].split()[0])
 
 
 def result_file(folder: Path) -> dict[str, Any]:
@@ -260,60 +237,6 @@ def change_camera(old: str, new: str) -> Spoil:
     return lambda folder: replace_text(folder / "camera.toml", old, new)
 
 
-def _place(network: Network, id: str) -> list[float]:
-    point = network.point_by_id[id]
-    return [axis.value for axis in (point.X, point.Y, point.Z) if axis is not None]
-
-
-def damaged(data: bytes, name: str, rng: random.Random) -> bytes:
-    """The content of a file with one mishap: of its bytes, of its words, or of what it says."""
-    kinds: list[Callable[[bytes, random.Random], bytes]] = [_bits, _lost]
-    if not name.endswith(".npz"):
-        kinds += [_word] * 2
-    if name.endswith(".json"):
-        kinds += [_value] * 3
-    return rng.choice(kinds)(data, rng)
-
-
-def _bits(data: bytes, rng: random.Random) -> bytes:
-    changed = bytearray(data)
-    for _ in range(rng.choice((1, 1, 3, 30))):
-        changed[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
-    return bytes(changed)
-
-
-def _lost(data: bytes, rng: random.Random) -> bytes:
-    at = rng.randrange(len(data))
-    return data[:at] + data[at + rng.choice((1, 30, 1000, len(data))) :]
-
-
-def _word(data: bytes, rng: random.Random) -> bytes:
-    """One word, number or sign, replaced."""
-    text = data.decode("utf-8")
-    at = rng.randrange(len(text))
-    end = at + 1
-    while end < len(text) and text[end] not in ' ,"\n=[]':
-        end += 1
-    return (text[:at] + rng.choice(HOSTILE) + text[end:]).encode("utf-8", "replace")
-
-
-def _value(data: bytes, rng: random.Random) -> bytes:
-    """One value or key of a JSON file replaced."""
-    content = json.loads(data)
-    node, key = content, rng.choice(list(content))
-    while isinstance(node[key], dict | list) and node[key] and rng.random() < 0.9:
-        node = node[key]
-        key = rng.choice(list(node)) if isinstance(node, dict) else rng.randrange(len(node))
-    new: Any = rng.choice((None, -1, 0, 1e308, "9", [], {}, True, [[]] * 9, "\x1b[2J", 10**400, float("nan"), 2.5))
-    if isinstance(node, dict) and rng.random() < 0.3:
-        node["other"] = node.pop(key)
-    elif isinstance(node[key], float) and rng.random() < 0.5:
-        node[key] *= 1.001
-    else:
-        node[key] = new
-    return json.dumps(content).encode()
-
-
 def copied(source: Path, folder: Path) -> Path:
     shutil.copytree(source, folder)
     return folder / "project.toml"
@@ -335,12 +258,11 @@ def made_record(seed: int = 1, marks: int = 8, status: Status = Status.MEASURED,
 def mark(rng: random.Random, point: str, status: Status = Status.MEASURED) -> MarkMeasurement:
     noise = np.array([[rng.uniform(1e-4, 2e-4), 1e-5], [1e-5, rng.uniform(1e-4, 2e-4)]])
     film = np.array([[rng.uniform(1e-3, 2e-3), 0.0], [0.0, 1e-3]])
+    covariance = Covariance({Cause.NOISE: noise, Cause.FILM: film})
     place = np.array([rng.uniform(0, 5000), rng.uniform(0, 4000)])
     quality = {"snr": rng.uniform(5, 50), "contrast_dn": np.nan, "blur_px": rng.uniform(1, 2)}
     reason = Reason() if status is Status.MEASURED else Reason("it is faint", Code.CONTRAST)
-    return MarkMeasurement(
-        point, "fiducial", place, Covariance({Cause.NOISE: noise, Cause.FILM: film}), status, reason, quality
-    )
+    return MarkMeasurement(point, "fiducial", place, covariance, status, reason, quality)
 
 
 def changed(scan: MeasuredScan, numbers: Iterable[int], status: Status, reason: Reason) -> MeasuredScan:

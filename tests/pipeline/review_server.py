@@ -1,6 +1,7 @@
 """A review of a small project, served by a process of its own, and what a person does on its page."""
 
 import csv
+import http.client
 import json
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import tifffile
@@ -98,3 +100,28 @@ def comparator(folder: Path) -> Mapping[tuple[str, str], Mapping[str, str]]:
     lines = (folder / "comparator.csv").read_text(encoding="utf-8").splitlines()
     rows = csv.DictReader(line for line in lines if not line.startswith("#"))
     return {(row["image"], row["point"]): row for row in rows}
+
+
+def request(
+    server: Served, path: str, headers: Mapping[str, str] | None = None, method: str = "GET", body: str = ""
+) -> tuple[int, Mapping[str, str], str]:
+    """Status, headers and text of an answer; 500 where there is none, as after a fault of the program."""
+    where = urlsplit(server.address)
+    connection = http.client.HTTPConnection(where.hostname or "", where.port, timeout=60)
+    try:
+        connection.request(method, path, body or None, dict(headers or {}))
+        answer = connection.getresponse()
+        return answer.status, dict(answer.getheaders()), answer.read().decode(errors="replace")
+    except http.client.HTTPException as error:
+        return 500, {}, repr(error)
+    finally:
+        connection.close()
+
+
+def get_cookie(server: Served) -> str:
+    status, headers, _ = request(server, f"/?{urlsplit(server.address).query}")
+    assert (status, headers["location"]) == (303, "/")
+    cookie = headers["set-cookie"]
+    assert "HttpOnly" in cookie
+    assert "samesite=strict" in cookie.lower()
+    return cookie.split(";")[0]

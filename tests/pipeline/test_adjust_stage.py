@@ -1,39 +1,51 @@
-"""Reference adjustments, published numbers, datum, distances and other observed quantities through the user's files."""
+"""Networks adjusted through the user's files: reference cases, datum, other observations, choice of a model."""
 
 import csv
 import json
 import re
-from collections.abc import Callable, Iterable, Sequence
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from projects import Capture, fiducial_tables, result_file, write_network_project, write_tables
+from networks import BOARD_FRAME_MM, BOARD_TRUTH, Truth, board_network, field_points, film_parameters, simulated
+from projects import (
+    Capture,
+    Printed,
+    Refusal,
+    command,
+    fiducial_tables,
+    replace_text,
+    result_file,
+    write_network_project,
+    write_tables,
+)
 from real_data import DATA, needs
-from reference_cases import CASES, case_network
+from reference_cases import CASES, case_network, load
 from studies import parametrize_with_studies
+from test_bent_boards import BENDS_MM, bent_board, make_network
 
-from adjust import Adjustment
+from adjust import Adjustment, Distortion, Parameter, Prior
 from adjust.functional_model.rotation import rotation_from_angles
-from adjust.problem.network import EXTERIOR_NAMES
-from pipeline import InputError, read_adjustment, read_comparator, read_project, write_adjustment
+from adjust.functional_model.transformation import film_parameter_names
+from adjust.problem.network import EXTERIOR_NAMES, Transformation
+from pipeline import InputError, build_network, read_adjustment, read_comparator, read_project, write_adjustment
 from pipeline.adjusting.adjust_stage import adjust_marks
-from pipeline.cli import run
+from pipeline.cli import DONE, LOOK
 from pipeline.opencv_check.check import check_against_opencv
 from pipeline.report import ReportData
 from pipeline.report.verdict import judge
+from pipeline.results.adjustment_record import AdjustmentRecord
 
 NAMES = sorted(path.stem for path in CASES.glob("*.json") if not path.stem.startswith("v_"))
 
 
 @parametrize_with_studies("name", NAMES, quick=(5, 6))
 def test_reference_case_through_files(name: str, tmp_path: Path) -> None:
-    case = json.loads((CASES / f"{name}.json").read_text(encoding="utf-8"))
-    write_project(case, tmp_path)
-    project = read_project(tmp_path / "project.toml")
-    adjustment = adjust_marks(project, read_comparator(project.comparator))
+    case = load(name)
+    adjustment = adjust_network(write_project(case, tmp_path).parent)
     reference = case["result"]
     assert adjustment.converged
     assert (adjustment.unknowns, adjustment.redundancy) == (reference["unknowns"], reference["redundancy"])
@@ -61,25 +73,21 @@ def full_name(parameter: str) -> str:
     return ".".join([kind, *["C"] * (kind in ("IO", "FID")), *[id] * bool(id), name])
 
 
-def write_project(case: dict[str, Any], folder: Path) -> None:
+def write_project(case: dict[str, Any], folder: Path) -> Path:
     """The case as a user would write it."""
     network = case_network(case)
     camera = replace(network.cameras[0], name="C")
-    write_network_project(replace(network, cameras=(camera,)), folder, frame_mm="")
-
-
-CASE = "iii_selfcal_all_unknown_datum_A"
+    return write_network_project(replace(network, cameras=(camera,)), folder, frame_mm="")
 
 
 def free_project(folder: Path, adjust: str = "", objects: str = "", scale: float = 1.0) -> dict[str, Any]:
     """The reference network with approximate points and nothing known of them; more lines for its tables."""
-    case: dict[str, Any] = json.loads((CASES / f"{CASE}.json").read_text(encoding="utf-8"))
+    case = load("iii_selfcal_all_unknown_datum_A")
     case["input"]["pts_obs"] = [[scale * x for x in row] for row in case["input"]["pts_obs"]]
     case["input"]["pts_sigma"] = [[None] * 3 for _ in case["input"]["pts_sigma"]]
-    write_project(case, folder)
-    file = folder / "project.toml"
-    text = file.read_text(encoding="utf-8").replace("[object]\n", f"[object]\n{objects}\n")
-    file.write_text(f"{text}\n{adjust}\n", encoding="utf-8")
+    project = write_project(case, folder)
+    replace_text(project, "[object]\n", f"[object]\n{objects}\n")
+    project.write_text(f"{project.read_text(encoding='utf-8')}\n{adjust}\n", encoding="utf-8")
     return case
 
 
@@ -88,11 +96,12 @@ def adjust_network(folder: Path) -> Adjustment:
     return adjust_marks(project, read_comparator(project.comparator))
 
 
-def test_disks_larger_than_their_spacing_are_refused(tmp_path: Path) -> None:
-    """As where coordinates are in m and said to be in mm: the iteration diverged."""
-    free_project(tmp_path, '[targets]\nkind = "disk"\ndiameter_mm = 1e6\n')
-    with pytest.raises(InputError, match="would cover one another"):
-        adjust_network(tmp_path)
+def written_again(result: Adjustment, folder: Path) -> AdjustmentRecord:
+    """The result by its file, in which the parts of the redundancy sum up to the whole."""
+    write_adjustment(result, folder / "adjustment.json")
+    record = read_adjustment(folder / "adjustment.json")
+    assert sum(group.redundancy for group in record.groups.values()) == pytest.approx(record.redundancy)
+    return record
 
 
 def test_chosen_datum_coordinates(tmp_path: Path) -> None:
@@ -109,52 +118,38 @@ def test_chosen_datum_coordinates(tmp_path: Path) -> None:
 
 
 def test_distances_through_files(tmp_path: Path) -> None:
-    """Two scale bars give a free network its size; the rows come out with residuals, and a wrong one is named."""
-    objects = 'distances = "bars.csv"'
-    case = free_project(tmp_path, 'datum = "free"', objects)
+    """Two scale bars give a free network its size; the rows come out with residuals, and a wrong one is named. One to a
+    point that no image shows is left out."""
+    case = free_project(tmp_path, 'datum = "free"', 'distances = "bars.csv"')
     xyz = np.array(case["input"]["pts_obs"])
-    bars = [("1", "2", 1.0), ("3", "9", 1.0), ("5", "7", 1.01)]
-    lengths = [scale * float(np.linalg.norm(xyz[int(b) - 1] - xyz[int(a) - 1])) for a, b, scale in bars]
-    rows = [f"{a},{b},{length!r},0.2" for (a, b, _), length in zip(bars, lengths, strict=True)]
-    (tmp_path / "bars.csv").write_text("\n".join(["from,to,distance,sigma", *rows]) + "\n", encoding="utf-8")
+    rows = ["from,to,distance,sigma", "1,lost,3.0,0.1"]
+    for a, b, scale in ((1, 2, 1.0), (3, 9, 1.0), (5, 7, 1.01)):
+        rows.append(f"{a},{b},{scale * float(np.linalg.norm(xyz[b - 1] - xyz[a - 1]))!r},0.2")
+    (tmp_path / "bars.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    with (tmp_path / "points.csv").open("a", encoding="utf-8") as points:
+        points.write("lost,0.0,0.0,0.0,,,\n")
     result = adjust_network(tmp_path)
-    write_adjustment(result, tmp_path / "adjustment.json")
-    written = read_adjustment(tmp_path / "adjustment.json")
+    assert any("1 to lost" in warning for warning in result.warnings)
+    written = written_again(result, tmp_path)
     assert [(row.start, row.end) for row in written.distances] == [("1", "2"), ("3", "9"), ("5", "7")]
     assert written.groups["distance"].redundancy == pytest.approx(1.8, abs=0.2)
-    assert sum(group.redundancy for group in written.groups.values()) == pytest.approx(written.redundancy)
     verdict = judge(ReportData("t", adjustment=written))
     assert any("contradicted" in each.what and "5 to 7 (v = " in each.what for each in verdict.problems)
     assert written.redundancy == case["result"]["redundancy"] + 2
 
 
-def test_a_distance_to_a_point_that_no_image_shows_is_left_out(tmp_path: Path) -> None:
-    free_project(tmp_path, 'datum = "free"', 'distances = "bars.csv"')
-    with (tmp_path / "points.csv").open("a", encoding="utf-8") as points:
-        points.write("lost,0.0,0.0,0.0,,,\n")
-    (tmp_path / "bars.csv").write_text("from,to,distance,sigma\n1,lost,3.0,0.1\n", encoding="utf-8")
-    result = adjust_network(tmp_path)
-    assert result.further == ()
-    assert any("1 to lost" in warning for warning in result.warnings)
-
-
 def test_refraction_and_curvature_through_files(tmp_path: Path) -> None:
     """The field ten times as large: in decimetres it bends its lines of sight as in metres."""
-    results = []
+    results, bent = [], 'datum = "minimal"\nrefraction = true\nearth_curvature = true'
     for unit, scale in (("m", 10.0), ("dm", 100.0)):
-        folder = tmp_path / unit
-        folder.mkdir()
-        case = free_project(
-            folder, 'datum = "minimal"\nrefraction = true\nearth_curvature = true', f'unit = "{unit}"', scale
-        )
-        results.append(adjust_network(folder))
+        case = free_project(tmp_path, bent, f'unit = "{unit}"', scale)
+        results.append(adjust_network(tmp_path))
     straight = case["result"]["parameters"]["IO.c"]
     first, second = results
     assert second.value("IO.C.c") == pytest.approx(first.value("IO.C.c"), abs=1e-6 * straight["std_apriori"])
     assert second.vpv == pytest.approx(first.vpv, rel=1e-7)
     assert abs(first.value("IO.C.c") - straight["value"]) > 1e-4
-    write_adjustment(first, tmp_path / "adjustment.json")
-    written = read_adjustment(tmp_path / "adjustment.json")
+    written = written_again(first, tmp_path)
     assert (written.refraction, written.earth_curvature) == (True, True)
     assert check_against_opencv(first).cameras["C"].verdict == "not possible"
 
@@ -163,91 +158,80 @@ def test_refraction_and_curvature_through_files(tmp_path: Path) -> None:
 def earlier(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Adjustment]:
     """The folder of a reference case, and its adjustment."""
     folder = tmp_path_factory.mktemp("earlier")
-    write_project(json.loads((CASES / "iii_selfcal_mixed.json").read_text(encoding="utf-8")), folder)
+    write_project(load("iii_selfcal_mixed"), folder)
     first = adjust_network(folder)
     write_adjustment(first, folder / "adjustment.json")
     return folder, first
 
 
-def adjust_antennas(earlier: tuple[Path, Adjustment], folder: Path, sigma: str) -> Adjustment:
-    """The reference case with antennas observed where its adjustment puts them, 2.5 units away from the lenses."""
-    source, first = earlier
-    offset = (0.5, -1.0, 2.2)
-    rows = ["image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg,sX0,sY0,sZ0"]
-    for image in first.network.images:
-        place = [first.value(f"EO.{image.name}.{name}") for name in EXTERIOR_NAMES]
-        antenna = np.array(place[:3]) + rotation_from_angles(np.array(place[3:])).T @ offset
-        rows.append(
-            ",".join([image.name, *map(repr, [*antenna.tolist(), *np.degrees(place[3:]).tolist()]), *[sigma] * 3])
-        )
-    (folder / "images.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
-    for file in ("camera.toml", "points.csv", "comparator.csv"):
-        (folder / file).write_bytes((source / file).read_bytes())
-    text = (source / "project.toml").read_text(encoding="utf-8")
-    keys = f'[object]\nimages = "images.csv"\nantenna_offset = {list(offset)}\n'
-    (folder / "project.toml").write_text(text.replace("[object]\n", keys), encoding="utf-8")
+def once_more(earlier: Path, folder: Path, **changes: tuple[str, str]) -> Adjustment:
+    """The same observations adjusted again, where files of these names say something else."""
+    for file in ("project.toml", "camera.toml", "points.csv", "comparator.csv"):
+        shutil.copy(earlier / file, folder)
+    for name, change in changes.items():
+        replace_text(folder / f"{name}.toml", *change)
     return adjust_network(folder)
 
 
-def test_observed_antennas_through_files(earlier: tuple[Path, Adjustment], tmp_path: Path) -> None:
-    """They are where the adjustment puts them, so that nothing moves but every station becomes more certain."""
-    _, first = earlier
-    result = adjust_antennas(earlier, tmp_path, "0.05")
+@pytest.mark.parametrize("sigma", ["0.05", "0"])
+def test_observed_antennas_through_files(earlier: tuple[Path, Adjustment], sigma: str, tmp_path: Path) -> None:
+    """2.5 units away from the lenses, where the adjustment puts them, so that nothing moves but every station becomes
+    more certain."""
+    folder, first = earlier
+    offset = (0.5, -1.0, 2.2)
+    rows = ["image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg,sX0,sY0,sZ0"]
+    for image in first.network.images:
+        place = np.array([first.value(f"EO.{image.name}.{name}") for name in EXTERIOR_NAMES])
+        antenna = place[:3] + rotation_from_angles(place[3:]).T @ offset
+        values = [*antenna.tolist(), *np.degrees(place[3:]).tolist()]
+        rows.append(",".join([image.name, *map(repr, values), *[sigma] * 3]))
+    (tmp_path / "images.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    keys = f'[object]\nimages = "images.csv"\nantenna_offset = {list(offset)}\n'
+    if sigma == "0":
+        with pytest.raises(InputError, match="column sX0: is 0, but an antenna can be observed only"):
+            once_more(folder, tmp_path, project=("[object]\n", keys))
+        return
+    result = once_more(folder, tmp_path, project=("[object]\n", keys))
     for image in first.network.images:
         name = f"EO.{image.name}.Z0"
         assert result.value(name) == pytest.approx(first.value(name), abs=1e-3 * first.sigma(name))
         assert result.sigma(name) < first.sigma(name)
-    write_adjustment(result, tmp_path / "adjustment.json")
-    written = read_adjustment(tmp_path / "adjustment.json")
+    written = written_again(result, tmp_path)
     assert len(written.antennas) == 3 * len(first.network.images)
     assert written.groups["antenna"].redundancy > 0.0
-    assert sum(group.redundancy for group in written.groups.values()) == pytest.approx(written.redundancy)
-    with pytest.raises(InputError, match="column sX0: is 0, but an antenna can be observed only"):
-        adjust_antennas(earlier, tmp_path, "0")
 
 
-def once_more(earlier: Path, folder: Path, change: Callable[[str], str] = str) -> Adjustment:
-    """The same observations adjusted again, with that result as the earlier calibration of a changed camera."""
-    for file in ("project.toml", "points.csv", "comparator.csv"):
-        (folder / file).write_bytes((earlier / file).read_bytes())
-    text = (earlier / "camera.toml").read_text(encoding="utf-8")
-    key = f'calibration = "{(earlier / "adjustment.json").as_posix()}"'
-    (folder / "camera.toml").write_text(change(text.replace("[sigma]\n", f"[sigma]\n{key}\n", 1)), encoding="utf-8")
-    return adjust_network(folder)
-
-
-def test_an_earlier_calibration_through_files(earlier: tuple[Path, Adjustment], tmp_path: Path) -> None:
-    """The same observations twice: the same values, and smaller sigmas."""
+@pytest.mark.parametrize("marks", [True, False])
+def test_an_earlier_calibration_through_files(earlier: tuple[Path, Adjustment], marks: bool, tmp_path: Path) -> None:
+    """The same observations twice: the same values, and smaller sigmas. Its fiducials can be left out."""
     folder, first = earlier
-    second = once_more(folder, tmp_path)
+    keys = f'[sigma]\ncalibration = "{(folder / "adjustment.json").as_posix()}"\n'
+    keys += "" if marks else "calibration_fiducials = false\n"
+    second = once_more(folder, tmp_path, camera=("[sigma]\n", keys))
     assert second.converged
+    assert {row.name.split(".")[0] for row in second.further} == {"IO", *["FID"] * marks}
     for name in ("c", "x0", "y0", "k3"):
         sigma = first.sigma(f"IO.C.{name}")
-        assert second.value(f"IO.C.{name}") == pytest.approx(first.value(f"IO.C.{name}"), abs=0.05 * sigma)
+        if marks:
+            assert second.value(f"IO.C.{name}") == pytest.approx(first.value(f"IO.C.{name}"), abs=0.05 * sigma)
         assert second.sigma(f"IO.C.{name}") < 0.95 * sigma
-    write_adjustment(second, tmp_path / "second.json")
-    written = read_adjustment(tmp_path / "second.json")
-    rows = {row.name: row for row in written.calibrations}
+    rows = {row.name: row for row in written_again(second, tmp_path).calibrations}
     assert rows["IO.C.c"].value == first.value("IO.C.c")
     assert rows["IO.C.c"].sigma == pytest.approx(first.sigma("IO.C.c"), rel=1e-9)  # a posteriori
-    assert {f"FID.C.{i}.{axis}" for i in range(1, 5) for axis in "xy"} <= set(rows)
+    assert ({f"FID.C.{i}.{axis}" for i in range(1, 5) for axis in "xy"} <= set(rows)) is marks
     assert "IO.C.k7" not in rows  # fixed in both
-    assert sum(group.redundancy for group in written.groups.values()) == pytest.approx(written.redundancy)
 
 
-def test_fiducials_of_an_earlier_calibration_can_be_left_out(earlier: tuple[Path, Adjustment], tmp_path: Path) -> None:
-    keys = "[sigma]\ncalibration_fiducials = false"
-    second = once_more(earlier[0], tmp_path, lambda text: text.replace("[sigma]", keys, 1))
-    assert {row.name.split(".")[0] for row in second.further} == {"IO"}
+SIX_DISTANCES = [("1", "2"), ("2", "3"), ("3", "4"), ("4", "1"), ("1", "3"), ("2", "4")]
 
 
-def fiducial_project(folder: Path, distances: list[tuple[str, str, float]]) -> Path:
-    """Eight affine frames of the fiducials alone, whose coordinates are free, and distances between them."""
+def fiducial_project(folder: Path, **errors: float) -> Path:
+    """Eight affine frames of the fiducials alone, whose coordinates are free, and their distances."""
     place = {"1": (-106.0, 106.0), "2": (106.0, 106.0), "3": (106.0, -106.0), "4": (-106.0, -106.0)}
     true = {id_: np.array(xy) + shift for (id_, xy), shift in zip(place.items(), [0.0, 0.03, -0.02, 0.05], strict=True)}
     lines = ['name = "K"', "frame_mm = [228.0, 228.0]", fiducial_tables(place, 'sigma_mm = "free"\n')]
-    for start, end, error in distances:
-        length = float(np.linalg.norm(true[end] - true[start])) + error if end in true and start in true else 100.0
+    for start, end in SIX_DISTANCES:
+        length = float(np.linalg.norm(true[end] - true[start])) + errors.get(f"from{start}to{end}", 0.0)
         lines += ["[[fiducial_distance]]", f'from = "{start}"', f'to = "{end}"', f"mm = {length!r}", "sigma_mm = 0.005"]
     rows, rng = ["image,point,kind,x_mm,y_mm,sx_mm,sy_mm"], np.random.default_rng(3)
     for image in "abcdefgh":
@@ -258,105 +242,184 @@ def fiducial_project(folder: Path, distances: list[tuple[str, str, float]]) -> P
     return write_tables(folder, 'camera = "camera.toml"', camera=lines, comparator=rows)
 
 
-ALL_SIX = [("1", "2", 0.0), ("2", "3", 0.0), ("3", "4", 0.0), ("4", "1", 0.0), ("1", "3", 0.0), ("2", "4", 0.0)]
-
-
-def test_distances_between_fiducials_through_files(tmp_path: Path, capsys: Capture) -> None:
+def test_distances_between_fiducials_through_files(tmp_path: Path, printed_line: Printed) -> None:
     """Affine films tell no form; six distances of a certificate do, with one to spare, and their table is written."""
-    project = fiducial_project(tmp_path, ALL_SIX)
-    assert run(["run", str(project)]) == 0
-    printed = " ".join(capsys.readouterr().out.split())
-    assert "1 to 3: 299.81" in printed
+    assert "1 to 3: 299.81" in printed_line("run", fiducial_project(tmp_path))
     written = read_adjustment(tmp_path / "out" / "adjustment.json")
-    assert [(row.camera, row.start, row.end) for row in written.fiducial_distances] == [("K", *p[:2]) for p in ALL_SIX]
-    assert sum(row.redundancy for row in written.fiducial_distances) == pytest.approx(
-        3.0, abs=0.3
-    )  # affinity by them alone
+    assert [(row.start, row.end) for row in written.fiducial_distances] == SIX_DISTANCES
+    redundancy = sum(row.redundancy for row in written.fiducial_distances)
+    assert redundancy == pytest.approx(3.0, abs=0.3)  # affinity by them alone
     mm = {id_: np.array(mark.xy_mm) for id_, mark in written.cameras["K"].fiducials.items()}
     assert np.linalg.norm(mm["3"] - mm["1"]) == pytest.approx(212.0 * np.sqrt(2.0), abs=0.012)
 
 
 def test_a_wrong_distance_of_a_certificate_is_named(tmp_path: Path) -> None:
-    project = fiducial_project(tmp_path, [*ALL_SIX[:4], ("1", "3", 0.4), ("2", "4", 0.0)])
-    result = adjust_network(project.parent)
-    write_adjustment(result, tmp_path / "adjustment.json")
-    verdict = judge(ReportData("t", adjustment=read_adjustment(tmp_path / "adjustment.json")))
+    written = written_again(adjust_network(fiducial_project(tmp_path, from1to3=0.4).parent), tmp_path)
+    verdict = judge(ReportData("t", adjustment=written))
     assert any("contradicted" in each.what and "1 to 3 of K" in each.what for each in verdict.problems)
 
 
-FILM = DATA / "film_numbers"
-
-
-def adjusted_result(
-    folder: Path, camera: str, project: str, rows: Iterable[Sequence[object]], points: str = ""
-) -> dict[str, Any]:
-    """The result of `reseau adjust` on files; rows of comparator.csv in its own order."""
-    given = '[object]\npoints = "points.csv"\n' if points else ""
-    lines = ["image,point,kind,x_mm,y_mm,sx_mm,sy_mm", *(",".join(map(str, row)) for row in rows)]
-    text, points = f'camera = "camera.toml"\n{given}{project}', f"point,X,Y,Z,sX,sY,sZ\n{points}"
-    assert run(["adjust", str(write_tables(folder, text, camera=camera, points=points, comparator=lines))]) in (0, 1)
-    result = result_file(folder)
-    assert result["converged"]
-    return result
-
-
-def table(file: Path) -> list[dict[str, str]]:
-    with file.open(encoding="utf-8", newline="") as lines:
-        return list(csv.DictReader(lines))
-
-
-def fiducials(rows: list[dict[str, str]], sigma: float) -> str:
-    return "".join(
-        f'[[fiducial]]\nid = "{row["id"]}"\nxy_mm = [{float(row["cal_x_mm"])}, {float(row["cal_y_mm"])}]\n'
-        f"sigma_mm = {sigma}\n"
-        for row in rows
-    )
-
-
 @needs("film_numbers")
-def test_interior_orientation_of_eight_fiducials(tmp_path: Path) -> None:
-    """An affine transformation published with its rms, all errors in the given coordinates: they are given 1 mm."""
-    pitch_mm = 0.042
-    marks = table(FILM / "sju_8fid" / "fiducials.csv")
-    rows = [
-        ("left", m["id"], "fiducial", float(m["x_px"]) * pitch_mm, -float(m["y_px"]) * pitch_mm, 1e-4, 1e-4)
-        for m in marks
-    ]
-    result = adjusted_result(tmp_path, 'name = "SJU"\n' + fiducials(marks, 1.0), "", rows)
-    found = {key: part["value"] for key, part in result["images"]["left"]["transformation"].items() if key[0] in "ab"}
-    per_px = [pitch_mm * found["a2"], -pitch_mm * found["a3"], pitch_mm * found["b2"], -pitch_mm * found["b3"]]
-    assert per_px == pytest.approx([0.041989, 0.000144, 0.000147, -0.041985], abs=6e-7)
-    assert (found["a1"], found["b1"]) == pytest.approx(
-        (-120.259262, 116.872551), abs=1e-5
-    )  # computed in single precision
-    datum = result["groups"]["datum"]
-    assert (datum["rms_x_um"], datum["rms_y_um"]) == pytest.approx((18.612, 10.329), abs=1e-3)
-    assert result["redundancy"] == 10
-
-
-@needs("film_numbers")
-@pytest.mark.parametrize(
-    ("kind", "rms_um"), [("affine", ((5.7, 5.1), (5.7, 4.3))), ("similarity", ((6.8, 6.2), (6.5, 5.3)))]
-)
-def test_fiducials_of_a_film_pair(kind: str, rms_um: Sequence[tuple[float, float]], tmp_path: Path) -> None:
-    """A Wild RC30 pair, the calibrated fiducials held fixed."""
-    result = adjusted_result(tmp_path, *rc30(kind))
+@pytest.mark.parametrize("kind", ["affine", "similarity"])
+def test_interior_orientation_has_the_published_residuals(kind: str, tmp_path: Path) -> None:
+    """A Wild RC30 pair, the calibrated fiducials held fixed; the readings' origin is at the lower left, y up."""
+    with (DATA / "film_numbers" / "rc30_AR112_3574_3575" / "fiducials.csv").open(encoding="utf-8") as lines:
+        marks = list(csv.DictReader(lines))
+    rms_um = {"affine": ((5.7, 5.1), (5.7, 4.3)), "similarity": ((6.8, 6.2), (6.5, 5.3))}[kind]
+    places = {m["id"]: (float(m["cal_x_mm"]), float(m["cal_y_mm"])) for m in marks}
+    rows = ["image,point,kind,x_mm,y_mm,sx_mm,sy_mm"]
+    for image in ("3574", "3575"):
+        for m in marks:
+            x, y = (0.016 * float(m[f"img{image}_{axis}_px"]) for axis in "xy")
+            rows.append(f"{image},{m['id']},fiducial,{x},{y},0.005,0.005")
+    camera = 'name = "RC30"\n' + fiducial_tables(places, "sigma_mm = 0\n")
+    project = f'camera = "camera.toml"\n[adjust]\ntransformation = "{kind}"'
+    result = adjust_network(write_tables(tmp_path, project, camera=camera, comparator=rows).parent)
     for image, expected in zip(("3574", "3575"), rms_um, strict=True):
-        v = [(row["vx_um"], row["vy_um"]) for row in result["residuals"] if row["image"] == image]
-        assert np.sqrt((np.array(v) ** 2).mean(axis=0)) == pytest.approx(expected, abs=0.06)
-    assert result["redundancy"] == 2 * (16 - {"affine": 6, "similarity": 4}[kind])
+        v_um = 1e3 * result.residuals.v_mm[np.array(result.network.observations.image) == image]
+        assert np.sqrt((v_um**2).mean(axis=0)) == pytest.approx(expected, abs=0.06)
+    assert result.redundancy == 2 * (16 - {"affine": 6, "similarity": 4}[kind])
 
 
-def rc30(kind: str) -> tuple[str, str, list[tuple[object, ...]]]:
-    """Camera, project and fiducial rows of the pair: the readings' origin is at the lower left, y up."""
-    marks = table(FILM / "rc30_AR112_3574_3575" / "fiducials.csv")
-    rows: list[tuple[object, ...]] = [
-        (image, m["id"], "fiducial", *(0.016 * float(m[f"img{image}_{axis}_px"]) for axis in "xy"), 0.005, 0.005)
-        for image in ("3574", "3575")
-        for m in marks
-    ]
-    camera = (
-        'name = "RC30"\nprincipal_distance_mm = 153.324\nprincipal_point_mm = [-0.002, 0.004]\n'
-        "[sigma]\nprincipal_distance_mm = 0\nprincipal_point_mm = 0\n"
-    )
-    return camera + fiducials(marks, 0.0), f'[adjust]\ntransformation = "{kind}"\n', rows
+def test_film_is_added_to_the_covariance_of_every_mark(tmp_path: Path) -> None:
+    network, _ = simulated(np.random.default_rng(1))
+    path = write_network_project(network, tmp_path)
+    path.write_text(path.read_text(encoding="utf-8") + "film_sigma_um = 7.0\n", encoding="utf-8")
+    project = read_project(path)
+    built, left_out = build_network(project, read_comparator(project.comparator))
+    assert not left_out
+    expected = network.observations.covariance_mm2 + 0.007**2 * np.eye(2)
+    np.testing.assert_allclose(built.observations.covariance_mm2, expected, rtol=1e-9)
+
+
+def test_one_frame_with_too_few_fiducials_does_not_end_the_others(tmp_path: Path) -> None:
+    network, _ = simulated(np.random.default_rng(1))
+    project = read_project(write_network_project(network, tmp_path))
+    marks = read_comparator(project.comparator)
+    few = [mark for mark in marks if mark.kind != "fiducial" or mark.image != "f1" or mark.point in "12"]
+    built, (left_out,) = build_network(project, few)
+    assert left_out.startswith("Image 'f1' has no part in the adjustment: it shows 2 fiducial marks, and its affine ")
+    assert [image.name for image in built.images] == ["f0", "f2", "f3"]
+    assert set(built.observations.image) == {"f0", "f2", "f3"}
+    assert build_network(project, [mark for mark in marks if mark.kind != "fiducial"])[1] == ()
+
+
+DRAWN_MM = 0.005  # of a pixel, as the pictures were projected
+
+
+def pixel_project(folder: Path, camera: str = "", project: str = "") -> Path:
+    """Pictures of a board by a digital camera: a list of pixels, without fiducials and film."""
+    marks = board_network(np.random.default_rng(2), 6, 1e-4).observations
+    rows = ["image,point,col_px,row_px"]
+    for image, point, (x_mm, y_mm) in zip(marks.image, marks.point, marks.xy_mm.tolist(), strict=True):
+        rows.append(f"{image},{point},{x_mm / DRAWN_MM:.5f},{-y_mm / DRAWN_MM:.5f}")
+    given = [f"b{number},{25 * (number % 9)},{25 * (number // 9)},0,0,0,0" for number in range(54)]
+    lens = '[distortion]\nfamily = "opencv"\n[distortion.sigma]\nk1 = "free"\nk2 = "free"'
+    text = f'camera = "camera.toml"\n{project}[object]\npoints = "points.csv"\nunit = "mm"'
+    points = ["point,X,Y,Z,sX,sY,sZ", *given]
+    return write_tables(folder, text, camera=f'name = "desk"\n{camera}{lens}', points=points, comparator=rows)
+
+
+def adjust_pixels(path: Path) -> Adjustment:
+    project = read_project(path)
+    return adjust_marks(project, read_comparator(project.comparator, project.list_pitch_um))
+
+
+@pytest.mark.parametrize(("line", "pitch_mm"), [("", 0.005), ("pitch_um = 8.0\n", 0.008)])
+def test_a_digital_camera_comes_from_pixels_alone(tmp_path: Path, line: str, pitch_mm: float) -> None:
+    result = adjust_pixels(pixel_project(tmp_path, project=line))
+    for name in ("c", "x0", "y0"):
+        key = Parameter.interior("desk", name)
+        assert abs(result.value(key) / pitch_mm - BOARD_TRUTH[name] / DRAWN_MM) < 4.0 * result.sigma(key) / pitch_mm
+    assert any("5 µm are assumed" in note for note in result.unused) == (not line)
+
+
+def test_a_camera_file_in_mm_needs_the_size_of_a_pixel(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="Set pitch_um in"):
+        adjust_pixels(pixel_project(tmp_path, camera=f"frame_mm = {[*BOARD_FRAME_MM]}\n"))
+
+
+def bent_project(folder: Path) -> Path:
+    network = make_network(np.random.default_rng(5))
+    free = {"principal_distance_mm": Prior(20.5, np.inf), "x0_mm": Prior(0.0, np.inf), "y0_mm": Prior(0.0, np.inf)}
+    network = replace(network, cameras=(replace(network.cameras[0], **free),))  # type: ignore[arg-type]
+    project = write_network_project(network, folder)
+    replace_text(project, "[object]\n", '[object]\nunit = "mm"\nboard_bend = "free"\n')
+    return project
+
+
+def test_a_bent_board_from_the_project_file_to_the_report(tmp_path: Path) -> None:
+    """Its bends within four sigmas, its points where they are and not on the plane, OpenCV in agreement there."""
+    assert command("run", bent_project(tmp_path)) in (DONE, LOOK)
+    result = result_file(tmp_path)
+    board = result["boards"]["board"]
+    assert board["points"] == 70
+    for name, value in zip(("bend_x", "bend_y"), BENDS_MM, strict=True):
+        assert abs(board[name]["value"] - value) < 4.0 * board[name]["sigma"]
+        assert board[name]["p"] < 1e-6
+    middle = result["points"]["p34"]["Z"]
+    assert middle["sigma"] > 0.0
+    assert abs(middle["value"] - bent_board()[34, 2]) < 4.0 * middle["sigma"]
+    assert result["points"]["p0"]["Z"]["sigma"] == 0.0
+    check = json.loads((tmp_path / "out" / "check.json").read_text(encoding="utf-8"))
+    assert check["verdict"] == "agrees"
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "The board of 70 points is bent" in page
+
+
+def test_points_that_are_no_board_are_reported(tmp_path: Path, refusal: Refusal) -> None:
+    project = bent_project(tmp_path)
+    points = (tmp_path / "points.csv").read_text(encoding="utf-8").splitlines()
+    moved = [",".join([*(cells := line.split(","))[:3], "90.0", *cells[4:]]) for line in points[1:20]]
+    (tmp_path / "points.csv").write_text("\n".join([points[0], *moved, *points[20:]]) + "\n", encoding="utf-8")
+    assert "the object points are no board" in refusal("adjust", project)
+
+
+SCANS = Truth(middle_mm=(120.0, -115.0), mirrored=(False, True, False, False))
+
+
+@parametrize_with_studies(
+    "kind", ["congruent", "projective", "bilinear", "conformal(2)", "polynomial(2)"], quick=(0, 1)
+)
+def test_films_of_every_kind_are_adjusted_from_files(kind: Transformation, tmp_path: Path) -> None:
+    points = field_points(np.random.default_rng(7), 16)
+    network, _ = simulated(np.random.default_rng(4), SCANS, kind, points)
+    write_network_project(network, tmp_path)
+    assert command("adjust", tmp_path / "project.toml") == (1 if kind == "polynomial(2)" else 0)  # too few marks
+    result = result_file(tmp_path)
+    assert result["converged"]
+    for i in range(4):
+        film = result["images"][f"f{i}"]["transformation"]
+        assert film["kind"] == kind
+        assert film["mirrored"] == (i == 1)
+        for name, truth in zip(film_parameter_names(kind), film_parameters(SCANS, i, kind), strict=True):
+            found, expected = (film["angle_deg"], np.degrees(truth)) if name == "angle" else (film[name], truth)
+            off = (found["value"] - expected + 180.0) % 360.0 - 180.0 if name == "angle" else found["value"] - expected
+            assert abs(off) <= 5.0 * found["sigma"]
+    assert command("check", tmp_path / "project.toml") in (0, 1)
+    assert command("report", tmp_path / "project.toml") in (0, 1)
+
+
+@parametrize_with_studies("given", ["none", "torlegard"])
+def test_the_project_is_reported_what_its_data_ask_for(given: str, tmp_path: Path, capsys: Capture) -> None:
+    """A lens without distortion: right as given without any, and to be looked at where k3 is estimated."""
+    points = field_points(np.random.default_rng(1), 15)
+    network, _ = simulated(np.random.default_rng(8), Truth(distortion={}), "none", points=points)
+    parameters = {"k3": Prior(0.0, np.inf)} if given == "torlegard" else {}
+    camera = replace(network.cameras[0], distortion=Distortion(given, parameters), fiducials={})
+    project = write_network_project(replace(network, cameras=(camera,)), tmp_path)
+    assert command("choose", project) == (DONE if given == "none" else LOOK)
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "The data ask for no distortion." in shown
+    assert ("That is the model as it is given." in shown) is (given == "none")
+    result = json.loads((tmp_path / "out" / "choose.json").read_text(encoding="utf-8"))
+    assert result["chosen"] == {"transformation": "none", "family": "none", "parameters": [], "bends": {}}
+    names = [each["name"] for each in result["candidates"]]
+    assert names[:3] == ["no distortion", "torlegard k3", "torlegard k3 k5"]
+    assert {"ebner", "legendre(3)"} <= set(names)
+    first = result["candidates"][0]
+    assert first["cross_validation"]["rays"] == 60
+    assert first["aic"] == pytest.approx(first["vpv"] + 2 * first["unknowns"])
+    assert result["tests"][0] | {"F": 0, "p": 0} == {
+        "simpler": "no distortion", "richer": "torlegard k3", "F": 0, "degrees": [1, first["redundancy"] - 1], "p": 0,
+    }  # fmt: skip

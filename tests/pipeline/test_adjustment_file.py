@@ -165,19 +165,8 @@ def test_a_broken_file_names_the_place(path: Path, keys: tuple[Any, ...], value:
 
 def test_a_missing_or_broken_file_is_named_with_what_to_do(path: Path) -> None:
     file = covariance_path(path)
-    with np.load(file) as arrays:
-        content = dict(arrays)
-    content["names"][0] = "c"
-    wrong_size = {"names": np.array(["a", "b"]), "values": np.zeros(2), "matrix": np.zeros((3, 3))}
-    for arrays, words in (
-        (content, "'c' names no quantity of an adjustment"),
-        (wrong_size, "2 names do not fit a matrix"),
-    ):
-        np.savez_compressed(file, **arrays)
-        with pytest.raises(InputError, match=words):
-            read_covariance(path)
-    file.write_bytes(b"no archive")
-    with pytest.raises(InputError, match=r"adjustment\.npz: is not a covariance file"):
+    np.savez_compressed(file, names=np.array(["a", "b"]), values=np.zeros(2), matrix=np.zeros((3, 3)))
+    with pytest.raises(InputError, match="2 names do not fit a matrix"):
         read_covariance(path)
     file.unlink()
     with pytest.raises(InputError, match="there is no such file"):
@@ -219,22 +208,24 @@ def test_a_check_is_read_as_it_was_written_and_a_wrong_value_refused_with_its_pl
     corners = CornersCheck("findChessboardCorners", 3, 12, ("a",), pixels, pixels)
     row = Row.from_numbers("k1", "", Estimate(1.0, 0.1), Estimate(1.0, 0.1))
     camera = CameraCheck("agrees", "All agree.", 3, 12, 1.0, 1.1, 0.1, (row,), corners)
-    content = plain_json(Check.from_cameras({"K": camera}))
     path = tmp_path / "check.json"
-    path.write_text(json.dumps(content), encoding="utf-8")
-    assert plain_json(read_check(path)) == content
-    of_camera = content["cameras"]["K"]
-    for holder, key in ((content, "verdict"), (of_camera, "points"), (of_camera["rows"][0], "opencv")):
-        right, holder[key] = holder[key], True
+
+    def read(content: Any) -> Check:
         path.write_text(json.dumps(content), encoding="utf-8")
-        with pytest.raises(InputError, match=rf"{key} is True; it should be .* Run `reseau check` again"):
-            read_check(path)
+        return read_check(path)
+
+    content = plain_json(Check.from_cameras({"K": camera}))
+    assert plain_json(read(content)) == content
+    of_camera = content["cameras"]["K"]
+    (of_row,) = of_camera["rows"]
+    for holder, key, value, words in (
+        (content, "verdict", True, "verdict is True; it should be .* Run `reseau check` again"),
+        (of_camera, "points", True, "points is True; it should be .* Run `reseau check` again"),
+        (of_row["opencv"], "sigma", -0.1, r"opencv\.sigma is -0\.1; it should be a number of at least 0, or null"),
+    ):
+        right, holder[key] = holder[key], value
+        with pytest.raises(InputError, match=words):
+            read(content)
         holder[key] = right
-    of_camera["rows"][0]["opencv"]["sigma"] = -0.1
-    path.write_text(json.dumps(content), encoding="utf-8")
-    with pytest.raises(InputError, match=r"opencv\.sigma is -0\.1; it should be a number of at least 0, or null"):
-        read_check(path)
-    of_camera["rows"] = []
     del of_camera["corners_px"]  # of an earlier version
-    path.write_text(json.dumps(content), encoding="utf-8")
-    assert read_check(path).cameras["K"].corners_px is None
+    assert read(content).cameras["K"].corners_px is None

@@ -14,7 +14,18 @@ import numpy as np
 import pytest
 import tifffile
 from drawn import lay_out
-from projects import CAMERA, Capture, change_camera, change_project, replace_text, write_project, write_tables
+from projects import (
+    CAMERA,
+    Capture,
+    Printed,
+    Refusal,
+    change_camera,
+    change_project,
+    command,
+    replace_text,
+    write_project,
+    write_tables,
+)
 from studies import parametrize_with_studies
 
 from measure import Code, MarkShape, Pose, Reason, Status, polygon
@@ -24,7 +35,6 @@ from pipeline.archive.checked_results import read_measurement
 from pipeline.archive.schema import MEASUREMENTS, Schema, opened
 from pipeline.archive.status import archive_status
 from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_doubt
-from pipeline.cli import run
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.roll import check_scans
 from pipeline.measuring.scan_measurement import MeasuredFile, measure_file
@@ -68,7 +78,7 @@ def folder(done: Path, tmp_path: Path) -> Path:
 
 
 def measure(folder: Path, *options: str) -> int:
-    return run(["measure", str(folder / "project.toml"), *options])
+    return command("measure", folder / "project.toml", *options)
 
 
 def marks(folder: Path) -> bytes:
@@ -79,12 +89,6 @@ def verdicts(folder: Path) -> dict[str, str]:
     return {scan.image: str(scan.verdict) for scan in archive_status(read_project(folder / "project.toml")).scans}
 
 
-def one_pixel(folder: Path) -> None:
-    pixels = tifffile.imread(folder / "b.tif")
-    pixels[5, 5] ^= 1
-    tifffile.imwrite(folder / "b.tif", pixels)
-
-
 def one_more(folder: Path) -> None:
     pixels = tifffile.imread(folder / "b.tif")
     tifffile.imwrite(folder / "d.tif", pixels + 1)
@@ -93,7 +97,7 @@ def one_more(folder: Path) -> None:
 CHANGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "nothing": (lambda p: None, ""),
     "touched": (lambda p: os.utime(p / "b.tif", ns=(1, 1)), "b"),
-    "one pixel changed": (one_pixel, "b"),
+    "one pixel changed": (lambda p: change_pixel(p / "b.tif"), "b"),
     "renamed": (lambda p: (p / "b.tif").rename(p / "e.tif"), "e"),
     "one more": (one_more, "d"),
     "one less": (lambda p: (p / "b.tif").unlink(), ""),
@@ -124,30 +128,32 @@ def test_exactly_what_changed_is_measured_again(folder: Path, change: str) -> No
     assert marks(folder) == after
 
 
-def test_what_was_measured_with_other_options_comes_back_without_measuring(folder: Path) -> None:
+def test_results_come_back_by_options_and_move_with_their_project(folder: Path, tmp_path: Path) -> None:
     before = marks(folder)
-    replace_text(folder / "project.toml", 'pose = "0"', 'pose = "0"\ntone = "linear"')
-    measure(folder)
-    assert len(measured) == 3
-    replace_text(folder / "project.toml", 'pose = "0"\ntone = "linear"', 'pose = "0"')
-    measure(folder)
-    assert len(measured) == 3
+    for old, new in (('pose = "0"', 'pose = "0"\ntone = "linear"'), ('pose = "0"\ntone = "linear"', 'pose = "0"')):
+        replace_text(folder / "project.toml", old, new)
+        measure(folder)
+        assert len(measured) == 3
     assert marks(folder) == before
-
-
-@pytest.mark.study
-def test_a_new_revision_of_measuring_measures_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.provenance.result_key.__defaults__", (-1,))
-    measure(folder)
-    assert sorted(measured) == ["a", "b", "c"]
-
-
-def test_a_project_that_is_moved_as_a_whole_keeps_its_results(folder: Path, tmp_path: Path) -> None:
-    before = marks(folder)
     folder.rename(tmp_path / "elsewhere")
     assert measure(tmp_path / "elsewhere") == 0
-    assert not measured
+    assert len(measured) == 3
     assert marks(tmp_path / "elsewhere") == before
+
+
+def test_other_programs_read_the_marks(folder: Path) -> None:
+    with sqlite3.connect(folder / "out" / "measurement.db") as db:
+        rows = db.execute("select image, point, x_mm, y_mm, status from mark_view").fetchall()
+    lines = [line.split(",") for line in marks(folder).decode().splitlines() if line.startswith(("a,", "b,", "c,"))]
+    assert [(row[0], row[1], f"{row[2]:.7f}", f"{row[3]:.7f}", row[4]) for row in rows] == [
+        (line[0], line[1], line[3], line[4], line[10]) for line in lines
+    ]
+
+
+def change_pixel(path: Path) -> None:
+    pixels = tifffile.imread(path)
+    pixels[5, 5] ^= 1
+    tifffile.imwrite(path, pixels)
 
 
 def test_moved_files_are_known_by_content_where_requested(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -160,9 +166,7 @@ def test_moved_files_are_known_by_content_where_requested(folder: Path, monkeypa
     assert not measured
     os.utime(folder / "a.tif", ns=(1, 1))
     (folder / "b.tif").rename(folder / "e.tif")
-    one_pixel_of_c = tifffile.imread(folder / "c.tif")
-    one_pixel_of_c[3, 3] ^= 1
-    tifffile.imwrite(folder / "c.tif", one_pixel_of_c)
+    change_pixel(folder / "c.tif")
     measure(folder, "--moved")
     assert measured == ["c"]
     assert set(verdicts(folder)) == {"a", "c", "e"}
@@ -170,23 +174,16 @@ def test_moved_files_are_known_by_content_where_requested(folder: Path, monkeypa
     assert measured == ["c"]
 
 
-def spoil(folder: Path) -> None:
-    """Beside one good scan: a broken, a truncated, a foreign and a black one, and one that nobody may read."""
-    data = (folder / "b.tif").read_bytes()
-    (folder / "b.tif").write_bytes(data[: len(data) // 2])
+def test_bad_scans_have_a_verdict_and_the_others_are_measured(folder: Path, capsys: Capture) -> None:
+    """Beside one good scan: a truncated, a foreign and a black one, and one that is no picture."""
+    good = [line for line in marks(folder).decode().splitlines() if line.startswith("a,")]
+    (folder / "b.tif").write_bytes((folder / "b.tif").read_bytes()[:100_000])
     (folder / "c.tif").write_bytes(b"II*\0 and nothing that is right")
     (folder / "foreign.tif").write_text("a letter", encoding="utf-8")
-    black = np.zeros_like(tifffile.imread(folder / "a.tif"))
-    tifffile.imwrite(folder / "black.tif", black)
-
-
-def test_bad_scans_have_a_verdict_and_the_others_are_measured(folder: Path, capsys: Capture) -> None:
-    good = [line for line in marks(folder).decode().splitlines() if line.startswith("a,")]
-    spoil(folder)
+    tifffile.imwrite(folder / "black.tif", np.zeros_like(tifffile.imread(folder / "a.tif")))
     assert measure(folder) == 1
-    assert verdicts(folder) == {
-        "a": "good", "b": "failed", "c": "failed", "black": "poor", "foreign": "failed",
-    }  # fmt: skip
+    found = {"a": "good", "b": "failed", "c": "failed", "black": "poor", "foreign": "failed"}
+    assert verdicts(folder) == found
     rows = marks(folder).decode().splitlines()
     assert [row for row in rows if row.startswith("a,")] == good
     assert sum(",absent," in row and "the scan could not be measured" in row for row in rows) == 3 * 4
@@ -196,7 +193,7 @@ def test_bad_scans_have_a_verdict_and_the_others_are_measured(folder: Path, caps
     assert not measured
     assert measure(folder, "--retry") == 1
     assert sorted(measured) == ["b", "c", "foreign"]
-    assert run(["status", str(folder / "project.toml"), "--verdict", "failed"]) == 1
+    assert command("status", folder / "project.toml", "--verdict", "failed") == 1
     out, err = capsys.readouterr()
     assert "foreign" in out
     assert "Repair or replace" in out.replace("\n", " ")
@@ -244,11 +241,11 @@ def test_shards_joined_are_the_same_as_one_machine(folder: Path, three: Path, tm
     assert measure(parts, "--shard", "1/5") == 0
     assert not (parts / "comparator.csv").exists()
     store = parts / "out" / "measurement.{}-of-5.db"
-    assert run(["merge", str(project), str(store).format(1)]) == 1  # the others are waiting
+    assert command("merge", project, str(store).format(1)) == 1  # the others are waiting
     assert "waiting" in capsys.readouterr().out
     assert measure(parts, "--shard", "2/5") == 0
     assert sorted(measured) == ["a", "b", "c"]
-    assert run(["merge", str(project), *(str(store).format(k) for k in (1, 2))]) == 0
+    assert command("merge", project, *(str(store).format(k) for k in (1, 2))) == 0
     assert len(measured) == 3
     assert marks(parts) == marks(folder)
     assert measure(parts) == 0
@@ -279,23 +276,19 @@ def test_a_new_scan_has_its_own_lot_checked_again_and_no_other(folder: Path, mon
     assert set(verdicts(folder)) == {"a", "b", "c", "d"}
 
 
-def test_status_tells_what_changed_outside(folder: Path, capsys: Capture) -> None:
+def test_status_tells_what_changed_outside(folder: Path, printed: Printed) -> None:
     project = str(folder / "project.toml")
-    assert run(["status", project]) == 0
+    assert command("status", project) == 0
     one_more(folder)
     os.utime(folder / "a.tif", ns=(1, 1))
     (folder / "c.tif").unlink()
     assert verdicts(folder) == {"a": "old", "b": "good", "d": "waiting"}
-    capsys.readouterr()
-    assert run(["status", project, "--json"]) == 1
-    output = json.loads(capsys.readouterr().out)
+    output = json.loads(printed("status", project, "--json", code=1))
     assert {name: one["verdict"] for name, one in output["images"].items()} == {"a": "old", "d": "waiting"}
     assert output["verdicts"]["good"]["scans"] == 1
-    assert run(["status", project, "--csv", "--verdict", "waiting"]) == 1
-    assert capsys.readouterr().out.splitlines()[1].startswith("d,waiting,")
-    assert run(["status", project, "--verdict", "failed"]) == 1
-    assert "No scan has this verdict." in capsys.readouterr().out
-    assert run(["status", project, "--verdict", "dreadful"]) == 2
+    assert printed("status", project, "--csv", "--verdict", "waiting", code=1).splitlines()[1].startswith("d,waiting,")
+    assert "No scan has this verdict." in printed("status", project, "--verdict", "failed", code=1)
+    assert command("status", project, "--verdict", "dreadful") == 2
 
 
 def test_status_says_why_a_scan_needs_attention(folder: Path) -> None:
@@ -315,15 +308,6 @@ def test_the_pages_of_results_and_scans_have_the_tables_of_verdicts_and_failures
     )
     assert all(f"| `{verdict}` | {verdict.meaning} | {NEXT_STEP[verdict]} |" in results for verdict in Verdict)
     assert all(f"| `{code}` | {code.meaning} |" in scans for code in FailureCode)
-
-
-def test_other_programs_read_the_marks(folder: Path) -> None:
-    with sqlite3.connect(folder / "out" / "measurement.db") as db:
-        rows = db.execute("select image, point, x_mm, y_mm, status from mark_view").fetchall()
-    lines = [line.split(",") for line in marks(folder).decode().splitlines() if line.startswith(("a,", "b,", "c,"))]
-    assert [(row[0], row[1], f"{row[2]:.7f}", f"{row[3]:.7f}", row[4]) for row in rows] == [
-        (line[0], line[1], line[3], line[4], line[10]) for line in lines
-    ]
 
 
 TIP_MM = ((0.0, 0.0), (0.8, -1.0), (0.8, 1.0))  # of a wedge, whose sides lean on the tone curve
@@ -347,7 +331,7 @@ def test_the_tone_of_a_scanner_stays_when_scans_come_and_go(tmp_path: Path, caps
     assert measured == ["d"]
 
 
-def test_scans_that_fail_alike_are_reported_once_and_all_scans_are_counted(tmp_path: Path, capsys: Capture) -> None:
+def test_scans_that_fail_alike_are_reported_once_and_all_scans_are_counted(tmp_path: Path, refusal: Refusal) -> None:
     """No pitch in project and files: one sentence with the number and the names, not one a scan."""
     for number in range(6):
         pixels = np.full((40, 40), 90 + number, np.uint8)
@@ -356,10 +340,9 @@ def test_scans_that_fail_alike_are_reported_once_and_all_scans_are_counted(tmp_p
     project = f'camera = "camera.toml"\nscans = ["*.tif"]\n[object]\npoints = "points.csv"\n{disks}'
     points = ["point,X,Y,Z", "1,0,0,0", "2,9,0,0", "3,0,9,0", "4,9,9,1"]
     write_tables(tmp_path, project, camera='name = "c"\nprincipal_distance_mm = 10.0', points=points)
-    assert run(["measure", str(tmp_path / "project.toml")]) == 2
-    message = capsys.readouterr().err
-    (last,) = [line for line in message.splitlines() if line.startswith("reseau: ")]
-    assert last.startswith("reseau: 6 scans (s0, s1, s2, s3, s4, s5): pitch_um is missing in the project, and the file")
+    message = refusal("measure", tmp_path / "project.toml")
+    assert "reseau: 6 scans (s0, s1, s2, s3, s4, s5): pitch_um is missing in the project, and the file" in message
+    assert message.count("reseau: ") == 1
     assert message.count("pitch_um is missing") == 2  # at the first that fails, and at the end
     assert re.findall(r"measured (\d) of 6", message)[-1] == "6"
     assert "measured 1 of 1 " not in message

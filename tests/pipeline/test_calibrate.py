@@ -19,21 +19,13 @@ import pytest
 from networks import board_network
 from numpy.typing import NDArray
 from PIL import Image
-from projects import Refusal, made_record
+from projects import Refusal, command, made_record, present
 from rich.console import Console
 from scipy.spatial.distance import cdist
 
 from adjust import Approximations, Network, adjust
 from measure import Scan, open_scan
-from measure.boards.specs import (
-    ArucoSpec,
-    BoardSpec,
-    CharucoSpec,
-    ChessboardSpec,
-    CircleGridSpec,
-    SquareGridSpec,
-    aruco_dictionary,
-)
+from measure.boards.specs import ArucoSpec, BoardSpec, CharucoSpec, ChessboardSpec, CircleGridSpec, aruco_dictionary
 from measure.errors import MissingError
 from pipeline import InputError
 from pipeline.adjusting.network import turned_back
@@ -42,7 +34,6 @@ from pipeline.calibration.calibrate_stage import Calibration
 from pipeline.calibration.intrinsics import LensChoice, LensModel, choose_lens
 from pipeline.calibration.pictures import CameraPictures, find_pictures
 from pipeline.calibration.project_files import board_options
-from pipeline.cli import run
 from pipeline.files.target_table import read_targets
 from pipeline.measuring.roll import check_repeated_views
 from pipeline.opencv_check.check import BoardPictures, compare_corners, detector_name, find_points
@@ -100,9 +91,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def images() -> list[ImagePoints]:
     """The exact places of all corners, as if they had been measured."""
-    return [
-        ImagePoints(f"p{number}", POINTS, corners_px(number) * [PITCH_MM, -PITCH_MM]) for number in range(len(TURNS))
-    ]
+    return [ImagePoints(f"p{k}", POINTS, corners_px(k) * [PITCH_MM, -PITCH_MM]) for k in range(len(TURNS))]
 
 
 def calibrated(given: Sequence[ImagePoints]) -> OpenCvCalibration:
@@ -118,8 +107,7 @@ def test_both_figures_are_of_the_points_that_both_have(folder: Path) -> None:
         return open_scan(folder / f"{image}.png")
 
     pictures = BoardPictures(BOARD, opened, {f"p{number}": (10.0, 10.0) for number in range(len(TURNS))})
-    found = compare_corners(images(), pictures, calibrated)
-    assert found is not None
+    found = present(compare_corners(images(), pictures, calibrated))
     assert (found.images, found.points, found.not_found) == (4, 4 * 35, ("p4",))
     truth = np.array([FOCAL_PX, FOCAL_PX, *CENTER_PX])
     exact, own = (np.array([each.fx, each.fy, each.cx, each.cy]) for each in (found.reseau, found.opencv))
@@ -136,6 +124,7 @@ def test_both_figures_are_of_the_points_that_both_have(folder: Path) -> None:
     rms, matrix, *_ = cv2.calibrateCamera(objects, points, SIZE_PX, MATRIX.copy(), np.zeros(5), flags=flags)
     assert found.opencv.rms == pytest.approx(rms, rel=1e-3)
     np.testing.assert_allclose(own, matrix[[0, 1, 0, 1], [0, 1, 2, 2]], atol=0.01)
+    assert compare_corners(images()[:2], pictures, calibrated) is None
 
 
 def circles() -> NDArray[np.uint8]:
@@ -159,18 +148,6 @@ def test_opencvs_own_detectors_find_other_boards(board: BoardSpec, drawing: NDAr
     assert len(find_points(drawing, board)) == count
 
 
-def test_without_scans_or_a_detector_it_is_left_out(folder: Path) -> None:
-    def missing(image: str) -> Scan:
-        raise MissingError("not at hand")
-
-    assert compare_corners(images(), BoardPictures(BOARD, missing, {}), calibrated) is None
-    assert len(find_points(picture(0), SquareGridSpec(3, 3, 20.0, 20.0))) == 0
-
-
-TOO_FEW = (
-    "the board is in 1 picture of 440 x 360 px, and 3 or more with different tilts are needed. Pictures that were "
-    "cut are taken for another camera's: give them as they were taken."
-)
 CALIBRATED_BOARD = ("--board", "7x5", "--square", "2cm")
 
 
@@ -204,7 +181,7 @@ def result(calibrated_folder: Path, calibrations: list[Calibration]) -> dict[str
     with redirect_stdout(printed), pytest.MonkeyPatch.context() as patch:
         patch.setattr(calibrate_stage, "calibrate", keep)
         options = ("--lens", "opencv4", "--out", str(out), "--ros", "--json")
-        code = run(["calibrate", str(calibrated_folder), *CALIBRATED_BOARD, *options])
+        code = command("calibrate", calibrated_folder, *CALIBRATED_BOARD, *options)
     assert code == 1  # two pictures are left out
     return dict(json.loads(printed.getvalue()))
 
@@ -213,7 +190,7 @@ def test_a_folder_of_pictures_gives_intrinsics_in_pixels(result: dict[str, Any],
     (camera,), out = result["cameras"], calibrated_folder / "calibration"
     assert list(result["unreadable"]) == ["torn"]
     assert not any("targets was measured" in problem for problem in result["problems"])  # each has its own reason
-    assert result["not_calibrated"] == {"camera-440x360": TOO_FEW}  # and costs the other camera nothing
+    assert list(result["not_calibrated"]) == ["camera-440x360"]  # and costs the other camera nothing
     assert (camera["name"], camera["image_size_px"], camera["images_used"]) == ("camera-400x320", list(SIZE_PX), 5)
     assert (camera["images_turned_deg"], camera["unsure_turns"]) == ({"p4": 90}, [])
     assert camera["images_left_out"] == {"grey": "the scan has no contrast: its grey values span 0.0 % of the scale"}
@@ -286,39 +263,43 @@ def test_a_calibration_is_plotted_and_shown_in_a_notebook(
     ],
 )
 def test_a_wrong_option_is_named(options: tuple[str, ...], said: str, refusal: Refusal) -> None:
-    assert said in refusal(["calibrate", "nowhere", *options])
+    assert said in refusal("calibrate", "nowhere", *options)
 
 
-def test_pictures_are_sorted_by_size_and_results_are_no_pictures(tmp_path: Path) -> None:
+def save_picture(path: Path, size: tuple[int, int], tag: int = 1, focal_mm: float | None = None) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = tag
+    if focal_mm is not None:
+        exif.get_ifd(0x8769)[0x920A] = focal_mm
+    path.parent.mkdir(exist_ok=True)
+    Image.new("L", size).save(path, exif=exif)
+
+
+def test_pictures_are_sorted_by_size_and_focal_length_and_results_are_no_pictures(tmp_path: Path) -> None:
     for name, size in (("a", (40, 30)), ("b", (40, 30)), ("c", (20, 30)), ("out/d", (40, 30))):
-        path = tmp_path / f"{name}.png"
-        path.parent.mkdir(exist_ok=True)
-        Image.new("L", size).save(path)
-    found = find_pictures([tmp_path], tmp_path / "out")
-    assert [(camera.name, camera.images) for camera in found.cameras] == [
-        ("camera-40x30", ("a", "b")),
-        ("camera-20x30", ("c",)),
-    ]
+        save_picture(tmp_path / f"{name}.png", size)
+    cameras = find_pictures([tmp_path], tmp_path / "out").cameras
+    assert {camera.name: camera.images for camera in cameras} == {"camera-40x30": ("a", "b"), "camera-20x30": ("c",)}
     with pytest.raises(InputError, match="there is no picture"):
         find_pictures([tmp_path / "out"], tmp_path / "out")
+    for name, focal_mm in (("a", 24.0), ("b", 50.0)):
+        save_picture(tmp_path / "focal" / f"{name}.jpg", (40, 30), focal_mm=focal_mm)
+    cameras = find_pictures([tmp_path / "focal"], tmp_path / "out").cameras
+    assert {camera.name for camera in cameras} == {"camera-24mm", "camera-50mm"}
 
 
 def test_a_picture_turned_by_a_quarter_is_of_the_same_camera(tmp_path: Path) -> None:
     """By the tag where it has one; else it is left to what the pictures show."""
     for name, size, tag in (("a", (40, 30), 6), ("b", (40, 30), 1), ("c", (30, 40), 8), ("d", (30, 40), 1)):
-        exif = Image.Exif()
-        exif[0x0112] = tag
-        Image.new("L", size).save(tmp_path / f"{name}.jpg", exif=exif)
-    Image.new("L", (40, 30)).save(tmp_path / "e.png")
+        save_picture(tmp_path / f"{name}.jpg", size, tag)
     (camera,) = find_pictures([tmp_path], tmp_path / "out").cameras
-    assert (camera.name, camera.images) == ("camera", ("a", "b", "e", "c", "d"))
+    assert (camera.name, camera.images) == ("camera", ("a", "b", "c", "d"))
     assert (camera.width_px, camera.height_px) == (40, 30)
     assert camera.turned_deg == {"c": 270, "d": None}
 
 
 @pytest.mark.parametrize("turned_deg", [0, 90, 180, 270])
 def test_marks_of_a_turned_picture_are_turned_back(turned_deg: int) -> None:
-    """A pixel of a drawn picture, whose middle is where it was."""
     drawn = np.zeros((3, 5))
     drawn[1, 3] = 1.0
     (row,), (column,) = np.nonzero(np.rot90(drawn, turned_deg // 90))
@@ -326,71 +307,51 @@ def test_marks_of_a_turned_picture_are_turned_back(turned_deg: int) -> None:
     np.testing.assert_allclose(place, [0.03, -0.01])
 
 
-def test_pictures_of_other_focal_lengths_are_of_other_cameras(tmp_path: Path) -> None:
-    for name, focal in (("a", 24.0), ("b", 50.0)):
-        exif = Image.Exif()
-        exif.get_ifd(0x8769)[0x920A] = focal
-        Image.new("L", (40, 30)).save(tmp_path / f"{name}.jpg", exif=exif)
-    assert {camera.name for camera in find_pictures([tmp_path], tmp_path / "out").cameras} == {
-        "camera-24mm",
-        "camera-50mm",
-    }
+def named_scan(name: str, **changes: Any) -> MeasuredScan:
+    """Marks of its own, alike in all."""
+    made = made_record(1, 8)
+    marks = tuple(replace(mark, center_px=np.array(mark.center_px)) for mark in made.frame.marks)
+    return replace(made, frame=replace(made.frame, **{"image": name, "marks": marks, **changes}))
+
+
+def move_marks(scan: MeasuredScan, shift: Any, matrix: Any = np.eye(2)) -> MeasuredScan:  # noqa: B008
+    marks = tuple(replace(each, center_px=matrix @ each.center_px + shift) for each in scan.frame.marks)
+    return replace(scan, frame=replace(scan.frame, marks=marks))
+
+
+def counting(scans: Sequence[MeasuredScan]) -> set[str]:
+    """The images of which any mark counts."""
+    return {each.frame.image for each in scans if any(mark.status.is_observation for mark in each.frame.marks)}
 
 
 def test_a_board_at_the_same_place_counts_once() -> None:
     """Errors of lens and board repeat there: ten exposures without a movement had passed as ten pictures."""
-
-    def scan(name: str, shift_px: float, marks: int = 8) -> MeasuredScan:
-        made = made_record(1, marks)
-        moved = (
-            replace(mark, kind="target", center_px=np.asarray(mark.center_px) + shift_px) for mark in made.frame.marks
-        )
-        return replace(made, frame=replace(made.frame, image=name, marks=tuple(moved)))
-
-    shifts_px = {"few": 1.0, "first": 0.0, "again": 10.0, "next": 18.0}
-    scans = [scan(name, shift_px, 7 if name == "few" else 8) for name, shift_px in shifts_px.items()]
-    checked = {each.frame.image: each for each in check_repeated_views(scans, True)}  # 0.5 % of a side is 25 px
-    kept = {name for name, each in checked.items() if any(mark.status.is_observation for mark in each.frame.marks)}
-    assert kept == {"first", "next"}
-    assert "it shows the board where first does to within 14.1 px" in checked["again"].frame.problems[0]
+    targets = tuple(replace(mark, kind="target") for mark in named_scan("").frame.marks)
+    shifts_px = {"few": 1.0, "first": 0.0, "again": 10.0, "next": 18.0}  # 0.5 % of a side is 25 px
+    scans = [move_marks(named_scan(name, marks=targets[name == "few" :]), px) for name, px in shifts_px.items()]
+    checked = check_repeated_views(scans, True)
+    assert counting(checked) == {"first", "next"}
+    assert "it shows the board where first does to within 14.1 px" in checked[2].frame.problems[0]
 
 
 @pytest.mark.parametrize("has_target", [True, False])
 def test_a_scan_that_is_stored_twice_counts_once_where_targets_show_it(has_target: bool) -> None:
     """In another format, and at twice the size and turned by a quarter; the next frame lies half a pixel elsewhere."""
-
-    def scan(name: str, **changes: Any) -> MeasuredScan:
-        made = made_record(1)
-        marks = [replace(mark, center_px=np.asarray(mark.center_px)) for mark in made.frame.marks]
-        marks += [replace(marks[0], kind="target", center_px=np.array([500.0, 800.0]))] if has_target else []
-        return replace(made, frame=replace(made.frame, image=name, marks=tuple(marks), **changes))
-
-    def move_marks(scan: MeasuredScan, matrix: Any, shift: Any, **changes: Any) -> MeasuredScan:
-        marks = (replace(each, center_px=matrix @ each.center_px + shift) for each in scan.frame.marks)
-        return replace(scan, frame=replace(scan.frame, marks=tuple(marks)), **changes)
-
-    first, again, turned, other = map(scan, ("first", "again", "turned", "other"))
-    assert first.frame.pose is not None
-    assert first.frame.pose.name == "90m"
-    quarter = replace(first.frame.pose, name="180m")  # (column, row) becomes (row, width - 1 - column)
+    marks = named_scan("").frame.marks
+    target = replace(marks[0], kind="target", center_px=np.array([500.0, 800.0]))
+    given = (*marks, *[target] * has_target)
+    first, again, turned, other = (named_scan(name, marks=given) for name in ("first", "again", "turned", "other"))
+    assert present(first.frame.pose).name == "90m"
+    quarter = replace(present(first.frame.pose), name="180m")  # (column, row) becomes (row, width - 1 - column)
     turned = replace(turned, frame=replace(turned.frame, pose=quarter), width_px=8000, height_px=10000)
-    matrix = 2 * np.array([[0.0, 1.0], [-1.0, 0.0]])
-    turned = move_marks(turned, matrix, (0.5, 2 * first.width_px - 1.5))
-    scans = [first, move_marks(again, np.eye(2), 0.05), turned, move_marks(other, np.eye(2), (0.5, 0.0))]
-    checked = {each.frame.image: each.frame for each in check_repeated_views(scans, False)}
-    left_out = {name for name, each in checked.items() if not any(mark.status.is_observation for mark in each.marks)}
-    assert left_out == ({"again", "turned"} if has_target else set())
-    assert {name for name, each in checked.items() if each.problems} == {"again", "turned"}
+    turned = move_marks(turned, (0.5, 2 * first.width_px - 1.5), 2 * np.array([[0.0, 1.0], [-1.0, 0.0]]))
+    checked = check_repeated_views([first, move_marks(again, 0.05), turned, move_marks(other, (0.5, 0.0))], False)
+    assert counting(checked) == ({"first", "other"} if has_target else {"first", "again", "turned", "other"})
+    assert {each.frame.image for each in checked if each.frame.problems} == {"again", "turned"}
     said = "count once. To use this one, name first in `exclude`" if has_target else "count twice. Name one of both"
-    assert said in checked["turned"].problems[0]
-    target = replace(first.frame.marks[0], kind="target")
-    rectified = [
-        replace(
-            each,
-            frame=replace(each.frame, marks=(*each.frame.marks, replace(target, point="9", center_px=np.array(at)))),
-        )
-        for each, at in ((first, (50.0, 80.0)), (again, (90.0, 80.0)))
-    ]
+    assert said in checked[2].frame.problems[0]
+    targets = (replace(target, point="9", center_px=np.array(at)) for at in ((50.0, 80.0), (90.0, 80.0)))
+    rectified = [named_scan(name, marks=(*given, one)) for name, one in zip(("a", "b"), targets, strict=True)]
     assert not any(each.frame.problems for each in check_repeated_views(rectified, False))
 
 
@@ -425,52 +386,24 @@ def test_focal_lengths_of_square_pixels_are_one_unknown(square_pixels: bool) -> 
     assert not square_pixels or ("fx", "fy") not in {(one, other) for one, other, _ in found.correlations}
 
 
-@pytest.mark.study
-def test_square_pixels_have_one_focal_length(folder: Path, tmp_path: Path) -> None:
-    printed = io.StringIO()
-    with redirect_stdout(printed):
-        options = ("--lens", "opencv4", "--square-pixels", "--out", str(tmp_path / "out"), "--json")
-        run(["calibrate", str(folder), *CALIBRATED_BOARD, *options])
-    (camera,) = json.loads(printed.getvalue())["cameras"]
-    assert camera["fx_px"] == camera["fy_px"]
-    assert abs(camera["fx_px"]["value"] - FOCAL_PX) < 4.0 * camera["fx_px"]["sigma"] < 4.0
-    assert camera["distortion"].keys() == {"family", "k1", "k2", "p1", "p2"}
-    assert not any({"fx", "fy"} <= set(each["of"]) for each in camera["correlations"])
-    storage = cv2.FileStorage(str(tmp_path / "out" / "camera.yaml"), cv2.FILE_STORAGE_READ)
-    matrix = storage.getNode("camera_matrix").mat()
-    assert matrix[0, 0] == matrix[1, 1] == pytest.approx(camera["fx_px"]["value"])
-
-
 def test_a_count_that_is_wrong_is_named_with_the_one_that_fits(tmp_path: Path, refusal: Refusal) -> None:
     Image.fromarray(picture(0)).save(tmp_path / "p0.png")
-    assert "one of 7 x 5 is" in refusal(
-        ["calibrate", str(tmp_path), "--board", "6x5", "--square", "20mm", "--out", str(tmp_path / "out")]
-    )
+    assert "7 x 5 is" in refusal("calibrate", tmp_path, "--board", "6x5", "--square", "2cm", "--out", tmp_path / "o")
 
 
 PIXEL_MM = 0.005
 ERROR_PX = 0.1  # in x and y
 
 
-@pytest.fixture(scope="module")
-def choices() -> dict[float, LensChoice]:
-    """By the third radial term that the lens has."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.delitem(intrinsics.PARAMETERS, "opencv8")  # as slow as both others together
-        return {
-            k3: choose_lens(
-                board_network(np.random.default_rng(4), 6, ERROR_PX * PIXEL_MM, k3=k3), True, PIXEL_MM, adjust
-            )
-            for k3 in (0.0, -1.5)
-        }
-
-
 @pytest.mark.parametrize(("k3", "wanted"), [(0.0, "opencv4"), (-1.5, "opencv5")])
-def test_the_better_lens_is_taken(k3: float, wanted: LensModel, choices: dict[float, LensChoice]) -> None:
-    assert choices[k3].model == wanted
-    rms_px = choices[k3].rms_px
-    assert set(rms_px) == {"opencv4", "opencv5"}
-    assert rms_px[wanted] == pytest.approx(np.sqrt(2.0) * ERROR_PX, rel=0.15)
+def test_the_better_lens_is_taken(k3: float, wanted: LensModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the third radial term that the lens has."""
+    monkeypatch.delitem(intrinsics.PARAMETERS, "opencv8")  # as slow as both others together
+    network = board_network(np.random.default_rng(4), 6, ERROR_PX * PIXEL_MM, k3=k3)
+    choice = choose_lens(network, True, PIXEL_MM, adjust)
+    assert choice.model == wanted
+    assert set(choice.rms_px) == {"opencv4", "opencv5"}
+    assert choice.rms_px[wanted] == pytest.approx(np.sqrt(2.0) * ERROR_PX, rel=0.15)
 
 
 def test_a_fisheye_is_tried_where_the_field_is_wide(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -504,10 +437,3 @@ def test_of_lenses_as_good_the_simplest_is_taken(errors: dict[int | str, float],
         return SimpleNamespace(converged=True, start=None, value=lambda _: 1.0, prediction_errors=lambda _: squares)
 
     assert choose_lens(network, True, PIXEL_MM, fake_adjust).model == wanted
-
-
-@pytest.mark.parametrize("model", ["opencv4", "opencv5", "opencv8", "fisheye"])
-def test_focal_lengths_are_apart_unless_pixels_are_square(model: LensModel) -> None:
-    assert intrinsics.free_lens(model, square_pixels=False).parameters.keys() - intrinsics.free_lens(
-        model, square_pixels=True
-    ).parameters.keys() == {"b1"}

@@ -3,7 +3,6 @@
 import json
 import math
 import re
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,12 +13,11 @@ import tifffile
 from browser import browser_page, needs_browser
 from drawn import ALIKE, CORNERS, PITCH_UM, Array, frame_picture, pixel_from_camera
 from playwright.sync_api import Browser, Page, expect
-from projects import PLACES, PROJECT, Capture, Refusal, fiducial_tables, write_project
-from review_server import Served, comparator, decisions, served, steer
+from projects import PLACES, PROJECT, Printed, Refusal, command, fiducial_tables, present, write_project
+from review_server import comparator, decisions, served, steer
 
 from measure import open_scan
 from pipeline import InputError, read_camera
-from pipeline.cli import run
 from pipeline.files.decisions_file import Choice, Decision, append_decisions
 from pipeline.files.mark_table import MARK_TABLES
 from pipeline.files.project_file import read_project, read_undrawn
@@ -39,7 +37,6 @@ from pipeline.review.session import Session
 
 SIZES = {"ring_mm": 0.5, "ring_line_mm": 0.1, "arm_mm": 0.8, "line_mm": 0.1}  # of the marks in the scan
 TURN_RAD = 0.004
-DRAWING_PROJECT = f'camera = "camera.toml"\nscans = ["*.tif"]\npitch_um = {PITCH_UM}\n[measure]\npose = "0"\n'
 
 
 def true_px(pose: str = "0") -> Array:
@@ -52,15 +49,22 @@ def place_clicks(places: Array, given: bool = False) -> tuple[ClickedMark, ...]:
     return tuple(ClickedMark(str(k), (float(c), float(r)), xy[k - 1]) for k, (c, r) in enumerate(places, 1))
 
 
+def at_pitch(drawing: CameraDrawing) -> FramePlacement:
+    return place_frame(drawing, (400, 400), (PITCH_UM, PITCH_UM), "as the project says")
+
+
+def measured_px(folder: Path, image: str) -> Array:
+    """(4, 2): where the marks of an image were measured."""
+    rows = comparator(folder)
+    return np.array([[float(rows[image, p][f"{axis}_px"]) for axis in ("col", "row")] for p in "1234"])
+
+
 @pytest.fixture(scope="module")
 def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("drawing") / "a.tif"
     grey = frame_picture(ALIKE, pixel_from_camera("0", TURN_RAD), 1)
     tifffile.imwrite(path, np.clip(np.rint(grey), 0, 65535).astype(np.uint16))
     return path
-
-
-# --- handles
 
 
 @pytest.mark.parametrize("kind", [kind for kind in MARK_TABLES if kind != "polygon"])
@@ -96,16 +100,6 @@ def test_sizes_are_dragged_and_corners_come_and_go() -> None:
     assert len(remove_part(parts, "part.0.radius_mm")["part"]) == 1
 
 
-# --- where the frame lies
-
-
-@pytest.mark.parametrize("pose", ["0", "90", "180", "270m"])
-def test_the_axes_go_through_the_middles_of_opposite_marks(pose: str) -> None:
-    drawing = CameraDrawing("a", {"kind": "dot"}, place_clicks(true_px(pose)), pose=pose)
-    placement = place_frame(drawing, (400, 400), (PITCH_UM, PITCH_UM), "")
-    np.testing.assert_allclose([placement.camera_mm(one.px) for one in drawing.marks], CORNERS, atol=2e-3)
-
-
 def test_given_coordinates_or_the_size_of_the_frame_tell_the_pitch() -> None:
     drawing = CameraDrawing("a", {"kind": "dot"}, place_clicks(true_px("90m"), given=True))
     placement = place_frame(drawing, (400, 400), None, "")
@@ -118,19 +112,12 @@ def test_given_coordinates_or_the_size_of_the_frame_tell_the_pitch() -> None:
         place_frame(CameraDrawing("a", {"kind": "dot"}), (4000, 4000), None, "")
 
 
-# --- fitting and saving
-
-
-def placed(drawing: CameraDrawing) -> FramePlacement:
-    return place_frame(drawing, (400, 400), (PITCH_UM, PITCH_UM), "as the project says")
-
-
 def test_a_fit_finds_places_and_the_size_and_names_what_the_drawing_does_not_fit(scan: Path, tmp_path: Path) -> None:
     """Drawn 10 % too small, and clicked 3 px off."""
     sizes = {key: 0.9 * value for key, value in SIZES.items()}
     drawing = CameraDrawing("a", {"kind": "ring-cross", **sizes}, place_clicks(true_px() + np.array([3.0, -2.0])), "1")
     with open_scan(scan) as opened:
-        fitted = take_step(drawing, placed(drawing), {"fit": True}, opened)
+        fitted = take_step(drawing, at_pitch(drawing), {"fit": True}, opened)
     np.testing.assert_allclose([one.px for one in fitted.marks], true_px(), atol=0.05)
     assert fitted.mark["ring_mm"] == pytest.approx(0.5, rel=0.01)
     assert fitted.marks[0].blur_px == pytest.approx(0.8, abs=0.15)
@@ -138,13 +125,13 @@ def test_a_fit_finds_places_and_the_size_and_names_what_the_drawing_does_not_fit
     marks = (*place_clicks(true_px()), ClickedMark("5", (200.0, 230.0)))
     drawing = CameraDrawing("a", {"kind": "ring-cross", **SIZES}, marks, "1", frame_mm=(17.0, 17.0))
     with open_scan(scan) as opened:
-        fitted = take_step(drawing, placed(drawing), {"fit": True}, opened)
+        fitted = take_step(drawing, at_pitch(drawing), {"fit": True}, opened)
         assert [bool(one.unfitted) for one in fitted.marks] == [False] * 4 + [True]
         assert fitted.marks[4].px == (200.0, 230.0)
-        save_drawing(fitted, placed(fitted), opened, tmp_path / "camera.toml")
+        save_drawing(fitted, at_pitch(fitted), opened, tmp_path / "camera.toml")
     text = (tmp_path / "camera.toml").read_text(encoding="utf-8")
     assert "# The drawing did not fit at 5: as they were clicked.\n" in text
-    moved = take_step(replace(fitted, point="5"), placed(fitted), {"drag": "place", "px": [60.0, 60.0]}, opened)
+    moved = take_step(replace(fitted, point="5"), at_pitch(fitted), {"drag": "place", "px": [60.0, 60.0]}, opened)
     assert moved.marks[4].unfitted == ""
 
 
@@ -155,16 +142,14 @@ def test_a_fit_finds_places_and_the_size_and_names_what_the_drawing_does_not_fit
 def test_a_saved_camera_measures(mark: dict[str, float | str], statuses: set[str], scan: Path, tmp_path: Path) -> None:
     drawing = CameraDrawing("a", mark, place_clicks(true_px()), "1", name="K", frame_mm=(17.0, 17.0))
     with open_scan(scan) as opened:
-        camera = save_drawing(drawing, placed(drawing), opened, tmp_path / "camera.toml")
+        camera = save_drawing(drawing, at_pitch(drawing), opened, tmp_path / "camera.toml")
     text = (tmp_path / "camera.toml").read_text(encoding="utf-8")
     assert "xy_mm of 1, 2, 3, 4: from their places in the scan and its pixel, not from a certificate" in text
     assert {one.sigma_mm for one in camera.fiducials} == {(1.0, 1.0)}
-    (tmp_path / "project.toml").write_text(DRAWING_PROJECT.replace("*.tif", str(scan)), encoding="utf-8")
-    run(["measure", str(tmp_path / "project.toml")])
-    rows = comparator(tmp_path)
-    assert {row["status"] for row in rows.values()} <= statuses
-    found = np.array([[float(rows["a", p][f"{axis}_px"]) for axis in ("col", "row")] for p in "1234"])
-    np.testing.assert_allclose(found, true_px(), atol=0.1)
+    (tmp_path / "project.toml").write_text(PROJECT.replace("*.tif", str(scan)), encoding="utf-8")
+    command("measure", tmp_path / "project.toml")
+    assert {row["status"] for row in comparator(tmp_path).values()} <= statuses
+    np.testing.assert_allclose(measured_px(tmp_path, "a"), true_px(), atol=0.1)
 
 
 @pytest.mark.parametrize(
@@ -186,7 +171,7 @@ def test_what_is_no_camera_is_not_written(change: dict[str, object], words: str,
     def save() -> None:
         drawing = parse_drawing(given | change)
         with open_scan(scan) as opened:
-            save_drawing(drawing, placed(drawing), opened, tmp_path / "camera.toml")
+            save_drawing(drawing, at_pitch(drawing), opened, tmp_path / "camera.toml")
 
     with pytest.raises(InputError, match=words):
         save()
@@ -203,42 +188,35 @@ def test_a_camera_file_is_not_written_over_unless_it_was_drawn(scan: Path, tmp_p
     drawing = CameraDrawing("a", {"kind": "dot", "radius_mm": 0.5}, place_clicks(true_px()), frame_mm=(17.0, 17.0))
     with open_scan(scan) as opened:
         for _ in range(2):
-            save_drawing(drawing, placed(drawing), opened, camera_path(tmp_path, "new"))
+            save_drawing(drawing, at_pitch(drawing), opened, camera_path(tmp_path, "new"))
 
 
 def test_a_project_whose_camera_is_missing_can_be_opened_to_draw_it(scan: Path, tmp_path: Path) -> None:
     project = tmp_path / "project.toml"
-    project.write_text(
-        DRAWING_PROJECT.replace("*.tif", str(scan)).replace("camera.toml", "mine.toml"), encoding="utf-8"
-    )
+    project.write_text(PROJECT.replace("*.tif", str(scan)).replace("camera.toml", "mine.toml"), encoding="utf-8")
     session = Session(read_undrawn(project), "ann")
     assert (session.camera_name, dict(session.project.cameras)) == ("mine.toml", {})
     alone = read_undrawn(tmp_path / "none.toml", [scan])
     assert list(alone.scans) == ["a"]
 
 
-# --- a person's session
-
-
 @pytest.fixture
 def folder(scan: Path, tmp_path: Path) -> Path:
-    (tmp_path / "project.toml").write_text(DRAWING_PROJECT.replace("*.tif", str(scan)), encoding="utf-8")
+    (tmp_path / "project.toml").write_text(PROJECT.replace("*.tif", str(scan)), encoding="utf-8")
     return tmp_path
 
 
-@pytest.fixture
-def server(folder: Path) -> Iterator[Served]:
-    with served(folder / "project.toml") as one:
-        yield one
-
-
 @needs_browser
-def test_a_person_draws_a_camera_and_its_file_measures_the_scan(browser: Browser, server: Served, folder: Path) -> None:
-    with browser_page(browser) as page:
+def test_a_person_draws_a_camera_and_its_file_measures_the_scan(browser: Browser, folder: Path) -> None:
+    with served(folder / "project.toml") as server, browser_page(browser) as page:
         page.goto(server.address)
         expect(page.locator("#draw-view")).to_be_visible()  # the project has no camera yet
         expect(page.locator("#draw-pitch-told")).to_contain_text("50.00 × 50.00 µm as the project says")
-        click_marks(page)
+        box = present(page.locator("#draw-whole").bounding_box())
+        for col, row in true_px():
+            x, y = box["width"] * col / 400, box["height"] * row / 400
+            page.locator("#draw-whole").click(position={"x": x, "y": y})
+        expect(page.locator("#draw-marks tr")).to_have_count(4)
         page.locator("#draw-kind").select_option("ring-cross")
         for key in ("ring_mm", "arm_mm"):
             drag_size(page, key, SIZES[key])
@@ -257,45 +235,29 @@ def test_a_person_draws_a_camera_and_its_file_measures_the_scan(browser: Browser
         expect(page.locator("#draw-told")).to_contain_text("camera.toml with 4 marks. Next: reseau measure.")
     camera = read_camera(folder / "camera.toml")
     assert (camera.principal_distance_mm, camera.frame_mm, camera.name) == (30.0, (17.0, 17.0), "K")
-    assert run(["measure", str(folder / "project.toml")]) == 0
-    rows = comparator(folder)
-    assert {row["status"] for row in rows.values()} == {"measured"}
-    found = np.array([[float(rows["a", p][f"{axis}_px"]) for axis in ("col", "row")] for p in "1234"])
-    np.testing.assert_allclose(found, true_px(), atol=0.1)
-
-
-def click_marks(page: Page) -> None:
-    box = page.locator("#draw-whole").bounding_box()
-    assert box is not None
-    for col, row in true_px():
-        page.locator("#draw-whole").click(position={"x": box["width"] * col / 400, "y": box["height"] * row / 400})
-    expect(page.locator("#draw-marks tr")).to_have_count(4)
+    assert command("measure", folder / "project.toml") == 0
+    assert {row["status"] for row in comparator(folder).values()} == {"measured"}
+    np.testing.assert_allclose(measured_px(folder, "a"), true_px(), atol=0.1)
 
 
 def drag_size(page: Page, key: str, value: float) -> None:
     """Its handle, as far as the size is to grow, away from the mark's middle."""
     canvas = page.locator("#draw-mark")
-    expect(page.locator(f"#size-{key}")).to_be_visible()
     expect(canvas).to_have_attribute("data-handles", re.compile(f'"{key}"'))
-    box = canvas.bounding_box()
-    assert box is not None
-    places = json.loads(canvas.get_attribute("data-handles") or "{}")
-    before, scale = float(page.locator(f"#size-{key}").input_value()), box["width"] / 480
+    box, places = present(canvas.bounding_box()), json.loads(canvas.get_attribute("data-handles") or "{}")
+    before, arm_mm = (float(page.locator(f"#size-{name}").input_value()) for name in (key, "arm_mm"))
     start = np.array(places[key])
-    arm = np.hypot(*(np.array(places["arm_mm"]) - 240)) / float(page.locator("#size-arm_mm").input_value())
+    arm = np.hypot(*(np.array(places["arm_mm"]) - 240)) / arm_mm
     end = start + (start - 240) / np.hypot(*(start - 240)) * arm * (value - before)
-    page.mouse.move(box["x"] + 1 + scale * start[0], box["y"] + 1 + scale * start[1])
+    corner, scale = np.array([box["x"] + 1, box["y"] + 1]), box["width"] / 480
+    page.mouse.move(*(corner + scale * start))
     page.mouse.down()
-    page.mouse.move(box["x"] + 1 + scale * end[0], box["y"] + 1 + scale * end[1], steps=3)
+    page.mouse.move(*(corner + scale * end), steps=3)
     page.mouse.up()
-    for _ in range(100):
-        if abs(float(page.locator(f"#size-{key}").input_value()) - value) < 0.04:
-            return
-        page.wait_for_timeout(50)
-    raise AssertionError(f"{key} is {page.locator(f'#size-{key}').input_value()}, not {value}")
+    is_there = "([field, value]) => Math.abs(document.querySelector(field).value - value) < 0.04"
+    page.wait_for_function(is_there, arg=[f"#size-{key}", value])
 
 
-NAMES = ("a", "b", "c")
 OFF_MM = 5.0  # of the given coordinates: nothing recurs about them
 LEARNED = (
     'name = "K"\nframe_mm = [17.0, 17.0]\n'
@@ -306,36 +268,28 @@ LEARNED = (
 
 def learned_px(image: str) -> Array:
     """(4, 2): where marks were drawn."""
-    matrix = pixel_from_camera("0", 0.004 * (NAMES.index(image) + 1))
+    matrix = pixel_from_camera("0", 0.004 * ("abc".index(image) + 1))
     return np.array([matrix @ (*place, 1.0) for place in CORNERS])
 
 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
     """What `measure` cannot learn by itself."""
-    path = write_project(tmp_path / "p", NAMES, PROJECT)
+    path = write_project(tmp_path / "p", "abc", PROJECT)
     path.with_name("camera.toml").write_text(LEARNED, encoding="utf-8")
     return path
 
 
-@pytest.fixture
-def learning_server(project: Path) -> Iterator[Served]:
-    with served(project) as one:
-        yield one
-
-
 @pytest.mark.study
 @needs_browser
-def test_marks_are_shown_by_keys_and_learned(
-    project: Path, capsys: Capture, refusal: Refusal, browser: Browser, learning_server: Served
-) -> None:
-    assert "reseau review" in refusal(["measure", str(project)])
-    with browser_page(browser) as page:
-        page.goto(learning_server.address)
+def test_marks_are_shown_and_learned(project: Path, printed_line: Printed, refusal: Refusal, browser: Browser) -> None:
+    assert "reseau review" in refusal("measure", project)
+    with served(project) as server, browser_page(browser) as page:
+        page.goto(server.address)
         expect(page.locator("#left")).to_have_text("1 left: 1 camera")
         shown = show_marks(page)
         page.keyboard.press("m")
-        for name in NAMES:  # its own picture tells nothing of the place in the scan that it is from
+        for name in "abc":  # its own picture tells nothing of the place in the scan that it is from
             expect(page.locator("#trial")).to_contain_text(
                 f"{name}: 4 {'weak' if name == shown else 'measured'}; pose 0."
             )
@@ -344,14 +298,9 @@ def test_marks_are_shown_by_keys_and_learned(
         expect(page.locator("#left")).to_have_text("Nothing is left. Run reseau measure.")
     (one,) = decisions(project.parent)
     assert (one["decision"], one["image"], set(one["px"])) == ("learn", shown, set("1234"))
-    assert run(["measure", str(project)]) == 0
-    assert "Decisions stand behind these marks: 1 of ann." in " ".join(capsys.readouterr().out.split())
-    rows = comparator(project.parent)
-    places = {
-        n: np.array([[float(rows[n, p][f"{axis}_px"]) for axis in ("col", "row")] for p in "1234"]) for n in NAMES
-    }
-    off = np.array([places[name] - learned_px(name) for name in NAMES])
-    assert {row["status"] for row in rows.values()} == {"measured"}
+    assert "Decisions stand behind these marks: 1 of ann." in printed_line("measure", project)
+    off = np.array([measured_px(project.parent, name) - learned_px(name) for name in "abc"])
+    assert {row["status"] for row in comparator(project.parent).values()} == {"measured"}
     assert np.abs(off).max() < 2.0  # as well as somebody clicks
     assert np.abs(off - off.mean(axis=0)).max() < 0.06  # alike in all frames
 
@@ -382,9 +331,8 @@ def test_marks_of_one_scan_are_saved_as_a_camera_file(project: Path) -> None:
     assert "own.toml with 4 marks" in result["text"]
     assert 'name it in the project, camera = "own.toml"' in result["text"]
     project.write_text(PROJECT.replace("camera.toml", "own.toml").replace("*.tif", "b.tif"), encoding="utf-8")
-    assert run(["measure", str(project)]) == 0
-    rows = comparator(project.parent)
-    found = np.array([[float(rows["b", p][f"{axis}_px"]) for axis in ("col", "row")] for p in "1234"])
+    assert command("measure", project) == 0
+    found = measured_px(project.parent, "b")
     np.testing.assert_allclose(found - learned_px("b"), np.broadcast_to(off, (4, 2)), atol=0.1)
 
 
@@ -414,4 +362,4 @@ def project_clicks(project: Path) -> tuple[str, str] | None:
 
 def test_nothing_is_learned_from_another_file_of_the_same_name(project: Path, refusal: Refusal) -> None:
     append_decisions(project.with_name("decisions.jsonl"), [learn("a", fingerprint="0" * 64)])
-    assert "shown in a, whose file is another one since" in refusal(["measure", str(project)])
+    assert "shown in a, whose file is another one since" in refusal("measure", project)

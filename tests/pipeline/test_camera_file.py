@@ -8,19 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from networks import LENSES, lens_network
-from projects import Capture, Refusal, result_file, write_network_project
+from projects import Array, Printed, Refusal, command, present, replace_text, result_file, write_network_project
 from studies import parametrize_with_studies
 from test_lens_comparison import two_networks
 
 from measure import FiducialOptions, FrameMeasurement, Status, measure_fiducials, open_scan
 from pipeline import InputError, read_adjustment, read_project
-from pipeline.cli import DONE, LOOK, run
+from pipeline.cli import DONE, LOOK
 from pipeline.exchange.saved_cameras import save_cameras
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.library import MARK_KINDS, CameraSizes, camera_template
 from pipeline.measuring.target_identification import misplaced_principal_point
 from pipeline.rendered.scene_file import render_project
-from pipeline.results.adjustment_record import CameraRecord, Quantity
+from pipeline.results.adjustment_record import Quantity
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.review.camera_drawing import CameraDrawing, ClickedMark, place_frame
 from pipeline.review.drawing_view import fit_drawing
@@ -29,89 +29,56 @@ SIZE_MM = 20.0
 SCENE = """name = "one"
 seed = 4
 camera = "camera.toml"
-[field]
-kind = "natural"
-unit = "m"
-[picture]
-background = "plain"
-pad_mm = {pad_mm}
-[picture.tones]
-dark_mark = 0.06
-border = 0.06
-[film]
-transformation = "affine"
-dust = 0
-scratches = 0
-hairs = 0
-[scan]
-pitch_um = 40.0
-margin_mm = 1.5
-[[image]]
-name = "one"
-position = [0.0, 0.0, 5.0]
-angles_deg = [0.0, 0.0, 0.0]
+field = {{kind = "natural", unit = "m"}}
+picture = {{background = "plain", pad_mm = {pad_mm}, tones = {{dark_mark = 0.06, border = 0.06}}}}
+film = {{transformation = "affine", dust = 0, scratches = 0, hairs = 0}}
+scan = {{pitch_um = 40.0, margin_mm = 1.5}}
+image = [{{name = "one", position = [0.0, 0.0, 5.0], angles_deg = [0.0, 0.0, 0.0]}}]
 """
 POLARITY = {"notch": "light", "wedge": "dark", "wing": "dark"}
 
 
-def sizes(kind: str, place: str) -> CameraSizes:
-    size = (SIZE_MM, SIZE_MM)
-    return CameraSizes((kind,), size if place == "square" else None, size if place == "side" else None, None, 30.0)
-
-
-def image_camera(folder: Path, made: CameraSizes) -> CameraFile:
-    (folder / "camera.toml").write_text(camera_template(made), encoding="utf-8")
-    return read_camera(folder / "camera.toml")
+def rendered_frame(folder: Path, kind: str) -> tuple[CameraFile, dict[str, Array], Path]:
+    """The camera file of a template, a scan of its frame and where its marks are. The scene shows the marks light or
+    dark, as they are on film; the file leaves that open."""
+    place, size = MARK_KINDS[kind].at[-1], (SIZE_MM, SIZE_MM)
+    made = CameraSizes((kind,), size if place == "square" else None, size if place == "side" else None, None, 30.0)
+    text = camera_template(made)
+    (folder / "open.toml").write_text(text, encoding="utf-8")
+    drawn = text.replace('polarity = "auto"', f'polarity = "{POLARITY.get(kind, "light")}"')
+    (folder / "camera.toml").write_text(drawn, encoding="utf-8")
+    pad_mm = 0.0 if MARK_KINDS[kind].edge_mm is not None else 1.6
+    (folder / "scene.toml").write_text(SCENE.format(pad_mm=pad_mm), encoding="utf-8")
+    render_project(folder / "scene.toml", folder / "out", lambda *_: None)
+    truth = json.loads((folder / "out" / "truth.json").read_text(encoding="utf-8"))["images"]["one"]["fiducials"]
+    places = {id: np.array([mark["col_px"], mark["row_px"]]) for id, mark in truth.items()}
+    return read_camera(folder / "open.toml"), places, next((folder / "out" / "scans").iterdir())
 
 
 @pytest.mark.parametrize("kind", [kind for kind in MARK_KINDS if kind != "learned"])
 def test_a_rendered_frame_of_each_kind_is_measured_with_its_template(kind: str, tmp_path: Path) -> None:
-    """The scene shows the marks light or dark, as they are on film; the file that measures them leaves that open."""
-    place = MARK_KINDS[kind].at[-1]
-    given = image_camera(tmp_path, sizes(kind, place))
-    text = (tmp_path / "camera.toml").read_text(encoding="utf-8")
-    (tmp_path / "camera.toml").write_text(
-        text.replace('polarity = "auto"', f'polarity = "{POLARITY.get(kind, "light")}"'), encoding="utf-8"
-    )
-    pad_mm = 0.0 if MARK_KINDS[kind].edge_mm is not None else 1.6
-    (tmp_path / "scene.toml").write_text(SCENE.format(pad_mm=pad_mm), encoding="utf-8")
-    render_project(tmp_path / "scene.toml", tmp_path / "out", lambda *_: None)
-    truth = json.loads((tmp_path / "out" / "truth.json").read_text(encoding="utf-8"))["images"]["one"]["fiducials"]
-    with open_scan(next((tmp_path / "out" / "scans").iterdir())) as scan:
+    given, places, path = rendered_frame(tmp_path, kind)
+    with open_scan(path) as scan:
         frame = measure_fiducials(scan, given.layout(), scan.pitch_um, FiducialOptions(pose="0", writing="none"))
     for mark in frame.marks:
-        true = np.array([truth[mark.point]["col_px"], truth[mark.point]["row_px"]])
         assert mark.status is Status.MEASURED or kind == "frame-corner", mark  # the ground there is no even edge
-        assert mark.covariance_px2 is not None
-        off_px = np.asarray(mark.center_px) - true
-        assert off_px @ np.linalg.solve(mark.covariance_px2, off_px) < 20.0, (mark, true)  # one in 20,000
+        off_px = np.asarray(mark.center_px) - places[mark.point]
+        assert off_px @ np.linalg.solve(present(mark.covariance_px2), off_px) < 20.0, mark  # one in 20,000
 
 
 def test_a_wing_is_fitted_on_the_review_page_as_far_as_it_is_true(tmp_path: Path) -> None:
     """Beyond the frame's edge it merges into the border. Clicked 3 px off."""
-    given = image_camera(tmp_path, sizes("wing", "side"))
-    text = (tmp_path / "camera.toml").read_text(encoding="utf-8").replace('"auto"', '"dark"')
-    (tmp_path / "camera.toml").write_text(text, encoding="utf-8")
-    (tmp_path / "scene.toml").write_text(SCENE.format(pad_mm=0.0), encoding="utf-8")
-    render_project(tmp_path / "scene.toml", tmp_path / "out", lambda *_: None)
-    truth = json.loads((tmp_path / "out" / "truth.json").read_text(encoding="utf-8"))["images"]["one"]["fiducials"]
-    true = {one.id: np.array([truth[one.id]["col_px"], truth[one.id]["row_px"]]) for one in given.fiducials}
-    marks = tuple(ClickedMark(id, (float(px[0]) + 2.0, float(px[1]) - 2.0)) for id, px in true.items())
-    wing = tomllib.loads(text)["mark"]["side"]
+    given, places, path = rendered_frame(tmp_path, "wing")
+    marks = tuple(ClickedMark(id, (float(px[0]) + 2.0, float(px[1]) - 2.0)) for id, px in places.items())
+    wing = tomllib.loads((tmp_path / "camera.toml").read_text(encoding="utf-8"))["mark"]["side"]
     drawn = {key: wing[key] for key in ("kind", "vertices_mm", "rotate")}
     drawing = CameraDrawing("one", drawn, marks, "5", frame_mm=given.frame_mm or (0.0, 0.0))
-    with open_scan(next((tmp_path / "out" / "scans").iterdir())) as scan:
+    with open_scan(path) as scan:
         placement = place_frame(drawing, (scan.width_px, scan.height_px), scan.pitch_um, "")
         fitted = fit_drawing(drawing, placement, scan)
     for one in fitted.marks:
         assert not one.unfitted
-        assert np.hypot(*(np.array(one.px) - true[one.id])) < 0.02, one
-
-
-def test_marks_to_be_learned_ask_for_clicks(tmp_path: Path) -> None:
-    camera = image_camera(tmp_path, sizes("learned", "square"))
-    assert len(camera.learned) == 4
-    assert camera.needs_clicks
+        assert np.hypot(*(np.array(one.px) - places[one.id])) < 0.02, one
 
 
 @pytest.mark.parametrize(
@@ -132,11 +99,12 @@ def test_what_makes_no_camera_is_stated(words: tuple[str, str | None, str | None
     assert message in str(refused.value)
 
 
-def test_the_command_prints_a_file_that_loads(tmp_path: Path, capsys: Capture, refusal: Refusal) -> None:
-    assert run(["template", "camera", "--marks", "ring-cross", "--square", "212", "--side", "226x220"]) == 0
-    (tmp_path / "camera.toml").write_text(capsys.readouterr().out, encoding="utf-8")
+def test_the_command_prints_a_file_that_loads(tmp_path: Path, printed: Printed, refusal: Refusal) -> None:
+    (tmp_path / "camera.toml").write_text(
+        printed("template", "camera", "--marks", "ring-cross", "--square", "212", "--side", "226x220"), encoding="utf-8"
+    )
     assert [one.xy_mm for one in read_camera(tmp_path / "camera.toml").fiducials][4:6] == [(-113.0, 0.0), (113.0, 0.0)]
-    assert "--c go with `reseau template camera --marks KIND`" in refusal(["template", "project", "--marks", "cross"])
+    assert "--c go with `reseau template camera --marks KIND`" in refusal("template", "project", "--marks", "cross")
 
 
 @pytest.fixture(scope="module")
@@ -145,34 +113,30 @@ def archives(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("archives")
     for name, (network, _) in zip("ab+", two_networks("affine", 1.0), strict=True):
         (folder / name).mkdir()
-        assert run(["adjust", str(write_network_project(network, folder / name))]) in (0, 1)
+        assert command("adjust", write_network_project(network, folder / name)) in (0, 1)
     return folder
 
 
-def adjust_network(folder: Path) -> CameraRecord:
-    return read_adjustment(folder / "out" / "adjustment.json").cameras["K"]
-
-
-def quantities(camera: CameraRecord) -> dict[str, Quantity]:
+def quantities(folder: Path) -> dict[str, Quantity]:
+    """Of the adjusted camera."""
+    camera = read_adjustment(folder / "out" / "adjustment.json").cameras["K"]
     fiducials = {f"{id} {axis}": q for id, m in camera.fiducials.items() for axis, q in (("x", m.x_mm), ("y", m.y_mm))}
     return {**camera.interior, **fiducials}
 
 
-def test_a_project_with_a_saved_camera_is_both_together(archives: Path, tmp_path: Path, capsys: Capture) -> None:
-    assert run(["cameras", "--save", str(archives / "a" / "project.toml"), "--out", str(tmp_path / "saved")]) == 0
-    output = " ".join(capsys.readouterr().out.split())
+def test_a_project_with_a_saved_camera_is_both_together(archives: Path, tmp_path: Path, printed_line: Printed) -> None:
+    output = printed_line("cameras", "--save", archives / "a" / "project.toml", "--out", tmp_path / "saved")
     frames = len(read_adjustment(archives / "a" / "out" / "adjustment.json").images)
     assert f"adjusted from {frames} frames of 1 scanner in a" in output
     camera = read_camera(tmp_path / "saved" / "camera.toml")
     assert camera.source is not None
     assert (camera.source.frames, camera.source.scanners, camera.source.archives) == (frames, 1, 1)
-    first = quantities(adjust_network(archives / "a"))
+    first = quantities(archives / "a")
     assert camera.principal_distance_mm == pytest.approx(first["c"].value, abs=1e-12)
     later = shutil.copytree(archives / "b", tmp_path / "later", ignore=shutil.ignore_patterns("out"))
-    text = (later / "project.toml").read_text(encoding="utf-8").replace("camera.toml", "../saved/camera.toml", 1)
-    (later / "project.toml").write_text(text, encoding="utf-8")
-    assert run(["adjust", str(later / "project.toml")]) in (0, 1)
-    second, joint = quantities(adjust_network(later)), quantities(adjust_network(archives / "+"))
+    replace_text(later / "project.toml", "camera.toml", "../saved/camera.toml")
+    assert command("adjust", later / "project.toml") in (0, 1)
+    second, joint = quantities(later), quantities(archives / "+")
     for name, both in joint.items():
         if both.sigma > 0.0:
             assert second[name].value == pytest.approx(both.value, abs=0.1 * both.sigma), name
@@ -184,7 +148,7 @@ def test_two_archives_are_joined_to_what_both_together_give(archives: Path, tmp_
     projects = [read_project(archives / name / "project.toml") for name in "ab"]
     (saved,) = save_cameras(projects, tmp_path)
     assert (saved.source.archives, saved.source.text.split(" in ")[1]) == (2, "a, b")
-    joint, camera = quantities(adjust_network(archives / "+")), read_camera(saved.path)
+    joint, camera = quantities(archives / "+"), read_camera(saved.path)
     assert camera.calibration is not None
     held = dict(zip((one.quantity for one in camera.calibration.parameters), camera.calibration.values, strict=True))
     for name in ("c", "k3", "x0"):
@@ -208,7 +172,7 @@ def test_what_cannot_be_saved_is_refused(archives: Path, tmp_path: Path) -> None
 def test_a_lens_from_the_camera_file_to_the_report(name: str, tmp_path: Path) -> None:
     """Noisy images, nothing known of the lens; what OpenCV can and cannot compare is said."""
     project = write_network_project(lens_network(name, np.random.default_rng(4)), tmp_path)
-    assert run(["run", str(project)]) in (DONE, LOOK)
+    assert command("run", project) in (DONE, LOOK)
     result = result_file(tmp_path)
     distortion = result["cameras"]["L"]["distortion"]
     assert (distortion["family"], distortion["r0_mm"]) == (name, 13.0)

@@ -21,30 +21,15 @@ from networks import (
     project_field,
     relief_field,
 )
-from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
 from adjust import Camera, Network, ObjectPoint, adjust, approximate
-from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Lens, Prior
-from adjust.functional_model.lens_conversion import convert_lens
 from adjust.problem.network import Transformation
 from adjust.problem.observations import Observations
 from pipeline.opencv_check.check import check_against_opencv
-from pipeline.opencv_check.opencv_calibration import (
-    FISHEYE,
-    Freedom,
-    OpenCvCalibration,
-    calibrate,
-    camera_matrix,
-    fixed,
-    model_names,
-    opencv_values,
-    to_opencv_model,
-)
+from pipeline.opencv_check.opencv_calibration import Freedom, OpenCvCalibration, calibrate, to_opencv_model
 from pipeline.results.stage_files import CameraCheck, Check
-
-Array = NDArray[np.float64]
 
 MODERATE = (-0.002, 0.001, 5e-5, -3e-5, 0.0)  # 150 um in the frame's corner
 VERTICAL = [(0.0, 0.0, 1530.0, 0.0, 0.0, 0.3)]
@@ -129,9 +114,7 @@ def test_the_unit_of_the_object_costs_opencv_no_digits(unit: float) -> None:
 def test_a_tilted_sensor_agrees(known: bool) -> None:
     tilt = (0.03, -0.02)
     lens = (*MODERATE, *[0.0] * (12 - len(MODERATE)), *tilt)
-    priors = {
-        name: Prior(value if known else 0.0, 0.0 if known else FREE) for name, value in zip(TILT, tilt, strict=True)
-    }
+    priors = {name: Prior(value * known, 0.0 if known else FREE) for name, value in zip(TILT, tilt, strict=True)}
     given = free("opencv", "k1", "k2")
     distortion = replace(given, parameters={**given.parameters, **priors})
     network = simulated(CONVERGENT_STATIONS, lens=lens, distortion=distortion)
@@ -170,7 +153,7 @@ def test_what_cannot_be_checked_is_reported_with_its_reason() -> None:
 def test_unknown_points_and_different_standard_deviations_are_reported() -> None:
     network = simulated(CONVERGENT_STATIONS, distortion=FREE_LENS)
     points = tuple(
-        ObjectPoint(p.id, None, None, None) if int(p.id[1:]) >= 30 and count_rays(network, p.id) > 1 else p
+        ObjectPoint(p.id, None, None, None) if int(p.id[1:]) >= 30 and network.observations.point.count(p.id) > 1 else p
         for p in network.points
     )
     check = check_network(replace(network, points=points))
@@ -183,10 +166,6 @@ def test_unknown_points_and_different_standard_deviations_are_reported() -> None
     covariance[::2] *= 9.0
     check = check_network(replace(network, observations=replace(network.observations, covariance_mm2=covariance)))
     assert "differ up to 3" in check.reason
-
-
-def count_rays(network: Network, point: str) -> int:
-    return network.observations.point.count(point)
 
 
 def test_a_prior_or_a_value_that_the_observations_contradict_differs() -> None:
@@ -232,6 +211,14 @@ def test_a_fisheye_agrees_with_opencvs_fisheye(skew: bool) -> None:
     else:  # b1 was held at 0 and is 4e-4
         assert check.verdict == "differs"
         assert "Priors or weights move b1" in check.reason
+
+
+def test_a_fisheye_keeps_its_values_and_what_is_held_stays() -> None:
+    lens = Lens(Distortion("opencv_fisheye"), np.array([24.0, 0.05, -0.03]), np.array([0.03, -0.01, 0, 0, 4e-4, -3e-4]))
+    found = to_opencv_model(lens, np.array([[-10.0, -7.5], [10.0, 7.5]]), ())
+    assert found.is_same
+    np.testing.assert_allclose(found.lens.parameters, lens.parameters, rtol=1e-12)
+    assert Freedom(("fx", "fy")).held_interior == ("x0", "y0")
 
 
 @pytest.mark.parametrize("what", ["parameters", "sigmas"])
@@ -301,67 +288,3 @@ def test_parameters_that_cannot_be_separated_are_not_compared_one_by_one() -> No
     assert check.verdict == "agrees"
     assert {row.name for row in check.rows} == {"fx", "cx", "cy", "p1", "p2"}
     assert "cannot be separated: the radial terms are not compared one by one" in check.reason
-
-
-FRAME_MM = np.array([[-10.0, -7.5], [10.0, 7.5]])
-MODEL_C_MM = 24.0
-INTERIOR = np.array([MODEL_C_MM, 0.05, -0.03])
-RADIAL_TANGENTIAL = ("k1", "k2", "p1", "p2", "k3")
-VALUES = {
-    "opencv": {"k1": -0.26, "k2": 0.13, "p1": -2e-4, "p2": 4e-5, "k3": 0.01, "b1": 6e-4},
-    FISHEYE: {"k1": 0.03, "k2": -0.01, "b1": 4e-4, "b2": -3e-4},
-}
-RAYS = np.array([[0.3, 0.2], [-0.1, 0.25], [0.0, -0.4]])
-
-
-def make_lens(family: str, **values: float) -> Array:
-    return np.array([values.get(name, 0.0) for name in parameter_names(family)])
-
-
-@pytest.mark.parametrize("family", list(VALUES))
-def test_opencvs_own_families_keep_values_projection_and_derivatives(family: str) -> None:
-    lens = Lens(Distortion(family), INTERIOR, make_lens(family, **VALUES[family]))
-    found = to_opencv_model(lens, FRAME_MM, ())
-    values, _ = opencv_values(found.lens)
-    assert found.is_same
-    named = dict(zip(model_names(family), values, strict=True))
-    b1 = VALUES[family]["b1"]
-    of_interior = {"fx": MODEL_C_MM * (1.0 + b1), "fy": MODEL_C_MM, "cx": 0.05, "cy": -0.03}
-    own = {name: value for name, value in VALUES[family].items() if name not in ("b1", "b2")}
-    for name, value in {**of_interior, **own}.items():
-        assert named[name] == pytest.approx(value, rel=1e-12)
-    points, matrix = np.column_stack([RAYS * (1.0, -1.0), np.ones(len(RAYS))]), camera_matrix(values)
-    if family == FISHEYE:
-        projected, _ = cv2.fisheye.projectPoints(
-            points[:, None], np.zeros(3), np.zeros(3), matrix, values[4:8], alpha=named["alpha"]
-        )
-    else:
-        projected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, values[4:])
-    ours, _ = lens.camera_from_ray(RAYS)
-    np.testing.assert_allclose(ours, np.reshape(projected, (-1, 2)) * (1.0, -1.0), atol=1e-12)
-    start = np.concatenate([INTERIOR, make_lens(family, **VALUES[family])])
-
-    def converted_values(at: Array) -> Array:
-        return opencv_values(Lens(Distortion(family), at[:3], at[3:]))[0]
-
-    _, by_lens = opencv_values(lens)
-    for k, step in enumerate(1e-6 * np.eye(len(start))):
-        numeric = (converted_values(start + step) - converted_values(start - step)) / 2e-6
-        np.testing.assert_allclose(by_lens[:, k], numeric, atol=1e-7)
-
-
-def test_what_is_held_stays_and_its_share_is_not_taken_by_others() -> None:
-    """By k3 alone, c and the principal point held: OpenCV's k1 changes as the series says, and nothing else does."""
-    freedom = Freedom(("k1",))
-    lens = Lens(Distortion("torlegard"), INTERIOR, make_lens("torlegard", k3=1e-6))
-    whole = to_opencv_model(lens, FRAME_MM, RADIAL_TANGENTIAL)
-    held = fixed("opencv", dict(zip(parameter_names("opencv"), whole.lens.parameters.tolist(), strict=True)))
-    found = convert_lens(lens, held, FRAME_MM, freedom.distortion, held=freedom.held_interior)
-    np.testing.assert_allclose(found.lens.parameters[1:], whole.lens.parameters[1:], atol=1e-15)
-    assert (found.lens.interior == INTERIOR).all()
-    changed = found.by_source[:, 3]
-    assert changed[3] == pytest.approx(MODEL_C_MM**2, rel=1e-2)
-    assert np.flatnonzero(changed).tolist() == [3]
-    assert Freedom(("fx", "cx", "cy")).distortion == ()
-    assert Freedom(("fx", "fy", "cx", "cy", "alpha")).distortion == ("b1", "b2")
-    assert Freedom(("fx", "fy")).held_interior == ("x0", "y0")

@@ -8,18 +8,29 @@ import resource
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from projects import Capture, Refusal, Spoil, change_camera, change_project, replace_text, result_file, scan_content
+from projects import (
+    Capture,
+    Printed,
+    Refusal,
+    Spoil,
+    change_camera,
+    change_project,
+    command,
+    replace_text,
+    result_file,
+    scan_content,
+)
 from rich.console import Console
 from studies import parametrize_with_studies
 
 from pipeline import stages
 from pipeline.archive.verdicts import Verdict
-from pipeline.cli import run
 from pipeline.commands.shared import command_step, print_next, summary_steps
 from pipeline.progress import Reporter, time_left
 from pipeline.report.verdict import ReportVerdict
@@ -42,17 +53,14 @@ def results(folder: Path) -> dict[str, bytes]:
 
 def remove(*names: str) -> Spoil:
     def spoil(folder: Path) -> None:
-        for file in (file for name in names for file in folder.glob(name)):
+        for file in [file for name in names for file in folder.glob(name)]:
             file.unlink()
 
     return spoil
 
 
 def write(name: str, text: str) -> Spoil:
-    def spoil(folder: Path) -> None:
-        (folder / name).write_text(text, encoding="utf-8")
-
-    return spoil
+    return lambda folder: (folder / name).write_text(text, encoding="utf-8")
 
 
 def misspelt_key_and_no_file(folder: Path) -> None:
@@ -118,11 +126,10 @@ NO_COORDINATES = "point,X,Y,Z,sX,sY,sZ\n101,1.0,2.0,0.5,,,\n102,,,,,,\n"
         (one_fiducial, ["camera.toml has one fiducial mark", "two or more"]),
     ],
 )
-def test_wrong_input_leaves_earlier_results(project: Path, capsys: Capture, spoil: Spoil, words: list[str]) -> None:
+def test_wrong_input_leaves_earlier_results(project: Path, refusal: Refusal, spoil: Spoil, words: list[str]) -> None:
     before = results(project)
     spoil(project)
-    assert run(["run", str(project / "project.toml")]) == 2
-    message = capsys.readouterr().err
+    message = refusal("run", project / "project.toml")
     for word in words:
         assert word in message
     assert "Traceback" not in message
@@ -130,14 +137,12 @@ def test_wrong_input_leaves_earlier_results(project: Path, capsys: Capture, spoi
 
 
 def test_a_folder_in_place_of_a_project_is_answered_by_what_it_holds(tmp_path: Path, refusal: Refusal) -> None:
-    assert "is a folder; a TOML file is needed here. It holds none; `reseau template`" in refusal(
-        ["adjust", str(tmp_path)]
-    )
+    words = "is a folder; a TOML file is needed here. It holds none; `reseau template`"
+    assert words in refusal("adjust", tmp_path)
     for name in ("project.toml", "camera.toml"):
         (tmp_path / name).touch()
-    assert f"Name one that it holds: {tmp_path}/camera.toml, {tmp_path}/project.toml." in refusal(
-        ["adjust", str(tmp_path)]
-    )
+    words = f"Name one that it holds: {tmp_path}/camera.toml, {tmp_path}/project.toml."
+    assert words in refusal("adjust", tmp_path)
 
 
 def test_full_disk_gets_a_message_and_leaves_earlier_results(project: Path, capsys: Capture) -> None:
@@ -146,7 +151,7 @@ def test_full_disk_gets_a_message_and_leaves_earlier_results(project: Path, caps
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))
-        code = run(["adjust", str(project / "project.toml")])
+        code = command("adjust", project / "project.toml")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         signal.signal(signal.SIGXFSZ, handler)
@@ -155,15 +160,37 @@ def test_full_disk_gets_a_message_and_leaves_earlier_results(project: Path, caps
     assert results(project) == before
 
 
-def adjust_network(project: Path, capsys: Capture, marks: str | None = None) -> tuple[int, dict[str, Any], str]:
-    """`reseau adjust --json` on coordinates alone: exit code, summary, what was said on stderr."""
+def pixels_for_mm(rows: list[str]) -> list[str]:
+    cells = [row.split(",") for row in rows]
+    return [",".join([*row[:3], row[8], row[9], *row[5:]]) for row in cells if row[8]]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda rows: rows, ["in 3 frames"]),
+        (lambda rows: [row for row in rows if not row.startswith("frame2")], ["in 2 frames"]),
+        (lambda rows: [*rows, "frame1,1O1,target,1,2,0.001,0.001,0,,,measured,"], ["'1O1'", "Did you mean", "line"]),
+        (pixels_for_mm, ["comparator.csv, line 2: the fiducials of image 'frame1' stand 22.4 times as far apart"]),
+    ],
+)
+def test_what_the_coordinates_hold_is_adjusted_or_named(
+    project: Path, capsys: Capture, change: Callable[[list[str]], list[str]], words: list[str]
+) -> None:
+    """A point that nobody measured is a note: of a large pattern a part is used."""
     replace_text(project / "project.toml", "scans = [", "# scans = [")
-    if marks is not None:
-        (project / "comparator.csv").write_text(marks, encoding="utf-8")
+    with (project / "points.csv").open("a", encoding="utf-8") as file:
+        file.write("999,1,2,3,0,0,0,0,0,1\n")
+    lines = (project / "comparator.csv").read_text(encoding="utf-8").splitlines()
+    head = next(line for line in lines if line.startswith("image,"))
+    rows = change([line for line in lines if line.startswith("frame")])
+    (project / "comparator.csv").write_text("\n".join([head, *rows]) + "\n", encoding="utf-8")
     capsys.readouterr()
-    code = run(["adjust", str(project / "project.toml"), "--json"])
+    code = command("adjust", project / "project.toml", "--json")
     out, err = capsys.readouterr()
-    return code, json.loads(out) if out else {}, err
+    assert [word for word in words if word not in out + err] == []
+    assert code == (0 if "frames" in words[0] else 2)
+    assert code or any("999" in note for note in result_file(project)["notes"])
 
 
 def test_an_interrupt_has_a_code_of_its_own(project: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -171,66 +198,24 @@ def test_an_interrupt_has_a_code_of_its_own(project: Path, capsys: Capture, monk
         raise KeyboardInterrupt
 
     monkeypatch.setattr(stages, "run_adjust", interrupted)
-    assert run(["adjust", str(project / "project.toml")]) == 130
+    assert command("adjust", project / "project.toml") == 130
     assert "interrupted; files that were complete stay" in capsys.readouterr().err
 
 
-def test_point_that_nobody_measured_is_named(project: Path, capsys: Capture) -> None:
-    with (project / "points.csv").open("a", encoding="utf-8") as file:
-        file.write("999,1,2,3,0,0,0,0,0,1\n")
-    code, _, _ = adjust_network(project, capsys)
-    assert code == 0  # of a large pattern a part is used
-    assert any("999" in note for note in result_file(project)["notes"])
+def test_singular_network_is_named_in_words(project: Path, printed: Printed) -> None:
+    path = project / "camera.toml"
+    text = path.read_text(encoding="utf-8").replace("sigma_mm = [0.005, 0.005]", 'sigma_mm = "free"')
+    path.write_text(re.sub(r"(?m)^(principal_\w+) = (1.0|\[1.0, 1.0\])$", r'\1 = "free"', text), encoding="utf-8")
+    problems = json.loads(printed("adjust", project / "project.toml", "--json", code=1))["problems"]
+    what = " ".join(problem["what"] for problem in problems)
+    assert [word for word in ("Shift x", "Shift y", "Rotation", "Scale") if word not in what] == []
 
 
-def test_measured_point_that_nobody_gave_is_named_with_its_line(project: Path, capsys: Capture) -> None:
-    marks = (project / "comparator.csv").read_text(
-        encoding="utf-8"
-    ) + "frame1,1O1,target,1,2,0.001,0.001,0,,,measured,\n"
-    code, _, text = adjust_network(project, capsys, marks)
-    assert code == 2
-    for word in ("'1O1'", "Did you mean", "line", "comparator.csv"):
-        assert word in text
-
-
-def test_coordinates_in_pixels_are_refused(project: Path, capsys: Capture) -> None:
-    lines = (project / "comparator.csv").read_text(encoding="utf-8").splitlines()
-    rows = [line.split(",") for line in lines if line.startswith("frame")]
-    pixels = [",".join([*row[:3], row[8], row[9], *row[5:]]) for row in rows if row[8]]
-    head = next(line for line in lines if line.startswith("image,"))
-    code, _, text = adjust_network(project, capsys, "\n".join([head, *pixels]) + "\n")
-    assert code == 2
-    assert "comparator.csv, line 2: the fiducials of image 'frame1' stand 22.4 times as far apart" in text
-
-
-def test_frames_that_the_coordinates_no_longer_hold_are_not_counted(project: Path, capsys: Capture) -> None:
-    lines = (project / "comparator.csv").read_text(encoding="utf-8").splitlines()
-    kept = [line for line in lines if not line.startswith("frame2")]
-    _, summary, _ = adjust_network(project, capsys, "\n".join(kept) + "\n")
-    assert "in 2 frames" in summary["sentence"]
-    assert set(summary["poses"]) == {"frame1", "frame3"}
-
-
-def test_singular_network_is_named_in_words(project: Path, capsys: Capture) -> None:
-    replace_text(project / "camera.toml", "principal_distance_mm = 1.0", 'principal_distance_mm = "free"')
-    replace_text(project / "camera.toml", "principal_point_mm = [1.0, 1.0]", 'principal_point_mm = "free"')
-    text = (
-        (project / "camera.toml").read_text(encoding="utf-8").replace("sigma_mm = [0.005, 0.005]", 'sigma_mm = "free"')
-    )
-    (project / "camera.toml").write_text(text, encoding="utf-8")
-    code, summary, _ = adjust_network(project, capsys)
-    assert code == 1
-    what = " ".join(problem["what"] for problem in summary["problems"])
-    for word in ("Shift x", "Shift y", "Rotation", "Scale"):
-        assert word in what
-
-
-def test_unknown_command_and_option_have_code_2_and_the_help_is_whole(capsys: Capture, refusal: Refusal) -> None:
-    assert run(["mesure"]) == 2
-    assert run(["run", "--jason", "p.toml"]) == 2
-    assert "Traceback" not in refusal(["template", "cameras"])
-    assert run(["--help"]) == 0
-    text = capsys.readouterr().out
+def test_unknown_command_and_option_have_code_2_and_the_help_is_whole(printed: Printed, refusal: Refusal) -> None:
+    assert command("mesure") == 2
+    assert command("run", "--jason", "p.toml") == 2
+    assert "Traceback" not in refusal("template", "cameras")
+    text = printed("--help")
     titles = re.findall(r"^(\w+):$", text, flags=re.MULTILINE)
     assert titles == ["Options", "Measure", "Calibrate", "Archive", "Exchange", "Plan", "Tools"]
     assert "..." not in text.split("Measure:")[1]
@@ -264,17 +249,8 @@ PROJECT = Path("my project.toml")
 def summary(*files: str, adjustment: Any = None, parts: int = 0, frames: Any = None, **verdicts: int) -> Any:
     """One that has what the steps depend on."""
     counts = {Verdict[name]: count for name, count in verdicts.items()}
-    paths = {word: Path("out", word) for word in files}
-    return Summary(
-        ReportVerdict("look", "", (), ()),
-        frames or {"a": {"measured": 4}},
-        {},
-        adjustment,
-        None,
-        paths,
-        verdicts=counts,
-        parts=parts,
-    )
+    paths, shown = {word: Path("out", word) for word in files}, frames or {"a": {"measured": 4}}
+    return Summary(ReportVerdict("look", "", (), ()), shown, {}, adjustment, None, paths, verdicts=counts, parts=parts)
 
 
 def adjustment(is_calibrated: bool) -> Any:
@@ -309,19 +285,8 @@ def test_steps_counts_and_times_are_printed_in_one_form(capsys: Capture) -> None
     rest = {"without a camera": 3, "broken": 0}
     assert count_sentence("can be measured", 15, 18, rest) == "15 of 18 scans can be measured (3 without a camera)"
     assert count_sentence("measured", 1, 1, {}) == "1 of 1 scan measured"
-
-
-@pytest.mark.parametrize(
-    ("seconds", "words"),
-    [
-        (0.2, "about a minute left"),
-        (110.0, "about 2 minutes left"),
-        (3000.0, "about 50 minutes left"),
-        (9000.0, "about 2.5 hours left"),
-    ],
-)
-def test_the_rest_takes_so_long(seconds: float, words: str) -> None:
-    assert time_left(seconds) == words
+    left = [time_left(seconds).removeprefix("about ") for seconds in (0.2, 110.0, 3000.0, 9000.0)]
+    assert left == ["a minute left", "2 minutes left", "50 minutes left", "2.5 hours left"]
 
 
 def lines(quiet: bool = False, terminal: bool = False) -> list[str]:

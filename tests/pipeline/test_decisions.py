@@ -1,7 +1,6 @@
 """decisions.jsonl: what counts of it, what it changes, and what is said of a file that is not as it should be."""
 
 import json
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,23 +9,16 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from projects import Capture, comparator_points, write_project
+from projects import Capture, Printed, command, write_project
 
 from measure.fiducials.options import Click, FiducialOptions
 from measure.flags import Cause, Code, Reason, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement
 from pipeline.archive.review_decisions import after_checks, apply_decisions, before_checks
-from pipeline.cli import run
 from pipeline.errors import InputError, WriteError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.decisions_file import Choice, Decision, append_decisions, read_decisions, standing
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
-from pipeline.results.comparator_file import (
-    describe_decisions,
-    read_comparator,
-    read_decision_counts,
-    write_comparator,
-)
 from pipeline.results.measured_record import MeasuredScan
 
 TASK = ScanTask("a", "a.tif", ScanOptions(cast(CameraFile, SimpleNamespace()), None, FiducialOptions()))
@@ -38,9 +30,8 @@ def task_key(task: ScanTask) -> str:
     return f"{fiducials.pose} {[(click.point, click.col_px) for click in fiducials.clicks]}"
 
 
-def result_pose(key: str) -> str | None:
+def no_pose(_: str) -> None:
     """In the stand-in for the store no result tells its pose."""
-    return None
 
 
 def mark_decision(choice: Choice, point: str = "1", **rest: Any) -> Decision:
@@ -128,7 +119,7 @@ def test_a_typing_error_in_the_last_line_is_named(line: str, path: Path) -> None
 
 
 @pytest.mark.study
-def test_lines_that_do_not_apply_are_named_and_do_not_count(tmp_path: Path, capsys: Capture) -> None:
+def test_lines_that_do_not_apply_are_named_and_do_not_count(tmp_path: Path, printed_line: Printed) -> None:
     project = write_project(tmp_path / "p", ["a", "b"])
     path = project.with_name("decisions.jsonl")
     unknown = [
@@ -147,66 +138,34 @@ def test_lines_that_do_not_apply_are_named_and_do_not_count(tmp_path: Path, caps
         "line 4: what was decided about fiducial '3' of image 'a' is of an earlier result",
         "line 5: is cut short, or has a typing error",
     )
-    for command in ("measure", "report", "status"):
-        assert run([command, str(project)]) == 1, command
-        output = " ".join(capsys.readouterr().out.split())
-        assert [word for word in words if word not in output] == [], command
+    for name in ("measure", "report", "status"):
+        output = printed_line(name, project, code=1)
+        assert [word for word in words if word not in output] == [], name
         assert "Decisions stand behind" not in output
 
 
-def test_status_is_stale_until_a_decision_is_used(tmp_path: Path, capsys: Capture) -> None:
-    project = write_project(tmp_path / "p", ["a", "b"])
-    assert run(["measure", str(project)]) == 0
-    append_decisions(project.with_name("decisions.jsonl"), [mark_decision(Choice.REJECT)])
-    capsys.readouterr()
-    assert run(["status", str(project), "--json"]) == 1
-    images = json.loads(capsys.readouterr().out)["images"]
-    assert {image: one["verdict"] for image, one in images.items()} == {"a": "old"}
-    assert "not taken in yet" in images["a"]["why"]
-    run(["measure", str(project)])
-    capsys.readouterr()
-    run(["status", str(project), "--json"])
-    assert "old" not in {one["verdict"] for one in json.loads(capsys.readouterr().out)["images"].values()}
-
-
-@pytest.mark.study
-def test_a_million_lines_are_read_in_little_more_than_their_json_takes(path: Path) -> None:
-    """1.3 times as long."""
-    line = '{{"image": "box/{0:05d}", "point": "{1}", "kind": "fiducial", "decision": "reject", "who": "ann"}}'
-    path.write_text("\n".join(line.format(k % 50_000, k % 8) for k in range(1_000_000)) + "\n")
-    began = time.process_time()
-    assert len(read_decisions(path)) == 1_000_000
-    reading_s, began = time.process_time() - began, time.process_time()
-    with path.open("rb") as file:
-        for text in file:
-            json.loads(text)
-    assert reading_s < 2.5 * (time.process_time() - began)
-
-
 def test_lines_of_all_forms_are_read_in_their_order(path: Path) -> None:
-    forms: Sequence[dict[str, Any]] = [
-        {"image": "a", "point": "{}", "decision": "accept"},
-        {"decision": "place", "image": "b", "point": "{}", "kind": "target", "col_px": 3, "row_px": 4.5},
-        {"image": "c", "decision": "pose", "pose": "90m", "note": "{}"},
-        {"image": "d", "decision": "learn", "px": {"1": [2, 3.5]}, "who": "{}", "pose": "0", "window": [0, 1, 2, 3]},
-        {"image": "e", "decision": "undo", "fingerprint": "{}", "row_px": 0.0, "px": {"1": [1, 2]}},
+    """Many at once, as of an archive, with blank lines between them."""
+    forms: Sequence[tuple[dict[str, Any], Decision]] = [
+        ({"image": "a", "point": "7", "decision": "accept"}, Decision("a", Choice.ACCEPT, "7")),
+        (
+            {"decision": "place", "image": "b", "point": "7", "kind": "target", "col_px": 3, "row_px": 4.5},
+            Decision("b", Choice.PLACE, "7", "target", 3.0, 4.5),
+        ),
+        (
+            {"image": "d", "decision": "learn", "px": {"1": [2, 3.5]}, "who": "ann", "window": [0, 1, 2, 3]},
+            Decision("d", Choice.LEARN, kind="learned", who="ann", window=(0.0, 1.0, 2.0, 3.0), px={"1": (2.0, 3.5)}),
+        ),
+        ({"image": "e", "decision": "undo", "row_px": 0.0}, Decision("e", Choice.UNDO, row_px=0.0)),
     ]
     chosen = np.random.default_rng(3).integers(len(forms), size=200).tolist()
-    lines = [json.dumps(forms[form]).replace("{}", str(k)) for k, form in enumerate(chosen)]
+    lines = [json.dumps(forms[form][0]) for form in chosen]
     path.write_text("\n \n".join(lines) + "\n")
     read = read_decisions(path)
-    expected = [
-        Decision("a", Choice.ACCEPT, "{}"),
-        Decision("b", Choice.PLACE, "{}", "target", 3.0, 4.5),
-        Decision("c", Choice.POSE, pose="90m", note="{}"),
-        Decision("d", Choice.LEARN, kind="learned", who="{}", window=(0.0, 1.0, 2.0, 3.0), px={"1": (2.0, 3.5)}),
-        Decision("e", Choice.UNDO, fingerprint="{}", row_px=0.0),
-    ]
-    field = ("point", "point", "note", "who", "fingerprint")
     assert [one.line for one in read] == list(range(1, 400, 2))
-    assert read == tuple(replace(expected[form], **{field[form]: str(k)}) for k, form in enumerate(chosen))
-    wrong = lines[150].replace("image", "imagine")
-    path.write_text("\n \n".join([*lines[:150], wrong, *lines[151:]]) + "\n")
+    assert read == tuple(forms[form][1] for form in chosen)
+    lines[150] = lines[150].replace("image", "imagine")
+    path.write_text("\n \n".join(lines) + "\n")
     with pytest.raises(InputError, match="line 301, imagine: there is no such key"):
         read_decisions(path)
 
@@ -240,14 +199,14 @@ def test_decisions_count_in_their_order_and_of_their_own_result() -> None:
     assert standing([accept, undo]) == {}
     old = mark_decision(Choice.ACCEPT, fingerprint="another file")
     own = mark_decision(Choice.REJECT, "2", fingerprint=task_key(TASK))
-    assert list(apply_decisions(TASK, [old, own], task_key, result_pose)[1].values()) == [own]
+    assert list(apply_decisions(TASK, [old, own], task_key, no_pose)[1].values()) == [own]
     # Accepted, then another mark placed, then, on what was measured from that, one more rejected.
     accept = mark_decision(Choice.ACCEPT, "1", fingerprint=task_key(TASK))
     placed = place("2", 7.0, fingerprint=task_key(TASK))
-    now, _ = apply_decisions(TASK, [accept, placed], task_key, result_pose)
+    now, _ = apply_decisions(TASK, [accept, placed], task_key, no_pose)
     assert now.options.fiducials.clicks == (Click("2", 7.0, 2.0),)
     reject = mark_decision(Choice.REJECT, "3", fingerprint=task_key(now))
-    assert set(apply_decisions(TASK, [accept, placed, reject], task_key, result_pose)[1].values()) == {
+    assert set(apply_decisions(TASK, [accept, placed, reject], task_key, no_pose)[1].values()) == {
         accept,
         placed,
         reject,
@@ -258,13 +217,13 @@ def test_decisions_about_marks_count_in_the_pose_in_which_they_were_found() -> N
     placed = place("2", 7.0, fingerprint=task_key(TASK))
     pose = Decision("a", Choice.POSE, pose="90", fingerprint=task_key(TASK))
     late = mark_decision(Choice.ACCEPT, "3", fingerprint=task_key(TASK))  # on a page that was not measured anew yet
-    now, counting = apply_decisions(TASK, [pose, late], task_key, result_pose)
+    now, counting = apply_decisions(TASK, [pose, late], task_key, no_pose)
     assert now.options.fiducials.pose == "90"
     assert list(counting.values()) == [pose]
     other = replace(pose, pose="180")  # somebody thinks again, on that page
-    assert apply_decisions(TASK, [pose, other], task_key, result_pose)[0].options.fiducials.pose == "180"
+    assert apply_decisions(TASK, [pose, other], task_key, no_pose)[0].options.fiducials.pose == "180"
     undone = Decision("a", Choice.UNDO, fingerprint="whatever is shown")
-    assert apply_decisions(TASK, [placed, pose, undone], task_key, result_pose)[0].options.fiducials.pose == "auto"
+    assert apply_decisions(TASK, [placed, pose, undone], task_key, no_pose)[0].options.fiducials.pose == "auto"
     # Decided on one page, the pose first or last, before it is measured anew.
     early, late = (mark_decision(Choice.ACCEPT, point, fingerprint=task_key(TASK)) for point in "13")
     found = {task_key(TASK): "90"}
@@ -281,16 +240,12 @@ def make_scan(*marks: MarkMeasurement) -> MeasuredScan:
 
 def weak(point: str, kind: Any = "fiducial") -> MarkMeasurement:
     covariance = Covariance({Cause.NOISE: 0.01 * np.eye(2)})
-    return MarkMeasurement(
-        point, kind, np.array([5.0, 6.0]), covariance, Status.WEAK, Reason("a scratch", Code.COVERED)
-    )
+    return MarkMeasurement(point, kind, np.ones(2), covariance, Status.WEAK, Reason("a scratch", Code.COVERED))
 
 
 def test_a_mark_becomes_what_was_settled_and_says_by_whom() -> None:
     choices = {"1": Choice.ACCEPT, "2": Choice.REJECT, "3": Choice.ABSENT}
-    counting = {
-        one.subject: one for point, choice in choices.items() if (one := mark_decision(choice, point, who="ann"))
-    }
+    counting = {one.subject: one for id, choice in choices.items() if (one := mark_decision(choice, id, who="ann"))}
     scan = make_scan(*(weak(point) for point in "1234"))
     before, after = before_checks(scan, counting), after_checks(scan, counting)
     statuses = [Status.WEAK, Status.REJECTED, Status.ABSENT, Status.WEAK]
@@ -301,9 +256,7 @@ def test_a_mark_becomes_what_was_settled_and_says_by_whom() -> None:
     assert after.frame.marks[2].center_px is None
     assert after.decided_by == {"ann": 3}
     assert after_checks(scan, {}) == scan
-    bare = MarkMeasurement(
-        "1", "fiducial", np.array([5.0, 6.0]), None, Status.PREDICTED, Reason("not seen", Code.NOT_FOUND)
-    )
+    bare = MarkMeasurement("1", "fiducial", np.ones(2), None, Status.PREDICTED, Reason("not seen", Code.NOT_FOUND))
     one = mark_decision(Choice.ACCEPT)
     assert after_checks(make_scan(bare), {one.subject: one}).frame.marks[0].status is Status.PREDICTED
     one = Decision("a", Choice.PLACE, "1", "target", col_px=50.0, row_px=60.0)
@@ -312,36 +265,25 @@ def test_a_mark_becomes_what_was_settled_and_says_by_whom() -> None:
     np.testing.assert_array_equal(np.asarray(mark.center_px), (50.0, 60.0))
 
 
-def test_what_is_settled_is_not_open_and_every_command_says_who_settled(tmp_path: Path, capsys: Capture) -> None:
+def test_what_is_settled_is_not_open_and_every_command_says_who_settled(
+    tmp_path: Path, capsys: Capture, printed: Printed
+) -> None:
     """A mark that no scan shows needs a look, until a person says that it is not there."""
+
     project = write_project(tmp_path / "p", ["a"])
     with project.with_name("camera.toml").open("a") as camera:
         camera.write('[[fiducial]]\nid = "5"\nxy_mm = [7.0, 0.0]\nsigma_mm = 0.01\nmark = "m"\n')
-    assert run(["measure", str(project)]) == 1
+    assert command("measure", project) == 1
     append_decisions(project.with_name("decisions.jsonl"), [mark_decision(Choice.ABSENT, "5", who="ann lee")])
-    assert run(["measure", str(project)]) == 0
-    capsys.readouterr()
-    assert run(["status", str(project), "--json"]) == 0
-    verdicts = json.loads(capsys.readouterr().out)["verdicts"]
+    (stale,) = json.loads(printed("status", project, "--json", code=1))["images"].values()
+    assert (stale["verdict"], "not taken in yet" in stale["why"]) == ("old", True)
+    assert command("measure", project) == 0
+    verdicts = json.loads(printed("status", project, "--json"))["verdicts"]
     assert (verdicts["decided"]["scans"], verdicts["good"]["scans"], verdicts["look"]["scans"]) == (1, 0, 0)
     result = "Decisions stand behind these marks: 1 of ann lee."
-    for command in ("adjust", "report", "check"):
-        run([command, str(project)])
-        assert result in " ".join(capsys.readouterr().out.split()), command
+    for name in ("adjust", "report", "check"):
+        command(name, project)
+        assert result in " ".join(capsys.readouterr().out.split()), name
     assert result in project.parent.joinpath("out", "report.html").read_text(encoding="utf-8")
-    assert run(["export", str(project), "csv", str(tmp_path / "csv")]) == 0
+    assert command("export", project, "csv", tmp_path / "csv") == 0
     assert result in (tmp_path / "csv" / "README.txt").read_text(encoding="utf-8")
-
-
-def test_whose_decisions_stand_behind_a_file_is_read_from_its_head(tmp_path: Path) -> None:
-    apply_decisions = {("a.toml", "ann, the second"): 2, ("b.toml", "bob"): 1, ("b.toml", "line\nend"): 3}
-    path = tmp_path / "comparator.csv"
-    pitch_um = {"f": (20.0, 20.0)}
-    points = comparator_points([FrameMeasurement("f", (weak("1"),))], pitch_um)
-    write_comparator(path, points, pitch_um, decided=apply_decisions)
-    read = read_decision_counts(path)
-    assert read == {("a.toml", "ann, the second"): 2, ("b.toml", "bob"): 1, ("b.toml", "line end"): 3}
-    text = "a.toml: 2 of ann, the second; b.toml: 1 of bob, 3 of line end"
-    assert describe_decisions(read) == f"Decisions stand behind these marks: {text}."
-    assert describe_decisions({}) == ""
-    assert len(read_comparator(path)) == 1

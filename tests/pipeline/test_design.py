@@ -2,16 +2,17 @@
 
 import json
 import math
+from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from projects import Capture, Refusal, fiducial_tables
+from projects import Capture, Printed, Refusal, command, fiducial_tables, present
 
 from pipeline import InputError
-from pipeline.cli import DONE, run
+from pipeline.cli import DONE
 from pipeline.design.expected import alone, alternatives, expect, rms
 from pipeline.design.setup import planned_network, scene_setup
 from pipeline.design.sweeps import Variations, sweep
@@ -25,10 +26,7 @@ SMALL = (
 name = "K"
 frame_mm = [60.0, 60.0]
 principal_distance_mm = 60.0
-[camera.distortion]
-family = "torlegard"
-[camera.distortion.sigma]
-k3 = "free"
+distortion = {family = "torlegard", sigma = {k3 = "free"}}
 """
     + fiducial_tables({"a": (28, 28), "b": (-28, 28), "c": (-28, -28), "d": (28, -28)}, table="camera.fiducial")
     + """[field]
@@ -72,8 +70,7 @@ def test_what_would_help_is_tried(tmp_path: Path) -> None:
     assert len(third.expected.network.images) == 3
     assert all(gain > 0.0 for gain in third.gain_percent.values())
     assert sum(change.startswith("one more photo: as ") for change in helpful) == 3
-    better = helpful["given heights twice as good"].expected.network.points[0].Z
-    assert better is not None
+    better = present(helpful["given heights twice as good"].expected.network.points[0].Z)
     assert better.sigma == 0.0005
     targets = helpful["targets measured twice as well"].gain_percent
     assert 30.0 < targets["k3"] <= 50.0
@@ -81,10 +78,10 @@ def test_what_would_help_is_tried(tmp_path: Path) -> None:
     assert doubled["k3"] == pytest.approx(100 * (1 - math.sqrt(0.5)), abs=1.0)
 
 
-def test_design_writes_what_it_found(tmp_path: Path, capsys: Capture) -> None:
+def test_design_writes_what_it_found(tmp_path: Path, capsys: Capture, printed: Printed) -> None:
     swept = '[[design.sweep]]\nquantity = "design.transformation"\nvalues = ["similarity", "affine"]\n[[image]]'
     scene = small(tmp_path, ("[[image]]", swept))
-    assert run(["design", str(scene), "--json"]) == DONE
+    assert command("design", scene, "--json") == DONE
     folder = tmp_path / "small-design"
     content = json.loads((folder / "design.json").read_text())
     assert content == json.loads(capsys.readouterr().out)
@@ -104,8 +101,7 @@ def test_design_writes_what_it_found(tmp_path: Path, capsys: Capture) -> None:
     drawn = ElementTree.parse(folder / swept["picture"]).getroot()
     drawn_words = {word.text for word in drawn.iter("{http://www.w3.org/2000/svg}text")}
     assert drawn_words >= {"similarity", "affine", "design.transformation", "c", "k3"}
-    assert run(["design", str(scene), str(tmp_path / "there")]) == DONE
-    table = capsys.readouterr().out
+    table = printed("design", scene, tmp_path / "there")
     assert "Smallest gross errors" in table
     assert "What would help" in table
     assert "Sigmas over design.transformation" in table
@@ -115,10 +111,8 @@ def test_the_network_is_what_the_frames_show(tmp_path: Path) -> None:
     setup = Variations.read(small(tmp_path)).setup()
     network, values = planned_network(setup)
     assert len(network.points) == 16
-    assert network.point_by_id["1"].X is not None
-    assert network.point_by_id["1"].X.sigma == 0.0
-    assert network.point_by_id["1"].Z is not None
-    assert network.point_by_id["1"].Z.sigma == 0.001
+    assert present(network.point_by_id["1"].X).sigma == 0.0
+    assert present(network.point_by_id["1"].Z).sigma == 0.001
     np.testing.assert_allclose(values.transformation["one"], [0, 1, 0, 0, 0, 1], atol=1e-12)
     near = small(tmp_path, ("[0.0, 0.0, 5.0]", "[0.0, 0.0, 2.1]"))
     assert len(Variations.read(near).setup().visible_points(Variations.read(near).setup().images[0])) == 4
@@ -138,22 +132,19 @@ def test_the_network_is_what_the_frames_show(tmp_path: Path) -> None:
         ("design.sigma_fiducial_um", 45, lambda setup: setup.settings.sigma_fiducial_um),
     ],
 )
-def test_any_quantity_of_the_scene_can_be_varied(tmp_path: Path, quantity: str, value: float, found: object) -> None:
+def test_any_quantity_of_the_scene_can_be_varied(
+    tmp_path: Path, quantity: str, value: float, found: Callable[[object], float]
+) -> None:
     varied = Variations.read(small(tmp_path)).varied(1, Sweep(quantity=quantity, values=(value, 99)), value)
-    assert callable(found)
     assert found(varied.setup()) == pytest.approx(value)
 
 
 def test_points_and_cameras_of_other_files_can_be_varied_and_natural_points_not(tmp_path: Path) -> None:
-    scene = Variations.read(small(tmp_path))
-    xyz = np.array(
-        [point.xyz for point in scene.varied(1, Sweep(quantity="field.points", values=(100, 1)), 100).setup().points]
-    )
-    assert np.ptp(xyz[:, :2], axis=0) == pytest.approx([4.0 * 9 / 10] * 2)
-    scene = Variations.read(SCENES / "aerial_five.toml")
-    varied = scene.varied(1, Sweep(quantity="camera.principal_distance_mm", values=(210.0, 300.0)), 210.0)
-    assert varied.setup().lens.principal_distance_mm == 210.0
-    assert len(varied.setup().camera.fiducials) == 8
+    setup = Variations.read(small(tmp_path)).varied(1, Sweep(quantity="field.points", values=(100, 1)), 100).setup()
+    assert np.ptp([point.xyz[:2] for point in setup.points], axis=0) == pytest.approx([4.0 * 9 / 10] * 2)
+    sweep = Sweep(quantity="camera.principal_distance_mm", values=(210.0, 300.0))
+    varied = Variations.read(SCENES / "aerial_five.toml").varied(1, sweep, 210.0).setup()
+    assert (varied.lens.principal_distance_mm, len(varied.camera.fiducials)) == (210.0, 8)
     with pytest.raises(InputError, match="has no targets"):
         scene_setup(read_scene(SCENES / "juhl_natural.toml"))
 
@@ -169,9 +160,8 @@ def test_points_and_cameras_of_other_files_can_be_varied_and_natural_points_not(
     ],
 )
 def test_a_wrong_quantity_is_reported_with_what_is_near(tmp_path: Path, quantity: str, words: str) -> None:
-    scene = Variations.read(small(tmp_path))
     with pytest.raises(InputError) as caught:
-        sweep(scene, 1, Sweep(quantity=quantity, values=(1.5, 2.5)))
+        sweep(Variations.read(small(tmp_path)), 1, Sweep(quantity=quantity, values=(1.5, 2.5)))
     assert f"[design.sweep[1]] {quantity} = 1.5" in str(caught.value)
     assert words in str(caught.value)
 
@@ -191,7 +181,7 @@ def test_a_wrong_quantity_is_reported_with_what_is_near(tmp_path: Path, quantity
     ],
 )
 def test_a_wrong_table_is_reported(tmp_path: Path, refusal: Refusal, line: str, words: str) -> None:
-    assert words in refusal(["design", str(small(tmp_path, ("[[image]]", f"{line}\n[[image]]")))])
+    assert words in refusal("design", small(tmp_path, ("[[image]]", f"{line}\n[[image]]")))
     assert not (tmp_path / "small-design").exists()
 
 

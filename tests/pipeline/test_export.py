@@ -7,7 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from unittest.mock import MagicMock
+from unittest.mock import MagicMock, Mock
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -23,20 +24,22 @@ from projects import (
     PITCH_MM,
     POINTS,
     TRUTH,
-    Capture,
     Refusal,
     adjusted_project,
     camera_mm,
+    command,
     frame_px,
     ideal_mm,
     make_project,
+    present,
     result_file,
     scan_px,
+    stated_misfit_px,
 )
 
 from adjust import LineOfSight
 from pipeline import read_project
-from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
+from pipeline.cli import DONE, LOOK, WRONG_INPUT
 from pipeline.exchange import micmac_format, pinhole
 from pipeline.exchange.block import read_block
 from pipeline.exchange.formats import FORMATS
@@ -45,11 +48,7 @@ from pipeline.exchange.geojson_format import lon_lat
 Array = NDArray[np.float64]
 
 SAME_PX = 1e-6
-PINHOLES: dict[str, Callable[[Path, str, Array], Array]] = {
-    "opencv": opencv_px,
-    "colmap": colmap_px,
-    "asp": asp_px,
-}
+PINHOLES: dict[str, Callable[[Path, str, Array], Array]] = {"opencv": opencv_px, "colmap": colmap_px, "asp": asp_px}
 
 
 @pytest.fixture(scope="module")
@@ -58,14 +57,8 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def exported(project: Path, format: str, folder: Path, *options: str, code: int = DONE) -> Path:
-    assert run(["export", str(project), format, str(folder / format), *options]) == code
+    assert command("export", project, format, folder / format, *options) == code
     return folder / format
-
-
-def stated_misfit_px(folder: Path) -> float:
-    """The residual that the README tells."""
-    text = (folder / "README.txt").read_text(encoding="utf-8")
-    return float(text[text.index("off by ") + 7 :].split()[0])
 
 
 @pytest.mark.parametrize("format", ["colmap", "asp"])
@@ -100,8 +93,6 @@ def test_frames_with_and_without_their_lens_are_as_reported(format: str, project
 
 
 def test_colmap_has_the_tracks_of_the_marks_and_opencv_the_pitch_that_was_set(project: Path, tmp_path: Path) -> None:
-    import pycolmap
-
     model = pycolmap.Reconstruction(str(exported(project, "colmap", tmp_path) / "sparse"))
     assert (model.num_points3D(), model.num_images(), model.compute_num_observations()) == (100, 4, 400)
     image = next(each for each in model.images.values() if each.name == "f0.tif")
@@ -131,8 +122,6 @@ def test_micmac_makes_the_frames_that_its_camera_is_for(project: Path, tmp_path:
 
 
 def test_mmvii_has_the_whole_covariance(project: Path, tmp_path: Path) -> None:
-    from xml.etree import ElementTree
-
     comparator = project.parent / "comparator.csv"
     rows = list(csv.DictReader(comparator.read_text(encoding="utf-8").splitlines()[1:]))
     folder = exported(project, "mmvii", tmp_path) / "MMVII-PhgrProj" / "PointsMeasure"
@@ -154,9 +143,8 @@ def test_covariances_and_bent_sights_follow_the_axes(project: Path) -> None:
     # The earth's curvature lowers a point at 700 m by 4 cm: some 3 um in the picture.
     block = read_block(read_project(project))
     frame = block.frames[0]
-    assert frame.model is not None
     assert pinhole.sight_misfit_mm(block, frame) == 0.0
-    bent = replace(frame, model=replace(frame.model, line_of_sight=LineOfSight(curvature=True)))
+    bent = replace(frame, model=replace(present(frame.model), line_of_sight=LineOfSight(curvature=True)))
     reach = np.hypot(*(POINTS - TRUTH.stations[0]).T[:2])
     lowered_mm = TRUTH.c * reach**3 / (2 * 6.37e6) / (TRUTH.stations[0][2] - POINTS[:, 2]) ** 2
     assert pinhole.sight_misfit_mm(block, bent) == pytest.approx(lowered_mm.max(), rel=0.2)
@@ -204,9 +192,7 @@ def test_bingo_is_free_of_film_and_lens(project: Path, tmp_path: Path) -> None:
 
 def test_footprints_hold_what_the_frames_show(tmp_path: Path) -> None:
     """In degrees as object coordinates the outline is seen by the camera at its frame's border."""
-    upright = replace(
-        TRUTH, attitudes=((0.01, -0.02, 0.1), (-0.08, 0.06, 1.6), (-0.05, -0.09, 3.0), (-0.05, 0.03, -1.5))
-    )
+    upright = replace(TRUTH, attitudes=((0.0, 0.0, 0.1), (-0.08, 0.06, 1.6), (-0.05, -0.09, 3.0), (-0.05, 0.03, -1.5)))
     project = adjusted_project(tmp_path, upright, "EPSG:4326")
     content = json.loads((exported(project, "geojson", tmp_path) / "footprints.geojson").read_text(encoding="utf-8"))
     assert [feature["properties"]["image"] for feature in content["features"]] == ["f0", "f1", "f2", "f3"]
@@ -215,8 +201,6 @@ def test_footprints_hold_what_the_frames_show(tmp_path: Path) -> None:
         assert ring[0].tolist() == ring[-1].tolist()
         x, y = ring[:-1].T
         assert (x * np.roll(y, -1) - np.roll(x, -1) * y).sum() > 0.0
-        from networks import camera_point
-
         ground = np.column_stack([ring[:-1], np.full(len(x), feature["properties"]["ground"])])
         projected = camera_point(upright, i, ground)
         np.testing.assert_allclose(np.abs(projected).max(axis=1), 114.0, atol=1e-4)
@@ -265,42 +249,43 @@ def test_tables_tell_what_the_adjustment_says(project: Path, tmp_path: Path) -> 
     np.testing.assert_allclose(view, camera_mm(1), atol=1e-7)
 
 
-def test_only_observations_go_out(tmp_path: Path) -> None:
+def test_only_observations_go_out_and_without_an_adjustment_the_marks(tmp_path: Path, refusal: Refusal) -> None:
     project = adjusted_project(tmp_path)
     comparator = tmp_path / "comparator.csv"
-    lines = comparator.read_text(encoding="utf-8").splitlines()
-    head, *rows = lines[1:]
+    first, head, *rows = comparator.read_text(encoding="utf-8").splitlines()
     states = ["predicted", "rejected", "weak", *["measured"] * (len(rows) - 3)]
     rows = [f"{row},{state}" for row, state in zip(rows, states, strict=True)]
-    comparator.write_text("\n".join([lines[0], f"{head},status", *rows]) + "\n", encoding="utf-8")
-    assert (
-        run(["export", str(project), "mmvii", str(tmp_path / "o")]) == WRONG_INPUT
-    )  # the adjustment is of other marks
-    assert run(["adjust", str(project)]) in (DONE, LOOK)
+    comparator.write_text("\n".join([first, f"{head},status", *rows]) + "\n", encoding="utf-8")
+    refusal("export", project, "mmvii", tmp_path / "o")  # the adjustment is of other marks
+    assert command("adjust", project) in (DONE, LOOK)
+    marks = exported(project, "micmac", tmp_path) / "Ori-InterneScan"
+    assert (marks / "MeasuresIm-f0.tif.xml").read_text(encoding="utf-8").count("<OneMesureAF1I>") == 3  # of five
+    (tmp_path / "out" / "adjustment.json").unlink()
     folder = exported(project, "micmac", tmp_path)
-    text = (folder / "Ori-InterneScan" / "MeasuresIm-f0.tif.xml").read_text(encoding="utf-8")
-    assert text.count("<OneMesureAF1I>") == 3  # of five fiducials
+    assert not (folder / "Ori-Reseau").exists()
+    assert len(list((folder / "Ori-InterneScan").iterdir())) == 5
+    assert "0.1 BoxCh=[-114,-114,114,114]" in (folder / "README.txt").read_text(encoding="utf-8")
+    assert sorted(path.name for path in exported(project, "csv", tmp_path).iterdir()) == ["README.txt", "marks.csv"]
+    assert "Run `reseau adjust` first" in refusal("export", project, "colmap", tmp_path / "c")
 
 
 def test_what_cannot_go_out_is_refused_with_its_reason(project: Path, tmp_path: Path, refusal: Refusal) -> None:
-    assert f"possible are {', '.join(FORMATS)}" in refusal(["export", str(project), "orima", str(tmp_path / "a")])
-    assert "Give crs in [object]" in refusal(["export", str(project), "geojson", str(tmp_path / "a")])
-    assert "no model that takes this camera" in refusal(
-        ["export", str(project), "opencv", str(tmp_path / "a"), "--misfit-px", "0"]
-    )
-    assert not (tmp_path / "a").exists()
+    for format, options, words in (
+        ("orima", (), f"possible are {', '.join(FORMATS)}"),
+        ("geojson", (), "Give crs in [object]"),
+        ("opencv", ("--misfit-px", "0"), "no model that takes this camera"),
+    ):
+        assert words in refusal("export", project, format, tmp_path / "a", *options)
     assert list(tmp_path.iterdir()) == []
-    full = tmp_path / "full"
-    full.mkdir()
-    (full / "mine.txt").write_text("mine", encoding="utf-8")
-    assert "holds something that is no export" in refusal(["export", str(project), "csv", str(full)])
-    assert [path.name for path in full.iterdir()] == ["mine.txt"]
+    (tmp_path / "mine.txt").write_text("mine", encoding="utf-8")
+    assert "holds something that is no export" in refusal("export", project, "csv", tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
 def test_a_strong_lens_is_refused_unless_requested(tmp_path: Path, refusal: Refusal) -> None:
     strong = replace(TRUTH, distortion={**LENS, "k3": 4e-6, "k5": -2e-10})
     project = adjusted_project(tmp_path, strong)
-    assert "allow more with --misfit-px" in refusal(["export", str(project), "asp", str(tmp_path / "a")])
+    assert "allow more with --misfit-px" in refusal("export", project, "asp", tmp_path / "a")
     folder = exported(project, "asp", tmp_path, "--misfit-px", "100")
     stated_px = stated_misfit_px(folder)
     assert stated_px > 0.05
@@ -311,19 +296,13 @@ def test_a_strong_lens_is_refused_unless_requested(tmp_path: Path, refusal: Refu
 def test_an_export_is_replaced_whole(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = exported(project, "opencv", tmp_path)
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
-
-    def full(path: Path, content: object) -> None:
-        if path.name == "f2.yml":
-            raise OSError(28, "No space left on device")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()
-
+    full = Mock(side_effect=[None, None, OSError(28, "No space left on device")])
     with monkeypatch.context() as broken:
         broken.setattr("pipeline.exchange.exchange_stage.write_atomically", full)
-        assert run(["export", str(project), "opencv", str(folder)]) == WRONG_INPUT
+        assert command("export", project, "opencv", folder) == WRONG_INPUT
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
     assert [path.name for path in tmp_path.iterdir()] == ["opencv"]
-    assert run(["export", str(project), "opencv", str(folder), "--lens"]) == DONE
+    assert command("export", project, "opencv", folder, "--lens") == DONE
     assert (folder / "f2.yml").read_bytes() != before["f2.yml"]
 
 
@@ -363,15 +342,3 @@ def test_how_far_out_an_estimated_lens_is_known_goes_out(tmp_path: Path) -> None
     assert f"# {words}" in text
     storage: Any = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
     assert storage.getNode("distortion_coefficients").mat().size == 5
-
-
-def test_without_an_adjustment_the_marks_go_out(tmp_path: Path, capsys: Capture, refusal: Refusal) -> None:
-    project = adjusted_project(tmp_path)
-    (tmp_path / "out" / "adjustment.json").unlink()
-    folder = exported(project, "micmac", tmp_path)
-    assert not (folder / "Ori-Reseau").exists()
-    assert len(list((folder / "Ori-InterneScan").iterdir())) == 5
-    assert "0.1 BoxCh=[-114,-114,114,114]" in (folder / "README.txt").read_text(encoding="utf-8")
-    assert sorted(path.name for path in exported(project, "csv", tmp_path).iterdir()) == ["README.txt", "marks.csv"]
-    capsys.readouterr()
-    assert "Run `reseau adjust` first" in refusal(["export", str(project), "colmap", str(tmp_path / "c")])

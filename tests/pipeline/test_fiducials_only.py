@@ -1,27 +1,18 @@
 """Frames of fiducial marks alone, the form of their fiducials; snooping, robust weights and components by files."""
 
-import json
 import re
-from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from networks import field_points, film_network, given_marks, simulated
-from numpy.typing import NDArray
-from projects import Capture, fiducial_tables, result_file, write_tables
+from networks import field_points, simulated
+from projects import Capture, Printed, command, fiducial_tables, result_file, write_tables
 from projects import write_network_project as write_network
-from reference_cases import CASES
+from reference_cases import load
 from studies import parametrize_with_studies
 from test_adjust_stage import write_project
 
-from adjust import Adjustment, Camera, Parameter, adjust, approximate
-from adjust.problem.estimates import adjusted_image
-from adjust.problem.network import Transformation
-from pipeline.cli import run
-from pipeline.report.fiducials import Figure, figure_of_films
-from pipeline.results.adjustment_record import FiducialRecord, GivenQuantity, Quantity
+from adjust import Parameter
 from pipeline.results.covariance_file import read_own_covariance
 
 GIVEN = {"1": (-106.0, 106.0), "2": (106.0, 106.0), "3": (106.0, -106.0), "4": (-106.0, -106.0), "5": (0.0, 112.0)}
@@ -48,18 +39,17 @@ def write_fiducials_project(
     return write_tables(folder, 'camera = "camera.toml"', camera=text, comparator=rows)
 
 
-def test_film_transformations_without_an_object(tmp_path: Path, capsys: Capture) -> None:
+def test_film_transformations_without_an_object(tmp_path: Path, printed_line: Printed) -> None:
     """Against the linear least-squares fit, values and standard deviations; no orientation, no calibration."""
     project = write_fiducials_project(tmp_path, {"a": 5, "b": 5, "c": 3})
-    assert run(["run", str(project)]) == 0
-    printed = " ".join(capsys.readouterr().out.split())
-    assert "Film transformations from 13 marks in 3 frames; no frame is oriented, and no camera calibrated" in printed
+    text = printed_line("run", project)
+    assert "Film transformations from 13 marks in 3 frames; no frame is oriented, and no camera calibrated" in text
     report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert report.count("No exterior orientation") == 3
     assert "Exterior orientation</caption>" not in report
     assert "Film report</p>" in report
     assert "Calibration report" not in report
-    assert run(["report", str(project)]) == 0  # and it may be written over
+    assert command("report", project) == 0  # and it may be written over
     result = result_file(tmp_path)
     assert result["converged"]
     assert (result["unknowns"], result["redundancy"]) == (18, 8)
@@ -74,9 +64,7 @@ def test_film_transformations_without_an_object(tmp_path: Path, capsys: Capture)
                 sigma = float(np.sqrt(cofactor[k, k]))
                 assert found["value"] == pytest.approx(fitted[k, axis], abs=0.01 * sigma)
                 assert found["sigma"] == pytest.approx(sigma, rel=0.01)
-        assert {(each["value"], each["sigma"]) for each in result["images"][image]["exterior"].values()} == {
-            (None, None)
-        }
+        assert {(one["value"], one["sigma"]) for one in result["images"][image]["exterior"].values()} == {(None, None)}
     camera = result["cameras"]["K"]
     assert camera["principal_distance_mm"] == {"value": None, "sigma": None}
     assert camera["principal_point_mm"]["x"]["sigma"] is None
@@ -87,7 +75,7 @@ def test_a_frame_without_enough_targets_keeps_its_film_transformation(tmp_path: 
     project = write_fiducials_project(tmp_path, {"a": 5, "b": 2}, "principal_distance_mm = 153.0", target)
     (tmp_path / "points.csv").write_text("point,X,Y,Z\nt1,0,0,0\n", encoding="utf-8")
     project.write_text('camera = "camera.toml"\n[object]\npoints = "points.csv"\n', encoding="utf-8")
-    assert run(["adjust", str(project)]) == 1
+    assert command("adjust", project) == 1
     result = result_file(tmp_path)
     assert list(result["images"]) == ["a"]
     assert {row["kind"] for row in result["residuals"]} == {"fiducial"}
@@ -98,25 +86,19 @@ def test_a_frame_without_enough_targets_keeps_its_film_transformation(tmp_path: 
     assert result["cameras"]["K"]["principal_distance_mm"]["sigma"] is None
 
 
-def test_too_few_fiducials_are_reported(tmp_path: Path, capsys: Capture) -> None:
-    assert run(["adjust", str(write_fiducials_project(tmp_path, {"a": 2}))]) == 2
-    message = " ".join(capsys.readouterr().err.split())
-    assert "'a' shows the most fiducials, 2, and its affine transformation needs 3" in message
-
-
-def test_the_film_transformation_can_be_chosen(tmp_path: Path, capsys: Capture) -> None:
+def test_the_film_transformation_can_be_chosen(tmp_path: Path, printed_line: Printed) -> None:
     """No lens to choose, but the kind of film: these marks have two scales that differ by 0.2 %."""
-    assert run(["choose", str(write_fiducials_project(tmp_path, {"a": 5, "b": 5}))]) == 0
-    assert "The data ask for affine, no distortion" in " ".join(capsys.readouterr().out.split())
+    assert "The data ask for affine, no distortion" in printed_line(
+        "choose", write_fiducials_project(tmp_path, {"a": 5, "b": 5})
+    )
 
 
-def test_the_form_of_the_fiducials_is_reported_where_they_are_estimated(tmp_path: Path, capsys: Capture) -> None:
+def test_the_form_of_the_fiducials_is_reported_where_they_are_estimated(tmp_path: Path, printed_line: Printed) -> None:
     """Marks with a datum of 1 mm: no figure of mm is left in the form, and the dashes are gone."""
     project = write_fiducials_project(tmp_path, {f"f{i}": 5 for i in range(60)}, sigma_mm=1.0)
-    assert run(["run", str(project)]) == 0
-    printed = " ".join(capsys.readouterr().out.split())
-    assert re.search(r"K: Corrections to the certificate, after a common affine transformation: \d\.\d µm rms", printed)
-    assert "the worst first (8 of 60)" in printed
+    text = printed_line("run", project)
+    assert re.search(r"K: Corrections to the certificate, after a common affine transformation: \d\.\d µm rms", text)
+    assert "the worst first (8 of 60)" in text
     report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     form = report[report.index('<section id="fiducials">') : report.index('<section id="reliability">')]
     row = r"<td>\d</td>\s*<td[^>]*>[+−][\d.]+</td><td[^>]*>([\d.]+)</td><td[^>]*>[+−][\d.]+</td><td[^>]*>([\d.]+)</td>"
@@ -129,7 +111,7 @@ def test_the_form_of_the_fiducials_is_reported_where_they_are_estimated(tmp_path
 def test_a_single_frame_with_a_mere_datum_has_a_priori_sigmas(tmp_path: Path, capsys: Capture) -> None:
     """sigma0 was 0.003 here, and multiplied the datum's 1 mm: now the shift is known to 1 mm over the root of 5."""
     project = write_fiducials_project(tmp_path, {"a": 5}, sigma_mm=1.0)
-    run(["adjust", str(project)])
+    command("adjust", project)
     printed = " ".join(capsys.readouterr().out.split())
     assert "standard deviations a priori" in printed
     result = result_file(tmp_path)
@@ -142,89 +124,23 @@ def test_a_single_frame_with_a_mere_datum_has_a_priori_sigmas(tmp_path: Path, ca
 def test_one_frame_within_its_certificate_needs_no_attention(tmp_path: Path) -> None:
     """Four calibrated fiducials of one frame, given to 10 µm and measured to 4 µm: nothing speaks against any."""
     project = write_fiducials_project(tmp_path, {"a": 4}, sigma_mm=0.01)
-    assert run(["run", str(project)]) == 0
+    assert command("run", project) == 0
     rows = (tmp_path / "comparator.csv").read_text(encoding="utf-8").splitlines()
     name, id_, kind, x, *rest = rows[1].split(",")
     wrong = ",".join((name, id_, kind, str(float(x) + 0.4), *rest))  # 0.2 mm and more at each mark of an affine fit
     (tmp_path / "comparator.csv").write_text("\n".join([rows[0], wrong, *rows[2:]]) + "\n", encoding="utf-8")
-    assert run(["run", str(project)]) == 1
+    assert command("run", project) == 1
 
 
-Array = NDArray[np.float64]
-
-GIVEN_MM = np.array(
-    [(-106, 106), (106, 106), (106, -106), (-106, -106), (0, 112), (112, 0), (0, -112), (-112, 0)], dtype=np.float64
-)
-IDS = tuple("12345678")
-MARK_SIGMA_MM, FRAMES, RUNS = 0.004, 10, 20
-TRUE_MM = GIVEN_MM + np.random.default_rng(0).normal(0.0, 0.006, GIVEN_MM.shape)
-
-
-class Known:
-    """The covariance of an adjustment, as the report has it from its file."""
-
-    def __init__(self, adjustment: Adjustment) -> None:
-        self.adjustment = adjustment
-
-    def select(self, names: Iterable[str]) -> Array:
-        return self.adjustment.sigma0**2 * self.adjustment.cofactor_of(list(names))
-
-
-def stored(result: Adjustment) -> dict[str, FiducialRecord]:
-    """What adjustment.json has of the fiducials."""
-
-    def quantity(id: str, axis: str, given: float) -> Quantity:
-        return Quantity(result.value(f"FID.K.{id}.{axis}"), 0.0, GivenQuantity(given, 1.0))
-
-    return {
-        id: FiducialRecord(quantity(id, "x", x), quantity(id, "y", y), 0.0)
-        for id, (x, y) in zip(IDS, GIVEN_MM.tolist(), strict=True)
-    }
-
-
-def form(kind: Transformation, seed: int) -> Figure:
-    """Frames that bear little of what such a film can, with noise."""
-    rng = np.random.default_rng(seed)
-    names = tuple(f"f{i}" for i in range(FRAMES))
-    turn = rng.uniform(-0.5, 0.5, FRAMES)
-    linear = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]).transpose(2, 0, 1)
-    if kind != "similarity":
-        linear = linear + rng.normal(0.0, 1e-3, linear.shape)
-    xy_mm = TRUE_MM @ linear.transpose(0, 2, 1) + rng.normal(0.0, 5.0, (FRAMES, 1, 2))
-    if kind == "projective":
-        xy_mm /= 1.0 + np.einsum("nki,ni->nk", xy_mm, rng.normal(0.0, 1e-5, (FRAMES, 2)))[..., None]
-    xy_mm = xy_mm + rng.normal(0.0, MARK_SIGMA_MM, xy_mm.shape)
-    marks = given_marks(dict(zip(IDS, GIVEN_MM, strict=True)), 1.0)
-    network = film_network(Camera("K", None, None, None, fiducials=marks), kind, names, xy_mm, MARK_SIGMA_MM)
-    result = adjust(network, approximate(network))
-    films = {name: adjusted_image(result, name).film for name in names}
-    found = figure_of_films("K", stored(result), Known(result), films)  # type: ignore[arg-type]
-    assert found is not None
-    return found
-
-
-def test_the_form_is_that_of_the_truth() -> None:
-    """Against the truth less its own best affine transformation, by least squares."""
-    found = form("affine", 99)
-    design = np.column_stack([np.ones(len(IDS)), GIVEN_MM])
-    offset = TRUE_MM - GIVEN_MM
-    left_um = 1e3 * (offset - design @ np.linalg.lstsq(design, offset)[0])
-    sigma_um = np.sqrt(np.diag(found.covariance_um2)).reshape(-1, 2)
-    assert np.abs((found.change_um - left_um) / sigma_um).max() < 4.0
-    assert np.abs(left_um).max() > 5.0
-
-
-CASE = "i_five_images_affine_reduced"
 POINT = "7"
 
 
 def spoilt_project(folder: Path, adjust: str) -> Path:
     """The reference network with one target wrong by 0.1 mm."""
-    case: dict[str, Any] = json.loads((CASES / f"{CASE}.json").read_text(encoding="utf-8"))
+    case = load("i_five_images_affine_reduced")
     row = next(row for row in case["input"]["obs"] if str(row[1]) == POINT)
     row[2] += 0.1
-    write_project(case, folder)
-    file = folder / "project.toml"
+    file = write_project(case, folder)
     file.write_text(file.read_text(encoding="utf-8") + adjust + "\n", encoding="utf-8")
     return file
 
@@ -235,7 +151,7 @@ def spoilt_project(folder: Path, adjust: str) -> Path:
 )
 def test_a_gross_error_is_named_in_file_and_report(adjust: str, removed: bool, tmp_path: Path) -> None:
     project = spoilt_project(tmp_path, adjust)
-    assert run(["adjust", str(project)]) == 1
+    assert command("adjust", project) == 1
     result = result_file(tmp_path)
     (suspect,) = result["suspects"]
     name = f"target {POINT} in image {suspect['owner']}"
@@ -248,7 +164,7 @@ def test_a_gross_error_is_named_in_file_and_report(adjust: str, removed: bool, t
     assert outer["IO.C.c"]["cause"]
     given = {each["name"]: each for each in result["reliability"]["given"]}
     assert given["given fiducial 3 x (camera C)"]["smallest_error"] > 0.0
-    assert run(["report", str(project)]) == 1
+    assert command("report", project) == 1
     report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert f"{'Left out as gross errors' if removed else '1 gross error suspected'}: {name} (w = " in report
     assert "of an undetected error in" in report
@@ -262,10 +178,8 @@ def test_a_lens_known_in_the_middle_alone_needs_attention(frame_mm: float, level
     """Targets within some 110 mm of the principal point: most of a picture of 228 mm, a quarter of one of 600 mm."""
     free = {"k3": np.inf, "k5": np.inf}
     network, _ = simulated(np.random.default_rng(1), points=field_points(np.random.default_rng(2), 40), free=free)
-    project = write_network(network, tmp_path)
-    camera = tmp_path / "camera.toml"
-    camera.write_text(camera.read_text(encoding="utf-8").replace("228.0", str(frame_mm)), encoding="utf-8")
-    assert run(["adjust", str(project)]) == level
+    project = write_network(network, tmp_path, f"frame_mm = [{frame_mm}, {frame_mm}]")
+    assert command("adjust", project) == level
     known = result_file(tmp_path)["cameras"]["K"]["lens_known"]
     assert (known["share"] < 0.5) is bool(level)
     assert known["corner_sigma_um"] > known["sigma_um"] > 0.0
@@ -275,7 +189,7 @@ def test_a_lens_known_in_the_middle_alone_needs_attention(frame_mm: float, level
     for radius, sigma in (("radius_mm", "sigma_um"), ("corner_mm", "corner_sigma_um")):
         by_terms = 1e3 * known[radius] ** np.array([3.0, 5.0])
         assert known[sigma] == pytest.approx(float(np.sqrt(by_terms @ of_terms @ by_terms)), rel=1e-6)
-    assert run(["report", str(project)]) in (0, level)
+    assert command("report", project) in (0, level)
     assert "of the way to the corner of the picture" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 
 
@@ -285,12 +199,12 @@ def test_points_that_no_image_shows_are_a_note_and_an_unknown_one_in_one_image_i
     project = write_network(network, tmp_path)
     points, marks = tmp_path / "points.csv", tmp_path / "comparator.csv"
     points.write_text(points.read_text(encoding="utf-8") + "u1,5,5,0,0,0,0\nu2,6,6,0,0,0,0\n", encoding="utf-8")
-    assert run(["adjust", str(project)]) == 0
+    assert command("adjust", project) == 0
     result = result_file(tmp_path)
     assert [note for note in result["notes"] if "measured in no image: 2 points, u1, u2" in note]
     points.write_text(points.read_text(encoding="utf-8") + "single,,,,,,\n", encoding="utf-8")
     marks.write_text(marks.read_text(encoding="utf-8") + "f2,single,target,10,10,0.005,0.005\n", encoding="utf-8")
-    assert run(["adjust", str(project)]) == 1
+    assert command("adjust", project) == 1
     result = result_file(tmp_path)
     (warning,) = [warning for warning in result["warnings"] if "single" in warning]
     assert "measured in one image only, and so left out: single (f2). Two images are needed" in warning

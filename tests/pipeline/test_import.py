@@ -8,14 +8,14 @@ import cv2
 import numpy as np
 import pytest
 from networks import FIDUCIALS
-from projects import PITCH_MM, TRUTH, Capture, Refusal, adjusted_project, result_file
+from projects import PITCH_MM, TRUTH, Capture, Refusal, adjusted_project, command, present, result_file
 from studies import parametrize_with_studies
 
 from adjust.functional_model.distortion_models import TORLEGARD_NAMES
 from adjust.functional_model.lens import Lens, Prior
 from adjust.problem.camera import FiducialDistance
 from pipeline import InputError, read_images
-from pipeline.cli import DONE, WRONG_INPUT, run
+from pipeline.cli import DONE, WRONG_INPUT
 from pipeline.exchange.certificate import fit, read_certificate
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.results.comparator_file import read_comparator, read_pitches
@@ -29,17 +29,13 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def exported(project: Path, format: str, folder: Path, *options: str) -> Path:
-    assert run(["export", str(project), format, str(folder / f"{format}-out"), *options]) in (0, 1)
+    assert command("export", project, format, folder / f"{format}-out", *options) in (0, 1)
     return folder / f"{format}-out"
 
 
 def imported(format: str, paths: list[Path], folder: Path, *options: str) -> Path:
-    assert run(["import", format, *map(str, paths), str(folder / format), *options]) == DONE
+    assert command("import", format, *paths, folder / format, *options) == DONE
     return folder / format
-
-
-def make_lens(camera: CameraFile) -> dict[str, float]:
-    return {name: prior.value for name, prior in camera.distortion.parameters.items()}
 
 
 @parametrize_with_studies("format", ["mmvii", "micmac"], quick=(1,))
@@ -63,42 +59,30 @@ def test_marks_come_back_as_they_went(format: str, project: Path, tmp_path: Path
 def test_fiducials_from_a_corner_give_no_principal_point(tmp_path: Path, capsys: Capture) -> None:
     """As published for a T-11, y down: the principal point lies near the middle of the marks, and is free."""
     places = {"P5": "0.000 117.521", "P6": "237.846 117.521", "P7": "120.428 0.000", "P8": "120.421 235.000"}
-    marks = "".join(
-        f"<OneMesureAF1I><NamePt>{id}</NamePt><PtIm>{xy}</PtIm></OneMesureAF1I>" for id, xy in places.items()
-    )
-    file = tmp_path / "T-11" / "Ori-InterneScan" / "MeasuresCamera.xml"
-    file.parent.mkdir(parents=True)
+    one = "<OneMesureAF1I><NamePt>{}</NamePt><PtIm>{}</PtIm></OneMesureAF1I>"
+    marks = "".join(one.format(id, xy) for id, xy in places.items())
+    file = tmp_path / "MeasuresCamera.xml"
     file.write_text(f"<MesureAppuiFlottant1Im><NameIm>Glob</NameIm>{marks}</MesureAppuiFlottant1Im>")
-    folder = imported("micmac", [file], tmp_path)
-    camera = read_camera(folder / "camera.toml")
-    assert camera.principal_point_mm == pytest.approx((118.923, -117.5))
-    assert camera.principal_point_sigma_mm == (np.inf, np.inf)
-    output = " ".join(capsys.readouterr().out.split())
-    assert (
-        "the files give no principal point. Adjusting starts at the middle of the fiducials, (118.9, -117.5) mm"
-        in output
-    )
-    written = (folder / "camera.toml").read_text()
+    path = imported("micmac", [file], tmp_path) / "camera.toml"
+    words = "the files give no principal point. Adjusting starts at the middle of the fiducials, (118.9, -117.5) mm"
+    assert words in " ".join(capsys.readouterr().out.split())
+    lines = path.read_text().splitlines()
     bare = tmp_path / "bare.toml"
-    bare.write_text("\n".join(line for line in written.splitlines() if not line.startswith("principal_point_mm")))
-    assert read_camera(bare).principal_point_mm == pytest.approx((118.923, -117.5))
-    assert read_camera(bare).principal_point_sigma_mm == (np.inf, np.inf)
+    bare.write_text("\n".join(line for line in lines if not line.startswith("principal_point_mm")))
+    for camera in map(read_camera, (path, bare)):
+        assert camera.principal_point_mm == pytest.approx((118.923, -117.5))
+        assert camera.principal_point_sigma_mm == (np.inf, np.inf)
 
 
 def test_marks_without_a_sigma_need_one_that_is_stated(tmp_path: Path, refusal: Refusal) -> None:
     file = tmp_path / "MeasuresIm-a.tif.xml"
-    file.write_text(
-        "<MesureAppuiFlottant1Im><NameIm>a.tif</NameIm><OneMesureAF1I><NamePt>1</NamePt><PtIm>10 20</PtIm>"
-        "</OneMesureAF1I></MesureAppuiFlottant1Im>",
-        encoding="utf-8",
-    )
-    assert "say with --sigma-px" in refusal(["import", "micmac", str(file), str(tmp_path / "o"), *PITCH])
-    assert "with --pitch-um" in refusal(["import", "micmac", str(file), str(tmp_path / "o")])
+    file.write_text(MARKS.format("10 20").replace("<NameIm>a<", "<NameIm>a.tif<"), encoding="utf-8")
+    assert "say with --sigma-px" in refusal("import", "micmac", file, tmp_path / "o", *PITCH)
+    assert "with --pitch-um" in refusal("import", "micmac", file, tmp_path / "o")
     folder = imported("micmac", [file], tmp_path, *PITCH, "--sigma-px", "0.2")
     (mark,) = read_comparator(folder / "comparator.csv")
     assert (mark.image, mark.kind) == ("a", "fiducial")
-    np.testing.assert_allclose(mark.xy_mm, [1.0, -2.0])  # type: ignore[arg-type]
-    np.testing.assert_allclose(mark.sigma_mm, [0.02, 0.02])  # type: ignore[arg-type]
+    np.testing.assert_allclose([*np.asarray(mark.xy_mm), *np.asarray(mark.sigma_mm)], [1.0, -2.0, 0.02, 0.02])
 
 
 @pytest.mark.parametrize("format", ["opencv", "colmap"])
@@ -106,8 +90,7 @@ def test_poses_and_cameras_come_back_as_they_went(format: str, project: Path, tm
     out = exported(project, format, tmp_path, "--lens")
     paths = {"opencv": [out / "f1.yml"], "colmap": [out / "sparse"]}[format]
     folder = imported(format, paths, tmp_path, *PITCH)
-    exterior = read_images(folder / "images.csv").exterior["f1"]
-    assert exterior is not None
+    exterior = present(read_images(folder / "images.csv").exterior["f1"])
     assert not np.isfinite(exterior.sigmas).any()
     known = result_file(project.parent)["images"]["f1"]["exterior"]
     np.testing.assert_allclose(exterior.values[:3], [known[axis]["value"] for axis in ("X0", "Y0", "Z0")], atol=1e-8)
@@ -120,29 +103,10 @@ def test_poses_and_cameras_come_back_as_they_went(format: str, project: Path, tm
     assert camera.principal_point_mm == pytest.approx(point, abs=1e-9)
 
 
-def test_a_lens_comes_back_as_it_went(project: Path, tmp_path: Path) -> None:
-    """OpenCV's file, COLMAP's and Metashape's give the same lens; Metashape's counts from the middle of the frame."""
-    yml = exported(project, "opencv", tmp_path) / "f1.yml"
-    storage = cv2.FileStorage(str(yml), cv2.FILE_STORAGE_READ)
-    values = storage.getNode("distortion_coefficients").mat().ravel()
-    by_opencv = read_camera(imported("opencv", [yml], tmp_path, *PITCH) / "camera.toml")
-    assert make_lens(by_opencv) == pytest.approx(
-        dict(zip(("k1", "k2", "p1", "p2", "k3"), values, strict=True)), rel=1e-12
-    )
-    sparse = exported(project, "colmap", tmp_path) / "sparse"
-    by_colmap = read_camera(imported("colmap", [sparse], tmp_path, *PITCH) / "camera2.toml")
-    assert make_lens(by_colmap) == pytest.approx(make_lens(by_opencv), rel=1e-12)
-    xml = exported(project, "metashape", tmp_path) / "K.xml"
-    by_metashape = read_camera(imported("metashape", [xml], tmp_path, *PITCH, "--from-middle") / "camera.toml")
-    assert make_lens(by_metashape) == pytest.approx(make_lens(by_opencv), rel=1e-9)
-    assert by_metashape.principal_distance_mm == pytest.approx(TRUTH.c, abs=1e-3)
-    assert by_metashape.principal_point_mm == pytest.approx((TRUTH.x0, TRUTH.y0), abs=1e-3)
-    assert by_metashape.frame_mm == pytest.approx((228.0, 228.0))
-
-
 MARK = "<OneMesureAF1I><NamePt>1</NamePt><PtIm>{}</PtIm></OneMesureAF1I>"
 MARKS = f"<MesureAppuiFlottant1Im><NameIm>a</NameIm>{MARK}</MesureAppuiFlottant1Im>"
 PIXELS = "%YAML:1.0\n---\nK: !!opencv-matrix {{rows: 3, cols: 3, dt: d, data: [9, 0, 5, 0, 9, 5, 0, 0, 1]}}\n{}\n"
+CERTIFICATE = "calibrated_principal_distance_mm = 153.0\nangle_deg = [7.5, 15.0, 22.7]\nradial_um = [1.0, 2.0, 1.0]\n"
 ENTITIES = '<!DOCTYPE a [<!ENTITY b "bbbbbbbb"><!ENTITY c "&b;&b;&b;&b;">]><a>&c;</a>'
 
 
@@ -168,12 +132,14 @@ ENTITIES = '<!DOCTYPE a [<!ENTITY b "bbbbbbbb"><!ENTITY c "&b;&b;&b;&b;">]><a>&c
         ("opencv", PIXELS.format("xi: 0.8"), "omnidirectional (xi), is none of"),
         ("colmap", "", "is no reconstruction"),
         ("certificate", "radial_um = [1.0]", "calibrated principal distance"),
+        ("certificate", f"{CERTIFICATE}symmetry_mm = [0.0, 0.01]", "needs autocollimation_mm"),
+        ("certificate", f"{CERTIFICATE}principal_point_mm = [0, 0]\nsymmetry_mm = [0.0, 0.01]", "Give either"),
     ],
 )
 def test_wrong_files_are_refused(format: str, text: str, words: str, tmp_path: Path, capfd: Capture) -> None:
     file = tmp_path / "MeasuresIm-a.xml"
     file.write_text(text, encoding="utf-8")
-    assert run(["import", format, str(file), str(tmp_path / "o"), *PITCH, "--sigma-px", "1"]) == WRONG_INPUT
+    assert command("import", format, file, tmp_path / "o", *PITCH, "--sigma-px", "1") == WRONG_INPUT
     assert words in capfd.readouterr().err
     assert not (tmp_path / "o").exists()
 
@@ -188,6 +154,7 @@ def test_a_fisheye_of_opencv_s_own_program_is_one(tmp_path: Path) -> None:
 # A certificate
 
 ANGLES = [7.5, 15.0, 22.7, 30.0, 35.0, 40.0]
+TABLE = [1.0, 2.0, 1.0, -1.0, -2.0, 3.0]
 
 
 def printed(path: Path, c: float, radial_um: list[float], **more: str) -> Path:
@@ -230,18 +197,21 @@ def test_a_certificate_gives_back_the_lens_that_it_was_made_of_by_angles_and_rad
 def test_what_a_calibration_does_not_say_is_no_knowledge(tmp_path: Path, capsys: Capture) -> None:
     """A certificate without a principal point leaves it to the points; a calibration without standard deviations is
     held fixed, and says so."""
-    table = printed(tmp_path / "c.toml", 153.0, [1.0, 2.0, 1.0, -1.0, -2.0, 3.0])
-    camera = read_camera(imported("certificate", [table], tmp_path) / "camera.toml")
-    assert camera.principal_point_mm is None
-    assert camera.principal_point_sigma_mm == (np.inf, np.inf)
-    assert "gives no principal point: it is left to the points" in " ".join(capsys.readouterr().out.split())
-    printed(table, 153.0, [1.0, 2.0, 1.0, -1.0, -2.0, 3.0], principal_point_mm="[0.01, 0.02]")
-    assert read_camera(imported("certificate", [table], tmp_path) / "camera.toml").principal_point_mm == (0.01, 0.02)
-    assert "no standard deviation of the principal point: 1 mm is assumed" in " ".join(capsys.readouterr().out.split())
-    calibration = tmp_path / "m.xml"
-    calibration.write_text("<calibration><width>600</width><height>400</height><f>500</f></calibration>")
-    imported("metashape", [calibration], tmp_path, *PITCH)
-    assert "no standard deviations. The calibration is held fixed" in " ".join(capsys.readouterr().out.split())
+
+    def camera_and_words(format: str, file: Path, *options: str) -> tuple[CameraFile, str]:
+        camera = read_camera(imported(format, [file], tmp_path, *options) / "camera.toml")
+        return camera, " ".join(capsys.readouterr().out.split())
+
+    camera, words = camera_and_words("certificate", printed(tmp_path / "c.toml", 153.0, TABLE))
+    assert (camera.principal_point_mm, camera.principal_point_sigma_mm) == (None, (np.inf, np.inf))
+    assert "gives no principal point: it is left to the points" in words
+    table = printed(tmp_path / "c.toml", 153.0, TABLE, principal_point_mm="[0.01, 0.02]")
+    camera, words = camera_and_words("certificate", table)
+    assert camera.principal_point_mm == (0.01, 0.02)
+    assert "no standard deviation of the principal point: 1 mm is assumed" in words
+    (tmp_path / "m.xml").write_text("<calibration><width>600</width><height>400</height><f>500</f></calibration>")
+    _, words = camera_and_words("metashape", tmp_path / "m.xml", *PITCH)
+    assert "no standard deviations. The calibration is held fixed" in words
 
 
 def test_two_principal_points_of_a_certificate_are_one_lens(tmp_path: Path) -> None:
@@ -272,25 +242,13 @@ def test_two_principal_points_of_a_certificate_are_one_lens(tmp_path: Path) -> N
 def test_a_certificate_of_distances(tmp_path: Path) -> None:
     lines = ["[[fiducial]]", 'id = "1"', "xy_mm = [-106, 106]", "[[fiducial]]", 'id = "3"', "xy_mm = [106, -106]"]
     lines += ["[[fiducial_distance]]", 'from = "1"', 'to = "3"', "mm = 299.816", "sigma_mm = 0.005"]
-    table = printed(tmp_path / "c.toml", 153.0, [1.0, 2.0, 1.0, -1.0, -2.0, 3.0])
+    table = printed(tmp_path / "c.toml", 153.0, TABLE)
     table.write_text("\n".join([table.read_text(), *lines]) + "\n")
     camera = read_camera(imported("certificate", [table], tmp_path) / "camera.toml")
     assert camera.distances == (FiducialDistance("1", "3", 299.816, 0.005),)
     table.write_text(table.read_text().replace('to = "3"', 'to = "33"'))
     with pytest.raises(InputError, match=r"no fiducial '33'\. Did you mean '3'"):
         read_certificate(table)
-
-
-@pytest.mark.parametrize(
-    ("points", "words"),
-    [
-        ({"symmetry_mm": "[0.0, 0.01]"}, "needs autocollimation_mm"),
-        ({"principal_point_mm": "[0, 0]", "symmetry_mm": "[0.0, 0.01]"}, "Give either"),
-    ],
-)
-def test_principal_points_that_do_not_go_together(tmp_path: Path, points: dict[str, str], words: str) -> None:
-    with pytest.raises(InputError, match=words):
-        read_certificate(printed(tmp_path / "c.toml", 153.0, [1.0, 2.0, 1.0, -1.0, -2.0, 3.0], **points))
 
 
 def test_a_published_table_is_fitted_to_its_rounding(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,15 +12,13 @@ import numpy as np
 import pytest
 import tifffile
 from PIL import Image
-from projects import CAMERA, Capture, Refusal, write_project
+from projects import CAMERA, Capture, Printed, Refusal, command, write_project
 from range_server import range_server
 
-from measure.boards.find import recognise_board
-from measure.scans.opening import open_scan, read_head
+from measure.scans.opening import read_head
 from pipeline import read_project, stages
 from pipeline.archive import new_project
 from pipeline.archive.scan_groups import Catalogue, Sample, ScanGroup, catalogue, identify_sample, name_cameras
-from pipeline.cli import run
 from pipeline.files import library
 from pipeline.files.library import read_library
 from pipeline.measuring.camera_identification import Identification, Trial
@@ -37,7 +35,7 @@ def scan(path: Path, height: int = 60, width: int = 90, **tags: object) -> Path:
     return path
 
 
-def no_count(_what: str, _done: int, _total: int) -> None:
+def no_count(*_: object) -> None:
     """Nobody looks."""
 
 
@@ -90,15 +88,24 @@ def identify_camera(
     return Identification(path, (trial,) if names else (), {}, (20.0, 20.0), plate or {}, contradicted, alike, REPORTS)
 
 
-def kind(group: ScanGroup, *samples: Identification) -> ScanGroup:
+def fake_group(group: ScanGroup, *samples: Identification) -> ScanGroup:
     return replace(group, samples=samples)
+
+
+def fake_cameras(monkeypatch: pytest.MonkeyPatch, sample: Callable[[ScanGroup], Identification]) -> None:
+    """One sample a group, and what it says."""
+
+    def samples(grouped: Catalogue, *_: object) -> Catalogue:
+        return replace(grouped, groups=tuple(fake_group(group, sample(group)) for group in grouped.groups))
+
+    monkeypatch.setattr(new_project, "name_cameras", samples)
 
 
 def test_a_camera_is_known_by_most_samples_and_by_what_its_plate_does_not_contradict(box: Path) -> None:
     group = catalogue([box / "1958"], no_count).groups[0]
     path = group.paths[0]
     alike = identify_camera(path, "wild-rc10-153", "wild-rc10-305", against=["wild-rc10-305"])
-    assert kind(
+    assert fake_group(
         group, alike, identify_camera(path), identify_camera(path, "wild-rc10-153", "wild-rc10-305")
     ).cameras == ("wild-rc10-153",)
     for samples, why in [
@@ -107,18 +114,18 @@ def test_a_camera_is_known_by_most_samples_and_by_what_its_plate_does_not_contra
         ((alike, identify_camera(path), identify_camera(path)), "not all show the same camera"),
         ((identify_camera(path, "wild-rc5-153", against=["wild-rc5-153"]),), "the camera's plate in the picture names"),
     ]:
-        fake_identification = kind(group, *samples)
+        fake_identification = fake_group(group, *samples)
         assert fake_identification.cameras == ()
         assert why in fake_identification.why_not()
     form = identify_camera(path, "zeiss-rmk-a-153", beside="arrow-153")
-    assert kind(group, form).camera == ""
-    assert "compare the drawings" in kind(group, form).sentence()
+    assert fake_group(group, form).camera == ""
+    assert "compare the drawings" in fake_group(group, form).sentence()
     plate = {"camera_type": "Zeiss"}
-    assert kind(group, replace(form, plate=plate)).camera == "zeiss-rmk-a-153"
-    solid, lines = (kind(group, identify_camera(path, name)).rests_on_form for name in ("arrow-153", "park-153"))
+    assert fake_group(group, replace(form, plate=plate)).camera == "zeiss-rmk-a-153"
+    solid, lines = (fake_group(group, identify_camera(path, name)).rests_on_form for name in ("arrow-153", "park-153"))
     assert (solid, lines) == (True, False)
-    assert not kind(group, replace(identify_camera(path, "arrow-153"), plate=plate)).rests_on_form
-    both = kind(group, identify_camera(path, "wild-rc30-153", "wild-rc10-153"))
+    assert not fake_group(group, replace(identify_camera(path, "arrow-153"), plate=plate)).rests_on_form
+    both = fake_group(group, identify_camera(path, "wild-rc30-153", "wild-rc10-153"))
     assert both.camera == "wild-rc10-153"  # by far the more reports
 
 
@@ -126,22 +133,18 @@ def test_a_camera_is_known_by_most_samples_and_by_what_its_plate_does_not_contra
 def fake_identification(monkeypatch: pytest.MonkeyPatch) -> None:
     """What samples say, by where they stand: those of 1952 are of one camera, all others of none that is known."""
 
-    def samples(grouped: Catalogue, *_: object) -> Catalogue:
-        groups = []
-        for group in grouped.groups:
-            names = ("wild-rc10-153",) if group.folder.name in ("1952", "sub") else ()
-            plate, neighbour = {"camera_number": str(group.head.height_px)}, "arrow-153" * (group.folder.name == "sub")
-            groups.append(kind(group, identify_camera(group.paths[0], *names, plate=plate, beside=neighbour)))
-        return replace(grouped, groups=tuple(groups))
+    def sample(group: ScanGroup) -> Identification:
+        names = ("wild-rc10-153",) if group.folder.name in ("1952", "sub") else ()
+        plate, neighbour = {"camera_number": str(group.head.height_px)}, "arrow-153" * (group.folder.name == "sub")
+        return identify_camera(group.paths[0], *names, plate=plate, beside=neighbour)
 
-    monkeypatch.setattr(new_project, "name_cameras", samples)
+    fake_cameras(monkeypatch, sample)
 
 
 @pytest.mark.usefixtures("fake_identification")
-def test_the_project_has_each_scans_camera(box: Path, tmp_path: Path, capsys: Capture, refusal: Refusal) -> None:
+def test_the_project_has_each_scans_camera(box: Path, tmp_path: Path, printed: Printed, refusal: Refusal) -> None:
     out = tmp_path / "work" / "first"
-    assert run(["init", str(box), "--out", str(out), "--json"]) == 1
-    fake_identification = json.loads(capsys.readouterr().out)
+    fake_identification = json.loads(printed("init", box, "--out", out, "--json", code=1))
     project = read_project(out / "project.toml")
     assert sorted(project.scans) == ["0001", "0002", "0003", "0004"]
     assert all(project.image_camera(name).name == "Wild RC10, 153 mm" for name in project.scans)
@@ -159,16 +162,15 @@ def test_the_project_has_each_scans_camera(box: Path, tmp_path: Path, capsys: Ca
     text = (out / "project.toml").read_text(encoding="utf-8")
     assert "# the same bytes as another scan\n" in text
     assert "0002 Kopie.tif" in text
-    assert "init writes over nothing" in refusal(["init", str(box), "--out", str(out)])
+    assert "init writes over nothing" in refusal("init", box, "--out", out)
     assert (out / "project.toml").read_text(encoding="utf-8") == text
 
 
 @pytest.mark.usefixtures("fake_identification")
-def test_scans_are_of_the_camera_drawn(box: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+def test_scans_are_of_the_camera_drawn(box: Path, monkeypatch: pytest.MonkeyPatch, printed: Printed) -> None:
     """The project stands among the scans: what it will write is not taken for one."""
     monkeypatch.chdir(box / "1958")
-    assert run(["init", "."]) == 1
-    assert "have its marks learned" in capsys.readouterr().out
+    assert "have its marks learned" in printed("init", ".", code=1)
     (box / "1958/camera.toml").write_text("frame_mm = [230.0, 230.0]\n", encoding="utf-8")
     scan(box / "1958" / "out" / "learned" / "mark.TIF")
     text = Path("project.toml").read_text(encoding="utf-8")
@@ -202,7 +204,7 @@ def test_of_each_group_in_each_folder_three_are_tried(box: Path) -> None:
 @pytest.mark.usefixtures("fake_identification")
 def test_what_a_server_lists_is_inspected_at_as_a_folder_is(box: Path, tmp_path: Path) -> None:
     with range_server(box) as server:
-        assert run(["init", f"{server.url}/1952/", "--out", str(tmp_path / "p")]) == 1  # a broken file
+        assert command("init", f"{server.url}/1952/", "--out", tmp_path / "p") == 1  # a broken file
         project = read_project(tmp_path / "p" / "project.toml")
     text = (tmp_path / "p" / "project.toml").read_text(encoding="utf-8")
     assert "broken" not in text
@@ -220,7 +222,7 @@ def test_what_holds_no_scan_is_reported(given: str, said: str, tmp_path: Path, r
     (tmp_path / "empty").mkdir()
     (tmp_path / "only").mkdir()
     (tmp_path / "only" / "a.tif").write_bytes(b"no scan")
-    assert said in refusal(["init", str(tmp_path / given), "--out", str(tmp_path / "out")])
+    assert said in refusal("init", tmp_path / given, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -245,24 +247,19 @@ def photograph(path: Path, size: tuple[int, int] = (640, 480), board: tuple[int,
 @pytest.fixture
 def drawn_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with a small film scan, and a library that has their camera, which all samples show."""
-    cameras = tmp_path / "cameras"
-    cameras.mkdir()
-    source = '[source]\ntext = "drawn for a test"\n'
-    (cameras / "small.toml").write_text(f"{CAMERA}{source}", encoding="utf-8")
-    monkeypatch.setattr(library, "FOLDER", cameras)
+    (tmp_path / "cameras").mkdir()
+    camera = f'{CAMERA}[source]\ntext = "drawn for a test"\n'
+    (tmp_path / "cameras" / "small.toml").write_text(camera, encoding="utf-8")
+    monkeypatch.setattr(library, "FOLDER", tmp_path / "cameras")
 
-    def samples(grouped: Catalogue, *_: object) -> Catalogue:
-        groups = []
-        for group in grouped.groups:
-            names = () if group.head.camera or group.head.height_px < 100 else ("small",)
-            groups.append(replace(group, samples=(identify_camera(group.paths[0], *names),)))
-        return replace(grouped, groups=tuple(groups))
+    def sample(group: ScanGroup) -> Identification:
+        names = () if group.head.camera or group.head.height_px < 100 else ("small",)
+        return identify_camera(group.paths[0], *names)
 
-    monkeypatch.setattr(new_project, "name_cameras", samples)
-    folder = tmp_path / "box"
-    write_project(folder, ["a"])
-    (folder / "project.toml").unlink()
-    (folder / "camera.toml").unlink()
+    fake_cameras(monkeypatch, sample)
+    folder = write_project(tmp_path / "box", ["a"]).parent
+    for name in ("project.toml", "camera.toml"):
+        (folder / name).unlink()
     return folder
 
 
@@ -273,35 +270,29 @@ def test_a_folder_is_measured(drawn_library: Path, capsys: Capture, monkeypatch:
     photograph(drawn_library / "IMG_1.jpg", board=(7, 5))
     scan(drawn_library / "odd.tif")
     (drawn_library / "broken.tif").write_bytes(b"II*\0")
-    assert run(["run", str(drawn_library), "--quiet", "--workers", "1"]) == 1
+    assert command("run", drawn_library, "--quiet", "--workers", "1") == 1
     captured = capsys.readouterr()
     assert captured.err == ""
-    assert (
-        "4 files examined: 1 of 4 scans can be measured (1 without a camera, 1 by a digital camera, 1 broken)."
-        in captured.out
-    )
+    assert "1 of 4 scans can be measured (1 without a camera, 1 by a digital camera, 1 broken)." in captured.out
     assert "1 of 1 scan measured" in captured.out
     steps = [line for line in captured.out.splitlines() if line.startswith("Next: ")]
     assert captured.out.rstrip().splitlines()[-len(steps) :] == steps
     assert len(steps) <= 3
     assert steps[0].startswith(f"Next: edit {drawn_library / 'images.csv'}  # 1 scan without a camera")
     assert steps[1].startswith(f"Next: reseau calibrate {drawn_library} --board")
-    assert run(["run", str(drawn_library), "--json", "--workers", "1"]) in (0, 1)  # the project that stands there
+    assert command("run", drawn_library, "--json", "--workers", "1") in (0, 1)  # the project that stands there
     again = capsys.readouterr()
     assert set(json.loads(again.out)["frames"]) == {"a"}
     assert "1 of 1 scan measured in an earlier run" in again.err
 
 
-def test_photographs_alone_are_refused(tmp_path: Path, capsys: Capture, refusal: Refusal) -> None:
+def test_photographs_alone_are_refused(tmp_path: Path, refusal: Refusal) -> None:
     photograph(tmp_path / "p" / "IMG_1.jpg", board=(7, 5))
-    assert run(["run", str(tmp_path / "p"), "--out", str(tmp_path / "o")]) == 2
-    message = capsys.readouterr().err
+    message = refusal("run", tmp_path / "p", "--out", tmp_path / "o")
     assert f"reseau calibrate {tmp_path / 'p'} --board 7x5 --square SIZE" in message
     assert "taken by Canon EOS 80D, 35 mm" in message
     assert not (tmp_path / "o").exists()
-    assert "--out goes with a folder of scans" in refusal(
-        ["run", str(tmp_path / "project.toml"), "--out", str(tmp_path)]
-    )
+    assert "--out goes with a folder of scans" in refusal("run", tmp_path / "project.toml", "--out", tmp_path)
 
 
 def test_photographs_are_known_by_their_exif_and_not_tried_on_the_library(tmp_path: Path) -> None:
@@ -313,30 +304,18 @@ def test_photographs_are_known_by_their_exif_and_not_tried_on_the_library(tmp_pa
     assert read_head(scan(tmp_path / "c.tif")).camera == ""
     photograph(tmp_path / "a.jpg", board=(9, 6))
     identified = partial(identify_sample, cameras={}, pitch_um=None, max_pixels=None)
-    found = name_cameras(catalogue([tmp_path / "a.jpg"], lambda *_: None), identified, Reporter(quiet=True), None)
+    found = name_cameras(catalogue([tmp_path / "a.jpg"], no_count), identified, Reporter(quiet=True), None)
     (group,) = found.groups
     assert (group.camera, group.board) == ("", "--board 9x6")
     assert group.digital == "taken by Canon EOS 80D, 35 mm"
 
 
-@pytest.mark.parametrize(("board", "words"), [((9, 6), "--board 9x6"), ((5, 7), "--board 7x5"), (None, "")])
-def test_a_chessboard_is_recognised_with_its_count(board: tuple[int, int] | None, words: str, tmp_path: Path) -> None:
-    with open_scan(photograph(tmp_path / "a.jpg", board=board)) as picture:
-        assert recognise_board(picture) == words
-
-
 def test_scans_that_were_all_tried_have_each_its_own_camera(tmp_path: Path) -> None:
     """Two scans of one size by different cameras are no group that shows none."""
-    for number in range(2):
-        scan(tmp_path / f"{number}.tif")
+    cameras = {scan(tmp_path / f"{name}.tif"): name for name in ("wild-rc5-153", "zeiss-rmk-a-153")}
 
     def identified(sample: Sample) -> Identification | str:
-        path = sample[0]
-        return identify_camera(path, "wild-rc5-153" if path.stem == "0" else "zeiss-rmk-a-153")
+        return identify_camera(sample[0], cameras[sample[0]])
 
-    found = catalogue([tmp_path], lambda *_: None)
-    named = name_cameras(found, identified, Reporter(quiet=True), None)
-    assert {(group.camera, *(path.stem for path in group.paths)) for group in named.groups} == {
-        ("wild-rc5-153", "0"),
-        ("zeiss-rmk-a-153", "1"),
-    }
+    named = name_cameras(catalogue([tmp_path], no_count), identified, Reporter(quiet=True), None)
+    assert {group.paths: group.camera for group in named.groups} == {(path,): name for path, name in cameras.items()}

@@ -4,7 +4,6 @@ import json
 import math
 import re
 from dataclasses import replace
-from functools import partial
 from importlib import resources
 from pathlib import Path
 
@@ -13,19 +12,18 @@ import numpy as np
 import pytest
 import tifffile
 from numpy.typing import NDArray
-from projects import Capture, Refusal
+from projects import Printed, Refusal, command
 from real_data import DATA, needs
 from studies import parametrize_with_studies
-from truth_comparison import compare_with_truth
+from truth_comparison import compare_frames
 
 from measure.marks.rendering import known_picture
 from measure.marks.shapes import Mark, MarkShape, Polygon
 from measure.scans.metadata import Pitch
 from measure.scans.opening import ScanHead
 from pipeline import read_project
-from pipeline.archive.scan_groups import ScanGroup, catalogue, identify_sample, name_cameras
-from pipeline.cli import run
-from pipeline.files.camera_file import CameraFile, read_camera
+from pipeline.archive.scan_groups import ScanGroup
+from pipeline.files.camera_file import read_camera
 from pipeline.files.library import library_names, library_path, read_library
 from pipeline.measuring.camera_identification import Identification, Trial, drawn_alike
 from pipeline.measuring.camera_trials import _alike, identify
@@ -40,43 +38,35 @@ SPREADS = {"fairchild": 0.3, "park": 0.35}  # mm, of models whose cameras differ
 ENDS = {"left to right": ("5", "6"), "top to bottom": ("7", "8"), "1 to 2": ("1", "2"), "3 to 4": ("3", "4")}
 
 
-def render_frame(folder: Path, camera: str) -> Path:
-    """The project of one rendered frame of a library camera, which it names."""
+def scene_of(camera: str) -> str:
+    """One frame of a library camera."""
     start, end = SCENE.index("[camera]\n"), SCENE.index("[field]\n")
-    scene = SCENE[:start] + f'camera = "library:{camera}"\n' + SCENE[end:]
-    scene = scene[: scene.rindex("[[image]]")].replace("pitch_um = 45.0", "pitch_um = 100.0")
-    (folder / "scene.toml").write_text(scene, encoding="utf-8")
-    render_project(folder / "scene.toml", folder)
-    (folder / "project.toml").write_text(
-        f'camera = "library:{camera}"\nscans = ["scans/*.tif"]\n[measure]\npose = "0"\n', encoding="utf-8"
-    )
-    return folder / "project.toml"
+    return SCENE[:start] + f'camera = "library:{camera}"\n' + SCENE[end : SCENE.rindex("[[image]]")]
 
 
 @pytest.fixture(scope="module")
 def frame(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return render_frame(tmp_path_factory.mktemp("library"), RENDERED)
+    """The project of one rendered frame of a library camera, which it names."""
+    folder = tmp_path_factory.mktemp("library")
+    scene = scene_of(RENDERED).replace("pitch_um = 45.0", "pitch_um = 100.0")
+    (folder / "scene.toml").write_text(scene, encoding="utf-8")
+    render_project(folder / "scene.toml", folder)
+    text = f'camera = "library:{RENDERED}"\nscans = ["scans/*.tif"]\n[measure]\npose = "0"\n'
+    (folder / "project.toml").write_text(text, encoding="utf-8")
+    return folder / "project.toml"
 
 
-def distance(camera: CameraFile, first: str, second: str) -> float:
-    places = {one.id: np.array(one.xy_mm) for one in camera.fiducials}
-    return float(np.hypot(*(places[first] - places[second])))
-
-
-def test_every_camera_is_listed_and_printed_as_a_file_to_start_from(capsys: Capture, tmp_path: Path) -> None:
-    assert run(["cameras", "--json"]) == 0
-    listed = {entry["name"]: entry for entry in json.loads(capsys.readouterr().out)}
+def test_every_camera_is_listed_and_printed_as_a_file_to_start_from(printed: Printed, tmp_path: Path) -> None:
+    listed = {entry["name"]: entry for entry in json.loads(printed("cameras", "--json"))}
     assert tuple(listed) == library_names()
     assert len(listed) >= 20
     assert all(entry["source"] for entry in listed.values())
     assert listed["wild-rc8-153"]["drawn"] == ["1", "2", "3", "4"]
     assert listed["jena-lmk-153"]["drawn"] == []
-    assert run(["cameras"]) == 0
-    printed = capsys.readouterr().out
-    assert all(name in printed for name in listed)
-    assert "learned" in printed
-    assert run(["cameras", "zeiss-rmk-a-153"]) == 0
-    (tmp_path / "camera.toml").write_text(capsys.readouterr().out, encoding="utf-8")
+    table = printed("cameras")
+    assert all(name in table for name in listed)
+    assert "learned" in table
+    (tmp_path / "camera.toml").write_text(printed("cameras", "zeiss-rmk-a-153"), encoding="utf-8")
     camera = read_camera(tmp_path / "camera.toml")
     assert camera.fiducials == LIBRARY["zeiss-rmk-a-153"].fiducials
     assert camera.source == LIBRARY["zeiss-rmk-a-153"].source
@@ -94,8 +84,10 @@ def test_a_camera_is_typical_and_its_spread_is_one_of_cameras(name: str) -> None
     reported = camera.source is not None and camera.source.reports
     assert (sigmas < (SPREADS.get(name.split("-")[0], 0.05) if reported else 1.1)).all()
     assert len(camera.fiducials) in (4, 8, 9, 25)
+    places = {one.id: np.array(one.xy_mm) for one in camera.fiducials}
     for words, mm, spread, _ in SEPARATION.findall(library_path(name).read_text(encoding="utf-8")):
-        assert distance(camera, *ENDS[words]) == pytest.approx(float(mm), abs=max(0.02, 1.5 * float(spread)))
+        first, second = (places[id] for id in ENDS[words])
+        assert np.hypot(*(first - second)) == pytest.approx(float(mm), abs=max(0.02, 1.5 * float(spread)))
 
 
 @pytest.mark.parametrize(
@@ -107,18 +99,17 @@ def test_a_camera_is_typical_and_its_spread_is_one_of_cameras(name: str) -> None
         ("Wild RC9", "'wild-rc9-88'"),
     ],
 )
-def test_a_misspelt_camera(name: str, near: str, tmp_path: Path, capsys: Capture, refusal: Refusal) -> None:
+def test_a_misspelt_camera(name: str, near: str, tmp_path: Path, refusal: Refusal) -> None:
     (tmp_path / "project.toml").write_text(f'output = "out"\ncamera = "library:{name}"\n', encoding="utf-8")
-    assert run(["measure", str(tmp_path / "project.toml")]) == 2
-    message = capsys.readouterr().err
+    message = refusal("measure", tmp_path / "project.toml")
     assert f"project.toml, line 2: camera: the camera library has no '{name}'. Did you mean {near}" in message
     assert "`reseau cameras`" in message
-    assert near in refusal(["cameras", name])
+    assert near in refusal("cameras", name)
 
 
 @pytest.mark.parametrize("words", [["wild-rc9-88", "wild-rc8-153"], ["wild-rc9-88", "--json"], ["--pitch", "20"]])
 def test_options_that_do_not_go_together(words: list[str], refusal: Refusal) -> None:
-    assert "give NAME alone" in refusal(["cameras", *words])
+    assert "give NAME alone" in refusal("cameras", *words)
 
 
 def test_images_may_name_a_camera_and_a_folder_without_scans_is_reported(tmp_path: Path, refusal: Refusal) -> None:
@@ -128,26 +119,24 @@ def test_images_may_name_a_camera_and_a_folder_without_scans_is_reported(tmp_pat
     (tmp_path / "project.toml").write_text(text, encoding="utf-8")
     project = read_project(tmp_path / "project.toml")
     assert [project.image_camera(name).name for name in "ab"] == ["Wild RC9, 88 mm", "Wild RC8, 153 mm"]
-    assert "no scan there, nor below" in refusal(["cameras", "--scan", str(tmp_path)])
+    assert "no scan there, nor below" in refusal("cameras", "--scan", tmp_path)
 
 
 def test_a_frame_of_a_library_camera_is_measured_right(frame: Path) -> None:
     """All drawn marks within a tenth of a pixel of the truth; those that are not drawn are passed over. The marks are
     weak, since the edge of their pads, which is not drawn, counts as damage."""
-    assert run(["measure", str(frame)]) == 1
-    measured = frame.parent / "out" / "measurement.db"
-    (compared,) = compare_with_truth(frame.parent / "truth.json", measured).frames
+    assert command("measure", frame) == 1
+    (compared,) = compare_frames(frame.parent)
     assert compared.observed["fiducial"] == 4
-    assert compared.wrong == ()
+    assert compared.wrong == []
     assert np.abs(compared.errors_px).max() < 0.1
     assert (frame.parent / "comparator.csv").read_text(encoding="utf-8").count(",fiducial,") == 4
 
 
-def test_marks_of_unknown_shape_are_learned_and_not_from_one_scan_alone(frame: Path, capsys: Capture) -> None:
+def test_marks_of_unknown_shape_are_learned_and_not_from_one_scan_alone(frame: Path, refusal: Refusal) -> None:
     other = frame.with_name("other.toml")
     other.write_text(frame.read_text(encoding="utf-8").replace(RENDERED, "jena-lmk-153"), encoding="utf-8")
-    assert run(["measure", str(other)]) == 2
-    assert "jena-lmk-153.toml: the marks are to be learned, and with one scan nothing" in capsys.readouterr().err
+    assert "jena-lmk-153.toml: the marks are to be learned, and with one scan nothing" in refusal("measure", other)
     camera = LIBRARY["jena-lmk-153"]
     assert len(camera.learned) == 8
     # A template's origin lies somewhere on its mark, of which the reports know nothing.
@@ -222,12 +211,8 @@ Picture = NDArray[np.uint8]
 GALLERY = DATA / "mark_gallery"
 MM_A_PIXEL = 0.0320
 HALF_PX, SEARCH_PX, RIM_PX = 140, 9, 8
-DOTS = {"1": (304, 1606), "2": (1617, 301), "3": (304, 301), "4": (1617, 1606)} | {
-    "5": (304, 953),
-    "6": (1617, 953),
-    "7": (960, 301),
-    "8": (960, 1606),
-}
+DOTS = {"1": (304, 1606), "2": (1617, 301), "3": (304, 301), "4": (1617, 1606)}
+DOTS |= {"5": (304, 953), "6": (1617, 953), "7": (960, 301), "8": (960, 1606)}
 SEEN = [
     ("small_flat_wing", "fairchild-k17-small-flat-153", "5678", 0.75),
     ("tall_flat_wing", "fairchild-k17-tall-flat-153", "5678", 0.7),
@@ -298,30 +283,14 @@ def scene_text(name: str) -> str:
     marks = [each.mark for each in layout.marks]
     solid = any(isinstance(part, Polygon) for mark in marks if isinstance(mark, MarkShape) for part in mark.parts)
     pad_mm = 0.0 if solid or any(mark.polarity == "dark" for mark in marks) else 3.0
-    start, end = SCENE.index("[camera]\n"), SCENE.index("[field]\n")
-    scene = SCENE[:start] + f'camera = "library:{name}"\n' + SCENE[end:]
-    changes = {"pitch_um = 45.0": "pitch_um = 125.0", "margin_mm = 3.0": "margin_mm = 9.0"}
     neighbour = min(max(map(abs, each.xy_mm)) for each in layout.marks) > max(layout.frame_mm) / 2
     pocket_mm = 6.0 if neighbour and all(mark.polarity == "dark" for mark in marks) else 0.0
-    behind = {"pad_mm = 1.9": f"pad_mm = {pad_mm}", "pocket_mm = 0.0": f"pocket_mm = {pocket_mm}"}
-    for old, new in (changes | behind).items():
-        assert old in scene
-        scene = scene.replace(old, new)
-    return scene[: scene.rindex("[[image]]")]
-
-
-@pytest.mark.study
-def test_scans_of_wings_are_named_where_the_scan_tells_their_form(tmp_path: Path) -> None:
-    """Of three forms that are drawn much alike."""
-    name = "fairchild-k17-tall-flat-153"
-    (tmp_path / "scene.toml").write_text(scene_text(name), encoding="utf-8")
-    render_project(tmp_path / "scene.toml", tmp_path)
-    forms = {each: camera for each, camera in LIBRARY.items() if "k17" in each or each == "zeiss-rmk-a-153"}
-    grouped = catalogue([tmp_path / "scans"], lambda *_: None)
-    (group,) = name_cameras(
-        grouped, partial(identify_sample, cameras=forms, pitch_um=None, max_pixels=None), Reporter(), None
-    ).groups
-    assert group.camera == name, group.sentence()
+    scene = scene_of(name)
+    drawn = (("pad_mm", 1.9, pad_mm), ("pocket_mm", 0.0, pocket_mm))
+    for key, old, new in (("pitch_um", 45.0, 125.0), ("margin_mm", 3.0, 9.0), *drawn):
+        assert f"{key} = {old}" in scene
+        scene = scene.replace(f"{key} = {old}", f"{key} = {new}")
+    return scene
 
 
 @pytest.mark.study

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from projects import comparator_points, fiducial_tables, keep_scans, write_project, write_tables
+from projects import command, comparator_points, fiducial_tables, keep_scans, present, write_project, write_tables
 
 from measure import open_scan
 from measure.flags import Cause, Code, Reason, Status
@@ -21,7 +21,6 @@ from pipeline import read_project
 from pipeline.archive.checked_results import read_measurement, stored_judging
 from pipeline.archive.results_database import Store
 from pipeline.archive.thumbnails import Thumbnails, ThumbnailStore
-from pipeline.cli import run
 from pipeline.report import ReportData, Thumbnail, judge, render_report
 from pipeline.report.frame_views import MOST_CARDS
 from pipeline.report.load import MOST_FRAMES, frame_counts, reduced, report_data
@@ -34,7 +33,6 @@ from pipeline.review.session import Filters, Session
 FRAMES, MARKS = 2100, 8  # more of them are bad than a report shows
 BAD, FAILED = range(0, FRAMES, 10), range(5, FRAMES, 100)
 KNOWN = Covariance({Cause.NOISE: np.eye(2) * 4e-4})
-SIGMA_UM = (3.0, 4.0)
 
 
 def image(number: int) -> str:
@@ -64,7 +62,7 @@ def rows(scans: list[MeasuredScan]) -> Iterator[ComparatorPoint]:
     for each in scans:
         for mark in each.frame.marks:
             is_known = mark.center_px is not None
-            xy, sigma = (np.zeros(2), 1e-3 * np.array(SIGMA_UM)) if is_known else (None, None)
+            xy, sigma = (np.zeros(2), np.array([0.003, 0.004])) if is_known else (None, None)
             yield ComparatorPoint(each.frame.image, mark.point, "fiducial", xy, sigma, 0.0, mark.status, mark.reason)
 
 
@@ -74,12 +72,8 @@ def many() -> ReportData:
     return reduced(ReportData("Many", list(rows(scans))), iter(scans), lambda name: f"camera {name[6]}")
 
 
-@pytest.fixture(scope="module")
-def page(many: ReportData) -> str:
-    return render_report(many)
-
-
-def test_a_report_on_thousands_of_frames_is_small_and_escaped(page: str, many: ReportData) -> None:
+def test_a_report_on_thousands_of_frames_is_small_and_escaped(many: ReportData) -> None:
+    page = render_report(many)
     assert len(page.encode()) < 2_000_000
     assert page.count('<details class="frame"') == MOST_FRAMES
     assert "box&lt;b&gt;" in page
@@ -90,14 +84,14 @@ def test_a_report_on_thousands_of_frames_is_small_and_escaped(page: str, many: R
     assert len(page.encode()) < 10_000_000
 
 
-def test_counts_are_those_of_all_frames_and_the_worst_are_shown(many: ReportData, page: str) -> None:
-    assert many.totals is not None
+def test_counts_are_those_of_all_frames_and_the_worst_are_shown(many: ReportData) -> None:
+    verdicts = present(many.totals).verdicts
     good = FRAMES - len(BAD) - len(FAILED)
-    counts = sum(map(Counter, many.totals.verdicts.values()), Counter[str]())
+    counts = sum(map(Counter, verdicts.values()), Counter[str]())
     assert counts == {"good": good, "look": len(BAD), "failed": len(FAILED)}
     assert frame_counts(many, []) == counts  # of the terminal
-    assert {camera for camera, _ in many.totals.verdicts} == {"camera 0", "camera 1", "camera 2"}
-    assert {kind for _, kind in many.totals.verdicts} == {"tif", "jpg"}
+    assert {camera for camera, _ in verdicts} == {"camera 0", "camera 1", "camera 2"}
+    assert {kind for _, kind in verdicts} == {"tif", "jpg"}
     observed = FRAMES * MARKS - len(BAD) - MARKS * len(FAILED)
     assert judge(many).sentence.startswith(f"Measured: {observed} marks in {FRAMES} frames, but ")
     shown = set(many.measurement or {})
@@ -172,37 +166,28 @@ def test_natural_points_are_no_questions_to_a_reviewer(tmp_path: Path) -> None:
     assert [(one["point"], one["kind"]) for one in entries] == [("m1", "fiducial")]
 
 
-def as_written(folder: Path) -> None:
-    """As `reseau measure` says it at its end."""
-    comparator = folder / "comparator.csv"
-    with stored_judging(folder / "out" / "measurement.db", read_measurement_hash(comparator)) as judging:
-        assert judging is not None
-        judging.remember_written(comparator)
-
-
 def test_frames_that_need_no_attention_are_counted_as_if_each_were_read(tmp_path: Path, monkeypatch: Any) -> None:
     project = read_project(stored(tmp_path)[0])
     every = report_data(project, lambda path: path)
-    as_written(tmp_path)
+    comparator = tmp_path / "comparator.csv"
+    with stored_judging(tmp_path / "out" / "measurement.db", read_measurement_hash(comparator)) as judging:
+        present(judging).remember_written(comparator)  # as `reseau measure` says it at its end
     monkeypatch.setattr("pipeline.report.load.read_comparator", None)  # nobody reads all of it
     few = report_data(project, lambda path: path)
-    assert every.totals is not None
-    assert few.totals is not None
-    assert {n: +Counter(c) for n, c in few.totals.marks.items()} == {
-        n: +Counter(c) for n, c in every.totals.marks.items()
-    }
-    assert +Counter(few.totals.of_targets) == +Counter(every.totals.of_targets)
-    assert few.totals.verdicts == every.totals.verdicts
-    assert few.totals.problems == every.totals.problems
+    of_few, of_every = present(few.totals), present(every.totals)
+    marks = [{n: +Counter(c) for n, c in totals.marks.items()} for totals in (of_few, of_every)]
+    assert marks[0] == marks[1]
+    assert +Counter(of_few.of_targets) == +Counter(of_every.of_targets)
+    assert (of_few.verdicts, of_few.problems) == (of_every.verdicts, of_every.problems)
     for axis in ("column", "row"):
-        np.testing.assert_array_equal(few.totals.places_px[axis], every.totals.places_px[axis])
+        np.testing.assert_array_equal(of_few.places_px[axis], of_every.places_px[axis])
     assert set(few.measurement or {}) == set(every.measurement or {})
 
 
 @pytest.fixture(scope="module")
 def measured_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = write_project(tmp_path_factory.mktemp("thumbnails"), ["a", "b", "c"]).parent
-    assert run(["measure", str(folder / "project.toml")]) == 0
+    assert command("measure", folder / "project.toml") == 0
     return folder
 
 
@@ -215,8 +200,7 @@ def folder(measured_folder: Path, tmp_path: Path) -> Path:
 def keys(folder: Path) -> dict[str, str]:
     digest = read_measurement_hash(folder / "comparator.csv")
     with stored_judging(folder / "out" / "measurement.db", digest) as judging:
-        assert judging is not None
-        return judging.fingerprints(("a", "b", "c", "none"))
+        return present(judging).fingerprints(("a", "b", "c", "none"))
 
 
 def grey(pixels: np.ndarray) -> np.ndarray:
@@ -232,9 +216,8 @@ def test_every_mark_and_the_whole_scan_have_their_pictures(folder: Path) -> None
         for scan in read_measurement(folder / "out" / "measurement.db"):
             with open_scan(scan.scan) as opened:
                 for mark in scan.frame.marks:
-                    kept, own = store.get(found[scan.frame.image], mark.point, mark.kind), cut(opened, mark)
-                    assert kept is not None
-                    assert own is not None
+                    kept = present(store.get(found[scan.frame.image], mark.point, mark.kind))
+                    own = present(cut(opened, mark))
                     assert (kept.origin_px, kept.step_px, kept.pixels.shape) == (
                         own.origin_px,
                         own.step_px,
@@ -254,42 +237,39 @@ def test_every_mark_and_the_whole_scan_have_their_pictures(folder: Path) -> None
     assert jpeg_bytes < 100_000
 
 
-def test_a_report_and_a_frames_page_open_no_scan(folder: Path) -> None:
+def test_a_report_and_a_frames_page_open_no_scan_unless_the_pictures_are_gone(folder: Path) -> None:
+    page = folder / "out" / "frames" / "a.html"
+    pictures = (folder / "out" / "thumbnails.db").rename(folder / "kept.db")
+    assert command("report", folder / "project.toml", "--frames", "a") == 0
+    assert page.read_text(encoding="utf-8").count("data:image/png") == 4
+    pictures.replace(folder / "out" / "thumbnails.db")
     for scan in folder.glob("*.tif"):  # the same size and time, and nothing in it
         stat = scan.stat()
         scan.write_bytes(bytes(stat.st_size))
         os.utime(scan, ns=(stat.st_atime_ns, stat.st_mtime_ns))
     project = str(folder / "project.toml")
-    assert run(["report", project, "--frames", "a"]) == 0
-    assert run(["report", project]) in (0, 1)
-    page = (folder / "out" / "frames" / "a.html").read_text(encoding="utf-8")
-    assert page.count("data:image/png") == 4
+    assert command("report", project, "--frames", "a") == 0
+    assert command("report", project) in (0, 1)
+    assert page.read_text(encoding="utf-8").count("data:image/png") == 4
     assert (folder / "out" / "report.html").read_text(encoding="utf-8").count("data:image/png") == 12
-
-
-def test_pictures_come_from_their_file_or_else_from_the_scans(folder: Path) -> None:
-    (folder / "out" / "thumbnails.db").unlink()
-    assert run(["report", str(folder / "project.toml"), "--frames", "a"]) == 0
-    assert (folder / "out" / "frames" / "a.html").read_text(encoding="utf-8").count("data:image/png") == 4
 
 
 def test_a_mark_that_was_measured_elsewhere_since_is_cut_anew(folder: Path) -> None:
     scans, path = read_measurement(folder / "out" / "measurement.db"), folder / "out" / "measurement.db"
     with Thumbnails(scans, None, path, keys(folder)) as kept:
-        assert kept.get("a", "1", "fiducial").pixels.dtype == np.uint8  # type: ignore[union-attr]
+        assert present(kept.get("a", "1", "fiducial")).pixels.dtype == np.uint8
     for mark in scans[0].frame.marks:
-        assert mark.center_px is not None
-        np.add(mark.center_px, 60.0, out=mark.center_px)
+        np.add(center := present(mark.center_px), 60.0, out=center)
     with Thumbnails(scans, None, path, keys(folder)) as kept:
-        assert kept.get("a", "1", "fiducial").pixels.dtype == np.float32  # type: ignore[union-attr]
+        assert present(kept.get("a", "1", "fiducial")).pixels.dtype == np.float32
 
 
 def test_pictures_follow_results_that_are_moved_or_merged(folder: Path) -> None:
     project = str(folder / "project.toml")
-    run(["measure", project, "--moved", "--workers", "1"])
+    command("measure", project, "--moved", "--workers", "1")
     before = keys(folder)
     (folder / "a.tif").rename(folder / "aa.tif")
-    run(["measure", project, "--moved", "--workers", "1"])
+    command("measure", project, "--moved", "--workers", "1")
     with Store(folder / "out" / "measurement.db") as store:
         now = set(store.fingerprints()) - set(before.values())
     assert len(now) == 1

@@ -4,7 +4,6 @@ import json
 import re
 import shlex
 import shutil
-import subprocess
 import textwrap
 from collections.abc import Callable, Iterator
 from html.parser import HTMLParser
@@ -14,14 +13,15 @@ from unittest.mock import patch
 
 import cv2
 import matplotlib as mpl
+import numpy as np
 import pytest
 import real_data
 import typer
 from browser import browser_page, needs_browser
 from every_command import chessboard
 from playwright.sync_api import Browser, Page
-from projects import FRAMES, Capture
-from truth_comparison import compare_with_truth
+from projects import FRAMES, Capture, Printed, command, present
+from truth_comparison import camera_errors, compare_frames
 
 import measure
 import pipeline
@@ -32,32 +32,27 @@ from pipeline.results.adjustment_file import read_adjustment
 from pipeline.review import server
 
 
-def assert_measured_right_and_calibrated_within_its_sigmas(folder: Path, frames: int) -> None:
-    out = folder / "out"
-    comparison = compare_with_truth(folder / "truth.json", out / "measurement.db", out / "adjustment.json")
-    assert len(comparison.frames) == frames
-    for frame in comparison.frames:
-        assert frame.wrong == ()
-        assert frame.pose == frame.true_pose
-        assert frame.observed["fiducial"] == frame.visible["fiducial"] == 8
-        assert frame.observed["target"] >= 0.98 * frame.visible["target"] - 1
-    assert 0.85 < comparison.rms_error_over_sigma < 1.15
-    assert comparison.worst_camera_sigmas < 3.0
-
-
-def assert_agrees_with_opencv_and_reports(folder: Path, last: str) -> None:
-    check = json.loads((folder / "out" / "check.json").read_text(encoding="utf-8"))
-    assert check["verdict"] == "agrees"
+def assert_demonstrated(folder: Path, frames: int) -> None:
+    """Measured right, calibrated within its sigmas, in agreement with OpenCV, and reported."""
+    found = compare_frames(folder)
+    assert len(found) == frames
+    for frame in found:
+        assert frame.wrong == []
+        assert frame.pose == frame.truth["pose"]
+        assert frame.observed["fiducial"] == frame.visible("fiducial") == 8
+        assert frame.observed["target"] >= 0.98 * frame.visible("target") - 1
+    assert 0.85 < np.sqrt(np.mean(np.square([error for frame in found for error in frame.normalised]))) < 1.15
+    assert np.abs(camera_errors(folder)).max() < 3.0
+    assert json.loads((folder / "out" / "check.json").read_text(encoding="utf-8"))["verdict"] == "agrees"
     page = (folder / "out" / "report.html").read_text(encoding="utf-8")
     HTMLParser().feed(page)
-    assert last in page
+    assert f"frame{frames}" in page
 
 
 def test_the_demonstration_is_measured_right_agrees_with_opencv_and_is_reported(finished: tuple[Path, int]) -> None:
     folder, code = finished
     assert code == DONE
-    assert_measured_right_and_calibrated_within_its_sigmas(folder, FRAMES)
-    assert_agrees_with_opencv_and_reports(finished[0], f"frame{FRAMES}")
+    assert_demonstrated(folder, FRAMES)
 
 
 def assert_report_is_short(page: Page, folder: Path) -> None:
@@ -65,8 +60,7 @@ def assert_report_is_short(page: Page, folder: Path) -> None:
     page.goto((folder / "out" / "report.html").as_uri())
     assert page.evaluate("document.documentElement.scrollHeight") <= 6000
     assert len(page.inner_text("body").split()) <= 2500
-    camera = page.locator("#camera").bounding_box()
-    assert camera is not None
+    camera = present(page.locator("#camera").bounding_box())
     assert camera["y"] < 300
     assert page.locator("#camera svg").count() == 2
     assert page.evaluate("document.documentElement.scrollWidth") <= 1300
@@ -81,7 +75,7 @@ def test_its_report_is_short_and_begins_with_the_camera(browser: Browser, finish
 
 
 def test_its_summary_has_the_camera_first_and_at_most_40_lines(finished: tuple[Path, int], capsys: Capture) -> None:
-    run(["report", str(finished[0] / "project.toml")])
+    command("report", finished[0] / "project.toml")
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) <= 40
     text = "\n".join(lines)
@@ -92,9 +86,8 @@ def test_its_summary_has_the_camera_first_and_at_most_40_lines(finished: tuple[P
 @pytest.mark.study
 def test_the_demonstration_as_it_is_shown(browser: Browser, tmp_path: Path, capsys: Capture) -> None:
     """All five frames, by the command that shows them."""
-    assert run(["demo", str(tmp_path / "demo")]) == DONE
-    assert_measured_right_and_calibrated_within_its_sigmas(tmp_path / "demo", 5)
-    assert_agrees_with_opencv_and_reports(tmp_path / "demo", "frame5")
+    assert command("demo", tmp_path / "demo") == DONE
+    assert_demonstrated(tmp_path / "demo", 5)
     assert len(capsys.readouterr().out.splitlines()) <= 40
     with browser_page(browser) as page:
         assert_report_is_short(page, tmp_path / "demo")
@@ -123,34 +116,23 @@ def test_the_tutorial_is_right(project: Path, monkeypatch: pytest.MonkeyPatch, c
     assert (project.parent / "w.png").stat().st_size > 3000
 
 
-PYTHON_PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "python.md"
-
-
-@pytest.fixture
-def names(project: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """What the example has made, by its own names."""
+@pytest.mark.study
+def test_the_example_measures_adjusts_and_plots(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the names that it gives."""
     mpl.use("Agg")
     project.rename(project.with_name("demo"))
     monkeypatch.chdir(project.parent)
-    _, code = re.findall(
-        r"^```python\n(.*?)^```", PYTHON_PAGE.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE
-    )
+    page = (ROOT / "docs" / "how-to" / "python.md").read_text(encoding="utf-8")
+    _, code = re.findall(r"^```python\n(.*?)^```", page, flags=re.DOTALL | re.MULTILINE)
     made: dict[str, Any] = {}
-    exec(compile(code, PYTHON_PAGE.name, "exec"), made)
-    return made
-
-
-@pytest.mark.study
-def test_the_example_measures_adjusts_and_plots(names: dict[str, Any], tmp_path: Path) -> None:
-    frame, result = names["frame"], names["result"]
-    truth = pipeline.read_adjustment(tmp_path / "demo" / "out" / "adjustment.json")
+    exec(compile(code, "python.md", "exec"), made)
+    frame, result = made["frame"], made["result"]
+    truth = pipeline.read_adjustment(tmp_path / "demo" / "out" / "adjustment.json").cameras["metric 6 x 6"]
     assert sum(mark.status is measure.Status.MEASURED for mark in frame.marks) >= 6
     assert result.converged
-    assert result.value("IO.metric 6 x 6.c") == pytest.approx(
-        truth.cameras["metric 6 x 6"].principal_distance_mm.value, abs=0.05
-    )
+    assert result.value("IO.metric 6 x 6.c") == pytest.approx(truth.principal_distance_mm.value, abs=0.05)
     assert (tmp_path / "residuals.png").stat().st_size > 5000
-    shown = (frame, frame.marks[0], result, names["network"], result.network.observations, result.residuals)
+    shown = (frame, frame.marks[0], result, made["network"], result.network.observations, result.residuals)
     for each in (*shown, result.reliability):
         assert "\n" not in repr(each)
         assert len(repr(each)) < 200
@@ -160,37 +142,27 @@ def test_the_example_measures_adjusts_and_plots(names: dict[str, Any], tmp_path:
 
 ROOT = Path(__file__).parents[2]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
-BOARD_PICTURES = 7
 
 
 def commands(page: Path) -> Iterator[str]:
     """The lines of indented or fenced blocks that are commands of the program."""
     text = page.read_text(encoding="utf-8")
-    lines = re.findall(r"^    (.*)$", text, flags=re.MULTILINE)
-    lines += [
-        line
-        for block in re.findall(r"^```\w*\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE)
-        for line in block.splitlines()
-    ]
-    for line in lines:
+    blocks = re.findall(r"^```\w*\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE)
+    for line in [*re.findall(r"^    (.*)$", text, flags=re.MULTILINE), *"".join(blocks).splitlines()]:
         if found := re.match(r"(?:\.venv/bin/|env/bin/)?reseau( .*)?$", line.strip()):
             yield f"reseau{(found[1] or '').partition(' #')[0].rstrip()}"
-
-
-def split_words(command: str) -> list[str]:
-    return shlex.split(command, comments=True)[1:]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_command_of_a_page_exists_with_its_options(page: Path) -> None:
     known = typer.main.get_command(app).commands  # type: ignore[attr-defined]
     general = {"--version", "--help", "--install-completion"}
-    for command in commands(page):
-        name, *others = split_words(command.split(">")[0])
+    for line in commands(page):
+        name, *others = shlex.split(line.split(">")[0], comments=True)[1:]
         if name in general:
             continue
         options = {option for parameter in known[name].params for option in parameter.opts}
-        assert {word for word in others if word.startswith("--")} <= options | general, f"{page}: {command}"
+        assert {word for word in others if word.startswith("--")} <= options | general, f"{page}: {line}"
 
 
 @pytest.fixture
@@ -199,7 +171,7 @@ def desk(finished: tuple[Path, int], tmp_path: Path, monkeypatch: pytest.MonkeyP
     folder = tmp_path / "desk"
     shutil.copytree(finished[0], folder)
     (folder / "pictures").mkdir()
-    for number in range(BOARD_PICTURES):
+    for number in range(7):
         cv2.imwrite(str(folder / "pictures" / f"{number}.png"), chessboard(number, 9, 6))
     monkeypatch.chdir(folder)
     return folder
@@ -216,51 +188,18 @@ def small_library(monkeypatch: pytest.MonkeyPatch) -> None:
 def run_all(page: Path, skip: Callable[[str], bool] = lambda _: False) -> dict[str, int]:
     """The exit code of each command of a page, run in the current folder."""
     done = dict.fromkeys(command for command in commands(page) if not skip(command))
-    return {command: run(split_words(command)) for command in done}
+    return {command: run(shlex.split(command, comments=True)[1:]) for command in done}
 
 
 @pytest.mark.study
+@pytest.mark.parametrize(("page", "count"), [("README.md", 4), ("docs/start/board.md", 1)])
 @pytest.mark.usefixtures("desk", "small_library")
-def test_the_commands_of_the_readme_run() -> None:
-    codes = run_all(ROOT / "README.md")
-    assert len(codes) == 4
-    assert set(codes.values()) <= {DONE, LOOK}
-    assert Path("demo/out/report.html").exists()
-    assert Path("calibration/camera.yaml").exists()
-    assert Path("archive/project.toml").exists()
-
-
-@pytest.mark.usefixtures("small_library")
-def test_the_quick_commands_of_the_readme_run(desk: Path) -> None:
-    """The project, which is measured already; neither demonstration, board nor folder."""
-    codes = run_all(ROOT / "README.md", lambda command: "project.toml" not in command)
-    assert list(codes.values()) == [DONE]
-    assert (desk / "out" / "report.html").exists()
-
-
-@pytest.mark.study
-@pytest.mark.usefixtures("desk")
-def test_the_commands_of_the_page_of_boards_run(capsys: Capture) -> None:
-    codes = run_all(ROOT / "docs" / "start" / "board.md")
+def test_the_commands_of_a_page_run(page: str, count: int, capsys: Capture) -> None:
+    codes = run_all(ROOT / page)
+    assert len(codes) >= count
     assert set(codes.values()) <= {DONE, LOOK}
     assert Path("calibration/camera.yaml").exists()
     assert "Next: open calibration/out/report.html" in capsys.readouterr().out
-
-
-@pytest.mark.study
-def test_the_commands_of_the_tutorial_run(desk: Path) -> None:
-    page = ROOT / "docs" / "start" / "film-scan.md"
-    desk.rename(desk.with_name("demo"))
-    folder = desk.parent
-    copying = re.findall(r"^    ((?:mkdir|cp) .*)$", page.read_text(encoding="utf-8"), flags=re.MULTILINE)
-    assert len(copying) == 2
-    subprocess.run("\n".join(copying), shell=True, cwd=folder, check=True)
-    (folder / "mine" / "project.toml").write_text(block("toml"), encoding="utf-8")
-    with pytest.MonkeyPatch.context() as there:
-        there.chdir(folder)
-        codes = run_all(page, lambda command: "mine/" not in command)
-    assert list(codes.values()) == [DONE, DONE]
-    assert (folder / "mine" / "out" / "report.html").exists()
 
 
 @pytest.mark.study
@@ -275,7 +214,7 @@ def test_the_commands_of_the_page_of_archives_run(desk: Path) -> None:
         codes = run_all(page, lambda command: "project.toml" in command or "--scan" in command)
         project = desk / "project.toml"
         text = project.read_text(encoding="utf-8")
-        assert run(["review", str(project)]) == DONE
+        assert command("review", project) == DONE
         project.write_text(text.replace('# camera = "camera.toml"', 'camera = "camera.toml"'), encoding="utf-8")
         codes |= run_all(page, lambda command: "project.toml" not in command)
     assert set(codes.values()) <= {DONE, LOOK}, codes
@@ -285,22 +224,20 @@ def test_the_commands_of_the_page_of_archives_run(desk: Path) -> None:
 @pytest.mark.study
 def test_the_figures_of_the_demonstration_on_the_pages(tmp_path: Path) -> None:
     """Those of the tutorial, and the table of the page of models."""
-    assert run(["demo", str(tmp_path)]) == DONE
+    assert command("demo", tmp_path) == DONE
     mine = tmp_path / "mine"
     shutil.copytree(tmp_path / "scans", mine / "scans")
     for name in ("camera.toml", "points.csv"):
         shutil.copy(tmp_path / name, mine)
     (mine / "project.toml").write_text(block("toml"), encoding="utf-8")
-    assert run(["run", str(mine / "project.toml")]) == DONE
+    assert command("run", mine / "project.toml") == DONE
     adjustment = read_adjustment(mine / "out" / "adjustment.json")
     (camera,) = adjustment.cameras.values()
     c = camera.principal_distance_mm
     assert f"c = {c.value:.3f} mm, with a standard deviation of {c.sigma:.3f}" in PAGE
     assert f"Here it is {adjustment.sigma0:.2f}" in PAGE
-    assert run(["choose", str(tmp_path / "project.toml")]) == DONE
-    candidates = {
-        each["name"]: each for each in json.loads((tmp_path / "out" / "choose.json").read_text())["candidates"]
-    }
+    assert command("choose", tmp_path / "project.toml") == DONE
+    candidates = {one["name"]: one for one in json.loads((tmp_path / "out" / "choose.json").read_text())["candidates"]}
     rows = table((ROOT / "docs" / "how-to" / "choose-a-model.md"), "model")
     assert len(rows) == 6
     for name, unknowns, redundancy, sigma0, *_ in rows:
@@ -311,17 +248,15 @@ def test_the_figures_of_the_demonstration_on_the_pages(tmp_path: Path) -> None:
 
 @real_data.needs("film_scans", "aerial")
 @pytest.mark.study
-def test_the_example_of_the_page_of_archives(tmp_path: Path, capsys: Capture) -> None:
+def test_the_example_of_the_page_of_archives(tmp_path: Path, printed: Printed) -> None:
     page = (ROOT / "docs" / "start" / "archive.md").read_text(encoding="utf-8")
-    assert run(["template", "camera", "--marks", "ring-cross", "--square", "212", "--c", "153"]) == DONE
-    drawn = capsys.readouterr().out.partition("[mark.corner]")[0]
-    mark = re.search(r"^    \[mark.corner\]\n(?:    .*\n)+", page, flags=re.MULTILINE)
-    assert mark is not None
+    drawn = printed("template", "camera", "--marks", "ring-cross", "--square", "212", "--c", "153").split("[mark")[0]
+    mark = present(re.search(r"^    \[mark.corner\]\n(?:    .*\n)+", page, flags=re.MULTILINE))
     (tmp_path / "camera.toml").write_text(drawn + textwrap.dedent(mark[0]), encoding="utf-8")
     scan = real_data.DATA / "film_scans" / "aerial" / "0b50b18e.jpeg"
     project = f'camera = "camera.toml"\nscans = ["{scan}"]\n[measure]\ntone = "linear"\nwriting = "none"\n'
     (tmp_path / "project.toml").write_text(project, encoding="utf-8")
-    assert run(["measure", str(tmp_path / "project.toml")]) == LOOK
+    assert command("measure", tmp_path / "project.toml") == LOOK
     rows = (tmp_path / "comparator.csv").read_text(encoding="utf-8").splitlines()
     shown = re.findall(r"^    (0b50b18e,.*)$", page, flags=re.MULTILINE)
     assert len(shown) == 2
@@ -333,7 +268,7 @@ def test_the_example_of_the_page_of_archives(tmp_path: Path, capsys: Capture) ->
 def test_the_table_of_the_page_of_boards(tmp_path: Path, capsys: Capture) -> None:
     pictures = sorted((real_data.DATA / "chessboards" / "opencv").glob("left[0-9]*.jpg"))
     options = ("--board", "9x6", "--square", "25mm", "--json", "--out", str(tmp_path / "out"))
-    run(["calibrate", *map(str, pictures), *options])
+    command("calibrate", *pictures, *options)
     (camera,) = json.loads(capsys.readouterr().out)["cameras"]
     page = ROOT / "docs" / "start" / "board.md"
     rows = table(page, "parameter")

@@ -11,21 +11,19 @@ import numpy as np
 import pytest
 from networks import Truth, field_points, simulated
 from numpy.typing import NDArray
-from projects import Refusal, write_network_project
+from projects import Refusal, command, present, write_network_project
 
 from adjust import Parameter, adjust, approximate
 from adjust.functional_model.lens import Lens
-from adjust.quality.cofactor import larger_covariance
 from adjust.quality.lens_uncertainty import distortion_curves
 from measure.flags import NO_REASON, Status
 from pipeline import build_network, read_comparator, read_project
-from pipeline.cli import run
 from pipeline.drawing.svg import round_step, ticks
 from pipeline.report import Thumbnail
 from pipeline.report.data import Mark, natural
 from pipeline.report.fiducials import Figure, figure_of_films, figure_plot
 from pipeline.report.frame_views import SIZE_PX, mark_picture
-from pipeline.report.lens import curves_plot, largest_effects_um, lens, lens_map
+from pipeline.report.lens import curves_plot, lens, lens_map
 from pipeline.report.load import report_data
 from pipeline.report.numbers import value_and_sigma
 from pipeline.report.parameters import high_correlations, parameter_rows
@@ -97,8 +95,7 @@ def crosshair(picture: str) -> NDArray[np.float64]:
 def take_picture(picture: str) -> NDArray[np.float64]:
     data = re.search(r"base64,([^\"]+)", picture)
     assert data
-    image = cv2.imdecode(np.frombuffer(base64.b64decode(data[1]), np.uint8), cv2.IMREAD_UNCHANGED)
-    assert image is not None
+    image = present(cv2.imdecode(np.frombuffer(base64.b64decode(data[1]), np.uint8), cv2.IMREAD_UNCHANGED))
     return image.astype(float)
 
 
@@ -166,8 +163,7 @@ def test_coverage_is_counted_in_the_cell_of_each_observation() -> None:
 def test_contours_of_a_field_that_grows_to_the_right_are_upright_lines_at_their_values() -> None:
     x_mm, y_mm = np.linspace(-60.0, 60.0, 25), np.linspace(-30.0, 30.0, 13)
     sigma_um = np.broadcast_to((x_mm + 60.0) / 12.0, (13, 25))  # 0 at the left edge, 10 at the right
-    plot = contour_plot(FRAME, x_mm, y_mm, sigma_um, "field")
-    assert plot is not None
+    plot = present(contour_plot(FRAME, x_mm, y_mm, sigma_um, "field"))
     lines = re.findall(r'<path d="([^"]+)" class="contour"', plot)
     places = sorted(round(np.median([float(v) for v in re.findall(r"[\d.]+", line)[::2]]), 1) for line in lines)
     labels = sorted(float(text) for text in re.findall(r'class="contour-label"[^>]*>([\d.]+)<', plot))
@@ -191,61 +187,6 @@ def camera(family: str, c_mm: float = 153.0, **parameters: float) -> CameraRecor
 
 def covariance(name: str, parameters: tuple[str, ...], matrix: Array) -> Covariance:
     return Covariance(tuple(Parameter.interior(name, each) for each in parameters), np.zeros(len(parameters)), matrix)
-
-
-def test_a_covariance_is_enlarged_in_the_directions_in_which_leaving_out_images_scatters_more() -> None:
-    keys = tuple(Parameter.interior("K", each) for each in ("c", "x0"))
-    model, along = np.array([[4.0, 1.0], [1.0, 1.0]]), np.array([[1.0, -1.0]])
-    clusters = Covariance(keys, np.zeros(2), 25.0 * along.T @ along)
-    known = Covariance(keys, np.zeros(2), model, clusters=clusters)
-    larger = known.select_larger((*keys, Parameter.interior("K", "k1")))
-    assert np.linalg.eigvalsh(larger[:2, :2] - model).min() > -1e-9
-    assert np.linalg.eigvalsh(larger[:2, :2] - clusters.matrix).min() > -1e-9
-    assert not larger[2].any()
-    assert Covariance(keys, np.zeros(2), model).select_larger(keys).tolist() == model.tolist()
-    fixed = np.array([[4.0, 2.0], [2.0, 1.0]])  # of one direction: a converted lens with more parameters than before
-    np.testing.assert_allclose(larger_covariance(fixed, 9.0 * fixed), 9.0 * fixed, atol=1e-12)
-    np.testing.assert_allclose(larger_covariance(fixed, 0.0 * fixed), fixed, atol=1e-12)
-
-
-def test_the_radial_curve_of_torlegard_is_its_polynomial_and_its_sigma_follows() -> None:
-    """dr = k3 r³ + k5 r⁵; with the correlation of k3 and k5 its variance is a quadratic form in (r³, r⁵)."""
-    k3, k5, s3, s5, rho = 1.7e-7, -5.4e-12, 3e-9, 2e-13, -0.97
-    matrix = np.array([[s3**2, rho * s3 * s5], [rho * s3 * s5, s5**2]])
-    drawn = distortion_curves(
-        lens("A", camera("torlegard", k3=k3, k5=k5), covariance("A", ("k3", "k5"), matrix)), RADIUS_MM
-    )  # fmt: skip
-    r = drawn.radius_mm
-    np.testing.assert_allclose(drawn.radial_um, 1e3 * (k3 * r**3 + k5 * r**5), rtol=1e-10)
-    variance = (s3 * r**3) ** 2 + (s5 * r**5) ** 2 + 2.0 * rho * s3 * s5 * r**8
-    np.testing.assert_allclose(drawn.radial_sigma_um, 1e3 * np.sqrt(variance), rtol=1e-8)
-    np.testing.assert_allclose(drawn.asymmetric_um, 0.0, atol=1e-9)
-
-
-def test_the_opencv_family_is_drawn_as_opencv_undistorts() -> None:
-    c, pitch = 20.0, 0.005
-    k = (-0.12, 0.08, 0.0, 0.0, -0.01)
-    of = lens("A", camera("opencv", c, k1=k[0], k2=k[1], k3=k[4]))
-    angles = np.linspace(0.0, 2.0 * np.pi, 13)
-    observed = np.concatenate(
-        [radius * np.stack([np.cos(angles), np.sin(angles)], axis=1) for radius in (2.0, 6.0, 9.0)]
-    )
-    matrix = np.array([[c / pitch, 0.0, 0.0], [0.0, c / pitch, 0.0], [0.0, 0.0, 1.0]])
-    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-15)
-    pixels = (observed * (1.0, -1.0) / pitch)[:, None, :]
-    rays = cv2.undistortPoints(pixels, matrix, np.array(k), criteria=criteria)
-    ideal = c * rays.reshape(-1, 2) * (1.0, -1.0)
-    np.testing.assert_allclose(of.displacement(observed).value_um, 1e3 * (observed - ideal), atol=1e-6)
-
-
-def test_the_effect_of_a_parameter_is_the_displacement_it_makes() -> None:
-    effects = largest_effects_um(lens("A", camera("torlegard")), RADIUS_MM)
-    assert effects["k3"] == pytest.approx(1e3 * RADIUS_MM**3)
-    assert effects["p2"] == pytest.approx(3e3 * RADIUS_MM**2)
-    # 2 (ξ² - 2/3) is largest in the middle, 4/3 mm, where ξη is 0.
-    entry = camera("ebner", b3=0.01)
-    entry = replace(entry, distortion=replace(entry.distortion, half_mm=(114.0, 90.0)))
-    assert largest_effects_um(lens("A", entry), RADIUS_MM)["b3"] > 1e3 * 4 / 3 * np.sqrt(90 / 114)
 
 
 WIDE_FRAME = Plane(np.array([[-75.0, -75.0], [75.0, 75.0]]), 500.0)
@@ -312,9 +253,7 @@ def fiducials(estimated: Array) -> dict[str, FiducialRecord]:
 
 def changed(estimated: Array, matrix: Array) -> Figure:
     places = tuple(Parameter.fiducial("A", str(i), axis) for i in range(len(GIVEN)) for axis in "xy")
-    form = figure_of_films("A", fiducials(estimated), Covariance(places, estimated.ravel(), matrix), {})
-    assert form is not None
-    return form
+    return present(figure_of_films("A", fiducials(estimated), Covariance(places, estimated.ravel(), matrix), {}))
 
 
 def test_a_similarity_changes_no_form_and_a_displaced_mark_does() -> None:
@@ -337,7 +276,7 @@ def adjusted_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rng, truth = np.random.default_rng(4), Truth()
     network, _ = simulated(rng, truth, points=field_points(rng, 20), free=dict.fromkeys(truth.distortion, np.inf))
     project = write_network_project(network, tmp_path_factory.mktemp("simulated"))
-    assert run(["adjust", str(project)]) in (0, 1)
+    assert command("adjust", project) in (0, 1)
     return project
 
 
@@ -363,9 +302,7 @@ def test_plots_that_cannot_be_made(
 ) -> None:
     for name in ("camera.toml", "points.csv", "comparator.csv", "project.toml"):
         (tmp_path / name).write_bytes((adjusted_folder.parent / name).read_bytes())
-    assert "There is no calibrated camera to plot." in refusal(
-        ["report", str(tmp_path / "project.toml"), "--plots", str(tmp_path / "plots")]
-    )
+    assert "no calibrated camera to plot." in refusal("report", tmp_path / "project.toml", "--plots", tmp_path / "p")
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    assert "--plots needs Matplotlib" in refusal(["report", str(adjusted_folder), "--plots", str(tmp_path / "plots")])
+    assert "--plots needs Matplotlib" in refusal("report", adjusted_folder, "--plots", tmp_path / "plots")
     assert not (tmp_path / "plots").exists()

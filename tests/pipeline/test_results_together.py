@@ -1,19 +1,36 @@
-"""Results say what they were made from, take their places together, and never that of somebody's file."""
+"""Results say what they were made from, take their places together whatever ends a command, never that of a file."""
 
 import errno
 import json
 import os
+import random
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from in_process import Loses
-from projects import Capture, Refusal, Spoil, change_camera, change_project, comparator_points, keep_scans, replace_text
+from in_process import Loses, wait_until
+from projects import (
+    Capture,
+    Refusal,
+    Spoil,
+    change_camera,
+    change_project,
+    command,
+    comparator_points,
+    keep_scans,
+    replace_text,
+    scan_content,
+)
 from test_command_line import results, rewritten_scans
 
 from adjust import Prior
@@ -21,7 +38,6 @@ from measure import Status
 from pipeline import read_measurement, read_project, stages
 from pipeline.adjusting import second_visit
 from pipeline.archive.made_from import measured_from
-from pipeline.cli import run
 from pipeline.provenance import fingerprint, parts_hash
 from pipeline.report.load import adjusted_data
 from pipeline.results.comparator_file import write_comparator
@@ -31,27 +47,18 @@ from pipeline.summary import summarise
 
 def load_summary(folder: Path) -> tuple[int, dict[str, Any]]:
     """Exit code and summary that `reseau report` has of what stands in the folder."""
-    data = adjusted_data(read_project(folder / "project.toml"), lambda path: path)
-    own_summary = summarise(data, {})
-    return own_summary.verdict.exit_code, own_summary.as_json()
+    own = summarise(adjusted_data(read_project(folder / "project.toml"), lambda path: path), {})
+    return own.verdict.exit_code, own.as_json()
 
 
-def summary(folder: Path, capsys: Capture, command: str) -> tuple[int, dict[str, Any]]:
+def summary(folder: Path, capsys: Capture, name: str) -> tuple[int, dict[str, Any]]:
     capsys.readouterr()
-    code = run([command, str(folder / "project.toml"), "--json"])
+    code = command(name, folder / "project.toml", "--json")
     return code, json.loads(capsys.readouterr().out)
 
 
 def join_problems(told: dict[str, Any]) -> str:
     return " ".join(problem["what"] for problem in told["problems"])
-
-
-def measured_as(folder: Path, scans: tuple[MeasuredScan, ...]) -> None:
-    """The files that `reseau measure` would leave if it had measured this."""
-    project = read_project(folder / "project.toml")
-    digest = keep_scans(project.measurement_path, scans, measured_from(project))
-    frames, pitch_um = [scan.frame for scan in scans], {scan.frame.image: scan.pitch_um for scan in scans}
-    write_comparator(project.comparator, comparator_points(frames, pitch_um), pitch_um, digest)
 
 
 def one_scan_more(folder: Path) -> MeasuredScan:
@@ -66,14 +73,19 @@ def test_a_finished_project_is_current(finished: tuple[Path, int]) -> None:
     project, code = finished
     after, own_summary = load_summary(project)
     assert after == code
-    assert own_summary["adjustment"] is not None
-    assert own_summary["check"] is not None
+    assert None not in (own_summary["adjustment"], own_summary["check"])
     assert not [name for name in os.listdir(project / "out") if name.startswith(".")]
 
 
 def test_an_adjustment_of_one_scan_less_is_not_shown(project: Path, capsys: Capture) -> None:
-    more = one_scan_more(project)
-    measured_as(project, (*read_measurement(project / "out" / "measurement.db"), more))
+    """As `reseau measure` leaves the files."""
+    path = project / "out" / "measurement.db"
+    scans = (*read_measurement(path), one_scan_more(project))
+    digest = keep_scans(path, scans, measured_from(read_project(project / "project.toml")))
+    pitch_um = {scan.frame.image: scan.pitch_um for scan in scans}
+    write_comparator(
+        project / "comparator.csv", comparator_points([scan.frame for scan in scans], pitch_um), pitch_um, digest
+    )
     code, own_summary = summary(project, capsys, "report")
     assert code == 1
     assert own_summary["sentence"].startswith("Measured: ")
@@ -114,7 +126,7 @@ def old(name: str) -> Spoil:
     def change(folder: Path) -> None:
         data = (folder / "out" / name).read_bytes()
         surer_camera(folder)
-        assert run(["adjust", str(folder / "project.toml")]) in (0, 1)
+        assert command("adjust", folder / "project.toml") in (0, 1)
         (folder / "out" / name).write_bytes(data)
 
     return change
@@ -180,15 +192,13 @@ def test_a_check_writes_nothing_but_its_own_file(project: Path, refusal: Refusal
 
     before = states()
     (project / "out" / "check.json").unlink()
-    assert run(["check", str(project / "project.toml")]) == 0
+    assert command("check", project / "project.toml") == 0
     assert states() == before
     assert json.loads((project / "out" / "check.json").read_text(encoding="utf-8"))["verdict"] == "agrees"
     surer_camera(project)
-    assert "is of other cameras than there are now. Run `reseau adjust` first." in refusal(
-        ["check", str(project / "project.toml")]
-    )
+    assert "other cameras than there are now. Run `reseau adjust` first." in refusal("check", project / "project.toml")
     (project / "out" / "adjustment.json").unlink()
-    assert "Run `reseau adjust` first." in refusal(["check", str(project / "project.toml")])
+    assert "Run `reseau adjust` first." in refusal("check", project / "project.toml")
 
 
 def test_files_that_say_the_same_in_other_letters_are_the_same(project: Path, tmp_path: Path) -> None:
@@ -210,17 +220,10 @@ def test_files_that_say_the_same_in_other_letters_are_the_same(project: Path, tm
     assert own_summary["poses"]
 
 
-def make_failing(error: BaseException) -> Callable[..., Any]:
-    def fail(*_: object) -> None:
-        raise error
-
-    return fail
-
-
 def test_an_end_after_measuring_leaves_all_as_it_was(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = results(project)
-    monkeypatch.setattr(stages, "adjust_marks", make_failing(KeyboardInterrupt()))
-    assert run(["run", str(project / "project.toml")]) == 130
+    monkeypatch.setattr(stages, "adjust_marks", Mock(side_effect=KeyboardInterrupt))
+    assert command("run", project / "project.toml") == 130
     assert results(project) == before
 
 
@@ -245,7 +248,7 @@ def test_an_ended_second_pass_costs_no_other(project: Path, capsys: Capture, mon
     assert {visit.image for visit in requests if isinstance(visit, second_visit.Visit)} > {"frame1", "frame2"}
 
 
-def test_a_place_that_cannot_be_taken_is_named(project: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_place_that_is_held_is_named(project: Path, refusal: Refusal, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = os.replace
 
     def refuse(source: Path, target: Path) -> None:
@@ -254,8 +257,7 @@ def test_a_place_that_cannot_be_taken_is_named(project: Path, capsys: Capture, m
         whole(source, target)
 
     monkeypatch.setattr("pipeline.publishing.os.replace", refuse)
-    assert run(["adjust", str(project / "project.toml")]) == 2
-    message = capsys.readouterr().err
+    message = refusal("adjust", project / "project.toml")
     assert "adjustment.npz: cannot be written (held by another program)" in message
     assert "New are: adjustment.json." in message
     assert ".unfinished" not in message
@@ -277,7 +279,7 @@ def test_what_is_no_result_is_left_alone(project: Path, refusal: Refusal, name: 
         (project / name).write_text(content, encoding="utf-8")
     else:
         (project / name).symlink_to("/dev/null")
-    assert words in refusal(["run", str(project / "project.toml")])
+    assert words in refusal("run", project / "project.toml")
     assert (project / name).read_text(encoding="utf-8") == content
 
 
@@ -294,7 +296,7 @@ def test_inputs_are_never_outputs(project: Path, refusal: Refusal, old: str, new
     shutil.copytree(project / "out", project / "earlier")
     change_camera("[sigma]", '[sigma]\ncalibration = "earlier/adjustment.json"')(project)
     replace_text(project / "project.toml", old, new)
-    assert words in refusal(["run", str(project / "project.toml")])
+    assert words in refusal("run", project / "project.toml")
 
 
 def test_a_folder_outside_the_projects_is_named(project: Path, tmp_path: Path, capsys: Capture) -> None:
@@ -313,7 +315,7 @@ def test_what_an_ended_process_left_is_cleared(project: Path) -> None:
     (project / f".comparator.unfinished.{host}.999999999.csv").touch()
     mine = project / "out" / f".unfinished.{host}.{os.getppid()}"
     mine.mkdir()
-    assert run(["adjust", str(project / "project.toml")]) in (0, 1)
+    assert command("adjust", project / "project.toml") in (0, 1)
     assert not left.exists()
     assert not list(project.glob(".comparator*"))
     assert mine.exists()
@@ -347,3 +349,87 @@ def test_a_scan_counts_as_another_wherever_a_piece_of_it_changes(tmp_path: Path)
             found.add(parts_hash(file))
         assert len(found) == 1 + len(list(places)[:8]), size
     assert parts_hash(tmp_path / "none.tif") == ""
+
+
+END_S = 5.0  # within which every process is to be gone
+LONGEST_S = 300.0
+State = dict[str, bytes]
+
+
+def state(folder: Path) -> State:
+    """The results in a project's folder; what begins with a point has not taken its place."""
+    files = [folder / "comparator.csv", *sorted((folder / "out").rglob("*"))]
+    names = {str(file.relative_to(folder)): file for file in files if file.is_file()}
+    left = {name: file for name, file in names.items() if "/." not in name and not name.endswith(("-wal", "-shm"))}
+    return {name: result for name, file in left.items() if (result := scan_content(file))}
+
+
+def started(folder: Path, command: str) -> subprocess.Popen[bytes]:
+    # What is started in the background of a shell inherits that it hears no interrupt.
+    heard = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    program = f"{heard}; from pipeline.main import main; main()"
+    return subprocess.Popen(
+        [sys.executable, "-c", program, command, str(folder / "project.toml")],
+        start_new_session=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+
+
+def ended(source: Path, folder: Path, command: str, sign: signal.Signals, after_s: float) -> tuple[bool, State, str]:
+    """Whether a command, begun in a copy of a project, ended before it was ended after so many seconds; what stands
+    there then; and what is wrong beside it: processes that run on, or that it took its time."""
+    shutil.copytree(source, folder)
+    parent = started(folder, command)
+    is_early = wait_until(lambda: parent.poll() is not None, after_s)
+    begun = time.monotonic()
+    if not is_early:
+        parent.send_signal(sign)
+    parent.wait(LONGEST_S)
+    wrong = "" if is_early or time.monotonic() - begun < END_S else "not ended in time"
+    wait_until(lambda: not _session(parent.pid), END_S)
+    for pid in _session(parent.pid):
+        os.kill(pid, signal.SIGKILL)
+        wrong = "processes left"
+    found = state(folder)
+    shutil.rmtree(folder)
+    return is_early, found, wrong
+
+
+def _session(leader: int) -> list[int]:
+    """The processes of a session that are no zombies."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            text = (entry / "stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
+        except OSError:
+            continue
+        if text[0] != "Z" and int(text[3]) == leader:
+            found.append(int(entry.name))
+    return found
+
+
+@pytest.mark.study
+def test_two_hundred_kills(rendered_demo: Path, tmp_path: Path) -> None:
+    """Of a project whose results are of other input than it has now."""
+    old, rng = tmp_path / "old", random.Random(2)
+    shutil.copytree(rendered_demo, old)
+    project = old / "project.toml"
+    replace_text(project, ', "scans/frame3.tif"', "")
+    assert command("run", project) in (0, 1)
+    replace_text(old / "camera.toml", "principal_distance_mm = 1.0", "principal_distance_mm = 0.5")
+    project.write_text(f"pitch_um = 45.001\n{project.read_text(encoding='utf-8')}", encoding="utf-8")  # other places
+    earlier, start = state(old), time.monotonic()
+    _, complete, _ = ended(old, tmp_path / "trial", "run", signal.SIGKILL, LONGEST_S)
+    seconds = time.monotonic() - start
+    assert complete.keys() >= earlier.keys() - {"out/check.json", "out/report.html"}
+    assert all(complete[name] != earlier[name] for name in ("out/adjustment.json", "out/adjustment.npz"))
+    faults = []
+    for number in range(200):
+        sign = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)[number % 3]
+        after_s = rng.uniform(0.0, 1.1 * seconds)
+        _, found, wrong = ended(old, tmp_path / "trial", "run", sign, after_s)
+        if wrong or found not in (earlier, complete):
+            names = [name for name in complete if found.get(name) != complete[name]]
+            faults.append(f"{sign.name} after {after_s:.1f} s: {wrong or f'earlier {names}'}")
+    assert not faults, "\n".join(faults)

@@ -1,19 +1,19 @@
 """The review page: who may ask, windows of scans, decisions, and a person's whole session in a real browser."""
 
-import http.client
 import json
 import shutil
 import tracemalloc
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from urllib.parse import quote, urlsplit
+from urllib.parse import quote
 
 import cv2
 import numpy as np
 import pytest
 import tifffile
 from browser import browser_page, needs_browser
-from playwright.sync_api import Browser, Page, Position, expect
+from playwright.sync_api import Browser, Page, expect
+from projects import command
 from review_server import (
     BARE,
     GOOD,
@@ -22,14 +22,15 @@ from review_server import (
     Served,
     comparator,
     decisions,
+    get_cookie,
     mark_px,
+    request,
     served,
     steer,
     write_faults,
 )
 
 from pipeline import read_project
-from pipeline.cli import run
 from pipeline.files.decisions_file import Choice, Decision
 from pipeline.review.pictures import Pictures, _overlapping_pixels
 from pipeline.review.session import Filters, Session
@@ -39,7 +40,7 @@ from pipeline.review.session import Filters, Session
 def measured_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The project's folder, measured once."""
     project = write_faults(tmp_path_factory.mktemp("review") / "faults")
-    assert run(["measure", str(project)]) == 1
+    assert command("measure", project) == 1
     return project.parent
 
 
@@ -57,32 +58,6 @@ def page(browser: Browser, server: Served, measured_folder: Path) -> Iterator[Pa
         one.goto(server.address)
         expect(one.locator("#left")).to_contain_text("3 left: 1 frame, 2 marks")
         yield one
-
-
-# --- who may ask
-
-
-def request(
-    server: Served, path: str, headers: Mapping[str, str] | None = None, method: str = "GET", body: str = ""
-) -> tuple[int, Mapping[str, str], str]:
-    """Status, headers and text of an answer. A Host of None is the server's own."""
-    where = urlsplit(server.address)
-    connection = http.client.HTTPConnection(where.hostname or "", where.port)
-    try:
-        connection.request(method, path, body or None, dict(headers or {}))
-        answer = connection.getresponse()
-        return answer.status, dict(answer.getheaders()), answer.read().decode(errors="replace")
-    finally:
-        connection.close()
-
-
-def get_cookie(server: Served) -> str:
-    status, headers, _ = request(server, f"/?{urlsplit(server.address).query}")
-    assert (status, headers["location"]) == (303, "/")
-    cookie = headers["set-cookie"]
-    assert "HttpOnly" in cookie
-    assert "samesite=strict" in cookie.lower()
-    return cookie.split(";")[0]
 
 
 def test_only_who_has_the_address_is_answered(server: Served) -> None:
@@ -144,9 +119,6 @@ def test_wrong_decisions_are_refused(decision: object, words: str, server: Serve
     assert not (measured_folder / "decisions.jsonl").exists()
 
 
-# --- a person's session
-
-
 @needs_browser
 def test_a_session_by_keyboard_alone_leads_to_the_right_marks(page: Page, measured_folder: Path) -> None:
     rows = comparator(measured_folder)
@@ -174,8 +146,9 @@ def test_a_session_by_keyboard_alone_leads_to_the_right_marks(page: Page, measur
 def test_a_click_in_a_marks_picture_places_it(page: Page, measured_folder: Path) -> None:
     open_entry(page, BARE)
     canvas = page.locator("#mark")
-    where = middle(page, "#mark")
-    canvas.click(position={"x": where["x"] + 56, "y": where["y"]})  # a tenth of the picture's width
+    box = canvas.bounding_box()
+    assert box is not None
+    canvas.click(position={"x": box["width"] / 2 + 56, "y": box["height"] / 2})  # a tenth of the picture's width
     expect(page.locator("#left")).to_contain_text("2 left")
     (one,) = decisions(measured_folder)
     assert (one["decision"], one["image"], one["point"]) == ("place", BARE, "3")
@@ -183,20 +156,12 @@ def test_a_click_in_a_marks_picture_places_it(page: Page, measured_folder: Path)
     assert off_px == pytest.approx((0.1 * one["window"][2], 0.0), abs=1.0)
 
 
-@needs_browser
-def test_names_are_shown_as_text(page: Page) -> None:
-    open_entry(page, BARE)
-    expect(page.locator("#title")).to_contain_text(BARE)
-    assert page.locator("main img, nav img").count() == 0
-
-
-# --- what a person does, and what comes of it
-
-
 def open_entry(page: Page, image: str) -> None:
+    """Its name is shown as text."""
     page.locator("#queue button", has_text=image).first.click()
     expect(page.locator("#title")).to_contain_text(image)
     expect(page.locator("#mark-view")).to_be_visible()
+    assert page.locator("main img, nav img").count() == 0
 
 
 def place_frame_by_keys(page: Page) -> None:
@@ -214,12 +179,6 @@ def place_frame_by_keys(page: Page) -> None:
     page.keyboard.press("Enter")
 
 
-def middle(page: Page, selector: str) -> Position:
-    box = page.locator(selector).bounding_box()
-    assert box is not None
-    return {"x": box["width"] / 2, "y": box["height"] / 2}
-
-
 def check_measured_again(folder: Path, before: Mapping[tuple[str, str], Mapping[str, str]]) -> None:
     """Measured with the decisions: the rows that they are about changed, and no others."""
     copy = folder.parent / "again"
@@ -227,7 +186,7 @@ def check_measured_again(folder: Path, before: Mapping[tuple[str, str], Mapping[
         shutil.copytree(folder, copy, dirs_exist_ok=True)
     except shutil.Error:  # the page's server closed its database meanwhile, whose log is then gone
         shutil.copytree(folder, copy, dirs_exist_ok=True)
-    run(["measure", str(copy / "project.toml")])
+    command("measure", copy / "project.toml")
     after = comparator(copy)
     assert {key for key in before if before[key] != after[key]} == {
         (BARE, "3"),

@@ -11,17 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from drawn import CORNERS, pixel_from_camera
+from drawn import pixel_from_camera
 from moto.server import ThreadedMotoServer
-from numpy.typing import NDArray
-from projects import PROJECT, Capture, Refusal, write_project
+from projects import PLACES, PROJECT, Capture, Refusal, command, write_project
 from range_server import range_server
 
 from measure import Status
 from measure.scans import remote
 from pipeline import InputError, read_comparator, read_project
 from pipeline.archive.scan_groups import Catalogue, catalogue
-from pipeline.cli import LOOK, run
+from pipeline.cli import LOOK
 from pipeline.files.scan_files import find_scans, found_names
 from pipeline.measuring.scan_measurement import measured_scan
 from pipeline.measuring.scan_task import scan_tasks
@@ -82,9 +81,6 @@ def test_a_file_is_one_scan_however_many_links_lead_to_it(folder: Path) -> None:
     assert "scans/7.tif" in find_scans_case(folder, "scans/**/*.tif")
 
 
-Array = NDArray[np.float64]
-
-
 @pytest.fixture(scope="module")
 def roll(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A project of one TIFF: its first page shows frames a and b side by side, its second one b alone."""
@@ -99,11 +95,6 @@ def roll(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def truth(number: int) -> Array:
-    """Where the marks of the first or second frame were drawn."""
-    return np.array([pixel_from_camera("0", 0.004 * number) @ (*place, 1.0) for place in CORNERS])
-
-
 def test_what_a_scan_shows_next_to_the_frame_that_was_measured_needs_attention(roll: Path) -> None:
     scan = measured_scan(scan_tasks(read_project(roll / "project.toml"), ["roll"])[0])
     finding = " ".join(scan.frame.problems)
@@ -113,91 +104,63 @@ def test_what_a_scan_shows_next_to_the_frame_that_was_measured_needs_attention(r
 
 
 def test_pages_and_windows_are_images_of_their_own(roll: Path, capsys: Capture, refusal: Refusal) -> None:
-    width = tifffile.imread(roll / "roll.tif", key=1).shape[1]
+    """Their neighbours are in no rectified scan: the second page shows the second frame alone."""
+    height, width = tifffile.imread(roll / "roll.tif", key=1).shape
     whole = roll / "whole.toml"
     whole.write_text((roll / "project.toml").read_text() + '[object]\nimages = "images.csv"\n')
-    height = tifffile.imread(roll / "roll.tif", key=1).shape[0]
     lines = [f"roll-a,1,0 0 {width} {height}", f"roll-b,1,{width} 0 {width} {height}", "roll-c,2,"]
     (roll / "images.csv").write_text("\n".join(["image,page,window", *lines]) + "\n")
-    assert run(["measure", str(whole)]) in (0, LOOK)
+    assert command("measure", whole) in (0, LOOK)
     rows = {(row.image, row.point): row for row in read_comparator(roll / "comparator.csv")}
-    assert {image for image, _ in rows} == {"roll-a", "roll-b", "roll-c"}
-    first, second = truth(1), truth(2)
-    for image, places in (("roll-a", first), ("roll-b", second + np.array([width, 0])), ("roll-c", second)):
-        for id, place in zip("1234", places, strict=True):
+    assert len(rows) == 3 * 4
+    for image, number, shift_px in (("roll-a", 1, 0), ("roll-b", 2, width), ("roll-c", 2, 0)):
+        for id, place in PLACES.items():
             row = rows[image, id]
             assert row.status is Status.MEASURED
-            np.testing.assert_allclose(np.asarray(row.xy_mm) / 0.05 * (1, -1), place, atol=0.1)
+            drawn = pixel_from_camera("0", 0.004 * number) @ (*place, 1.0) + (shift_px, 0.0)
+            np.testing.assert_allclose(np.asarray(row.xy_mm) / 0.05 * (1, -1), drawn, atol=0.1)
     output = capsys.readouterr().out
     assert "second frame" not in output
     assert "pictures of full size" not in output
-    (roll / "images.csv").write_text("image,window\nother,0 0 10 10\n")
-    assert "no scan is called as it begins" in refusal(["measure", str(whole)])
-    (roll / "images.csv").write_text("image,window\nroll,0 0 0 10\n")
-    assert '"col row width height" in px' in refusal(["measure", str(whole)])
-
-
-def test_a_window_is_resampled_and_its_neighbour_is_not(roll: Path, tmp_path: Path) -> None:
-    """Both frames stood in each rectified scan; the second page shows the second frame alone."""
-    height, width = tifffile.imread(roll / "roll.tif", key=1).shape
-    project = roll / "windows.toml"
-    text = (
-        (roll / "project.toml")
-        .read_text()
-        .replace("[measure]", 'output = "windows"\ncomparator = "windows.csv"\n[measure]')
-    )
-    project.write_text(text + '[object]\nimages = "windows_images.csv"\n')
-    (roll / "windows_images.csv").write_text(
-        f"image,page,window\nroll-a,1,0 0 {width} {height}\nroll-b,1,{width} 0 {width} {height}\nroll-c,2,\n"
-    )
-    assert run(["measure", str(project)]) in (0, LOOK)
-    assert run(["resample", str(project), str(tmp_path), "--pitch-um", "50"]) in (0, LOOK)
-    first, second, alone = (tifffile.imread(tmp_path / f"roll-{name}.tif") for name in "abc")
+    assert command("resample", whole, roll / "frames", "--pitch-um", "50") in (0, LOOK)
+    first, second, alone = (tifffile.imread(roll / "frames" / f"roll-{name}.tif") for name in "abc")
     assert second.shape == alone.shape
     middle = np.s_[10:-10, 10:-10]
     assert np.abs(second[middle].astype(float) - alone[middle]).max() < 0.02 * np.ptp(alone)
     assert max(np.subtract(first.shape, alone.shape)) < 8
+    (roll / "images.csv").write_text("image,window\nother,0 0 10 10\n")
+    assert "no scan is called as it begins" in refusal("measure", whole)
+    (roll / "images.csv").write_text("image,window\nroll,0 0 0 10\n")
+    assert '"col row width height" in px' in refusal("measure", whole)
 
 
 @pytest.fixture(scope="module")
 def store() -> Iterator[Any]:
-    """A client of a store that runs here, with an empty bucket `prints`."""
+    """A client of a store that runs here, with empty buckets."""
     boto3, fsspec = import_module("boto3"), import_module("fsspec")
     server = ThreadedMotoServer(port=0, verbose=False)
     server.start()
     host, port = server.get_host_and_port()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
-        patch.setenv("AWS_ACCESS_KEY_ID", "test")
-        patch.setenv("AWS_SECRET_ACCESS_KEY", "test")
-        patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+        for name, value in {"ACCESS_KEY_ID": "t", "SECRET_ACCESS_KEY": "t", "DEFAULT_REGION": "us-east-1"}.items():
+            patch.setenv(f"AWS_{name}", value)
         fsspec.get_filesystem_class("s3").clear_instance_cache()
         client = boto3.client("s3")
-        client.create_bucket(Bucket="prints")
-        client.create_bucket(Bucket="boxes")
+        for bucket in ("prints", "boxes"):
+            client.create_bucket(Bucket=bucket)
         yield client
     server.stop()
 
 
 @pytest.fixture(scope="module")
 def local(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("local")
-    write_project(folder, ["a", "b"])
-    return folder
+    return write_project(tmp_path_factory.mktemp("local"), ["a", "b"]).parent
 
 
 def write_scan_project(folder: Path, scans: str) -> Path:
     write_project(folder, [], PROJECT.replace('"*.tif"', scans))
     return folder
-
-
-def measure_remote_picture(folder: Path, *options: str) -> int:
-    return run(["measure", str(folder / "project.toml"), *options])
-
-
-def rows(folder: Path) -> list[str]:
-    lines = (folder / "comparator.csv").read_text(encoding="utf-8").splitlines()
-    return [line for line in lines if not line.startswith("#")]
 
 
 def test_names_are_paths_and_contents_tell_copies(store: Any, local: Path, tmp_path: Path) -> None:
@@ -227,7 +190,7 @@ def test_init_of_a_bucket(store: Any, local: Path, tmp_path: Path, monkeypatch: 
         return grouped
 
     monkeypatch.setattr("pipeline.archive.new_project.name_cameras", unnamed)
-    assert run(["init", "s3://boxes/1952/", "--out", str(tmp_path)]) == 1
+    assert command("init", "s3://boxes/1952/", "--out", tmp_path) == 1
     text = (tmp_path / "project.toml").read_text(encoding="utf-8")
     assert 'scans = ["s3://boxes/1952/**/*.tif"]' in text
     assert '# camera = "camera.toml"' in text  # which there is not yet
@@ -238,7 +201,7 @@ def test_init_of_a_bucket(store: Any, local: Path, tmp_path: Path, monkeypatch: 
         "a": "s3://boxes/1952/a.tif",
         "sub/b": "s3://boxes/1952/sub/b.tif",
     }
-    assert run(["init", "s3://nowhere/", "--out", str(tmp_path / "q")]) == 2
+    assert command("init", "s3://nowhere/", "--out", tmp_path / "q") == 2
 
 
 def test_a_bucket_without_scans_and_one_that_is_not_there(store: Any, tmp_path: Path) -> None:
@@ -253,7 +216,7 @@ def test_a_closed_address_costs_no_other(
     monkeypatch.setattr(remote, "_WAITS_S", (0.01,))
     with range_server(local) as server:
         folder = write_scan_project(tmp_path, f'"{server.url}/a.tif", "{server.url}/closed/b.tif"')
-        assert measure_remote_picture(folder, "--workers", "1") == 1
+        assert command("measure", folder / "project.toml", "--workers", "1") == 1
     with sqlite3.connect(folder / "out" / "measurement.db") as db:
         query = "select scan.name, detail ->> '$.failure.code' from result join scan on scan.id = result.scan"
         codes = dict(db.execute(query))
@@ -272,19 +235,19 @@ def test_credentials_are_reported_nowhere(
             server.signature = "s3cr3t2" if signature == "s3cr3t3" else signature
             url, query = server.url.replace("://", "://ann:hunter2@"), f"X-Amz-Date=1&X-Amz-Signature={signature}"
             folder = write_scan_project(tmp_path / "p", f'"{url}/a.tif?{query}", "{url}/b.tif?{query}"')
-            code = measure_remote_picture(folder, "--workers", "2")
+            code = command("measure", folder / "project.toml", "--workers", "2")
             captured = capsys.readouterr()
             assert f"{left} scans measured in an earlier run" in captured.err or not left
             assert code == (0 if left else 2)  # where no scan can be read
-            run(["report", str(folder / "project.toml")])
-            run(["status", str(folder / "project.toml"), "--csv"])
+            command("report", folder / "project.toml")
+            command("status", folder / "project.toml", "--csv")
             after = capsys.readouterr()
             result = [captured.out, captured.err, after.out, after.err]
             result += [path.read_bytes().decode("latin-1") for path in folder.rglob("*") if path.is_file()]
             result = [text for text in result if "scans = [" not in text]  # the user's own file
             for secret in ("s3cr3t", "hunter2", "ann:"):
                 assert not [text for text in result if secret in text], secret
-    assert {row.partition(",")[0] for row in rows(folder)[1:]} == {"a", "b"}
+    assert {mark.image for mark in read_comparator(folder / "comparator.csv")} == {"a", "b"}
 
 
 @pytest.mark.parametrize(

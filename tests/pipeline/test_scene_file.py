@@ -18,7 +18,7 @@ from pipeline import InputError, read_camera, read_project
 from pipeline.rendered.scene_file import read_scene, render_project
 from pipeline.rendered.scene_project import write_project
 from synthetic_images.frame import frame_truth
-from synthetic_images.scene import BoardField, ChipMark, DrawnMark
+from synthetic_images.scene import ChipMark, DrawnMark
 from synthetic_images.targets import field_targets
 
 TEMPLATE = resources.files("pipeline").joinpath("templates", "scene.toml").read_text(encoding="utf-8")
@@ -90,8 +90,10 @@ def test_the_template_becomes_a_project_and_its_truth(rendered_template: Rendere
 
 def test_what_is_given_has_the_errors_that_the_scene_asks_for(tmp_path: Path) -> None:
     text = changed("point_sigma = [0.0, 0.0]", "point_sigma = [0.002, 0.004]")
+    text = changed("# bend_um = {a20", "bend_um = {a20", text)
     scene_file = read_scene(written(tmp_path, text))
     write_project(scene_file, tmp_path)
+    assert 'scanner = "auto"' in (tmp_path / "project.toml").read_text(encoding="utf-8")
     given = read_camera(tmp_path / "camera.toml")
     assert given.principal_distance_mm != 60.0
     assert given.principal_distance_mm == pytest.approx(60.0, abs=5 * 0.2)
@@ -156,24 +158,19 @@ def test_a_mark_cut_from_a_scan_is_drawn_and_given(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("field", "board"),
     [
-        ('kind = "chessboard"\ncolumns = 7\nrows = 5\nsquare_mm = 90.0', ChessboardSpec(7, 5, 90.0)),
-        (
-            'kind = "circle-grid"\ncolumns = 7\nrows = 5\nspacing_mm = 90.0\ndiameter_mm = 40.0\nasymmetric = true',
-            CircleGridSpec(7, 5, 90.0, 40.0, True),
-        ),
+        ("square_mm = 90.0", ChessboardSpec(7, 5, 90.0)),
+        ("spacing_mm = 90.0\ndiameter_mm = 40.0\nasymmetric = true", CircleGridSpec(7, 5, 90.0, 40.0, True)),
     ],
 )
 def test_boards_have_their_points(tmp_path: Path, field: str, board: ChessboardSpec | CircleGridSpec) -> None:
-    text = TEMPLATE[: TEMPLATE.index("\n[field]")] + f'\n[field]\nunit = "mm"\n{field}\n' + TEMPLATE[IMAGES:]
-    text = text.replace("[[image]]", "[scan]\npitch_um = 45.0\n\n[[image]]", 1)
-    scene_file = read_scene(written(tmp_path, text))
+    kind = "chessboard" if isinstance(board, ChessboardSpec) else "circle-grid"
+    table = f'[field]\nunit = "mm"\nkind = "{kind}"\ncolumns = 7\nrows = 5\n{field}\n[scan]\npitch_um = 45.0\n'
+    scene_file = read_scene(written(tmp_path, TEMPLATE[: TEMPLATE.index("[field]\n")] + table + TEMPLATE[IMAGES:]))
     write_project(scene_file, tmp_path)
     points = {target.id: tuple(target.center) for target in field_targets(scene_file.scene.field)}
     assert points == {id: pytest.approx(place) for id, place in board.object_points().items()}
-    project = tomllib.loads((tmp_path / "project.toml").read_text(encoding="utf-8"))
-    assert isinstance(scene_file.scene.field, BoardField)
-    assert project["targets"]["kind"] == scene_file.scene.field.kind
-    assert project["targets"]["columns"] == 7
+    targets = tomllib.loads((tmp_path / "project.toml").read_text(encoding="utf-8"))["targets"]
+    assert (targets["kind"], targets["columns"]) == (kind, 7)
 
 
 @pytest.mark.parametrize(
@@ -203,16 +200,15 @@ def test_a_wrong_scene_file_says_what_is_wrong(tmp_path: Path, old: str, new: st
 
 def test_a_scene_that_cannot_be_rendered_is_refused(tmp_path: Path) -> None:
     (tmp_path / "camera.toml").write_text('name = "mine"', encoding="utf-8")
-    with pytest.raises(InputError, match=r"holds camera.toml, which would be overwritten.*Name another folder"):
-        render_project(written(tmp_path, TEMPLATE), tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {"camera.toml", "scene.toml"}
-    with pytest.raises(InputError, match=r"nowhere\.toml: there is no such file"):
-        read_scene(tmp_path / "nowhere.toml")
-    with pytest.raises(InputError, match="at least one image"):
-        read_scene(written(tmp_path, TEMPLATE[:IMAGES]))
-    bare = TEMPLATE[: TEMPLATE.index("[[field.grid]]")] + TEMPLATE[TEMPLATE.index("[picture]") :]
-    with pytest.raises(InputError, match="no target"):
-        read_scene(written(tmp_path, bare))
     path = written(tmp_path, TEMPLATE)
+    with pytest.raises(InputError, match=r"holds camera.toml, which would be overwritten.*Name another folder"):
+        render_project(path, tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"camera.toml", "scene.toml"}
     with pytest.raises(InputError, match="cannot be written"):
         render_project(path, path / "out")
+    with pytest.raises(InputError, match=r"nowhere\.toml: there is no such file"):
+        read_scene(tmp_path / "nowhere.toml")
+    bare = TEMPLATE[: TEMPLATE.index("[[field.grid]]")] + TEMPLATE[TEMPLATE.index("[picture]") :]
+    for text, words in ((TEMPLATE[:IMAGES], "at least one image"), (bare, "no target")):
+        with pytest.raises(InputError, match=words):
+            read_scene(written(tmp_path, text))

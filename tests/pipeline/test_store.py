@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from projects import FOLDER, changed, comparator_points, content, failed, kept_result, made_record, stored
+from projects import FOLDER, changed, comparator_points, content, failed, kept_result, made_record, present, stored
 
 from measure import Code, Reason, Status
 from pipeline import InputError
@@ -59,8 +59,7 @@ def test_a_judging_changes_what_is_visible_and_not_what_was_measured(path: Path)
         doubted = changed(made_record(1), [2], Status.WEAK, Reason("the others say otherwise", Code.OFF_GIVEN))
         now = [doubted, made_record(2, problems=(Reason("it is the frame of 1.", Code.COPY),))]
         frames = [CheckedResult(row, scan) for row, scan in zip(rows, now, strict=True)]
-        judging = find_judging(store, judge(store, {"settings": "a"}, "input", frames).digest)
-        assert judging is not None
+        judging = present(find_judging(store, judge(store, {"settings": "a"}, "input", frames).digest))
         assert judging.made_from == {"settings": "a"}
         assert contents(judging) == [content(scan) for scan in now]
         assert [stored(store, row, name) for row, name in zip(rows, "12", strict=True)] == [
@@ -102,8 +101,7 @@ def test_a_lot_whose_input_was_tested_is_not_tested_again(path: Path) -> None:
         anew = contents(again)
         rows = list(comparator_lines(again.points(), {}))
     with Store(path) as store:
-        judging = find_judging(store, second.digest)
-        assert judging is not None
+        judging = present(find_judging(store, second.digest))
         assert contents(judging) == anew
         assert list(comparator_lines(judging.points(), {})) == rows
         points = comparator_points([scan.frame for scan in judging.scans()], judging.pitches_um())
@@ -150,19 +148,15 @@ def test_what_is_no_store_is_refused(path: Path, tmp_path: Path) -> None:
         Store(path)
     path.unlink()
     opened(path).close()
-    with sqlite3.connect(path) as db:
-        db.execute(f"pragma user_version = {MEASUREMENTS.version + 1}")
-    with pytest.raises(InputError, match="a later reseau"):
-        Store(path)
-    with sqlite3.connect(path) as db:
-        db.execute(f"pragma user_version = {MEASUREMENTS.first - 1}")
-    with pytest.raises(InputError, match="before the first release"):
-        Store(path)
+    for version, words in ((MEASUREMENTS.version + 1, "a later reseau"), (MEASUREMENTS.first - 1, "before the first")):
+        with sqlite3.connect(path) as db:
+            db.execute(f"pragma user_version = {version}")
+        with pytest.raises(InputError, match=words):
+            Store(path)
     with Store(tmp_path / "a.db") as store:
-        with pytest.raises(InputError, match="there is no such results database"):
-            merge(store, [tmp_path / "b.db"])
-        with pytest.raises(InputError, match="joined into"):
-            merge(store, [tmp_path / "a.db"])
+        for name, words in (("b.db", "there is no such results database"), ("a.db", "joined into")):
+            with pytest.raises(InputError, match=words):
+                merge(store, [tmp_path / name])
 
 
 WRITER = """
@@ -210,12 +204,11 @@ def test_failed_scans_are_tried_again_only_when_requested(path: Path) -> None:
 def test_verdicts_of_scans() -> None:
     good, counts = made_record(), {"ann": 1}
     answered = changed(good, [0], Status.REJECTED, Reason("rejected by ann", Code.DECIDED))
-    assert good.frame.pose is not None
     verdicts: list[tuple[MeasuredScan, Verdict]] = [
         (good, Verdict.GOOD),
         (made_record(status=Status.WEAK), Verdict.LOOK),
         (made_record(problems=(LOOK,)), Verdict.LOOK),
-        (made_record(pose=replace(good.frame.pose, decided=False)), Verdict.LOOK),
+        (made_record(pose=replace(present(good.frame.pose), decided=False)), Verdict.LOOK),
         (made_record(status=Status.ABSENT), Verdict.POOR),
         (made_record(pixel_from_camera=None), Verdict.POOR),
         (changed(good, range(2, 8), Status.REJECTED, LOOK), Verdict.POOR),

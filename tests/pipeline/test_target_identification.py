@@ -4,20 +4,17 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import tifffile
 from numpy.typing import NDArray
-from projects import Refusal, measure_scan, write_tables
+from projects import measure_scan, present, replace_text, write_tables
 from real_data import DATA, needs
 
-from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.projection import ImageModel
-from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.transformation import Film
 from measure import Status, open_scan
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement
@@ -65,72 +62,6 @@ def test_a_regular_grid_is_laid_next_to_its_prediction() -> None:
         np.testing.assert_allclose(predicted[target] - grid[mark], (30.0, -20.0))
 
 
-def test_eccentricity_and_place_of_a_disk_are_those_of_the_rendered_one(rendered_demo: Path) -> None:
-    truth = json.loads((rendered_demo / "truth.json").read_text(encoding="utf-8"))
-    (camera,) = truth["cameras"].values()
-    radius = 0.013  # m
-    largest = 0.0
-    for frame in truth["images"].values():
-        model, pitch = true_model(camera, frame), tuple(frame["pitch_um"])
-        centers, normals, true_px, ellipse_px = shown_disks(truth, frame)
-        place_px, maps, perspective, visible = disk_images(model, pitch, centers, normals, radius)
-        assert visible.all()
-        # A point of the plane ten radii off, moved by perspective by up to 0.8 px: film and lens hardly bend here.
-        off_px = maps @ (6.0, 8.0)
-        first, second = across(normals)
-        far, _ = model.comparator_from_object(centers + radius * (6.0 * first + 8.0 * second))
-        projected_px = place_px + off_px / (1.0 + np.sum(perspective * off_px, axis=1))[:, None]
-        np.testing.assert_allclose(pixel_from_comparator(far, pitch), projected_px, atol=0.03)
-        np.testing.assert_allclose(place_px, true_px, atol=1e-6)
-        off_px = pixel_from_comparator(eccentricity_mm(model, centers, normals, radius), pitch)
-        np.testing.assert_allclose(off_px, ellipse_px - true_px, atol=2e-5)
-        largest = max(largest, float(np.abs(off_px).max()))
-    assert largest > 0.005  # or there was nothing to see
-
-
-def shown_disks(truth: dict[str, Any], frame: dict[str, Any]) -> tuple[Array, Array, Array, Array]:
-    """Centres, normals, places and middles of the ellipses of a frame's visible disks."""
-    shown = {id: place for id, place in frame["targets"].items() if place["visible"]}
-    points = [truth["points"][id] for id in shown]
-    return (
-        np.array([[point[axis]["value"] for axis in "XYZ"] for point in points]),
-        np.array([point["normal"] for point in points]),
-        np.array([(place["col_px"], place["row_px"]) for place in shown.values()]),
-        np.array([(place["ellipse_col_px"], place["ellipse_row_px"]) for place in shown.values()]),
-    )
-
-
-def true_model(camera: dict[str, Any], frame: dict[str, Any]) -> ImageModel:
-    distortion, exterior, film = camera["distortion"], frame["exterior"], frame["transformation"]
-    point = camera["principal_point_mm"]
-    angles = np.deg2rad([exterior[name]["value"] for name in ("omega_deg", "phi_deg", "kappa_deg")])
-    return ImageModel(
-        Lens(
-            Distortion(distortion["family"], {}, distortion["decentering"], distortion["r0_mm"]),
-            np.array([camera["principal_distance_mm"]["value"], *(point[axis]["value"] for axis in "xy")]),
-            np.array([distortion[name]["value"] for name in parameter_names(distortion["family"])]),
-        ),
-        rotation_from_angles(angles),
-        np.array([exterior[name]["value"] for name in ("X0", "Y0", "Z0")]),
-        Film("affine", np.array([film[name]["value"] for name in ("a1", "a2", "a3", "b1", "b2", "b3")]), np.zeros(2)),
-    )
-
-
-def test_normals_of_a_flat_field_are_its_planes_and_face_the_camera() -> None:
-    rng = np.random.default_rng(1)
-    coordinates = np.column_stack([rng.uniform(-1.0, 1.0, (6, 2)), np.zeros(6)])
-    plane = plane_normal(coordinates)
-    ids = [str(i) for i in range(6)]
-    below = np.array([0.0, 0.0, -5.0])
-    normals, known = disk_normals(ids, coordinates, {"2": np.array([1.0, 0.0, 0.0])}, plane, below)
-    assert known.all()
-    np.testing.assert_allclose(normals[0], (0.0, 0.0, -1.0), atol=1e-12)
-    np.testing.assert_allclose(normals[2], (1.0, 0.0, 0.0))
-    _, known = disk_normals(ids, coordinates, {}, None, below)
-    assert not known.any()
-    assert plane_normal(rng.uniform(-1.0, 1.0, (6, 3))) is None
-
-
 PINHOLE = ImageModel(
     Lens(Distortion("none", {}), np.array([100.0, 0.0, 0.0]), np.empty(0)),
     np.eye(3),
@@ -164,28 +95,26 @@ def test_eccentricities_are_those_of_the_outline_also_at_seven_digits() -> None:
     np.testing.assert_allclose(there, eccentricity_mm(PINHOLE, centers, normals, 0.013), rtol=0.0, atol=1e-12)
 
 
+def test_places_in_the_plane_of_a_disk_follow_from_its_perspective() -> None:
+    """Ten radii off, moved by it by 10 px."""
+    centers, normals = np.array([[0.8, -0.5, -3.0], [-1.0, 0.6, -2.7]]), np.array([[0.6, 0.0, 0.8], [0.36, -0.48, 0.8]])
+    radius, pitch = 0.01, (20.0, 20.0)
+    place_px, maps, perspective, _ = disk_images(PINHOLE, pitch, centers, normals, radius)
+    first, second = across(normals)
+    far, _ = PINHOLE.comparator_from_object(centers + radius * (6.0 * first + 8.0 * second))
+    off_px = maps @ (6.0, 8.0)
+    projected_px = place_px + off_px / (1.0 + np.sum(perspective * off_px, axis=1))[:, None]
+    np.testing.assert_allclose(pixel_from_comparator(far, pitch), projected_px, atol=0.05)
+
+
 SCENE = """seed = 3
-[camera]
-name = "c"
-frame_mm = [24.0, 16.0]
-principal_distance_mm = 20.0
-[scan]
-pitch_um = 20.0
-margin_mm = 0.1
-noise = 0.01
-[[image]]
-name = "a"
-position = [0.9, -0.4, 2.3]
-angles_deg = [10.0, 22.0, 130.0]
+camera = {{name = "c", frame_mm = [24.0, 16.0], principal_distance_mm = 20.0}}
+scan = {{pitch_um = 20.0, margin_mm = 0.1, noise = 0.01}}
+image = [{{name = "a", position = [0.9, -0.4, 2.3], angles_deg = [10.0, 22.0, 130.0]}}]
 [field]
 surround = 1.5
+scatter = [{{first = 5001, points = 20, right = [2.2, 0.0, 0.0], up = [0.0, 1.5, 0.0], relief = 0.35}}]
 {field}
-[[field.scatter]]
-first = 5001
-points = 20
-right = [2.2, 0.0, 0.0]
-up = [0.0, 1.5, 0.0]
-relief = 0.35
 """
 CROSSES = 'kind = "crosses"\narm_mm = 45.0\nline_mm = 12.0'
 RINGS = 'kind = "coded-rings"\ndiameter_mm = 36.0\nevery = 2'
@@ -214,11 +143,7 @@ def rendered(scene: Path, folder: Path) -> tuple[Path, dict[str, Array]]:
 
 def errors(scan: MeasuredScan, places: dict[str, Array]) -> dict[str, Array]:
     marks = {mark.point: mark for mark in scan.frame.marks if mark.status.is_observation}
-    return {id: error(marks[id], place) for id, place in places.items() if id in marks}
-
-
-def error(mark: MarkMeasurement, place: Array) -> Array:
-    return np.asarray(mark.center_px) - place
+    return {id: np.asarray(marks[id].center_px) - place for id, place in places.items() if id in marks}
 
 
 @pytest.mark.study
@@ -231,18 +156,6 @@ def test_crosses_in_space_with_no_principal_distance(scenes: dict[str, Path], tm
     off = errors(scan, places)
     assert len(off) == len(places) > 12
     assert max(np.abs(one).max() for one in off.values()) < 0.03
-
-
-@pytest.mark.study
-def test_an_orientation_that_does_not_fit_is_not_used(scenes: dict[str, Path], tmp_path: Path) -> None:
-    project, places = rendered(scenes[CROSSES], tmp_path)
-    turned = "image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg\na,-1.2,0.9,2.0,-25.0,-30.0,-90.0\n"
-    (tmp_path / "images.csv").write_text(turned, encoding="utf-8")
-    text = project.read_text(encoding="utf-8")
-    project.write_text(text.replace("[object]", '[object]\nimages = "images.csv"'), encoding="utf-8")
-    scan = measure_scan(read_project(project), "a")
-    assert len(errors(scan, places)) == len(places)
-    assert any("orientation in images.csv was not used" in problem for problem in scan.frame.problems)
 
 
 @pytest.mark.study
@@ -281,28 +194,26 @@ def test_a_ring_read_twice_is_the_one_at_its_place(scenes: dict[str, Path], tmp_
     assert marks[second].reason == f"the ring at its place reads as {first}"
 
 
-CODED = 'kind = "coded-ring"\ndiameter_mm = 200.0\n[targets.codes]\nt8 = 23\nt12 = 347\n'
+def test_normals_of_a_flat_field_are_its_planes_and_face_the_camera() -> None:
+    rng = np.random.default_rng(1)
+    coordinates = np.column_stack([rng.uniform(-1.0, 1.0, (6, 2)), np.zeros(6)])
+    plane = plane_normal(coordinates)
+    ids = [str(i) for i in range(6)]
+    below = np.array([0.0, 0.0, -5.0])
+    normals, known = disk_normals(ids, coordinates, {"2": np.array([1.0, 0.0, 0.0])}, plane, below)
+    assert known.all()
+    np.testing.assert_allclose(normals[0], (0.0, 0.0, -1.0), atol=1e-12)
+    np.testing.assert_allclose(normals[2], (1.0, 0.0, 0.0))
+    _, known = disk_normals(ids, coordinates, {}, None, below)
+    assert not known.any()
+    assert plane_normal(rng.uniform(-1.0, 1.0, (6, 3))) is None
 
 
-@pytest.mark.parametrize(
-    ("targets", "message"),
-    [
-        ('kind = "cross"\narm_mm = 5.0\nline_mm = 6.0', "a line of 6 mm is no line for arms of 5 mm"),
-        ('kind = "cross"\nline_mm = 6.0', "arm_mm"),
-        (f"{CODED}u3 = 5", "points.csv has no coordinates of such a point"),
-        (f"{CODED}t3 = 4095", "is no number of 12 bits"),
-        (f"{CODED}t3 = 46", "is, turned, the code of t8 too"),
-        (f"{CODED}[targets.more]", "is no key of this table"),
-    ],
-)
-def test_what_targets_cannot_be(targets: str, message: str, tmp_path: Path, refusal: Refusal) -> None:
-    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((60, 80), np.uint8))
-    rows = [f"t{i},{i % 7},{i // 7},0" for i in range(49)]
-    scans = 'camera = "camera.toml"\nscans = ["*.png"]\npitch_um = 40.0'
-    project = f'{scans}\n[targets]\n{targets}\n[object]\npoints = "points.csv"'
-    camera = 'name = "c"\nframe_mm = [36.0, 27.2]'
-    write_tables(tmp_path, project, camera=camera, points=["point,X,Y,Z", *rows])
-    assert message in refusal(["measure", str(tmp_path / "project.toml")])
+def test_a_code_of_no_point_of_the_sheet(scenes: dict[str, Path], tmp_path: Path) -> None:
+    project, _ = rendered(scenes[RINGS], tmp_path)
+    replace_text(project, "[targets]\n", "[targets]\ncodes = {u3 = 5}\n")
+    with pytest.raises(InputError, match=r"\[targets.codes\] u3: points.csv has no coordinates of such a point"):
+        scan_tasks(read_project(project), ["a"])
 
 
 def test_coordinates_in_another_unit_than_the_project_says(scenes: dict[str, Path], tmp_path: Path) -> None:
@@ -347,9 +258,9 @@ def view_points(rng: np.random.Generator, xyz: Array) -> Array:
 
 def measure_picture(rng: np.random.Generator, project: Project, name: str, wrong: dict[str, float]) -> MeasuredScan:
     """One picture, some of its points so many px off in some direction."""
-    assert project.targets is not None
-    assert project.targets.board is not None
-    xyz = {id: np.array(place) for id, place in project.targets.board.object_points().items()}
+    targets = present(project.targets)
+    assert targets.board is not None
+    xyz = {id: np.array(place) for id, place in targets.board.object_points().items()}
     xyz[BUCKLED] = xyz[BUCKLED] + (0.0, 0.0, 1.0)
     xyz[MISPRINTED] = xyz[MISPRINTED] + (0.4, -0.3, 0.0)
     marks = []

@@ -1,7 +1,9 @@
-"""Natural points on rendered terrain, and blocks through COLMAP."""
+"""Natural points on rendered terrain, blocks through COLMAP, and frames scanned in overlapping halves."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -9,7 +11,20 @@ import pytest
 import tifffile
 from networks import FIDUCIALS, affine, rotation
 from numpy.typing import NDArray
-from projects import IMAGES, PITCH_MM, POINTS, TRUTH, camera_mm, ideal_mm, scan_px, write_tables
+from projects import (
+    IMAGES,
+    PITCH_MM,
+    POINTS,
+    TRUTH,
+    camera_mm,
+    command,
+    fiducial_tables,
+    ideal_mm,
+    present,
+    result_file,
+    scan_px,
+    write_tables,
+)
 from scipy.spatial.distance import pdist
 
 from adjust import ObjectPoint
@@ -19,7 +34,8 @@ from adjust.functional_model.transformation import Film as OtherFilm
 from measure import Status
 from measure.tie_points.features import TieFrame
 from measure.tie_points.find_points import TieOptions, measure_ties
-from pipeline import InputError, build_network, read_images, read_project
+from measure.tie_points.joins import measure_joins
+from pipeline import InputError, build_network, read_images, read_measurement, read_project
 from pipeline.blocks.block_stage import A_CELL, CELLS, feature_precision, oriented_by_control, tie_marks, written_block
 from pipeline.blocks.mapping import (
     BlockPicture,
@@ -32,11 +48,10 @@ from pipeline.blocks.mapping import (
 )
 from pipeline.exchange.incoming import fiducial_camera
 from pipeline.files.camera_file import CameraFile
-from pipeline.measuring.tie_stage import check_tie_names
+from pipeline.measuring.tie_stage import add_joins, check_tie_names
 from pipeline.resampling.canvas import FrameChain
 from pipeline.resampling.resample_stage import FAST, FrameScan, ResampleTask, resampled
 from pipeline.results.comparator_file import ComparatorPoint, read_comparator, write_comparator
-from synthetic_images.film import FrameGeometry
 from synthetic_images.render import render_scene
 from synthetic_images.scene import DiskField, Distortion, Film, Scanner, Scene, SceneCamera, SceneImage
 from synthetic_images.terrain import transferred
@@ -58,17 +73,14 @@ SCENE = Scene(
 )
 
 
-def tie_frame(geometry: FrameGeometry, folder: Path) -> TieFrame:
-    name = geometry.image.name
-    pixel_from_camera = np.linalg.inv(geometry.camera_from_pixel)[:2].astype(np.float64)
-    return TieFrame(name, folder / "scans" / f"{name}.tif", pixel_from_camera, (38.0, 38.0), np.zeros((0, 3)))
-
-
 @pytest.mark.study
 def test_natural_points_are_where_the_scene_says(tmp_path: Path) -> None:
     truth = render_scene(SCENE, tmp_path)
     geometry = {frame.geometry.image.name: frame.geometry for frame in truth.frames}
-    frames = [tie_frame(each, tmp_path) for each in geometry.values()]
+    frames = []
+    for name, each in geometry.items():
+        matrix = np.linalg.inv(each.camera_from_pixel)[:2].astype(np.float64)
+        frames.append(TieFrame(name, tmp_path / "scans" / f"{name}.tif", matrix, (38.0, 38.0), np.zeros((0, 3))))
     ties = measure_ties(frames, TieOptions(wanted=24))
     assert not ties.problems
     marks = {image: {mark.point: mark for mark in own} for image, own in ties.marks.items()}
@@ -78,8 +90,7 @@ def test_natural_points_are_where_the_scene_says(tmp_path: Path) -> None:
             if mark.status is not Status.MEASURED or mark.quality["reference"]:
                 continue
             start = next(i for i in marks if name in marks[i] and marks[i][name].quality.get("reference"))
-            place = marks[start][name].center_px
-            assert place is not None
+            place = present(marks[start][name].center_px)
             errors.append(np.asarray(mark.center_px) - transferred(place[None], geometry[start], geometry[image])[0])
             claimed.append(mark.quality["sigma_to_reference_px"])
     assert len(errors) > 41
@@ -94,11 +105,8 @@ def test_natural_points_are_where_the_scene_says(tmp_path: Path) -> None:
 
 
 PROJECT = """camera = "camera.toml"
-[object]
-points = "points.csv"
-[ties]
-height = 42.0
-height_sigma = 0.05
+object = {points = "points.csv"}
+ties = {height = 42.0, height_sigma = 0.05}
 """
 CAMERA = 'name = "c"\nprincipal_distance_mm = 100.0\nprincipal_point_mm = [0.0, 0.0]\n'
 NATURAL_POINTS = ("tie0001", "tie0002", "7", "8")
@@ -115,9 +123,8 @@ def written(folder: Path, project: str = PROJECT) -> Path:
 def test_natural_points_have_the_ground_s_height_and_names_of_their_own(tmp_path: Path) -> None:
     project = read_project(written(tmp_path))
     network, _ = build_network(project, read_comparator(project.comparator))
-    assert Prior(42.0, 0.05) == network.point_by_id["tie0001"].Z
-    assert network.point_by_id["tie0001"].X is None
-    assert Prior(3.0, 0.01) == network.point_by_id["7"].Z
+    tie = network.point_by_id["tie0001"]
+    assert (None, Prior(42.0, 0.05), Prior(3.0, 0.01)) == (tie.X, tie.Z, network.point_by_id["7"].Z)
     path = written(tmp_path)
     (tmp_path / "points.csv").write_text("point,X,Y,Z\ntie7,1,2,3\n")
     with pytest.raises(InputError, match="'tie7'"):
@@ -271,29 +278,23 @@ def test_control_in_either_scan_of_a_frame_places_the_block(tmp_path: Path) -> N
     marks, points = control(8)
     cut = []
     for mark in marks:
-        assert mark.xy_mm is not None
-        is_right = mark.xy_mm[0] > 0.5 * (LEFT_PX + RIGHT_PX) * PITCH_MM
+        is_right = present(mark.xy_mm)[0] > 0.5 * (LEFT_PX + RIGHT_PX) * PITCH_MM
         shift = np.array([RIGHT_PX * PITCH_MM, 0.0]) if is_right else np.zeros(2)
-        cut.append(replace(mark, image=f"{mark.image}{'r' if is_right else 'l'}", xy_mm=mark.xy_mm - shift))
+        cut.append(replace(mark, image=f"{mark.image}{'r' if is_right else 'l'}", xy_mm=present(mark.xy_mm) - shift))
     placed = oriented_by_control(mapped(), [half_picture(i) for i in IMAGES], cut, points, rays)
     for i in IMAGES:
         np.testing.assert_allclose(placed[f"f{i}"][1], TRUTH.stations[i], atol=1e-6)
-    (tmp_path / "images.csv").write_text(
-        "image,part_of\n" + "".join(f"f{i}{half},f{i}\n" for i in IMAGES for half in "lr"), encoding="utf-8"
-    )
-    (tmp_path / "camera.toml").write_text('name = "K"\n', encoding="utf-8")
-    (tmp_path / "project.toml").write_text(
-        'camera = "camera.toml"\n[object]\nimages = "images.csv"\n', encoding="utf-8"
-    )
+    images = ["image,part_of", *(f"f{i}{half},f{i}" for i in IMAGES for half in "lr")]
     cut += [replace(cut[0], image=f"f{i}{half}", point="1", kind="fiducial") for i in IMAGES for half in "lr"]
-    write_comparator(tmp_path / "comparator.csv", cut, {})
-    own = written_block(read_project(tmp_path / "project.toml"), tmp_path / "block", cut, {"f1": placed["f1"]})
+    text = 'camera = "camera.toml"\n[object]\nimages = "images.csv"'
+    path = write_tables(tmp_path, text, camera='name = "K"', images=images)
+    write_comparator(path.with_name("comparator.csv"), cut, {})
+    own = written_block(read_project(path), tmp_path / "block", cut, {"f1": placed["f1"]})
     again = read_images(tmp_path / "block" / "images.csv")
     assert again.part_of == {f"f{i}{half}": f"f{i}" for i in IMAGES for half in "lr"}
     assert own.scanned_frame("f2l") == "f2"
     for half in "lr":
-        exterior = again.exterior[f"f1{half}"]
-        assert exterior is not None
+        exterior = present(again.exterior[f"f1{half}"])
         np.testing.assert_allclose(exterior.values[:3], TRUTH.stations[1], atol=1e-6)
         assert again.exterior[f"f0{half}"] is None
     assert {mark.image for mark in read_comparator(own.comparator) if mark.kind == "target"} <= {"f1l", "f1r"}
@@ -334,3 +335,123 @@ def test_the_camera_that_colmap_is_given_counts_from_the_corner() -> None:
     assert fx == fy == pytest.approx(TRUTH.c / PITCH_MM)
     assert (cx, cy) == pytest.approx(lattice_px(np.array([TRUTH.x0, TRUTH.y0])) + 0.5)
     assert rest == [0.0] * 4
+
+
+MARKS = """
+[camera]
+name = "K"
+frame_mm = [44.0, 44.0]
+principal_distance_mm = 60.0
+sigma = {principal_distance_mm = 0.1, principal_point_mm = 0.1}
+[camera.mark]
+m = {kind = "ring-cross", polarity = "light", ring_mm = 0.7, ring_line_mm = 0.14, arm_mm = 0.5, line_mm = 0.14}
+""" + fiducial_tables(
+    {"1": (19, -19), "2": (-19, -19), "3": (-19, 19), "4": (19, 19)},
+    'sigma_mm = 0.003\nmark = "m"\n',
+    "camera.fiducial",
+)
+HALVES_SCENE = f"""
+name = "halves"
+seed = 4
+film = {{scale_sigma_ppm = 300.0, shear_sigma_urad = 100.0, grain = 0.01}}
+scan = {{pitch_um = 60.0, margin_mm = 3.0, turn_sigma_deg = 0.3, offset_sigma_mm = 0.2, noise = 0.005}}
+given = {{fiducial_error_mm = 0.003}}
+picture = {{background = "wall", pad_mm = 1.9, tones = {{contrast = 0.1}}}}
+{MARKS}
+[field]
+kind = "disks"
+unit = "m"
+diameter_mm = 40.0
+surround = 2.0
+[[field.grid]]
+first = 101
+columns = 5
+rows = 5
+center = [0.0, 0.0, 0.0]
+right = [0.5, 0.0, 0.0]
+up = [0.0, 0.5, 0.0]
+jitter = 0.1
+relief = 0.4
+""" + "".join(
+    f'[[image]]\nname = "f{half}"\nposition = [0.1, -0.1, 4.0]\nangles_deg = [1.0, -2.0, 3.0]\n'
+    f'part_of = "f"\npart = [{first}, {end}]\n'
+    for half, first, end in (("a", 0.0, 0.6), ("b", 0.4, 1.0))
+)
+
+
+@pytest.fixture(scope="module")
+def halves(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the project, measured and adjusted."""
+    folder = tmp_path_factory.mktemp("halves")
+    (folder / "scene.toml").write_text(HALVES_SCENE, encoding="utf-8")
+    assert command("render", folder / "scene.toml", folder) == 0
+    for name in ("measure", "adjust", "report"):
+        assert command(name, folder / "project.toml") in (0, 1)
+    return folder
+
+
+def image_camera(image: dict[str, Any], pixels: np.ndarray) -> np.ndarray:
+    """Camera mm of pixels (n, 2), by the truth."""
+    x, y = (pixels * [0.06, -0.06]).T
+    t = {name: value["value"] for name, value in image["transformation"].items() if name != "kind"}
+    return np.stack([t["a1"] + t["a2"] * x + t["a3"] * y, t["b1"] + t["b2"] * x + t["b3"] * y], axis=1)
+
+
+@pytest.mark.study
+def test_one_adjustment_knows_both_films_one_orientation_and_all_marks_in_one_frame(halves: Path) -> None:
+    truth = json.loads((halves / "truth.json").read_text(encoding="utf-8"))["images"]
+    result = result_file(halves)
+    assert result["converged"]
+    assert result["images"]["fa"]["exterior"] == result["images"]["fb"]["exterior"]
+    assert result["groups"]["join"]["redundancy"] > 60.0
+    frame = result["frames"]["f"]
+    assert set(frame["parts"]) == {"fa", "fb"}
+    assert len(frame["joins"]) >= 40
+    for name, part in frame["parts"].items():
+        corners = np.array([[0.0, 0.0], [0.0, 832.0], [499.0, 0.0], [499.0, 832.0]])
+        own = {key: value for key, value in result["images"][name]["transformation"].items() if key != "mirrored"}
+        adjusted = image_camera({"transformation": own}, corners)
+        off_um = 1000.0 * np.hypot(*(adjusted - image_camera(truth[name], corners)).T)
+        assert off_um.max() < 5.0 * part["corner_sigma_um"]
+    errors = []
+    for mark in frame["marks"]:
+        if mark["kind"] == "target":
+            true = truth[mark["image"]]["targets"][mark["point"]]
+            place = image_camera(truth[mark["image"]], np.array([[true["ellipse_col_px"], true["ellipse_row_px"]]]))[0]
+            errors += [(mark["x_mm"] - place[0]) / mark["sx_mm"], (mark["y_mm"] - place[1]) / mark["sy_mm"]]
+    assert len(errors) > 40
+    assert np.sqrt(np.mean(np.square(errors))) < 2.0
+
+
+def test_scans_that_have_nothing_in_common_are_reported(tmp_path: Path) -> None:
+    parts = []
+    for seed, name in enumerate(("a", "b")):
+        noise = np.random.default_rng(seed).normal(30000.0, 3000.0, (300, 300))
+        tifffile.imwrite(tmp_path / f"{name}.tif", noise.astype(np.uint16))
+        parts.append(TieFrame(name, tmp_path / f"{name}.tif", np.eye(2, 3), None, np.zeros((0, 3))))
+    joins = measure_joins(parts)
+    assert not joins.marks["a"]
+    assert not joins.marks["b"]
+    assert "Nothing joins it to the other scans of its frame: with b" in joins.problems["a"]
+
+
+@pytest.mark.study
+def test_fiducials_that_contradict_the_joins_are_rejected(halves: Path) -> None:
+    """As if the frame of the right half had been found one mark too far to the right."""
+    project = read_project(halves / "project.toml")
+    scans = []
+    for scan, shift_px in zip(read_measurement(halves / "out" / "measurement.db"), (0.0, 50.0), strict=True):
+        marks = tuple(mark for mark in scan.frame.marks if mark.kind != "join")
+        place = np.array(scan.frame.pixel_from_camera) + np.array([[0.0, 0.0, shift_px], [0.0, 0.0, 0.0]])
+        scans.append(replace(scan, frame=replace(scan.frame, marks=marks, problems=(), pixel_from_camera=place)))
+    result = add_joins(project, scans, lambda *_: None, None)
+    assert all("contradict those of" in " ".join(scan.frame.problems) for scan in result)
+    assert not any(mark.kind == "fiducial" and mark.status.is_observation for mark in result[1].frame.marks)
+
+
+def test_one_part_tells_the_orientation_of_all(tmp_path: Path) -> None:
+    path = tmp_path / "images.csv"
+    path.write_text("image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg,part_of\na,,,,,,,f\nb,1,0,9,0,0,0,f\n")
+    given = read_images(path)
+    assert given.part_of == {"a": "f", "b": "f"}
+    assert given.exterior["a"] is given.exterior["b"] is not None

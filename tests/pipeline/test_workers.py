@@ -6,17 +6,16 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
+from in_process import wait_until
 
 from pipeline import InputError, workers
 from pipeline.workers import LocalPool, SubmittedAgain, WorkerKilled, cluster_executor, worker_pool
-
-WAIT_S = 60.0
 
 
 def count_up(told: Path) -> None:
@@ -49,20 +48,13 @@ def test_a_worker_ends_with_the_process_that_started_it(kind: str, tmp_path: Pat
     program = f"from pathlib import Path; from test_workers import begin; begin({kind!r}, Path({str(result)!r}))"
     paths = os.pathsep.join(sys.path)
     parent = subprocess.Popen([sys.executable, "-c", program], env=os.environ | {"PYTHONPATH": paths})
-    _wait(lambda: result.is_file() and result.read_text(encoding="utf-8") != "", 120.0)
+    assert wait_until(lambda: result.is_file() and result.read_text(encoding="utf-8") != "", 120.0)
     worker = int(result.read_text(encoding="utf-8"))
     assert is_alive(worker)
     time.sleep(0.3)
     parent.send_signal(signal.SIGKILL)
     parent.wait()
-    _wait(lambda: not is_alive(worker), WAIT_S)
-
-
-def _wait(holds: Callable[[], bool], most_s: float) -> None:
-    end = time.monotonic() + most_s
-    while not holds():
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    assert wait_until(lambda: not is_alive(worker), 60.0)
 
 
 def is_alive(pid: int) -> bool:
@@ -145,15 +137,6 @@ def test_a_process_killed_on_its_way_says_nothing_of_the_task(tmp_path: Path) ->
         assert task.result(60) == 7
 
 
-@pytest.mark.study
-def test_where_no_process_stands_tasks_are_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.workers.prepare", os.abort)
-    with worker_pool(1, workers=1) as pool:
-        for task in [pool.submit(square, number) for number in range(2)]:
-            with pytest.raises(WorkerKilled):
-                task.result(60)
-
-
 def test_a_process_that_is_begun_while_the_pool_ends_is_ended_too(monkeypatch: pytest.MonkeyPatch) -> None:
     begin = LocalPool._start
 
@@ -208,41 +191,27 @@ def test_a_cluster_that_cannot_be_had_is_reported(monkeypatch: pytest.MonkeyPatc
         pass
 
 
-class Answers:
-    """A client whose workers answer so."""
-
-    def __init__(self, answers: dict[str, Any]) -> None:
-        self.answers = answers
-
-    def wait_for_workers(self, *_: Any, **__: Any) -> None:
-        pass
-
-    def run(self, *_: Any, **__: Any) -> dict[str, Any]:
-        return self.answers
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_workers_are_requested_their_versions_and_their_way_to_the_scans() -> None:
-    same = workers.versions()
-    good = (same, list[tuple[str, str]]())
-    workers._check_workers(Answers({"a": good}), "x", [])
-    other = ({**same, "numpy": "1.0"}, list[tuple[str, str]]())
-    cases = {
-        "b: has numpy 1.0, here": other,
-        r"b: cannot read /scans/1.tif \(No such file\). Give it the same path": (
-            same,
-            [("/scans/1.tif", "No such file")],
-        ),
-        r"b: cannot read s3://x/1.tif \(403\). Give it the extra, the credentials": (same, [("s3://x/1.tif", "403")]),
-        "b: does not answer .*is reseau installed": ModuleNotFoundError("pipeline"),
-    }
-    for words, answer in cases.items():
-        with pytest.raises(InputError, match=words):
-            workers._check_workers(Answers({"a": good, "b": answer}), "x", [])
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [
+        (({"numpy": "1.0"}, []), "b: has numpy 1.0, here"),
+        (({}, [("/1.tif", "No such file")]), r"b: cannot read /1.tif \(No such file\). Give it the same path"),
+        (({}, [("s3://1.tif", "403")]), r"b: cannot read s3://1.tif \(403\). Give it the extra, the credentials"),
+        (ModuleNotFoundError("pipeline"), "b: does not answer .*is reseau installed"),
+    ],
+)
+def test_workers_are_requested_their_versions_and_their_way_to_the_scans(answer: Any, words: str) -> None:
+    good: tuple[dict[str, str], list[tuple[str, str]]] = (workers.versions(), [])
+    client = MagicMock(run=lambda *_, **__: {"a": good})
+    workers._check_workers(client, "x", [])
+    other = answer if isinstance(answer, Exception) else (good[0] | answer[0], answer[1])
+    client = MagicMock(run=lambda *_, **__: {"a": good, "b": other})
+    with pytest.raises(InputError, match=words):
+        workers._check_workers(client, "x", [])
 
 
 class LosesFirst(Executor):
-    """LosesFirst the first tasks that it is given."""
+    """The first tasks that it is given."""
 
     def __init__(self, times: int) -> None:
         self.times = times
