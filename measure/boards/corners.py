@@ -225,11 +225,12 @@ class _CornerFits:
         lists = [np.flatnonzero(each) for each in near.all(axis=1)]
         self.counts = [len(each) for each in lists]
         self.pixels = np.zeros((len(lists), max(self.counts)), np.intp)
-        self.valid, self.grey = np.zeros(self.pixels.shape, np.float32), np.zeros(self.pixels.shape, np.float32)
+        self.valid, self.grey, self.sides = (np.zeros(self.pixels.shape, np.float32) for _ in range(3))
         for number, (chosen, window) in enumerate(zip(lists, self.windows, strict=True)):
             here, usable = (number, slice(len(chosen))), window.usable.ravel()[chosen]
             self.pixels[here], self.valid[here] = chosen, usable
             self.grey[here] = np.where(usable, window.grey.ravel()[chosen], 0.0)
+            self.sides[here] = window.sides.ravel()[chosen]
         self.places = np.stack([axis[self.pixels] for axis in (col, row)], axis=1)
 
     def run(self) -> list[Corner]:
@@ -258,6 +259,7 @@ class _CornerFits:
         """Assemble the corners, with covariances from the autocovariance of the residuals, and junctions."""
         design, residuals = self.design, self.residuals
         area, used = self._area(np.arange(len(self.windows))), self.weights > _UNDAMAGED
+        used &= design[:, _SHAPE_UNKNOWNS + 1] != 0  # the offset's derivative is 0 for clipped pixels only
         weighted = design * self.weights[:, None]
         normal = (weighted @ design.swapaxes(1, 2)).astype(float)
         influence = np.linalg.pinv(normal, hermitian=True)[:, :2].astype(np.float32) @ weighted
@@ -341,8 +343,10 @@ class _CornerFits:
         for edge, by in enumerate((by_u, by_v)):
             design[:, 2 + edge] = by * along[edge] + by_correlation * turned[edge]
         design[:, 4] = (by_u * u + by_v * v) * (-0.5 / sigma**2).astype(np.float32)
-        self.design[numbers] = design
-        self.residuals[numbers] = self.grey[numbers] - (linear[:, None] @ grey)[:, 0]
+        residuals = self.grey[numbers] - (linear[:, None] @ grey)[:, 0]
+        # A clipped grey value says nothing where the model lies beyond the end of the range as well.
+        telling = self.sides[numbers] * residuals >= 0
+        self.design[numbers], self.residuals[numbers] = design * telling[:, None], residuals * telling
 
     def _step(self, numbers: Indices, scale: Array) -> Array:
         """Apply a Gauss-Newton step, shortened to the range of the linearisation. Returns (m,) lengths in px."""

@@ -22,7 +22,7 @@ from measure.boards.specs import (
     SquareGridSpec,
 )
 from measure.flags import NO_REASON, Code, Reason, Status
-from measure.matching.window import ScanWindow
+from measure.matching.window import ScanWindow, clipped_sides
 from measure.results import Covariance, MarkMeasurement
 from measure.scans.scan import Scan
 from measure.targets.block_search import Candidate, Patches
@@ -197,11 +197,14 @@ def _fit_found(scan: Scan, found: Mapping[str, FoundCorner], spec: BoardSpec) ->
         for each in found.values()
     ]
 
+    stands_alone = isinstance(spec, ArucoSpec | SquareGridSpec) and not isinstance(spec, AprilGridSpec)
+
     def read(col: int, row: int, side: int) -> ScanWindow:
         place_px = col, row, side, side
-        return ScanWindow(scan.window(*place_px), (col, row), scan.inside(*place_px, is_read=True))
+        # The place of a crossing does not depend on clipping.
+        sides = clipped_sides(scan, *place_px, None) if stands_alone else None
+        return ScanWindow(scan.window(*place_px), (col, row), scan.inside(*place_px, is_read=True), sides)
 
-    stands_alone = isinstance(spec, ArucoSpec | SquareGridSpec) and not isinstance(spec, AprilGridSpec)
     surface: Surface = quarter if stands_alone else crossing
     return dict(zip(found, fit_corners(read, starts, surface), strict=True))
 

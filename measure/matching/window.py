@@ -15,6 +15,7 @@ from measure.flags import NATURAL_END
 from measure.marks.rendering import picture
 from measure.marks.shapes import Mark
 from measure.noise.robust_estimation import robust_scale
+from measure.scans.metadata import Samples
 from measure.scans.scan import Scan
 from measure.tone.curve import LINEAR, Tone
 
@@ -193,12 +194,16 @@ def clipped_sides(scan: Scan, col0: int, row0: int, width: int, height: int, wei
     (height, width) int8: 1 at the upper end of the scanner's range or where whites are clipped below it, -1 at the
     lower end, 0 elsewhere.
     """
-    sides = np.zeros((height, width), np.int8)
-    for channel in range(scan.channels):
+    return clipped_samples(scan.samples(col0, row0, width, height), scan.full_scale_dn, weights)
+
+
+def clipped_samples(samples: Samples, full_scale_dn: float, weights: Sequence[float] | None = None) -> Sides:
+    """Find the clipped ones among stored values (height, width, channels), as `clipped_sides`."""
+    sides = np.zeros(samples.shape[:2], np.int8)
+    for channel in range(samples.shape[2]):
         if weights is None or weights[channel] > 0:
-            only = tuple(float(index == channel) for index in range(scan.channels))
-            grey = scan.window(col0, row0, width, height, only)
-            if grey.max() in _limits(scan.full_scale_dn) or _is_cut(grey):
+            grey = samples[..., channel]
+            if grey.max() in _limits(full_scale_dn) or _is_cut(grey):
                 sides[grey == grey.max()] = 1
             sides[grey == 0] = -1
     return sides
@@ -266,7 +271,7 @@ def _hazard(within: Array, log_chance: Array) -> Array:
     return np.asarray(np.exp(_LOG_DENSITY - within**2 / 2 - log_chance))
 
 
-def _is_cut(grey: NDArray[np.floating]) -> bool:
+def _is_cut(grey: Samples) -> bool:
     """Whether whites were clipped at the maximum. In the unclipped tail of a histogram, of the values within _TAIL
     noise standard deviations of the maximum, the maximum itself has at most a uniform share."""
     greatest = grey.max()
@@ -275,10 +280,10 @@ def _is_cut(grey: NDArray[np.floating]) -> bool:
         return False
     both_below = (grey[:, 1:] < greatest) & (grey[:, :-1] < greatest)
     sigma = robust_scale(np.diff(grey.astype(float), axis=1)[both_below]) / np.sqrt(2)
-    step = float(np.diff(np.unique(grey)).min(initial=np.inf))
+    step = float(np.diff(np.unique(grey).astype(float)).min(initial=np.inf))
     if both_below.sum() < _FEWEST or not sigma > _LEAST_STEPS * step:
         return False
-    tail = int((grey >= greatest - _TAIL * sigma).sum())
+    tail = int((grey >= float(greatest) - _TAIL * sigma).sum())
     return bool(bdtrc(pile - 1, tail, step / (_TAIL * sigma)) < NATURAL_END)
 
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from itertools import product
 from math import lcm
 from typing import TYPE_CHECKING, TypeVar
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from measure.array_types import Array, Single
+from measure.matching.window import Sides, clipped_samples
 from measure.scans.metadata import Samples
 from measure.scans.parallel import map_in_threads
 from measure.scans.scan import Scan, means, weighted
@@ -51,10 +53,21 @@ class Block:
     def grey_values(self, corners: NDArray[np.intp], col: NDArray[np.intp], row: NDArray[np.intp]) -> Single:
         """(n, count) grey values at columns and rows (n, count) counted from corners (n, 2) in the scan; arbitrary ones
         outside the block."""
-        width, height = self.size_px
-        at = row * width + col
-        at += (corners - self.place_px) @ np.array([[1], [width]])
-        return weighted(self.samples.reshape(width * height, -1).take(at, axis=0, mode="clip"), self.scan.weights)
+        pixels = self.samples.reshape(-1, self.samples.shape[2])
+        at = self._index(corners, col, row)
+        return weighted(pixels.take(at, axis=0, mode="clip"), self.scan.weights)
+
+    def clipped_sides(self, corners: NDArray[np.intp], col: NDArray[np.intp], row: NDArray[np.intp]) -> Sides:
+        """(n, count) ends of the scanner's range at which the grey values of these pixels are clipped."""
+        return self._sides.take(self._index(corners, col, row), mode="clip")
+
+    @cached_property
+    def _sides(self) -> Sides:
+        return clipped_samples(self.samples, self.scan.full_scale_dn)
+
+    def _index(self, corners: NDArray[np.intp], col: NDArray[np.intp], row: NDArray[np.intp]) -> NDArray[np.intp]:
+        width, _ = self.size_px
+        return np.asarray(row * width + col + (corners - self.place_px) @ np.array([[1], [width]]))
 
     def reductions(self, factors: Iterable[int]) -> dict[int, Single]:
         """Area averages of the grey values by each factor, computed from the coarsest finer one that divides it. Each

@@ -82,7 +82,7 @@ def place_disks(block: Block, patches: Patches, margins_px: Array) -> list[MarkF
     placed: dict[int, MarkFit] = {}
     for group in _groups(patches, strides, margins_px):
         own = patches.part(group)
-        fit = _Fit(block, own, blurs[group], strides[group], margins_px[group])
+        fit = _Fit(block, own, blurs[group], strides[group], margins_px[group], is_censored=True)
         for step in range(_MOST_STEPS):
             before = fit.centers
             fit.step(is_robust=step >= _PLAIN_STEPS)
@@ -124,9 +124,18 @@ def _half_sides(patches: Patches, strides: Indices, margins_px: Array) -> Indice
 class _Fit:
     """State of the fit of n disks. centers (n, 2) relative to the window centres, px; shapes (n, 2, 2); blur (n,), px;
     greys (n, 4): gain, offset, slopes. Windows of side * side pixels: col, row (n, pixels) relative to their centres,
-    grey (n, pixels), used (n, pixels): inside the ellipse and its margin."""
+    grey (n, pixels), used (n, pixels): inside the ellipse and its margin. is_censored: whether grey values at the ends
+    of the range may stand for any beyond."""
 
-    def __init__(self, block: Block, patches: Patches, blurs: Array, strides: Indices, margins_px: Array) -> None:
+    def __init__(
+        self,
+        block: Block,
+        patches: Patches,
+        blurs: Array,
+        strides: Indices,
+        margins_px: Array,
+        is_censored: bool = False,
+    ) -> None:
         half, stride = int(_half_sides(patches, strides, margins_px).max()), strides[:, None]
         middles = np.rint(patches.centers).astype(np.intp)
         corners, self.side = middles - half * stride, 2 * half + 1
@@ -134,6 +143,7 @@ class _Fit:
         col, row = np.tile(along, self.side), np.repeat(along, self.side, axis=1)
         inside = block.holds(corners[..., None] + along[:, None])
         self.grey = block.grey_values(corners, col, row)
+        self.sides = block.clipped_sides(corners, col, row) if is_censored else np.int8(0)
         self.col, self.row = (np.asarray(one - half * stride, np.float32) for one in (col, row))
         self.middles, self.radius = middles, patches.radii
         self.centers, self.shapes = patches.centers - middles, patches.shapes
@@ -149,11 +159,13 @@ class _Fit:
         self.design = design
         self.residuals = self.grey - (self.greys[:, None].astype(np.float32) @ self.design[:, 6:])[:, 0]
         self.design[:, :6] *= self.greys[:, :1, None].astype(np.float32)
-        self.scale = _robust_scales_of_used(self.residuals, self.used)
+        # A clipped grey value says nothing where the model lies beyond the end of the range as well.
+        self.telling = self.used & (self.sides * self.residuals >= 0)
+        self.scale = _robust_scales_of_used(self.residuals, self.telling)
 
     def step(self, is_robust: bool) -> None:
         """Take one Gauss-Newton step; a robust one down-weights dust and neighbours."""
-        weights = self._weights() if is_robust else self.used.astype(np.float32)
+        weights = self._weights() if is_robust else self.telling.astype(np.float32)
         change = gauss_newton_step(self.design, self.residuals, weights, _DAMPING)
         form = change[:, :5] / np.maximum(np.abs(change[:, :5]).max(axis=1, keepdims=True) / _LONGEST_STEP, 1.0)
         self.centers = self.centers + (self.shapes @ form[:, :2, None])[..., 0]
@@ -167,7 +179,7 @@ class _Fit:
     def _weights(self) -> Single:
         """(n, pixels), Tukey's."""
         scale = np.maximum(self.scale, _SCALE_FLOOR * np.abs(self.greys[:, 0]) + 1e-6)
-        return np.asarray(self.used * tukey_weights(self.residuals / scale[:, None].astype(np.float32), 1.0))
+        return np.asarray(self.telling * tukey_weights(self.residuals / scale[:, None].astype(np.float32), 1.0))
 
     def placed(self, is_disk: Mask) -> Iterator[MarkFit]:
         """The disks in scan pixels, with covariances."""
@@ -181,7 +193,7 @@ class _Fit:
             influence.reshape(size), self.residuals.reshape(size)[:, 0], counted.reshape(size)[:, 0], _UNKNOWNS
         )
         blurs_px = np.sqrt(np.maximum(self.blur**2 - PIXEL_VARIANCE_PX2, 0.0))
-        damaged = 1 - weights.sum(axis=1) / np.maximum(self.used.sum(axis=1), 1)
+        damaged = 1 - weights.sum(axis=1) / np.maximum(self.telling.sum(axis=1), 1)
         for number, (center_px, shape) in enumerate(zip(found.centers, found.shapes, strict=True)):
             yield MarkFit(
                 converged=bool(is_disk[number]),
@@ -197,7 +209,7 @@ class _Fit:
 
     def misfit(self) -> Array:
         """(n,) residual scale over its limit, which is lower where neighbouring residuals are correlated."""
-        left = (self.residuals * self.used).reshape(-1, self.side, self.side)
+        left = (self.residuals * self.telling).reshape(-1, self.side, self.side)
         neighbours = (left[:, :, 1:] * left[:, :, :-1]).sum(axis=(1, 2))
         neighbours += (left[:, 1:] * left[:, :-1]).sum(axis=(1, 2))
         correlation = neighbours / np.maximum(2 * (left * left).sum(axis=(1, 2)), 1e-6)
