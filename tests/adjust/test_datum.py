@@ -4,13 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from networks import Truth, orient, simulated
+from networks import Truth, simulated
 from numpy.typing import NDArray
 from reference_cases import case_approximations, case_network, load
 
 from adjust import Adjustment, AdjustmentError
-from adjust.problem.network import Exterior
-from adjust.solution.adjustment import Datum, Options, adjust
+from adjust.solution.adjustment import Options, adjust
 
 Array = NDArray[np.float64]
 
@@ -61,34 +60,6 @@ def test_chosen_coordinates_are_held_where_they_are_given() -> None:
         point, axis = name.split(".")
         given = getattr(network.point_by_id[point], axis).value
         assert (result.value(f"PT.{name}"), result.sigma(f"PT.{name}")) == (given, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("known", "open_directions"),
-    [
-        ({"f0": np.array([0.05, 0.05, 0.05, np.inf, np.inf, np.inf])}, 4),  # one station: turns and scale are free
-        ({f"f{i}": np.array([np.inf, np.inf, 0.05, np.inf, np.inf, np.inf]) for i in range(3)}, 4),
-        ({f"f{i}": np.array([0.05, 0.05, 0.05, np.inf, np.inf, np.inf]) for i in range(2)}, 1),
-        ({"f0": np.array([np.inf, np.inf, np.inf, 1e-4, 1e-4, 1e-4])}, 4),
-    ],
-)
-def test_mixtures_of_observed_stations_and_a_free_network(known: dict[str, Array], open_directions: int) -> None:
-    """What observed stations leave free is fixed minimally or by inner constraints: the same fit, the same camera."""
-    truth = Truth()
-    network, start = simulated(np.random.default_rng(6), truth, point_sigma=np.inf)
-    rng = np.random.default_rng(8)
-    given = dict(zip(start.exterior, truth.exteriors, strict=True))
-    exteriors = {name: Exterior(given[name] + rng.normal(0, 1e-4, 6), sigmas) for name, sigmas in known.items()}
-    network = orient(network, exteriors)
-    plain = adjust(network, start)
-    assert len(plain.singular) == open_directions
-    minimal, free = adjust(network, start, Options(datum="minimal")), adjust(network, start, Options(datum="free"))
-    assert plain.unknowns - minimal.unknowns == open_directions
-    assert free.redundancy == minimal.redundancy
-    values, sigmas = camera_part(minimal)
-    np.testing.assert_allclose((camera_part(free)[0] - values) / sigmas.clip(1e-30), 0.0, atol=1e-9)
-    np.testing.assert_allclose(camera_part(free)[1], sigmas, rtol=1e-9)
-    assert free.vpv == pytest.approx(minimal.vpv, rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -175,14 +146,3 @@ def test_no_attitude_is_singular() -> None:
     assert result.vpv < 1e-12
     assert np.isfinite(result.cofactor_of(result.names)).all()
     assert result.value("EO.f0.phi") == pytest.approx(half, abs=1e-6)
-
-
-@pytest.mark.parametrize("datum", ["minimal", "free"])
-def test_a_datum_that_is_given_is_left_alone(datum: Datum) -> None:
-    """Known points, and points with standard deviations: nothing is free, and nothing more is fixed."""
-    for sigma in (0.0, 0.05):
-        network, start = simulated(np.random.default_rng(13), point_sigma=sigma)
-        plain, other = adjust(network, start), adjust(network, start, Options(datum=datum))
-        assert other.unknowns == plain.unknowns
-        np.testing.assert_array_equal(other.values, plain.values)
-        np.testing.assert_allclose(other.cofactor_of(other.names), plain.cofactor_of(plain.names), rtol=1e-9)

@@ -329,16 +329,6 @@ def test_a_point_behind_the_cameras_is_a_slip() -> None:
     assert [(each.tested.name, each.removed) for each in result.suspects] == [(f"control point {WRONG} Z", True)]
 
 
-@pytest.mark.usefixtures("one_by_one")
-def test_exchanged_points_are_both_named() -> None:
-    network, xyz = field()
-    warnings = adjust_network(set_given(network, {0: xyz[WRONG], WRONG: xyz[0]}), iteration_limit=STOPPED).warnings
-    assert len(warnings) == 2
-    for name, other in ((0, WRONG), (WRONG, 0)):
-        (own,) = (each for each in warnings if each.startswith(f"Control point {name} "))
-        assert f"It lies where point {other} is given." in own
-
-
 @pytest.mark.study
 def test_what_is_wrong_with_all_points_is_no_slip_of_one() -> None:
     network, xyz = field(3, 20)

@@ -12,7 +12,7 @@ from row_roots import row_roots
 from scipy.sparse import csc_array, csr_array, eye_array, vstack
 from scipy.sparse.linalg import splu
 
-from adjust import Approximations, Network, ObjectPoint, Prior, adjust
+from adjust import Approximations, Network, adjust
 from adjust.least_squares.equations import Numbering, WhitenedRows, prior_root_weights
 from adjust.least_squares.iteration import Linearised, factorise, linearise
 from adjust.linear_algebra import elimination, fronts, sparse_factor
@@ -20,7 +20,6 @@ from adjust.linear_algebra.elimination import eliminate
 from adjust.linear_algebra.factor import Blocks, Factor
 from adjust.linear_algebra.fronts import make_fronts
 from adjust.problem.problem import number
-from adjust.rank_defect import diagnosis
 
 Array = NDArray[np.float64]
 
@@ -287,19 +286,3 @@ def test_variances_along_a_line_are_those_of_its_differences(
     np.testing.assert_allclose(factor.variances(), weight**-2 + 0.5 * np.arange(count), rtol=1e-9)
     (roots,) = row_roots(factor, blocks)
     np.testing.assert_allclose(roots @ roots.swapaxes(1, 2), np.full((count - 1, 2, 2), 0.5), atol=1e-9)
-
-
-@pytest.mark.usefixtures("finely")
-def test_the_many_ways_in_which_a_strip_can_bend_are_reported_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is known well stands at one end: the other end is weak in as many ways as one cares to count."""
-    monkeypatch.setattr(diagnosis, "WEAK", 0.02)
-    network, start = strip(50.0)
-    points = [
-        ObjectPoint(each.id, *(Prior(float(x)) for x in start.points[each.id])) if int(each.id) < 10 else each
-        for each in network.points
-    ]
-    result = adjust(replace(network, points=tuple(points)), start)
-    assert result.converged
-    (warning,) = [text for text in result.warnings if "bend" in text]
-    assert "ways" in warning
-    assert "Z0" in warning

@@ -215,14 +215,6 @@ def test_texts_of_any_names_are_unique_and_are_read_back() -> None:
     assert all(parameter_from_text(each.text) == each for each in keys)
 
 
-def test_one_of_many_is_read_back_too() -> None:
-    of = [Parameter.fiducial("K.1", "2.3", "x"), Parameter.point("2", "X"), Parameter.exterior("f", "Z0")]
-    of += [Parameter.film("f", "a1"), Parameter.join("f", "2.3", "x"), Parameter.interior("K", "c")]
-    texts = [each.any_owner.text for each in of]
-    assert texts == ["FID.K.1.*.x", "PT.*.X", "EO.*.Z0", "T.*.a1", "JOIN.*.x", "IO.K.c"]
-    assert [parameter_from_text(text) for text in texts] == [each.any_owner for each in of]
-
-
 @pytest.mark.parametrize("text", ["", "IO", "IO.K", "XX.K.c", "FID.K.x", "IO.K.", "f1 X", "IO.f.1 X", "K.c"])
 def test_what_names_nothing_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="names no quantity"):

@@ -152,35 +152,10 @@ def test_a_singular_network_tells_too_what_is_nearly_singular() -> None:
         assert adjust(*CATALOGUE[name].setup.network(), CATALOGUE[name].options).warnings == ()
 
 
-def triangle(rng: np.random.Generator, singular: Array) -> Array:
-    """A triangle with some singular values."""
-    count = len(singular)
-    left, right = (np.linalg.qr(rng.normal(size=(count, count)))[0] for _ in range(2))
-    return np.asarray(np.linalg.qr(left @ np.diag(singular) @ right, mode="r"))
-
-
 def factorise(shared: Array, *blocks: BlockFactors) -> Factor:
     count = len(shared) + sum(block.own.size for block in blocks)
     dense = Triangle(Fronts.single(len(shared)), (shared,), (np.zeros((len(shared), 0)),))
     return Factor(DenseBlocks(blocks), dense, np.zeros(len(shared)), np.ones(count))
-
-
-@pytest.mark.parametrize("below", [diagnosis.SINGULAR, 1e-4])
-@pytest.mark.parametrize(
-    "small", [(), (1e-16,) * 9, (1e-17, 1e-16, 1e-6, 3e-5, 9e-5), tuple(np.geomspace(1e-6, 1e-3, 60))]
-)
-def test_small_singular_values_are_found_one_and_all(small: tuple[float, ...], below: float) -> None:
-    """Also more of them than are iterated at first, and next to others that are hardly larger."""
-    rng = np.random.default_rng(1)
-    count = 2 * diagnosis.DENSE
-    singular = np.array([*small, *np.geomspace(2e-3, 1.0, count - len(small))])
-    shared = triangle(rng, singular)
-    vectors, view = diagnosis.null_space(factorise(shared), [], below)
-    expected = np.sort(singular[singular <= below])
-    assert len(view) == len(expected)
-    np.testing.assert_allclose(np.sort(view), expected, rtol=0.02, atol=1e-14)
-    np.testing.assert_allclose(vectors.T @ vectors, np.eye(len(view)), atol=1e-12)
-    assert np.linalg.norm(shared @ vectors, axis=0).max(initial=0.0) <= below
 
 
 def test_a_block_without_its_own_determination_lends_its_rows_to_the_shared() -> None:

@@ -166,18 +166,6 @@ def test_what_is_removed_is_named_and_has_no_influence() -> None:
     assert sum(group.redundancy for group in result.groups.values()) == pytest.approx(result.redundancy)
 
 
-def test_suspects_are_named_without_being_removed() -> None:
-    """The residuals of good observations that a gross error has spoilt do not make them suspect."""
-    network, start = checkable(1)
-    spoilt = add_errors(network, {8: np.array([0.1, 0.0]), 30: np.array([-0.08, 0.1])})
-    result = adjust(spoilt, start)
-    w = np.abs(result.residuals.w).max(axis=1)
-    assert (w > 4.5).sum() > 2
-    assert named(result) == sorted([row_name(network, 8), row_name(network, 30)])
-    assert not any(suspect.removed for suspect in result.suspects)
-    assert (result.weights == 1.0).all()
-
-
 def test_wrong_given_values_are_named() -> None:
     network, start = checkable(2)
     spoilt = spoil_fiducial(spoil_control(network, 1.0), 0.15)

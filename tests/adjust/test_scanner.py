@@ -63,15 +63,6 @@ def test_only_terms_that_no_film_transformation_takes(kind: Transformation, left
     assert set(smooth_terms([kind, "affine"])) <= set(left)
 
 
-@pytest.mark.parametrize("kind", ["similarity", "affine", "projective", "bilinear"])
-def test_what_is_left_no_film_transformation_can_make_up(kind: Transformation) -> None:
-    """Films in one pose, their marks known: the terms are determined beside the films' own parameters."""
-    names = smooth_terms([kind])
-    result = solved(bent_films([0.0], {}, free(*names), kind=kind, sigma_given_mm=1e-3, marks_mm=RESEAU_MM))
-    assert result.converged
-    assert max(result.sigma(f"SC.S.{name}") for name in names) / result.sigma0 < 0.02
-
-
 @pytest.mark.parametrize("method", ["combined", "elements"])
 def test_perfect_data_give_the_bend_back(method: Literal["combined", "elements"]) -> None:
     """Targets and fiducials in four convergent frames, one of them mirrored: nothing is left, the truth comes out."""

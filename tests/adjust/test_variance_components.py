@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from networks import (
     FILM_CAMERA,
-    FRAME_NOISE_MM,
     DrawnFrames,
     Truth,
     add_errors,
@@ -184,20 +183,6 @@ def test_a_gross_error_that_is_left_out_does_not_spoil_the_factors() -> None:
 
 def adjust_network(truth: DrawnFrames) -> Adjustment:
     return adjust(truth.network, truth.start)
-
-
-def test_a_single_frame_whose_marks_only_place_the_datum_has_a_priori_sigmas() -> None:
-    """Of the shift by hand: the design matrix, and the two standard deviations of a mark."""
-    truth = draw_frames("affine", 1, 8, 1.0, 0.01, np.random.default_rng(1))
-    result = adjust_network(truth)
-    assert result.redundancy == 10
-    assert result.variance.is_a_priori
-    assert result.sigma0 == 1.0
-    assert result.groups["fiducial"].sigma0 == 0.0
-    design = np.column_stack([np.ones(8), truth.network.observations.xy_mm])
-    cofactor = np.linalg.inv(design.T @ design) * (1.0 + FRAME_NOISE_MM**2)
-    sigmas = [result.sigma(f"T.f0.a{k}") for k in (1, 2, 3)]
-    np.testing.assert_allclose(sigmas, np.sqrt(np.diag(cofactor)), rtol=1e-3)
 
 
 def test_sigma0_multiplies_the_noise_of_marks_and_not_the_datum() -> None:

@@ -17,7 +17,7 @@ from measure.detection.responses import ByteCache, CorrelationMaps, Responses, T
 from measure.fiducials.faint_marks import FaintMark, detect_faint
 from measure.fiducials.mark_fit import detect_mark
 from measure.flags import Cause
-from measure.marks.shapes import Bar, MarkShape, cross, dot, polygon, ring_cross
+from measure.marks.shapes import Bar, MarkShape, cross, dot, polygon
 from measure.tone.curve import Tone, power
 
 CROSS = MarkShape(cross(0.5, 0.05), "dark")
@@ -177,25 +177,6 @@ def test_a_line_far_thinner_than_a_pixel_is_not_detected_in_noise_and_warns_of_n
     assert localise(make_scan(GROUND + 3000 * noise), MarkPrediction(mark, place, 3.0, -1)) is None
 
 
-def test_a_solid_mark_at_the_frames_border_is_visible_however_far_about_it_is_sought() -> None:
-    """Its ground is that of the frame, not that of the border, of which the more is seen the smaller the window is."""
-    rng, size, center = np.random.default_rng(4), 400, np.array([200.3, 199.6])
-    block = MarkShape(polygon(((0.0, 0.0), (2.8, 0.0), (2.8, -1.4), (0.56, -1.4))), known_mm=((-9.0, -9.0), (1.9, 9.0)))
-    place = np.column_stack([np.diag([36.0, -36.0]), center])
-    x, y = np.moveaxis((np.stack(np.meshgrid(*[np.arange(size)] * 2), axis=-1) - center) / (36.0, -36.0), -1, 0)
-    exposed = (x < 1.9) & ~((y < 0) & (y > -1.4) & (x > -0.4 * y))
-    ground = 30000 + 2500 * 14 * gaussian_filter(rng.standard_normal((size, size)), 4.0)
-    border = 14000 + 3000 * rng.standard_normal((size, size))
-    light = gaussian_filter(exposed.astype(float), 1.0)
-    scan = make_scan(light * ground + (1 - light) * border)
-    for search_px in (5.0, 24.0):
-        start = np.column_stack([place[:, :2], center + np.array([3.0, -2.0])])
-        observation = localise(scan, MarkPrediction(block, start, search_px, -1))
-        assert observation is not None
-        assert observation[1] < 1e-3
-        assert np.hypot(*(observation[0] - center)) < 6.0
-
-
 PX_PER_MM = 30.0
 BEYOND_EDGE_GROUND, EDGE, NOISE = 55000.0, 5000.0, 600.0
 WING = MarkShape(polygon(((0.0, 0.0), (0.8, 0.35), (0.8, -0.35))))
@@ -222,15 +203,15 @@ def test_a_faint_light_cross_is_measured_whose_dark_pad_ends_next_to_it_in_a_lig
     assert np.hypot(*(detection.fit.center_px - place[:, 2])) < 0.3
 
 
-MAP = np.random.default_rng(5).normal(size=(40, 50)).astype(np.float32)
-
-
 def responses_to(
     surroundings: Surroundings, grey: np.ndarray, template: np.ndarray, detail_px: float, faint_dn: float
 ) -> Map:
     """The correlation of a picture, freed of its ground, with a template."""
     flat = surroundings.flattened(grey.astype(np.float32), detail_px, faint_dn)
     return correlation(flat, *surroundings.pattern(template, detail_px, flat))
+
+
+MAP = np.random.default_rng(5).normal(size=(40, 50)).astype(np.float32)
 
 
 def test_responses_are_freed_with_the_search_and_not_by_the_next_garbage_collection() -> None:
@@ -255,26 +236,6 @@ SET = Templates(TURNED, [2.0, 3.0] * 4, (), 1)
 def maps(cache: ByteCache) -> CorrelationMaps:
     channels = [SCAN.window(-4, -4, 118, 98, weights) for weights in np.eye(3).tolist()]
     return CorrelationMaps(channels, SET, (1, -1), WIDE, 100.0, cache)
-
-
-def test_a_faint_mark_next_to_the_frames_edge_is_what_answers_most() -> None:
-    """The edge is nine times as strong as the mark on overexposed film."""
-    rng = np.random.default_rng(1)
-    mark = MarkShape(ring_cross(0.5, 0.1, 0.8, 0.1), "light")
-    linear = np.diag([12.0, -12.0])
-    grey = np.full((180, 180), 2000.0)
-    grey[30:, 30:] = 56000.0
-    place = np.array([46.0, 47.0])  # its ring ends six pixels from both edges
-    grey += 6000.0 * brute_picture(mark, np.column_stack([linear, place]), 180, 180, 0.8)
-    grey += rng.normal(0.0, 1000.0, grey.shape)
-    template = brute_picture(mark, np.column_stack([linear, [12.0, 12.0]]), 25, 25, 0.6)
-    response = responses_to(WIDE, grey, template, 1.2, 130.0)
-    row, col = np.unravel_index(int(response.argmax()), response.shape)
-    assert abs(col + 12 - place[0]) <= 1
-    assert abs(row + 12 - place[1]) <= 1
-    highest = response.max()
-    response[row - 3 : row + 4, col - 3 : col + 4] = 0.0
-    assert response.max() < 0.6 * highest
 
 
 def test_lines_as_fine_as_the_grain_answer_at_closer_matching_by_what_the_grain_hides_least() -> None:

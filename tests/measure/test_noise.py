@@ -169,20 +169,6 @@ def test_clipping_does_not_move_a_mark(name: str, beyond: float) -> None:
     np.testing.assert_allclose(sighted(mark, CLIPPING_FULL - grey, 1).center_px, mark.place[:, 2], atol=0.002)
 
 
-@parametrize_with_studies("name", ["ring-dot", "wing"], quick=(1,))
-def test_the_sigma_of_a_clipped_mark_says_what_was_lost(name: str) -> None:
-    rng = np.random.default_rng(2)
-    errors, covariances, whole = [], [], []
-    for _ in range(8):
-        mark, grey = dark_mark(name, 0.3, 20.0, rng)
-        fit = sighted(mark, grey)
-        errors.append(fit.center_px - mark.place[:, 2])
-        covariances.append(fit.covariance_px2)
-        whole.append(np.trace(mark.bound(1 / 20.0)))
-    assert 0.7 < whitened_rms(errors, covariances) < 1.3
-    assert np.mean([np.trace(each) for each in covariances]) > 1.4 * np.mean(whole)
-
-
 @pytest.mark.parametrize("within", [-1.0, 0.0, 1.0])
 def test_noise_is_distinguished_from_what_is_visible_of_it_and_little_dust_does_not_change_that(within: float) -> None:
     noise = 3 * np.random.default_rng(4).standard_normal(20000)

@@ -67,18 +67,6 @@ def test_a_file_without_loss_tells_that_its_picture_was_jpeg(quality: int, share
             assert "was compressed as JPEG before" in scan.notes[-1]
 
 
-@pytest.mark.parametrize("levels", [256, 64, 16])
-def test_what_never_was_jpeg_is_not_taken_for_it(levels: int, tmp_path: Path) -> None:
-    """Few grey values, and a board whose squares repeat with the blocks' period, are no comb of one grid alone."""
-    board = np.kron(np.indices((48, 48)).sum(axis=0) % 2, np.ones((8, 8))) * 130 + 60
-    for index, picture in enumerate((film(), np.asarray(board, np.uint8))):
-        path = tmp_path / f"{index}.tif"
-        tifffile.imwrite(path, picture // (256 // levels) * (256 // levels))
-        with open_scan(path) as scan:
-            assert not scan.is_lossy
-            assert not scan.notes
-
-
 def test_faint_marks_that_jpeg_rounds_are_as_far_off_as_is_stated() -> None:
     """Of a contrast of three, four and six rounding steps: the rms error over the claim, both measured at once. What
     residuals do not show falls with the square of the contrast: one that fell with it would be twice too large."""

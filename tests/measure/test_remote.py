@@ -150,23 +150,6 @@ def test_a_thumbnail_of_another_form_is_no_overview(tmp_path: Path, server: Rang
         np.testing.assert_array_equal(remote.reduced(4), local.reduced(4))
 
 
-def test_tiles_of_a_window_are_requested_together(
-    tmp_path: Path, server: RangeServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    tifffile.imwrite(tmp_path / "s.tif", noise(), **LAYOUTS["tiles"])
-    requests: list[int] = []
-    ranges = Address.ranges
-
-    def counting(address: Address, extents: Any) -> Any:
-        requests.append(len(extents))
-        return ranges(address, extents)
-
-    with open_scan(f"{server.url}/s.tif") as scan:
-        monkeypatch.setattr(Address, "ranges", counting)
-        scan.samples(100, 100, 200, 200)
-    assert requests == [9]
-
-
 def test_a_picture_in_one_piece_is_fetched_whole_and_says_so(tmp_path: Path, server: RangeServer) -> None:
     tifffile.imwrite(tmp_path / "s.tif", noise(), compression="zlib", rowsperstrip=SIDE_PX)
     with open_scan(f"{server.url}/s.tif") as scan:

@@ -71,21 +71,6 @@ def test_planes_kept_apart_or_together(tmp_path: Path, planar: str, tile: tuple[
     np.testing.assert_array_equal(blue, truth[..., 2])
 
 
-@pytest.mark.parametrize("channels", [1, 3])
-@pytest.mark.parametrize("writer", ["tifffile", "libtiff"])
-def test_jpeg_in_tiff(tmp_path: Path, channels: int, writer: str) -> None:
-    smooth = cv2.GaussianBlur(picture(np.uint8, channels), (0, 0), 3)
-    path = tmp_path / "s.tif"
-    if writer == "tifffile":
-        kind = "rgb" if channels == 3 else "minisblack"
-        tifffile.imwrite(
-            path, smooth, photometric=kind, tile=(64, 64), compression="jpeg", compressionargs={"level": 95}
-        )
-    else:
-        PIL.Image.fromarray(smooth).save(path, compression="jpeg", quality=95)
-    assert np.sqrt(np.mean((whole(path) - luminance(smooth)) ** 2)) < 1.0
-
-
 @pytest.mark.parametrize("ending", [".png", ".tif"])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize("channels", [1, 3])

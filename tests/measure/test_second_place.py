@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from drawn import Array, brute_picture, draw, ellipse, make_scan, placed
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
@@ -15,7 +14,6 @@ from measure.detection.localisation import MarkPrediction
 from measure.fiducials.mark_fit import detect_mark
 from measure.flags import Cause
 from measure.marks.shapes import (
-    Bar,
     Disk,
     FiducialLayout,
     LayoutMark,
@@ -31,7 +29,6 @@ from measure.matching.covariance import LinearFit, across_edges
 from measure.noise.noise_model import NoiseModel, combined, products
 from measure.results import MarkFit, SecondPlace
 from measure.targets.disks import UNIT_DISK, fit_disk
-from measure.tone.curve import Tone
 
 SIZE, CONTRAST = 41, 500.0
 RING_CROSS = MarkShape(ring_cross(1.0, 0.2, 1.6, 0.15))
@@ -92,7 +89,6 @@ def test_where_paint_slopes_its_place_is_nearer_than_the_matched_one() -> None:
     assert fit.sloping.chance < 1e-6
 
 
-CROSS = MarkShape(cross(1.5, 0.15))
 FOLD, SPARE_PX = 4, 6
 SHIFTS = ((2, 0), (0, 2), (1, 1), (3, 2), (2, 3))
 
@@ -116,21 +112,6 @@ def test_the_sums_are_of_second_derivatives_across_the_edges() -> None:
         across = np.einsum("irc,ij,jrc->rc", slopes, hessian, slopes) / np.maximum((slopes**2).sum(axis=0), 1e-300)
         expected = (slopes * across).sum(axis=(1, 2))
         np.testing.assert_allclose((weights * picture).sum(axis=(1, 2)), expected, rtol=0.01, atol=0.02)
-
-
-def test_ragged_lines_are_known_as_badly_as_they_are() -> None:
-    """Each pixel's length of them lies elsewhere by 0.08 px, one standard deviation. The ground is clear, and would let
-    a cross be known three times as well as it is."""
-    rng, errors, known, by_noise = np.random.default_rng(4), [], [], []
-    for _ in range(8):
-        mark = some_mark(Kind("ragged", MarkShape((*ragged(0, rng), *ragged(1, rng)))), 1.0, rng)
-        grey = 1000 * mark.picture + rng.normal(0, 10, (mark.size, mark.size))
-        fit = match(ScanWindow(grey), CROSS, mark.place, MatchOptions())
-        errors.append(fit.center_px - mark.place[:, 2])
-        known.append(fit.covariance_px2)
-        by_noise.append(fit.place_covariance.parts[Cause.NOISE])
-    assert whitened_rms(errors, by_noise) > 2.3
-    assert whitened_rms(errors, known) < 1.7
 
 
 def test_a_mark_in_a_textured_border_is_known_as_badly_as_it_is() -> None:
@@ -162,17 +143,6 @@ def test_what_damage_leaves_next_to_itself_is_a_cause_of_a_marks_covariance() ->
     moved = (by_grey[:2] * margin * fit.used).sum(axis=(1, 2))
     np.testing.assert_allclose(fit.damage_px2(damaged), np.outer(moved, moved) / 3, rtol=1e-6)
     assert not fit.damage_px2(np.zeros_like(used)).any()
-
-
-def ragged(axis: int, rng: np.random.Generator) -> list[Bar]:
-    """The pieces of a line of 3 mm along an axis."""
-    ends, off_mm = np.linspace(-1.5, 1.5, 31).tolist(), rng.normal(0, 0.008, 30).tolist()
-
-    def place(along: float, off: float) -> tuple[float, float]:
-        return (off, along) if axis else (along, off)
-
-    pieces = zip(ends[:-1], ends[1:], off_mm, strict=True)
-    return [Bar(place(begin, off), place(end, off), 0.15) for begin, end, off in pieces]
 
 
 def test_a_chip_sampled_too_coarsely_is_found_in_pictures_shifted_by_known_parts_of_a_pixel() -> None:
@@ -284,17 +254,3 @@ def test_lines_far_wider_than_the_mark_s_are_not_the_mark() -> None:
     detection = detect_mark(make_scan(grey, 255), MarkPrediction(fine, mark.place, 3.0, 1), FiducialOptions().match)
     assert detection.fit is None
     assert "far wider than the mark's lines" in detection.reason
-
-
-def test_what_compression_makes_of_the_tone_curve_is_alike_in_all_marks() -> None:
-    rng = np.random.default_rng(4)
-    mark = some_mark(KIND["wedge"], 1.0, rng)
-    grey = GROUND + PRECISION_CONTRAST * (mark.picture + rng.standard_normal((mark.size, mark.size)) / 100)
-    expected = MarkPrediction(mark.kind.shape, mark.place, 3.0, 1)
-    for step, alike in ((0.0, 0.0), (0.1, 0.35**2)):  # 3.5 times the step over the contrast
-        scan = make_scan(grey, rounding_step_dn=step * PRECISION_CONTRAST).replace_tone(Tone.unknown())
-        fit = detect_mark(scan, expected, FiducialOptions().match, mark.kind.known).fit
-        assert fit is not None
-        assert fit.tone is not None
-        assert fit.tone.information.matrix.any()
-        assert fit.tone.information.common_variance == pytest.approx(alike, rel=0.1)

@@ -116,30 +116,6 @@ def test_the_tip_of_a_wedge_is_where_it_was_drawn_whatever_the_curve(curve: floa
     assert whitened_rms(errors, covariances) < 2.2  # of three scans, in fact: the tips of one are off together
 
 
-def test_the_linearised_effect_of_a_curve_is_that_of_a_fit_at_another_one() -> None:
-    rng = np.random.default_rng(5)
-    mark = some_mark(TIP, 1.0, rng)
-    code, tone = encode_mark(mark, 2.2, 200.0, rng), Tone(power(2.2), covariance=np.eye(5))
-    estimate = fit_mark(mark, code, tone).tone
-    assert estimate is not None
-    for k in range(3):
-        step = 0.1 * np.eye(5)[k]
-        more, less = (fit_mark(mark, code, tone.replace_departures(way * step)).center_px for way in (1, -1))
-        np.testing.assert_allclose((more - less) / 0.2, estimate.on_place[:, k], atol=0.03)
-
-
-def test_what_the_marks_contradict_one_another_by_is_in_the_covariance_of_each() -> None:
-    result = {n: mark_tone(way * np.eye(5)[0]) for n, way in enumerate((1.0, -1.0, 1.0, -1.0))}
-    agreed = {n: mark_tone(np.zeros(5)) for n in range(4)}
-    prior = Tone.unknown()
-    sigma, sigma_agreed = (
-        float(np.sqrt(FrameTone.from_marks(prior, each, prior).covariance_px2(each[0])[0, 0]))
-        for each in (result, agreed)
-    )
-    assert sigma_agreed < 0.06  # four marks, each 0.1 px
-    assert sigma > 0.5  # they are 1 px from what they agree on
-
-
 def test_a_picture_that_contradicts_the_others_hardly_moves_the_curve() -> None:
     agreed = [mark_tone(np.eye(5)[0]).information] * 4
     alone, prior = mark_tone(-3 * np.ones(5)).information, Tone.unknown()
