@@ -154,8 +154,8 @@ class Judging:
             self.check()
         names = self.names if images is None else self.names.intersection(images)
         connection, own = self.store.connection, "where judging = ? and scan = ?"
-        scans = self.values("name, scan")
-        for name, scan in sorted(row for row in scans if row[0] in names):
+        frames = connection.execute("select name, scan from judged_frame where judging = ? order by name", (self.row,))
+        for name, scan in [frame for frame in frames if frame[0] in names]:
             query = f"select is_whole, {columns} from checked_frame {own}"
             is_whole, *values = connection.execute(query, (self.row, scan)).fetchone()
             marks = connection.execute(f"select {MARKS} from checked_mark {own} order by number", (self.row, scan))
