@@ -20,7 +20,7 @@ from adjust.problem.camera import Camera
 from adjust.problem.estimates import adjusted_image, adjusted_places
 from adjust.problem.network import Network, ObjectPoint
 from adjust.problem.parameter import Parameter, shortened
-from adjust.solution.left_out_images import FEWEST, linear_transformations
+from adjust.solution.left_out_images import FEWEST, LARGE, linear_transformations
 from adjust.solution.result import Adjustment
 
 TOLERATED = 2.0  # factor on the given standard deviations up to which residuals need no explanation
@@ -88,8 +88,26 @@ def network_hypotheses(network: Network, bare: Network, given: Adjustment | None
         yield [NetworkHypothesis(unit_words(factor), _move_points(network, by), remedy, by)]
     is_far = given is None or not given.converged or given.sigma0 > ONE_AXIS
     alone = _exchanged_frames(network, given), _mirrored_images(network), _distances(network)
-    heights, plane = (_one_axis(network, axes) if is_far else () for axes in ((2,), (0, 1)))
+    heights = _one_axis(network, (2,)) if is_far else ()
+    plane = _one_axis(network, (0, 1)) if is_far and _may_be_stretched(network, given) else ()
     yield from ([each] for each in chain(heights, *alone, plane))
+
+
+def _may_be_stretched(network: Network, given: Adjustment | None) -> bool:
+    """Whether linear transformations of the given points fit all images, as with any units of the axes, and the
+    adjustment as given misses the marks by as much as a wrong one makes it."""
+    places, observations, fits = network.known_places, network.observations, list[bool]()
+    if given is not None and given.converged:
+        miss_mm = np.sqrt(np.mean(given.residuals.v_mm**2))
+        fits.append(bool(miss_mm > LARGE * np.ptp(observations.xy_mm)))
+    for number in range(len(network.images)):
+        own = np.flatnonzero((network.image_numbers == number) & ~observations.is_fiducial)
+        rows = [row for row in own if observations.point[row] in places]
+        if len(rows) >= FEWEST:
+            xyz = np.array([[places[observations.point[row]] for row in rows]])
+            (misfit,) = linear_transformations(xyz, observations.xy_mm[rows][None])[1]
+            fits.append(bool(misfit < LARGE))
+    return all(fits)
 
 
 def _one_axis(network: Network, axes: Sequence[int]) -> Iterator[NetworkHypothesis]:
