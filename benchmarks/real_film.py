@@ -2,7 +2,7 @@
 
 Each scan is measured alone, with automatic pose, and checked as a camera of one frame. --keep writes all marks to a
 file; --against names such a file, and marks whose status differs or whose place differs by more than 0.005 px are
-listed. --tone linear takes grey values as light.
+listed, and problems that differ. --tone linear takes grey values as light.
 """
 
 import json
@@ -97,7 +97,7 @@ def case(scan: str, tone: str = "auto", against: str | None = None) -> Row:
         for mark in frame.marks
     }
     claims = [mark["sigma_px"] for mark in marks.values() if mark["status"] == "measured"]
-    return {
+    row = {
         "found": len(claims) + sum(mark["status"] == "weak" for mark in marks.values()),
         "of": len(marks),
         "measured": len(claims),
@@ -105,20 +105,21 @@ def case(scan: str, tone: str = "auto", against: str | None = None) -> Row:
         "cpu_s": cpu_s,
         "marks": marks,
         "problems": [str(problem) for problem in frame.problems],
-        "changes": changes(_mark_counts(Path(against), scan), marks) if against else [],
     }
+    return {**row, "changes": changes(_kept_row(Path(against), scan), row) if against else []}
 
 
-def _mark_counts(kept: Path, scan: str) -> Row:
-    rows = (json.loads(text)[1] for text in kept.read_text(encoding="utf-8").splitlines())
-    return next((dict(row["marks"]) for row in rows if row["scan"] == scan), {})
+def _kept_row(kept: Path, scan: str) -> Row:
+    rows = (dict(json.loads(text)[1]) for text in kept.read_text(encoding="utf-8").splitlines())
+    return next((row for row in rows if row["scan"] == scan), {"marks": {}, "problems": []})
 
 
 def changes(before: Row, after: Row) -> list[str]:
-    """Lines of the marks whose results differ."""
-    lines = []
-    for point in before.keys() & after.keys():
-        old, new = before[point], after[point]
+    """Lines of the marks whose results differ, and of the frame's problems that are new or gone."""
+    lines = [f"problem gone: {each}" for each in before["problems"] if each not in after["problems"]]
+    lines += [f"problem new: {each}" for each in after["problems"] if each not in before["problems"]]
+    for point in before["marks"].keys() & after["marks"].keys():
+        old, new = before["marks"][point], after["marks"][point]
         places = old["place_px"], new["place_px"]
         moved_px = float(np.hypot(*np.subtract(*places))) if all(places) else np.nan
         if old["status"] != new["status"] or moved_px > MOVED_PX:

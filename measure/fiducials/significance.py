@@ -20,6 +20,10 @@ from measure.flags import FRAME_BY_CHANCE, NO_FRAME, NO_REASON, Code, Reason
 _CRITERIA = 3  # by which a false frame may be as good: response heights, misfit, and misfit under a stretch
 _STRETCHES = np.linspace(-0.03, 0.03, 13)  # relative, of non-square pixels; a step moves marks within narrow bounds
 _PLACES = 64  # compared beside the marks: enough to test three marks found of four
+_SELDOM, _HOPELESS = 1e-3, 1e6  # expected false frames between which full resolution may change the decision
+_COUNTED = 3  # marks at most to whose false-alarm rates the share at full resolution applies
+_REDUCED_PX = 1.5  # px of the reduced scan, largest distance between the peaks at reduced and full resolution
+_APART = 2.0  # in search radii: beyond the response of a mark itself
 _OFFSETS = (2.5, 4.5)  # in search radii: beyond the response of the mark itself
 _FREE = 2  # marks that a similarity fits wherever they lie
 _SURE = 12  # inliers from which the frame is no false alarm: specks do not agree so often
@@ -39,7 +43,8 @@ def false_frames(result: SearchResult, frame: Frame, indices: Iterable[int]) -> 
     """Expected number of false frames as good in the scan as one with marks, by index, found where they were fitted.
 
     Null hypothesis: detections are uniform within the search tolerance. A good fit of many marks by a similarity, with
-    or without a stretch, is then improbable.
+    or without a stretch, is then improbable. Many places respond as strongly at reduced resolution, but few of them at
+    full resolution: the number is multiplied by their share to the power of at most `_COUNTED` marks.
     """
     placement, found_px = frame.placement, {index: frame.inlier_fits[index].center_px for index in indices}
     widest_px, expected = result.searches[placement.pitch_mm].tolerance_px, list[float]()
@@ -47,7 +52,38 @@ def false_frames(result: SearchResult, frame: Frame, indices: Iterable[int]) -> 
         misfit_px = _misfit_px(frame, found_px, stretches)
         tolerance_px = min(max(misfit_px, NARROW * widest_px), widest_px)
         expected.append(len(stretches) * _false_alarms(result, placement, found_px, frame.inside, tolerance_px))
-    return _CRITERIA * min(expected)
+    reduced = _CRITERIA * min(expected)
+    if placement.reduction == 1 or not _SELDOM < reduced < _HOPELESS:
+        return reduced
+    return reduced * _share_at_full_resolution(result, frame, found_px) ** min(_COUNTED, len(found_px))
+
+
+def _share_at_full_resolution(result: SearchResult, frame: Frame, found_px: Mapping[int, Array]) -> float:
+    """Share of the places with responses as strong at reduced resolution that also have them at full resolution."""
+    marks_px, apart_px = np.array([*found_px.values()]), _APART * frame.first_search_px()
+    others = [
+        (index, place)
+        for index, own in found_px.items()
+        for place in _places_as_good(result, frame.placement, index, own)[: _PLACES // len(found_px)]
+        if np.hypot(*(marks_px - place).T).min() > apart_px
+    ]
+    weakest = min(_response(frame, index, place, _FITTED_PX) for index, place in found_px.items())
+    radius_px = _REDUCED_PX * frame.placement.reduction
+    return _share(sum(_response(frame, index, place, radius_px) >= weakest for index, place in others), len(others))
+
+
+def _places_as_good(result: SearchResult, placement: Placement, index: int, found_px: Array) -> Array:
+    """(n, 2) candidates of a mark that respond at least as strongly, at reduced resolution, as found_px (2,)."""
+    search = result.searches[placement.pitch_mm]
+    responses, key = search.responses, search.key(placement, index)
+    height = responses.dilated(key, search.tolerance_px).height(responses.reduced_px(found_px))
+    candidates = responses.candidates(key)
+    return responses.scan_px(candidates[responses.highest_about(key, candidates, 0.0)[1] >= height])
+
+
+def _share(hits: int, places: int) -> float:
+    """Share by Laplace's rule of succession: no hit among sixty places does not mean a rate of zero."""
+    return (hits + 1) / (places + 2)
 
 
 def _misfit_px(frame: Frame, found_px: Mapping[int, Array], stretches: Array) -> float:
@@ -134,9 +170,7 @@ def _doubt_by_neighbourhood(frame: Frame, inside: Sequence[int], clear: Sequence
     fitted = ((index, frame.inlier_fits[index].center_px) for index in clear)
     weakest = min((_response(frame, *each, _FITTED_PX) for each in fitted), default=0.0)
     hits = sum(_response(frame, index, place, radius_px) >= weakest for index, place in places)
-    # Laplace's rule of succession: no hit among sixty places does not mean a rate of zero.
-    share = (hits + 1) / (len(places) + 2)
-    chance = float(bdtrc(found - _FREE - 1, len(inside) - _FREE, share))
+    chance = float(bdtrc(found - _FREE - 1, len(inside) - _FREE, _share(hits, len(places))))
     if chance <= FRAME_BY_CHANCE:
         return NO_REASON
     return Reason(
