@@ -6,6 +6,7 @@ Places are complex numbers here, x + iy in mm of the scan's axes (right, up), so
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,16 +37,8 @@ _OUTSIDE_COST = 0.1  # score subtracted for each mark outside the scan
 _STEP_MM = 0.01  # mm, step of numerical derivatives
 
 
-@dataclass(frozen=True)
-class Bounds:
-    """Bounds of a placement.
-
-    Attributes
-    ----------
-    scale_tolerance : largest deviation of the scale from 1, for the given pitch.
-    rotation_rad : largest rotation.
-    misfit_mm : largest deviation of a mark.
-    """
+class Bounds(NamedTuple):
+    """Bounds of a placement: largest deviation of the scale from 1, largest rotation, largest deviation of a mark."""
 
     scale_tolerance: float
     rotation_rad: float
@@ -163,6 +156,16 @@ def _similarity_matrix(scale: complex | Complex, offset: complex | Complex) -> A
     return np.array([[scale.real, -scale.imag, offset.real], [scale.imag, scale.real, offset.imag]])
 
 
+def lattice_steps_mm(camera_mm: Array, within_mm: float) -> Array:
+    """(n, 2) steps from the middle mark to near ones that map most of the marks (marks, 2) to others."""
+    tree, middle = cKDTree(camera_mm), camera_mm.mean(axis=0)
+    origin = camera_mm[np.hypot(*(camera_mm - middle).T).argmin()]
+    distance, near = (np.ravel(each)[1:] for each in tree.query(origin, k=min(len(camera_mm), _NEIGHBOURS + 1)))
+    steps = camera_mm[near[distance > within_mm]] - origin
+    onto = [np.mean(tree.query(camera_mm + step)[0] < within_mm) for step in steps]
+    return np.asarray(steps[np.array(onto) > _ALIKE])
+
+
 def same_picture(
     marks: Sequence[LayoutMark],
     first: tuple[str, Sequence[int]],
@@ -222,19 +225,16 @@ class PlacementSearch:
         """Search in an orientation; one equivalent to an earlier one takes over its placements."""
         misfit_mm = self.bounds.misfit_mm
         same, similar = (
-            next((each for each in self.kinds if self._same_picture(each, pose, kinds, within_mm)), "")
-            for within_mm in (_SAME * misfit_mm, misfit_mm)
+            next((known for known in self.kinds.items() if same_picture(self.marks, known, (pose, kinds), mm)), None)
+            for mm in (_SAME * misfit_mm, misfit_mm)
         )
         if same:
-            self.placements[pose] = [placement.posed(pose, self.camera_mm) for placement in self.placements[same]]
+            self.placements[pose] = [placement.posed(pose, self.camera_mm) for placement in self.placements[same[0]]]
         else:
             self.placements[pose] = self.find_placements(pose, kinds)
         self.kinds[pose] = kinds
         if not similar:
             self.distinct.append(pose)
-
-    def _same_picture(self, known: str, pose: str, kinds: tuple[int, ...], within_mm: float) -> bool:
-        return same_picture(self.marks, (known, self.kinds[known]), (pose, kinds), within_mm)
 
     def key(self, placement: Placement, index: int) -> Key:
         """Key of the responses to a mark, by index, in the orientation and polarity of a placement."""
@@ -242,13 +242,8 @@ class PlacementSearch:
 
     @cached_property
     def steps_mm(self) -> Array:
-        """(n, 2) steps of a lattice: from the middle mark to near ones, if they map most marks to others."""
-        tree, middle = cKDTree(self.camera_mm), self.camera_mm.mean(axis=0)
-        origin = self.camera_mm[np.hypot(*(self.camera_mm - middle).T).argmin()]
-        near = np.ravel(tree.query(origin, k=min(len(self.camera_mm), _NEIGHBOURS + 1))[1])[1:]
-        steps = self.camera_mm[near] - origin
-        onto = [np.mean(tree.query(self.camera_mm + step)[0] < self.bounds.misfit_mm) for step in steps]
-        return np.asarray(steps[np.array(onto) > _ALIKE])
+        """(n, 2) steps of a lattice of marks; none if they form no lattice."""
+        return lattice_steps_mm(self.camera_mm, self.bounds.misfit_mm)
 
     def find_placements(self, pose: str, kinds: Sequence[int]) -> list[Placement]:
         """Find the distinct placements of an orientation, best first; none if no two marks respond.

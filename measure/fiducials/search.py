@@ -6,11 +6,10 @@ from itertools import groupby
 from operator import attrgetter
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from measure.detection.correlation import WIDE, Surroundings
 from measure.detection.responses import Effort, MarkView, Responses, correlate_scan, correlate_windows
-from measure.fiducials.constellation import Bounds, Placement, PlacementSearch, mark_signs
+from measure.fiducials.constellation import Bounds, Placement, PlacementSearch, lattice_steps_mm, mark_signs
 from measure.fiducials.options import FiducialOptions
 from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import FiducialLayout
@@ -26,8 +25,6 @@ _LARGE_PX = 1 << 24  # px in a large scan; smaller ones are read whole in a shor
 _REACH = 0.025  # fraction of the frame's side: film laid by hand is off by some millimetres and a degree
 _LARGEST_SHARE = 0.25  # fraction of the scan: above it the whole scan is searched, for the additional evidence
 _BEYOND_MM = 3.0  # mm beyond the scan's edge: a frame may be cut off there by less than its rim
-_FINE = 0.05  # fraction of the distance within which steps are alike: to which they are rounded
-_ALIKE = 0.5  # fraction of the marks that fall on others after one step: above it a lattice may be found one step off
 _WINDOWS_SHARE = 0.6  # fraction of the scan: above it the whole scan takes no longer than the windows
 
 
@@ -118,15 +115,8 @@ def is_searched_by_windows(scan: Scan, layout: FiducialLayout, pitch_mm: tuple[f
 
 
 def is_lattice(layout: FiducialLayout) -> bool:
-    """Whether one shift maps more than half of the marks to others."""
-    xy, near = np.array([mark.xy_mm for mark in layout.marks]), reach_mm(layout) / 2
-    steps = (xy[:, None] - xy[None]).reshape(-1, 2)
-    # A large lattice has a million steps, few of them distinct: count rounded ones.
-    rounded = np.round(steps[np.hypot(*steps.T) > near] / (_FINE * near))
-    fine, times = np.unique(rounded @ [1, 1j], return_counts=True)
-    places = _FINE * near * np.stack([fine.real, fine.imag], axis=1)
-    alike = [times[others].sum() for others in cKDTree(places).query_ball_point(places, near)] if len(places) else []
-    return max(alike, default=0) > _ALIKE * len(xy)
+    """Whether a step maps most marks to others: a lattice may be found one step off."""
+    return len(lattice_steps_mm(np.array([mark.xy_mm for mark in layout.marks]), reach_mm(layout) / 2)) > 0
 
 
 @dataclass(frozen=True, eq=False)

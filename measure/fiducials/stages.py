@@ -5,7 +5,7 @@ frame: the expected number of false frames in all stages so far, or in those und
 likelier than all others together.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from typing import Literal
@@ -194,41 +194,35 @@ def measure_stage(
         places = [each for each in places if number * false_placements(result, each) <= PLACEMENTS_BY_CHANCE]
     if kind == "pitch" or stage.tone is not None:
         places = [each for each in places if shows_marks(scan, layout, each, options)]
-    if stage.is_given:
-        frame = best_frame(scan, layout, places, options, result)
-        return [] if frame is None else [(0.0 if frame.accepted else np.inf, frame)]
-    if kind == "faint":
-        faint = (_faint_frame(scan, layout, each, options, result, tried) for each in places)
-        return sorted((each for each in faint if each is not None), key=itemgetter(0))
     least = _OBLIQUE, _GAINED - 1  # marks in all, and missing ones, for a perspective
     if kind == "oblique":
         places = [each for each in places if each.supported >= max(least[0], len(layout.marks) - least[1])]
-    frames = [measure_frame(scan, layout, each, options) for each in places]
-    frames = [frame for frame in frames if frame.accepted]
+    measured = (measure_frame(scan, layout, each, options) for each in places)
+    if stage.is_given:
+        frame = best_frame(measured, max((each.supported for each in places), default=0), result)
+        return [] if frame is None else [(0.0 if frame.accepted else np.inf, frame)]
+    if kind == "faint":
+        faint = (_evaluate_faint(each, result, tried) for each in measured)
+        return sorted((each for each in faint if each is not None), key=itemgetter(0))
+    frames = [frame for frame in measured if frame.accepted]
     if kind == "oblique":
         frames = [frame for frame in frames if frame.measured_count >= max(least[0], frame.inside - least[1])]
     expected = [(tried * false_frames(result, frame, frame.unblemished), frame) for frame in frames]
     return sorted(expected, key=itemgetter(0))
 
 
-def best_frame(
-    scan: Scan, layout: FiducialLayout, places: Sequence[Placement], options: FiducialOptions, result: SearchResult
-) -> Frame | None:
-    """Measure the frame in some placements and select one.
+def best_frame(measured: Iterable[Frame], most_supported: int, result: SearchResult) -> Frame | None:
+    """Select one of the frames that are measured in some placements; no more are measured than needed.
 
     Selected is the first frame that is sure and not outdone by a placement with more supporting marks; else the sure
     frame with most measured marks; else the first accepted one; else one whose fits failed; else by inliers. Frames
     whose marks are all among those of an accepted frame tried before are skipped.
     """
     frames = list[Frame]()
-    for placement in places:
-        frame = measure_frame(scan, layout, placement, options)
-        if frame.accepted and frame.scan.tone.sharpening:  # it belongs to the scan, wherever its frame lies
-            scan = scan.replace_tone(scan.tone.sharpened(frame.scan.tone.sharpening))
+    for frame in measured:
         if any(before.accepted and before.contains(frame) for before in frames):
             continue
-        is_outdone = any(place.supported > frame.measured_count for place in places)
-        if frame.is_sure and not (is_outdone and doubt_frame(result, frame)):
+        if frame.is_sure and not (most_supported > frame.measured_count and doubt_frame(result, frame)):
             return frame
         frames.append(frame)
     return max(frames, key=_preference, default=None)
@@ -241,25 +235,18 @@ def _preference(frame: Frame) -> tuple[int, ...]:
     return (1, 0) if frame.accepted else (0, bool(frame.failed_fits), int(frame.inliers.sum()))
 
 
-def _faint_frame(
-    scan: Scan,
-    layout: FiducialLayout,
-    placement: Placement,
-    options: FiducialOptions,
-    result: SearchResult,
-    tried: int,
-) -> Evaluated | None:
-    """Measure the faint frame in a placement and in its likeliest pose: names of other poses would hide its marks."""
-    frames = [measure_frame(scan, layout, placement, options)]
-    if options.pose == "auto" and frames[0].inliers.any():
-        pose = decide_pose(frames[0]).name
-        frames += [] if pose == placement.pose else [rename_frame(scan, frames[0], pose)]
-    frames = [frame for frame in frames if frame.agrees]
+def _evaluate_faint(frame: Frame, result: SearchResult, tried: int) -> Evaluated | None:
+    """Evaluate a faint frame, also in its likeliest pose: names of other poses would hide its marks."""
+    placement, frames = frame.placement, [frame]
+    if frame.options.pose == "auto" and frame.inliers.any():
+        pose = decide_pose(frame).name
+        frames += [] if pose == placement.pose else [rename_frame(frame.scan, frame, pose)]
+    frames = [each for each in frames if each.agrees]
     if not frames:
         return None
     # By the measured marks, or by the responses at reduced resolution: the smaller counts, times two for two criteria.
-    as_measured = min(false_frames(result, frame, frame.inlier_fits) for frame in frames)
-    most = max(frames, key=lambda frame: frame.inliers.sum())
+    as_measured = min(false_frames(result, each, each.inlier_fits) for each in frames)
+    most = max(frames, key=lambda each: each.inliers.sum())
     return 2 * tried * min(as_measured, false_placements(result, placement)), most
 
 
