@@ -53,6 +53,18 @@ def test_a_pose_mirrors_first_and_then_turns() -> None:
     np.testing.assert_allclose(up_from_camera("90") @ (1.0, 0.0), (0.0, 1.0))
 
 
+def test_halving_a_marks_sigma_changes_its_share_of_the_residual() -> None:
+    """Trap: a weight matrix that is the covariance instead of its inverse."""
+    turn, disturbed = up_from_camera("0"), view_marks(EIGHT, up_from_camera("0"))
+    disturbed[0] += (0.05, 0.0)
+    sizes = []
+    for sigma in (0.02, 0.01, 0.005):
+        sigmas = np.full(8, 0.01)
+        sigmas[0] = sigma
+        sizes.append(np.hypot(*fit_frame(EIGHT, disturbed, sigmas, turn).residuals_mm[0]))
+    assert sizes[0] > 1.1 * sizes[1] > 1.2 * sizes[2]
+
+
 def outlying(camera: Array, up: Array) -> list[int]:
     marks = FrameMarks.from_places(camera, up, np.tile(1e-6 * np.eye(2), (len(camera), 1, 1)))
     return np.flatnonzero(gross_errors(marks, Scatter(0.005, 4.0), 0.3)).tolist()

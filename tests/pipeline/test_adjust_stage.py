@@ -281,6 +281,26 @@ def test_interior_orientation_has_the_published_residuals(kind: str, tmp_path: P
     assert result.redundancy == 2 * (16 - {"affine": 6, "similarity": 4}[kind])
 
 
+@needs("film_numbers")
+def test_the_affine_transformation_of_eight_fiducials_is_the_published_one(tmp_path: Path) -> None:
+    """Published with its rms, all errors in the given coordinates: they are given 1 mm, the readings 0.1 µm."""
+    pitch_mm = 0.042
+    with (DATA / "film_numbers" / "sju_8fid" / "fiducials.csv").open(encoding="utf-8") as lines:
+        marks = list(csv.DictReader(lines))
+    places = {m["id"]: (float(m["cal_x_mm"]), float(m["cal_y_mm"])) for m in marks}
+    rows = ["image,point,kind,x_mm,y_mm,sx_mm,sy_mm"]
+    rows += [
+        f"left,{m['id']},fiducial,{pitch_mm * float(m['x_px'])},{-pitch_mm * float(m['y_px'])},1e-4,1e-4" for m in marks
+    ]
+    camera = 'name = "SJU"\n' + fiducial_tables(places, "sigma_mm = 1\n")
+    result = adjust_network(write_tables(tmp_path, 'camera = "camera.toml"', camera=camera, comparator=rows).parent)
+    found = {name: result.value(f"T.left.{name}") for name in ("a1", "a2", "a3", "b1", "b2", "b3")}
+    per_px = [pitch_mm * found["a2"], -pitch_mm * found["a3"], pitch_mm * found["b2"], -pitch_mm * found["b3"]]
+    assert per_px == pytest.approx([0.041989, 0.000144, 0.000147, -0.041985], abs=6e-7)
+    assert (found["a1"], found["b1"]) == pytest.approx((-120.259262, 116.872551), abs=1e-5)  # from single precision
+    assert result.redundancy == 10
+
+
 def test_film_is_added_to_the_covariance_of_every_mark(tmp_path: Path) -> None:
     network, _ = simulated(np.random.default_rng(1))
     path = write_network_project(network, tmp_path)

@@ -25,6 +25,7 @@ from truth_comparison import camera_errors, compare_frames
 
 import measure
 import pipeline
+from pipeline import read_comparator
 from pipeline.cli import DONE, LOOK, app, run
 from pipeline.files.library import read_library
 from pipeline.files.project_file import read_project
@@ -53,6 +54,16 @@ def test_the_demonstration_is_measured_right_agrees_with_opencv_and_is_reported(
     folder, code = finished
     assert code == DONE
     assert_demonstrated(folder, FRAMES)
+
+
+def test_trap_a_failed_scan_is_dropped_from_the_table(finished: tuple[Path, int]) -> None:
+    """Every mark of every scan has its row, found or not, with a reason unless it was measured."""
+    folder, _ = finished
+    points = read_comparator(folder / "comparator.csv")
+    assert {point.image for point in points} == {path.stem for path in (folder / "scans").iterdir()}
+    for image in {point.image for point in points}:
+        assert sum(point.image == image and point.kind == "fiducial" for point in points) == 8
+    assert all(point.reason for point in points if point.status != "measured")
 
 
 def assert_report_is_short(page: Page, folder: Path) -> None:

@@ -159,6 +159,18 @@ def test_crosses_in_space_with_no_principal_distance(scenes: dict[str, Path], tm
 
 
 @pytest.mark.study
+def test_an_orientation_that_does_not_fit_is_not_used(scenes: dict[str, Path], tmp_path: Path) -> None:
+    project, places = rendered(scenes[CROSSES], tmp_path)
+    turned = "image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg\na,-1.2,0.9,2.0,-25.0,-30.0,-90.0\n"
+    (tmp_path / "images.csv").write_text(turned, encoding="utf-8")
+    text = project.read_text(encoding="utf-8")
+    project.write_text(text.replace("[object]", '[object]\nimages = "images.csv"'), encoding="utf-8")
+    scan = measure_scan(read_project(project), "a")
+    assert len(errors(scan, places)) == len(places)
+    assert any("orientation in images.csv was not used" in problem for problem in scan.frame.problems)
+
+
+@pytest.mark.study
 def test_ring_codes_in_space_and_two_that_are_confused(scenes: dict[str, Path], tmp_path: Path) -> None:
     project, places = rendered(scenes[RINGS], tmp_path)
     off = errors(measure_scan(read_project(project), "a"), places)
