@@ -7,7 +7,7 @@ import numpy as np
 
 from adjust.array_types import Indices
 from adjust.errors import AdjustmentError
-from adjust.functional_model.families import family
+from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.transformation import fewest_marks, marks_needed
 from adjust.problem.camera import Camera
@@ -88,7 +88,12 @@ def _camera_faults(network: Network) -> Faults:
         c, distortion = camera.principal_distance_mm, camera.distortion
         if c is not None and c.value <= 0.0:
             yield f"camera {camera.name}: the principal distance must be positive, not {c.value} mm."
-        needed = family(distortion.family).needs
+        names, needed = parameter_names(distortion.family), family(distortion.family).needs
+        if unknown := sorted(set(distortion.parameters) - set(names)):
+            yield (
+                f"camera {camera.name}: the distortion family {distortion.family} has no parameter "
+                f"{', '.join(unknown)}; it has {', '.join(names) or 'none at all'}."
+            )
         if needed == "r0_mm" and distortion.r0_mm <= 0.0:
             yield f"camera {camera.name}: the distortion family juhl needs r0 > 0, Juhl's is 1.35 dm."
         if needed == "half_mm" and min(distortion.half_mm) <= 0.0:

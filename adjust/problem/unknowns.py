@@ -205,12 +205,6 @@ def _camera_quantities(camera: Camera, approximations: Approximations) -> list[Q
     quantities: list[Quantity] = list(zip(("c", "x0", "y0"), priors, starts, strict=True))
     names = parameter_names(camera.distortion.family)
     given = camera.distortion.parameters
-    unknown = sorted(set(given) - set(names))
-    if unknown:
-        raise AdjustmentError(
-            f"camera {camera.name}: the distortion family {camera.distortion.family} has no parameter "
-            f"{', '.join(unknown)}; it has {', '.join(names) or 'none at all'}."
-        )
     distortion = approximations.distortion.get(camera.name, {})
     return quantities + [(name, given.get(name, Prior(0.0, 0.0)), distortion.get(name)) for name in names]
 

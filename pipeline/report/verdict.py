@@ -227,7 +227,9 @@ def _too_large(adjustment: AdjustmentRecord) -> Iterator[Problem]:
     step = f"Reject gross errors first; then {model}, or state film_sigma_um. All σ are already multiplied by σ₀."
     yield Problem(
         f"{size} ({_group_sigmas(adjustment)}).",
-        'Try transformation = "affine" first: uneven shrinkage of films looks like gross errors.' if is_rigid else step,
+        'Try transformation = "affine" first: uneven shrinkage of films has the effect of gross errors.'
+        if is_rigid
+        else step,
         section="reliability",
     )
 
