@@ -30,6 +30,7 @@ _LARGEST_PART_PX = 2048  # largest side of a part in whole segments; larger segm
 _COMPRESSION_PX = 256  # side of the central part tested for an earlier compression: 1000 blocks
 _PLAINLY_COARSER = 1.5  # least ratio to the file's own rounding step, which shows as well
 _OF_A_PX = 0.01  # tolerance of an overview's size, px, where its last pixel covers only a part
+_LOOKED_PX, _LOOKS = 64, 4  # side of the windows in which values are counted, and their number across and down
 _NAMED = 3  # damaged parts listed by name; more are counted
 _LEAST_UNIT_DN = 16  # least step of grey values of 8 bits stored in 16: 12 bits in the high bits have this step
 
@@ -96,6 +97,21 @@ class Scan:
             "the picture was compressed as JPEG before it was stored as it is (to steps of some"
             f" {self._earlier_step_dn:.0f} grey values): its marks have the larger standard deviations of such a file"
         )
+
+    @cached_property
+    def is_two_valued(self) -> bool:
+        """Whether only two values occur in windows spread over it: thresholding took the grey values from its edges."""
+        width, height = (min(side, _LOOKED_PX) for side in (self.width_px, self.height_px))
+        lefts, tops = (
+            np.linspace(0, side - own, _LOOKS).astype(int).tolist()
+            for side, own in ((self.width_px, width), (self.height_px, height))
+        )
+        values = set[int]()
+        for left, top in product(lefts, tops):
+            values.update(np.unique(self.samples(left, top, width, height)).tolist())
+            if len(values) > 2:
+                return False
+        return len(values) == 2
 
     @property
     def samples_dtype(self) -> type[np.uint8] | type[np.uint16]:

@@ -107,6 +107,11 @@ def _opened_and_measured(task: ScanTask, look: SecondPass | None) -> MeasuredSca
         window, lens = scan.path.window if isinstance(scan.path, ScanPart) else None, task.options.fiducials.lens
         if isinstance(lens, CalibratedLens) and (misfit := lens.misfit(scan)):
             raise MeasurementError(misfit)
+        if scan.is_two_valued:
+            raise MeasurementError(
+                f"{task.shown_scan} has black and white pixels only, and marks are measured by the grey values along "
+                "their edges: scan it again as grey or RGB with 8 or 16 bits a sample"
+            )
         measured = _measure_window(task, scan, window) if window else _measure(task, scan, task.options)
         if look is not None:
             look(scan, measured)

@@ -171,6 +171,14 @@ def test_trap_black_and_white_png(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "s.png"), black_and_white, [cv2.IMWRITE_PNG_BILEVEL, 1])
     with pytest.raises(MeasurementError, match="black and white pixels only"):
         whole(tmp_path / "s.png")
+    for name, values in {
+        "two.tif": black_and_white,
+        "many.tif": picture(np.uint8),
+        "one.tif": 0 * black_and_white,
+    }.items():
+        tifffile.imwrite(tmp_path / name, values)
+        with open_scan(tmp_path / name) as scan:
+            assert scan.is_two_valued == (name == "two.tif")
 
 
 def test_pitch_of_png_and_jpeg(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+import tifffile
 from in_process import Here, Loses
 from loaded_script import script
 from projects import CAMERA, PROJECT, Refusal, present, write_project, write_tables
@@ -165,6 +166,14 @@ def test_failures_are_results(
     assert present(scan.failure).code == code
     assert words in present(scan.failure).sentence
     assert [(mark.point, mark.status) for mark in scan.frame.marks] == [(id, Status.ABSENT) for id in "1234"]
+
+
+def test_a_thresholded_scan_is_refused(tmp_path: Path) -> None:
+    project = write_project(tmp_path, ["a"])
+    grey = tifffile.imread(tmp_path / "a.tif")
+    tifffile.imwrite(tmp_path / "a.tif", 255 * (grey > np.median(grey)).astype(np.uint8))
+    scan = measured_scan(scan_tasks(read_project(project), ["a"])[0])
+    assert "has black and white pixels only" in present(scan.failure).sentence
 
 
 def test_a_failed_scan_has_a_row_for_each_target(tmp_path: Path) -> None:
