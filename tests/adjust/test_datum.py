@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from reference_cases import case_approximations, case_network, load
 
 from adjust import Adjustment, AdjustmentError
+from adjust.problem.problem import number
+from adjust.rank_defect.datum import object_datum
 from adjust.solution.adjustment import Options, adjust
 
 Array = NDArray[np.float64]
@@ -102,6 +104,18 @@ def test_a_coordinate_that_is_given_needs_no_holding() -> None:
     network, start = simulated(np.random.default_rng(5), point_sigma=0.05)
     with pytest.raises(AdjustmentError, match="X is given with the standard deviation"):
         adjust(network, start, Options("minimal", ("0.X",)))
+
+
+def test_a_generator_moves_a_point_at_the_fields_root_mean_square_distance_by_one_unit() -> None:
+    network, start = simulated(np.random.default_rng(5), point_sigma=np.inf)
+    problem = number(network, start)
+    datum = object_datum(problem, problem.start())
+    points = np.array(list(start.points.values()))
+    spread = np.sqrt(((points - points.mean(axis=0)) ** 2).sum() / len(points))
+    assert datum.extent == pytest.approx(spread, rel=1e-9)
+    positions = np.array([problem.unknowns.point[name] for name in start.points])
+    motions = datum.generators[positions, 6]
+    np.testing.assert_allclose(motions, (points - points.mean(axis=0)) / spread, atol=1e-9)
 
 
 @pytest.mark.parametrize("carrying", [(), ("1", "5", "7")], ids=["all", "some"])

@@ -119,6 +119,18 @@ def test_one_frame_names_the_mark_that_alone_is_off() -> None:
     assert known.sigmas_px[Cause.GIVEN_PLACES] == pytest.approx(3.0 / np.sqrt(2), rel=0.1)
 
 
+@pytest.mark.parametrize("count", [1, 4])
+def test_a_bent_frame_is_a_problem_of_the_frame(count: int) -> None:
+    rng, layout = np.random.default_rng(7), make_layout(EIGHT)
+    frames = make_frames(layout, count, rng)
+    frames[0] = make_frames(layout, 1, rng, film_mm=0.08)[0]
+    result = check_frames(frames, layout, [(20.0, 20.0)] * count)
+    assert weak(result.frames) == set()
+    assert [len(frame.problems) for frame in result.frames] == [1] + [0] * (count - 1)
+    assert ("one frame does not tell" in result.frames[0].problems[0]) == (count == 1)
+    assert 0.04 < result.film_sigma_mm[0] < 0.14
+
+
 @pytest.mark.parametrize("step_px", [(4.5, 0.0), (0.0, -4.5)])
 def test_a_jump_within_a_scan_is_a_problem_of_the_frame(step_px: tuple[float, float]) -> None:
     """By 90 µm, which each mark shows by a part only: an affine transformation takes up most of it."""
@@ -272,6 +284,20 @@ def test_a_mark_of_four_that_is_wrong_is_named_next_to_ten_frames_and_no_other_i
         assert found <= {("0", str(wrong))}
         right += bool(found)
     assert right >= 4  # in nine of ten of 200 folders
+
+
+def test_film_that_scatters_more_than_expected_is_a_problem_of_all_frames() -> None:
+    """Next to two frames that are bent as well, a mark that is 1 mm off does not stand out."""
+    rng = np.random.default_rng(4)
+    for _ in range(5):
+        frames, wrong, _ = folder(rng, 3)
+        result = check_network(frames)
+        assert named(result) <= {("0", str(wrong))}
+        assert all("state film_sigma_um" in frame.problems[-1] for frame in result.frames)
+        stated = check_frames(
+            frames, make_layout(FOUR), [(1000 / PX_PER_MM,) * 2] * 3, BelievedFilm(1.0, is_stated=True)
+        )
+        assert not any(frame.problems for frame in stated.frames)
 
 
 @parametrize_with_studies("count", [1, 10])

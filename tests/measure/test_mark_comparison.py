@@ -85,6 +85,20 @@ def test_marks_of_one_blur_are_rarely_doubted_and_another_blur_is() -> None:
     assert found > 270
 
 
+def test_how_much_blurs_differ_from_mark_to_mark_comes_out_as_it_was_drawn() -> None:
+    """By the moments of marks that tell their blurs unequally well: the square is unbiased."""
+    rng, between, squares = np.random.default_rng(6), 0.25, []
+    sigmas = np.array([0.03, 0.05, 0.08, 0.12, 0.2, 0.2, 0.1])
+    for _ in range(400):
+        own = 1.1 * np.exp(rng.normal(0, np.hypot(sigmas, between)))
+        shared = shared_blurs(fits(np.append(own, 1.1), [*sigmas, 0.3]))[-1]
+        assert shared is not None
+        squares.append(shared.sigma**2)
+    of_mean = 1 / np.sum(1 / (sigmas**2 + between**2 + 0.05**2))
+    expected = between**2 + 0.05**2 + of_mean
+    assert np.mean(squares) == pytest.approx(expected, rel=0.08)
+
+
 def test_a_match_with_the_others_blur_rarely_contradicts_it_unless_its_own_is_another() -> None:
     rng, others_sigma, own_sigma = np.random.default_rng(3), 0.06, 0.1
     result, weight = SharedBlur(np.sqrt(1.1**2 - PIXEL), others_sigma, False), others_sigma**2 / (0.06**2 + 0.1**2)

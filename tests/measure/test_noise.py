@@ -13,10 +13,23 @@ from measure.fiducials.mark_fit import detect_mark
 from measure.matching.covariance import second_order
 from measure.matching.window import clipped_sides, noise_scale, read_window
 from measure.noise.grain import _KERNELS, GRAIN_PX, PATCH_PX, PLANE, grain_model
-from measure.noise.noise_model import noise_model, steadiness
+from measure.noise.noise_model import influence_covariances, noise_model, steadiness
 from measure.tone.curve import Tone, power
 
 FULL = 65535.0
+
+
+def test_the_variance_of_noise_is_that_before_the_fit_took_its_share() -> None:
+    """Twelve unknowns of 64 pixels: a fit leaves less than there was, by as many."""
+    rng, sigma, unknowns, variances = np.random.default_rng(4), 5.0, 12, []
+    design = np.linalg.qr(rng.normal(size=(64, unknowns)))[0]
+    for _ in range(400):
+        noise = rng.normal(0, sigma, 64)
+        left = (noise - design @ (design.T @ noise)).reshape(8, 8)
+        used = np.ones((8, 8), bool)
+        of_many = influence_covariances(np.ones((1, 1, 8, 8)), left[None], used[None], unknowns)[1]
+        variances.append((noise_model(left, used, unknowns).variance_dn2, of_many.item()))
+    np.testing.assert_allclose(np.mean(variances, axis=0), sigma**2, rtol=0.03)
 
 
 @pytest.mark.parametrize("grows", [0.0, 0.25, 0.5])
