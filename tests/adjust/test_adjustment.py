@@ -1,5 +1,6 @@
 """The adjustment against reference cases, a dense implementation by complex steps, and published calibrations."""
 
+import random
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -82,6 +83,25 @@ def test_reference_case(name: str) -> None:
     redundancy = reference["redundancy_numbers"][: v.size]
     np.testing.assert_allclose(result.residuals.redundancy.ravel(), redundancy, rtol=0, atol=1e-9)
     assert sum(group.redundancy for group in result.groups.values()) == pytest.approx(result.redundancy)
+
+
+@pytest.mark.parametrize("name", ["i_five_images_affine_reduced", "iii_selfcal_mixed"])
+def test_the_order_of_inputs_does_not_matter(name: str) -> None:
+    case = load(name)
+    network = case_network(case)
+    order = list(range(len(network.observations)))
+    random.Random(7).shuffle(order)
+    shuffled = Network(
+        network.cameras,
+        network.images[::-1],
+        tuple(sorted(network.points, key=lambda point: point.id[::-1])),
+        network.observations.only(np.array(order)),
+    )
+    plain, other = adjust_network(case), adjust_network(case, shuffled)
+    for i, unknown in enumerate(plain.names):
+        sigma = max(np.sqrt(plain.cofactor.variances[i]), 1e-30)
+        assert abs(plain.values[i] - other.value(unknown)) <= 1e-9 * sigma
+    np.testing.assert_allclose(other.residuals.w, plain.residuals.w[order], atol=1e-8)
 
 
 def test_an_iteration_limit_is_reported() -> None:

@@ -168,6 +168,24 @@ def test_perfect_data_leave_nothing_and_give_the_truth_back(kind: Transformation
     assert result.mirrored == {"f1"}
 
 
+@pytest.mark.parametrize("kind", [pytest.param("polynomial(3)", marks=pytest.mark.study), "polynomial(5)"])
+def test_the_origin_of_the_comparator_does_not_matter(kind: Transformation) -> None:
+    """A metre and a half off, as on a film strip; with exact observations, which are moved without a rounding."""
+    network, _ = simulated(
+        np.random.default_rng(4), Truth(), "polynomial(3)", field_points(np.random.default_rng(5), 40), noise=False
+    )
+    network = replace(network, images=tuple(replace(image, transformation=kind) for image in network.images))
+    observations = network.observations
+    moved = replace(network, observations=replace(observations, xy_mm=observations.xy_mm + 1500.0))
+    results = [adjust(each, approximate(each)) for each in (network, moved)]
+    for result in results:
+        assert result.converged
+        assert np.abs(result.residuals.v_mm).max() < 1e-10
+    for name in ("IO.K.c", "IO.K.x0", "FID.K.3.y", "EO.f2.omega"):
+        near, far = (result.sigma(name) / result.sigma0 for result in results)
+        assert far == pytest.approx(near, rel=1e-9)
+
+
 @pytest.mark.parametrize(("kind", "marks"), [("projective", 3), ("bilinear", 3), ("conformal(3)", 2)])
 def test_targets_determine_what_too_few_marks_leave_open(kind: Transformation, marks: int) -> None:
     network = add_marks(exact_network(kind, 25), marks)

@@ -77,6 +77,14 @@ def test_a_trend_is_found() -> None:
     assert still.trend_um == pytest.approx(ends.field_um[0], abs=0.05)
 
 
+def test_over_flat_ground_another_principal_distance_is_another_height() -> None:
+    change = np.array([0.05, 0.04, 0.0, 0.0, 0.0, 0.0, 0.0])
+    pair = [calibration(TRUE), calibration(TRUE + change)]
+    assert compare(pair, HALF).same.probability < 1e-6
+    assert np.abs(compare(pair, HALF, use="flat").field_um).max() < 1.0  # what the lens shifts with its point
+    assert np.abs(compare(pair, HALF).field_um).max() > 3.0
+
+
 @pytest.mark.parametrize(
     ("count", "times", "words"), [(1, None, "two calibrations or more"), (2, (1960.0, 1950.0), "in rising order")]
 )
