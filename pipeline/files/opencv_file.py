@@ -69,6 +69,11 @@ def _pixel_camera(path: Path, storage: Any) -> PixelCamera:
     matrix, lens, size, height = (first(names) for names in (_MATRIX, _LENS, _WIDTH, _HEIGHT))
     if matrix is None or matrix.mat() is None or matrix.mat().shape != (3, 3):
         raise InputError(f"{path}: has no 3 x 3 matrix {_MATRIX[0]} (or {', '.join(_MATRIX[1:])}).")
+    if not storage.getNode("M2").empty():
+        raise InputError(
+            f"{path}: holds two cameras (M1 and M2 of a stereo pair). Save each in a file of its own, with the keys "
+            f"{_MATRIX[0]} and {_LENS[0]}."
+        )
     k = np.array(matrix.mat(), dtype=float)
     values = np.zeros(0) if lens is None else np.ravel(lens.mat()).astype(float)
     model = storage.getNode("distortion_model").string()

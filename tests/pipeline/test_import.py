@@ -130,6 +130,7 @@ ENTITIES = '<!DOCTYPE a [<!ENTITY b "bbbbbbbb"><!ENTITY c "&b;&b;&b;&b;">]><a>&c
         ("metashape", "<calibration><projection>fisheye</projection></calibration>", "only frame cameras"),
         ("opencv", PIXELS.format("distortion_model: inverse_brown_conrady"), "inverse_brown_conrady, is none of"),
         ("opencv", PIXELS.format("xi: 0.8"), "omnidirectional (xi), is none of"),
+        ("opencv", PIXELS.format("M2: 1"), "holds two cameras"),
         ("colmap", "", "is no reconstruction"),
         ("certificate", "radial_um = [1.0]", "calibrated principal distance"),
         ("certificate", f"{CERTIFICATE}symmetry_mm = [0.0, 0.01]", "needs autocollimation_mm"),
