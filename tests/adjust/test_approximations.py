@@ -163,7 +163,7 @@ def make_heights_network(seed: int) -> Network:
     rng = np.random.default_rng(seed)
     free = dict.fromkeys(TILTED.distortion, np.inf)
     network, _ = simulated(rng, TILTED, points=field_points(rng, 100, relief=8.0), free=free)
-    network = map_priors(network, lambda _, prior: replace(prior, sigma=0.02))
+    network = map_priors(network, lambda name, prior: replace(prior, sigma=0.02) if name.endswith(".Z") else prior)
     network = free_points(network, network.point_by_id, "XY")
     unknown = Prior(0.0, np.inf)
     distortion = replace(network.cameras[0].distortion, parameters=dict.fromkeys(TILTED.distortion, unknown))
