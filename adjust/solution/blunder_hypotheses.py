@@ -87,10 +87,10 @@ def network_hypotheses(network: Network, bare: Network, given: Adjustment | None
         remedy = "Give both in the unit that [object] unit names."
         yield [NetworkHypothesis(unit_words(factor), _move_points(network, by), remedy, by)]
     is_far = given is None or not given.converged or given.sigma0 > ONE_AXIS
-    alone = _exchanged_frames(network, given), _mirrored_images(network), _distances(network)
-    heights = _one_axis(network, (2,)) if is_far else ()
+    exchanged, mirrored_images = _exchanged_frames(network, given), _mirrored_images(network)
+    heights = _one_axis(network, (2,)) if is_far else ()  # before distances, of which one may do the same
     plane = _one_axis(network, (0, 1)) if is_far and _may_be_stretched(network, given) else ()
-    yield from ([each] for each in chain(heights, *alone, plane))
+    yield from ([each] for each in chain(exchanged, heights, mirrored_images, _distances(network), plane))
 
 
 def _may_be_stretched(network: Network, given: Adjustment | None) -> bool:

@@ -7,7 +7,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -72,14 +72,15 @@ class ByteCache:
 
     def __init__(self, limit_bytes: int) -> None:
         self.limit_bytes = limit_bytes
-        self._entries = OrderedDict[Hashable, Map | Dilation]()
+        self._entries = OrderedDict[Hashable, Any]()  # a key always has values of the same type
         self._bytes = 0
 
     def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
         """Return the value of a key; one that is absent, or was dropped, is made."""
         if key in self._entries:
             self._entries.move_to_end(key)
-            return self._entries[key]  # type: ignore[return-value]
+            kept: Value = self._entries[key]
+            return kept
         value = make()
         while self._entries and self._bytes + value.nbytes > self.limit_bytes:
             self._bytes -= self._entries.popitem(last=False)[1].nbytes

@@ -38,7 +38,7 @@ _FAR = 4.0  # times the median misfit of the inliers: nearly five standard devia
 _LEAST_SCATTER_MM = 2 * SCATTER_MM  # mm, least median misfit: a few marks may agree by chance better than film allows
 _FAILED = {Code.NO_FIT, Code.OFF_PLACE, Code.SIZE, Code.POLARITY}  # reasons that another tone curve may cure
 _SAME_MARK_PX = 5.0  # px between two fits of one mark at most; two marks lie farther apart: each is some 14 px large
-_REDUCED_PX = 1.5  # px of the reduced scan: accuracy of the places that a placement predicts
+REDUCED_PX = 1.5  # px of the reduced scan: accuracy of the places that a placement predicts
 _CLICK_REACH_PX = 6 * CLICK_SIGMA_PX  # px around a click: three sigma, doubled for people who point less accurately
 
 
@@ -105,7 +105,7 @@ class Frame:
     def first_search_px(self, share: float = 1.0) -> float:
         """Search radius around a place predicted from the placement, for a share of the largest deviation allowed."""
         search_px = share * self.options.search_mm(self.layout) / float(self.pitch_mm.mean())
-        return _REDUCED_PX * self.placement.reduction + search_px
+        return REDUCED_PX * self.placement.reduction + search_px
 
     @cached_property
     def predicted_px(self) -> Array:

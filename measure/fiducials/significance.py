@@ -13,7 +13,7 @@ from scipy.special import bdtrc, comb
 from measure.array_types import Array
 from measure.detection.localisation import highest_peak
 from measure.fiducials.constellation import NARROW, Placement
-from measure.fiducials.frame import Frame
+from measure.fiducials.frame import REDUCED_PX, Frame
 from measure.fiducials.search import SearchResult
 from measure.flags import FRAME_BY_CHANCE, NO_FRAME, NO_REASON, Code, Reason
 
@@ -22,7 +22,6 @@ _STRETCHES = np.linspace(-0.03, 0.03, 13)  # relative, of non-square pixels; a s
 _PLACES = 64  # compared beside the marks: enough to test three marks found of four
 _SELDOM, _HOPELESS = 1e-3, 1e6  # expected false frames between which full resolution may change the decision
 _COUNTED = 3  # marks at most to whose false-alarm rates the share at full resolution applies
-_REDUCED_PX = 1.5  # px of the reduced scan, largest distance between the peaks at reduced and full resolution
 _APART = 2.0  # in search radii: beyond the response of a mark itself
 _OFFSETS = (2.5, 4.5)  # in search radii: beyond the response of the mark itself
 _FREE = 2  # marks that a similarity fits wherever they lie
@@ -68,7 +67,7 @@ def _share_at_full_resolution(result: SearchResult, frame: Frame, found_px: Mapp
         if np.hypot(*(marks_px - place).T).min() > apart_px
     ]
     weakest = min(_response(frame, index, place, _FITTED_PX) for index, place in found_px.items())
-    radius_px = _REDUCED_PX * frame.placement.reduction
+    radius_px = REDUCED_PX * frame.placement.reduction
     return _share(sum(_response(frame, index, place, radius_px) >= weakest for index, place in others), len(others))
 
 

@@ -30,7 +30,7 @@ _LARGEST_PART_PX = 2048  # largest side of a part in whole segments; larger segm
 _COMPRESSION_PX = 256  # side of the central part tested for an earlier compression: 1000 blocks
 _PLAINLY_COARSER = 1.5  # least ratio to the file's own rounding step, which shows as well
 _OF_A_PX = 0.01  # tolerance of an overview's size, px, where its last pixel covers only a part
-_LOOKED_PX, _LOOKS = 64, 4  # side of the windows in which values are counted, and their number across and down
+_COUNTED_PX, _COUNTED_SIDE = 64, 4  # side of the windows in which values are counted, and their number a side
 _NAMED = 3  # damaged parts listed by name; more are counted
 _LEAST_UNIT_DN = 16  # least step of grey values of 8 bits stored in 16: 12 bits in the high bits have this step
 
@@ -101,9 +101,9 @@ class Scan:
     @cached_property
     def is_two_valued(self) -> bool:
         """Whether only two values occur in windows spread over it: thresholding took the grey values from its edges."""
-        width, height = (min(side, _LOOKED_PX) for side in (self.width_px, self.height_px))
+        width, height = (min(side, _COUNTED_PX) for side in (self.width_px, self.height_px))
         lefts, tops = (
-            np.linspace(0, side - own, _LOOKS).astype(int).tolist()
+            np.linspace(0, side - own, _COUNTED_SIDE).astype(int).tolist()
             for side, own in ((self.width_px, width), (self.height_px, height))
         )
         values = set[int]()

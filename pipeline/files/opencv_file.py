@@ -53,8 +53,10 @@ def read_pixel_camera(path: Path) -> tuple[PixelCamera, Any]:
         text = read_bytes(path, MOST_MB).decode("utf-8")
         storage: Any = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         return _pixel_camera(path, storage), storage
-    except (FileNotFoundError, IsADirectoryError):
+    except FileNotFoundError:
         raise InputError(f"{path}: there is no such file.") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: is a folder. Name the camera's file in it.") from None
     except (UnicodeDecodeError, cv2.error, SystemError):
         raise InputError(
             f"{path}: is no YAML, XML or JSON file of OpenCV (cv2.FileStorage) with a camera in it. Name one."

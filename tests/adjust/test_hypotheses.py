@@ -1,6 +1,7 @@
 """What makes sigma0 too large is named, and nothing else is blamed: model, coordinates, whole networks."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -251,8 +252,8 @@ def set_given(network: Network, coordinates: dict[int, Array]) -> Network:
     return map_priors(network, lambda name, prior: replace(prior, value=float(places.get(name, prior.value))))
 
 
-def adjust_network(network: Network, **options: bool | str | int) -> Adjustment:
-    return adjust(network, approximate(network), Options(**options))  # type: ignore[arg-type]
+def adjust_network(network: Network, **options: Any) -> Adjustment:
+    return adjust(network, approximate(network), Options(**options))
 
 
 def place(sentence: str) -> Array:

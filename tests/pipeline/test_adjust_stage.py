@@ -10,7 +10,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from networks import BOARD_FRAME_MM, BOARD_TRUTH, Truth, board_network, field_points, film_parameters, simulated
+from networks import (
+    BOARD_FRAME_MM,
+    BOARD_TRUTH,
+    Truth,
+    board_network,
+    field_points,
+    film_parameters,
+    set_camera,
+    simulated,
+)
 from projects import (
     Capture,
     Printed,
@@ -362,7 +371,7 @@ def test_a_camera_file_in_mm_needs_the_size_of_a_pixel(tmp_path: Path) -> None:
 def bent_project(folder: Path) -> Path:
     network = make_network(np.random.default_rng(5))
     free = {"principal_distance_mm": Prior(20.5, np.inf), "x0_mm": Prior(0.0, np.inf), "y0_mm": Prior(0.0, np.inf)}
-    network = replace(network, cameras=(replace(network.cameras[0], **free),))  # type: ignore[arg-type]
+    network = set_camera(network, **free)
     project = write_network_project(network, folder)
     replace_text(project, "[object]\n", '[object]\nunit = "mm"\nboard_bend = "free"\n')
     return project

@@ -314,8 +314,8 @@ def named_scan(name: str, **changes: Any) -> MeasuredScan:
     return replace(made, frame=replace(made.frame, **{"image": name, "marks": marks, **changes}))
 
 
-def move_marks(scan: MeasuredScan, shift: Any, matrix: Any = np.eye(2)) -> MeasuredScan:  # noqa: B008
-    marks = tuple(replace(each, center_px=matrix @ each.center_px + shift) for each in scan.frame.marks)
+def move_marks(scan: MeasuredScan, shift: Any, matrix: Any = ((1, 0), (0, 1))) -> MeasuredScan:
+    marks = tuple(replace(each, center_px=np.array(matrix) @ each.center_px + shift) for each in scan.frame.marks)
     return replace(scan, frame=replace(scan.frame, marks=marks))
 
 

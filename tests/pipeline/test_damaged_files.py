@@ -307,6 +307,7 @@ def set_status(first: str, others: str, columns: str) -> Changes:
         ("project.toml", targets(f"{CODED}[targets.more]"), ["is no key of this table"]),
         ("project.toml", {OBJECT: '[scanner]\nlens = "a.yaml"\n[object]\n'}, ["goes with pitch_um, one number"]),
         ("project.toml", lens("nothing.yaml"), ["there is no such file"]),
+        ("project.toml", lens("."), ["is a folder. Name the camera's file in it"]),
         ("project.toml", {**lens("a.yaml"), '"affine"': '"none"'}, ["there is no film"]),
         ("project.toml", {OBJECT: '[scanner]\nlense = "a.yaml"\n[object]\n'}, ["lense", "'lens'"]),
         # images

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,10 +29,10 @@ RNG = np.random.default_rng(9)
 REPORTS = {name: camera.source.reports for name, camera in read_library().items() if camera.source}
 
 
-def scan(path: Path, height: int = 60, width: int = 90, **tags: object) -> Path:
+def scan(path: Path, height: int = 60, width: int = 90, **tags: Any) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     picture = RNG.integers(0, 255, (height, width)).astype(np.uint8)
-    tifffile.imwrite(path, picture, **{"resolution": (500, 500), "resolutionunit": "CENTIMETER", **tags})  # type: ignore[arg-type]
+    tifffile.imwrite(path, picture, **{"resolution": (500, 500), "resolutionunit": "CENTIMETER", **tags})
     return path
 
 

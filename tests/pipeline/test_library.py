@@ -17,6 +17,8 @@ from real_data import DATA, needs
 from studies import parametrize_with_studies
 from truth_comparison import compare_frames
 
+from measure import FiducialOptions, measure_fiducials, open_scan
+from measure.flags import Code
 from measure.marks.rendering import known_picture
 from measure.marks.shapes import Mark, MarkShape, Polygon
 from measure.scans.metadata import Pitch
@@ -302,3 +304,13 @@ def test_a_drawn_camera_is_found_among_all(name: str, tmp_path: Path) -> None:
     (scan,) = (tmp_path / "scans").glob("*.tif")
     found = identify(scan, LIBRARY, None, Reporter())
     assert name in [each for trial in found.best for each in trial.cameras], found.sentence()
+
+
+@needs("film_scans", "aerial")
+def test_notches_that_much_of_the_reduced_scan_resembles_are_no_false_alarm() -> None:
+    """At full resolution few of these places answer as strongly."""
+    layout = LIBRARY["zeiss-rmk-a-153"].layout()
+    with open_scan(DATA / "film_scans" / "aerial" / "0b4cb981.jpeg") as scan:
+        frame = measure_fiducials(scan, layout, None, FiducialOptions(pose="180"))
+    assert sum(mark.status.is_observation for mark in frame.marks) == 4
+    assert not any(Code.CHANCE in problem.codes for problem in frame.problems)

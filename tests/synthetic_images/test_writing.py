@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -44,9 +45,9 @@ def test_letters_stand_upright() -> None:
     assert top[:30].sum() > 1.5 * top[30:].sum()
 
 
-def written(folder: Path, **changes: object) -> tuple[Array, SceneImage]:
+def written(folder: Path, **changes: Any) -> tuple[Array, SceneImage]:
     """A scan of the plain scene, written on above its frame, less the same without writing."""
-    line = replace(Writing("LENS 7", (1.0, 6.5), 0.5), **changes)  # type: ignore[arg-type]
+    line = replace(Writing("LENS 7", (1.0, 6.5), 0.5), **changes)
     image = replace(OBLIQUE, writing=(line,))
     grey, truth = rendered(folder / "with", scene(images=(image,)))
     bare, _ = rendered(folder / "without", scene(images=(OBLIQUE,)))
