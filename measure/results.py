@@ -17,6 +17,7 @@ from measure.geometry import linear_scale
 from measure.tone.estimate import FrameTone, MarkTone
 from measure.tone.sharpening import SharpeningScore
 
+CLEAR_LIKENESS = 0.5  # correlation with the drawing: below it most of the image is not the mark
 Kind = Literal["fiducial", "target", "tie", "join"]
 ON_FILM: tuple[Kind, ...] = ("fiducial", "join")  # kinds that are points of the film, not of the object
 # Stored results are reused only if this is unchanged. Increase it whenever measurements would change:
@@ -332,6 +333,11 @@ class MarkFit:
     sharpening: SharpeningScore | None = None
     covariance: Array | None = None
     figures: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the mark correlates clearly with its drawing."""
+        return self.likeness >= CLEAR_LIKENESS
 
     @property
     def covariance_px2(self) -> Array:

@@ -72,7 +72,7 @@ def recognise_frame(scan: Scan, layout: FiducialLayout, answered: Answer, times:
 def _may_be_there(scan: Scan, layout: FiducialLayout, placement: Placement) -> bool:
     """Whether the three most significant peaks are improbable as noise: ten times as fast as a fit."""
     frame = Frame.from_placement(scan, layout, placement, _QUICK_OPTIONS)
-    peaks = [localise(scan, frame.prediction(index, frame.first_search_px())) for index in range(len(layout.marks))]
+    peaks = [localise(scan, frame.prediction(index, frame.first_search_px)) for index in range(len(layout.marks))]
     false_alarms = np.sort([1.0 if peak is None else peak[1] for peak in peaks])[:_AT_LEAST]
     return bool(comb(len(peaks), len(false_alarms)) * false_alarms.prod() <= CAMERA_BY_NOISE)
 

@@ -87,7 +87,7 @@ def detect_faint_marks(frame: Frame, reach_px: float) -> Frame:
     faint = [
         index
         for index in inside
-        if not (frame.is_clear(index) and near[index])
+        if not (frame.detections[index].is_clear and near[index])
         if not isinstance(frame.layout.marks[index].mark, FrameCorner)  # it has no lines that stand out from texture
     ]
     fits = frame.inlier_fits
@@ -131,7 +131,7 @@ def _surrounding_grey(frame: Frame, mark: Mark, pixel_from_mark: Array, times: f
 
 def _decide(frame: Frame, index: int, mark: FaintMark | None, why_not: Reason) -> tuple[Detection, bool]:
     """Choose between the earlier detection of a mark and the faint one; returns also whether it is certain."""
-    before, is_clear = frame.detections[index], frame.is_clear(index)
+    before, is_clear = frame.detections[index], frame.detections[index].is_clear
     if mark is None:
         return before if is_clear else Detection(before.predicted_px, True, None, why_not), False
     away_px = np.inf if before.fit is None else float(np.hypot(*(before.fit.center_px - mark.fit.center_px)))

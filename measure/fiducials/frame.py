@@ -1,6 +1,6 @@
 """One frame of a scan as an immutable value: detections, inliers and the interior orientation from the inliers."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -9,22 +9,18 @@ from scipy.special import chdtrc
 
 from measure.array_types import Array, Mask
 from measure.detection.localisation import MarkPrediction
-from measure.fiducials.consistency import gross_errors
 from measure.fiducials.constellation import Placement, mark_sign
-from measure.fiducials.interior_orientation import FilmFit, fit_frame
+from measure.fiducials.interior_orientation import FilmFit
 from measure.fiducials.mark_fit import Detection
-from measure.fiducials.misfit_model import FrameMarks, Scatter
-from measure.fiducials.options import CLICK_SIGMA_PX, SCATTER_DEGREES, SCATTER_MM, FiducialOptions
+from measure.fiducials.options import CLICK_SIGMA_PX, SCATTER_MM, FiducialOptions
 from measure.flags import LARGE_ERROR, NO_REASON, Code, Reason, Status
-from measure.geometry import up_from_camera
-from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
+from measure.marks.shapes import FiducialLayout
 from measure.results import MarkFit
 from measure.scans.scan import Scan
 from measure.tone.curve import LINEAR
 from measure.tone.estimate import FrameTone
 
 MANY = 6  # inliers from which the predicted place of a faint mark is reliable
-CLEAR_LIKENESS = 0.5  # correlation with the drawing: below it most of the image is not the mark
 CLEAR_DAMAGE = 0.25  # fraction of a mark: with more of it damaged, the rest may belong to something else
 _CLEAR_SNR = 3.0  # contrast over the noise of a pixel: with less a mark is weak,
 _CLEAR_SIGNIFICANCE = 10.0  # unless its contrast has this many standard deviations: texture alone reaches 4.5
@@ -102,10 +98,15 @@ class Frame:
         """Search radius around a place predicted from the other marks."""
         return self.options.gate_mm / float(self.pitch_mm.mean())
 
-    def first_search_px(self, share: float = 1.0) -> float:
-        """Search radius around a place predicted from the placement, for a share of the largest deviation allowed."""
-        search_px = share * self.options.search_mm(self.layout) / float(self.pitch_mm.mean())
-        return REDUCED_PX * self.placement.reduction + search_px
+    @property
+    def largest_misfit_px(self) -> float:
+        """Largest deviation of a mark from its given place that is allowed in the search."""
+        return self.options.search_mm(self.layout) / float(self.pitch_mm.mean())
+
+    @property
+    def first_search_px(self) -> float:
+        """Search radius around a place predicted from the placement."""
+        return REDUCED_PX * self.placement.reduction + self.largest_misfit_px
 
     @cached_property
     def predicted_px(self) -> Array:
@@ -143,11 +144,6 @@ class Frame:
         sign = mark_sign(mark.mark, self.placement.polarity)
         return MarkPrediction(mark.mark, start, search_px, sign, self.weights, self.placement.surroundings)
 
-    def is_clear(self, index: int) -> bool:
-        """Whether a mark correlates clearly with its drawing, inlier or not."""
-        fit = self.detections[index].fit
-        return fit is not None and fit.likeness >= CLEAR_LIKENESS
-
     def replace_detections(self, changed: Mapping[int, Detection]) -> "Frame":
         """Return the frame with the detections of some marks replaced, by index."""
         return replace(self, detections=tuple(changed.get(index, each) for index, each in enumerate(self.detections)))
@@ -172,7 +168,7 @@ class Frame:
     @cached_property
     def clear_fits(self) -> dict[int, MarkFit]:
         """Fits of the inliers that correlate clearly with their drawings, by index."""
-        return {index: fit for index, fit in self.inlier_fits.items() if fit.likeness >= CLEAR_LIKENESS}
+        return {index: fit for index, fit in self.inlier_fits.items() if fit.is_clear}
 
     @cached_property
     def fitted_placement(self) -> Placement:
@@ -211,7 +207,7 @@ class Frame:
     @property
     def accepted(self) -> bool:
         """Whether enough marks agree for the frame to be no false alarm, at least three of them clear."""
-        return self.agrees and len(self.clear_fits) >= self._least
+        return self.agrees and len(self.clear_fits) >= self.least
 
     @property
     def unblemished(self) -> list[int]:
@@ -227,7 +223,7 @@ class Frame:
     @property
     def is_sure(self) -> bool:
         """Whether it is accepted and has enough unblemished marks: a frame found at a wrong place has hardly any."""
-        return self.accepted and self.measured_count >= self._least
+        return self.accepted and self.measured_count >= self.least
 
     @property
     def is_complete(self) -> bool:
@@ -237,10 +233,11 @@ class Frame:
     @property
     def _enough(self) -> int:
         """Least number of inliers."""
-        return max(self._least, int(np.ceil(_AGREEING_SHARE * self.inside)))
+        return max(self.least, int(np.ceil(_AGREEING_SHARE * self.inside)))
 
     @property
-    def _least(self) -> int:
+    def least(self) -> int:
+        """Least number of clear marks."""
         return 2 if self.options.part else max(min(_AGREEING, len(self.detections)), 2)
 
     def contains(self, other: "Frame") -> bool:
@@ -260,34 +257,6 @@ class Frame:
         fractions = [fit.damaged_fraction for fit in self.inlier_fits.values()]
         return float(np.median(fractions)) if len(fractions) >= _CHECKED else 0.0
 
-    def misfit(self, ids: Sequence[str]) -> Reason:
-        """Explain why the frame is not accepted. ids: of its marks, in the order of the detections."""
-        found = f"{len(self.inlier_fits)} of {len(self.detections)} marks were found where the others put them"
-        if self.agrees:
-            return Reason(
-                f"{found}, but only {len(self.clear_fits)} of them match their drawings, where {self._least} have "
-                "to: compare the drawings with the scan, or set its tone curve (tone under [measure])",
-                Code.NO_FRAME,
-            )
-        if self.failed_fits:
-            names = ", ".join(ids[index] for index in self.failed_fits)
-            return Reason(
-                f"only {found}, and the fit of {names} did not converge, with whatever tone curve it began", Code.NO_FIT
-            )
-        return Reason(f"the constellation does not fit: only {found}{self._marks_outside(ids)}", Code.NO_FRAME)
-
-    def _marks_outside(self, ids: Sequence[str]) -> str:
-        """Clause on marks predicted outside the scan; empty if there are none."""
-        outside = [
-            id for id, detection in zip(ids, self.detections, strict=True) if Code.OUTSIDE in detection.reason.codes
-        ]
-        if not outside or self.inliers.sum() < 2:
-            return ""
-        return (
-            f", and these put {', '.join(outside)} outside of the scan: scan the whole frame, or say by part_of in "
-            "images.csv that this scan is a part of it"
-        )
-
     def verdict(self, index: int) -> tuple[Status, Reason]:
         """Status of a mark and the reasons for it.
 
@@ -298,7 +267,7 @@ class Frame:
             off = f"{self.misfit_mm[index]:.2f} mm from where the other {int(self.inliers.sum())} marks put it"
             return Status.REJECTED, Reason(f"what was measured lies {off}", Code.OFF_PLACE)
         reasons = [self.detections[index].reason]
-        if fit.likeness < CLEAR_LIKENESS:
+        if not fit.is_clear:
             reasons.append(Reason(f"it correlates with its drawing by only {fit.likeness:.2f}", Code.LIKENESS))
         if fit.snr < _CLEAR_SNR and fit.significance < _CLEAR_SIGNIFICANCE:
             reasons.append(Reason(f"its contrast is only {fit.snr:.1f} times the noise", Code.CONTRAST))
@@ -323,38 +292,3 @@ def may_be_wrong(covariance_px2: Array) -> bool:
 def largest_sigma_px(covariance_px2: Array) -> float:
     """Standard deviation in the direction in which it is largest: semi-major axis of the error ellipse (2, 2)."""
     return float(np.sqrt(np.linalg.eigvalsh(covariance_px2)[-1]))
-
-
-def orient_frame(frame: Frame) -> Frame:
-    """Separate inliers from gross errors and estimate the interior orientation from the inliers.
-
-    Each place has the covariance of its fit and of its given coordinates; the film's scatter is added to the weights.
-    Certain and clicked marks are never removed.
-    """
-    found = np.array([each.fit is not None for each in frame.detections])
-    inliers = found.copy()
-    if found.sum() < 2:
-        return replace(frame, inliers=inliers)
-    index = np.flatnonzero(found)
-    fits = [frame.detections[i].fit for i in index]
-    up = frame.up_mm(np.array([fit.center_px for fit in fits if fit]))
-    scaled = np.diag(frame.pitch_mm)
-    covariances = np.array([scaled @ fit.covariance_px2 @ scaled for fit in fits if fit])
-    given = np.array([min(*frame.layout.marks[i].sigma_mm, MOST_GIVEN_SIGMA_MM) for i in index])
-    covariances += given[:, None, None] ** 2 * np.eye(2)
-    film, camera, model = (
-        Scatter(frame.options.film_sigma_mm, SCATTER_DEGREES),
-        frame.camera_mm,
-        frame.options.film_model,
-    )
-    clicked = {click.point for click in frame.options.clicks}
-    known = frame.certain | [mark.id in clicked for mark in frame.layout.marks]
-    out = gross_errors(FrameMarks.from_places(camera[index], up, covariances, model), film, frame.options.gate_mm)
-    out &= ~known[index]
-    inliers[index[out]] = False
-    sigma = np.sqrt(np.trace(covariances, axis1=1, axis2=2) / 2 + film.sigma**2)
-    fit = fit_frame(camera[index[~out]], up[~out], sigma[~out], up_from_camera(frame.placement.pose), model)
-    pixel_from_camera = np.diag([1.0, -1.0]) @ fit.up_from_camera / frame.pitch_mm[:, None]
-    return replace(
-        frame, inliers=inliers, pixel_from_camera=pixel_from_camera, linear_sigma=fit.linear_sigma, film=fit.film
-    )

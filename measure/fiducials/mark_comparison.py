@@ -14,8 +14,24 @@ import numpy as np
 from scipy.special import ndtr
 
 from measure.array_types import Array, Mask
-from measure.flags import FALSE_DOUBT, MARK_UNLIKE_THE_OTHERS, NO_REASON, Code, Reason, Status
-from measure.matching.models import PIXEL_VARIANCE_PX2
+from measure.fiducials.frame import WRONG_PX, Frame
+from measure.fiducials.mark_fit import Detection
+from measure.flags import (
+    FALSE_DOUBT,
+    LARGE_ERROR,
+    MARK_UNLIKE_THE_OTHERS,
+    NO_REASON,
+    Cause,
+    Code,
+    Reason,
+    Status,
+)
+from measure.geometry import linear_scale
+from measure.marks.rendering import picture, reach_px
+from measure.marks.shapes import Bar, Disk, Mark, MarkShape, Ring
+from measure.matching.match import mark_window
+from measure.matching.models import PIXEL_VARIANCE_PX2, background_planes
+from measure.matching.window import ScanWindow, read_window
 from measure.results import FrameMeasurement, MarkFit, MarkMeasurement
 
 _FEWEST_BLURS = 3  # other marks needed to estimate their scatter in blur
@@ -39,6 +55,8 @@ _NEAR = 3.0  # standard deviations from the median, within which frames agree
 _WIDTH_SIGMA = 0.15  # standard deviation of the logarithm of the width of a frame's lines over the drawn one
 _LEAST_WIDTH, _LONGEST_WIDTH = 0.03, 0.2  # of the same: a smaller change is ignored, a larger one is not linear
 _SHORTEST = 0.1  # lower bound of ratios: an arm shorter than this counts as missing
+_CHANGE = 0.3  # fraction of the arm's length, step of the central differences in the design matrix
+_LEAST_GAIN = 0.1  # fraction of the fitted contrast: a smaller gain is replaced by it
 _ARM, _SHAPE, _BLUR = "arm", "shape", "blur"
 
 
@@ -260,6 +278,114 @@ def touch_of_edges(shape: SharedShape, on_place: Array, middle_px: float, is_dam
     measured point.
     """
     return Touch(shape.touched(_TOUCHED_PX / middle_px, is_damaged), float(np.hypot(*(on_place @ shape.off))), 0.0)
+
+
+def compare_shapes(frame: Frame) -> Frame:
+    """Doubt marks with an outlying size or rotation; each covariance grows by what an object touching it may cause."""
+    fits = {index: fit for index, fit in frame.clear_fits.items() if fit.covariance is not None}
+    groups: dict[Mark | None, list[int]] = defaultdict(list)
+    for index, fit in fits.items():
+        mark = frame.layout.marks[index].mark
+        if isinstance(mark, MarkShape) and not mark.is_held_by_frame:
+            groups[mark].append(index)
+        elif isinstance(mark, MarkShape) and fit.own_shape is not None:
+            groups[None].append(index)
+    changed = {}
+    for drawn, indices in groups.items():
+        figures = [_shape_figures(fits[index], frame.linear(index), drawn is None) for index in indices]
+        own, sigmas = (np.array(each) for each in zip(*figures, strict=True))
+        for index, shape, sigma in zip(indices, shared_shapes(own, sigmas), sigmas, strict=True):
+            if shape is not None:
+                changed[index] = _doubt_shape(frame, index, fits[index], shape, sigma)
+    return frame.replace_detections(changed)
+
+
+def _shape_figures(fit: MarkFit, linear: Array, is_held: bool) -> tuple[Array, Array]:
+    """Log ratio of a mark's size to the frame's, and its rotation (rad) if the frame gave it; standard deviations."""
+    if is_held and fit.own_shape is not None:
+        return fit.own_shape.change, fit.own_shape.sigma
+    return np.array([np.log(linear_scale(fit.pixel_from_mark) / linear_scale(linear))]), np.array([fit.size_sigma])
+
+
+def _doubt_shape(frame: Frame, index: int, fit: MarkFit, shape: SharedShape, sigma: Array) -> Detection:
+    """Store the shape of a mark relative to the others, and doubt an outlier. sigma (k,): of the mark's own figures."""
+    mark, is_damaged, touch = frame.layout.marks[index].mark, fit.damaged_fraction > 0, None
+    figures = dict(
+        zip(("size_ratio", "turn_rad"), (float(np.exp(shape.off[0])), *shape.off[1:].tolist()), strict=False)
+    )
+    figures |= dict(zip(("size_sigma", "turn_sigma"), sigma.tolist(), strict=False))
+    if isinstance(mark, MarkShape) and mark.is_cross:
+        place = np.column_stack([frame.linear(index), fit.center_px])
+        window = read_window(frame.scan, mark_window(mark, place, frame.options.match.margin_px), frame.weights)
+        for number, (length, sigma_length) in enumerate(zip(*measure_arms(window, mark, place, fit), strict=True), 1):
+            figures |= {f"arm{number}_ratio": float(length), f"arm{number}_sigma": float(sigma_length)}
+    unlike = unlike_others(figures["size_ratio"], figures.get("turn_rad"))
+    if fit.own_shape is not None and mark.is_held_by_frame:
+        middle_px = reach_px(mark, fit.pixel_from_mark[:, :2]) / 2
+        touch = touch_of_edges(shape, fit.own_shape.on_place, middle_px, is_damaged)
+    elif mark.is_round:
+        px_per_mm = linear_scale(fit.pixel_from_mark)
+        touch = touch_of_round(shape, _radius_mm(mark) * px_per_mm, px_per_mm, is_damaged)
+    reasons = [unlike] if shape.differs else []
+    if not reasons and touch and mark.is_round and is_damaged and touch.exceedance(WRONG_PX) > LARGE_ERROR:
+        near = f"and the picture next to it is damaged: something may touch it; error over {WRONG_PX} px"
+        reasons = [unlike.reword(f"{unlike.split(':')[0]}, {near}")]
+    parts = {} if touch is None else {Cause.TOUCHED: touch.variance_px2 * np.eye(2)}
+    return frame.detections[index].amend(*reasons, parts=parts, figures=figures)
+
+
+def _radius_mm(mark: Mark) -> float:
+    """Radius of the outline of a round mark."""
+    parts = mark.parts if isinstance(mark, MarkShape) else ()
+    return max(part.radius_mm for part in parts if isinstance(part, Disk | Ring))
+
+
+def measure_arms(window: ScanWindow, mark: MarkShape, pixel_from_mark: Array, fit: MarkFit) -> tuple[Array, Array]:
+    """Estimate the lengths of the arms of a cross, relative to the drawn ones, by linear least squares.
+
+    Gain, offset and slopes are further unknowns. The derivative with respect to a length is the image of a line about
+    the end of the arm, uniform along it: the estimate is proportional to the missing part, regardless of the blur.
+    Pixels masked as damage are used, since a missing arm is masked, too.
+
+    Parameters
+    ----------
+    window : window with the cross.
+    pixel_from_mark : (2, 3) in pixels of the scan. The place is the matched one. The linear part is that of the frame,
+        since the mark's own depends on the ends of its arms.
+
+    Returns
+    -------
+    (arms,) relative lengths, in the order of the bars' ends, and their standard deviations.
+    """
+    place = pixel_from_mark - np.column_stack([np.zeros((2, 2)), window.origin_px])
+    height, width = window.grey.shape
+    drawn = picture(mark, place, width, height, fit.blur_px)
+    changes = [picture(tip, place, width, height, fit.blur_px) / (2 * _CHANGE) for tip in _arm_tips(mark)]
+    used = window.usable & (window.sides == 0)
+    design = np.stack([*changes, drawn, *background_planes(height, width)])[:, used]
+    grey = window.grey[used]
+    inverse: Array = np.asarray(np.linalg.pinv(design @ design.T), float)
+    solution = inverse @ (design @ grey)
+    left = grey - solution @ design
+    # Noise correlated by rho along columns and rows reduces the effective number of pixels.
+    rho = float(np.clip(fit.neighbour_correlation, 0.0, 0.9))
+    variance = float(left @ left) / max(len(grey) - len(design), 1) * ((1 + rho) / (1 - rho)) ** 2
+    gain = solution[len(changes)]
+    gain = gain if abs(gain) > _LEAST_GAIN * abs(fit.contrast_dn) else fit.contrast_dn
+    sigmas = np.sqrt(variance * np.diag(inverse)[: len(changes)]) / abs(gain)
+    return 1 + solution[: len(changes)] / gain, sigmas
+
+
+def _arm_tips(mark: MarkShape) -> list[MarkShape]:
+    """For each arm: what it has more if it is longer than if it is shorter, the line about its end."""
+    tips = list[MarkShape]()
+    for bar in mark.parts:
+        assert isinstance(bar, Bar)
+        for tip, other in ((bar.from_mm, bar.to_mm), (bar.to_mm, bar.from_mm)):
+            if np.dot(tip, np.subtract(tip, other)) > 0:  # the start of an arm near the centre is no tip
+                inner, outer = ((tip[0] * share, tip[1] * share) for share in (1 - _CHANGE, 1 + _CHANGE))
+                tips.append(replace(mark, parts=(Bar(inner, outer, bar.line_mm),)))
+    return tips
 
 
 def check_own_figures(frames: Sequence[FrameMeasurement]) -> list[FrameMeasurement]:

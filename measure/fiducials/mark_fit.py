@@ -9,7 +9,7 @@ from measure.array_types import Array
 from measure.detection.localisation import MarkPrediction, localise
 from measure.flags import NO_REASON, Cause, Code, Reason
 from measure.marks.rendering import extent_px
-from measure.marks.shapes import Disk, FrameCorner, Mark, MarkShape, MarkTemplate, Polygon
+from measure.marks.shapes import FrameCorner, Mark, MarkShape, MarkTemplate
 from measure.matching.frame_edge import fit_frame_corner
 from measure.matching.match import MatchOptions, mark_window, match
 from measure.matching.window import FAINT, pixels_beyond_edge, read_window
@@ -47,6 +47,11 @@ class Detection:
     reason: Reason = NO_REASON
     false_alarms: float = 1.0
     closer: bool = False
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the fit correlates clearly with the drawing."""
+        return self.fit is not None and self.fit.is_clear
 
     def amend(
         self,
@@ -153,13 +158,13 @@ def options_for(mark: Mark, options: MatchOptions, frame_sigma: float | None) ->
     predicted values, or get the standard deviation of the frame as prior: rotation and scale if the mark is held by
     the frame, stretch and shear if its drawing is one-sided.
     """
-    if _is_solid(mark):
+    if mark.is_solid:
         options = replace(
             options,
             margin_px=max(options.margin_px, _SOLID_MARGIN_PX),
             margin_blurs=max(options.margin_blurs, _SOLID_MARGIN_BLURS),
         )
-    leans = is_held_by_frame(mark)
+    leans = mark.is_held_by_frame
     if frame_sigma is None:
         return replace(options, freedom="shift") if leans else options
     if not leans and np.allclose(_one_sided_px(mark, np.eye(2)), 0.0):
@@ -167,19 +172,6 @@ def options_for(mark: Mark, options: MatchOptions, frame_sigma: float | None) ->
     in_part = isinstance(mark, MarkShape) and mark.true_mm is not None
     held = float(np.hypot(frame_sigma, _DRAWN_SIGMA if in_part else 0.0))
     return replace(options, freedom="affine", linear_sigma=held if leans else options.linear_sigma, strain_sigma=held)
-
-
-def _is_solid(mark: Mark) -> bool:
-    """Whether the mark has an outline only, whose place depends on the slope of the background."""
-    return isinstance(mark, MarkShape) and all(isinstance(part, Polygon | Disk) for part in mark.parts)
-
-
-def is_held_by_frame(mark: Mark) -> bool:
-    """Whether rotation and scale have to come from the other marks.
-
-    The edges of a wedge or a notch, or a template of them, do not separate scale from place.
-    """
-    return isinstance(mark, MarkTemplate) or all(isinstance(part, Polygon) for part in mark.parts)
 
 
 def strain_error_px(mark: Mark, fitted: Array, linear: Array, sigma: float) -> float:

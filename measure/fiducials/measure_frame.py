@@ -1,10 +1,12 @@
 """Measurement of one frame at full resolution, starting from its placement.
 
-The marks are detected, the interior orientation is estimated from the inliers, the other marks are detected where it
-predicts them, and all marks are refitted with the frame's rotation, scale, stretch and shear as priors.
+The marks are detected and the interior orientation is estimated from the inliers. The other marks are detected where it
+predicts them. All marks are then refitted with what they have in common: rotation, scale and strain of the frame, width
+of the lines, sharpening, tone curve and blur.
 """
 
-from collections.abc import Iterable, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import replace
 from itertools import permutations
 
@@ -13,18 +15,34 @@ import numpy as np
 from measure.array_types import Array
 from measure.detection.correlation import CLOSE
 from measure.detection.localisation import MarkPrediction, highest_peak
+from measure.fiducials.consistency import gross_errors
 from measure.fiducials.constellation import NARROW, Placement
 from measure.fiducials.faint_marks import detect_faint_marks, faint_reach_px
-from measure.fiducials.frame import CLEAR_LIKENESS, MANY, Frame, orient_frame
-from measure.fiducials.mark_fit import Detection, detect_mark, not_found
-from measure.fiducials.options import FiducialOptions
-from measure.fiducials.refit import fit_lines_and_sharpening, refit_frame
-from measure.flags import FAINT_MARK_BY_NOISE, TEXTURE_LIKE_A_FAINT_MARK
+from measure.fiducials.frame import MANY, REDUCED_PX, Frame
+from measure.fiducials.interior_orientation import fit_frame
+from measure.fiducials.mark_comparison import (
+    SharedBlur,
+    compare_shapes,
+    shared_blurs,
+    shared_line_width,
+    unlike_blur,
+)
+from measure.fiducials.mark_fit import Detection, detect_mark, not_found, strain_error_px
+from measure.fiducials.misfit_model import FrameMarks, Scatter
+from measure.fiducials.options import SCATTER_DEGREES, FiducialOptions, film_terms, interleaved
+from measure.flags import FAINT_MARK_BY_NOISE, TEXTURE_LIKE_A_FAINT_MARK, Cause
+from measure.geometry import up_from_camera
 from measure.marks.rendering import picture
-from measure.marks.shapes import FiducialLayout, Mark
+from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout, Mark, MarkShape, widen_lines
 from measure.matching.match import mark_window
+from measure.matching.models import PIXEL_VARIANCE_PX2, MatchOptions
+from measure.noise.noise_model import may_be_noise
+from measure.results import MarkFit
 from measure.scans.parallel import map_in_threads
 from measure.scans.scan import LUMINANCE, SINGLE_CHANNELS, Scan
+from measure.tone.curve import Tone
+from measure.tone.estimate import FrameTone, MarkTone
+from measure.tone.sharpening import FEWEST_MARKS, Sharpening, estimate_sharpening
 
 LEAST_LIKENESS = 0.35  # correlation with the drawing: below it texture, text and scratches are as similar
 _LEAST_SIGNIFICANCE = 4.5  # standard deviations of the contrast: texture alone stays below it
@@ -38,6 +56,14 @@ _COINCIDING_PX, _FEWEST_SHIFTS = 0.5, 3  # px between two channels below which t
 _SHRINK = 0.1  # shrinkage of the noise covariance towards a multiple of the unit matrix: few pixels determine it poorly
 _FEWEST_SHARPENED = 4  # clear marks for a first estimate of the sharpening: of three, one may be taken for halos
 _ROUNDS = 2  # of detecting faint marks: the first marks found improve the predictions of the others
+_STRAINED = 1 / 3  # fraction of a mark's standard deviation: a larger strain error raises it by more than a twentieth
+_TONE_ROUNDS = 5  # largest number of refits with an improved tone curve
+_OTHER_STARTS, _AGREED = (2.2, 1.0), 0.1  # gammas of further initial curves; disagreement up to which none is tried
+_TELLING = 8  # most significant marks, refitted until widths, sharpening and tone curve are settled: more cost time
+_SHARED_ROUNDS = 8  # largest number of refits with improved widths and sharpening
+_MOVED = 0.3  # fraction of a mark's standard deviation: smaller shifts by a better curve are ignored
+_UNCHECKED = 3  # marks, which an affine transformation fits without residuals
+_REFIT_PX = 1.5  # search range around a mark that was fitted already
 
 
 def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
@@ -47,120 +73,9 @@ def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, opti
 
 def detect_frame(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
     """Detect the marks of a frame, clear and faint ones, without the refit."""
-    clear = detect_clear_marks(scan, layout, placement, options)
+    frame = choose_channels(Frame.from_placement(scan, layout, placement, options))
+    clear = orient_frame(_detect(frame, range(len(layout.marks)), frame.first_search_px))
     return detect_missing_marks(fit_lines_and_sharpening(clear, _FEWEST_SHARPENED))
-
-
-def detect_clear_marks(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
-    """Detect the marks of a frame around the places predicted by its placement, and orient the frame."""
-    frame = choose_channels(Frame.from_placement(scan, layout, placement, options))
-    return orient_frame(_detect(frame, range(len(layout.marks)), frame.first_search_px()))
-
-
-def shows_marks(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> bool:
-    """Whether any of some marks, spread over the frame, is clear in a placement."""
-    frame = choose_channels(Frame.from_placement(scan, layout, placement, options))
-    some = range(0, len(layout.marks), max(1, len(layout.marks) // _TRIALS))
-    return any(_detect(frame, [index], frame.first_search_px()).is_clear(index) for index in some)
-
-
-def rename_frame(scan: Scan, frame: Frame, pose: str) -> Frame:
-    """Name the marks of a frame as in another pose.
-
-    Marks found are fitted at their places, the others are detected. The frame is kept unchanged if fewer marks agree
-    under the new names.
-    """
-    placement = frame.fitted_placement.posed(pose, frame.camera_mm)
-    found = np.array([fit.center_px for fit in frame.fits if fit])
-    names = placement.names(found, frame.camera_mm).tolist() if len(found) else []
-    renamed = Frame.from_placement(scan, frame.layout, placement, frame.options)
-    renamed = replace(renamed, weights=frame.weights, channel_note=frame.channel_note)
-    places = {name: place for name, place in zip(names, found, strict=True) if name >= 0}
-    renamed = orient_frame(
-        renamed.replace_detections(
-            {name: _detection(renamed, renamed.prediction(name, 0.0).shift_to(place)) for name, place in places.items()}
-        )
-    )
-    unclear = [index for index in range(len(frame.detections)) if not renamed.is_clear(index)]
-    renamed = refit_frame(detect_missing_marks(orient_frame(_detect(renamed, unclear, renamed.first_search_px()))))
-    return renamed if renamed.inliers.sum() >= frame.inliers.sum() else frame
-
-
-def detect_missing_marks(frame: Frame) -> Frame:
-    """Detect the missing and unclear marks around the places predicted from the inliers."""
-    if frame.accepted:
-        frame = orient_frame(_detect_closer(frame))
-    if frame.inliers.sum() >= 2 and not frame.is_certain_of_places:
-        if len(frame.detections) > MANY:
-            # If the frame itself is uncertain, the wide radius would turn texture into marks.
-            reach_px = frame.first_search_px(NARROW) if frame.placement.surroundings.robust else frame.gate_px
-            frame = detect_faint_marks(frame, reach_px)
-            # With such a search radius no mark is exempt from the outlier test.
-            frame = replace(frame, certain=np.zeros_like(frame.certain))
-        else:
-            frame = _detect_elsewhere(frame)
-        frame = orient_frame(frame)
-    for _ in range(_ROUNDS):
-        if frame.is_certain_of_places:
-            frame = orient_frame(detect_faint_marks(frame, faint_reach_px(frame)))
-    return frame
-
-
-def _detect(frame: Frame, indices: Iterable[int], search_px: float) -> Frame:
-    """Detect marks again within search_px of their current predictions."""
-    # From the bottom upwards: the search in windows ended there, and the rows read last are still decoded.
-    upwards = sorted(indices, key=lambda index: -frame.predicted_px[index, 1])
-    detections = map_in_threads(lambda index: _detection(frame, frame.prediction(index, search_px)), upwards)
-    return frame.replace_detections(dict(zip(upwards, detections, strict=True)))
-
-
-def _detection(frame: Frame, expected: MarkPrediction) -> Detection:
-    """Detect one mark; a fit that texture could give is dropped, unless faint marks together decide on the frame."""
-    detection = detect_mark(frame.scan, expected, replace(frame.options.match, tells_sharpening=True))
-    fit, closer = detection.fit, frame.placement.surroundings.robust
-    sure = closer and detection.false_alarms <= FAINT_MARK_BY_NOISE
-    likeness, significance = (0.0, _FAINT_SIGNIFICANCE) if sure else (LEAST_LIKENESS, _LEAST_SIGNIFICANCE)
-    if fit is not None and (fit.likeness < likeness or fit.significance < significance):
-        return Detection(detection.predicted_px, True, None, not_found(expected.search_px))
-    return detection
-
-
-def _detect_closer(frame: Frame) -> Frame:
-    """Detect unclear marks again with narrow surroundings, since dust or an edge may lie beside."""
-    changed = {}
-    for index in range(len(frame.detections)):
-        if frame.is_clear(index) and frame.inliers[index]:
-            continue
-        expected = replace(frame.prediction(index, frame.gate_px), surroundings=CLOSE)
-        detection = detect_mark(frame.scan, expected, frame.options.match)
-        fit, is_sure = detection.fit, detection.false_alarms <= TEXTURE_LIKE_A_FAINT_MARK
-        if is_sure and fit and fit.likeness >= CLEAR_LIKENESS and fit.significance >= _LEAST_SIGNIFICANCE:
-            changed[index] = replace(detection, closer=True)
-    return frame.replace_detections(changed)
-
-
-def _detect_elsewhere(frame: Frame) -> Frame:
-    """Detect unclear marks within the gate of their predictions, then farther off, where only clear fits count."""
-    for index in [index for index in range(len(frame.detections)) if not frame.is_clear(index)]:
-        near = _detect(frame, [index], frame.gate_px)
-        far_px = _farthest_px(frame, index)
-        far = _detect(frame, [index], far_px) if not near.is_clear(index) and far_px > frame.gate_px else near
-        frame = far if far.is_clear(index) else near
-    return frame
-
-
-def _farthest_px(frame: Frame, index: int) -> float:
-    """Largest distance of a mark from the place predicted by the others at which its residual keeps the gate.
-
-    In the adjustment with the mark itself, the residual is that distance divided by 1 + q, where q is the variance of
-    the prediction from the others in units of a mark's variance.
-    """
-    others = np.flatnonzero(frame.inliers & (np.arange(len(frame.inliers)) != index))
-    affine = np.column_stack([frame.camera_mm, np.ones(len(frame.camera_mm))])
-    if np.linalg.matrix_rank(affine[others]) < affine.shape[1]:
-        return frame.gate_px
-    variance = float(affine[index] @ np.linalg.inv(affine[others].T @ affine[others]) @ affine[index])
-    return min((1 + variance) * frame.gate_px, frame.first_search_px())
 
 
 def choose_channels(frame: Frame) -> Frame:
@@ -174,7 +89,7 @@ def choose_channels(frame: Frame) -> Frame:
         return frame
     marks = frame.layout.marks
     tried = range(0, len(marks), max(1, len(marks) // _TRIALS))
-    predictions = [frame.prediction(index, frame.first_search_px()) for index in tried]
+    predictions = [frame.prediction(index, frame.first_search_px) for index in tried]
     peaks = [
         [highest_peak(frame.scan, replace(expected, weights=weights)) for weights in (*SINGLE_CHANNELS, LUMINANCE)]
         for expected in predictions
@@ -279,3 +194,376 @@ def best_weights(
         return None
     weights = np.maximum(best * discriminant, 0.0) @ units
     return tuple(float(weight) for weight in weights / weights.sum()), best
+
+
+def _detect(frame: Frame, indices: Iterable[int], search_px: float) -> Frame:
+    """Detect marks again within search_px of their current predictions."""
+    # From the bottom upwards: the search in windows ended there, and the rows read last are still decoded.
+    upwards = sorted(indices, key=lambda index: -frame.predicted_px[index, 1])
+    detections = map_in_threads(lambda index: _detection(frame, frame.prediction(index, search_px)), upwards)
+    return frame.replace_detections(dict(zip(upwards, detections, strict=True)))
+
+
+def _detection(frame: Frame, expected: MarkPrediction) -> Detection:
+    """Detect one mark; a fit that texture could give is dropped, unless faint marks together decide on the frame."""
+    detection = detect_mark(frame.scan, expected, replace(frame.options.match, tells_sharpening=True))
+    fit, closer = detection.fit, frame.placement.surroundings.robust
+    sure = closer and detection.false_alarms <= FAINT_MARK_BY_NOISE
+    likeness, significance = (0.0, _FAINT_SIGNIFICANCE) if sure else (LEAST_LIKENESS, _LEAST_SIGNIFICANCE)
+    if fit is not None and (fit.likeness < likeness or fit.significance < significance):
+        return Detection(detection.predicted_px, True, None, not_found(expected.search_px))
+    return detection
+
+
+def orient_frame(frame: Frame) -> Frame:
+    """Separate inliers from gross errors and estimate the interior orientation from the inliers.
+
+    Each place has the covariance of its fit and of its given coordinates; the film's scatter is added to the weights.
+    Certain and clicked marks are never removed.
+    """
+    found = np.array([each.fit is not None for each in frame.detections])
+    inliers = found.copy()
+    if found.sum() < 2:
+        return replace(frame, inliers=inliers)
+    index = np.flatnonzero(found)
+    fits = [frame.detections[i].fit for i in index]
+    up = frame.up_mm(np.array([fit.center_px for fit in fits if fit]))
+    scaled = np.diag(frame.pitch_mm)
+    covariances = np.array([scaled @ fit.covariance_px2 @ scaled for fit in fits if fit])
+    given = np.array([min(*frame.layout.marks[i].sigma_mm, MOST_GIVEN_SIGMA_MM) for i in index])
+    covariances += given[:, None, None] ** 2 * np.eye(2)
+    film, camera, model = (
+        Scatter(frame.options.film_sigma_mm, SCATTER_DEGREES),
+        frame.camera_mm,
+        frame.options.film_model,
+    )
+    clicked = {click.point for click in frame.options.clicks}
+    known = frame.certain | [mark.id in clicked for mark in frame.layout.marks]
+    out = gross_errors(FrameMarks.from_places(camera[index], up, covariances, model), film, frame.options.gate_mm)
+    out &= ~known[index]
+    inliers[index[out]] = False
+    sigma = np.sqrt(np.trace(covariances, axis1=1, axis2=2) / 2 + film.sigma**2)
+    fit = fit_frame(camera[index[~out]], up[~out], sigma[~out], up_from_camera(frame.placement.pose), model)
+    pixel_from_camera = np.diag([1.0, -1.0]) @ fit.up_from_camera / frame.pitch_mm[:, None]
+    return replace(
+        frame, inliers=inliers, pixel_from_camera=pixel_from_camera, linear_sigma=fit.linear_sigma, film=fit.film
+    )
+
+
+def detect_missing_marks(frame: Frame) -> Frame:
+    """Detect the missing and unclear marks around the places predicted from the inliers."""
+    if frame.accepted:
+        frame = orient_frame(_detect_closer(frame))
+    if frame.inliers.sum() >= 2 and not frame.is_certain_of_places:
+        if len(frame.detections) > MANY:
+            # If the frame itself is uncertain, the wide radius would turn texture into marks.
+            reach_px = (
+                REDUCED_PX * frame.placement.reduction + NARROW * frame.largest_misfit_px
+                if frame.placement.surroundings.robust
+                else frame.gate_px
+            )
+            frame = detect_faint_marks(frame, reach_px)
+            # With such a search radius no mark is exempt from the outlier test.
+            frame = replace(frame, certain=np.zeros_like(frame.certain))
+        else:
+            frame = _detect_elsewhere(frame)
+        frame = orient_frame(frame)
+    for _ in range(_ROUNDS):
+        if frame.is_certain_of_places:
+            frame = orient_frame(detect_faint_marks(frame, faint_reach_px(frame)))
+    return frame
+
+
+def _detect_closer(frame: Frame) -> Frame:
+    """Detect unclear marks again with narrow surroundings, since dust or an edge may lie beside."""
+    changed = {}
+    for index in range(len(frame.detections)):
+        if frame.detections[index].is_clear and frame.inliers[index]:
+            continue
+        expected = replace(frame.prediction(index, frame.gate_px), surroundings=CLOSE)
+        detection = detect_mark(frame.scan, expected, frame.options.match)
+        fit, is_sure = detection.fit, detection.false_alarms <= TEXTURE_LIKE_A_FAINT_MARK
+        if is_sure and fit and fit.is_clear and fit.significance >= _LEAST_SIGNIFICANCE:
+            changed[index] = replace(detection, closer=True)
+    return frame.replace_detections(changed)
+
+
+def _detect_elsewhere(frame: Frame) -> Frame:
+    """Detect unclear marks within the gate of their predictions, then farther off, where only clear fits count."""
+    for index in [index for index, each in enumerate(frame.detections) if not each.is_clear]:
+        near = far = _detect(frame, [index], frame.gate_px)
+        far_px = _farthest_px(frame, index)
+        if not near.detections[index].is_clear and far_px > frame.gate_px:
+            far = _detect(frame, [index], far_px)
+        frame = far if far.detections[index].is_clear else near
+    return frame
+
+
+def _farthest_px(frame: Frame, index: int) -> float:
+    """Largest distance of a mark from the place predicted by the others at which its residual keeps the gate.
+
+    In the adjustment with the mark itself, the residual is that distance divided by 1 + q, where q is the variance of
+    the prediction from the others in units of a mark's variance.
+    """
+    others = np.flatnonzero(frame.inliers & (np.arange(len(frame.inliers)) != index))
+    affine = np.column_stack([frame.camera_mm, np.ones(len(frame.camera_mm))])
+    if np.linalg.matrix_rank(affine[others]) < affine.shape[1]:
+        return frame.gate_px
+    variance = float(affine[index] @ np.linalg.inv(affine[others].T @ affine[others]) @ affine[index])
+    return min((1 + variance) * frame.gate_px, frame.first_search_px)
+
+
+def fit_lines_and_sharpening(frame: Frame, fewest: int = 0) -> Frame:
+    """Estimate what all marks of the scan share, the width of their lines and its sharpening, and refit them with it.
+
+    fewest: marks without which the sharpening is left for later.
+
+    Exposure widens or narrows the lines of all crosses of a frame alike. Where a line is drawn too wide, the size of a
+    cross takes that up, and the ends of its arms are taken for damage, as are the halos of a sharpened scan.
+    """
+    begun, plainest = frame, _by_significance(frame)
+    options, telling = replace(frame.options.match, tells_sharpening=True), plainest
+    last = before = frame.scan.tone.sharpening
+    for _ in range(_SHARED_ROUNDS):
+        drawn = _widen_drawings(frame, telling)
+        fits = (frame.detections[index].fit for index in telling)
+        scores = [fit.sharpening for fit in fits if fit and fit.sharpening and fit.sharpening.normal.any()]
+        found = before
+        if begun.agrees and len(scores) >= max(fewest, FEWEST_MARKS):
+            found = estimate_sharpening(before, scores, len(frame.scan.tone.mean)) or Sharpening()
+        if drawn is frame and found.is_as(before):
+            break
+        last, before = before, found.damped(before, last) if last else found
+        telling = telling[:_TELLING]
+        frame = _refit(_sharpened(drawn, before), dict.fromkeys(telling, options), orient=False)
+    if frame is begun:
+        return frame
+    return _refit(_sharpened(frame, found), dict.fromkeys({*plainest} - {*telling}, options))
+
+
+def _widen_drawings(frame: Frame, among: Sequence[int]) -> Frame:
+    """Draw the lines of crosses as wide as those among the marks show them; the same frame if they are so already."""
+    groups: dict[Mark, list[tuple[float, float] | None]] = defaultdict(list)
+    for index in among:
+        fit = frame.detections[index].fit
+        groups[frame.layout.marks[index].mark].append(None if fit is None else fit.line_width)
+    ratios = {mark: shared_line_width(widths) for mark, widths in groups.items() if isinstance(mark, MarkShape)}
+    if all(ratio == 1 for ratio in ratios.values()):
+        return frame
+    wider: dict[Mark, Mark] = {mark: widen_lines(mark, ratio) for mark, ratio in ratios.items()}
+    marks = tuple(replace(each, mark=wider.get(each.mark, each.mark)) for each in frame.layout.marks)
+    return replace(frame, layout=replace(frame.layout, marks=marks))
+
+
+def _sharpened(frame: Frame, sharpening: Sharpening) -> Frame:
+    return replace(frame, scan=frame.scan.replace_tone(frame.scan.tone.sharpened(sharpening)))
+
+
+def refit_frame(frame: Frame) -> Frame:
+    """Refit the marks of a frame with parameters estimated from all of them, and compare them with one another.
+
+    Marks whose image does not determine rotation and scale take those of the frame, as do marks displaced by stretch
+    and shear, which no single fit determines. Marks displaced by the tone curve are refitted with the curve estimated
+    from all marks. Marks whose blur is poorly determined take that of the others.
+    """
+    if len(frame.inlier_fits) >= 2:
+        frame = _refit_with_blur(_refit_with_tone(frame))
+    return compare_shapes(_add_common_covariances(frame))
+
+
+def _refit_with_blur(frame: Frame) -> Frame:
+    """Refit faint marks and those with a poorly determined blur, with the blur of the others as an observation."""
+    drawn = {
+        index: fit for index, fit in frame.inlier_fits.items() if isinstance(frame.layout.marks[index].mark, MarkShape)
+    }
+    faint = {index: fit for index, fit in drawn.items() if fit.covariance is None}
+    fits = {
+        index: fit for index, fit in drawn.items() if index not in faint and frame.detections[index].is_clear
+    } | faint
+    shared = dict(zip(fits, shared_blurs(list(fits.values())), strict=True))
+    options = {
+        index: replace(frame.options.match, blur_px=blur.blur_px, blur_sigma=blur.sigma)
+        for index, blur in shared.items()
+        if blur is not None
+    }
+    matched = _refit(frame, {index: each for index, each in options.items() if index not in faint}, orient=False)
+    sigma = _linear_sigma(frame)
+    again = {index: _fit_again(frame, index, options.get(index, frame.options.match), sigma) for index in faint}
+    better = {index: fit for index, fit in again.items() if fit and _is_better(faint[index], fit, shared[index])}
+    matched, amended = matched.replace_fits(better), {}
+    total_px = {index: float(np.sqrt(fit.blur_px**2 + PIXEL_VARIANCE_PX2)) for index, fit in fits.items()}
+    usual_px = float(np.median(list(total_px.values()))) if total_px else 1.0
+    for index, blur in shared.items():
+        ratio, blur_sigma = total_px[index] / usual_px, fits[index].blur_sigma
+        figures = {"blur_ratio": ratio, "blur_sigma": blur_sigma} if np.isfinite(blur_sigma) else {}
+        is_unlike = blur is not None and blur.differs and index not in faint
+        amended[index] = matched.detections[index].amend(*[unlike_blur(ratio)] * is_unlike, figures=figures)
+    return orient_frame(matched.replace_detections(amended))
+
+
+def _is_better(before: MarkFit, fit: MarkFit, blur: SharedBlur | None) -> bool:
+    """Whether the fit of a faint mark replaces its filtered place: same mark, others' blur, smaller sigma."""
+    if blur is not None and not blur.is_confirmed(fit):
+        return False
+    off = fit.center_px - before.center_px
+    return fit.sigma_px < before.sigma_px and may_be_noise(off, before.covariance_px2 + fit.covariance_px2)
+
+
+def _refit_with_tone(frame: Frame) -> Frame:
+    """Refit the marks with the tone curve estimated from the telling ones; if these disagree, from further curves."""
+    prior, begun, options = frame.scan.tone.prior, frame.scan.tone, frame.options.match
+    sigma = _linear_sigma(frame)
+    pending = {index for index, fit in frame.clear_fits.items() if _needs_frame(frame, index, fit, sigma)}
+    telling = {*_by_significance(frame)[:_TELLING]}
+    best = _settle_tone(frame, prior, telling, pending & telling)
+    is_open = best.tone.disagreement > _AGREED and any(
+        tone.sensitivity_px > best.clear_fits[index].sigma_px for index, tone in _mark_tones(best).items()
+    )
+    for power in _OTHER_STARTS if is_open else ():
+        start = replace(best, scan=best.scan.replace_tone(prior.shift_to_power(power)))
+        start = _refit(start, dict.fromkeys(telling & _mark_tones(best).keys(), options))
+        other = _settle_tone(start, prior, telling, frozenset())
+        is_better = not other.tone.is_doubted and other.tone.disagreement < best.tone.disagreement
+        best = other if is_better else best
+    rest = pending if best.scan.tone is begun else pending | {*_mark_tones(best)}
+    if rest <= telling:
+        return best
+    best = _refit(best, dict.fromkeys(rest - telling, options))
+    every = FrameTone.from_marks(prior, _mark_tones(best), best.scan.tone)
+    return best if best.tone.is_doubted else replace(best, tone=every)
+
+
+def _settle_tone(frame: Frame, prior: Tone, telling: Set[int], pending: Set[int]) -> Frame:
+    """Refit marks and estimate the tone curve from the telling ones in turn.
+
+    prior: curve known before; pending: telling marks to be refitted with any curve.
+    """
+    for rounds_left in range(_TONE_ROUNDS, -1, -1):
+        tones, fits = _mark_tones(frame, telling), frame.clear_fits
+        estimate = FrameTone.from_marks(prior, tones, frame.scan.tone)
+        frame = replace(frame, tone=estimate)
+        moves = [estimate.shift_px(each, frame.scan.tone) > _MOVED * fits[n].sigma_px for n, each in tones.items()]
+        changed = pending | tones.keys() if any(moves) else pending
+        if not (changed and rounds_left):
+            break
+        if any(moves):
+            frame = replace(frame, scan=frame.scan.replace_tone(estimate.next_curve(frame.scan.tone)))
+        frame, pending = _refit(frame, dict.fromkeys(changed, frame.options.match)), frozenset()
+        if estimate.is_doubted:  # by the prior curve again, the marks would only lead to the same estimate
+            break
+    return frame
+
+
+def _needs_frame(frame: Frame, index: int, fit: MarkFit, linear_sigma: float) -> bool:
+    """Whether a fit depends on rotation, scale, stretch or shear of the frame; with a film model or lens all do."""
+    if frame.film is not None or frame.options.lens is not None:
+        return True
+    mark, linear = frame.layout.marks[index].mark, frame.linear(index)
+    error_px = strain_error_px(mark, fit.pixel_from_mark[:, :2], linear, linear_sigma)
+    return mark.is_held_by_frame or error_px > _STRAINED * fit.sigma_px
+
+
+def _mark_tones(frame: Frame, among: Set[int] | None = None) -> dict[int, MarkTone]:
+    """Information of the clear marks, or of those among them, on the tone curve."""
+    fits = frame.clear_fits.items()
+    return {index: fit.tone for index, fit in fits if fit.tone is not None and (among is None or index in among)}
+
+
+def _add_common_covariances(frame: Frame) -> Frame:
+    """Add the uncertainties of tone curve, sharpening and taking lens to the covariance of each mark."""
+    sharpening, by_lens = frame.scan.tone.sharpening, _lens_covariances(frame)
+    detections = list(frame.detections)
+    for index, detection in enumerate(detections):
+        fit, parts = detection.fit, {Cause.LENS: by_lens[index]} if index in by_lens else {}
+        if fit is not None and fit.tone is not None:
+            parts[Cause.TONE] = frame.tone.covariance_px2(fit.tone)
+        if fit is not None and fit.sharpening is not None and sharpening:
+            parts[Cause.SHARPENING] = fit.sharpening.covariance_px2(sharpening)
+        detections[index] = detection.amend(parts=parts)
+    return replace(frame, detections=tuple(detections))
+
+
+def _lens_covariances(frame: Frame) -> dict[int, Array]:
+    """Covariances (2, 2) of the inliers by the taking lens, as far as affine transformation and film model leave
+    them."""
+    fits, lens = frame.inlier_fits, frame.options.lens
+    if lens is None or not fits:
+        return {}
+    covariance = lens.covariance_px2(np.array([fit.center_px for fit in fits.values()]))
+    given = frame.camera_mm[list(fits)] / np.abs(frame.camera_mm).max()
+    (x, y), one, none = given.T, np.ones(len(given)), np.zeros(len(given))
+    affine = interleaved((x, none), (y, none), (one, none), (none, x), (none, y), (none, one))
+    free = np.hstack([affine, film_terms(frame.options.film_model, given)])
+    left = np.eye(len(free)) - free @ np.linalg.pinv(free)
+    parts = (left @ covariance @ left).reshape(len(fits), 2, len(fits), 2)
+    return {index: parts[number, :, number] for number, index in enumerate(fits)}
+
+
+def _by_significance(frame: Frame) -> list[int]:
+    """Indices of the clear marks, the most significant first."""
+    return sorted(frame.clear_fits, key=lambda index: -frame.clear_fits[index].significance)
+
+
+def _linear_sigma(frame: Frame) -> float:
+    """Standard deviation of the frame's rotation (rad), scale, stretch and shear at a mark, bending included."""
+    places = frame.camera_mm[frame.inliers]
+    radius_mm = float(np.hypot(*(places - places.mean(axis=0)).T).mean())
+    bend = float(np.hypot(frame.options.film_sigma_mm, frame.scatter_mm)) / radius_mm
+    unchecked = 0.0
+    if frame.inliers.sum() <= _UNCHECKED:  # a wrong name or place appears as stretch and shear
+        greater, less = np.linalg.svd(frame.pixel_from_camera[:, :2] * frame.pitch_mm[:, None], compute_uv=False)
+        unchecked = (greater - less) / (greater + less)
+    return float(np.linalg.norm([frame.linear_sigma, bend, unchecked]))
+
+
+def _refit(frame: Frame, options: Mapping[int, MatchOptions], orient: bool = True) -> Frame:
+    """Refit marks at their places, with options by index. A clear fit stays if the new one is not clear."""
+    sigma = _linear_sigma(frame) if options else np.inf
+    fits = {index: _fit_again(frame, index, each, sigma) for index, each in sorted(options.items())}
+    kept = {
+        index: fit
+        for index, fit in fits.items()
+        if fit is not None and (fit.is_clear or not frame.detections[index].is_clear)
+    }
+    frame = frame.replace_fits(kept)
+    return orient_frame(frame) if orient else frame
+
+
+def _fit_again(frame: Frame, index: int, options: MatchOptions, linear_sigma: float) -> MarkFit | None:
+    """Refit a mark at its measured place, with the frame's rotation and scale if it is held by them."""
+    before = frame.detections[index].fit
+    if before is None:
+        return None
+    expected = frame.prediction(index, _REFIT_PX).shift_to(before.center_px)
+    # Marks whose size, place and blur are less separate begin anew: they have further minima.
+    begun = before if isinstance(expected.mark, MarkShape) and expected.mark.is_cross else None
+    return detect_mark(frame.scan, expected, options, linear_sigma, begun).fit
+
+
+def shows_marks(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> bool:
+    """Whether any of some marks, spread over the frame, is clear in a placement."""
+    frame = choose_channels(Frame.from_placement(scan, layout, placement, options))
+    some = range(0, len(layout.marks), max(1, len(layout.marks) // _TRIALS))
+    return any(_detect(frame, [index], frame.first_search_px).detections[index].is_clear for index in some)
+
+
+def rename_frame(scan: Scan, frame: Frame, pose: str) -> Frame:
+    """Name the marks of a frame as in another pose.
+
+    Marks found are fitted at their places, the others are detected. The frame is kept unchanged if fewer marks agree
+    under the new names.
+    """
+    placement = frame.fitted_placement.posed(pose, frame.camera_mm)
+    found = np.array([fit.center_px for fit in frame.fits if fit])
+    names = placement.names(found, frame.camera_mm).tolist() if len(found) else []
+    renamed = Frame.from_placement(scan, frame.layout, placement, frame.options)
+    renamed = replace(renamed, weights=frame.weights, channel_note=frame.channel_note)
+    places = {name: place for name, place in zip(names, found, strict=True) if name >= 0}
+    renamed = orient_frame(
+        renamed.replace_detections(
+            {name: _detection(renamed, renamed.prediction(name, 0.0).shift_to(place)) for name, place in places.items()}
+        )
+    )
+    unclear = [index for index, each in enumerate(renamed.detections) if not each.is_clear]
+    renamed = refit_frame(detect_missing_marks(orient_frame(_detect(renamed, unclear, renamed.first_search_px))))
+    return renamed if renamed.inliers.sum() >= frame.inliers.sum() else frame

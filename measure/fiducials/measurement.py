@@ -198,7 +198,7 @@ def _leads_to(placement: Placement, frame: Frame) -> bool:
     fits = frame.inlier_fits
     places = np.array([fit.center_px for fit in fits.values()]).reshape(-1, 2)
     off_px = np.hypot(*(placement.places_px(frame.camera_mm[list(fits)]) - places).T)
-    return bool(fits) and bool(off_px.max() <= frame.first_search_px())
+    return bool(fits) and bool(off_px.max() <= frame.first_search_px)
 
 
 def _lacks_its_own(frame: Frame, rival: Placement) -> bool:
@@ -207,7 +207,7 @@ def _lacks_its_own(frame: Frame, rival: Placement) -> bool:
     found = np.array([fit is not None for fit in frame.fits])
     inside = np.array([detection.inside for detection in frame.detections])
     apart_px, _ = cKDTree(rival.places_px(frame.camera_mm)).query(frame.predicted_px)
-    own = inside & (apart_px > frame.first_search_px())
+    own = inside & (apart_px > frame.first_search_px)
     return bool(own.any() and found[own].mean() < _HARDLY * found[inside].mean())
 
 

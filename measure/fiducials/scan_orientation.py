@@ -91,7 +91,7 @@ def decide_pose(frame: Frame, lines: Sequence[Line] = (), poses: Sequence[str] =
     # Sites without a mark take contrast and noise from a typical one: another orientation may predict a mark there.
     usual = sorted(fits, key=lambda fit: abs(fit.contrast_dn))[len(fits) // 2]
     places = [*((fit, fit.center_px) for fit in fits), *((usual, place) for place in missed)]
-    reach_px = frame.first_search_px()
+    reach_px = frame.first_search_px
 
     def site_likelihoods(index: int) -> Array:
         """(hypotheses,) log-likelihoods of the image at a site."""

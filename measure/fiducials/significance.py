@@ -59,7 +59,7 @@ def false_frames(result: SearchResult, frame: Frame, indices: Iterable[int]) -> 
 
 def _share_at_full_resolution(result: SearchResult, frame: Frame, found_px: Mapping[int, Array]) -> float:
     """Share of the places with responses as strong at reduced resolution that also have them at full resolution."""
-    marks_px, apart_px = np.array([*found_px.values()]), _APART * frame.first_search_px()
+    marks_px, apart_px = np.array([*found_px.values()]), _APART * frame.first_search_px
     others = [
         (index, place)
         for index, own in found_px.items()
@@ -164,7 +164,7 @@ def doubt_frame(result: SearchResult, frame: Frame) -> Reason:
 
 def _doubt_by_neighbourhood(frame: Frame, inside: Sequence[int], clear: Sequence[int]) -> Reason:
     """Test a frame of which some marks were not found, by the correlation beside the marks (binomial)."""
-    found, radius_px = len(clear), frame.first_search_px()
+    found, radius_px = len(clear), frame.first_search_px
     places = _neighbouring_places(frame, inside, radius_px)
     fitted = ((index, frame.inlier_fits[index].center_px) for index in clear)
     weakest = min((_response(frame, *each, _FITTED_PX) for each in fitted), default=0.0)

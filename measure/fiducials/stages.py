@@ -141,7 +141,6 @@ def find_frame(
     """Find the frame of a scan. pitch_um: given by the user or the file, None if unknown."""
     search, result = FrameSearch(scan, layout, options), SearchResult()
     found, every, at_given = Found(), 0, 0
-    ids = [mark.id for mark in layout.marks]
     for stage in list_stages(scan, layout, pitch_um, options):
         if stage.is_unnecessary(found):
             continue
@@ -157,7 +156,7 @@ def find_frame(
             found = replace(found, result=result, frame=frame, is_taken=True)
         elif stage.is_given:
             if stage.tone is None or (frame is not None and frame.is_nearer_than(found.frame)):
-                misfit = frame.misfit(ids) if frame else _NOTHING
+                misfit = explain_misfit(frame) if frame else _NOTHING
                 found = replace(found, result=result, frame=frame, is_taken=False, misfit=misfit)
         else:
             likely = [] if stage.at_given else [each for each in frames if _is_taken_if_given(each, at_given / tried)]
@@ -259,6 +258,38 @@ def _places_to_try(found: Sequence[Placement]) -> list[Placement]:
     """Best placement, then others elsewhere by score times supporting marks: a few high peaks alone are often false."""
     others = sorted(found[1:], key=lambda placement: -placement.score * placement.supported)
     return distinct_places((*found[:1], *others), _TRIALS + 1)
+
+
+def explain_misfit(frame: Frame) -> Reason:
+    """Explain why a frame is not accepted."""
+    found = f"{len(frame.inlier_fits)} of {len(frame.detections)} marks were found where the others put them"
+    if frame.agrees:
+        return Reason(
+            f"{found}, but only {len(frame.clear_fits)} of them match their drawings, where {frame.least} have "
+            "to: compare the drawings with the scan, or set its tone curve (tone under [measure])",
+            Code.NO_FRAME,
+        )
+    if frame.failed_fits:
+        names = ", ".join(frame.layout.marks[index].id for index in frame.failed_fits)
+        return Reason(
+            f"only {found}, and the fit of {names} did not converge, with whatever tone curve it began", Code.NO_FIT
+        )
+    return Reason(f"the constellation does not fit: only {found}{_marks_outside(frame)}", Code.NO_FRAME)
+
+
+def _marks_outside(frame: Frame) -> str:
+    """Clause on marks predicted outside the scan; empty if there are none."""
+    outside = [
+        mark.id
+        for mark, detection in zip(frame.layout.marks, frame.detections, strict=True)
+        if Code.OUTSIDE in detection.reason.codes
+    ]
+    if not outside or frame.inliers.sum() < 2:
+        return ""
+    return (
+        f", and these put {', '.join(outside)} outside of the scan: scan the whole frame, or say by part_of in "
+        "images.csv that this scan is a part of it"
+    )
 
 
 def _pitch_to_try(unsure: Sequence[Frame]) -> str:

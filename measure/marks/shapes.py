@@ -6,7 +6,7 @@ The kinds (cross, dot, ...) are shorthands that return parts; all other modules 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, TypeGuard
+from typing import ClassVar, Literal, TypeGuard
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -87,6 +87,28 @@ class MarkShape:
         """Apply the perspective to points (n, 2) of the parts."""
         return np.asarray(places_mm / (1.0 + places_mm @ self.perspective)[:, None])
 
+    @property
+    def is_round(self) -> bool:
+        """Whether the mark is invariant under rotation."""
+        centred = all(isinstance(part, Disk | Ring) and part.center_mm == (0.0, 0.0) for part in self.parts)
+        return centred and not any(self.perspective)
+
+    @property
+    def is_cross(self) -> bool:
+        """Whether the mark consists of bars only, with the ends of all arms known."""
+        return self.known_mm is None and all(isinstance(part, Bar) for part in self.parts)
+
+    @property
+    def is_solid(self) -> bool:
+        """Whether the mark has an outline only, whose place depends on the slope of the background."""
+        return all(isinstance(part, Polygon | Disk) for part in self.parts)
+
+    @property
+    def is_held_by_frame(self) -> bool:
+        """Whether rotation and scale have to come from the other marks: the edges of a wedge or a notch do not separate
+        scale from place."""
+        return all(isinstance(part, Polygon) for part in self.parts)
+
 
 @dataclass(frozen=True)
 class FrameCorner(MarkShape):
@@ -123,6 +145,10 @@ class MarkTemplate:
     learned_mm : side of the learned square; 0 for a chip supplied by the user.
     alike : scan orientations that map the camera's learned marks, with their origins, onto one another.
     """
+
+    is_round: ClassVar[bool] = False
+    is_solid: ClassVar[bool] = False
+    is_held_by_frame: ClassVar[bool] = True
 
     image: Array
     pitch_um: float

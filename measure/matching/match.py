@@ -15,7 +15,7 @@ import numpy as np
 from measure.array_types import Array, Mask
 from measure.flags import Cause
 from measure.marks.rendering import extent_px, frame_pixel_mask, known_mask, picture
-from measure.marks.shapes import Bar, Mark, MarkShape, MarkTemplate, widen_lines
+from measure.marks.shapes import Mark, MarkShape, MarkTemplate, widen_lines
 from measure.matching.covariance import (
     Landscape,
     LinearFit,
@@ -32,9 +32,7 @@ from measure.matching.models import (
     MatchOptions,
     PictureModel,
     State,
-    background_planes,
     background_px,
-    is_round,
     smoothed_px2,
 )
 from measure.matching.tone_information import (
@@ -232,7 +230,7 @@ def _precision(fit: PictureFit, noise: NoiseModel, landscape: Landscape) -> dict
     if not model.is_chip and model.background_px is None:
         place = place.plus(Cause.TEXTURE, linear.texture_px2(fit.area & model.tells))
     freedom, has_blur = model.options.freedom, model.blur is not None and not model.blur_is_at_limit
-    tells_shape = freedom in ("similarity", "affine") and not is_round(model.mark)
+    tells_shape = freedom in ("similarity", "affine") and not model.mark.is_round
     shape, strain = slice(2, 4), slice(4, model.linear.stop)
     by_width = _by_line_width(fit)
     width = None
@@ -258,7 +256,7 @@ def _precision(fit: PictureFit, noise: NoiseModel, landscape: Landscape) -> dict
 def _by_line_width(fit: PictureFit) -> Array | None:
     """(height, width) derivative by the logarithm of the width of a cross's lines. None for other marks."""
     model, place = fit.model, fit.state.pixel_from_mark
-    if not (isinstance(model.mark, MarkShape) and is_cross(model.mark)):
+    if not (isinstance(model.mark, MarkShape) and model.mark.is_cross):
         return None
     height, width = model.grey.shape
     wider, drawn = (
@@ -309,63 +307,3 @@ def _likeness(fit: PictureFit) -> float:
     without = grey - combined(factors(background, grey), background)
     unexplained = np.sum(fit.model.misfit[fit.used] ** 2) / max(np.sum(without**2), 1e-12)
     return float(np.sqrt(max(1 - unexplained, 0.0)))
-
-
-# Measured lengths of the arms of a cross relative to the drawn ones.
-
-
-_CHANGE = 0.3  # fraction of the arm's length, step of the central differences in the design matrix
-_LEAST = 0.1  # fraction of the fitted contrast: a smaller gain is replaced by it
-
-
-def is_cross(mark: MarkShape) -> bool:
-    """Whether a mark consists of bars only, with the ends of all arms known."""
-    return mark.known_mm is None and all(isinstance(part, Bar) for part in mark.parts)
-
-
-def measure_arms(window: ScanWindow, mark: MarkShape, pixel_from_mark: Array, fit: MarkFit) -> tuple[Array, Array]:
-    """Estimate the lengths of the arms of a cross, relative to the drawn ones, by linear least squares.
-
-    Gain, offset and slopes are further unknowns. The derivative with respect to a length is the image of a line about
-    the end of the arm, uniform along it: the estimate is proportional to the missing part, regardless of the blur.
-    Pixels masked as damage are used, since a missing arm is masked, too.
-
-    Parameters
-    ----------
-    window : window with the cross.
-    pixel_from_mark : (2, 3) in pixels of the scan. The place is the matched one. The linear part is that of the frame,
-        since the mark's own depends on the ends of its arms.
-
-    Returns
-    -------
-    (arms,) relative lengths, in the order of the bars' ends, and their standard deviations.
-    """
-    place = pixel_from_mark - np.column_stack([np.zeros((2, 2)), window.origin_px])
-    height, width = window.grey.shape
-    drawn = picture(mark, place, width, height, fit.blur_px)
-    changes = [picture(tip, place, width, height, fit.blur_px) / (2 * _CHANGE) for tip in _arm_tips(mark)]
-    used = window.usable & (window.sides == 0)
-    design = np.stack([*changes, drawn, *background_planes(height, width)])[:, used]
-    grey = window.grey[used]
-    inverse: Array = np.asarray(np.linalg.pinv(design @ design.T), float)
-    solution = inverse @ (design @ grey)
-    left = grey - solution @ design
-    # Noise correlated by rho along columns and rows reduces the effective number of pixels.
-    rho = float(np.clip(fit.neighbour_correlation, 0.0, 0.9))
-    variance = float(left @ left) / max(len(grey) - len(design), 1) * ((1 + rho) / (1 - rho)) ** 2
-    gain = solution[len(changes)]
-    gain = gain if abs(gain) > _LEAST * abs(fit.contrast_dn) else fit.contrast_dn
-    sigmas = np.sqrt(variance * np.diag(inverse)[: len(changes)]) / abs(gain)
-    return 1 + solution[: len(changes)] / gain, sigmas
-
-
-def _arm_tips(mark: MarkShape) -> list[MarkShape]:
-    """For each arm: what it has more if it is longer than if it is shorter, the line about its end."""
-    tips = list[MarkShape]()
-    for bar in mark.parts:
-        assert isinstance(bar, Bar)
-        for tip, other in ((bar.from_mm, bar.to_mm), (bar.to_mm, bar.from_mm)):
-            if np.dot(tip, np.subtract(tip, other)) > 0:  # the start of an arm near the centre is no tip
-                inner, outer = ((tip[0] * share, tip[1] * share) for share in (1 - _CHANGE, 1 + _CHANGE))
-                tips.append(replace(mark, parts=(Bar(inner, outer, bar.line_mm),)))
-    return tips

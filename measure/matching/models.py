@@ -12,7 +12,7 @@ from measure.array_types import Array, Mask
 from measure.flags import NO_REASON, Code, Reason
 from measure.geometry import linear_scale
 from measure.marks.rendering import Rendering, chip_steadiness, reach_px, render
-from measure.marks.shapes import Disk, Mark, MarkTemplate, Ring, thinnest_mm
+from measure.marks.shapes import Mark, MarkTemplate, thinnest_mm
 from measure.matching.window import ScanWindow, censored, tells
 from measure.noise.noise_model import combined, factors
 
@@ -96,14 +96,6 @@ class MatchOptions:
                 raise ValueError(f"{name} is {getattr(self, name)}; 0 or more is right")
 
 
-def is_round(mark: Mark) -> bool:
-    """Whether the mark is invariant under rotation."""
-    if isinstance(mark, MarkTemplate):
-        return False
-    centred = all(isinstance(part, Disk | Ring) and part.center_mm == (0.0, 0.0) for part in mark.parts)
-    return centred and not any(mark.perspective)
-
-
 def smoothed_px2(mark: Mark) -> float:
     """Variance (px²) of the Gaussian by which the window of a mark is smoothed: that of a chip, 0 for a drawing."""
     return _CHIP_SMOOTHED_PX**2 if isinstance(mark, MarkTemplate) else 0.0
@@ -175,7 +167,7 @@ class PictureModel:
         self.smoothed_px2 = smoothed_px2(mark)
         self.light = np.asarray(cv2.GaussianBlur(grey, (0, 0), _CHIP_SMOOTHED_PX), float) if self.is_chip else grey
         self.grey = self.detail(self.light)
-        names = [name for name in _FREEDOMS[options.freedom] if name != "turn" or not is_round(mark)]
+        names = [name for name in _FREEDOMS[options.freedom] if name != "turn" or not mark.is_round]
         self.generators = np.array([_GENERATORS[name] for name in names]).reshape(-1, 2, 2)
         sigmas = [options.strain_sigma if name in ("stretch", "shear") else options.linear_sigma for name in names]
         moving = 2 + len(names) + options.estimate_blur

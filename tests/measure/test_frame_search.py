@@ -1,6 +1,5 @@
 """The search for a frame: the list of attempts, hypotheses, and what is found at a closer look or not believed."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -14,8 +13,8 @@ from measure.detection.responses import ByteCache, Responses
 from measure.fiducials import stages
 from measure.fiducials.constellation import Bounds, Placement, PlacementSearch, same_picture
 from measure.fiducials.frame import Frame
+from measure.fiducials.measure_frame import fit_lines_and_sharpening
 from measure.fiducials.measurement import _lacks_its_own
-from measure.fiducials.refit import fit_lines_and_sharpening
 from measure.fiducials.rows import pitch_problem
 from measure.fiducials.search import PitchHypothesis, SearchResult
 from measure.fiducials.stages import Found, Kind, Stage, find_frame
@@ -156,9 +155,6 @@ class Stand:
         self.failed_fits: list[int] = []
         self.inliers, self.pixel_from_camera = np.ones(3, bool), np.eye(2, 3)
 
-    def misfit(self, ids: Sequence[str]) -> Reason:
-        return Reason(f"not {self.name}")
-
     def is_nearer_than(self, other: "Stand | None") -> bool:
         return other is None
 
@@ -187,6 +183,7 @@ def search_attempts(
     monkeypatch.setattr(stages, "search_stage", lambda *_: SearchResult())
     monkeypatch.setattr(stages, "measure_stage", measure)
     monkeypatch.setattr(stages, "doubt_frame", lambda *_: NO_REASON)
+    monkeypatch.setattr(stages, "explain_misfit", lambda stand: Reason(f"not {stand.name}"))
     return find_frame(SCAN, ALIKE, None, FiducialOptions()), checked
 
 

@@ -11,7 +11,7 @@ from true_marks import KIND, TrueMark, some_mark
 
 from measure import FiducialLayout, FiducialOptions, LayoutMark
 from measure.fiducials.constellation import Placement
-from measure.fiducials.frame import Frame, orient_frame
+from measure.fiducials.frame import Frame
 from measure.fiducials.mark_comparison import (
     SharedBlur,
     SharedShape,
@@ -22,8 +22,9 @@ from measure.fiducials.mark_comparison import (
     touch_of_round,
 )
 from measure.fiducials.mark_fit import not_found
-from measure.fiducials.measure_frame import detect_frame, measure_frame
+from measure.fiducials.measure_frame import detect_frame, measure_frame, orient_frame
 from measure.fiducials.rows import absent_frame
+from measure.fiducials.stages import explain_misfit
 from measure.flags import Cause, Status
 from measure.marks.shapes import MarkShape, cross, thinnest_mm
 from measure.matching.gauss_newton import UNSETTLED
@@ -228,7 +229,7 @@ def test_a_frame_in_which_marks_lie_as_they_should_but_differ_from_their_drawing
     ]
     refused = replace(plain, detections=tuple(unlike))
     assert not refused.accepted
-    assert refused.misfit("12345678").startswith(
+    assert explain_misfit(refused).startswith(
         "8 of 8 marks were found where the others put them, but only 2 of them match"
     )
 
@@ -237,15 +238,15 @@ def test_a_frame_whose_marks_do_not_converge_says_so_and_not_that_camera_and_pit
     failed = [replace(each, fit=None, reason=UNSETTLED) for each in plain.detections[2:]]
     refused = orient_frame(replace(plain, detections=(*plain.detections[:2], *failed)))
     assert refused.failed_fits == [2, 3, 4, 5, 6, 7]
-    reason = refused.misfit("12345678")
+    reason = explain_misfit(refused)
     assert "only 2 of 8 marks" in reason
-    assert "the fit of 3, 4, 5, 6, 7, 8 did not converge" in reason
+    assert "the fit of 2, 3, 4, 5, 6, 7 did not converge" in reason
     (problem,) = absent_frame(plain.scan, plain.layout, reason, 6.0, None).problems
     assert "set tone under [measure]" in problem
     assert "pitch" not in problem
     nothing = [replace(each, fit=None, reason=not_found(4.0)) for each in plain.detections[2:]]
     refused = orient_frame(replace(plain, detections=(*plain.detections[:2], *nothing)))
-    assert "pitch right" in absent_frame(plain.scan, plain.layout, refused.misfit("12345678"), 6.0, None).problems[0]
+    assert "pitch right" in absent_frame(plain.scan, plain.layout, explain_misfit(refused), 6.0, None).problems[0]
 
 
 def test_wings_of_three_marks_under_wrong_names_claim_no_more_than_the_stretch_that_these_make() -> None:

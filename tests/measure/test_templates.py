@@ -13,13 +13,13 @@ from scipy.special import ndtr
 from measure import ScanWindow
 from measure.detection.recurrence import recurrence
 from measure.fiducials.across_frames import check_frames
-from measure.fiducials.mark_comparison import check_own_figures, unlike_blur, unlike_others
+from measure.fiducials.mark_comparison import check_own_figures, measure_arms, unlike_blur, unlike_others
 from measure.flags import Cause, Code, Reason, Status
 from measure.geometry import POSES, up_from_camera
 from measure.marks.shapes import Bar, MarkShape, MarkTemplate, cross, polygon
 from measure.marks.templates import Chip, learn_template, share_origins
 from measure.matching.covariance import honest_covariance
-from measure.matching.match import MatchOptions, match, measure_arms
+from measure.matching.match import MatchOptions, match
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 
 Array = NDArray[np.float64]
