@@ -49,6 +49,9 @@ BROWN_UNITS = (*TORLEGARD_UNITS[:5], "–", "–")
 TORLEGARD_GROUPS = (("radial", TORLEGARD_NAMES[:3]), ("decentering", TORLEGARD_NAMES[3:5]))
 BROWN_GROUPS = (("radial", BROWN_NAMES[:3]), ("decentering", BROWN_NAMES[3:5]), ("affinity", BROWN_NAMES[5:]))
 AICON_GROUPS = (("radial", AICON_NAMES[:3]), ("decentering", AICON_NAMES[3:5]), ("affinity", AICON_NAMES[5:]))
+MM_PER_DM = 100.0
+UM_PER_MM = 1000.0
+TANGENTIAL_POWER = 1.85  # the tangential deformation grows with r to this power
 
 
 def torlegard(settings: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:
@@ -107,9 +110,6 @@ def _terms(r0_mm: float, decenterings: int = 1, shift_mm: tuple[float, float] = 
 JUHL_NAMES = ("t1", "t2", "t3", "t4", "r1", "r2", "r3", "af", "sh")
 JUHL_UNITS = ("µm at 1 dm",) * len(JUHL_NAMES)
 JUHL_GROUPS = (("tangential", JUHL_NAMES[:4]), ("radial", JUHL_NAMES[4:7]), ("affinity", JUHL_NAMES[7:]))
-MM_PER_DM = 100.0
-UM_PER_MM = 1000.0
-TANGENTIAL_POWER = 1.85  # the tangential deformation grows with r to this power
 
 
 def juhl(settings: Settings, xy: Array, _: Array, parameters: Array) -> Correction:

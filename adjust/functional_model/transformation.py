@@ -26,6 +26,7 @@ from adjust.array_types import Array, Mask
 from adjust.linear_algebra.small_matrices import NEWTON_STEPS, applied, determinant, solved
 
 NEWTON_TOLERANCE = 1e-9  # fraction of a coordinate: the remaining error is the square of the last step
+HIGHEST_ORDER = 5  # of polynomials: 21 terms an axis, more than fiducial marks of frames determine
 
 
 class FilmKind(ABC):
@@ -290,7 +291,6 @@ def _solved(matrix: Array, right: Array) -> tuple[Array, Mask]:
     return solved(matrix, right, regular, of), regular
 
 
-HIGHEST_ORDER = 5
 POSSIBLE = (
     "none, congruent, similarity, affine, projective, bilinear, conformal(n) and polynomial(n) with the order n from 1 "
     f"to {HIGHEST_ORDER}"

@@ -32,6 +32,7 @@ from adjust.validation import validate
 
 ON_A_LINE = 1e-6  # second extent of the known points over the first below which they lie on a line
 MOST_FOLDED = 0.05  # largest fraction of points outside the invertible range of the distortion (gross errors)
+CLEARLY_WORSE = 5.0  # ratio of the median residuals above which a resection replaces a given orientation
 
 
 def approximate(network: Network) -> Approximations:
@@ -218,9 +219,6 @@ def _exteriors(images: Sequence[Image], poses: Mapping[str, Pose]) -> dict[str, 
     return {
         image.name: np.concatenate([poses[image.name].center, own]) for image, own in zip(images, angles, strict=True)
     }
-
-
-CLEARLY_WORSE = 5.0  # ratio of the median residuals above which a resection replaces a given orientation
 
 
 def orient(

@@ -36,6 +36,7 @@ GROSS = 13.8  # squared distance, in variances of a coordinate, above which a ma
 PLAINLY = 0.01  # ratio of the squared residuals, mirrored over upright, below which a scan is mirrored
 LEAST_VARIANCE_MM2 = 1e-4  # of a coordinate: film deformation and scanner errors reach this
 LATTICE = np.stack(np.meshgrid(*2 * [np.linspace(-1.0, 1.0, 8)]), axis=-1).reshape(-1, 2)
+FEWEST_COMMON = 3  # common points of two parts: a mirrored similarity fits two points as well
 
 
 def fit_transformation(transformation: Transformation, comparator_mm: Array, camera_mm: Array) -> tuple[Array, bool]:
@@ -265,8 +266,6 @@ def _medians(values: Array, group: Indices, starts: Indices) -> Array:
 
 Film = tuple[Array, bool]  # parameters, and whether the scan is mirrored
 Mark = tuple[str, str]  # kind and point
-
-FEWEST_COMMON = 3  # common points of two parts: a mirrored similarity fits two points as well
 
 
 def joined_frame(network: Network, parts: Sequence[Image]) -> tuple[dict[str, Film], dict[str, Array]]:

@@ -12,6 +12,15 @@ import numpy as np
 from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.rotation import rotation_from_vector
 
+LM_ITERATIONS = 12  # most of Levenberg and Marquardt's steps for a pose
+SETTLED = 1e-4  # relative change of a sum of squares at convergence
+BEHIND = 1e6  # squared residual, in squared principal distances, of a point behind the camera
+LARGEST_CHANGE = 0.5  # of the logarithm of the principal distance in one step
+USUAL_BEND = 0.3  # prior standard deviation of third-degree radial distortion, at an angle of 45 degrees
+ITERATIONS = 16  # of reweighting, half with weights of the first power
+SMALLEST_ANGLE = 1e-12  # rad, rounding: keeps weights finite where all rays meet
+WEAKEST = 1e-8  # least eigenvalue of the normal matrix of a usable point: rays 0.01 degrees apart
+
 
 @dataclass(frozen=True)
 class Sight:
@@ -26,13 +35,6 @@ class Sight:
     def rays(self) -> Array:
         """(n, 3) directions to the points in the camera frame: (x', y', -c)."""
         return np.column_stack([self.xy_mm, np.full(len(self.xy_mm), -self.principal_distance_mm)])
-
-
-LM_ITERATIONS = 12
-SETTLED = 1e-4  # relative change of a sum of squares at convergence
-BEHIND = 1e6  # squared residual, in squared principal distances, of a point behind the camera
-LARGEST_CHANGE = 0.5  # of the logarithm of the principal distance in one step
-USUAL_BEND = 0.3  # prior standard deviation of third-degree radial distortion, at an angle of 45 degrees
 
 
 @dataclass(frozen=True)
@@ -261,11 +263,6 @@ def _triad(points: Array) -> Array:
     x = x / np.linalg.norm(x, axis=-1, keepdims=True)
     z = z / np.linalg.norm(z, axis=-1, keepdims=True)
     return np.stack([x, np.cross(z, x), z], axis=-1)
-
-
-ITERATIONS = 16
-SMALLEST_ANGLE = 1e-12
-WEAKEST = 1e-8  # least eigenvalue of the normal matrix of a usable point: rays 0.01 degrees apart
 
 
 def intersect(centers: Array, directions: Array, point: Indices, known: Array) -> tuple[Array, Array]:

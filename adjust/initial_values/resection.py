@@ -41,6 +41,15 @@ SAME_PLACE = 1e-4  # in extents of the points: poses nearer than this are the sa
 LINE = 1e-5  # width over length of collinear points: the camera may rotate around their line
 POINTS_AT_ONCE = 20_000
 REWEIGHTINGS = 2  # largest number of estimates of a principal distance, each from the inliers of the one before
+GRID = np.geomspace(0.35, 16.0, 9)  # principal distances tried, in radii of the imaged field: 140 to 7 degrees
+FEWEST = 4  # known points of an image
+COARSE_IMAGES, COARSE_POINTS = 4, 15  # images and points of each that choose a principal distance
+FINE_IMAGES = 50  # images that refine it
+LARGEST_RELATIVE_SIGMA, CLEAR_SIGMA = 0.15, 0.05  # of a principal distance that is used, and that ends the search
+ANGLES_DEG = np.arange(88.0, 8.0, -4.0)  # trial angles between the axis and the outermost point of all images
+WIDE_IMAGES = 5  # images that choose a wide field's
+FEWEST_WIDE = 6  # known points of an image
+HALVES = 4  # halvings of the step between trial angles in the fine search
 
 
 class Effort(NamedTuple):
@@ -362,17 +371,6 @@ def _robust_sigmas(squared: Array, counts: Indices) -> Array:
         truncation = 1 + np.where(left_out > 0, left_out * np.log(left_out) / (1 - left_out), 0.0)
     sums = np.take_along_axis(np.cumsum(np.sort(squared, axis=1), axis=1), half[:, None] - 1, axis=1)[:, 0]
     return np.asarray(np.sqrt(sums / np.maximum(2 * half - 6, 1) / truncation))
-
-
-GRID = np.geomspace(0.35, 16.0, 9)  # principal distances tried, in radii of the imaged field: 140 to 7 degrees
-FEWEST = 4  # known points of an image
-COARSE_IMAGES, COARSE_POINTS = 4, 15
-FINE_IMAGES = 50
-LARGEST_RELATIVE_SIGMA, CLEAR_SIGMA = 0.15, 0.05
-ANGLES_DEG = np.arange(88.0, 8.0, -4.0)  # trial angles between the axis and the outermost point of all images
-WIDE_IMAGES = 5
-FEWEST_WIDE = 6  # known points of an image
-HALVES = 4  # halvings of the step between trial angles in the fine search
 
 
 def find_principal_distance(fields: Sequence[KnownField]) -> tuple[float | None, dict[KnownField, Pose]]:

@@ -37,6 +37,10 @@ from adjust.linear_algebra.sparse_factor import (
 from adjust.linear_algebra.sparse_rows import Pattern, SharedEquations, SparseRows, batches, take_columns
 
 COMPILED_OWN = 3  # largest number of own unknowns per block in kernels.c
+CHEAP = 1e7  # rows times columns squared of the shared unknowns, up to which Householder QR is always used
+REFLECTED = 1e9  # the same, up to which it is used where normal equations would lose digits
+SAFE = 1e-6  # reciprocal condition of the shared triangle down to which normal equations suffice beyond that
+STEADY = 1e3  # norm of the triangles' inverses up to which no singular value of the design matrix is near 0
 
 
 @dataclass(frozen=True)
@@ -283,12 +287,6 @@ class SparseBlocks:
             triangle = triangle / self.scale[block.own][:, None, :]
             found.append(BlockFactors(block.own, block.shared, triangle, border, self.right[at[:, None], columns]))
         return tuple(found)
-
-
-CHEAP = 1e7  # rows times columns squared of the shared unknowns, up to which Householder QR is always used
-REFLECTED = 1e9  # the same, up to which it is used where normal equations would lose digits
-SAFE = 1e-6  # reciprocal condition of the shared triangle down to which normal equations suffice beyond that
-STEADY = 1e3  # norm of the triangles' inverses up to which no singular value of the design matrix is near 0
 
 
 def eliminate(

@@ -24,6 +24,8 @@ SAFE = 1e-6  # reciprocal condition of a root down to which its square is accura
 TEN_DIGITS = 1e-3  # and in a small one: variances keep ten digits
 ELEMENTS_AT_ONCE = 2_000_000  # elements of the roots in one batch
 POWERS = 20  # steps of the power iteration
+ROWS_PER_COLUMN = 4  # pending rows are factorised when they exceed this number per column
+CONDENSED_ROWS = 2000  # and this number in all
 
 
 @dataclass(frozen=True)
@@ -225,9 +227,6 @@ def _lifted(triangle: Array, least: float) -> Array:
 
 
 Rows = tuple[Indices, Array]  # unknowns (b, s) and rows (b, k, s + 1) in them, the right side last
-
-ROWS_PER_COLUMN = 4  # pending rows are factorised when they exceed this number per column
-CONDENSED_ROWS = 2000  # and this number in all
 
 
 def reflected(

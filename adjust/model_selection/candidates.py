@@ -40,6 +40,7 @@ TRANSFORMATIONS: Mapping[Transformation, tuple[Transformation, ...]] = {
 Bends = tuple[tuple[str, tuple[str, ...]], ...]  # (name, terms) of every scanner with terms
 
 SETS = {"ebner": ("b1", "b2"), "legendre(3)": ("a10", "a01")}  # their parameters of affinity and shear
+DECISIVE = 10.0  # difference of AICc above which the worse model has essentially no support (Burnham and Anderson)
 
 
 @dataclass(frozen=True)
@@ -153,9 +154,6 @@ def lenses(network: Network, transformation: Transformation, with_sets: bool) ->
             models.append(Model(transformation, name, tuple(p for p in parameter_names(name) if p not in taken)))
     own = replace(given_model(network), transformation=transformation, bends=())
     return tuple(models if own in models else [*models, own])
-
-
-DECISIVE = 10.0  # difference of AICc above which the worse model has essentially no support (Burnham and Anderson)
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,12 @@ from adjust.problem.problem import Problem, State
 from adjust.quality.run import Run, derivatives_by
 from adjust.rank_defect.datum import free_motion
 
+FEWEST_IMAGES = 5  # needed to estimate standard deviations, then to about a third
+MOST_SHARED = 300  # shared quantities: with many unknown points the dense matrix would be too large
+LARGEST_SHARE = 0.999  # of one image in the information on some combination of unknowns; above, it rests on that image
+UNDETERMINED = 1e-9  # relative singular value of an image's equations, below which a direction is not determined
+RANK = 1e-12  # eigenvalue of a scaled covariance, below which a direction is fixed
+
 
 @dataclass(frozen=True)
 class NoCofactor:
@@ -138,15 +144,6 @@ def _reported(problem: Problem, state: State) -> csr_array:
     matrix = csr_array((np.concatenate(values), entries), shape=(count, count))
     matrix.eliminate_zeros()
     return matrix
-
-
-FEWEST_IMAGES = 5  # needed to estimate standard deviations, then to about a third
-MOST_SHARED = 300  # shared quantities: with many unknown points the dense matrix would be too large
-LARGEST_SHARE = 0.999  # of one image in the information on some combination of unknowns; above, it rests on that image
-UNDETERMINED = (
-    1e-9  # relative singular value of the equations of an image, below which it does not determine a direction
-)
-RANK = 1e-12  # eigenvalue of a scaled covariance, below which a direction is fixed
 
 
 def cluster_covariance(run: Run, cofactor: Cofactor) -> Array | None:

@@ -32,6 +32,11 @@ from adjust.problem.parameter import Parameter
 
 RADII = 80
 DIRECTIONS = 36
+REACH_DIRECTIONS = 12  # around the axis, in which the distortion is compared
+REACH_RADII = 8  # at which the standard deviation of the distortion is evaluated, out to the outermost target
+MOST_IMAGES = 100  # used for the fit of the orientation, evenly chosen
+GRID = 33  # places along the longer side of an image
+RANK = 1e-9  # relative eigenvalue of the scaled normal matrix of an orientation, below which a direction is not fitted
 
 
 @dataclass(frozen=True)
@@ -116,10 +121,6 @@ def directions(count: int = DIRECTIONS) -> Array:
     return np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
-REACH_DIRECTIONS = 12
-REACH_RADII = 8  # at which the standard deviation of the distortion is evaluated, out to the outermost target
-
-
 @dataclass(frozen=True)
 class LensReach:
     """Extent of the observations of a lens."""
@@ -164,11 +165,6 @@ def _sigma_um(estimates: Estimates, camera: Camera, radius_mm: float) -> float:
     by = moved.by_unknowns_um
     variances = np.linalg.eigvalsh(by @ estimates.cofactor_of(unknowns) @ by.swapaxes(1, 2))[:, -1]
     return estimates.sigma0 * float(np.sqrt(max(variances.max(), 0.0)))
-
-
-MOST_IMAGES = 100  # used for the fit of the orientation, evenly chosen
-GRID = 33  # places along the longer side of an image
-RANK = 1e-9  # relative eigenvalue of the scaled normal matrix of an orientation, below which a direction is not fitted
 
 
 @dataclass(frozen=True, eq=False)

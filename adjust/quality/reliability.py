@@ -24,6 +24,13 @@ from adjust.quality.run import UNCHECKED, GrossError, Run, surplus
 from adjust.quality.tested import Probabilities, Tested, robust_scale
 
 UNCONTROLLED = 1e-4  # redundancy number below which only errors of hundreds of standard deviations are detectable
+TOLD_APART = 7.0  # difference of two statistics that decides between explanations: odds of 30 to 1
+ALIKE_SHOWN = 3  # observations named with a suspect that residuals do not tell from it
+AT_ONCE = 20  # columns of V computed in one pass
+MOST_SUSPECT = 0.25  # largest fraction of gross errors; beyond it, right and wrong cannot be distinguished
+MOST_AT_ONCE = 60  # gross errors in one adjustment; the next one continues
+MANY = 500  # image points whose median is robust against some gross errors
+RAISED = 1.02  # least ratio of a scale that counts as larger
 
 
 @dataclass(frozen=True)
@@ -151,15 +158,6 @@ def _outer_effects(run: Run, errors: Array, tested: tuple[Tested, ...], shift: f
         in_sigmas = abs(effect) / float(np.sqrt(cofactor[numbering.numbers[position], k]))
         found.append(OuterEffect(unknowns.parameters[position], effect, in_sigmas, cause if effect else ""))
     return tuple(found)
-
-
-TOLD_APART = 7.0  # difference of two statistics that decides between explanations: odds of 30 to 1
-ALIKE_SHOWN = 3
-AT_ONCE = 20  # columns of V computed in one pass
-MOST_SUSPECT = 0.25  # largest fraction of gross errors; beyond it, right and wrong cannot be distinguished
-MOST_AT_ONCE = 60  # gross errors in one adjustment; the next one continues
-MANY = 500  # image points whose median is robust against some gross errors
-RAISED = 1.02  # least ratio of a scale that counts as larger
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,8 @@ from adjust.quality.tested import TestedUnits, Weighting
 from adjust.rank_defect.flat_valleys import pseudo_square_sum
 
 UNCHECKED = 1e-9  # redundancy below which an observation is unchecked
+UM_PER_MM = 1000.0
+NEARLY_ONE = 0.99  # least redundancy of a group with a sigma0 of its own
 
 
 @dataclass(frozen=True)
@@ -228,10 +230,6 @@ def derivatives_by(problem: Problem, matrix: Array, positions: Indices, rows: In
     values = matrix[row, :, at].ravel()
     entries = values, (np.stack([2 * row, 2 * row + 1], axis=1).ravel(), column[row, at].repeat(2))
     return csr_array(entries, shape=(2 * len(column), len(positions)))
-
-
-UM_PER_MM = 1000.0
-NEARLY_ONE = 0.99  # least redundancy of a group with a sigma0 of its own
 
 
 @dataclass(frozen=True, repr=False)

@@ -33,6 +33,12 @@ from adjust.quality.run import Run, surplus
 LEVEL = 0.01  # significance level: probability of calling a superfluous parameter significant
 FIXED = Prior(0.0)
 UNCHECKED = 1e-6  # redundancy of a prior below which it cannot be tested
+UNSEEN = 1e-6  # least redundancy of a direction that the other observations determine
+HIGH = 0.95  # correlation from which quantities are told to be hardly separable
+IMAGES_AT_ONCE = 16  # bounds the memory of correlations
+SHARE = 0.3  # least share in a direction of an element of the exterior orientation that is named
+SHOWN = 3  # images named one by one
+FIELD = 4  # known points needed for a known field
 
 
 @dataclass(frozen=True)
@@ -145,9 +151,6 @@ def _significance_test(
     return SignificanceTest(name, parameters, statistic, f_probability(statistic, count, r))
 
 
-UNSEEN = 1e-6  # least redundancy of a direction that the other observations determine
-
-
 @dataclass(frozen=True, eq=False)
 class CalibrationTest:
     """Compatibility test of the images with correlated observations."""
@@ -210,11 +213,6 @@ def _as_marks_show(along: Array, unseen: Mask, parameters: Sequence[Parameter]) 
     return np.asarray(along - along[:, unseen] @ (by_marks @ along))
 
 
-HIGH = 0.95
-IMAGES_AT_ONCE = 16
-SHARE = 0.3  # least share in a direction of an element of the exterior orientation that is named
-SHOWN = 3  # images named one by one
-FIELD = 4  # known points needed for a known field
 DIRECTIONS = (  # of an exterior orientation: kind, and words
     ("across", "the station's place across its axis in x'"),
     ("across", "the station's place across its axis in y'"),

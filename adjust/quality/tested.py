@@ -17,6 +17,12 @@ from adjust.linear_algebra.small_matrices import laid_out
 from adjust.problem.parameter import Parameter
 from adjust.problem.problem import ABSENT, Problem
 
+STANDARD = 2.0  # standardised length, per coordinate, above which an observation is down-weighted
+LOST = 4.5  # the same, above which the redescending function gives no weight
+MEDIAN_LENGTH = np.sqrt(np.log(2.0))  # median of that length for a pair of normally distributed errors
+STANDSTILL = 1e-3  # change of a weight, or relative change of a variance, at convergence
+NO_WEIGHT = 1e-12  # stands for zero weight: not an observation
+
 
 @dataclass(frozen=True)
 class Probabilities:
@@ -159,12 +165,6 @@ def _group(parameter: Parameter) -> str:
 
 
 WeightFunction = Literal["huber", "igg3"]
-
-STANDARD = 2.0  # standardised length, per coordinate, above which an observation is down-weighted
-LOST = 4.5  # the same, above which the redescending function gives no weight
-MEDIAN_LENGTH = np.sqrt(np.log(2.0))  # median of that length for a pair of normally distributed errors
-STANDSTILL = 1e-3  # change of a weight, or relative change of a variance, at convergence
-NO_WEIGHT = 1e-12  # stands for zero weight: not an observation
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ TOO_GOOD = 1e-3  # p-value below which given values agree too well for their sta
 NO_EVIDENCE = 0.01  # least share of the other observations' errors in residuals that are evidence of them
 ERROR_FREE = 1e-4  # v'Pv over redundancy of simulated observations without errors
 APART = 3.0  # ratio of standard deviations that separates two sources of one camera's marks
+MOST_COLUMNS, SIGNS = 500, 200  # columns of a part of the hat matrix; random sums of more than these
 
 
 class _Given(NamedTuple):
@@ -121,9 +122,6 @@ def added_variance(squares: Array, variances: Array, redundancy: float) -> float
         return float((squares / np.maximum(variances + added, 1e-300)).sum()) - redundancy
 
     return float(brentq(excess, 0.0, most)) if most > 0.0 and excess(0.0) > 0.0 else None
-
-
-MOST_COLUMNS, SIGNS = 500, 200  # columns of a part of the hat matrix; random sums of more than these
 
 
 def refined_factors(run: Run) -> Weighting:

@@ -31,6 +31,15 @@ FIRST_COUNT = 24  # vectors of the first inverse iteration where there are more
 ITERATIONS = 50
 STANDSTILL = 1e-3  # change of small singular values at convergence, relative to the limit
 ROUNDING = 1e-14  # rounding error of a singular value, relative to the largest
+WEAK = 1e-4  # relative singular value of the scaled rows below which a direction is weak
+INVOLVED = 0.01  # components of a null vector that are named, relative to the largest
+PURE = 1e-5  # least share of a named direction in an exact null direction, beyond the names before it
+MIXED = 0.05  # the same in a weak direction, where everything has a small share
+SETTLED = 3.0  # ratio of the weights of priors and observations above which the priors settle a weak direction
+INSIDE = 1e-6  # tolerance for a known direction to lie in the null space: rounding
+NAMES_SHOWN = 3  # more names of one kind are collapsed to one with a star
+LOOSE = 0.05  # relative standard deviation of a principal distance above which a warning says so
+UNDETERMINED = 0.99  # ratio of posterior and prior standard deviation above which a quantity is undetermined
 
 
 @dataclass(frozen=True)
@@ -131,16 +140,7 @@ def _inverse_iteration(triangle: Triangle, count: int, limit: float) -> tuple[Ar
     return singular, vectors
 
 
-WEAK = 1e-4  # relative singular value of the scaled rows below which a direction is weak
-INVOLVED = 0.01  # components of a null vector that are named, relative to the largest
-PURE = 1e-5  # least share of a named direction in an exact null direction, beyond the names before it
-MIXED = 0.05  # the same in a weak direction, where everything has a small share
-SETTLED = 3.0  # ratio of the weights of priors and observations above which the priors settle a weak direction
-INSIDE = 1e-6  # tolerance for a known direction to lie in the null space: rounding
 OBJECT_AXES = ("X", "Y", "Z", "X0", "Y0", "Z0")  # positions of points and stations
-NAMES_SHOWN = 3  # more names of one kind are collapsed to one with a star
-LOOSE = 0.05  # relative standard deviation of a principal distance above which a warning says so
-UNDETERMINED = 0.99  # ratio of posterior and prior standard deviation above which a quantity is undetermined
 
 
 def singular_directions(numbering: Numbering, state: State, factor: Factor) -> tuple[NullDirection, ...]:

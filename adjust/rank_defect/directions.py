@@ -21,6 +21,10 @@ FLAT = 0.01  # ratio of smallest and largest extent below which the field is fla
 PARALLEL_RAD = np.radians(1.0)  # largest angle between parallel axes
 FIELD = 4  # known points needed to determine more than the datum
 LEAST_BEND = 1e-6  # second-order part of a tilt, relative, below which it is an affinity (three marks)
+ALIKE_DEG = 20.0  # rotations that differ by less count as equal
+HARDLY = 20.0  # ratio of a term's standard deviation to that with all else known, above which it is weak
+IN_LINE = 1e-3  # width over length of collinear marks, and base over distance of coincident stations
+SHOWN = 3  # names listed one by one
 
 
 class Reason(NamedTuple):
@@ -240,9 +244,6 @@ def field_geometry(problem: Problem, state: State, camera: str) -> FieldGeometry
 
 Pose = tuple[int, bool]  # rotation of a frame in its scan, degrees, and whether it is mirrored
 
-ALIKE_DEG = 20.0  # rotations that differ by less count as equal
-HARDLY = 20.0  # ratio of a term's standard deviation to that with all else known, above which it is weak
-
 
 def _scanner_directions(problem: Problem, state: State, scanner: str) -> Iterator[NamedDirection]:
     """Directions named after the terms of a scanner's deformation."""
@@ -358,9 +359,6 @@ def scan_poses(problem: Problem, state: State, scanner: str) -> list[Pose]:
                 poses.append((turn, mirrored))
     return sorted(poses)
 
-
-IN_LINE = 1e-3  # width over length of collinear marks, and base over distance of coincident stations
-SHOWN = 3  # names listed one by one
 
 # Cause and remedy by the kind of the unknown that moves most.
 UNNAMED: Mapping[str, tuple[str, str]] = {

@@ -35,6 +35,9 @@ __all__ = ["Datum", "Method", "Options", "adjust"]
 
 GUESSED = 0.1  # relative standard deviation of a principal distance above which the value is a guess
 TRIAL_STEPS = 6  # iterations of a trial adjustment, enough to test v'Pv, which decreases with each
+MOST_FAR = 0.25  # fraction of the given points: if more are far off, the correct ones cannot be identified
+FEWEST_IMAGES = 2  # images needed for an intersection
+ENOUGH = 5  # points needed to identify a wrong one: the resection without it is still redundant
 
 
 def adjust(
@@ -296,11 +299,6 @@ class _Solver:
                 )
                 return replace(result, remarks=(warning, *result.remarks))
         return stopped
-
-
-MOST_FAR = 0.25  # fraction of the given points: if more are far off, the correct ones cannot be identified
-FEWEST_IMAGES = 2  # images needed for an intersection
-ENOUGH = 5  # points needed to identify a wrong one: the resection without it is still redundant
 
 
 class _FarPoint(NamedTuple):

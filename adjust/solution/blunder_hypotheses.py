@@ -38,6 +38,11 @@ AXES = {  # blunders that mirror the points, and the matrices that correct them
         for axes, order in (("X and Y", [1, 0, 2]), ("X and Z", [2, 1, 0]), ("Y and Z", [0, 2, 1]))
     },
 }
+CLEARLY = 3.0  # factor by which an explanation must reduce sigma0
+NEAR = 0.3  # fraction of its distance from the field's centre that a station may lie off its given place
+PITCHES = (10.0, 25.4, 100.0, 1000.0, 2.0)  # ratios of principal distances by another unit or pixel pitch
+ROUND = 0.05  # relative tolerance of these ratios
+FLAT = 1e-3  # relative thickness of a flat field, which is mirrored by mirroring the stations
 
 
 @dataclass(frozen=True)
@@ -253,11 +258,6 @@ def _exchanged_frames(network: Network, given: Adjustment | None) -> Iterator[Ne
         )
 
 
-CLEARLY = 3.0  # factor by which an explanation must reduce sigma0
-NEAR = 0.3  # fraction of its distance from the field's centre that a station may lie off its given place
-PITCHES = (10.0, 25.4, 100.0, 1000.0, 2.0)  # ratios of principal distances by another unit or pixel pitch
-ROUND = 0.05  # relative tolerance of these ratios
-FLAT = 1e-3  # relative thickness of a flat field, which is mirrored by mirroring the stations
 MIRRORED = "the points are mirrored: the sign of X, Y or Z of all of them is wrong, or two axes are exchanged"
 
 

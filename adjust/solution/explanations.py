@@ -51,6 +51,10 @@ WORTH = 0.3  # fraction of the largest first-order decrease above which a hypoth
 STEPS = 20
 GROUP_SHARE = 0.5  # of v'Pv; curled edges of real boards remove up to 0.3 as points beside a line
 LEAST_SHARE = 0.05  # of v'Pv; further lens terms remove up to 0.02 on real boards
+FEWEST = 30  # coordinates needed to test the distribution of residuals
+CHANCE = 0.001  # significance level of each test of the noise hypothesis
+NEIGHBOURS = 8  # nearest neighbours searched for one in the same, or in another, image
+UNCHECKED = 0.05  # redundancy number below which a residual is not tested
 
 
 @dataclass(frozen=True)
@@ -257,10 +261,6 @@ def _explanation(kind: str, words: tuple[str, str], p: float, without: _Model, l
     return Explanation(kind, f"{words[0]}; {figures}.", words[1], p, sigma0)
 
 
-FEWEST = 30  # coordinates needed to test the distribution of residuals
-CHANCE = 0.001  # significance level of each test of the noise hypothesis
-NEIGHBOURS = 8  # nearest neighbours searched for one in the same, or in another, image
-UNCHECKED = 0.05  # redundancy number below which a residual is not tested
 KINDS = (("marks", ("target", "tie", "fiducial")), ("targets", ("target", "tie")), ("fiducials", ("fiducial",)))
 
 

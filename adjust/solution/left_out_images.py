@@ -22,6 +22,14 @@ from adjust.solution.result import Adjustment
 FITTING = 3.0  # in sigma0 of the others: largest rms standardised residual of an image that agrees with them
 CONTRADICTING = 0.5  # share of v'Pv above which one image explains why the iteration does not converge
 FEWEST_RAYS = 2  # rays needed for a point without priors
+FEWEST = 8  # points of an image that tell by a linear transformation what is wrong with it
+FEWEST_IMAGES = 3  # images needed for a median misfit
+FLAT_FIELD = 0.05  # relative thickness of a field below which a linear transformation does not tell its depth
+WORSE, LARGE = 4.0, 0.01  # times the median misfit of the images, and misfit above which other numbers are tried
+BETTER, MUCH_BETTER = 3.0, 10.0  # ratio by which right numbers lower the misfit of an image worse than most, or alike
+NAMED = 5  # images named in a message
+MOST_OFF = 30  # largest shift of numbers tried
+LEAST_DEPTH = 1e-12  # of points in a field of size 1: nearer ones are imaged as far off as that
 
 
 def leave_out(network: Network, frames: Collection[str]) -> Network | None:
@@ -102,16 +110,6 @@ def _adopt_camera(camera: Camera, result: Adjustment) -> Camera:
         y0_mm=adopted("y0", camera.y0_mm),
         distortion=replace(of, parameters=parameters),
     )
-
-
-FEWEST = 8  # points of an image that tell by a linear transformation what is wrong with it
-FEWEST_IMAGES = 3
-FLAT_FIELD = 0.05  # relative thickness of a field below which a linear transformation does not tell its depth
-WORSE, LARGE = 4.0, 0.01  # times the median misfit of the images, and misfit above which other numbers are tried
-BETTER, MUCH_BETTER = 3.0, 10.0  # ratio by which right numbers lower the misfit of an image worse than most, or alike
-NAMED = 5  # images named in a message
-MOST_OFF = 30  # largest shift of numbers tried
-LEAST_DEPTH = 1e-12  # of points in a field of size 1: nearer ones are imaged as far off as that
 
 
 def misnumbered_images(network: Network) -> dict[str, str]:

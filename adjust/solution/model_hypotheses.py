@@ -27,6 +27,12 @@ from adjust.solution.partitions import Selection, two_groups
 
 FREE = Prior(0.0, np.inf)
 NONE = Selection()
+RADIAL_DEGREES = (3, 5, 7, 9, 11, 13)  # powers of the radius, as of k1 to k6
+TERMS_TOGETHER = 2  # radial terms tested jointly
+FEWEST_DRIFTING = 4  # images that tell a drift from their scatter
+LEAST_CHANGE = 0.05  # of the distance
+NAMED = 5  # images named in a message, and points with their errors
+ALIKE = 7.0  # difference of chi-square plus twice the unknowns below which two readings are not distinguished
 
 
 class Estimate(NamedTuple):
@@ -140,8 +146,6 @@ def camera_hypotheses(run: Run) -> Iterator[ModelHypothesis]:
     yield from chain(*of_cameras, _scanner_pixels(run))
 
 
-RADIAL_DEGREES = (3, 5, 7, 9, 11, 13)
-TERMS_TOGETHER = 2  # radial terms tested jointly
 # Of the six terms of degree 2 two are decentering, and the tilts of the images take two.
 BOW: tuple[Term, Term] = (({(0, 2): 1.0}, ZERO), (ZERO, {(2, 0): 1.0}))
 
@@ -226,10 +230,6 @@ def _pixel_words(camera: str, per_mm: float) -> Words:
     return words
 
 
-FEWEST_DRIFTING = 4  # images that tell a drift from their scatter
-LEAST_CHANGE = 0.05  # of the distance
-
-
 def _drift(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
     """A principal distance that changes with the number of the image, or with the distance of the object."""
     problem, state = run.problem, run.end.state
@@ -310,10 +310,6 @@ def _wrong_interior_orientation(run: Run, camera: Camera) -> Iterator[ModelHypot
 
     if len(added):
         yield ModelHypothesis("interior", words, continued_with(run, added), added)
-
-
-NAMED = 5  # images named in a message, and points with their errors
-ALIKE = 7.0  # difference of chi-square plus twice the unknowns below which two readings are not distinguished
 
 
 def _second_interior_orientation(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:

@@ -22,6 +22,8 @@ from adjust.solution.partitions import Selection, displaced_points
 CLEAR = 3.0  # standard deviations above which one of two changes of a board is told
 FEWEST_GIVEN, FEWEST_IMAGES = 5, 2  # given points, and images of one, that tell a wrong one
 NAMED = 5  # points named with their errors
+MISMEASURED = 0.1  # relative error of the given diameter of disks whose effect is reported
+MOST_NAMED = 10  # points named in a message
 
 
 def object_hypotheses(run: Run, most_points: int) -> Iterator[ModelHypothesis]:
@@ -86,13 +88,13 @@ def _strain_words(count: int, found: Estimate) -> tuple[str, str]:
     ]
     changes = [(float(row @ value), np.sqrt(row @ found.covariance @ row), unit, what) for row, unit, what in rows]
     significant = [each for each in changes if abs(each[0]) > CLEAR * each[1]] or changes
-    told = " and ".join(
+    figures = " and ".join(
         f"{abs(unit * v):.3g} ± {unit * s:.1g} {what.format('longer' if v > 0.0 else 'shorter')}"
         for v, s, unit, what in significant
     )
     what = "board" if count == 2 else "object"
     return (
-        f"The {what} of the given points has another shape than given: it is {told}",
+        f"The {what} of the given points has another shape than given: it is {figures}",
         f"Measure the {what} and give the coordinates that it has: printers stretch paper in one direction.",
     )
 
@@ -113,9 +115,6 @@ def _of_targets(run: Run, by_point: Mapping[str, Array]) -> Array:
     """(n, k, 3) displacements of the points of all targets, of those (k, 3) by name; 0 for others."""
     none = np.zeros_like(next(iter(by_point.values())))
     return np.array([by_point.get(name, none) for name in run.problem.network.observations.point])
-
-
-MISMEASURED = 0.1  # relative error of the given diameter of disks whose effect is reported
 
 
 def _possible_radius(run: Run) -> float:
@@ -147,16 +146,16 @@ def _disks(run: Run) -> Iterator[ModelHypothesis]:
 
     def words(found: Estimate) -> tuple[str, str]:
         sigma, diameter = found.sigma[0], 2.0 * np.sqrt(max((given or 0.0) ** 2 + found.value[0], 0.0))
-        told = f"{diameter:.3g} ± {2.0 * sigma / max(diameter, np.sqrt(sigma)):.1g} (points' unit)"
+        figures = f"{diameter:.3g} ± {2.0 * sigma / max(diameter, np.sqrt(sigma)):.1g} (points' unit)"
         if given is None:
             return (
                 "The points are centres of dots, whose perspective is not corrected: their diameter is found as "
-                f"{told}",
+                f"{figures}",
                 'Give their diameter_mm under [targets], kind = "disk".',
             )
         return (
             f"The disks do not have the diameter of {2.0 * given:.4g} that is given, or the points another spacing: by "
-            f"the coordinates it is found as {told}",
+            f"the coordinates it is found as {figures}",
             "Measure a disk, and from one to the next; correct diameter_mm or the coordinates and their unit.",
         )
 
@@ -192,9 +191,6 @@ def diameter_notes(run: Run) -> Iterator[str]:
                     f"of camera {camera} changes by {change:+.2g} mm. Give their diameter_mm under [targets], kind = "
                     '"disk".'
                 )
-
-
-MOST_NAMED = 10  # points named in a message
 
 
 def _wrong_points(run: Run, most: int) -> Iterator[ModelHypothesis]:

@@ -21,6 +21,13 @@ from adjust.quality.cofactor import image_equations
 from adjust.quality.run import Run, derivatives_by
 
 FLAT = 1e-9  # fraction of the largest eigenvalue below which a direction is undetermined
+MOST_TURNS = 20  # iterations of two-means
+DRAWS = 4000  # simulated sets of images
+FEWEST, MOST = 5, 400  # given points: so many tell a wrong one; N is dense
+MOST_WRONG = 1 / 3  # fraction of the points
+SAME_LINE = 1e-3  # fraction of the field's extent by which the points of a line lie off it
+REGULAR = 2.0  # points per line of a regular field, on average, at least
+LEVEL = 0.001  # probability of a point that is not wrong beside those that are
 
 
 @dataclass(frozen=True)
@@ -37,10 +44,6 @@ class Selection:
     choices: float = 0.0
     contrasts: int = 0
     p_scatter: Callable[[], float] = float
-
-
-MOST_TURNS = 20  # iterations of two-means
-DRAWS = 4000  # simulated sets of images
 
 
 def two_groups(run: Run, camera: str) -> Selection | None:
@@ -129,13 +132,6 @@ def _clearness(changes: Array, weight: Array) -> Array:
     below = np.cumsum(weights, axis=1)[:, :-1]
     between = np.cumsum(weights * centred, axis=1)[:, :-1] ** 2 * (1.0 / below + 1.0 / (total - below))
     return np.asarray(between.max(axis=1) / (weights * centred**2).sum(axis=1))
-
-
-FEWEST, MOST = 5, 400  # given points: so many tell a wrong one; N is dense
-MOST_WRONG = 1 / 3  # fraction of the points
-SAME_LINE = 1e-3  # fraction of the field's extent by which the points of a line lie off it
-REGULAR = 2.0  # points per line of a regular field, on average, at least
-LEVEL = 0.001  # probability of a point that is not wrong beside those that are
 
 
 def displaced_points(run: Run, axes: Array, problem: Problem, names: tuple[str, ...], most: int) -> Iterator[Selection]:

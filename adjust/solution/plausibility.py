@@ -40,7 +40,7 @@ def check_plausibility(result: Adjustment, trials: Trials) -> Adjustment:
 
 
 @dataclass(frozen=True)
-class _View:
+class _CameraMarks:
     """Object points in the images of one camera.
 
     rows: rows of the observations; xy_mm (n, 2): camera coordinates; digital: whether its images have no film
@@ -87,13 +87,13 @@ def _is_outside(picture: Array, xy_mm: Array) -> Mask:
     return np.asarray(((xy_mm < picture[0] - margin) | (xy_mm > picture[1] + margin)).any(axis=1))
 
 
-def _views(result: Adjustment) -> list[_View]:
+def _views(result: Adjustment) -> list[_CameraMarks]:
     """Views of the cameras whose images show object points."""
     xy_mm, images = observed_in_camera(result.run.problem, result.run.end.state), result.network.images
     films = {image.camera for image in images if image.transformation != "none"}
     of_camera = result.network.camera_by_name
     targets = result.run.problem.targets_by_camera.items()
-    return [_View(of_camera[name], name not in films, rows, xy_mm[rows]) for name, rows in targets if len(rows)]
+    return [_CameraMarks(of_camera[name], name not in films, rows, xy_mm[rows]) for name, rows in targets if len(rows)]
 
 
 def _marks_outside(result: Adjustment, rows: Sequence[int], trials: Trials) -> Iterator[str]:
@@ -165,7 +165,7 @@ def _sides(result: Adjustment) -> dict[str, float]:
     return {name: side for name, side in shown.items() if name not in network.objectless_images}
 
 
-def _principal_point(view: _View, result: Adjustment, family: float) -> Iterator[str]:
+def _principal_point(view: _CameraMarks, result: Adjustment, family: float) -> Iterator[str]:
     name, picture, kind = view.camera.name, view.picture, "outside the picture"
     parameters = [Parameter.interior(name, axis) for axis in ("x0", "y0")]
     found = result.values_of(parameters)

@@ -256,8 +256,8 @@ class Adjustment(Estimates, PlottedResult):
     @cached_property
     def notes(self) -> tuple[str, ...]:
         """Notes that need no action."""
-        is_told = any(each.kind == "disks" for each in self.explanations)
-        of_disks = () if is_told else diameter_notes(self.run)
+        is_explained = any(each.kind == "disks" for each in self.explanations)
+        of_disks = () if is_explained else diameter_notes(self.run)
         notes = (held_decentering_notes, film_scale_notes) if self.converged else ()
         of_interior = (note for each in notes for note in each(self.run, self.cofactor))
         return (*self.unused, *(sentence for _, sentence in self._inseparable.values()), *of_disks, *of_interior)

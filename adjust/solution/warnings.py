@@ -33,6 +33,13 @@ GROSS = 20.0  # in a-priori standard deviations: a larger residual may come from
 NEARER = 0.25  # fraction of the distance of two marks: largest offset of one from the other's expected place
 NAMED = 5  # images named in a warning
 UNCHECKED = 1e-6  # redundancy of all targets of an image below which its orientation is unchecked
+WORSE = 2.0  # ratio of standard deviations with decentering free and held at 0 above which it is told
+CORRELATED = 0.9  # correlation of a principal point with a distortion parameter above which its valley is followed
+FAR = 5.0  # standard deviations by which it is moved
+FILM_SCALE = 1.5e-3  # film keeps its size better than that, most scanners too
+CLAIMS = 5.0  # standard deviations of c by which another unit of the fiducials would move it
+CURVED = 0.5  # share of the rise of v'Pv that these promise below which they are too small
+STEPS = 60  # iterations along a curved valley, which converge slowly
 
 
 def run_warnings(run: Run, cofactor: Cofactor, residuals: Residuals) -> list[str]:
@@ -195,15 +202,6 @@ def _cross(observed_mm: Array, expected_mm: Array, i: int, j: int) -> bool:
     """Whether two marks each lie where the other is expected."""
     off = np.linalg.norm(expected_mm[[i, j]] - observed_mm[[j, i]], axis=1)
     return bool(off.max() < NEARER * np.linalg.norm(observed_mm[i] - observed_mm[j]))
-
-
-WORSE = 2.0  # ratio of standard deviations with decentering free and held at 0 above which it is told
-CORRELATED = 0.9  # correlation of a principal point with a distortion parameter above which its valley is followed
-FAR = 5.0  # standard deviations by which it is moved
-FILM_SCALE = 1.5e-3  # film keeps its size better than that, most scanners too
-CLAIMS = 5.0  # standard deviations of c by which another unit of the fiducials would move it
-CURVED = 0.5  # share of the rise of v'Pv that these promise below which they are too small
-STEPS = 60
 
 
 def held_decentering_notes(run: Run, cofactor: Cofactor) -> Iterator[str]:

@@ -36,6 +36,21 @@ KNOWN_SIGMA = 0.05  # relative standard deviation of a known principal distance
 # Unknown principal distance, in diagonals of the frame, usual ones first; the largest error is a factor of 1.41:
 UNKNOWN, UNKNOWN_SIGMA = (1.2, 0.6, 2.4, 0.3, 4.8), 0.3
 OTHER_CLUSTERS = 8  # clusters tried as other points; if each is found with p = 0.5, one case in 256 is missed
+_NEARBY = 6  # nearest points in space, two of which form a cluster with a point
+_RANK_SHARE = 0.8  # quantile of the ranks over the directions
+_SLENDER = 0.25  # width over length of a triangle below which its pose is poor
+_ABOUT = 16  # points around a cluster that test it ...
+_FARTHER = 40  # ... and that test it again after a fit to them
+_DETECTED = 0.75  # assumed detection rate of points in the frame
+_REACH, _LATER_REACH = 0.07, 0.02  # gate over the distance from the cluster, for a pose of three marks and a fitted one
+_NOISE = 3.0  # gate in standard deviations of a mark
+_SELF_REACH = 1.3  # factor on the distances in a cluster for points confused with it
+_KEPT, _RETURNED = 96, 6  # best namings that are extended, and that are returned
+_CHUNK = 20_000  # hypotheses tested at a time, to limit memory
+# Viewing directions for the ranks of neighbours in the image: unit vectors distributed over the sphere (Fibonacci)
+_HEIGHTS, _AZIMUTHS = 1.0 - (np.arange(24) + 0.5) / 12.0, np.pi * (1.0 + np.sqrt(5.0)) * (np.arange(24) + 0.5)
+_WIDTHS = np.sqrt(1.0 - _HEIGHTS**2)
+_DIRECTIONS = np.column_stack([_WIDTHS * np.cos(_AZIMUTHS), _WIDTHS * np.sin(_AZIMUTHS), _HEIGHTS])
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,23 +260,6 @@ def _is_alike(other: Grown, best: Grown) -> bool:
     # many as those missed by chance.
     closer = 2 * len(other.mark) * np.log10(other.gate / best.gate)  # likelihood of two coordinates each
     return len(other.mark) >= ALIKE_SHARE * len(best.mark) and bool(closer < TOLD_LOG10)
-
-
-_NEARBY = 6  # nearest points in space, two of which form a cluster with a point
-_RANK_SHARE = 0.8  # quantile of the ranks over the directions
-_SLENDER = 0.25  # width over length of a triangle below which its pose is poor
-_ABOUT = 16  # points around a cluster that test it ...
-_FARTHER = 40  # ... and that test it again after a fit to them
-_DETECTED = 0.75  # assumed detection rate of points in the frame
-_REACH, _LATER_REACH = 0.07, 0.02  # gate over the distance from the cluster, for a pose of three marks and a fitted one
-_NOISE = 3.0  # gate in standard deviations of a mark
-_SELF_REACH = 1.3  # factor on the distances in a cluster for points confused with it
-_KEPT, _RETURNED = 96, 6
-_CHUNK = 20_000  # hypotheses tested at a time, to limit memory
-# Viewing directions for the ranks of neighbours in the image: unit vectors distributed over the sphere (Fibonacci)
-_HEIGHTS, _AZIMUTHS = 1.0 - (np.arange(24) + 0.5) / 12.0, np.pi * (1.0 + np.sqrt(5.0)) * (np.arange(24) + 0.5)
-_WIDTHS = np.sqrt(1.0 - _HEIGHTS**2)
-_DIRECTIONS = np.column_stack([_WIDTHS * np.cos(_AZIMUTHS), _WIDTHS * np.sin(_AZIMUTHS), _HEIGHTS])
 
 
 def clusters(xyz: Array, normals: Array, marks_per_point: float) -> list[Cluster]:

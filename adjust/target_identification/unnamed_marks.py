@@ -14,6 +14,13 @@ from adjust.functional_model.rotation import rotation_from_vector
 _CELLS = 600  # cells of the look-up table along each side of the frame
 _COARSE_CELLS = 60  # cells of the density table along each side
 _CROWD = 6  # nearest marks from which the local density is estimated
+_ROUNDS = 25  # of assignment and adjustment in turns
+_GATE_SIGMAS = 3.5  # distance of a mark from a prediction, above which it is another's
+_MOST_CHANCE = 0.1  # largest probability of a random mark in a point's gate; otherwise not identified yet
+_PRIOR_RADIAL = 0.1  # standard deviation of k1: 10 % of the radius for rays at 45 degrees
+_ROBUST = 2.0  # in standard deviations, limit of Huber's weight function
+_BEFORE = -1e-6  # z of a point before the camera, in units of its distance
+OF_POSE = 3  # points that agree with some pose whatever they are
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,15 +91,6 @@ def log10_of_agreement(agreeing: int, of: int, chance: float) -> float:
     """log10 of the binomial probability that at least `agreeing` of `of` points agree by chance."""
     with np.errstate(divide="ignore"):  # underflow gives -inf
         return float(np.log10(bdtrc(agreeing - 1, of, chance)))
-
-
-_ROUNDS = 25
-_GATE_SIGMAS = 3.5
-_MOST_CHANCE = 0.1  # largest probability of a random mark in a point's gate; otherwise not identified yet
-_PRIOR_RADIAL = 0.1  # standard deviation of k1: 10 % of the radius for rays at 45 degrees
-_ROBUST = 2.0  # in standard deviations, limit of Huber's weight function
-_BEFORE = -1e-6
-OF_POSE = 3  # points that agree with some pose whatever they are
 
 
 @dataclass(frozen=True, eq=False)

@@ -60,7 +60,7 @@ class NewProject:
         return [group for group in self.found.groups if group.camera]
 
     @property
-    def needs_look(self) -> bool:
+    def needs_review(self) -> bool:
         """Whether anything is left to decide."""
         return any(cases for _, cases in self.remarks())
 

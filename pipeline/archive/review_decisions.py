@@ -121,7 +121,7 @@ def after_checks(scan: MeasuredScan, counting: Mapping[About, Decision]) -> Meas
     marks = {(scan.frame.image, mark.point, mark.kind) for mark in scan.frame.marks}
     applied = [one for about, one in counting.items() if not about[1] or about in marks]
     people = Counter(one.who or "somebody" for one in applied)
-    return replace(_changed(scan, counting), decided_by=dict(sorted(people.items())))
+    return replace(_changed(scan, counting), reviewers=dict(sorted(people.items())))
 
 
 def _apply_to_task(task: ScanTask, decisions: Iterable[Decision]) -> ScanTask:

@@ -67,7 +67,7 @@ class ArchiveStatus:
 
     @property
     def all_good(self) -> bool:
-        return not self.idle_decisions and not any(scan.verdict.needs_look for scan in self.scans)
+        return not self.idle_decisions and not any(scan.verdict.needs_review for scan in self.scans)
 
     def select(self, verdict: Verdict | None) -> "ArchiveStatus":
         """Status of the scans of one verdict; None: all."""
@@ -138,7 +138,7 @@ def status_json(status: ArchiveStatus) -> dict[str, object]:
             scan.image: {name: getattr(scan, name) for name in ("verdict", "why", "scan", "camera")}
             | {"failure": scan.failure or None}
             for scan in status.scans
-            if scan.verdict.needs_look
+            if scan.verdict.needs_review
         },
         "decisions_that_do_not_apply": list(status.idle_decisions),
     }

@@ -10,6 +10,8 @@ from pipeline.text.wording import count_sentence
 if TYPE_CHECKING:
     from pipeline.results.measured_record import MeasuredScan  # with numpy, for which `reseau --help` would wait
 
+_LEAST_FIDUCIALS = 3  # two determine an interior orientation without any check
+
 
 class Verdict(MeaningfulWord):
     """Verdict on a scan: the worst of its marks and problems, ordered from the best to not yet known."""
@@ -27,7 +29,7 @@ class Verdict(MeaningfulWord):
     OLD = "old", "Stale: the file, the options or the review decisions have changed since it was measured."
 
     @property
-    def needs_look(self) -> bool:
+    def needs_review(self) -> bool:
         return self not in (Verdict.GOOD, Verdict.DECIDED)
 
 
@@ -45,7 +47,6 @@ _COUNTED = {each: str(each) for each in Verdict} | {Verdict.LOOK: "to look at", 
 _MARK_VERDICTS = {status: Verdict.GOOD if status is Status.MEASURED else Verdict.LOOK for status in Status}
 _MEASURED = (Verdict.GOOD, Verdict.DECIDED, Verdict.LOOK, Verdict.POOR)
 _ANSWERED = frozenset((Code.DECIDED, Code.CLICKED))
-_LEAST_FIDUCIALS = 3  # two determine an interior orientation without any check
 MarkState = tuple[str, Status, Collection[str]]  # kind, status, codes of the reason
 
 
@@ -64,13 +65,13 @@ def scan_verdict(scan: "MeasuredScan", marks: Sequence[MarkState] | None = None)
     if marks is None:
         marks = [(mark.kind, mark.status, mark.reason.codes) for mark in scan.frame.marks]
     has_frame = scan.frame.pixel_from_camera is not None
-    return frame_verdict(marks, has_frame, has_problem(scan), bool(scan.decided_by))
+    return frame_verdict(marks, has_frame, has_problem(scan), bool(scan.reviewers))
 
 
 def scan_doubt(scan: "MeasuredScan") -> str:
     """First reason why a scan needs a look; "" if it needs none."""
     frame = scan.frame
-    if not scan_verdict(scan).needs_look:
+    if not scan_verdict(scan).needs_review:
         return ""
     of_pose = [f"pose {frame.pose.name} is assumed"] if frame.pose is not None and not frame.pose.decided else []
     marks = (mark for mark in frame.marks if mark.reason and not is_answered(mark.reason.codes))

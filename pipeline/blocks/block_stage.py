@@ -53,6 +53,7 @@ FEWEST_CONTROL = 3
 _CONSISTENT = 3.0  # largest rms reprojection error of a track, in standard deviations
 _FEWEST_SIGHTS = 3
 _ROUNDS = 5
+MOST_PX = 3000  # pixels along the longer side of a frame, unless the user gives a pitch
 
 
 @dataclass(frozen=True)
@@ -211,9 +212,6 @@ def oriented_by_control(
         image: (np.asarray(Y_DOWN_Z_FORWARD @ rotation @ block.rotation.T), block.apply(stations[image]))
         for image, (rotation, _) in mapped.poses.items()
     }
-
-
-MOST_PX = 3000  # pixels along the longer side of a frame, unless the user gives a pitch
 
 
 def run_block(

@@ -26,6 +26,10 @@ Picture = NDArray[np.uint8]
 _BORDER = 0.02  # fraction of the frame's side: vignetting, edge of the frame
 _MARK = 0.03  # masked around fiducials, which would match themselves in every frame; fraction of the frame's side
 _DARKEST, _LIGHTEST = 0.5, 99.5  # percentiles that are mapped to black and white
+FEATURES = 2000  # per image; a block needs hundreds of them in common
+SEED = 0  # of the mapper's random choices, so that a block is the same in every run
+_EXHAUSTIVE = 60  # images up to which every pair is matched
+_NEIGHBOURS = 12  # neighbours in the sequence with which an image is matched in larger blocks
 
 
 @dataclass(frozen=True)
@@ -145,12 +149,6 @@ def _eight_bits(picture: Array, mask: Mask) -> Picture:
     dark, light = np.percentile(picture[mask], (_DARKEST, _LIGHTEST))
     scaled = (picture - dark) * (255.0 / max(light - dark, 1e-9))
     return np.asarray(np.clip(np.rint(scaled), 0, 255).astype(np.uint8))
-
-
-FEATURES = 2000  # per image; a block needs hundreds of them in common
-SEED = 0
-_EXHAUSTIVE = 60  # images up to which every pair is matched
-_NEIGHBOURS = 12  # neighbours in the sequence with which an image is matched in larger blocks
 
 
 @dataclass(frozen=True)

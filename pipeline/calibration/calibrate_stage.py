@@ -99,7 +99,7 @@ class Calibration(PlottedResult):
         return f"<p>{escape(repr(self))}</p><table><tr>{head}</tr>{rows}</table>"
 
     @property
-    def needs_look(self) -> bool:
+    def needs_review(self) -> bool:
         """Whether images were left out, or the adjustment or its check has a problem."""
         left_out = self.unreadable or self.not_calibrated or any(camera.left_out for camera in self.cameras)
         return bool(left_out) or self.summary.verdict.exit_code != 0
@@ -125,7 +125,7 @@ class Calibration(PlottedResult):
         """Print the cameras, then the problems, then the files except the report."""
         for camera in self.cameras:
             camera.print(console)
-        console.print("Needs a look." if self.needs_look else "Good: every test was passed.", highlight=False)
+        console.print("Needs a look." if self.needs_review else "Good: every test was passed.", highlight=False)
         for line in self._lines():
             console.print(line, markup=False, highlight=False, soft_wrap=True)
 

@@ -33,6 +33,9 @@ PARAMETERS: dict[LensModel, tuple[str, ...]] = {
 FOLDS = 5
 FEWEST_PICTURES = 6  # images needed for the cross-validation
 WIDE = 1.0  # half the image's diagonal over the principal distance, above which a fisheye is tried: 45 degrees
+HIGHLY_CORRELATED = 0.9  # from which a correlation is listed
+ONE_UNKNOWN = 1.0 - 1e-9  # correlation of fx and fy of square pixels
+_WORST = 3  # images named
 
 
 @dataclass(frozen=True)
@@ -105,9 +108,6 @@ def _is_better(squares: Array | None, than: Array | None) -> bool:
     return bool(gain.mean() > gain.std(ddof=1) / np.sqrt(len(gain)))
 
 
-HIGHLY_CORRELATED = 0.9
-ONE_UNKNOWN = 1.0 - 1e-9  # correlation of fx and fy of square pixels
-_WORST = 3  # images named
 _FIGURES = ("rms_px", "sigma0", "corner_sigma_px", "unmodelled_sigma_px", "known_share")
 
 

@@ -32,6 +32,8 @@ from pipeline.text.files import SCAN_ENDINGS, names_below
 _Kind = tuple[int, int, float | None]  # width, height, focal length
 QUARTERS_DEG = (90, 270)
 TURNS_BY_TAG = {6: 90, 8: 270}  # Exif's Orientation of images that viewers turn back
+PLAIN = 20.0  # twice the log-likelihood ratio; odds of e to the 10
+FEWEST_PICTURES = 3  # images with known turns needed to determine the lens
 
 
 @dataclass(frozen=True)
@@ -138,10 +140,6 @@ def _names(cameras: Sequence[_Kind]) -> list[str]:
         parts += ["no-focal-length" if focal is None else f"{focal:g}mm"] if len(focals) > 1 else []
         names.append("camera-" + "-".join(parts))
     return names
-
-
-PLAIN = 20.0  # twice the log-likelihood ratio; odds of e to the 10
-FEWEST_PICTURES = 3  # images with known turns needed to determine the lens
 
 
 def find_turns(project: Project, marks: Sequence[ComparatorPoint], camera: CameraPictures) -> CameraPictures:

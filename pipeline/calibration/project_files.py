@@ -22,6 +22,7 @@ BoardKind = Literal["chessboard", "charuco", "aprilgrid", "aruco", "circle-grid"
 MOST = 500  # largest number of columns or rows in `[targets]`
 KALIBR_SPACING = 0.3  # default gap between the tags of an AprilGrid, in sides of a tag
 MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
+OPENCV_COUNTS = (4, 5, 8, 12, 14)  # numbers of coefficients that OpenCV accepts
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,6 @@ def _length_mm(option: str, text: str) -> float:
 
 OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 FISHEYE_ORDER = ("k1", "k2", "k3", "k4")
-OPENCV_COUNTS = (4, 5, 8, 12, 14)  # numbers of coefficients that OpenCV accepts
 
 
 @dataclass(frozen=True)

@@ -187,7 +187,7 @@ def calibrate(
     )
     show(as_json, found.as_json, found.print)
     print_next(as_json, *_steps(found))
-    return LOOK if found.needs_look else DONE
+    return LOOK if found.needs_review else DONE
 
 
 def _steps(found: "Calibration") -> Iterator[str]:

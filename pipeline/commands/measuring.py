@@ -78,7 +78,7 @@ def init(
     show(as_json, new.as_json, lambda console: print_new_project(new, console))
     run_step = [command_step("run", new.folder / PROJECT)] if new.named else []
     print_next(as_json, *init_steps(new), *run_step)
-    return LOOK if new.needs_look else DONE
+    return LOOK if new.needs_review else DONE
 
 
 Shard = Annotated[
@@ -146,7 +146,7 @@ def run(
     record = summary.as_json if new is None else lambda: {**summary.as_json(), "init": new.as_json()}
     show(as_json, record, lambda console: print_summary(summary, console))
     print_next(as_json, *(init_steps(new) if new else ()), *summary_steps(file, summary))
-    return max(summary.verdict.exit_code, LOOK) if new and new.needs_look else summary.verdict.exit_code
+    return max(summary.verdict.exit_code, LOOK) if new and new.needs_review else summary.verdict.exit_code
 
 
 def measure(

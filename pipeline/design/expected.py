@@ -31,6 +31,8 @@ QUARTERS = 4
 ROUNDING_UM = 1e-9
 INTERIOR = ("c", "x0", "y0")
 ROUNDING = 1e-9  # relative cut-off of singular values of the null directions
+QUARTER = math.pi / 2  # rad
+FOUND = 100.0  # percent: gain where only the changed plan determines a quantity
 
 
 @dataclass(frozen=True)
@@ -251,10 +253,6 @@ def _freed_camera(camera: Camera) -> Camera:
 
 def _freed(prior: Prior) -> Prior:
     return prior if prior.sigma == 0.0 else Prior(prior.value, np.inf)
-
-
-QUARTER = math.pi / 2
-FOUND = 100.0  # percent: gain where only the changed plan determines a quantity
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,7 @@ class GivenFiducial:
     xy_mm, sigma_mm : given coordinates and their standard deviations, mm.
     mark : drawing; None if the fiducial can be adjusted but not measured.
     passed_over : whether it is not to be measured.
-    seen_mm : origin of a learned mark's template in the scan from which it was first cut, mm.
+    template_origin_mm : origin of a learned mark's template in the scan from which it was first cut, mm.
     """
 
     id: str
@@ -92,7 +92,7 @@ class GivenFiducial:
     sigma_mm: shapes.Point
     mark: shapes.Mark | shapes.LearnedMark | None
     passed_over: bool = False
-    seen_mm: shapes.Point | None = None
+    template_origin_mm: shapes.Point | None = None
 
     @property
     def prior_sigma_mm(self) -> tuple[float, float]:
@@ -159,7 +159,7 @@ class CameraFile:
     def layout_marks(self) -> tuple[shapes.LayoutMark, ...]:
         """Fiducials that can be found in a scan."""
         return tuple(
-            shapes.LayoutMark(one.id, one.seen_mm or one.xy_mm, one.sigma_mm, one.mark)
+            shapes.LayoutMark(one.id, one.template_origin_mm or one.xy_mm, one.sigma_mm, one.mark)
             for one in self.fiducials
             if isinstance(one.mark, shapes.Mark)
         )
@@ -271,7 +271,7 @@ def _fiducials(
         drawing = drawings.get(one.mark or "")
         drawn = None if drawing is None else _placed(*drawing, one.xy_mm)
         fiducials[one.id] = GivenFiducial(
-            one.id, one.xy_mm, one.sigma_mm, drawn, one.mark == NO_MARK and drawn is None, one.seen_mm
+            one.id, one.xy_mm, one.sigma_mm, drawn, one.mark == NO_MARK and drawn is None, one.template_origin_mm
         )
     return tuple(fiducials.values())
 
@@ -388,7 +388,7 @@ def camera_text(camera: CameraFile, save: SavePicture) -> str:
                 "id": one.id,
                 "xy_mm": one.xy_mm,
                 "sigma_mm": one.sigma_mm,
-                "seen_mm": one.seen_mm,
+                "seen_mm": one.template_origin_mm,
                 "mark": names[one.mark] if one.mark is not None else NO_MARK if one.passed_over else None,
             }
             for one in camera.fiducials

@@ -144,7 +144,9 @@ class FiducialTable:
     xy_mm: Annotated[shapes.Point, "Given coordinates."]
     sigma_mm: Annotated[SigmaPair, "Of the given coordinates."] = (DEFAULT_SIGMA_MM, DEFAULT_SIGMA_MM)
     mark: Annotated[str | None, 'Name of a table [mark.NAME], or "none" to pass it over.'] = None
-    seen_mm: Annotated[shapes.Point | None, "Of a learned mark: where its template has its origin."] = None
+    template_origin_mm: Annotated[
+        shapes.Point | None, Field(alias="seen_mm"), "Of a learned mark: where its template has its origin."
+    ] = None
 
 
 @table_model

@@ -23,6 +23,10 @@ PREFIX = "library:"
 FOLDER = Path(__file__).parents[1] / "cameras"
 
 Json = dict[str, Any]
+FORMATS_MM = (56.0, 60.0, 70.0, 100.0, 130.0, 180.0, 228.0, 232.0, 240.0, 300.0)  # usual sides of frames
+_AERIAL_MM = 220.0  # approximate distance of marks of aerial cameras, to which the sizes below apply
+_LEAST_SCALE = 0.5  # smallest factor of these sizes for small cameras
+_RIM_MM = 1.0  # margin of the frame beyond its outermost mark
 
 
 def camera_path(text: str, folder: Path) -> Path:
@@ -116,10 +120,6 @@ def _entry(name: str, camera: CameraFile) -> Json:
     }
 
 
-FORMATS_MM = (56.0, 60.0, 70.0, 100.0, 130.0, 180.0, 228.0, 232.0, 240.0, 300.0)  # usual sides of frames
-_AERIAL_MM = 220.0  # approximate distance of marks of aerial cameras, to which the sizes below apply
-_LEAST_SCALE = 0.5  # smallest factor of these sizes for small cameras
-_RIM_MM = 1.0  # margin of the frame beyond its outermost mark
 _PLACES: Mapping[str, Mapping[str, Point]] = {  # in units of the distances, numbered as in calibration reports
     "square": {"1": (-0.5, -0.5), "2": (0.5, 0.5), "3": (-0.5, 0.5), "4": (0.5, -0.5)},
     "side": {"5": (-0.5, 0.0), "6": (0.5, 0.0), "7": (0.0, 0.5), "8": (0.0, -0.5)},

@@ -76,7 +76,7 @@ class DiskTable(SingleTargetTable):
 
 
 @table_model
-class CrossTable(SingleTargetTable):
+class CrossTargetTable(SingleTargetTable):
     """[targets] of crosses."""
 
     arm_mm: Annotated[Positive, "Half the length of a bar in object space."]
@@ -203,7 +203,7 @@ class AprilGridTable(BoardTable):
 
 TARGET_TABLES: Mapping[str, type[TargetTable]] = {
     "disk": DiskTable,
-    "cross": CrossTable,
+    "cross": CrossTargetTable,
     "coded-ring": CodedRingTable,
     "chessboard": ChessboardTable,
     "circle-grid": CircleGridTable,

@@ -206,7 +206,7 @@ def _start(
         if isinstance(one.mark, shapes.LearnedMark):
             chip = cut(scan, np.column_stack([placement[:, :2], px[one.id]]), one.mark.size_mm)
             x, y = Affine(placement).inverse.apply(px[one.id]).tolist()
-            one = replace(one, seen_mm=(x, y), mark=learn_template([chip], one.mark.size_mm))
+            one = replace(one, template_origin_mm=(x, y), mark=learn_template([chip], one.mark.size_mm))
         fiducials.append(one)
     is_clicked = camera.clicks is not None
     sha256, pose = content_hash(scan.path), _pose(placement)

@@ -203,11 +203,11 @@ def _average_origins(camera: CameraFile, poses: Collection[str]) -> CameraFile:
     learned = [one for one in camera.fiducials if isinstance(one.mark, MarkTemplate) and one.mark.learned_mm]
     if not learned:
         return camera
-    places = np.array([one.seen_mm or one.xy_mm for one in learned])
+    places = np.array([one.template_origin_mm or one.xy_mm for one in learned])
     marks = [one.mark for one in learned if isinstance(one.mark, MarkTemplate)]
     templates, moves = share_origins(marks, places, poses)
     moved = {
-        one.id: replace(one, mark=template, seen_mm=(float(x), float(y)))
+        one.id: replace(one, mark=template, template_origin_mm=(float(x), float(y)))
         for one, template, (x, y) in zip(learned, templates, places + moves, strict=True)
     }
     return replace(camera, fiducials=tuple(moved.get(one.id, one) for one in camera.fiducials))

@@ -138,7 +138,7 @@ def _measure(task: ScanTask, scan: Scan, options: ScanOptions) -> MeasuredScan:
     """Measure a scan, whole or cropped to a window."""
     # Fiducials are measured in grey values corrected by the tone curve. Targets have edges on all sides and are
     # measured in the grey values as they are.
-    tone = prior_tone(options.tone, scan.path).include_information(options.said)
+    tone = prior_tone(options.tone, scan.path).include_information(options.tone_information)
     frame = replace(_fiducials(options, scan.replace_tone(tone)), image=task.name)
     pitch, problems, notes = _pitch(options, scan, frame)
     of_file = (Reason(f"{capitalised(problem)}.", Code.SECOND_PICTURE) for problem in scan.problems)

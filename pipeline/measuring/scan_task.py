@@ -46,7 +46,7 @@ class ScanOptions:
     pitch_um : as given in the project; None: from the file or the marks.
     fiducials : scan orientation, film and reading of text.
     known_pose : scan orientation of a scan from which marks were learned.
-    said : information on the curve from other scans of the scanner.
+    tone_information : information on the curve from other scans of the scanner.
     exterior : approximate exterior orientation for the identification of targets.
     """
 
@@ -55,7 +55,7 @@ class ScanOptions:
     fiducials: FiducialOptions
     known_pose: Pose | None = None
     tone: float | str = "auto"
-    said: tuple[ToneInformation, ...] = ()
+    tone_information: tuple[ToneInformation, ...] = ()
     targets: "SoughtTargets | None" = None
     exterior: Exterior | None = None
 
@@ -105,21 +105,21 @@ class ScanTask:
     def fiducials_alone(self, tone: float | str) -> "ScanTask":
         """Copy that measures only the fiducials, with the given tone curve."""
         task = self.changed(writing="none", known_lines=())
-        return replace(task, options=replace(task.options, tone=tone, said=(), targets=None, exterior=None))
+        return replace(task, options=replace(task.options, tone=tone, tone_information=(), targets=None, exterior=None))
 
 
 Measure = Callable[[Iterable[ScanTask]], Iterator[MeasuredScan]]  # runs tasks, or reads their results from a store
 
 
 def scan_tasks(
-    project: Project, names: Sequence[str], said: Mapping[str, tuple[ToneInformation, ...]] | None = None
+    project: Project, names: Sequence[str], tone_information: Mapping[str, tuple[ToneInformation, ...]] | None = None
 ) -> tuple[ScanTask, ...]:
     """Tasks of these images, in their order; scans with the same options share one object.
 
-    said: by image, information on the scanner's tone curve from other scans. Raises InputError where some marks cannot
-    be searched for.
+    tone_information: by image, information on the scanner's tone curve from other scans. Raises InputError where some
+    marks cannot be searched for.
     """
-    options = image_options(project, said or {})
+    options = image_options(project, tone_information or {})
     scans = {name: project.scans.get(name) for name in names}
     return tuple(
         ScanTask(name, "" if scan is None else fetch_location(scan), options(name), project.max_pixels)
@@ -127,7 +127,9 @@ def scan_tasks(
     )
 
 
-def image_options(project: Project, said: Mapping[str, tuple[ToneInformation, ...]]) -> Callable[[str], ScanOptions]:
+def image_options(
+    project: Project, tone_information: Mapping[str, tuple[ToneInformation, ...]]
+) -> Callable[[str], ScanOptions]:
     """Function that returns the options of an image by its name; see `scan_tasks`."""
     cameras = {name: _sought(project, camera) for name, camera in project.cameras.items()}
     key_of = {id(camera): name for name, camera in project.cameras.items()}
@@ -137,7 +139,7 @@ def image_options(project: Project, said: Mapping[str, tuple[ToneInformation, ..
     def options_for(name: str) -> ScanOptions:
         given = project.image_camera(name)
         pose, known = _pose(project, given, name)
-        by_others = said.get(name, ())
+        by_others = tone_information.get(name, ())
         exterior = project.given_images.exterior.get(name) if project.given_images and targets else None
         part = bool(project.scanned_frame(name))
         key = (key_of[id(given)], pose, known is None, part, *map(id, by_others), id(exterior))

@@ -49,7 +49,15 @@ from pipeline.opencv_check.opencv_calibration import (
     model_names,
 )
 from pipeline.results.comparator_file import comparator_from_pixel
-from pipeline.results.stage_files import CameraCheck, Check, CornersCheck, Estimate, PixelCalibration, Row, Verdict
+from pipeline.results.stage_files import (
+    CameraCheck,
+    Check,
+    ComparedParameter,
+    CornersCheck,
+    Estimate,
+    PixelCalibration,
+    Verdict,
+)
 from pipeline.types import Array
 
 Bytes = NDArray[np.uint8]
@@ -60,6 +68,18 @@ CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.0001)  # of t
 FLAGS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_FAST_CHECK | cv2.CALIB_CB_NORMALIZE_IMAGE  # of the same sample
 NEAREST = 0.4  # of the distance to the next point: largest distance between corresponding points
 FEWEST_PICTURES = 3
+LARGEST_DIFFERENCE = 1.0  # sigmas; about 0.1 is usual, since the two models differ slightly
+LARGEST_SIGMA_RATIO = 1.2  # ratio of standard deviations; 1.006 to 1.03 is usual
+SAME_MODEL_DIFFERENCE = 0.1  # sigmas, where both programs use the identical model
+SAME_MODEL_SIGMA_RATIO = 1.02  # the same of standard deviations
+LARGEST_DEPARTURE = 3.0  # sigmas, largest accepted change of a parameter by priors, weights etc.
+NOTABLE_DEPARTURE = 0.1  # standard deviations from which a departure is told
+LARGEST_REFIT = 0.5  # fraction of an image coordinate's sigma: above it, OpenCV's model does not fit the lens
+UNDETERMINED = 0.05  # relative sigma of the principal distance above which no comparison is possible
+WORSE_RMS = 1.02  # ratio of OpenCV's rms to the adjustment's that shows that its iteration stopped early
+ROUNDINGS = 20.0  # rms, in units of OpenCV's rounding of one coordinate, below which rounding dominates the residuals
+NOTABLE_SPREAD = 1.5  # ratio of the largest to the smallest sigma of marks, from which it is told
+NOTABLE_ROUNDING = 0.01  # fraction of the standard deviation of an image coordinate
 
 
 @dataclass(frozen=True)
@@ -170,20 +190,6 @@ def _paired(image: ImagePoints, pictures: BoardPictures) -> tuple[ImagePoints, I
 def _pixel_calibration(calibration: OpenCvCalibration, pitch_mm: Array) -> PixelCalibration:
     fx, fy, cx, cy = (calibration.parameters[:4] / np.tile(pitch_mm, 2) * (1.0, 1.0, 1.0, -1.0)).tolist()
     return PixelCalibration(fx, fy, cx, cy, calibration.rms_um / 1000.0 / float(np.sqrt(pitch_mm.prod())))
-
-
-LARGEST_DIFFERENCE = 1.0  # sigmas; about 0.1 is usual, since the two models differ slightly
-LARGEST_SIGMA_RATIO = 1.2  # ratio of standard deviations; 1.006 to 1.03 is usual
-SAME_MODEL_DIFFERENCE = 0.1  # sigmas, where both programs use the identical model
-SAME_MODEL_SIGMA_RATIO = 1.02
-LARGEST_DEPARTURE = 3.0  # sigmas, largest accepted change of a parameter by priors, weights etc.
-NOTABLE_DEPARTURE = 0.1
-LARGEST_REFIT = 0.5  # fraction of an image coordinate's sigma: above it, OpenCV's model does not fit the lens
-UNDETERMINED = 0.05  # relative sigma of the principal distance above which no comparison is possible
-WORSE_RMS = 1.02
-ROUNDINGS = 20.0  # rms, in units of OpenCV's rounding of one coordinate, below which rounding dominates the residuals
-NOTABLE_SPREAD = 1.5
-NOTABLE_ROUNDING = 0.01  # fraction of the standard deviation of an image coordinate
 
 
 def check_against_opencv(adjustment: Adjustment, pictures: BoardPictures | None = None) -> Check:
@@ -340,9 +346,9 @@ def _rms_um(solved: Adjustment) -> float:
 
 def _rows(
     names: Sequence[str], freedom: Freedom, conversion: Converted, sigma0: float, opencv: OpenCvCalibration
-) -> tuple[Row, ...]:
+) -> tuple[ComparedParameter, ...]:
     return tuple(
-        Row.from_numbers(
+        ComparedParameter.from_numbers(
             name,
             "mm" if name in INTERIOR else "rad" if name in ("tau_x", "tau_y") else "1",
             Estimate(float(conversion.parameters[k]), float(sigma0 * conversion.sigmas[k])),
@@ -353,7 +359,7 @@ def _rows(
     )
 
 
-def _agreement(rows: Sequence[Row], sigmas_tell: bool) -> tuple[Verdict, str]:
+def _agreement(rows: Sequence[ComparedParameter], sigmas_tell: bool) -> tuple[Verdict, str]:
     """Verdict from the parameters. sigmas_tell: whether the residuals are larger than OpenCV's rounding."""
     worst = max(rows, key=lambda row: row.difference_sigmas)
     loosest = max(rows, key=_sigma_ratio)
@@ -366,7 +372,7 @@ def _agreement(rows: Sequence[Row], sigmas_tell: bool) -> tuple[Verdict, str]:
     return "agrees", f"All {len(rows)} parameters agree: {found}."
 
 
-def _sigma_ratio(row: Row) -> float:
+def _sigma_ratio(row: ComparedParameter) -> float:
     smaller, larger = sorted((row.reseau.sigma, row.opencv.sigma))
     return larger / smaller if smaller > 0 else np.inf
 

@@ -167,9 +167,9 @@ class Mark:
         return self.reason.codes
 
     @property
-    def needs_look(self) -> bool:
+    def needs_review(self) -> bool:
         """Whether it is a reason to look at its frame, as in `reseau status`."""
-        return mark_verdict(self.kind, self.status, self.codes).needs_look
+        return mark_verdict(self.kind, self.status, self.codes).needs_review
 
     @property
     def sigma_px(self) -> Array | None:

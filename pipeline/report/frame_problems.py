@@ -209,7 +209,7 @@ def _assumed_pose(frame: Frame) -> Iterator[Problem]:
 def _other_problems(frame: Frame) -> Iterator[Problem]:
     """Yield problems but for an assumed pose: at least one where the verdict on the scan asks for a look."""
     problems = list(_measurement_problems(frame))
-    if problems or any(_assumed_pose(frame)) or frame.scan is None or not frame.verdict.needs_look:
+    if problems or any(_assumed_pose(frame)) or frame.scan is None or not frame.verdict.needs_review:
         yield from problems
     else:
         yield Problem(frame.verdict.meaning, NEXT_STEP[frame.verdict])
@@ -222,7 +222,7 @@ def _measurement_problems(frame: Frame) -> Iterator[Problem]:
     for problem in measured.problems if measured else ():
         if problem not in evidence:
             yield Problem(drop_file_name(problem, frame.scan.scan) if frame.scan else problem)
-    doubtful = [mark for mark in frame.marks if mark.needs_look]
+    doubtful = [mark for mark in frame.marks if mark.needs_review]
     lost, weak = ([mark for mark in doubtful if mark.status.is_observation is is_used] for is_used in (False, True))
     found = sum(mark.is_fiducial and mark.status.is_observation for mark in frame.marks)
     if lost and (found or pose):  # otherwise the frame was not found, which is a problem of its own

@@ -170,7 +170,7 @@ class Card:
     unit: ImageUnit
 
     @property
-    def needs_look(self) -> bool:
+    def needs_review(self) -> bool:
         """Whether the mark is suspect, not plainly measured, or has a large residual."""
         return self.is_suspect or self.mark.status is not Status.MEASURED or abs(self.mark.w or 0.0) > LARGE_W
 
@@ -203,7 +203,7 @@ class FrameView:
     def badness(self) -> tuple[bool, float, int]:
         """Sort key, larger is worse: no mark observed, then residuals, then number of open marks."""
         is_lost = not any(mark.status.is_observation for mark in self.frame.marks)
-        return is_lost, sum(self.rms or (0.0,)), sum(mark.needs_look for mark in self.frame.marks)
+        return is_lost, sum(self.rms or (0.0,)), sum(mark.needs_review for mark in self.frame.marks)
 
 
 def frame_views(data: ReportData, shots: list[Frame], every_mark: bool = False) -> list[FrameView]:
@@ -241,7 +241,7 @@ def frame_views(data: ReportData, shots: list[Frame], every_mark: bool = False) 
 
 def cards_to_show(views: Iterable[FrameView]) -> tuple[list[Card], int]:
     """Cards of marks that need a look, those of the worst frame first, and the number of further ones."""
-    cards = [card for view in views for card in view.cards if card.needs_look]
+    cards = [card for view in views for card in view.cards if card.needs_review]
     return cards[:MOST_CARDS], len(cards[MOST_CARDS:])
 
 

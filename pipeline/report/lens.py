@@ -51,7 +51,7 @@ class CertificateRow:
 
 
 @dataclass(frozen=True)
-class Certificate:
+class CertificateTable:
     """Distortion in the form of a calibration certificate.
 
     Attributes
@@ -99,7 +99,7 @@ def largest_effects_um(lens: Lens, radius_mm: float) -> dict[str, float]:
     return dict(zip(parameter_names(lens.distortion.family), sizes.tolist(), strict=True))
 
 
-def certificate(lens: Lens, largest_radius_mm: float) -> Certificate:
+def certificate(lens: Lens, largest_radius_mm: float) -> CertificateTable:
     """Convert a lens to the form of a calibration certificate, out to a radius.
 
     Notes
@@ -133,7 +133,7 @@ def certificate(lens: Lens, largest_radius_mm: float) -> Certificate:
     )
     values = zip((1e3 * (radii - calibrated * at)).tolist(), (1e3 * np.array(sigmas[2:])).tolist(), strict=True)
     rows = [CertificateRow(*each) for each in zip(angles, radii.tolist(), values, asymmetric, strict=True)]
-    return Certificate((calibrated, sigmas[0]), (near, sigmas[1]), largest_radius_mm, rows)
+    return CertificateTable((calibrated, sigmas[0]), (near, sigmas[1]), largest_radius_mm, rows)
 
 
 def _angles_deg(largest: float) -> list[float]:

@@ -141,7 +141,7 @@ def reduced(
             verdict, problems = frame.verdict, list(single_frame_problems(frame))
             kind = camera_of(frame.image), _ending(frame.scan.scan) if frame.scan else "given"
             totals.add(frame, kind, verdict, problems)
-            if problems or verdict.needs_look or frame.image in suspect:
+            if problems or verdict.needs_review or frame.image in suspect:
                 largest_w = max((abs(mark.w or 0.0) for mark in frame.marks), default=0.0)
                 yield (-_BEST_FIRST.index(verdict), -largest_w), one
 

@@ -174,8 +174,8 @@ def _problem_view(problem: Problem, views: Sequence[FrameView]) -> dict[str, obj
         if (card.mark.kind, card.mark.point) == (kind, point)
     )
     picture = next((card.picture for card in marks if card.picture), None)
-    told = {"cause": problem.cause, "detail": problem.detail, "remedy": problem.remedy}
-    return {**told, "links": links, "picture": picture}
+    words = {"cause": problem.cause, "detail": problem.detail, "remedy": problem.remedy}
+    return {**words, "links": links, "picture": picture}
 
 
 def _points_word(shots: list[Frame]) -> str:

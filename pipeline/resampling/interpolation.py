@@ -25,9 +25,11 @@ Degree = Literal[3, 5]
 
 
 MARGIN_PX = 16  # around a tile: there the prefilter of a spline of degree 5, with pole 0.43, has decayed to 1e-6
+_NODES = 129  # along the longer side of the frame; the seam is straight between them
+_SHOWN = 33  # points of a seam in the description
 
 
-class Source:
+class SampleSource:
     """A scan whose file allows windows (height, width, channels) to be read without decoding the rest. Outside of the
     scan its edge is repeated."""
 
@@ -49,7 +51,7 @@ class Source:
         return np.asarray(inside | ~(in_rows[:, None] & (cols >= 0) & (cols < self.width_px)))
 
 
-class _Decoded(Source):
+class _Decoded(SampleSource):
     """A scan decoded into an uncompressed file that is read row by row; mapping the file would count as used memory."""
 
     is_decoded = True
@@ -74,7 +76,7 @@ class _Decoded(Source):
 
 
 @contextmanager
-def open_source(scan: Scan, rows_at_a_time: int, scratch: Path) -> Iterator[Source]:
+def open_source(scan: Scan, rows_at_a_time: int, scratch: Path) -> Iterator[SampleSource]:
     """Open a scan as a source. Where a row of tiles needs more rows than stay decoded, the scan is decoded to a file
     first.
 
@@ -84,7 +86,7 @@ def open_source(scan: Scan, rows_at_a_time: int, scratch: Path) -> Iterator[Sour
     """
     wide = scan.segment_px[1] >= scan.width_px
     if not wide or rows_at_a_time <= scan.rows_kept:
-        yield Source(scan)
+        yield SampleSource(scan)
         return
     with tempfile.TemporaryFile(dir=scratch, prefix=".decoded-") as file:
         yield _Decoded(scan, file.fileno())
@@ -105,7 +107,7 @@ class Tile(NamedTuple):
     clamped: int
 
 
-def interpolated(source: Source, columns: Array, rows: Array, degree: Degree) -> Tile:
+def interpolated(source: SampleSource, columns: Array, rows: Array, degree: Degree) -> Tile:
     """Interpolate the scan at places (side, side) by splines of the degree; 0 outside of the scan."""
     shape = columns.shape
     inside = (columns >= -0.5) & (columns <= source.width_px - 0.5) & (rows >= -0.5) & (rows <= source.height_px - 0.5)
@@ -150,16 +152,12 @@ def spline_samples(
     return np.clip(values, 0, highest).astype(dtype), clamped
 
 
-_NODES = 129  # along the longer side of the frame; the seam is straight between them
-_SHOWN = 33  # points of a seam in the description
-
-
 @dataclass(frozen=True, eq=False)
 class Part:
     """An open partial scan, with its chain to the frame. inner: which of its edges (left, right, top, bottom) lie in
     another scan."""
 
-    source: Source
+    source: SampleSource
     chain: FrameChain
     inner: tuple[bool, ...] = (False,) * 4
 

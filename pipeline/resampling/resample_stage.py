@@ -46,6 +46,8 @@ _SMALLEST_PX = 512
 _LARGEST_REDUCED_BYTES = 32 << 20  # largest size of the first reduced page, which is held in memory
 _CLASSIC_BYTES = 3_900_000_000  # above it BigTIFF is written: classic TIFF has 32-bit offsets
 _REDUCED, _MASK = 1, 4  # TIFF 6.0, NewSubfileType
+BEST: Degree = 5  # of the spline
+FAST: Degree = 3
 
 
 def read_description(path: Path) -> dict[str, Any] | None:
@@ -163,10 +165,6 @@ def _averaged(samples: Samples, factor: int) -> Samples:
     whole = np.pad(samples, ((0, height - samples.shape[0]), (0, width - samples.shape[1]), (0, 0)), mode="edge")
     means = whole.reshape(height // factor, factor, width // factor, factor, -1).mean(axis=(1, 3))
     return np.asarray(np.rint(means).astype(samples.dtype))
-
-
-BEST: Degree = 5
-FAST: Degree = 3
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,8 @@ from pipeline.results.image_unit import FILM_UNIT, ImageUnit
 from pipeline.results.record_json import FOREIGN, Finite, Flag, Number, NumberOrNone, Sigma, Whole, WithRest
 from pipeline.types import Array
 
+_UNKNOWN = 0.1  # standard deviation over the radius from which nothing is known of the distortion
+
 
 @dataclass(frozen=True, slots=True)
 class GivenQuantity:
@@ -132,9 +134,6 @@ class FiducialRecord:
     def given_mm(self) -> tuple[float, float] | None:
         x, y = self.x_mm.given, self.y_mm.given
         return None if x is None or y is None else (x.value, y.value)
-
-
-_UNKNOWN = 0.1  # standard deviation over the radius from which nothing is known of the distortion
 
 
 @dataclass(frozen=True, slots=True)

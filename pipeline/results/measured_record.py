@@ -65,7 +65,7 @@ class MeasuredScan:
     failure : why nothing was measured; all marks are then absent, size and pitch are 0 and NaN, and the sentence is a
         problem of the frame. None if the scan was measured.
     seconds : computing time; neither compared nor stored.
-    decided_by : number of review decisions by reviewer.
+    reviewers : number of review decisions by reviewer.
     """
 
     scan: str
@@ -76,7 +76,7 @@ class MeasuredScan:
     notes: tuple[str, ...] = ()
     failure: Failure | None = None
     seconds: float = field(default=0.0, compare=False)
-    decided_by: Mapping[str, int] = field(default_factory=dict)
+    reviewers: Mapping[str, int] = field(default_factory=dict)
 
     @classmethod
     def failed(cls, scan: str, frame: FrameMeasurement, failure: Failure) -> "MeasuredScan":
@@ -130,7 +130,7 @@ def scan_detail(measured: MeasuredScan, uri: str) -> dict[str, object]:
         "notes": list(measured.notes),
         "frame_notes": list(frame.notes),
     }
-    return detail | ({"decided_by": dict(measured.decided_by)} if measured.decided_by else {})
+    return detail | ({"decided_by": dict(measured.reviewers)} if measured.reviewers else {})
 
 
 def read_scan(image: str, detail: Mapping[str, Any], marks: Sequence[MarkMeasurement], scan: str) -> MeasuredScan:
@@ -153,7 +153,7 @@ def read_scan(image: str, detail: Mapping[str, Any], marks: Sequence[MarkMeasure
     failure = detail["failure"] and Failure(FailureCode(detail["failure"]["code"]), detail["failure"]["sentence"])
     size = (int(detail["width_px"]), int(detail["height_px"]))
     pitch_um, notes = (float(across), float(down)), tuple(detail["notes"])
-    return MeasuredScan(scan, *size, pitch_um, frame, notes, failure, decided_by=detail.get("decided_by", {}))
+    return MeasuredScan(scan, *size, pitch_um, frame, notes, failure, reviewers=detail.get("decided_by", {}))
 
 
 def scan_location(uri: str, folder: Path) -> str:

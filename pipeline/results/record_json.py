@@ -31,6 +31,7 @@ from pipeline.text.files import parse_json, quote_value, read_bytes, write_atomi
 from pipeline.text.table_models import name_in_file
 
 Record = TypeVar("Record")
+_AT_A_TIME = 10_000  # JSON tokens written at once
 
 
 def _number(value: Any) -> float:
@@ -70,7 +71,6 @@ _EXPECTED = {
     "string_type": "a text", "bool_type": "true or false", "int_type": "a whole number", "float_type": "a number",
     "dict_type": "a table", "dataclass_type": "a table",
 }  # fmt: skip
-_AT_A_TIME = 10_000  # JSON tokens written at once
 
 
 class _Foreign:

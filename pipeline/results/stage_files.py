@@ -28,7 +28,7 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class Row:
+class ComparedParameter:
     """Parameter of OpenCV's model from both programs. difference_sigmas: absolute difference in standard deviations of
     the adjustment."""
 
@@ -39,7 +39,7 @@ class Row:
     difference_sigmas: Number
 
     @classmethod
-    def from_numbers(cls, name: str, unit: str, reseau: Estimate, opencv: Estimate) -> "Row":
+    def from_numbers(cls, name: str, unit: str, reseau: Estimate, opencv: Estimate) -> "ComparedParameter":
         apart = abs(reseau.value - opencv.value)
         return cls(name, unit, reseau, opencv, apart / reseau.sigma if reseau.sigma > 0 else 0.0)
 
@@ -87,7 +87,7 @@ class CameraCheck:
     rms_opencv_um: Number = float("nan")
     rms_reseau_um: Number = float("nan")
     refit_residual_um: Number = float("nan")
-    rows: tuple[Row, ...] = ()
+    rows: tuple[ComparedParameter, ...] = ()
     corners_px: CornersCheck | None = field(default_factory=lambda: None)  # null in the file where there is none
 
 

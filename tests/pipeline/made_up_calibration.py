@@ -27,7 +27,7 @@ from pipeline.results.adjustment_record import FilmRecord
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.results.covariance_file import read_covariance
 from pipeline.results.measured_record import MeasuredScan
-from pipeline.results.stage_files import CameraCheck, Check, Estimate, Row
+from pipeline.results.stage_files import CameraCheck, Check, ComparedParameter, Estimate
 
 Array = NDArray[np.float64]
 
@@ -285,7 +285,7 @@ def _replace(result: Adjustment) -> ReportData:
         write_adjustment(result, path)
         stored, known = read_adjustment(path), read_covariance(path)
     rows = tuple(
-        Row.from_numbers(name, unit, Estimate(value, sigma), Estimate(value + 0.1 * sigma, sigma))
+        ComparedParameter.from_numbers(name, unit, Estimate(value, sigma), Estimate(value + 0.1 * sigma, sigma))
         for name, unit, value, sigma in CHECKED
     )
     camera = CameraCheck("agrees", "All parameters agree within 0.1 sigma.", 5, 120, 4.61, 4.60, 0.012, rows)

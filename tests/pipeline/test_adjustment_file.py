@@ -15,7 +15,15 @@ from pipeline import InputError, read_adjustment, write_adjustment
 from pipeline.results import covariance_file
 from pipeline.results.covariance_file import covariance_path, read_covariance
 from pipeline.results.record_json import plain_json
-from pipeline.results.stage_files import CameraCheck, Check, CornersCheck, Estimate, PixelCalibration, Row, read_check
+from pipeline.results.stage_files import (
+    CameraCheck,
+    Check,
+    ComparedParameter,
+    CornersCheck,
+    Estimate,
+    PixelCalibration,
+    read_check,
+)
 
 
 @pytest.fixture
@@ -206,7 +214,7 @@ def test_a_large_network_is_in_blocks(adjustment: Adjustment, path: Path, monkey
 def test_a_check_is_read_as_it_was_written_and_a_wrong_value_refused_with_its_place(tmp_path: Path) -> None:
     pixels = PixelCalibration(1.0, 2.0, 3.0, 4.0, 0.5)
     corners = CornersCheck("findChessboardCorners", 3, 12, ("a",), pixels, pixels)
-    row = Row.from_numbers("k1", "", Estimate(1.0, 0.1), Estimate(1.0, 0.1))
+    row = ComparedParameter.from_numbers("k1", "", Estimate(1.0, 0.1), Estimate(1.0, 0.1))
     camera = CameraCheck("agrees", "All agree.", 3, 12, 1.0, 1.1, 0.1, (row,), corners)
     path = tmp_path / "check.json"
 

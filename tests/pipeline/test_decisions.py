@@ -269,7 +269,7 @@ def test_a_mark_becomes_what_was_settled_and_says_by_whom() -> None:
     assert "accepted by ann: a scratch" in after.frame.marks[0].reason
     assert [mark.reason.code for mark in after.frame.marks] == ["decided covered", "decided", "decided", "covered"]
     assert after.frame.marks[2].center_px is None
-    assert after.decided_by == {"ann": 3}
+    assert after.reviewers == {"ann": 3}
     assert after_checks(scan, {}) == scan
     bare = MarkMeasurement("1", "fiducial", np.ones(2), None, Status.PREDICTED, Reason("not seen", Code.NOT_FOUND))
     one = mark_decision(Choice.ACCEPT)

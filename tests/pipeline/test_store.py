@@ -213,10 +213,10 @@ def test_verdicts_of_scans() -> None:
         (made_record(pixel_from_camera=None), Verdict.POOR),
         (changed(good, range(2, 8), Status.REJECTED, LOOK), Verdict.POOR),
         (failed(), Verdict.FAILED),
-        (replace(answered, decided_by=counts), Verdict.DECIDED),
-        (replace(answered, frame=replace(answered.frame, problems=(LOOK,)), decided_by=counts), Verdict.LOOK),
-        (replace(good, decided_by=counts), Verdict.DECIDED),
-        (replace(made_record(status=Status.WEAK), decided_by=counts), Verdict.LOOK),
+        (replace(answered, reviewers=counts), Verdict.DECIDED),
+        (replace(answered, frame=replace(answered.frame, problems=(LOOK,)), reviewers=counts), Verdict.LOOK),
+        (replace(good, reviewers=counts), Verdict.DECIDED),
+        (replace(made_record(status=Status.WEAK), reviewers=counts), Verdict.LOOK),
     ]
     target = replace(good.frame.marks[0], kind="target", point="t", status=Status.REJECTED, reason=LOOK)
     for status, verdict in ((Status.WEAK, Verdict.GOOD), (Status.REJECTED, Verdict.LOOK)):
@@ -226,7 +226,7 @@ def test_verdicts_of_scans() -> None:
     assert set(NEXT_STEP) == set(Verdict)
     for scan, verdict in verdicts:  # the summary, and so the exit code, say the same
         (frame,) = frames(ReportData("", measurement={scan.frame.image: scan}))
-        assert any(single_frame_problems(frame)) is verdict.needs_look, verdict
+        assert any(single_frame_problems(frame)) is verdict.needs_review, verdict
 
 
 def test_keys_and_shards_depend_on_all_that_they_name() -> None:
