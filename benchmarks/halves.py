@@ -25,7 +25,7 @@ from adjust.functional_model.lens import Prior
 from adjust.problem.camera import Camera
 from adjust.problem.network import Image, Network, ObjectPoint
 from adjust.problem.observations import Observations
-from adjust.solution.unmodelled_error import adjust_unmodelled
+from adjust.solution.adjustment import adjust_unmodelled
 from benchmarks.harness import DATA, Row
 from benchmarks.peers import SYSTEM_PYTHON
 from measure.boards.measure import measure_board, one_definition

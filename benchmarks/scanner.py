@@ -107,5 +107,5 @@ def _names_bend(result: Adjustment) -> bool:
 def _chosen(truth: Mapping[str, float], seed: int) -> tuple[str, ...]:
     turns = QUARTERS * 2
     network = bent_films(turns, truth, {}, np.random.default_rng(seed))
-    choice = choose_bends(network, partial(adjust, approximations=_start(turns)))
-    return tuple(choice.network.scanners[0].terms)
+    bent, _ = choose_bends(network, partial(adjust, approximations=_start(turns)))
+    return tuple(bent.scanners[0].terms)

@@ -22,8 +22,7 @@ from test_corners import board_steps, square_picture
 from test_targets import field
 from true_marks import KIND, TrueMark, some_mark
 
-from adjust.functional_model.transformation import film_kind
-from adjust.initial_values.frames import fit_transformation
+from adjust.functional_model.transformation import film_kind, fit_transformation
 from benchmarks.harness import Row, rms
 from benchmarks.measured_marks import CONTRAST, GROUND, draw_mark, measure_mark, start_off
 from measure.boards.corners import junctions

@@ -149,10 +149,10 @@ class _Fits:
         if not any(image.scanner for image in network.images):
             return (), ()
         try:
-            choice = choose_bends(network, lambda bent: adjust(bent, _start(model, near), self.options))
+            bent, remarks = choose_bends(network, lambda trial: adjust(trial, _start(model, near), self.options))
         except AdjustmentError as error:
             return (), (f"No bend of the scanner was estimated: {error}",)
-        return given_model(choice.network).bends, choice.remarks
+        return given_model(bent).bends, remarks
 
     def _candidate(self, model: Model) -> Candidate:
         near = self.starts.get(model.transformation)

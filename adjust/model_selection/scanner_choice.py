@@ -24,24 +24,14 @@ from adjust.solution.result import Adjustment
 WEAK_MM = 0.1  # weak prior of every term in the trial, removed afterwards; it keeps terms not estimable small
 
 
-@dataclass(frozen=True)
-class ScannerChoice:
-    """Network with the selected terms of every scanner, and remarks on terms that are not estimable."""
-
-    network: Network
-    remarks: tuple[str, ...]
-
-
 def bent_network(network: Network, terms: Sequence[str] | None = None, sigma_mm: float = np.inf) -> Network:
     """Add terms to every scanner of a network's images, over the extent of their observations.
 
     terms: names; None: all smooth and combined terms that no film transformation absorbs. sigma_mm: standard deviation
     of every term, given as 0.
     """
-    smooth = smooth_terms(_films(network))
-    return network_with_terms(
-        network, {name: smooth if terms is None else tuple(terms) for name in _scanners(network)}, sigma_mm
-    )
+    added = tuple(smooth_terms(_films(network)) if terms is None else terms)
+    return network_with_terms(network, dict.fromkeys(_scanners(network), added), sigma_mm)
 
 
 def network_with_terms(network: Network, terms: Mapping[str, Sequence[str]], sigma_mm: float = np.inf) -> Network:
@@ -64,13 +54,14 @@ def network_with_terms(network: Network, terms: Mapping[str, Sequence[str]], sig
 
 def choose_bends(
     network: Network, adjusted: Callable[[Network], Adjustment], sigma_mm: float = np.inf
-) -> ScannerChoice:
-    """Select the significant terms of every scanner.
+) -> tuple[Network, tuple[str, ...]]:
+    """Select the significant terms of every scanner; also return remarks on terms that are not estimable.
 
     adjusted: adjusts a network; called once, with all candidates. sigma_mm: as in `bent_network`.
     """
-    smooth, films = smooth_terms(_films(network)), _films(network)
-    candidates = (*smooth, *carriage_terms(films))
+    films = _films(network)
+    smooth, carriage = smooth_terms(films), carriage_terms(films)
+    candidates = (*smooth, *carriage)
     trial = adjusted(network_with_terms(network, dict.fromkeys(_scanners(network), candidates), WEAK_MM))
     if not trial.converged:
         causes = "".join(f" {each.cause}" for each in trial.singular)
@@ -78,7 +69,7 @@ def choose_bends(
             "No bend of the scanner was estimated: the adjustment with all of its terms ended with "
             f"{trial.termination}.{causes}"
         )
-        return ScannerChoice(network_with_terms(network, {}), (remark,))
+        return network_with_terms(network, {}), (remark,)
     chosen: dict[str, tuple[str, ...]] = {}
     remarks: list[str] = []
     for scanner in trial.network.scanners:
@@ -90,7 +81,7 @@ def choose_bends(
         remarks += undetermined_term_sentences(
             scanner.name, undetermined_terms, set(undetermined_terms) - set(with_lens), poses
         )
-    return ScannerChoice(network_with_terms(network, chosen, sigma_mm), tuple(remarks))
+    return network_with_terms(network, chosen, sigma_mm), tuple(remarks)
 
 
 def _films(network: Network) -> set[str]:

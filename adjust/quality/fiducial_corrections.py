@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.array_types import Array
-from adjust.functional_model.transformation import Film, film_kind, film_parameter_names
-from adjust.initial_values.frames import fit_transformation
+from adjust.functional_model.transformation import Film, film_kind, film_parameter_names, fit_transformation
 
 KEEPS_DISTANCES = ("none", "congruent")
 STEPS = 10  # Gauss-Newton steps at most; models that are linear in their parameters need one

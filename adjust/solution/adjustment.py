@@ -4,37 +4,52 @@ Blunders of the whole network are refused. Images that keep it from a solution a
 robust methods, are given points whose blunders are too large for coordinates as observations.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from adjust.array_types import Array
 from adjust.errors import AdjustmentError, DatumError, NoImageError, UnorientedError
+from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Lens, Prior
-from adjust.initial_values.approximations import initial_values
-from adjust.initial_values.frames import camera_frames
+from adjust.initial_values.approximations import camera_frames, initial_values
 from adjust.initial_values.pose import Pose, Sight, image_distances, intersect
 from adjust.least_squares.malloc_tuning import keep_freed_memory, pause_cycle_search
+from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Network, ObjectPoint
 from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem, number
 from adjust.problem.unknowns import Reduction
+from adjust.quality.variance_components import added_variance
 from adjust.rank_defect.datum import held_as_known
-from adjust.solution.blunder_hypotheses import Trials, blunder_sentence, stations_elsewhere
-from adjust.solution.left_out_images import adopt_lens, contradicting_image, fitting, leave_out, misnumbered_images
+from adjust.solution.blunder_hypotheses import (
+    Trials,
+    blunder_sentence,
+    check_plausibility,
+    misnumbered_images,
+    stations_elsewhere,
+)
 from adjust.solution.options import Datum, Method, Options
-from adjust.solution.plausibility import check_plausibility
 from adjust.solution.result import Adjustment, adjust_problem
 from adjust.validation import validate
 
-__all__ = ["Datum", "Method", "Options", "adjust"]
+__all__ = ["Datum", "Method", "Options", "adjust", "adjust_unmodelled"]
 
 GUESSED = 0.1  # relative standard deviation of a principal distance above which the value is a guess
 TRIAL_STEPS = 6  # iterations of a trial adjustment, enough to test v'Pv, which decreases with each
+FITTING = 3.0  # in sigma0 of the others: largest rms standardised residual of an image that agrees with them
+CONTRADICTING = 0.5  # share of v'Pv above which one image explains why the iteration does not converge
+FEWEST_RAYS = 2  # rays needed for a point without priors
+ROUNDS = 6  # two or three suffice: nearly equal weights hardly change the residuals
+FIRST = 1e-3  # initial value, fraction of the frame's diagonal: above any lens misfit, below a blunder
+PLAUSIBLE = 3e-4  # fraction of the frame's diagonal that lens, board and processing may cause: 1.5 px of 5000 px
+SETTLED = 0.01  # relative change of a standard deviation that means convergence
 MOST_FAR = 0.25  # fraction of the given points: if more are far off, the correct ones cannot be identified
 FEWEST_IMAGES = 2  # images needed for an intersection
 ENOUGH = 5  # points needed to identify a wrong one: the resection without it is still redundant
@@ -83,6 +98,71 @@ def adjust(
         else:
             found = solver.check_whole(network, approximations, None)
         return check_plausibility(found, solver.trials)
+
+
+def adjust_unmodelled(network: Network, options: Options | None = None) -> Adjustment:
+    """Adjust with a standard deviation of unmodelled errors, estimated for each camera.
+
+    It is added in quadrature to those of the camera's targets and tie points, such that their v'Pv equals their
+    redundancy (Förstner's condition for a variance component, here an additive one). It is 0 where the given standard
+    deviations explain the residuals. The first adjustment allows FIRST of the frame's diagonal, so that blunders of the
+    whole network are refused before an error is attributed to unmodelled effects. An implausibly large one is a
+    warning.
+
+    Parameters
+    ----------
+    network : marks with their standard deviations from image measurement
+    options : of each adjustment
+
+    Returns
+    -------
+    Adjustment
+        With the added standard deviations in `unmodelled_mm`. Raises AdjustmentError as `adjust` does.
+    """
+    diagonal_mm = {each.name: float(np.hypot(*each.frame_mm)) for each in network.cameras}
+    sigma_mm = {each: FIRST * diagonal_mm[each] for each in diagonal_mm}
+    result = adjust(add_unmodelled(network, sigma_mm), options=options)
+    for _ in range(ROUNDS):
+        if not result.converged:
+            break
+        before, sigma_mm = sigma_mm, _components_mm(result, sigma_mm)
+        if all(abs(sigma_mm[each] - before[each]) <= SETTLED * sigma_mm[each] for each in sigma_mm):
+            break
+        result = adjust(add_unmodelled(network, sigma_mm), result.start, options)
+    large = [each for each in sigma_mm if sigma_mm[each] > PLAUSIBLE * diagonal_mm[each] > 0.0]
+    warnings = (
+        f"Camera {each}: errors of {1000.0 * sigma_mm[each]:.3g} µm are not modelled, one part in "
+        f"{diagonal_mm[each] / sigma_mm[each]:.0f} of the picture's diagonal. Look for pictures that are blurred or "
+        "moved, for a wrong size or count of the board, and whether the lens model suits."
+        for each in large
+    )
+    return replace(result, unmodelled_mm=sigma_mm, remarks=(*result.remarks, *warnings))
+
+
+def add_unmodelled(network: Network, sigma_mm: Mapping[str, float]) -> Network:
+    """Add a standard deviation by camera to the targets and tie points of a network."""
+    added = np.array([sigma_mm.get(camera, 0.0) for camera in _cameras(network)]) ** 2
+    covariance_mm2 = network.observations.covariance_mm2 + added[:, None, None] * np.eye(2)
+    return replace(network, observations=replace(network.observations, covariance_mm2=covariance_mm2))
+
+
+def _cameras(network: Network) -> NDArray[np.str_]:
+    """Camera of every target and tie point; "" for other marks."""
+    cameras = np.array([image.camera for image in network.images])[network.image_numbers]
+    return np.where(np.isin(network.observations.kind, ("target", "tie")), cameras, "")
+
+
+def _components_mm(result: Adjustment, before_mm: Mapping[str, float]) -> dict[str, float]:
+    """Standard deviations by camera with which v'Pv of its marks equals their redundancy, for the current residuals."""
+    found, cameras, residuals = dict[str, float](), _cameras(result.network), result.residuals
+    variances = np.diagonal(result.network.observations.covariance_mm2, axis1=1, axis2=2)
+    for camera, before in before_mm.items():
+        rows = cameras == camera
+        redundancy = float(residuals.redundancy[rows].sum())
+        squares, given = residuals.v_mm[rows] ** 2, variances[rows] - before**2
+        added = added_variance(squares, given, redundancy) if redundancy >= 1.0 else None
+        found[camera] = float(np.sqrt(added or 0.0))
+    return found
 
 
 @dataclass(frozen=True)
@@ -299,6 +379,86 @@ class _Solver:
                 )
                 return replace(result, remarks=(warning, *result.remarks))
         return stopped
+
+
+def leave_out(network: Network, frames: Collection[str]) -> Network | None:
+    """Remove some frames and what only they show from a network; None where no more than half of it would remain."""
+    left = {image.frame for image in network.images if image.frame not in frames}
+    if len(left) <= len(frames):
+        return None
+    images, observations = tuple(image for image in network.images if image.frame in left), network.observations
+    names = {image.name for image in images}
+    shown = np.isin(observations.image, list(names))
+    frames_of = defaultdict[str, set[str]](set)
+    for row in np.flatnonzero(shown & ~observations.is_fiducial):
+        frames_of[observations.point[row]].add(network.image_by_name[observations.image[row]].frame)
+    located = {
+        point.id
+        for point in network.points
+        if len(frames_of[point.id]) >= (FEWEST_RAYS if point.X is point.Y is point.Z is None else 1)
+    }
+    kept = shown & (observations.is_fiducial | np.isin(observations.point, list(located)))
+    return replace(
+        network,
+        images=images,
+        points=tuple(
+            point for point in network.points if point.id in located or point.id not in network.observed_points
+        ),
+        observations=observations.only(np.flatnonzero(kept)),
+        distances=tuple(each for each in network.distances if {each.start, each.end} <= located | names),
+    )
+
+
+def adopt_lens(network: Network, result: Adjustment) -> Network:
+    """Replace the cameras of a network by those adjusted from a part of it."""
+    used = {image.camera for image in result.network.images} - result.network.idle_cameras
+    cameras = (_adopt_camera(camera, result) if camera.name in used else camera for camera in network.cameras)
+    return replace(network, cameras=tuple(cameras))
+
+
+def fitting(result: Adjustment, frames: Collection[str], sigma0: float) -> set[str]:
+    """Select the frames whose residuals agree with sigma0 of the others."""
+    of_mark = np.array([image.frame for image in result.network.images])[result.network.image_numbers]
+    excess = (np.nan_to_num(result.residuals.w) ** 2).sum(axis=1) - 2.0 * (FITTING * sigma0) ** 2
+    return {frame for frame in frames if (result.weights * excess)[of_mark == frame].sum() <= 0.0}
+
+
+def contradicting_image(result: Adjustment) -> dict[str, str]:
+    """The frame that causes most of v'Pv in an adjustment without a solution, with the reason; empty if none does."""
+    image_numbers = result.network.image_numbers
+    frames = np.array([image.frame for image in result.network.images])[image_numbers]
+    # Without a solution there are no standardised residuals.
+    variances = np.diagonal(result.network.observations.covariance_mm2, axis1=1, axis2=2)
+    share = (result.residuals.v_mm**2 / variances).sum(axis=1)
+    names, of_frame = np.unique(frames, return_inverse=True)
+    sums = np.bincount(of_frame, share)
+    worst = int(np.argmax(sums))
+    if len(names) < 2 or sums[worst] <= CONTRADICTING * sums.sum():
+        return {}
+    point = result.network.observations.point[int(np.argmax(np.where(of_frame == worst, share, -1.0)))]
+    return {
+        str(
+            names[worst]
+        ): f"with image {names[worst]} the iteration does not converge, without it it does. Its largest "
+        f"residual is that of {point}. Check the point numbers of this image."
+    }
+
+
+def _adopt_camera(camera: Camera, result: Adjustment) -> Camera:
+    def adopted(name: str, given: Prior | None) -> Prior:
+        return Prior(result.value(Parameter.interior(camera.name, name)), np.inf if given is None else given.sigma)
+
+    of = camera.distortion
+    parameters = {
+        name: adopted(name, of.parameters[name]) for name in parameter_names(of.family) if name in of.parameters
+    }
+    return replace(
+        camera,
+        principal_distance_mm=adopted("c", camera.principal_distance_mm),
+        x0_mm=adopted("x0", camera.x0_mm),
+        y0_mm=adopted("y0", camera.y0_mm),
+        distortion=replace(of, parameters=parameters),
+    )
 
 
 class _FarPoint(NamedTuple):

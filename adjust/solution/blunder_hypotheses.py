@@ -1,26 +1,34 @@
 """Test whether a blunder of the whole network explains its contradictions.
 
 Mirrored points or exchanged axes, another unit, y pointing down, exchanged frames, mirrored images, a wrong principal
-distance.
+distance. Such a blunder leaves residuals everywhere, and tests of single observations would reject good ones.
 
-Such a blunder leaves residuals everywhere, and tests of single observations would reject good ones.
+Others contradict the geometry of photographs, independent of the residuals: marks outside the image, stations on both
+sides of an opaque board, a principal point outside the image or far from its given place. On a flat board a mirrored
+image has the same residuals as a correct one, with its station on the other side; y pointing down mirrors all images.
+The mirrored network is adjusted, and its sigma0 is reported where it explains all observations.
+
+The projective transformation of the given points to an image tells wrong numbers without a camera: with right ones it
+fits but for the distortion, which all images share. Images that it fits worse by far are tried with other numbers.
 """
 
+import re
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import chain, combinations, product
 
 import numpy as np
-from scipy.special import chdtrc
+from scipy.special import chdtrc, chdtri
 
-from adjust.array_types import Array, Mask
+from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.lens import Prior
 from adjust.problem.camera import Camera
+from adjust.problem.condition_equations import observed_in_camera
 from adjust.problem.estimates import adjusted_image, adjusted_places
 from adjust.problem.network import Network, ObjectPoint
 from adjust.problem.parameter import Parameter, shortened
-from adjust.solution.left_out_images import FEWEST, LARGE, linear_transformations
 from adjust.solution.result import Adjustment
 
 TOLERATED = 2.0  # factor on the given standard deviations up to which residuals need no explanation
@@ -28,9 +36,25 @@ CHECKED = 10  # smallest redundancy for an explanation
 NAMED = 5  # images named in a message
 MOST_PAIRS = 15  # pairs of frames tried as exchanged, largest residuals first
 ONE_AXIS = 10.0  # sigma0 that one axis in another unit leaves at least
+CLEARLY = 3.0  # factor by which an explanation must reduce sigma0
+NEAR = 0.3  # fraction of its distance from the field's centre that a station may lie off its given place
+PITCHES = (10.0, 25.4, 100.0, 1000.0, 2.0)  # ratios of principal distances by another unit or pixel pitch
+ROUND = 0.05  # relative tolerance of these ratios
+FLAT = 1e-3  # relative thickness of a flat field, which is mirrored by mirroring the stations
+FEWEST = 8  # points of an image that tell by a linear transformation what is wrong with it
+FEWEST_IMAGES = 3  # images needed for a median misfit
+FLAT_FIELD = 0.05  # relative thickness of a field below which a linear transformation does not tell its depth
+WORSE, LARGE = 4.0, 0.01  # times the median misfit of the images, and misfit above which other numbers are tried
+BETTER, MUCH_BETTER = 3.0, 10.0  # ratio by which right numbers lower the misfit of an image worse than most, or alike
+MOST_OFF = 30  # largest shift of numbers tried
+LEAST_DEPTH = 1e-12  # of points in a field of size 1: nearer ones are imaged as far off as that
+MARGIN = 0.01  # fraction of the frame that a mark may lie outside: edge of the outermost pixel, rounded frame size
+NEARLY_ALL = 0.9  # fraction of marks outside the image above which the axes are wrong, not the marks
+FLAT_BOARD = 1e-2  # relief of given points over their extent below which they are flat
+AROUND = 0.25  # fraction of the extent of all marks by which an image of unknown size may extend beyond them
 UNITS = (1000.0, 100.0, 10.0, 0.3048, 25.4)  # ratios of length units: m, dm, cm, mm, feet, inches
 FACTORS = (*UNITS, *(1.0 / each for each in UNITS))
-
+MIRRORED = "the points are mirrored: the sign of X, Y or Z of all of them is wrong, or two axes are exchanged"
 AXES = {  # blunders that mirror the points, and the matrices that correct them
     **{f"the sign of {'XYZ'[i]} of all points is wrong": np.diag(1.0 - 2.0 * np.eye(3)[i]) for i in range(3)},
     **{
@@ -38,11 +62,6 @@ AXES = {  # blunders that mirror the points, and the matrices that correct them
         for axes, order in (("X and Y", [1, 0, 2]), ("X and Z", [2, 1, 0]), ("Y and Z", [0, 2, 1]))
     },
 }
-CLEARLY = 3.0  # factor by which an explanation must reduce sigma0
-NEAR = 0.3  # fraction of its distance from the field's centre that a station may lie off its given place
-PITCHES = (10.0, 25.4, 100.0, 1000.0, 2.0)  # ratios of principal distances by another unit or pixel pitch
-ROUND = 0.05  # relative tolerance of these ratios
-FLAT = 1e-3  # relative thickness of a flat field, which is mirrored by mirroring the stations
 
 
 @dataclass(frozen=True)
@@ -105,13 +124,10 @@ def _may_be_stretched(network: Network, given: Adjustment | None) -> bool:
     if given is not None and given.converged:
         miss_mm = np.sqrt(np.mean(given.residuals.v_mm**2))
         fits.append(bool(miss_mm > LARGE * np.ptp(observations.xy_mm)))
-    for number in range(len(network.images)):
-        own = np.flatnonzero((network.image_numbers == number) & ~observations.is_fiducial)
-        rows = [row for row in own if observations.point[row] in places]
-        if len(rows) >= FEWEST:
-            xyz = np.array([[places[observations.point[row]] for row in rows]])
-            (misfit,) = linear_transformations(xyz, observations.xy_mm[rows][None])[1]
-            fits.append(bool(misfit < LARGE))
+    for rows in _rows_of_given(network):
+        xyz = np.array([[places[observations.point[row]] for row in rows]])
+        (misfit,) = linear_transformations(xyz, observations.xy_mm[rows][None])[1]
+        fits.append(bool(misfit < LARGE))
     return all(fits)
 
 
@@ -169,14 +185,12 @@ def reversed_y(network: Network, keeps_given: bool = False) -> Network:
 
 def _mirrored_images(network: Network) -> Iterator[NetworkHypothesis]:
     """Hypothesis: those digital images are mirrored that a linear transformation of the given points shows so."""
-    rows = ~network.observations.is_fiducial
-    names = []
-    for number, image in enumerate(network.images):
-        own = np.flatnonzero(rows & (network.image_numbers == number))
-        known = [row for row in own if network.observations.point[row] in network.known_places]
-        places = np.array([network.known_places[network.observations.point[row]] for row in known]).reshape(-1, 3)
-        if image.transformation == "none" and len(known) >= FEWEST:
-            (handedness,), _ = linear_transformations(places[None], network.observations.xy_mm[known][None])
+    observations, names = network.observations, list[str]()
+    for rows in _rows_of_given(network):
+        image = network.image_by_name[observations.image[rows[0]]]
+        if image.transformation == "none":
+            xyz = np.array([[network.known_places[observations.point[row]] for row in rows]])
+            (handedness,), _ = linear_transformations(xyz, observations.xy_mm[rows][None])
             names += [image.name] if handedness > 0.0 else []
     if 0 < len(names) < len(network.images):
         who = f"image {names[0]} is" if len(names) == 1 else f"the images {shortened(names, NAMED)} are"
@@ -256,9 +270,6 @@ def _exchanged_frames(network: Network, given: Adjustment | None) -> Iterator[Ne
             replace(network, observations=replace(observations, image=image)),
             "Exchange them, or the frames' fiducial marks.",
         )
-
-
-MIRRORED = "the points are mirrored: the sign of X, Y or Z of all of them is wrong, or two axes are exchanged"
 
 
 def blunder_sentence(network: Network, given: Adjustment | None, trials: Trials) -> str:
@@ -377,3 +388,296 @@ def stations_elsewhere(network: Network, result: Adjustment) -> str:
                 f"another reading of the points: {words}. Correct the points, or the stations."
             )
     return ""
+
+
+def check_plausibility(result: Adjustment, trials: Trials) -> Adjustment:
+    """Add remarks on contradictions with the geometry of photographs to a result."""
+    if result.termination == "singular" or not result.network.observed_points:
+        return result
+    views = _views(result)
+    outside = sorted(row for view in views for row in view.outside)
+    remarks, misread = list(_marks_outside(result, outside, trials)), tuple(_both_sides(result, trials))
+    if result.converged and not outside:
+        remarks += [each for view in views for each in _principal_point(view, result, trials.family)]
+    return replace(result, misread=misread, remarks=(*result.remarks, *remarks))
+
+
+@dataclass(frozen=True)
+class _CameraMarks:
+    """Object points in the images of one camera.
+
+    rows: rows of the observations; xy_mm (n, 2): camera coordinates; digital: whether its images have no film
+    transformation.
+    """
+
+    camera: Camera
+    digital: bool
+    rows: Indices
+    xy_mm: Array
+
+    @cached_property
+    def picture(self) -> Array | None:
+        """Image area in mm, by two opposite corners (2, 2); None where its size is unknown.
+
+        That of a digital camera starts at the first pixel, like the comparator coordinates. That of a film camera is
+        centred on the fiducial marks. It is centred on the origin where nearly all marks lie inside then, and more than
+        otherwise.
+        """
+        size = np.array(self.camera.frame_mm)
+        if not size.all():
+            return None
+        marks = [[mark.x_mm.value, mark.y_mm.value] for mark in self.camera.fiducials.values()]
+        middle_mm = (np.min(marks, axis=0) + np.max(marks, axis=0)) / 2.0 if marks else np.zeros(2)
+        low = size * [0.0, -1.0] if self.digital else middle_mm - size / 2.0
+        usual, middle = np.array([low, low + size]), np.array([-size / 2.0, size / 2.0])
+        outside = _is_outside(middle, self.xy_mm).mean()
+        return middle if outside < min(1.0 - NEARLY_ALL, _is_outside(usual, self.xy_mm).mean()) else usual
+
+    @property
+    def outside(self) -> list[int]:
+        """Rows of the marks outside the image area.
+
+        For a digital camera of unknown size these are all rows, if all marks lie above and right of the first pixel.
+        """
+        if self.picture is not None:
+            return [int(row) for row in self.rows[_is_outside(self.picture, self.xy_mm)]]
+        return self.rows.tolist() if self.digital and (self.xy_mm > 0.0).all() else []
+
+
+def _is_outside(picture: Array, xy_mm: Array) -> Mask:
+    """Mask of points (n, 2) outside an image area."""
+    margin = MARGIN * float(np.ptp(picture, axis=0).max())
+    return np.asarray(((xy_mm < picture[0] - margin) | (xy_mm > picture[1] + margin)).any(axis=1))
+
+
+def _views(result: Adjustment) -> list[_CameraMarks]:
+    """Views of the cameras whose images show object points."""
+    xy_mm, images = observed_in_camera(result.run.problem, result.run.end.state), result.network.images
+    films = {image.camera for image in images if image.transformation != "none"}
+    of_camera = result.network.camera_by_name
+    targets = result.run.problem.targets_by_camera.items()
+    return [_CameraMarks(of_camera[name], name not in films, rows, xy_mm[rows]) for name, rows in targets if len(rows)]
+
+
+def _marks_outside(result: Adjustment, rows: Sequence[int], trials: Trials) -> Iterator[str]:
+    if not rows:
+        return
+    network, observations = result.network, result.network.observations
+    count = int((~observations.is_fiducial).sum())
+    sized = [camera for camera in network.cameras if all(camera.frame_mm)]
+    where = f"(frame_mm = {list(sized[0].frame_mm)})" if sized else "above its first row of pixels"
+    words = f"{len(rows)} of {count} marks lie outside the picture{' ' if sized else ', '}{where}"
+    if len(rows) < NEARLY_ALL * count:
+        shown = shortened([f"{observations.image[row]}/{observations.point[row]}" for row in rows], NAMED)
+        yield f"{words}: {shown}. Their coordinates, frame_mm or the pitch is wrong. Correct it."
+        return
+    other = reversed_y(network, keeps_given=True)
+    is_digital = all(image.transformation == "none" for image in network.images)
+    turned = trials.adjust(other) if is_digital else None
+    if turned is None or any(view.outside for view in _views(turned)):
+        yield (
+            f"{words}: the comparator counts x to the right and y up, from the first pixel. Correct the coordinates, "
+            "frame_mm or the pitch."
+        )
+        return
+    fits = trials.explains(turned) or turned.sigma0 < 1.01 * result.sigma0
+    yield (
+        f"{words}. With y pointing up instead of down all lie inside (σ₀ = {turned.sigma0:.2f}; as it stands "
+        f"{result.sigma0:.2f}){'' if fits else ', but the observations agree less then'}: the y axis of the comparator "
+        "coordinates points down, or they count from the lower left corner. Give them with y up, from the first pixel."
+    )
+
+
+def _both_sides(result: Adjustment, trials: Trials) -> Iterator[str]:
+    """Report images whose stations lie on the other side of an opaque board than most."""
+    network, sides = result.network, _sides(result)
+    balance = sum(sides.values()) or -1.0  # equally many on both sides
+    fewer = [name for name, side in sides.items() if side * balance < 0.0]
+    if network.transparent or not fewer:
+        return
+    turned = trials.adjust(mirrored_images(network, fewer))
+    same = turned is not None and len(set(_sides(turned).values())) == 1
+    one, figures, even = len(fewer) == 1, "", ", or the others," if 2 * len(fewer) == len(sides) else ""
+    if turned is not None and same and turned.sigma0 < 1.05 * result.sigma0:
+        figures = (
+            f" With {'it' if one else 'them'} mirrored, all stations lie on one side and all observations agree as well"
+            f" (σ₀ = {turned.sigma0:.2f}; as it stands {result.sigma0:.2f})."
+        )
+    yield (
+        f"{'Image' if one else 'The images'} {shortened(fewer, NAMED)}{even}"
+        f" {'is' if one else 'are'} mirrored, or numbered as in a mirror, or the flat board is transparent: "
+        f"{'its station lies' if one else 'their stations lie'} on the other side of it than those of the "
+        f"{len(sides) - len(fewer)} other images, which an opaque board hides.{figures} Mirror "
+        f"{'the image' if one else 'the images'} and measure again, correct the point numbers, or write transparent = "
+        "true under [targets] or [object]."
+    )
+
+
+def _sides(result: Adjustment) -> dict[str, float]:
+    """Side (1 or -1) of the plane of the given points on which each station lies, by image; empty without a plane."""
+    network = result.network
+    places = [place for id_, place in network.known_places.items() if id_ in network.observed_points]
+    if len(places) < max(4, len(network.observed_points)):
+        return {}
+    xyz = np.array(places)
+    _, extents, axes = np.linalg.svd(xyz - xyz.mean(axis=0), full_matrices=False)
+    if extents[1] < FLAT_BOARD * extents[0] or extents[2] > FLAT_BOARD * extents[0]:
+        return {}
+    sides = np.sign((result.values[result.run.problem.exterior[:, :3]] - xyz.mean(axis=0)) @ axes[2]).tolist()
+    shown = {image.name: side for image, side in zip(network.images, sides, strict=True)}
+    return {name: side for name, side in shown.items() if name not in network.objectless_images}
+
+
+def _principal_point(view: _CameraMarks, result: Adjustment, family: float) -> Iterator[str]:
+    name, picture, kind = view.camera.name, view.picture, "outside the picture"
+    parameters = [Parameter.interior(name, axis) for axis in ("x0", "y0")]
+    found = result.values_of(parameters)
+    words = f"The principal point of camera {name} is found at ({found[0]:.4g}, {found[1]:.4g}) mm"
+    if far := _far_from_given(view.camera, found, result, family):
+        yield f"{words}, {far}"
+        return
+    if picture is None:
+        low, high = (np.array([limit(values) for values in view.xy_mm.T]) for limit in (np.min, np.max))
+        reach = AROUND * (high - low).max()
+        picture = np.array([low - reach, high + reach])
+        if view.digital:
+            picture = np.array([np.minimum(picture[0], 0.0), np.maximum(picture[1], 0.0)])
+        kind = "outside all that the marks cover"
+    if _is_outside(picture, found[None])[0]:
+        (left, lower), (right, upper) = picture
+        yield (
+            f"{words}, {kind} (x from {left:g} to {right:g}, y from {lower:g} to {upper:g} mm), where no lens has it: "
+            "the images do not tell it from their tilts, or points are misnamed or misplaced. Give principal_point_mm "
+            "with its standard deviation (0 fixes it), or add images with other tilts; check the points' numbers and "
+            "coordinates."
+        )
+
+
+def _far_from_given(camera: Camera, found: Array, result: Adjustment, family: float) -> str:
+    """Describe a significant contradiction between estimated and given principal point; empty where there is none."""
+    priors = [prior for prior in (camera.x0_mm, camera.y0_mm) if prior is not None and 0.0 < prior.sigma < np.inf]
+    if len(priors) < len(found):
+        return ""
+    given, sigma = np.array([(prior.value, prior.sigma) for prior in priors]).T
+    cofactor = result.cofactor_of([Parameter.interior(camera.name, axis) for axis in ("x0", "y0")])
+    size, axes = np.linalg.eigh((np.diag(sigma**2) - cofactor) / np.outer(sigma, sigma))
+    along = axes.T @ ((found - given) / sigma)
+    checked = size > 1e-6
+    if not checked.any():
+        return ""
+    statistic = float((along[checked] ** 2 / size[checked]).sum()) / max(1.0, result.sigma0) ** 2
+    if statistic <= chdtri(int(checked.sum()), family):
+        return ""
+    off = found - given
+    turned = np.abs(off[0]) < abs(off[1]) and abs(found[1] + given[1]) < 0.1 * abs(off[1])
+    sign = " The sign of y looks wrong: y points up." if turned else ""
+    return (
+        f"({off[0]:+.3g}, {off[1]:+.3g}) mm from ({given[0]:g}, {given[1]:g}) ± ({sigma[0]:g}, {sigma[1]:g}), where it "
+        f"is given: {np.sqrt(statistic):.1f} times what its standard deviation allows.{sign} Check principal_point_mm, "
+        "from where it counts and its sign, or give it with a larger standard deviation."
+    )
+
+
+def misnumbered_images(network: Network) -> dict[str, str]:
+    """Find the frames whose point numbers are off, with the reasons; empty where all may be right."""
+    places, observations = network.known_places, network.observations
+    names, number = observations.numbered_points
+    rows_of = _rows_of_given(network)
+    if len(rows_of) < FEWEST_IMAGES:
+        return {}
+    nowhere = np.full(3, np.nan)
+    given = np.array([places.get(name, nowhere) for name in names])[number]
+    as_given = np.empty(len(rows_of))
+    sizes = np.array([len(rows) for rows in rows_of])
+    for size in np.unique(sizes):
+        rows = np.array([each for each in rows_of if len(each) == size])
+        as_given[sizes == size] = linear_transformations(given[rows], observations.xy_mm[rows])[1]
+    is_worse = as_given > WORSE * np.median(as_given)
+    doubted = np.flatnonzero(is_worse | (as_given > LARGE))
+    if not len(doubted):
+        return {}
+    in_order = sorted(places, key=_natural)
+    place_of, xyz = {name: k for k, name in enumerate(in_order)}, np.array([places[name] for name in in_order])
+    orders, frames = list(_orders(xyz)), defaultdict[str, list[str]](list)
+    for image in doubted:
+        rows = rows_of[image]
+        numbers = [place_of[observations.point[row]] for row in rows]
+        reordered = np.array([xyz[order[numbers]] for _, order in orders])
+        xy_mm = np.broadcast_to(observations.xy_mm[rows], (*reordered.shape[:2], 2))
+        misfits = linear_transformations(reordered, xy_mm)[1]
+        best = int(np.argmin(misfits))
+        if (BETTER if is_worse[image] else MUCH_BETTER) * misfits[best] < as_given[image]:
+            frames[orders[best][0]].append(network.image_by_name[observations.image[rows[0]]].frame)
+    return {
+        frame: f"the points of {shortened(some, NAMED)} are not numbered as they are given: {words}. Correct them."
+        for words, some in frames.items()
+        for frame in some
+    }
+
+
+def _rows_of_given(network: Network) -> list[Indices]:
+    """Rows of the given points in every image that shows FEWEST of them."""
+    names, number = network.observations.numbered_points
+    is_given = np.array([name in network.known_places for name in names], dtype=bool)[number]
+    rows = np.flatnonzero(is_given & ~network.observations.is_fiducial)
+    rows = rows[np.argsort(network.image_numbers[rows], kind="stable")]
+    counts = np.bincount(network.image_numbers[rows], minlength=len(network.images))
+    return [own for own in np.split(rows, np.cumsum(counts)[:-1]) if len(own) >= FEWEST]
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Sorting key by which p10 follows p9."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
+def _orders(xyz: Array) -> Iterator[tuple[str, Indices]]:
+    """Other orders of numbered points (p, 3): the point at each number, with words."""
+    count = len(xyz)
+    for off in range(1, min(MOST_OFF, count // 2) + 1):
+        for sign, how in ((1, "high"), (-1, "low")):
+            yield f"their numbers are {off} too {how}", (np.arange(count) - sign * off) % count
+    steps = np.linalg.norm(np.diff(xyz, axis=0), axis=1)
+    ends = np.flatnonzero(steps > 1.5 * np.median(steps)) + 1  # of the lines of a field that is numbered by lines
+    if len(ends) and len(set(np.diff([0, *ends, count]).tolist())) == 1:
+        lines = np.arange(count).reshape(len(ends) + 1, -1)
+        yield "these are numbered by columns, not by rows, or the reverse", lines.T.ravel()
+        turned = lines.copy()
+        turned[1::2] = lines[1::2, ::-1]
+        yield "these are numbered to and fro, or only here not", turned.ravel()
+
+
+def linear_transformations(xyz: Array, xy_mm: Array) -> tuple[Array, Array]:
+    """Handedness (m,) and misfit (m,) of direct linear transformations of points (m, n, 3) to images (m, n, 2).
+
+    Handedness: positive for a mirrored image, 0 for a flat field, whose mirror images are images. The misfit is the
+    median residual in units of the image's extent.
+    """
+    (points, extents, axes), (xy, _, _) = _normalised(xyz), _normalised(xy_mm)
+    is_flat = extents[:, -1] < FLAT_FIELD * extents[:, 0]
+    handedness, misfits = np.zeros(len(xyz)), np.zeros(len(xyz))
+    for flat in np.unique(is_flat):
+        own = is_flat == flat
+        of, to = points[own], xy[own]
+        at = of @ axes[own, :, :2] if flat else of
+        at = np.concatenate([at, np.ones((*at.shape[:2], 1))], axis=2)
+        none = np.zeros_like(at)
+        along = np.concatenate([at, none, -to[..., :1] * at], axis=2)
+        rows = np.concatenate([along, np.concatenate([none, at, -to[..., 1:] * at], axis=2)], axis=1)
+        normal = rows.swapaxes(1, 2) @ rows
+        projection = np.linalg.eigh(normal)[1][:, :, 0].reshape(len(at), 3, -1)
+        projected = at @ projection.swapaxes(1, 2)
+        depths = projected[..., 2]
+        off = projected[..., :2] / np.where(np.abs(depths) < LEAST_DEPTH, LEAST_DEPTH, depths)[..., None] - to
+        misfits[own] = np.median(np.linalg.norm(off, axis=2), axis=1)
+        if not flat:
+            handedness[own] = np.linalg.det(projection[..., :3]) * np.median(depths, axis=1)
+    return handedness, misfits
+
+
+def _normalised(places: Array) -> tuple[Array, Array, Array]:
+    """Places (m, n, k) about their centroid, of size 1, their extents (m, k) along their axes, and these (m, k, k)."""
+    centred = places - places.mean(axis=1, keepdims=True)
+    centred /= np.maximum(np.abs(centred).max(axis=(1, 2), keepdims=True), 1e-300)  # for the squares
+    squares, axes = np.linalg.eigh(centred.swapaxes(1, 2) @ centred)
+    extents = np.sqrt(np.maximum(squares[:, ::-1], 0.0))
+    return centred / np.maximum(extents[:, :1, None], 1e-300), extents, axes[..., ::-1]

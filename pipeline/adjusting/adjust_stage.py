@@ -17,9 +17,8 @@ from adjust.model_selection.model_choice import Choice, choose
 from adjust.model_selection.scanner_choice import bent_network, choose_bends
 from adjust.problem.estimates import adjusted_image, adjusted_places
 from adjust.problem.network import Network
-from adjust.solution.adjustment import Options, adjust
+from adjust.solution.adjustment import Options, adjust, adjust_unmodelled
 from adjust.solution.result import Adjustment
-from adjust.solution.unmodelled_error import adjust_unmodelled
 from measure.results import ON_FILM
 from pipeline.adjusting.network import build_network
 from pipeline.archive.made_from import adjusted_from
@@ -79,8 +78,7 @@ def add_scanner_bends(
         )
     sigma_mm = settings.scanner_sigma_um / UM_PER_MM
     if settings.scanner == "auto":
-        choice = choose_bends(network, adjusted, sigma_mm)
-        return choice.network, choice.remarks
+        return choose_bends(network, adjusted, sigma_mm)
     if settings.scanner == "bend":
         return bent_network(network, None, sigma_mm), ()
     possible = (*smooth_terms(films), *carriage_terms(films))

@@ -11,7 +11,7 @@ import numpy as np
 
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.transformation import fewest_marks, marks_needed
-from adjust.initial_values.frames import FEWEST_COMMON
+from adjust.initial_values.approximations import FEWEST_COMMON
 from adjust.problem.camera import Camera
 from adjust.problem.network import Board, Image, LineOfSight, Network, ObjectPoint, Scanner, Transformation
 from adjust.problem.observations import Calibration, Distance, Observations

@@ -9,7 +9,7 @@ import numpy as np
 
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.scanner import smooth_terms
-from adjust.initial_values.frames import fit_transformation
+from adjust.functional_model.transformation import fit_transformation
 from adjust.problem import network
 from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Network, Transformation

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from adjust.functional_model.transformation import film_kind
-from adjust.initial_values.frames import fit_transformation
+from adjust.functional_model.transformation import film_kind, fit_transformation
 from measure.annotations.text import networks, read_writing
 from measure.fiducials.camera_recognition import Answer, likeness, recognise_frame, search_camera
 from measure.fiducials.frame import Frame

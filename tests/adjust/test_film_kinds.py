@@ -19,8 +19,8 @@ from adjust import AdjustmentError, adjust, approximate
 from adjust.functional_model.transformation import (
     Film,
     film_kind,
+    fit_transformation,
 )
-from adjust.initial_values.frames import fit_transformation
 from adjust.problem.network import Image, Network, Transformation
 
 Array = NDArray[np.float64]

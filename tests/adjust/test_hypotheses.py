@@ -31,8 +31,8 @@ from studies import parametrize_with_studies
 from adjust import Adjustment, AdjustmentError, Network, Options, Prior, adjust, approximate
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.quality.tested import Probabilities
+from adjust.solution.adjustment import adjust_unmodelled
 from adjust.solution.explanations import explain
-from adjust.solution.unmodelled_error import adjust_unmodelled
 
 QUICK = (
     "lens: no radial term",

@@ -28,7 +28,7 @@ from adjust import Adjustment, AdjustmentError, Distortion, Parameter, Prior, ad
 from adjust.functional_model.rotation import rotation_from_vector
 from adjust.problem.estimates import adjusted_image, adjusted_lens
 from adjust.problem.network import Approximations, Board, Network
-from adjust.solution.unmodelled_error import adjust_unmodelled
+from adjust.solution.adjustment import adjust_unmodelled
 
 Array = NDArray[np.float64]
 

@@ -178,17 +178,17 @@ def test_a_bend_that_the_films_make_too_is_laid_to_the_films() -> None:
 
 
 def chosen(network: Network, start: Approximations | None = None) -> set[str]:
-    choice = choose_bends(network, lambda network: adjust(network, start or approximate(network)))
-    return set(choice.network.scanners[0].terms)
+    bent, _ = choose_bends(network, lambda network: adjust(network, start or approximate(network)))
+    return set(bent.scanners[0].terms)
 
 
 def test_the_terms_that_are_there_are_chosen() -> None:
     truth = {"a20": 0.02, "b11": -0.015, "b02": 0.01}
     network = bent_films(QUARTERS * 2, truth, {}, np.random.default_rng(1))
-    choice = choose_bends(network, solved)
+    bent, _ = choose_bends(network, solved)
     # over the extent of the marks, which is not that of the truth, products of degree 2 take parts of degree 1 and 0
-    assert set(choice.network.scanners[0].terms) == set(truth)
-    result = solved(choice.network)
+    assert set(bent.scanners[0].terms) == set(truth)
+    result = solved(bent)
     assert result.sigma0 == pytest.approx(1.0, abs=0.2)
     assert result.value("SC.S.a20") == pytest.approx(0.02, rel=0.15)
 
@@ -210,9 +210,8 @@ def test_where_nothing_bends_nothing_is_chosen() -> None:
 
 
 def test_frames_that_lie_alike_get_no_bend_and_a_sentence() -> None:
-    choice = choose_bends(bent_films([0.0] * 4, {"a20": 0.05}, {}, np.random.default_rng(3)), solved)
-    assert not choice.network.scanners[0].terms
-    even, odd = choice.remarks
+    bent, (even, odd) = choose_bends(bent_films([0.0] * 4, {"a20": 0.05}, {}, np.random.default_rng(3)), solved)
+    assert not bent.scanners[0].terms
     assert "a20, a11, a02, b20, b11, b02: all frames lie alike in the scanner" in even
     assert even.endswith("turned by 180 degrees.")
     assert odd.endswith("turned by 90 degrees.")
@@ -223,9 +222,9 @@ def test_two_photographs_are_enough_for_terms_that_they_tell() -> None:
     truth = Truth(stations=STATIONS[:2], attitudes=((0.0, 0.0, 0.0), (-0.05, 0.36, 1.6)), middle_mm=SCAN_MIDDLE_MM)
     points = field_points(np.random.default_rng(5), 30)
     network, _ = simulated(np.random.default_rng(4), truth, points=points, free={"k3": np.inf, "k5": np.inf})
-    choice = choose_bends(bend_in_scanner(network, {"a20": 0.04, "b11": -0.03}, {}), solved)
-    assert {"a20", "b11"} <= set(choice.network.scanners[0].terms)
-    assert not any("No bend of the scanner was estimated" in text for text in choice.remarks)
+    bent, remarks = choose_bends(bend_in_scanner(network, {"a20": 0.04, "b11": -0.03}, {}), solved)
+    assert {"a20", "b11"} <= set(bent.scanners[0].terms)
+    assert not any("No bend of the scanner was estimated" in text for text in remarks)
 
 
 def test_a_bend_of_given_terms_over_the_extent_of_the_scans() -> None:
