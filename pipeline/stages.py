@@ -29,7 +29,7 @@ from pipeline.publishing import Unpublished, unpublished
 from pipeline.report.data import ReportData
 from pipeline.report.load import adjusted_data, frame_data, measured_data, report_data
 from pipeline.report.page import write_frame_page, write_report
-from pipeline.results.adjustment_file import read_adjustment, write_adjustment
+from pipeline.results.adjustment_file import covariance_path, read_adjustment, write_adjustment
 from pipeline.results.comparator_file import (
     ComparatorPoint,
     read_comparator,
@@ -37,7 +37,6 @@ from pipeline.results.comparator_file import (
     read_pitches,
     write_comparator,
 )
-from pipeline.results.covariance_file import covariance_path
 from pipeline.results.measured_record import MeasuredScan, for_images, write_frames
 from pipeline.results.record_json import write_record
 from pipeline.summary import Summary, archive_summary, shard_summary, summarise

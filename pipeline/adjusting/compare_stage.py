@@ -17,9 +17,8 @@ from adjust.problem.parameter import Parameter
 from adjust.quality.lens_comparison import CameraCalibration, Comparison, Test, Use, compare, sigmas
 from pipeline.drawing import svg
 from pipeline.errors import InputError
-from pipeline.results.adjustment_file import observed_mm, read_adjustment
+from pipeline.results.adjustment_file import observed_mm, read_adjustment, read_own_covariance
 from pipeline.results.adjustment_record import AdjustmentRecord
-from pipeline.results.covariance_file import read_own_covariance
 from pipeline.results.record_json import write_record
 from pipeline.results.stage_files import DRIFT, ComparisonRecord, ParameterDifference, comparison_record
 from pipeline.text.files import check_writable

@@ -18,10 +18,9 @@ from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.files.project_tables import UNITS_MM
 from pipeline.resampling.canvas import FrameChain, image_chain
-from pipeline.results.adjustment_file import read_adjustment
+from pipeline.results.adjustment_file import Covariance, read_adjustment, read_own_covariance
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.comparator_file import ComparatorPoint, pixel_from_comparator, read_comparator, read_pitches
-from pipeline.results.covariance_file import Covariance, read_own_covariance
 from pipeline.types import Array
 
 if TYPE_CHECKING:

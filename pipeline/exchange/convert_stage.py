@@ -18,7 +18,13 @@ from pipeline.exchange.exchange_stage import check_folder, publish, readme
 from pipeline.files.camera_file import camera_text, read_camera
 from pipeline.files.mark_table import Picture, picture_file
 from pipeline.provenance import hash_content
-from pipeline.results.adjustment_file import observed_mm, read_adjustment
+from pipeline.results.adjustment_file import (
+    Covariance,
+    covariance_path,
+    observed_mm,
+    read_adjustment,
+    read_own_covariance,
+)
 from pipeline.results.adjustment_record import (
     CameraRecord,
     ConvertedFrom,
@@ -26,7 +32,6 @@ from pipeline.results.adjustment_record import (
     PrincipalPointRecord,
     Quantity,
 )
-from pipeline.results.covariance_file import Covariance, covariance_path, read_own_covariance
 from pipeline.results.record_json import json_text, plain_json
 from pipeline.text.files import read_bytes
 from pipeline.text.wording import did_you_mean, listed

@@ -22,10 +22,9 @@ from pipeline.files.camera_tables import Source
 from pipeline.files.earlier_calibration import EarlierCalibration
 from pipeline.files.mark_table import picture_writer
 from pipeline.files.project_file import Project
-from pipeline.results.adjustment_file import write_with_covariance
+from pipeline.results.adjustment_file import Covariance, read_own_covariance, write_with_covariance
 from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, FiducialRecord, Quantity
 from pipeline.results.comparator_file import read_comparator
-from pipeline.results.covariance_file import Covariance, read_own_covariance
 from pipeline.results.record_json import json_text
 from pipeline.text.files import write_atomically
 from pipeline.text.wording import counted, listed

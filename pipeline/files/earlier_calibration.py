@@ -13,9 +13,8 @@ from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.observations import Calibration
 from adjust.problem.parameter import Parameter
 from pipeline.files.camera_tables import SigmaTable
-from pipeline.results.adjustment_file import read_adjustment
+from pipeline.results.adjustment_file import Covariance, covariance_path, read_adjustment, read_covariance
 from pipeline.results.adjustment_record import CameraRecord, DistortionRecord
-from pipeline.results.covariance_file import Covariance, covariance_path, read_covariance
 from pipeline.text.tables import Table
 from pipeline.types import Array
 

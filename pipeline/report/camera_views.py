@@ -22,9 +22,9 @@ from pipeline.report.parameters import (
     term_rows,
 )
 from pipeline.report.vectors import contour_plot, coverage_plot, grid_mm, longest_vector, padded_plane, strokes_and_dots
+from pipeline.results.adjustment_file import Covariance
 from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, ScannerRecord
 from pipeline.results.assessment_record import ResidualRecord
-from pipeline.results.covariance_file import Covariance
 from pipeline.results.image_unit import ImageUnit
 from pipeline.types import Array
 

@@ -14,10 +14,10 @@ from measure.flags import Code, Reason, Status
 from measure.results import Covariance as MarkCovariance
 from measure.results import MarkMeasurement
 from pipeline.archive.verdicts import Verdict, frame_verdict, mark_verdict, scan_verdict
+from pipeline.results.adjustment_file import Covariance
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.assessment_record import ResidualRecord
 from pipeline.results.comparator_file import ComparatorPoint
-from pipeline.results.covariance_file import Covariance
 from pipeline.results.image_unit import FILM_UNIT, ImageUnit
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.results.stage_files import Check

@@ -10,8 +10,8 @@ from adjust.functional_model.transformation import Film, film_parameter_names
 from adjust.problem.parameter import Parameter
 from adjust.quality.fiducial_corrections import KEEPS_DISTANCES, corrections_to_given
 from pipeline.drawing import svg
+from pipeline.results.adjustment_file import Covariance
 from pipeline.results.adjustment_record import AdjustmentRecord, FiducialRecord
-from pipeline.results.covariance_file import Covariance
 from pipeline.text.wording import listed
 from pipeline.types import Array
 

@@ -21,8 +21,8 @@ from adjust.quality.lens_uncertainty import (
 )
 from pipeline.drawing import svg
 from pipeline.report.vectors import Plane, grid_mm, longest_vector, strokes_and_dots
+from pipeline.results.adjustment_file import Covariance
 from pipeline.results.adjustment_record import CameraRecord
-from pipeline.results.covariance_file import Covariance
 from pipeline.results.image_unit import FILM_UNIT, ImageUnit
 from pipeline.types import Array
 

@@ -41,7 +41,7 @@ from pipeline.report.frame_problems import (
 )
 from pipeline.report.frame_views import residuals_by_image
 from pipeline.report.verdict import suspect_rows
-from pipeline.results.adjustment_file import read_adjustment
+from pipeline.results.adjustment_file import read_adjustment, read_covariance
 from pipeline.results.comparator_file import (
     ComparatorPoint,
     describe_decisions,
@@ -51,7 +51,6 @@ from pipeline.results.comparator_file import (
     read_measurement_hash,
     read_pitches,
 )
-from pipeline.results.covariance_file import read_covariance
 from pipeline.results.measured_record import FailureCode, MeasuredScan
 from pipeline.results.stage_files import read_check
 from pipeline.text.wording import counted, did_you_mean, listed

@@ -13,8 +13,8 @@ from adjust.quality.significance import LEVEL
 from pipeline.report.data import ReportData
 from pipeline.report.lens import largest_effects_um, lens
 from pipeline.report.numbers import fixed, significant, value_and_sigma
+from pipeline.results.adjustment_file import Covariance
 from pipeline.results.adjustment_record import CameraRecord, GivenQuantity, GroupTestRecord, Quantity
-from pipeline.results.covariance_file import Covariance
 from pipeline.results.image_unit import FILM_UNIT, ImageUnit, pixel_intrinsics
 from pipeline.text.wording import capitalised
 from pipeline.types import Array

@@ -1,4 +1,4 @@
-"""Conversion of an adjustment to the record that `adjustment.json` holds."""
+"""Conversion of an adjustment to the record that `adjustment.json` holds, and to the arrays of `adjustment.npz`."""
 
 import math
 from collections import defaultdict
@@ -7,6 +7,7 @@ from dataclasses import replace
 from importlib.metadata import version
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Prior
@@ -58,14 +59,14 @@ from pipeline.results.assessment_record import (
     SuspectRecord,
     TestedGiven,
 )
-from pipeline.results.covariance_file import covariance_note
 from pipeline.results.record_json import record_from
-from pipeline.types import Array
+from pipeline.types import Array, Indices
 
 ANGLES = ("omega", "phi", "kappa", "angle")
 DEG_PER_RAD = 180.0 / math.pi
 UM_PER_MM = 1e3
 MOST_IMAGES = 500  # in larger networks projection_uncertainty takes too long to run with every adjustment
+AFFORDABLE = 3000  # largest number of quantities whose covariance is written as one matrix
 
 
 def joined_frames(adjustment: Adjustment) -> dict[str, JoinedFrameRecord]:
@@ -431,3 +432,71 @@ def _suspect(suspect: Suspect) -> SuspectRecord:
     tested = suspect.tested
     error = tuple(_scale(tested, axis) * value for axis, value in enumerate(suspect.error))
     return record_from(SuspectRecord, suspect, error=error, name=tested.name, **vars(tested))
+
+
+def covariance_arrays(adjustment: Adjustment) -> dict[str, NDArray[np.generic]]:
+    """Arrays of the covariance file by name; mm, object units, rad.
+
+    names (n), values (n) and matrix (n, n) hold all quantities if there are at most AFFORDABLE; otherwise those of
+    cameras and images; if these exceed it too, those of cameras. The remaining points (and images) are stored as
+    diagonal blocks, without covariances between them: point_names (p, 3), point_values (p, 3), point_matrices
+    (p, 3, 3), image_names (i, k) and so on, padded with empty names and zeros for images with fewer than k quantities.
+    """
+    whole, blocks = _parts(adjustment)
+    arrays = _named(adjustment, whole) | {"matrix": adjustment.sigma0**2 * adjustment.cofactor.part(whole)}
+    for kind, groups in blocks.items():
+        padded = np.full((len(groups), max(map(len, groups))), -1, dtype=np.intp)
+        for row, group in zip(padded, groups, strict=True):
+            row[: len(group)] = group
+        matrices = np.zeros((*padded.shape, padded.shape[1]))
+        lengths = (padded >= 0).sum(axis=1)
+        for length in np.unique(lengths):
+            cofactors = adjustment.cofactor.parts(padded[lengths == length, :length])
+            matrices[lengths == length, :length, :length] = adjustment.sigma0**2 * cofactors
+        named = _named(adjustment, padded) | {"matrices": matrices}
+        arrays |= {f"{kind}_{name}": array for name, array in named.items()}
+    return arrays | _cluster_arrays(adjustment)
+
+
+def _cluster_arrays(adjustment: Adjustment) -> dict[str, NDArray[np.generic]]:
+    """cluster_names (k), cluster_matrix (k, k) of the interior orientations, if an unmodelled error was estimated."""
+    keys = [key for key in adjustment.parameters if key.kind == "interior"] if adjustment.unmodelled_mm else []
+    matrix = adjustment.cluster_covariance_of(keys) if keys else None
+    if matrix is None:
+        return {}
+    return {"cluster_names": np.array([key.text for key in keys], dtype=np.str_), "cluster_matrix": matrix}
+
+
+def covariance_note(adjustment: Adjustment) -> str:
+    """State which parts of the covariance the file holds."""
+    count, alone = len(adjustment.parameters), " and every ".join(_parts(adjustment)[1])
+    if not alone:
+        return "adjustment.npz holds the covariance of all quantities."
+    whole = "cameras" if "image" in alone else "cameras and images"
+    return (
+        f"adjustment.npz holds the covariance of the {whole} together and of every {alone} by itself: the matrix of "
+        f"all {count} quantities would be too large."
+    )
+
+
+def _parts(adjustment: Adjustment) -> tuple[Indices, dict[str, list[Indices]]]:
+    """Positions of the quantities in the matrix, and by kind of those in each diagonal block."""
+    parameters = adjustment.parameters
+    whole = np.arange(len(parameters))
+    groups: dict[str, list[Indices]] = {}
+    # The quantities of a point or an image are contiguous and begin with X or X0.
+    for kind, kinds, first in (("point", ("point",), "X"), ("image", ("exterior", "film"), "X0")):
+        members = np.array([parameters[i].kind in kinds for i in whole], dtype=bool)
+        if len(whole) <= AFFORDABLE or not members.any():
+            continue
+        positions = whole[members]
+        begins = [j for j, i in enumerate(positions) if parameters[i].quantity == first]
+        groups[kind] = np.split(positions, begins[1:])
+        whole = whole[~members]
+    return whole, groups
+
+
+def _named(adjustment: Adjustment, positions: Indices) -> dict[str, NDArray[np.generic]]:
+    """Names and values at positions; "" and 0 at -1."""
+    names = np.array([*adjustment.names, ""], dtype=np.str_)
+    return {"names": names[positions], "values": np.append(adjustment.values, 0.0)[positions]}

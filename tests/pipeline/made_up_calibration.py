@@ -23,9 +23,9 @@ from measure.flags import Cause, Reason, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from pipeline import read_adjustment, write_adjustment
 from pipeline.report import ReportData, Thumbnail
+from pipeline.results.adjustment_file import read_covariance
 from pipeline.results.adjustment_record import FilmRecord
 from pipeline.results.comparator_file import ComparatorPoint
-from pipeline.results.covariance_file import read_covariance
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.results.stage_files import CameraCheck, Check, ComparedParameter, Estimate
 

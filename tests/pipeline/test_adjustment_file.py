@@ -12,8 +12,8 @@ import pytest
 from adjust import Adjustment, ObjectPoint, Prior
 from adjust.quality.run import Residuals
 from pipeline import InputError, read_adjustment, write_adjustment
-from pipeline.results import covariance_file
-from pipeline.results.covariance_file import covariance_path, read_covariance
+from pipeline.results import adjustment_content
+from pipeline.results.adjustment_file import covariance_path, read_covariance
 from pipeline.results.record_json import plain_json
 from pipeline.results.stage_files import (
     CameraCheck,
@@ -196,7 +196,7 @@ def test_a_large_network_is_in_blocks(adjustment: Adjustment, path: Path, monkey
         (len(adjustment.names) - 1, [*cameras, *images], ("point",)),
         (len(cameras), cameras, ("point", "image")),
     ):
-        monkeypatch.setattr(covariance_file, "AFFORDABLE", affordable)
+        monkeypatch.setattr(adjustment_content, "AFFORDABLE", affordable)
         write_adjustment(adjustment, path)
         covariance = read_covariance(path)
         assert sorted(each.text for each in covariance.parameters) == sorted(together)

@@ -21,7 +21,7 @@ from pipeline.exchange.saved_cameras import save_cameras
 from pipeline.files.project_file import read_project
 from pipeline.provenance import hash_file
 from pipeline.report.lens import ANGLES_DEG, certificate
-from pipeline.results.covariance_file import read_covariance
+from pipeline.results.adjustment_file import read_covariance
 
 CAMERA = """\
 name = "C"

@@ -13,7 +13,7 @@ from studies import parametrize_with_studies
 from test_adjust_stage import write_project
 
 from adjust import Parameter
-from pipeline.results.covariance_file import read_own_covariance
+from pipeline.results.adjustment_file import read_own_covariance
 
 GIVEN = {"1": (-106.0, 106.0), "2": (106.0, 106.0), "3": (106.0, -106.0), "4": (-106.0, -106.0), "5": (0.0, 112.0)}
 AFFINE = np.array([[1.001, 0.02], [-0.021, 0.999]])

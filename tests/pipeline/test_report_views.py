@@ -38,6 +38,7 @@ from pipeline.report.vectors import (
     coverage_plot,
     plane,
 )
+from pipeline.results.adjustment_file import Covariance
 from pipeline.results.adjustment_record import (
     CameraRecord,
     DistortionRecord,
@@ -47,7 +48,6 @@ from pipeline.results.adjustment_record import (
     Quantity,
 )
 from pipeline.results.assessment_record import ResidualRecord
-from pipeline.results.covariance_file import Covariance
 
 RESIDUAL = ResidualRecord("f1", "7", "target", *[0.0] * 16)
 

@@ -21,7 +21,7 @@ from pipeline.cli import DONE, LOOK
 from pipeline.files.opencv_file import read_lens
 from pipeline.rendered.scene_project import taking_camera_yaml
 from pipeline.report.camera_views import bend_field
-from pipeline.results.covariance_file import read_covariance
+from pipeline.results.adjustment_file import read_covariance
 from synthetic_images.film import frame_geometry, scanner_bend
 from synthetic_images.render import render_scene
 from synthetic_images.scene import Film, Scene, SceneCamera, SceneFiducial, SceneImage, TakingLens, Tones
