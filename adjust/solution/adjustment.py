@@ -560,8 +560,8 @@ def _coordinate_slips(
     critical = float(options.probabilities.critical(np.array([3]), len(given))[0]) * scale**2
     found = []
     for each in far if without.converged else ():
-        coordinates, point = [Parameter.point(each.name, axis) for axis in "XYZ"], network.point_by_id[each.name]
-        place, cofactor = without.values_of(coordinates), without.cofactor_of(coordinates)
+        at, point = without.run.problem.unknowns.point[each.name], network.point_by_id[each.name]
+        place, cofactor = without.values[at], without.cofactor.part(at)
         variances = [prior.sigma**2 for prior in point.priors if prior]
         weight: Array = np.asarray(np.linalg.inv(cofactor + np.diag(variances)), dtype=np.float64)
 

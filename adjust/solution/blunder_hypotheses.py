@@ -28,7 +28,7 @@ from adjust.problem.camera import Camera
 from adjust.problem.condition_equations import observed_in_camera
 from adjust.problem.estimates import adjusted_image, adjusted_places
 from adjust.problem.network import Network, ObjectPoint
-from adjust.problem.parameter import Parameter, shortened
+from adjust.problem.parameter import shortened
 from adjust.solution.result import Adjustment
 
 TOLERATED = 2.0  # factor on the given standard deviations up to which residuals need no explanation
@@ -236,10 +236,10 @@ def _middle_mm(network: Network, camera: Camera) -> float:
 
 def _distances(network: Network) -> Iterator[NetworkHypothesis]:
     """Hypothesis: the principal distance of a camera without an earlier calibration is wrong."""
-    calibrated = {parameter for each in network.calibrations for parameter in each.parameters}
+    calibrated = {(known.owner, known.quantity) for each in network.calibrations for known in each.parameters}
     for camera in network.cameras:
         given = camera.principal_distance_mm
-        if given is not None and np.isfinite(given.sigma) and Parameter.interior(camera.name, "c") not in calibrated:
+        if given is not None and np.isfinite(given.sigma) and (camera.name, "c") not in calibrated:
             free = replace(camera, principal_distance_mm=None)
             yield NetworkHypothesis(
                 f"the principal distance of camera {camera.name} is not the {given.value:g} mm that are given",
@@ -315,7 +315,7 @@ def _sentence(slips: Sequence[NetworkHypothesis], found: Adjustment, given: Adju
 
 def _found_distance(camera: str, given_mm: float, found: Adjustment) -> str:
     """Describe the estimated principal distance, and whether it is the given one in another unit or pixel pitch."""
-    c = found.value(Parameter.interior(camera, "c"))
+    c = float(found.values[found.run.problem.unknowns.camera[camera][0]])
     times = max(c / given_mm, given_mm / c)
     how = "long" if c < given_mm else "short"
     is_unit = any(abs(times / each - 1.0) < ROUND for each in PITCHES)
@@ -530,8 +530,8 @@ def _sides(result: Adjustment) -> dict[str, float]:
 
 def _principal_point(view: _CameraMarks, result: Adjustment, family: float) -> Iterator[str]:
     name, picture, kind = view.camera.name, view.picture, "outside the picture"
-    parameters = [Parameter.interior(name, axis) for axis in ("x0", "y0")]
-    found = result.values_of(parameters)
+    at = result.run.problem.unknowns.camera[name][1:3]
+    found = result.values[at]
     words = f"The principal point of camera {name} is found at ({found[0]:.4g}, {found[1]:.4g}) mm"
     if far := _far_from_given(view.camera, found, result, family):
         yield f"{words}, {far}"
@@ -559,7 +559,7 @@ def _far_from_given(camera: Camera, found: Array, result: Adjustment, family: fl
     if len(priors) < len(found):
         return ""
     given, sigma = np.array([(prior.value, prior.sigma) for prior in priors]).T
-    cofactor = result.cofactor_of([Parameter.interior(camera.name, axis) for axis in ("x0", "y0")])
+    cofactor = result.cofactor.part(result.run.problem.unknowns.camera[camera.name][1:3])
     size, axes = np.linalg.eigh((np.diag(sigma**2) - cofactor) / np.outer(sigma, sigma))
     along = axes.T @ ((found - given) / sigma)
     checked = size > 1e-6

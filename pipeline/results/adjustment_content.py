@@ -13,7 +13,7 @@ from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.problem.camera import Camera
-from adjust.problem.estimates import adjusted_image
+from adjust.problem.estimates import adjusted_image, observed_places
 from adjust.problem.network import EXTERIOR_NAMES, Image, ObjectPoint
 from adjust.problem.parameter import Kind, Parameter
 from adjust.quality.lens_uncertainty import projection_uncertainty
@@ -363,11 +363,10 @@ def _residuals(adjustment: Adjustment) -> tuple[ResidualRecord, ...]:
 
 def _camera_places(adjustment: Adjustment, xy_mm: Array) -> Array:
     """Transform comparator coordinates (n, 2) of all observations to camera coordinates (n, 2), mm."""
-    images = np.array(adjustment.network.observations.image)
     camera_mm = np.empty_like(xy_mm)
-    for name in sorted(set(images)):
-        rows = images == name
-        camera_mm[rows] = adjusted_image(adjustment, name).camera_from_comparator(xy_mm[rows])
+    for camera in adjustment.network.cameras:
+        rows, places_mm = observed_places(adjustment, camera.name, xy_mm)
+        camera_mm[rows] = places_mm
     return camera_mm
 
 
