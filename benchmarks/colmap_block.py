@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 import synthetic_images
 from adjust.initial_values.model_formation import absolute_orientation
 from benchmarks.harness import reseau, rms
-from pipeline.blocks.mapping import quiet_colmap
+from pipeline.blocks.block_stage import quiet_colmap
 from pipeline.rendered.scene_file import read_scene, render_project
 from pipeline.results.comparator_file import comparator_from_pixel
 from synthetic_images.film import frame_geometry

@@ -20,8 +20,7 @@ from scipy.ndimage import map_coordinates
 from adjust.functional_model.transformation import Film
 from benchmarks.harness import Row, rms
 from pipeline.resampling.canvas import FrameChain
-from pipeline.resampling.interpolation import Degree
-from pipeline.resampling.resample_stage import BEST, FAST, FrameScan, ResampleTask, resampled
+from pipeline.resampling.resample_stage import BEST, FAST, Degree, FrameScan, ResampleTask, resampled
 
 Array = NDArray[np.float64]
 Method = Callable[[Array, Array, Array], Array]

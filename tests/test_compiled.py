@@ -21,7 +21,7 @@ from adjust.linear_algebra.sparse_rows import Pattern, SharedEquations, SparseRo
 from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
 from pipeline.cli import DONE, run
-from pipeline.resampling.interpolation import Degree, spline_samples
+from pipeline.resampling.resample_stage import Degree, spline_samples
 
 needs_kernels = pytest.mark.skipif(compiled.kernels is None, reason=NO_COMPILER)
 Samples = NDArray[np.uint8 | np.uint16]

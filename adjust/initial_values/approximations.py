@@ -122,8 +122,7 @@ def _initial_values(network: Network) -> Approximations:
     if network.has_parts:
         return _joined_values(network)
     films = _film_transformations(network)
-    transformation = {name: parameters for name, (parameters, _) in films.items()}
-    mirrored = frozenset(name for name, (_, is_mirrored) in films.items() if is_mirrored)
+    transformation, mirrored = _by_image(films)
     frames = camera_frames(network, transformation, mirrored)
     used = [camera for camera in network.cameras if camera.name not in network.idle_cameras]
     resected = dict[str, Pose]()
@@ -152,13 +151,20 @@ def _joined_values(network: Network) -> Approximations:
     films |= _film_transformations(network)
     whole = whole_frames(network, films)
     found = _initial_values(whole) if whole.images else Approximations({}, {}, {}, {})
+    transformation, mirrored = _by_image(films)
     return replace(
         found,
         exterior={image.name: found.exterior[image.frame] for image in network.images if image.frame in found.exterior},
-        transformation={name: parameters for name, (parameters, _) in films.items()},
-        mirrored=frozenset(name for name, (_, is_mirrored) in films.items() if is_mirrored),
+        transformation=transformation,
+        mirrored=mirrored,
         joins=joins,
     )
+
+
+def _by_image(films: Mapping[str, FilmFit]) -> tuple[dict[str, Array], frozenset[str]]:
+    """Parameters by image, and the names of the mirrored scans."""
+    mirrored = frozenset(name for name, (_, is_mirrored) in films.items() if is_mirrored)
+    return {name: parameters for name, (parameters, _) in films.items()}, mirrored
 
 
 def _film_transformations(network: Network) -> dict[str, FilmFit]:
@@ -479,11 +485,9 @@ def whole_frames(network: Network, films: Mapping[str, FilmFit]) -> Network:
     for image in network.images:
         if image.name not in network.objectless_images:
             first.setdefault(image.frame, image)
-    observations, xy_mm = network.observations, network.straight_xy_mm.copy()
-    for i, image in enumerate(network.images):
-        rows = network.image_numbers == i
-        parameters, mirrored = films[image.name]
-        xy_mm[rows] = film_kind(image.transformation, mirrored).apply(parameters, xy_mm[rows])
+    frames, observations = camera_frames(network, *_by_image(films)), network.observations
+    xy_mm = network.straight_xy_mm.copy()
+    xy_mm[frames.rows] = frames.xy_mm
     frame_of = {image.name: image.frame for image in network.images}
     kept: dict[tuple[str, str], int] = {}
     for row in np.flatnonzero(~observations.is_fiducial):

@@ -24,14 +24,12 @@ from adjust.solution.result import Adjustment
 WEAK_MM = 0.1  # weak prior of every term in the trial, removed afterwards; it keeps terms not estimable small
 
 
-def bent_network(network: Network, terms: Sequence[str] | None = None, sigma_mm: float = np.inf) -> Network:
+def bent_network(network: Network, terms: Sequence[str], sigma_mm: float = np.inf) -> Network:
     """Add terms to every scanner of a network's images, over the extent of their observations.
 
-    terms: names; None: all smooth and combined terms that no film transformation absorbs. sigma_mm: standard deviation
-    of every term, given as 0.
+    sigma_mm: standard deviation of every term, given as 0.
     """
-    added = tuple(smooth_terms(_films(network)) if terms is None else terms)
-    return network_with_terms(network, dict.fromkeys(_scanners(network), added), sigma_mm)
+    return network_with_terms(network, dict.fromkeys(_scanners(network), terms), sigma_mm)
 
 
 def network_with_terms(network: Network, terms: Mapping[str, Sequence[str]], sigma_mm: float = np.inf) -> Network:

@@ -13,7 +13,7 @@ from adjust.functional_model.scanner import Bend
 from adjust.functional_model.transformation import FilmKind, film_kind
 from adjust.problem.further_observations import FurtherObservation, further_observations
 from adjust.problem.network import Approximations, Network, Transformation
-from adjust.problem.unknowns import Unknowns, list_unknowns
+from adjust.problem.unknowns import Reduction, Unknowns, list_unknowns
 
 _NOWHERE = np.full(3, -1, dtype=np.intp)
 ABSENT = -1  # position in a column that an observation does not use
@@ -25,6 +25,14 @@ def number(network: Network, approximations: Approximations, by_elements: bool =
     Raises AdjustmentError where a quantity has neither a value nor an approximation.
     """
     return Problem(network, list_unknowns(network, approximations), approximations.mirrored, by_elements)
+
+
+def number_reduced(
+    network: Network, approximations: Approximations, by_elements: bool = False
+) -> tuple["Problem", Reduction]:
+    """Number the quantities of a validated network in coordinates reduced to its centroid; see `number`."""
+    reduction = Reduction.to_centroid(network)
+    return number(reduction.network(network), reduction.approximations(approximations), by_elements), reduction
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from adjust.errors import DatumError
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.rotation import angles_near, rotation_from_vector
 from adjust.problem.network import Network, ObjectPoint
-from adjust.problem.parameter import Parameter, object_coordinate
+from adjust.problem.parameter import object_coordinate
 from adjust.problem.problem import Problem, State
 from adjust.rank_defect.directions import DATUM_DIRECTIONS
 
@@ -184,13 +184,13 @@ def free_motion(problem: Problem, state: State) -> Array:
 
 def held_as_known(network: Network, coordinates: Sequence[str]) -> Network:
     """Network for initial values: coordinates that are to be held, and have a value, count as known."""
-    held = {object_coordinate(text) for text in coordinates}
+    held = {(each.id, each.quantity) for each in map(object_coordinate, coordinates)}
     if not held:
         return network
     points = []
     for point in network.points:
         priors = zip("XYZ", point.priors, strict=True)
-        known = (p and Prior(p.value) if Parameter.point(point.id, axis) in held else p for axis, p in priors)
+        known = (p and Prior(p.value) if (point.id, axis) in held else p for axis, p in priors)
         points.append(ObjectPoint(point.id, *known))
     return replace(network, points=tuple(points))
 

@@ -24,8 +24,7 @@ from adjust.least_squares.malloc_tuning import keep_freed_memory, pause_cycle_se
 from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Network, ObjectPoint
 from adjust.problem.parameter import Parameter
-from adjust.problem.problem import Problem, number
-from adjust.problem.unknowns import Reduction
+from adjust.problem.problem import Problem, number, number_reduced
 from adjust.quality.variance_components import added_variance
 from adjust.rank_defect.datum import held_as_known
 from adjust.solution.blunder_hypotheses import (
@@ -312,8 +311,7 @@ class _Solver:
 
         doubted_points: points whose given coordinates are left out at first. plain: with the weights as given.
         """
-        reduction = Reduction.to_centroid(network)
-        problem = number(reduction.network(network), reduction.approximations(start), self.options.method == "elements")
+        problem, reduction = number_reduced(network, start, self.options.method == "elements")
         unknowns = problem.unknowns
         doubted = [int(position) for name in doubted_points for position in unknowns.point[name]]
         result = adjust_problem(problem, self.options.plain if plain else self.options, doubted=doubted)

@@ -15,8 +15,7 @@ from adjust.problem.estimates import NullDirection
 from adjust.problem.further_observations import error_free
 from adjust.problem.network import Approximations, Network
 from adjust.problem.parameter import Parameter
-from adjust.problem.problem import Problem, number
-from adjust.problem.unknowns import Reduction
+from adjust.problem.problem import Problem, number_reduced
 from adjust.quality.cofactor import free_cofactor
 from adjust.rank_defect.diagnosis import null_vectors
 from adjust.solution.options import Options
@@ -70,8 +69,8 @@ def plan(network: Network, values: Approximations, options: Options | None = Non
     """
     options = options or Options()
     validate_plan(network)
-    reduction = Reduction.to_centroid(network)
-    problem = _computed_problem(number(reduction.network(network), reduction.approximations(values)))
+    numbered, reduction = number_reduced(network, values)
+    problem = _computed_problem(numbered)
     result = adjust_problem(problem, options)
     singular = result.singular
     null = np.zeros((len(problem.unknowns), 0))

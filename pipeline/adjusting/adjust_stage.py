@@ -79,16 +79,16 @@ def add_scanner_bends(
     sigma_mm = settings.scanner_sigma_um / UM_PER_MM
     if settings.scanner == "auto":
         return choose_bends(network, adjusted, sigma_mm)
-    if settings.scanner == "bend":
-        return bent_network(network, None, sigma_mm), ()
-    possible = (*smooth_terms(films), *carriage_terms(films))
-    for term in settings.scanner:
+    smooth, carriage = smooth_terms(films), carriage_terms(films)
+    possible = (*smooth, *carriage)
+    terms = smooth if settings.scanner == "bend" else settings.scanner
+    for term in terms:
         if term not in possible:
             raise InputError(
                 f"{project.path}: [adjust] scanner names {term!r}, which the {' or '.join(sorted(films))} "
                 f"transformation of the films takes; it leaves {', '.join(possible) or 'no term'}."
             )
-    return bent_network(network, settings.scanner, sigma_mm), ()
+    return bent_network(network, terms, sigma_mm), ()
 
 
 def name_scanners(project: Project, network: Network) -> Network:

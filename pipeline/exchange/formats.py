@@ -13,10 +13,10 @@ LARGEST_MISFIT_PX = 0.05  # of a lens in another program's model: a third of the
 
 MODULES = {  # by format: where its functions write_FORMAT and import_FORMAT, and its convention FORMAT, are
     **dict.fromkeys(("csv", "parquet"), "tables"),
-    **dict.fromkeys(("opencv", "colmap"), "pinhole_formats"),
+    **dict.fromkeys(("opencv", "colmap"), "pinhole"),
     **dict.fromkeys(("micmac", "mmvii"), "micmac_format"),
     "metashape": "metashape_format",
-    "asp": "pinhole_formats",
+    "asp": "pinhole",
     "bingo": "tables",
     "geojson": "geojson_format",
     "certificate": "certificate",

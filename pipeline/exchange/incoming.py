@@ -12,7 +12,6 @@ import numpy as np
 from adjust.functional_model.lens import Distortion, Prior
 from pipeline.errors import InputError
 from pipeline.exchange.formats import Convention
-from pipeline.exchange.pinhole import Y_DOWN_Z_FORWARD
 from pipeline.files.camera_file import CameraFile, GivenFiducial
 from pipeline.files.camera_tables import DEFAULT_SIGMA_MM
 from pipeline.text.files import read_bytes
@@ -21,6 +20,7 @@ from pipeline.types import Array
 Element = ElementTree.Element
 Content: TypeAlias = "str | float | Array | Mapping[str, Content] | Sequence[tuple[str, Content]]"
 
+Y_DOWN_Z_FORWARD = np.diag([1.0, -1.0, -1.0])  # from the camera's axes (y up, looking along -z) to these programs' axes
 DEEPEST = 100  # largest nesting depth of elements: no format here has ten
 
 

@@ -12,6 +12,7 @@ from pipeline.errors import InputError
 from pipeline.exchange.block import Block, OutFrame
 from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.exchange.incoming import (
+    Y_DOWN_Z_FORWARD,
     Content,
     Element,
     ForeignMark,
@@ -25,7 +26,6 @@ from pipeline.exchange.incoming import (
 )
 from pipeline.exchange.pinhole import (
     BROWN,
-    Y_DOWN_Z_FORWARD,
     FittedLens,
     checked_misfits,
     frame_corners_mm,

@@ -16,10 +16,10 @@ from pipeline.results.comparator_file import comparator_from_pixel, pixel_from_c
 from pipeline.text.files import read_bytes
 from pipeline.types import Array
 
-FISHEYE = "fisheye"  # model of cv2.fisheye, also called "equidistant", and the key that ROS and others use
+FISHEYE_MODEL = "fisheye"  # model of cv2.fisheye, also called "equidistant", and the key that ROS and others use
 COVARIANCE = "intrinsics_covariance"  # key in camera.yaml: covariance of fx, fy, cx, cy and the distortion coefficients
 MOST_MB = 4
-_FISHEYES = (FISHEYE, "equidistant", "kannala_brandt")  # values of distortion_model
+_FISHEYES = (FISHEYE_MODEL, "equidistant", "kannala_brandt")  # values of distortion_model
 _OPENCV = ("plumb_bob", "rational_polynomial", "radtan", "brown_conrady", "pinhole", "opencv", "")
 _MATRIX = ("camera_matrix", "K", "Camera_Matrix", "cameraMatrix", "M1")
 _LENS = ("distortion_coefficients", "D", "Distortion_Coefficients", "distCoeffs", "D1")

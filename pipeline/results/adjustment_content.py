@@ -179,7 +179,7 @@ def adjustment_record(
         points={
             point.id: _point(adjustment, point)
             for point in network.points
-            if adjustment.has(Parameter.point(point.id, "X"))
+            if point.id in adjustment.run.problem.unknowns.point
         },
         residuals=_residuals(adjustment),
         refraction=network.line_of_sight.refraction,
@@ -281,16 +281,17 @@ def _tested(quantity: Quantity, test: SignificanceTest | None) -> Quantity:
 
 
 def _image(adjustment: Adjustment, image: Image) -> ImageRecord:
+    film_keys = [Parameter.film(image.name, name) for name in film_parameter_names(image.transformation)]
+    exterior_keys = [Parameter.exterior(image.frame, element) for element in EXTERIOR_NAMES]
     film = {}
-    for parameter in film_parameter_names(image.transformation):
-        key, scale = (f"{parameter}_deg", DEG_PER_RAD) if parameter in ANGLES else (parameter, 1.0)
-        film[key] = _quantity(adjustment, Parameter.film(image.name, parameter), None, scale)
+    for key in film_keys:
+        name, scale = (f"{key.quantity}_deg", DEG_PER_RAD) if key.quantity in ANGLES else (key.quantity, 1.0)
+        film[name] = _quantity(adjustment, key, None, scale)
     elements, known = [], image.exterior
-    for i, element in enumerate(EXTERIOR_NAMES):
+    for i, key in enumerate(exterior_keys):
         is_antenna = known is not None and known.has_antenna and i < 3
         given = None if known is None or is_antenna else Prior(float(known.values[i]), float(known.sigmas[i]))
-        scale = DEG_PER_RAD if element in ANGLES else 1.0
-        elements.append(_quantity(adjustment, Parameter.exterior(image.frame, element), given, scale))
+        elements.append(_quantity(adjustment, key, given, DEG_PER_RAD if key.quantity in ANGLES else 1.0))
     if image.name in adjustment.network.unoriented:
         elements = [replace(each, sigma=math.nan) for each in elements]
     return ImageRecord(
@@ -306,12 +307,11 @@ def _image(adjustment: Adjustment, image: Image) -> ImageRecord:
 
 def _point(adjustment: Adjustment, point: ObjectPoint) -> PointRecord:
     """Coordinates of a point with their priors; the deflection of a bent board is added."""
-    given = {"X": point.X, "Y": point.Y, "Z": point.Z}
-    place = {axis: _quantity(adjustment, Parameter.point(point.id, axis), prior) for axis, prior in given.items()}
+    keys = [Parameter.point(point.id, axis) for axis in "XYZ"]
+    place = {key.quantity: _quantity(adjustment, key, prior) for key, prior in zip(keys, point.priors, strict=True)}
     for board in adjustment.network.boards:
         if point.id in board.places:
-            unknowns = [Parameter.point(point.id, axis) for axis in "XYZ"]
-            unknowns += [Parameter.board(board.name, each) for each in board.names]
+            unknowns = [*keys, *(Parameter.board(board.name, each) for each in board.names)]
             by_unknowns = np.hstack([np.eye(3), board.lift_directions[point.id].T])
             values = by_unknowns @ adjustment.values_of(unknowns)
             variances = np.diag(by_unknowns @ adjustment.cofactor_of(unknowns) @ by_unknowns.T)

@@ -30,8 +30,7 @@ from pipeline.review.camera_drawing import (
     place_frame,
     save_drawing,
 )
-from pipeline.review.drawing_view import DrawingAnswers, take_step
-from pipeline.review.mark_handles import add_vertex, first_drawing, handles, remove_part
+from pipeline.review.drawing_view import DrawingAnswers, add_vertex, first_drawing, handles, remove_part, take_step
 from pipeline.review.pictures import Pictures
 from pipeline.review.session import Session
 

@@ -17,8 +17,7 @@ from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.transformation import Film
 from measure import MeasurementError, open_scan
 from pipeline.resampling.canvas import FrameChain, outline_canvas, scan_places
-from pipeline.resampling.interpolation import open_source
-from pipeline.resampling.resample_stage import BEST, FAST, FrameScan, ResampleTask, resampled
+from pipeline.resampling.resample_stage import BEST, FAST, FrameScan, ResampleTask, open_source, resampled
 
 Array = NDArray[np.float64]
 

@@ -36,15 +36,20 @@ from measure.tie_points.features import TieFrame
 from measure.tie_points.find_points import TieOptions, measure_ties
 from measure.tie_points.joins import measure_joins
 from pipeline import InputError, build_network, read_images, read_measurement, read_project
-from pipeline.blocks.block_stage import A_CELL, CELLS, feature_precision, oriented_by_control, tie_marks, written_block
-from pipeline.blocks.mapping import (
+from pipeline.blocks.block_stage import (
+    A_CELL,
+    CELLS,
     BlockPicture,
     BlockScan,
     Mapped,
     Sight,
     camera_lattice,
     camera_params,
+    feature_precision,
+    oriented_by_control,
+    tie_marks,
     write_pictures,
+    written_block,
 )
 from pipeline.exchange.incoming import fiducial_camera
 from pipeline.files.camera_file import CameraFile
