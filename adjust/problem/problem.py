@@ -119,7 +119,7 @@ class Problem:
     # explicit function of the unknowns (adjustment by elements, of indirect observations)
     by_elements: bool = False
     # standard deviations of pseudo-observations that hold free unknowns near their given values, by position (see
-    # `rank_defect.flat_valleys`). They are not observations and do not appear in the result.
+    # `rank_defect.diagnosis`). They are not observations and do not appear in the result.
     pseudo_observed: Mapping[int, float] = field(default_factory=dict)
 
     @cached_property

@@ -22,7 +22,7 @@ from adjust.problem.estimates import NullDirection
 from adjust.problem.further_observations import square_sum
 from adjust.problem.problem import ABSENT, Problem, State
 from adjust.quality.tested import TestedUnits, Weighting
-from adjust.rank_defect.flat_valleys import pseudo_square_sum
+from adjust.rank_defect.diagnosis import pseudo_square_sum
 
 UNCHECKED = 1e-9  # redundancy below which an observation is unchecked
 UM_PER_MM = 1000.0

@@ -60,7 +60,7 @@ from adjust.rank_defect.datum import (
     minimal_datum,
     object_datum,
 )
-from adjust.rank_defect.flat_valleys import held_directions, inseparable
+from adjust.rank_defect.diagnosis import held_directions, inseparable
 from adjust.solution.explanations import Explanation, explain
 from adjust.solution.object_hypotheses import diameter_notes
 from adjust.solution.options import Options

@@ -17,8 +17,7 @@ from adjust.quality.reliability import Snooping
 from adjust.quality.run import GrossError, Run
 from adjust.quality.tested import NO_WEIGHT, TestedUnits, WeightFunction, Weighting, robust_weights
 from adjust.quality.variance_components import refined_factors
-from adjust.rank_defect.diagnosis import singular_directions
-from adjust.rank_defect.flat_valleys import REACHES, edge_motions, is_contradicted, unresolved
+from adjust.rank_defect.diagnosis import REACHES, edge_motions, is_contradicted, singular_directions, unresolved
 from adjust.solution.options import Options
 
 ROUNDS = 30  # largest number of rounds of robust estimation, variance components or data snooping

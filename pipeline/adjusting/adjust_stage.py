@@ -12,8 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from adjust.functional_model.scanner import carriage_terms, smooth_terms
-from adjust.model_selection.candidates import Candidate
-from adjust.model_selection.model_choice import Choice, choose
+from adjust.model_selection.model_choice import Candidate, Choice, choose
 from adjust.model_selection.scanner_choice import bent_network, choose_bends
 from adjust.problem.estimates import adjusted_image, adjusted_places
 from adjust.problem.network import Network

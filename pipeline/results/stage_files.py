@@ -10,8 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from adjust.model_selection.candidates import Candidate, Model
-from adjust.model_selection.model_choice import Choice
+from adjust.model_selection.model_choice import Candidate, Choice, Model
 from adjust.quality.lens_comparison import CameraCalibration, Comparison, Test, sigmas
 from pipeline.results.record_json import Finite, Number, Sigma, Whole, read_record
 from pipeline.types import Array

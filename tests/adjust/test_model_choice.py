@@ -19,8 +19,19 @@ from networks import (
 )
 
 from adjust import Distortion, Options, Prior, adjust, approximate
-from adjust.model_selection.candidates import Candidate, CrossValidation, Model, f_test, lenses, simplest_sufficient
-from adjust.model_selection.model_choice import Choice, choose, cross_validate, folds, weighted_network
+from adjust.model_selection.model_choice import (
+    Candidate,
+    Choice,
+    CrossValidation,
+    Model,
+    choose,
+    cross_validate,
+    f_test,
+    folds,
+    lenses,
+    simplest_sufficient,
+    weighted_network,
+)
 from adjust.problem.estimates import adjusted_image
 from adjust.problem.network import Network, Transformation
 from adjust.quality.tested import WeightFunction
