@@ -34,6 +34,7 @@ _THOROUGHLY = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 _DRAWINGS = 3  # random seeds tried for a second board: one in twenty missed one at the edge
 _INTO_BORDER = 1.4  # in squares beyond the last crossings, where the light border is sampled
 _LIGHT_BORDER = 0.4  # fraction of the contrast by which the border may be darker than the light squares
+_ACROSS_END, _END_TOLERANCE = np.linspace(0.5, 1.5, 41), 0.12  # in squares: a cover's edge is no end of the squares
 _MOST = 0.85  # fraction of the places along a line
 _PLAIN_CORNERS = 8  # corners of a board of markers: two markers, which are never false alarms
 _LEAST = 3  # smallest number of lines of a chessboard in either direction
@@ -231,7 +232,7 @@ def _are_alike(naming: Integers, other: Integers, spec: ChessboardSpec) -> bool:
 
 
 def _has_border(picture: Bytes, grid: Array) -> bool:
-    """Whether a light border without squares lies beyond the squares before a grid's first row."""
+    """Whether a light border without squares begins where the whole squares before a grid's first row end."""
     middles, outward = (grid[0, 1:] + grid[0, :-1]) / 2, grid[0] - grid[1]
     step = (outward[1:] + outward[:-1]) / 2
 
@@ -251,7 +252,12 @@ def _has_border(picture: Bytes, grid: Array) -> bool:
     light = float(np.max(squares[known]))
     alternate = np.sign(contrast) * alternation > _CROSSING * abs(contrast)
     is_light = border[known] > light - _LIGHT_BORDER * abs(contrast)
-    return bool(contrast and alternate.mean() >= _MOST and is_light.mean() >= _MOST)
+    if not (contrast and alternate.mean() >= _MOST and is_light.mean() >= _MOST):
+        return False
+    is_dark = known & (squares < light - abs(contrast) / 2)
+    is_darker = np.stack([grey(middles + beyond * step) for beyond in _ACROSS_END]) < (squares + border) / 2
+    lengths = _ACROSS_END[0] + is_darker.mean(axis=0) * np.ptp(_ACROSS_END)
+    return bool(np.mean(np.abs(lengths[is_dark] - 1.0) < _END_TOLERANCE) >= _MOST)
 
 
 def _refusal(spec: ChessboardSpec, pattern: WholePattern | None) -> str:

@@ -65,11 +65,13 @@ class Comparison:
     off_px : (n, 2) observed minus predicted.
     chance : (n,) p-value of that deviation.
     covariance_px2 : (n, 2, 2) of off_px for exact object coordinates.
+    printed_off_px : (n, 2) observed minus the place of the given coordinates, moved off the sheet only.
     """
 
     off_px: Array
     chance: Array
     covariance_px2: Array
+    printed_off_px: Array
 
 
 def compare_targets(
@@ -90,7 +92,7 @@ def compare_targets(
     fits = [_regression(_design(targets, size_px, bending), offsets, targets, covariance_px2) for bending in _BENDING]
     best = min(fits, key=lambda fit: float(np.median(np.linalg.norm(fit.off_px, axis=1))))
     own = covariance_px2 + best.more_px2[:, None, None] * np.eye(2)
-    return Comparison(best.off_px, _p_values(best, targets), own + best.predicted_px2)
+    return Comparison(best.off_px, _p_values(best, targets), own + best.predicted_px2, best.off_px)
 
 
 def _design(targets: TargetPlaces, size_px: tuple[int, int], bending: float) -> Array:
@@ -217,7 +219,9 @@ class ImagePoints:
         known = self.by_point @ covariance @ self.by_point.swapaxes(1, 2)
         places = self.targets.places_px + moved
         targets = replace(self.targets, places_px=places, covariance_px2=known, is_claim=False)
-        return compare_targets(targets, self.observed_px, self.covariance_px2, self.size_px)
+        compared = compare_targets(targets, self.observed_px, self.covariance_px2, self.size_px)
+        along_sheet = np.einsum("nij,nj->ni", self.by_point[..., :2], off[:, :2])
+        return replace(compared, printed_off_px=compared.off_px + along_sheet)
 
 
 def compare_images(images: Sequence[ImagePoints], xyz: Array) -> list[Comparison]:

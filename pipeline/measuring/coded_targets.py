@@ -242,13 +242,18 @@ def check_sheet(project: Project, scans: Sequence[MeasuredScan]) -> tuple[Measur
     if not images:
         return tuple(scans)
     shown = Counter(int(point) for image in images.values() for point in image.index)
+    named_by_place = project.targets is not None and project.targets.board is not None
     names, checked = list(sheet), {scan.frame.image: scan for scan in scans}
     for (name, image), one in zip(images.items(), compare_images(list(images.values()), places), strict=True):
         most_px = FLAT * float(np.hypot(*np.ptp(image.targets.places_px, axis=0)))
         far_px, p_values = np.hypot(*one.off_px.T).tolist(), (shown.total() * one.chance).tolist()
+        # Codes name their points whatever the coordinates are; a board's points are named by their places.
+        printed_px = np.hypot(*one.printed_off_px.T) if named_by_place else np.zeros(len(far_px))
         verdicts = {
-            names[point]: (off_px, p, shown[point] - 1, off_px > most_px)
-            for point, off_px, p in zip(image.index.tolist(), far_px, p_values, strict=True)
+            names[point]: (off_px, p, shown[point] - 1, off_px > most_px, on_sheet_px if on_sheet_px > most_px else 0.0)
+            for point, off_px, p, on_sheet_px in zip(
+                image.index.tolist(), far_px, p_values, printed_px.tolist(), strict=True
+            )
         }
         scan = checked[name]
         checked[name] = scan.changed(
@@ -284,12 +289,18 @@ def _sheet_image(scan: MeasuredScan, row: Mapping[str, int]) -> SheetImage:
     )
 
 
-def _tested_mark(mark: MarkMeasurement, off_px: float, chance: float, others: int, is_beyond: bool) -> MarkMeasurement:
+def _tested_mark(
+    mark: MarkMeasurement, off_px: float, chance: float, others: int, is_beyond: bool, misplaced_px: float
+) -> MarkMeasurement:
     """Set the status of a mark by its distance from its place and p-value, of all images; others: that show the point;
-    is_beyond: farther off than the point can lie off its sheet."""
+    is_beyond: farther off than the point can lie off its sheet; misplaced_px: as far off in all images, or 0."""
     # Without another image, the mark and the point on the sheet may be at fault; with few others, any of them.
     if chance > SHEET_POINT_OFF_PLACE:
-        return mark
+        where = (
+            f"another mark, or the board is damaged: {misplaced_px:.2f} px from the point's place on it in all pictures"
+        )
+        rejected = replace(mark, status=Status.REJECTED, reason=Reason(where, Code.OFF_PLACE))
+        return rejected if misplaced_px else mark
     witnesses = "the sheet's other points" + (" and other pictures" if others else "")
     how = f"it lies {off_px:.2f} px from where {witnesses} put it"
     if (others >= _WITNESSES or is_beyond) and chance < SHEET_POINT_ELSEWHERE:

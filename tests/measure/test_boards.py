@@ -205,6 +205,20 @@ def test_a_part_of_a_chessboard_that_may_be_another_is_refused(
     assert "nothing tells which part it is" in board.reason
 
 
+@parametrize_with_studies("covered_mm", [28.0, 31.0, 34.0], quick=(1,))
+def test_the_edge_of_what_covers_a_board_is_not_where_its_squares_end(
+    large_board: tuple[Array, dict[str, Array]], covered_mm: float
+) -> None:
+    """Two columns are covered as lightly as paper, to beside the third at 48 mm, and two lie outside of the picture."""
+    picture, truth = large_board[0].copy(), large_board[1]
+    col, row = np.indices(picture.T.shape)
+    x, _ = mapped(board_from_pixel(8.0, 3e-4), np.stack([col, row], axis=-1).reshape(-1, 2)).T
+    picture[covered_mm > x.reshape(col.shape).T + 96.0] = 38000.0
+    end = int(min(truth[f"r{row}c7"][0] for row in range(LARGE.rows))) - 4
+    board = measure_board(make_scan(picture[:, :end]), LARGE)
+    assert not any(mark.status.is_observation for mark in board.marks)
+
+
 def test_a_board_whose_outer_corners_lie_outside_is_refused_in_words_that_fit(
     large_board: tuple[Array, dict[str, Array]],
 ) -> None:

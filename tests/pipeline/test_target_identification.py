@@ -244,7 +244,7 @@ def test_coordinates_in_another_unit_than_the_project_says(scenes: dict[str, Pat
 
 
 COLUMNS, ROWS, WIDTH, HEIGHT, NOISE_PX = 9, 8, 2200, 1700, 0.05
-BUCKLED, MISPRINTED = "r2c3", "r5c6"
+BUCKLED, MISPRINTED, PATCHED = "r2c3", "r5c6", "r6c2"
 
 
 def board(folder: Path) -> Project:
@@ -268,13 +268,16 @@ def view_points(rng: np.random.Generator, xyz: Array) -> Array:
     return np.asarray(bent * 2000.0 + (WIDTH / 2, HEIGHT / 2) + rng.normal(0.0, NOISE_PX, ideal.shape))
 
 
-def measure_picture(rng: np.random.Generator, project: Project, name: str, wrong: dict[str, float]) -> MeasuredScan:
-    """One picture, some of its points so many px off in some direction."""
+def measure_picture(
+    rng: np.random.Generator, project: Project, name: str, wrong: dict[str, float], patched_mm: float = 0.0
+) -> MeasuredScan:
+    """One picture, some of its points so many px off in some direction; one crossing of another place on the board."""
     targets = present(project.targets)
     assert targets.board is not None
     xyz = {id: np.array(place) for id, place in targets.board.object_points().items()}
     xyz[BUCKLED] = xyz[BUCKLED] + (0.0, 0.0, 1.0)
     xyz[MISPRINTED] = xyz[MISPRINTED] + (0.4, -0.3, 0.0)
+    xyz[PATCHED] = xyz[PATCHED] + (0.6 * patched_mm, 0.8 * patched_mm, 0.0)
     marks = []
     for id, place in zip(xyz, view_points(rng, np.array(list(xyz.values()))), strict=True):
         angle = rng.uniform(0.0, 6.28)
@@ -307,6 +310,16 @@ def test_what_one_picture_alone_shows_off_its_place_is_refused(tmp_path: Path) -
     assert {id for _, id in doubted} <= {"r3c4", BUCKLED, MISPRINTED}
     reason = next(mark.reason for mark in alone[0].frame.marks if mark.point == "r3c4")
     assert "no other picture tells" in reason
+
+
+def test_a_crossing_that_is_elsewhere_on_the_board_in_all_pictures_is_refused(tmp_path: Path) -> None:
+    rng, project = np.random.default_rng(6), board(tmp_path)
+    checked = check_sheet(project, [measure_picture(rng, project, f"p{k}", {}, patched_mm=4.0) for k in range(4)])
+    assert status(checked, Status.REJECTED) == {(f"p{k}", PATCHED) for k in range(4)}
+    assert not status(checked, Status.WEAK)
+    reason = next(mark.reason for mark in checked[0].frame.marks if mark.point == PATCHED)
+    assert "the board is damaged" in reason
+    assert "in all pictures" in reason
 
 
 @pytest.mark.parametrize("drawn_before", [12, 19, 120])
