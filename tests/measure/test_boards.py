@@ -211,7 +211,7 @@ def test_the_edge_of_what_covers_a_board_is_not_where_its_squares_end(
 ) -> None:
     """Two columns are covered as lightly as paper, to beside the third at 48 mm, and two lie outside of the picture."""
     picture, truth = large_board[0].copy(), large_board[1]
-    col, row = np.indices(picture.T.shape)
+    col, row = np.indices(picture.T.shape, float)
     x, _ = mapped(board_from_pixel(8.0, 3e-4), np.stack([col, row], axis=-1).reshape(-1, 2)).T
     picture[covered_mm > x.reshape(col.shape).T + 96.0] = 38000.0
     end = int(min(truth[f"r{row}c7"][0] for row in range(LARGE.rows))) - 4
