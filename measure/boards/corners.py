@@ -28,7 +28,7 @@ from measure.flags import NO_REASON, Code, Reason
 from measure.matching.gauss_newton import UNDETERMINED, UNSETTLED
 from measure.matching.models import PIXEL_VARIANCE_PX2
 from measure.matching.window import ScanWindow
-from measure.noise.noise_model import influence_covariances
+from measure.noise.noise_model import covariance_along, influence_covariances
 from measure.noise.robust_estimation import gauss_newton_step, robust_scale, tukey_weights
 
 Surface = Callable[[Single, Single, Single], tuple[Single, Single, Single, Single]]
@@ -140,6 +140,7 @@ class Corner:
     noise_dn : standard deviation of one pixel's noise.
     blur_px : standard deviation of the blur.
     damaged_fraction : fraction of the area rejected as outliers.
+    misfit : root of the covariance of neighbouring residuals over the contrast, outliers included. Noise has none.
     moved_px : distance from the start of the fit.
     junction_px : (2,) from `junctions`; None where not found, and for corners other than crossings.
     """
@@ -150,6 +151,7 @@ class Corner:
     noise_dn: float
     blur_px: float
     damaged_fraction: float
+    misfit: float
     moved_px: float
     reason: Reason = NO_REASON
     junction_px: Array | None = None
@@ -267,6 +269,7 @@ class _CornerFits:
             self._pictures(influence), self._pictures(residuals), self._pictures(used), self.unknowns
         )
         covariances = (covariances + covariances.swapaxes(1, 2)) / 2
+        shared_dn2 = covariance_along(self._pictures(residuals * (area > 0)), self._pictures(area > 0), 1)
         fails = np.array([bool(reason) for reason in self.reasons]) | (used.sum(axis=1) <= self.unknowns)
         covariances[fails], noise_dn = np.inf, np.where(fails, np.nan, np.sqrt(variances))
         rounding_dn = np.finfo(np.float32).eps * np.abs(self.linear[:, 1])  # for a uniform window without noise
@@ -288,6 +291,7 @@ class _CornerFits:
                 noise_dn=float(noise_dn[number]),
                 blur_px=float(np.sqrt(max(self.variance[number] - PIXEL_VARIANCE_PX2, 0.0))),
                 damaged_fraction=float(1 - self.weights[number].sum() / max(area[number].sum(), 1e-9)),
+                misfit=float(np.sqrt(max(shared_dn2[number], 0.0)) / max(2 * abs(self.linear[number, 0]), 1e-9)),
                 moved_px=float(np.hypot(*(self.center[number] - self.start[number]))),
                 reason=self.reasons[number],
                 junction_px=None if np.isnan(junction[0]) else junction + self.origin[number],

@@ -43,6 +43,10 @@ _MARKER_REACH = 0.8  # fraction of a marker's black border, or of the gap around
 _NEIGHBOURS = 4  # nearest crossings along the rows and columns
 _FEWEST_CROSSINGS = 30  # needed to distinguish coma from noise
 _WEAK_DAMAGE = 0.25  # fraction of the pixels around a corner: if more are rejected the corner is weak
+_WEAK_MISFIT = (
+    0.075  # structure left over, in contrasts: up to 0.065 on real boards; 0.07 to 0.4 where edges of shadows,
+)
+# lines or specks had moved a corner by more than five standard deviations
 
 
 @dataclass(frozen=True)
@@ -273,10 +277,13 @@ def _corner_mark(name: str, corner: Corner | None, missing: Reason) -> MarkMeasu
     }
     if corner.junction_px is not None:
         quality |= {"junction_col_px": corner.junction_px[0], "junction_row_px": corner.junction_px[1]}
-    weak = corner.damaged_fraction > _WEAK_DAMAGE
-    message = f"{100 * corner.damaged_fraction:.0f} % of the pixels about it do not fit"
-    reason = Reason(message, Code.COVERED) if weak else NO_REASON
-    status = Status.WEAK if weak else Status.MEASURED
+    reason = NO_REASON
+    if corner.damaged_fraction > _WEAK_DAMAGE:
+        reason = Reason(f"{100 * corner.damaged_fraction:.0f} % of the pixels about it do not fit", Code.COVERED)
+    elif corner.misfit > _WEAK_MISFIT:
+        share = f"{100 * corner.misfit:.0f} % of its contrast"
+        reason = Reason(f"a shadow, dirt or other edges about it: they leave {share} unexplained", Code.COVERED)
+    status = Status.WEAK if reason else Status.MEASURED
     return MarkMeasurement(
         name, "target", corner.center_px, Covariance.from_noise(corner.covariance_px2), status, reason, quality
     )

@@ -115,7 +115,7 @@ def influence_covariances(
     kept, count = np.where(used, residuals, 0.0), np.maximum(used.sum(axis=(1, 2)), 1)
     squares = (kept**2).sum(axis=(1, 2))
     variances = squares / np.maximum(count - unknowns, 1)
-    correlation = _covariance_along(kept, used, 1) / np.maximum(squares / count, 1e-300)
+    correlation = covariance_along(kept, used, 1) / np.maximum(squares / count, 1e-300)
     flat = influences.astype(np.float32).reshape(*influences.shape[:2], -1)
     covariances = variances[:, None, None] * (flat @ flat.swapaxes(1, 2))
     coloured = np.abs(correlation) >= 3 / np.sqrt(2 * count)
@@ -159,7 +159,7 @@ def as_if_white(
     count, kept = max(int(used.sum()), 1), np.where(used, residuals, 0.0)
     squares = float((kept**2).sum())
     variance = squares / max((count if information is None else information) - unknowns, 1)
-    correlation = float(_covariance_along(kept, used, 1)) / (squares / count) if squares else 0.0
+    correlation = float(covariance_along(kept, used, 1)) / (squares / count) if squares else 0.0
     return NoiseModel(variance, np.array([[variance]]), correlation), abs(correlation) < 3 / np.sqrt(2 * count)
 
 
@@ -169,7 +169,7 @@ def is_textured(residuals: Array, used: Mask, floor_dn: float) -> bool:
     kept = np.where(used, residuals, 0.0)
     if not kept.any():
         return False
-    return bool(_covariance_along(kept, used, REACH_PX) > _TEXTURE * max((kept**2).sum() / used.sum(), floor_dn**2))
+    return bool(covariance_along(kept, used, REACH_PX) > _TEXTURE * max((kept**2).sum() / used.sum(), floor_dn**2))
 
 
 def may_be_noise(off: Array, covariance: Array) -> bool:
@@ -219,7 +219,7 @@ def padded(shape: tuple[int, ...], reach: int) -> list[int]:
     return [fft.next_fast_len(size + reach, real=True) for size in shape]
 
 
-def _covariance_along(kept: Array, used: Mask, lag: int) -> Array:
+def covariance_along(kept: Array, used: Mask, lag: int) -> Array:
     """(...) mean product of images (..., height, width) at a lag along rows and columns."""
     products = kept[..., lag:] * kept[..., :-lag], kept[..., lag:, :] * kept[..., :-lag, :]
     pairs = used[..., lag:] & used[..., :-lag], used[..., lag:, :] & used[..., :-lag, :]

@@ -195,6 +195,23 @@ def test_what_covers_a_chessboard_is_no_end_of_it(large_board: tuple[Array, dict
     assert np.abs(errors).max() < 0.03
 
 
+def test_corners_at_the_edges_of_shadows_are_not_measured(large_board: tuple[Array, dict[str, Array]]) -> None:
+    """Bars' shadows, as wide as half a square, over a third of the board."""
+    picture, truth = large_board[0].copy(), large_board[1]
+    row, col = np.indices(picture.shape, float)
+    across = 0.8 * col + 0.6 * row
+    shade = 0.5 + 0.5 * np.tanh(4.0 * np.sin(2 * np.pi * across / 24.0))
+    board = measure_board(make_scan(picture * np.where(col < 130, 1 - 0.6 * shade, 1.0)), LARGE)
+    found = {mark.point: mark.center_px for mark in board.marks if mark.center_px is not None}
+    off = {point: float(np.hypot(*(center_px - truth[point]))) for point, center_px in found.items()}
+    measured = {mark.point for mark in board.marks if mark.status is Status.MEASURED}
+    shaded = {point for point, (column, _) in truth.items() if column < 120}
+    assert max(off[point] for point in shaded & off.keys()) > 0.3
+    assert {point for point, (column, _) in truth.items() if column > 140} <= measured
+    assert max(off[point] for point in measured) < 0.2
+    assert any("a shadow" in mark.reason for mark in board.marks)
+
+
 @parametrize_with_studies("shown", [np.s_[80:, 150:], np.s_[:, 60:250], np.s_[80:, 60:250]])
 def test_a_part_of_a_chessboard_that_may_be_another_is_refused(
     large_board: tuple[Array, dict[str, Array]], shown: Any
