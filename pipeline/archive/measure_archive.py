@@ -15,6 +15,8 @@ from itertools import chain
 from pathlib import Path
 from statistics import fmean
 
+import numpy as np
+
 from measure.errors import MeasurementError
 from measure.flags import Code, Reason, Status
 from measure.results import MEASURE_REVISION
@@ -39,7 +41,8 @@ from pipeline.files.project_file import Project
 from pipeline.files.scan_files import as_named
 from pipeline.measuring.camera_identification import add_plates
 from pipeline.measuring.learn_stage import collect_tones, learn_marks
-from pipeline.measuring.roll import add_known_lines, check_repeated_views, check_scans, name_roll, note_same_frames
+from pipeline.measuring.repeated_views import check_repeated_views
+from pipeline.measuring.roll import add_known_lines, check_scans, name_roll, note_same_frames
 from pipeline.measuring.scan_measurement import MeasuredFile, ended_scan, measure_file, reads_writing
 from pipeline.measuring.scan_task import ScanTask, scan_tasks
 from pipeline.measuring.tie_stage import check_tie_names, tie_scans
@@ -58,10 +61,12 @@ from pipeline.provenance import (
 )
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.wording import count_sentence, counted, drop_file_name, gathered, listed
+from pipeline.types import Array
 from pipeline.workers import TASKS_A_CORE, NotMeasured, WorkOptions, cluster_executor, iterate_results, worker_pool
 
 _hash_of = lru_cache(maxsize=4096)(hash_text)
 _MADE_BY = (version("reseau"), MEASURE_REVISION)
+_PICTURE_PX = 480  # px, about the largest side of a scan's reduced picture
 _TOGETHER = 2000  # most frames of a camera that are checked together, to limit memory
 OfCamera = tuple[CameraFile, Sequence[ScanTask]]
 Remarks = Mapping[str, tuple[tuple[Reason, ...], tuple[str, ...]]]  # problems and notes by image
@@ -115,6 +120,19 @@ class Work:
         """Scan of an image as last requested, with all decisions applied except acceptance (`before_checks`)."""
         scan = self._store.scan(self.results[name], name, self._folder)
         return before_checks(scan, self.counting[name])
+
+    def picture(self, scan: MeasuredScan) -> Array | None:
+        """Reduced grey values (rows, columns) of a whole scan, stored or read again; None where it cannot be read."""
+        key = self._store.first("select fingerprint from result where id = ?", self.results[scan.frame.image])
+        stored = self._thumbnails.get(key) if self._thumbnails else None
+        if stored is not None:
+            return np.asarray(stored.pixels)
+        try:
+            with self._project.open_scan(scan.frame.image) as opened:
+                grey = opened.reduced(max(1, max(opened.width_px, opened.height_px) // _PICTURE_PX))
+        except MeasurementError:
+            return None
+        return grey.astype(float)
 
     def written(self, names: Sequence[str]) -> list[str]:
         """Images on whose scans writing was found."""
@@ -481,7 +499,8 @@ def _check_camera(
     """Second step of the measurement. Scans whose marks get other names by it are measured again."""
     scans = name_roll(tasks, [work.read(task.name) for task in tasks], camera.writing, work.measure)
     checked = check_scans(camera, scans, project.film)
-    return tuple(check_repeated_views(checked, project.targets is not None and project.targets.board is not None))
+    is_board = project.targets is not None and project.targets.board is not None
+    return tuple(check_repeated_views(checked, is_board, work.picture))
 
 
 def _writing_remarks(project: Project, tasks: Sequence[ScanTask], work: Work) -> Remarks:

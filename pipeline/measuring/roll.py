@@ -15,7 +15,7 @@ from measure.fiducials.scan_orientation import DECIDED, TOLD
 from measure.flags import Code, Reason, Status
 from measure.geometry import POSES, pose_in_camera, up_from_camera
 from measure.marks.shapes import WrittenPlace
-from measure.results import FrameMeasurement, Kind, Pose
+from measure.results import FrameMeasurement, Pose
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.scan_task import Measure, ScanOptions, ScanTask, sample_names
 from pipeline.progress import Reporter
@@ -29,10 +29,6 @@ _READ_FIRST = 4  # frames of a camera on which all text is read
 _WAYS = 2  # scan orientations searched by known lines: more would take as long as reading all text
 _LEAST = 6  # letters and digits that a known line needs
 _TURNS = ("0", "90", "180", "270")  # directions of text in the camera's frame
-_SAME_VIEW = 0.005  # fraction of an image's longer side; in sets of boards no two images are nearer than 0.04
-_TARGET_WEIGHT = 0.1  # of distances of targets: in rectified scans of different frames they alone lie elsewhere
-_SAME_SCAN_PX = 0.2  # px: film that is laid on a scanner again lies many pixels elsewhere
-_FEWEST_COMMON = 4  # points in both of two images
 _SAME = ("run", "frames", "date")  # fields that identify a frame together with its number
 
 
@@ -211,65 +207,6 @@ def check_scans(camera: CameraFile, measured: Sequence[MeasuredScan], film: Beli
         frames = check_frames(frames, camera.layout(), [scan.pitch_um for scan in scans], film).frames
     by_image = {scan.frame.image: replace(scan, frame=frame) for scan, frame in zip(scans, frames, strict=True)}
     return tuple(by_image.get(scan.frame.image, scan) for scan in measured)
-
-
-def check_repeated_views(scans: Sequence[MeasuredScan], is_board: bool) -> list[MeasuredScan]:
-    """Reject a board's points in images that show it where another image does, and all marks of scans stored twice.
-
-    The errors of lens, board and picture's processing repeat in such an image, so that it adds nothing to the other. A
-    scan stored again, in another format, size or orientation, has all marks at the same places of the picture. Where
-    these are fiducials alone, it is only named: scans of different frames may be rectified to the same places.
-    """
-    weights = {"target": 1.0} if is_board else {"fiducial": 1.0, "target": _TARGET_WEIGHT}
-    marks = dict.fromkeys((mark.kind, mark.point) for scan in scans for mark in scan.frame.marks)
-    points, weight = (
-        {mark: at for at, mark in enumerate(marks)},
-        np.array([weights.get(kind, 0.0) for kind, _ in marks]),
-    )
-    is_target = np.array([kind == "target" for kind, _ in marks], dtype=bool)
-    sides_px = np.array([max(scan.width_px, scan.height_px, 1) for scan in scans])
-    places = np.full((len(scans), len(points), 2), np.nan)  # from the centre, in sides, along the camera's axes
-    for row, scan in enumerate(scans):
-        up = up_from_camera(scan.frame.pose.name) if scan.frame.pose else np.eye(2)
-        for mark in scan.frame.marks:
-            if mark.center_px is not None and mark.status.is_observation and mark.kind in weights:
-                centred = mark.center_px + 0.5 - np.array([scan.width_px, scan.height_px]) / 2
-                places[row, points[mark.kind, mark.point]] = centred * (1, -1) @ up / sides_px[row]
-    is_known = np.isfinite(places[..., 0])
-    kept, repeated = list[int](), dict[int, MeasuredScan]()
-    for row in np.argsort(-is_known.sum(axis=1), kind="stable").tolist():
-        apart = np.nan_to_num(weight * np.linalg.norm(places[kept] - places[row], axis=2)).max(axis=1, initial=0)
-        apart_px = apart * np.minimum(sides_px[kept], sides_px[row])
-        is_comparable = (is_known[kept] & is_known[row]).sum(axis=1) >= _FEWEST_COMMON
-        apart_px[~is_comparable] = np.inf
-        if apart_px.min(initial=np.inf) < (_SAME_VIEW * sides_px[row] if is_board else _SAME_SCAN_PX):
-            nearest, least_px = kept[int(apart_px.argmin())], max(float(apart_px.min()), 0.1)
-            has_targets = bool((is_known[nearest] & is_known[row])[is_target].any())
-            repeated[row] = _repeated(scans[row], scans[nearest], least_px, is_board, has_targets)
-        else:
-            kept.append(row)
-    return [repeated.get(row, scan) for row, scan in enumerate(scans)]
-
-
-def _repeated(
-    scan: MeasuredScan, original: MeasuredScan, apart_px: float, is_board: bool, is_sure: bool
-) -> MeasuredScan:
-    """Scan that repeats another one; its marks, of a board its points, are rejected if that is sure."""
-    first, within = original.frame.image, f"to within {apart_px:.1f} px"
-    if is_board:
-        what = f"it shows the board where {first} does {within}"
-        sentence = f"{what}: its points count once. Move the board or the camera from picture to picture."
-    elif is_sure:
-        what = f"its marks, targets too, lie where those of {first} do, {within}: both are the same scan"
-        sentence = f"{what}, and its marks count once. To use this one, name {first} in `exclude`."
-    else:
-        what = f"its marks lie where those of {first} do, {within}: both are the same scan"
-        twice = "its marks count twice. Name one of both in `exclude`."
-        sentence = f"{what} (or rectified to the same places), and {twice}"
-    if is_board or is_sure:
-        kind: Kind | None = "target" if is_board else None
-        scan = scan.restated(kind, Status.REJECTED, Reason(f"{what}, which counts", Code.COPY))
-    return scan.changed(problems=[Reason(sentence, Code.COPY)])
 
 
 def note_same_frames(scans: Sequence[MeasuredScan], part_of: Callable[[str], str]) -> list[MeasuredScan]:

@@ -35,7 +35,7 @@ from pipeline.calibration.intrinsics import LensChoice, LensModel, choose_lens
 from pipeline.calibration.pictures import CameraPictures, find_pictures
 from pipeline.calibration.project_files import board_options
 from pipeline.files.target_table import read_targets
-from pipeline.measuring.roll import check_repeated_views
+from pipeline.measuring.repeated_views import check_repeated_views
 from pipeline.opencv_check.check import BoardPictures, compare_corners, detector_name, find_points
 from pipeline.opencv_check.opencv_calibration import NAMES, Freedom, ImagePoints, OpenCvCalibration, calibrate
 from pipeline.results.measured_record import MeasuredScan
@@ -329,30 +329,53 @@ def test_a_board_at_the_same_place_counts_once() -> None:
     targets = tuple(replace(mark, kind="target") for mark in named_scan("").frame.marks)
     shifts_px = {"few": 1.0, "first": 0.0, "again": 10.0, "next": 18.0}  # 0.5 % of a side is 25 px
     scans = [move_marks(named_scan(name, marks=targets[name == "few" :]), px) for name, px in shifts_px.items()]
-    checked = check_repeated_views(scans, True)
+    checked = check_repeated_views(scans, True, lambda scan: None)
     assert counting(checked) == {"first", "next"}
     assert "it shows the board where first does to within 14.1 px" in checked[2].frame.problems[0]
 
 
+def drawn_picture(seed: int) -> Array:
+    """(400, 500) px of a landscape, darker towards the corners as every frame of the camera, with its marks."""
+    rng = np.random.default_rng(seed)
+    sides = np.stack(np.meshgrid(*(np.linspace(-1.0, 1.0, n) for n in (500, 400))), axis=-1)
+    land = cv2.GaussianBlur(rng.normal(0.0, 1.0, (400, 500)), (0, 0), 3.0)
+    picture = (120.0 + 40.0 * land / land.std()) * (1.0 - 0.4 * (sides**2).sum(axis=-1) / 2)
+    for mark in named_scan("").frame.marks:
+        col, row = (round(float(at) / 10.0) for at in present(mark.center_px))
+        picture[max(row - 1, 0) : row + 2, max(col - 1, 0) : col + 2] = 255.0
+    return np.clip(picture, 1.0, None)
+
+
 @pytest.mark.parametrize("has_target", [True, False])
-def test_a_scan_that_is_stored_twice_counts_once_where_targets_show_it(has_target: bool) -> None:
-    """In another format, and at twice the size and turned by a quarter; the next frame lies half a pixel elsewhere."""
+def test_a_scan_that_is_stored_twice_is_told_from_another_one_rectified_to_its_places(has_target: bool) -> None:
+    """In another format, and at twice the size and turned by a quarter; the next frame lies half a pixel elsewhere.
+
+    Where targets do not tell them apart the pictures do: darker as a negative, and with another tone curve.
+    """
     marks = named_scan("").frame.marks
     target = replace(marks[0], kind="target", center_px=np.array([500.0, 800.0]))
     given = (*marks, *[target] * has_target)
-    first, again, turned, other = (named_scan(name, marks=given) for name in ("first", "again", "turned", "other"))
+    names = ("first", "again", "turned", "other", "rectified", "and its copy")
+    first, again, turned, other, rectified, copy = (named_scan(name, marks=given) for name in names)
+    drawn, land = drawn_picture(1), drawn_picture(2)
+    pictures = {"first": drawn, "again": 200.0 - 0.7 * drawn, "turned": (np.rot90(drawn) / 99.0) ** 3}
+    pictures |= {"rectified": land, "and its copy": np.round(land / 30.0)}
     assert present(first.frame.pose).name == "90m"
     quarter = replace(present(first.frame.pose), name="180m")  # (column, row) becomes (row, width - 1 - column)
     turned = replace(turned, frame=replace(turned.frame, pose=quarter), width_px=8000, height_px=10000)
     turned = move_marks(turned, (0.5, 2 * first.width_px - 1.5), 2 * np.array([[0.0, 1.0], [-1.0, 0.0]]))
-    checked = check_repeated_views([first, move_marks(again, 0.05), turned, move_marks(other, (0.5, 0.0))], False)
-    assert counting(checked) == ({"first", "other"} if has_target else {"first", "again", "turned", "other"})
-    assert {each.frame.image for each in checked if each.frame.problems} == {"again", "turned"}
+    scans = [first, move_marks(again, 0.05), turned, move_marks(other, (0.5, 0.0))]
+    scans += [] if has_target else [move_marks(rectified, 0.02), copy]
+    checked = check_repeated_views(scans, False, lambda scan: pictures[scan.frame.image])
+    assert counting(checked) == ({"first", "other"} if has_target else {*names})
+    named = {each.frame.image: each.frame.problems[0] for each in checked if each.frame.problems}
+    assert {*named} == {"again", "turned"} | (set() if has_target else {"and its copy"})
     said = "count once. To use this one, name first in `exclude`" if has_target else "count twice. Name one of both"
-    assert said in checked[2].frame.problems[0]
+    assert said in named["turned"]
+    assert has_target or "those of rectified do" in named["and its copy"]
     targets = (replace(target, point="9", center_px=np.array(at)) for at in ((50.0, 80.0), (90.0, 80.0)))
-    rectified = [named_scan(name, marks=(*given, one)) for name, one in zip(("a", "b"), targets, strict=True)]
-    assert not any(each.frame.problems for each in check_repeated_views(rectified, False))
+    apart = [named_scan(name, marks=(*given, one)) for name, one in zip(("a", "b"), targets, strict=True)]
+    assert not any(each.frame.problems for each in check_repeated_views(apart, False, lambda scan: drawn))
 
 
 def test_boards_as_project_files_have_them() -> None:
