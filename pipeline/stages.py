@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 
 from adjust.solution.result import Adjustment
 from pipeline.adjusting.adjust_stage import adjust_marks
-from pipeline.adjusting.network import anything_to_adjust, check_transformation, sensor_size_mm
+from pipeline.adjusting.network import anything_to_adjust, check_transformation
+from pipeline.adjusting.picture_turn import picture_turn
 from pipeline.archive.checked_results import Judging, measured_scans, read_measurement, stored_judging
 from pipeline.archive.made_from import adjusted_from, differing
 from pipeline.archive.results_database import Merged, Store, merge
@@ -325,7 +326,7 @@ class _Run:
         if project.pitch_um:
             pitch_um = dict.fromkeys(project.scans, project.pitch_um) | pitch_um
         images = project.given_images.turned_deg if project.given_images else {}
-        turned = {image: (turned_deg, sensor_size_mm(project, image)) for image, turned_deg in images.items()}
+        turned = {image: picture_turn(project, image) for image in images}
         return BoardPictures(board, project.open_scan, pitch_um, turned)
 
     def report(self) -> Summary:

@@ -16,6 +16,7 @@ from adjust.problem.camera import Camera
 from adjust.problem.network import Board, Image, LineOfSight, Network, ObjectPoint, Scanner, Transformation
 from adjust.problem.observations import Calibration, Distance, Observations
 from measure.results import ON_FILM
+from pipeline.adjusting.picture_turn import rotate_to_sensor
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
@@ -385,46 +386,3 @@ def _covariance(settings: AdjustSettings, mark: ComparatorPoint) -> Array:
         covariance = np.outer(mark.sigma_mm, mark.sigma_mm) * np.array([[1.0, mark.rho], [mark.rho, 1.0]])
     film: Array = covariance + np.eye(2) * (settings.film_sigma_um / 1000.0) ** 2
     return film
-
-
-def rotate_to_sensor(project: Project, marks: Sequence[ComparatorPoint]) -> list[ComparatorPoint]:
-    """Marks in sensor coordinates, by the column turned_deg of images.csv.
-
-    Raises InputError where the size of a rotated image is unknown.
-    """
-    return [_turned_back(project, mark) if project.turned_deg(mark.image) else mark for mark in marks]
-
-
-def turned_back(xy_mm: Array, turned_deg: int, last_mm: tuple[float, float]) -> Array:
-    """(..., 2) comparator coordinates before a counter-clockwise rotation of the image.
-
-    last_mm: distances from the first to the last pixel of a row and of a column before the rotation, mm.
-    """
-    x, y = np.moveaxis(np.asarray(xy_mm, float), -1, 0)
-    width, height = last_mm
-    places = {0: (x, y), 90: (y + width, -x), 180: (width - x, -height - y), 270: (-y, x - height)}
-    return np.stack(places[turned_deg], axis=-1)
-
-
-def sensor_size_mm(project: Project, image: str) -> tuple[float, float]:
-    """Distances from the first to the last pixel of a row and of a column of the sensor, mm. Raises InputError where
-    they are unknown."""
-    camera, pitch_um = project.image_camera(image), project.pitch_um
-    if camera.frame_mm is None or pitch_um is None:
-        raise InputError(
-            f"{project.images_path}: image {image!r} is turned (column turned_deg), which needs the size of the "
-            f"picture: give frame_mm in {camera.path} and pitch_um in {project.path}."
-        )
-    (width, height), (across, down) = camera.frame_mm, pitch_um
-    return width - across / 1000.0, height - down / 1000.0
-
-
-def _turned_back(project: Project, mark: ComparatorPoint) -> ComparatorPoint:
-    if mark.xy_mm is None:
-        return mark
-    turned_deg = project.turned_deg(mark.image)
-    xy_mm = turned_back(mark.xy_mm, turned_deg, sensor_size_mm(project, mark.image))
-    if turned_deg == 180:
-        return replace(mark, xy_mm=xy_mm)
-    sigma_mm = None if mark.sigma_mm is None else mark.sigma_mm[::-1].copy()
-    return replace(mark, xy_mm=xy_mm, sigma_mm=sigma_mm, rho=-mark.rho)

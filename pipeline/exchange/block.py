@@ -11,7 +11,8 @@ import numpy as np
 from adjust.functional_model.lens import Lens
 from adjust.functional_model.projection import ImageModel, LineOfSight
 from adjust.functional_model.rotation import rotation_from_angles
-from pipeline.adjusting.network import rotate_to_sensor
+from adjust.functional_model.scanner import NO_BEND
+from pipeline.adjusting.picture_turn import NOT_TURNED, Turn, picture_turn, turned_back
 from pipeline.archive.made_from import adjusted_from, differing
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
@@ -38,6 +39,7 @@ class OutFrame:
     scan, pitch_um : path and pixel pitch; None if unknown.
     model : adjusted; None for images without a part in the adjustment.
     is_oriented : whether the exterior orientation was adjusted, too.
+    turn : of a digital picture, from its sensor.
     """
 
     image: str
@@ -47,6 +49,7 @@ class OutFrame:
     marks: tuple[ComparatorPoint, ...]
     model: ImageModel | None
     is_oriented: bool
+    turn: Turn = NOT_TURNED
 
     def observed(self, fiducials: bool) -> tuple[ComparatorPoint, ...]:
         """Its fiducials, or its object points."""
@@ -59,7 +62,7 @@ class OutFrame:
     def camera_mm(self, marks: tuple[ComparatorPoint, ...]) -> Array:
         """Observed places (n, 2) of marks in the camera's frame, mm."""
         assert self.model is not None  # only called for frames with a part in the adjustment
-        return self.model.camera_from_comparator(_places_mm(marks))
+        return self.model.camera_from_comparator(turned_back(_places_mm(marks), *self.turn))
 
     def frame_mm(self, marks: tuple[ComparatorPoint, ...], with_lens: bool) -> Array:
         """Observed places (n, 2) in the resampled frame, mm. with_lens: its distortion is removed."""
@@ -82,6 +85,13 @@ class OutFrame:
         return self.pitch_um
 
     @property
+    def is_as_taken(self) -> bool:
+        """Whether the comparator is the camera's frame: a digital camera's picture that was not turned."""
+        model = self.model
+        is_plain = model is not None and model.film.transformation == "none" and model.bend is NO_BEND
+        return is_plain and self.turn == NOT_TURNED
+
+    @property
     def is_mirrored(self) -> bool:
         """Whether the scan is mirrored with respect to the camera's frame."""
         if self.model is None:
@@ -93,7 +103,7 @@ class OutFrame:
         model = self.model
         assert model is not None
         lens = model.lens if with_lens else None
-        return FrameChain(self.known_pitch_um, model.film, model.bend, model.bend_parameters, lens)
+        return FrameChain(self.known_pitch_um, model.film, model.bend, model.bend_parameters, lens, self.turn)
 
     @property
     def file_name(self) -> str:
@@ -213,7 +223,7 @@ def read_block(project: Project) -> Block:
     adjustment = current_adjustment(project, marks)
     pitches = read_pitches(project.comparator)
     by_image: dict[str, list[ComparatorPoint]] = {mark.image: [] for mark in marks}
-    for mark in rotate_to_sensor(project, marks):
+    for mark in marks:
         if mark.status.is_observation:
             by_image[mark.image].append(mark)
     frames = [
@@ -252,7 +262,8 @@ def _frame(
     if adjustment is None or known is None:
         return OutFrame(image, camera, scan, pitch_um, marks, None, False)
     lens = adjustment.cameras[adjustment.image_camera(image)].lens()
-    places = _places_mm(marks)
+    turn = picture_turn(project, image)
+    places = turned_back(_places_mm(marks), *turn)
     middle_mm = (places.min(axis=0) + places.max(axis=0)) / 2.0 if len(places) else np.zeros(2)
     chain = image_chain(image, adjustment, NO_PITCH, middle_mm, False)
     exterior = np.array([element.value for element in known.exterior.elements.values()])
@@ -266,7 +277,7 @@ def _frame(
         chain.bend,
         chain.bend_parameters,
     )
-    return OutFrame(image, camera, scan, pitch_um, marks, model, known.exterior.is_oriented)
+    return OutFrame(image, camera, scan, pitch_um, marks, model, known.exterior.is_oriented, turn)
 
 
 def _variance(mark: ComparatorPoint) -> float:

@@ -2,13 +2,15 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+from pipeline.adjusting.picture_turn import NOT_TURNED
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, OutFrame
 from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.exchange.incoming import ImportOptions, Incoming, child_numbers, opencv_camera, read_xml, xml_text
-from pipeline.exchange.micmac_format import film_box
+from pipeline.exchange.micmac_format import TURNED, camera_box
 from pipeline.exchange.pinhole import BROWN, FittedLens, checked_misfits, sheared_lens
 from pipeline.files.camera_file import CameraFile
 from pipeline.opencv_check.opencv_calibration import INTERIOR
@@ -27,20 +29,29 @@ NAMES = ("f", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "b1", "b2")
 
 
 def write_metashape(block: Block, options: ExportOptions) -> Written:
-    """Write reseau_to_metashape.py with its data, and CAMERA.xml where there is an adjustment."""
-    reasons = {frame.image: _hindrance(frame) for frame in block.frames}
+    """Write reseau_to_metashape.py with its data, and CAMERA.xml where there is an adjustment; of digital cameras
+    CAMERA.xml alone."""
+    reasons = {frame.image: _hindrance(block, frame) for frame in block.frames}
     frames = [frame for frame in block.frames if not reasons[frame.image]]
-    left_out = tuple(f"{image}: {reason}" for image, reason in reasons.items() if reason)
+    digital = {frame.camera for frame in frames if not block.camera_file(frame.camera).fiducials}
+    others = [frame.image for frame in block.frames if frame not in frames and frame.camera not in digital]
+    left_out = tuple(f"{image}: {reasons[image]}" for image in others)
     if not frames:
         raise InputError(f"metashape: no image can go out. {' '.join(left_out[:_MOST_REASONS])}")
     files: dict[str, str | bytes] = {}
     notes = []
     for camera in dict.fromkeys(frame.camera for frame in frames if frame.is_oriented):
         own = [frame for frame in frames if frame.camera == camera and frame.is_oriented]
-        lens, box = sheared_lens(block, own[0], at_ideal=False), film_box(block, own[0], options)
+        lens, box = sheared_lens(block, own[0], at_ideal=False), camera_box(block, own[0], options)
+        if camera in digital:  # a film's box begins at the frame's edge, a picture's at the middle of its first pixel
+            box = replace(box, x_mm=box.x_mm - box.pitch_mm / 2.0, y_mm=box.y_mm + box.pitch_mm / 2.0)
         misfit_px = checked_misfits(block, own, lens, box, options, "metashape")
         files[f"{file_word(camera)}.xml"] = _calibration(lens, box)
         notes.append(f"{camera}: the lens was fitted over the frame: off by {misfit_px:.2g} px at most.")
+    frames = [frame for frame in frames if frame.camera not in digital]
+    if not frames:
+        notes.append("A digital camera: Tools > Camera Calibration loads the XML file in Metashape.")
+        return Written(files, ("standard deviations, poses, points and marks",), tuple(notes), left_out)
     data = {
         "cameras": {camera: _camera(block, camera, files) for camera in dict.fromkeys(f.camera for f in frames)},
         "images": [_image(frame) for frame in frames],
@@ -56,8 +67,11 @@ def write_metashape(block: Block, options: ExportOptions) -> Written:
     return Written(files, lost, tuple(notes), left_out)
 
 
-def _hindrance(frame: OutFrame) -> str:
-    """Reason why an image cannot be exported as one of a film camera; "" where it can."""
+def _hindrance(block: Block, frame: OutFrame) -> str:
+    """Reason why an image cannot be exported; "" where it can."""
+    if not block.camera_file(frame.camera).fiducials:
+        without = "it has no adjusted orientation, and no fiducials." if not frame.is_oriented else ""
+        return TURNED if frame.turn != NOT_TURNED else without
     if frame.is_mirrored:
         return (
             "its scan is mirrored, and Metashape is not known to take that. Resample it (reseau resample) and use the "

@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from pipeline.adjusting.picture_turn import NOT_TURNED
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, OutFrame
 from pipeline.exchange.formats import Convention, ExportOptions, Written
@@ -48,6 +49,7 @@ _Y_DOWN = np.array([1.0, -1.0])
 _KNOWN = {"KnownConv": "eConvApero_DistM2C"}
 _REECH = "OIS-Reech_"  # prefix of the files that ReSampFid writes
 _DIGITS = 12
+TURNED = "its picture is turned (column turned_deg). Turn the file back, and calibrate again; or export colmap."
 _FEWEST = 3  # marks needed for an affine transformation
 
 
@@ -90,14 +92,16 @@ def _camera_files(block: Block, camera: str, options: ExportOptions) -> Written:
             places = dict(zip(_names(marks), frame.pixels(marks) + MICMAC.first_pixel_px, strict=True))
             own = _marks(frame.file_name, places, _sigmas_px(marks, sum(frame.known_pitch_um) / 2000.0))
             files[f"Ori-InterneScan/MeasuresIm-{frame.file_name}.xml"] = xml_text(*own)
-    oriented = [frame for frame in frames if frame.is_oriented]
+    turned = [frame for frame in frames if frame.turn != NOT_TURNED]
+    left_out += tuple(f"{frame.image}: {TURNED}" for frame in turned)
+    oriented = [frame for frame in frames if frame.is_oriented and frame not in turned]
     if not oriented:
         has_frame = bool(fiducials and frames) and block.camera_file(camera).frame_mm is not None
         command = (_resampling(camera, film_box(block, frames[0], options)),) if has_frame else ()
         without = f"{camera}: no image is oriented, so there are marks only: camera and poses come by object points."
         return Written(files, notes=(*command, without), left_out=left_out)
     lens = sheared_lens(block, oriented[0], at_ideal=True)
-    box = film_box(block, oriented[0], options) if fiducials else _picture_box(block, oriented[0])
+    box = camera_box(block, oriented[0], options)
     reech = _REECH if fiducials else ""
     misfit_px = checked_misfits(block, oriented, lens, box, options, "micmac")
     calibration = f"Ori-Reseau/AutoCal_{file_word(camera)}.xml"
@@ -127,12 +131,18 @@ def film_box(block: Block, frame: OutFrame, options: ExportOptions) -> Canvas:
     return Canvas(left * pitch / 1000.0, top * pitch / 1000.0, pitch / 1000.0, width, height)
 
 
-def _picture_box(block: Block, frame: OutFrame) -> Canvas:
-    """Canvas of a digital camera's image, which is not resampled. Raises InputError where its pixels are not square."""
+def camera_box(block: Block, frame: OutFrame, options: ExportOptions) -> Canvas:
+    """Canvas of a camera's frames: `film_box`, or a digital camera's picture, which is not resampled.
+
+    Raises InputError for a picture whose pixels are not square.
+    """
+    if block.camera_file(frame.camera).fiducials:
+        return film_box(block, frame, options)
     x_um, y_um = frame.known_pitch_um
     if x_um != y_um:
         raise InputError(
-            f"micmac: a pixel of {frame.image!r} is {x_um:g} x {y_um:g} µm. Resample it, and export colmap."
+            f"a pixel of {frame.image!r} is {x_um:g} x {y_um:g} µm, and this format is for square ones. Resample it, "
+            "and export colmap."
         )
     with block.open_scan(frame) as scan:
         return Canvas(0.0, 0.0, x_um / 1000.0, scan.width_px, scan.height_px)

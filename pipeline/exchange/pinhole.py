@@ -169,7 +169,7 @@ def frame_corners_mm(block: Block, frame: OutFrame) -> Array:
         half = np.array(camera.frame_mm) / 2.0
         return np.array([-half, half])
     places = [
-        each.model.camera_from_comparator(np.array([mark.xy_mm for mark in each.marks]))
+        each.camera_mm(each.marks)
         for each in block.frames
         if each.camera == frame.camera and each.model is not None and each.marks
     ]
@@ -231,8 +231,12 @@ def _sheared(lens: Lens, rays: Array) -> Array:
 class PinholeFrame:
     """One image in its resampled frame.
 
-    Pixel (0, 0) is the centre of the first pixel; the camera's axes are x right, y down, z forward. misfit_px: largest
-    error of a point in the frame.
+    Pixel (0, 0) is the centre of the first pixel; the camera's axes are x right, y down, z forward.
+
+    Attributes
+    ----------
+    misfit_px : largest error of a point in the frame.
+    is_as_taken : whether the frame is a digital camera's picture, pixel by pixel.
     """
 
     frame: WholeFrame
@@ -240,11 +244,13 @@ class PinholeFrame:
     lens: FittedLens
     misfit_px: float
     with_lens: bool
+    is_as_taken: bool
 
     @property
     def picture(self) -> str:
-        """Name of the file that `reseau resample` writes."""
-        return f"{self.frame.image}.tif"
+        """Name of the file that `reseau resample` writes, or of the picture itself where the frame is just that."""
+        suffix = self.frame.scan.suffix if self.is_as_taken and self.frame.scan else ".tif"
+        return f"{self.frame.image}{suffix}"
 
     def interior_px(self, convention: Convention) -> Array:
         """fx, fy, cx, cy (4,) in px."""
@@ -341,13 +347,14 @@ def sight_misfit_mm(block: Block, frame: OutFrame) -> float:
 def _pinhole(block: Block, frame: WholeFrame, lens: FittedLens, options: ExportOptions) -> PinholeFrame:
     """Pinhole of one frame. Raises MeasurementError where the lens folds within the scan."""
     pitch_um = options.pitch_um or float(np.sqrt(np.prod(frame.known_pitch_um)))
-    scans = []
+    scans, is_as_taken = [], frame.is_as_taken and not options.with_lens and frame.pitch_um == (pitch_um, pitch_um)
     for each in frame.scans:
         with block.open_scan(each) as scan:
             scans.append((each.chain(options.with_lens), scan.part_px))
+            is_as_taken &= scan.part_px == (0, 0, scan.width_px, scan.height_px)
     canvas = outline_canvas(scans, pitch_um / 1000.0)
     misfit_mm = lens.largest_mm + sight_misfit_mm(block, frame)
-    return PinholeFrame(frame, canvas, lens, misfit_mm / canvas.pitch_mm, options.with_lens)
+    return PinholeFrame(frame, canvas, lens, misfit_mm / canvas.pitch_mm, options.with_lens, is_as_taken)
 
 
 def pinholes_written(
@@ -359,8 +366,11 @@ def pinholes_written(
         notes = ("The camera's model is the very same: nothing was fitted.", *notes)
     elif worst > 0.0:
         notes = (f"The camera's model was fitted over the frame: it is off by {worst:.2g} px at most.", *notes)
-    film = "the film transformation (it is that of the resampled frames)"
-    return Written(files, (film, "all standard deviations", lost), notes, tuple(left_out))
+    film: tuple[str, ...] = ("the film transformation (it is that of the resampled frames)",)
+    if any(frame.is_as_taken for frame in frames):
+        film = ()
+        notes = ("The frames are the pictures as taken; of turned ones, the .tif of `reseau resample`.", *notes)
+    return Written(files, (*film, "all standard deviations", lost), notes, tuple(left_out))
 
 
 def write_asp(block: Block, options: ExportOptions) -> Written:

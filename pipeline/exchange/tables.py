@@ -57,7 +57,7 @@ def _mark(frame: OutFrame, mark: ComparatorPoint) -> Row:
     assert mark.xy_mm is not None
     place, sigma = mark.xy_mm, (None, None) if mark.sigma_mm is None else mark.sigma_mm.tolist()
     col, row = frame.pixels((mark,))[0].tolist() if frame.pitch_um else (None, None)
-    camera = (None, None) if frame.model is None else frame.model.camera_from_comparator(place[None])[0].tolist()
+    camera = (None, None) if frame.model is None else frame.camera_mm((mark,))[0].tolist()
     return {
         "image": mark.image,
         "camera": frame.camera,

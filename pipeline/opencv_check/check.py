@@ -31,7 +31,7 @@ from measure.boards.markers import charuco_board
 from measure.boards.specs import ArucoSpec, BoardSpec, CharucoSpec, ChessboardSpec, CircleGridSpec, aruco_dictionary
 from measure.errors import MeasurementError
 from measure.scans.scan import Scan
-from pipeline.adjusting.network import turned_back
+from pipeline.adjusting.picture_turn import turned_back
 from pipeline.opencv_check.opencv_calibration import (
     FISHEYE,
     INTERIOR,

@@ -15,6 +15,7 @@ from adjust.functional_model.transformation import Film, film_parameter_names
 from measure.errors import MeasurementError
 from measure.geometry import Affine
 from measure.scans.remote import Window
+from pipeline.adjusting.picture_turn import NOT_TURNED, Turn, turned_back, turned_forth
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.comparator_file import comparator_from_pixel, pixel_from_comparator
 from pipeline.results.measured_record import MeasuredScan
@@ -28,9 +29,9 @@ _BEYOND = 3  # nodes beyond each side of a tile, for the interpolation
 
 @dataclass(frozen=True)
 class FrameChain:
-    """Transformations from the scan to the camera's frame, in this order: pitch, scanner bend, film, lens.
+    """Transformations from the scan to the camera's frame, in this order: pitch, turn, scanner bend, film, lens.
 
-    lens None: the frame keeps the lens distortion.
+    lens None: the frame keeps the lens distortion. turn: of a digital picture.
     """
 
     pitch_um: tuple[float, float]
@@ -38,6 +39,7 @@ class FrameChain:
     bend: Bend = NO_BEND
     bend_parameters: Array = field(default_factory=lambda: np.empty(0))
     lens: Lens | None = None
+    turn: Turn = NOT_TURNED
 
     def scan_from_frame(self, xy_mm: Array) -> tuple[Array, Mask]:
         """Pixels (n, 2), column and row, of camera coordinates (n, 2) in mm; mask of the places that have an image."""
@@ -47,11 +49,12 @@ class FrameChain:
             observed, is_imaged = self.lens.camera_from_ray(ray)
         comparator, on_film = self.film.comparator_from_camera(observed)
         place, on_glass = self.bend.inverse(self.bend_parameters, comparator)
-        return pixel_from_comparator(place, self.pitch_um), is_imaged & on_film & on_glass
+        return pixel_from_comparator(turned_forth(place, *self.turn), self.pitch_um), is_imaged & on_film & on_glass
 
     def frame_from_scan(self, col_row: Array) -> tuple[Array, Mask]:
         """Camera coordinates (n, 2) in mm of pixels (n, 2); mask of the pixels for which the lens can be inverted."""
-        comparator = self.bend.apply(self.bend_parameters, comparator_from_pixel(col_row, self.pitch_um))
+        sensor = turned_back(comparator_from_pixel(col_row, self.pitch_um), *self.turn)
+        comparator = self.bend.apply(self.bend_parameters, sensor)
         observed = self.film.camera_from_comparator(comparator)
         if self.lens is None:
             return observed, np.ones(len(observed), dtype=bool)

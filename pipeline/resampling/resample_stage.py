@@ -27,6 +27,7 @@ from measure.errors import MeasurementError
 from measure.scans.opening import open_scan
 from measure.scans.remote import scan_path
 from measure.scans.scan import Scan
+from pipeline.adjusting.picture_turn import picture_turn
 from pipeline.archive.checked_results import read_measurement
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
@@ -351,7 +352,7 @@ def resample_tasks(
         if isinstance(chain, str):
             failed.append(Resampled(image, None, problem=chain))
             continue
-        scan = FrameScan(image, scan_path(measured.scan), chain)
+        scan = FrameScan(image, scan_path(measured.scan), replace(chain, turn=picture_turn(project, image)))
         if frame in tasks:
             tasks[frame] = replace(tasks[frame], scans=(*tasks[frame].scans, scan))
             continue

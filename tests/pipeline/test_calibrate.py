@@ -28,7 +28,7 @@ from measure import Scan, open_scan
 from measure.boards.specs import ArucoSpec, BoardSpec, CharucoSpec, ChessboardSpec, CircleGridSpec, aruco_dictionary
 from measure.errors import MissingError
 from pipeline import InputError
-from pipeline.adjusting.network import turned_back
+from pipeline.adjusting.picture_turn import turned_back
 from pipeline.calibration import calibrate_stage, intrinsics
 from pipeline.calibration.calibrate_stage import Calibration
 from pipeline.calibration.intrinsics import LensChoice, LensModel, choose_lens

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,6 +16,7 @@ import numpy as np
 import pyarrow.parquet
 import pycolmap
 import pytest
+import tifffile
 from foreign_readers import asp_px, colmap_px, micmac_affine, micmac_px, opencv_px, values
 from networks import camera_point, halves, simulated
 from numpy.typing import NDArray
@@ -23,6 +25,7 @@ from projects import (
     LENS,
     PITCH_MM,
     POINTS,
+    SIZE_PX,
     TRUTH,
     Refusal,
     adjusted_project,
@@ -32,6 +35,7 @@ from projects import (
     ideal_mm,
     make_project,
     present,
+    replace_text,
     result_file,
     scan_px,
     stated_misfit_px,
@@ -325,6 +329,49 @@ def test_a_digital_camera_goes_out_as_its_pictures_are(tmp_path: Path, monkeypat
     assert not (folder / "Ori-InterneScan").exists()
     off = np.linalg.norm(micmac_px(folder, "f3", POINTS, "") - pixels[3], axis=1)
     assert off.max() < 1.05 * stated_misfit_px(folder) + SAME_PX
+
+
+def test_a_turned_picture_goes_out_turned_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its file went out with the sensor's principal point and the turned picture's size."""
+    monkeypatch.setattr("networks.FIDUCIALS", {})
+    here = replace(TRUTH, x0=125.4, y0=-125.3, mirrored=(False,) * 4)
+    project = adjusted_project(tmp_path, here, kind="none")
+    pixels = camera_mm(1, here) * (1, -1) / PITCH_MM
+    width_px, height_px = SIZE_PX, SIZE_PX - 100
+    lines = (tmp_path / "comparator.csv").read_text(encoding="utf-8").splitlines()
+    for at, line in enumerate(lines):
+        cells = line.split(",")
+        if cells[0] == "f1":  # counter-clockwise: (column, row) becomes (row, width - 1 - column)
+            col, row = pixels[int(cells[1])]
+            cells[3:5] = repr(float(PITCH_MM * row)), repr(float(-PITCH_MM * (width_px - 1 - col)))
+            lines[at] = ",".join(cells)
+    (tmp_path / "comparator.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    for i in IMAGES:
+        shape = (width_px, height_px) if i == 1 else (height_px, width_px)
+        tifffile.imwrite(tmp_path / "scans" / f"f{i}.tif", np.zeros(shape, np.uint8), compression="deflate")
+    (tmp_path / "images.csv").write_text("image,turned_deg\nf1,90\n", encoding="utf-8")
+    replace_text(project, "[object]\n", '[object]\nimages = "images.csv"\n')
+    size_mm = f"frame_mm = [{width_px * PITCH_MM}, {height_px * PITCH_MM}]\n"
+    camera = next(tmp_path.glob("camera*.toml"))
+    camera.write_text(re.sub("frame_mm = .*\n", size_mm, camera.read_text(encoding="utf-8")), encoding="utf-8")
+    assert command("adjust", project) in (DONE, LOOK)
+    for format, reader in PINHOLES.items():
+        folder = exported(project, format, tmp_path)
+        off = np.linalg.norm(reader(folder, "f1", POINTS) - pixels, axis=1)
+        assert off.max() < 1.05 * stated_misfit_px(folder) + SAME_PX
+    storage: Any = cv2.FileStorage(str(tmp_path / "opencv" / "f1.yml"), cv2.FILE_STORAGE_READ)
+    assert [storage.getNode(f"image_{side}").real() for side in ("width", "height")] == [width_px, height_px]
+    folder = exported(project, "micmac", tmp_path, code=LOOK)
+    assert "f1: its picture is turned" in (folder / "README.txt").read_text(encoding="utf-8")
+    table = (exported(project, "csv", tmp_path) / "marks.csv").read_text(encoding="utf-8").splitlines()[1:]
+    mark = next(row for row in csv.DictReader(table) if row["image"] == "f1" and row["point"] == "7")
+    stored_px = [pixels[7, 1], width_px - 1 - pixels[7, 0]]
+    assert [float(mark["col_px"]), float(mark["row_px"])] == pytest.approx(stored_px)
+    place_mm = float(mark["camera_x_mm"]), float(mark["camera_y_mm"])
+    assert place_mm == pytest.approx(camera_mm(1, here)[7])
+    xml = ElementTree.parse(exported(project, "metashape", tmp_path) / "K.xml").getroot()
+    assert [values(xml, name)[0] for name in ("width", "height")] == [width_px, height_px]
+    assert values(xml, "cx")[0] == pytest.approx(here.x0 / PITCH_MM + 0.5 - width_px / 2, abs=0.01)
 
 
 def test_how_far_out_an_estimated_lens_is_known_goes_out(tmp_path: Path) -> None:
