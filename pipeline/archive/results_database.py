@@ -39,6 +39,7 @@ from pipeline.results.measured_record import (
     scan_location,
 )
 
+_SQLITE = b"SQLite format 3"  # its files begin with it
 _PLACE = "project folder"
 _LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "tifffile", "imagecodecs")
 _PROGRAM = "version, measure_revision, python, libraries"
@@ -340,10 +341,9 @@ def merge(store: Store, others: Sequence[Path]) -> list[Merged]:
     Raises InputError for a file that is no store, before anything is imported.
     """
     for path in others:
-        if not path.is_file():
-            raise InputError(
-                f"{path}: there is no such results database. Name the out/measurement.K-of-N.db of each part."
-            )
+        if not path.is_file() or not _begins_with(path, _SQLITE):
+            what = "is no" if path.exists() else "there is no such"
+            raise InputError(f"{path}: {what} results database. Name the out/measurement.K-of-N.db of each part.")
         if path.resolve() == store.path.resolve():
             raise InputError(f"{path}: is the results database that the others are joined into. Name the others only.")
         Store(path).close()
@@ -358,6 +358,11 @@ def merge(store: Store, others: Sequence[Path]) -> list[Merged]:
         finally:
             store.connection.execute("detach other")
     return merged
+
+
+def _begins_with(path: Path, start: bytes) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(start)) == start
 
 
 def _insert(store: Store) -> int:

@@ -104,8 +104,12 @@ class Certificate:
             raise WrongKey("angle_deg", "or radius_mm is needed: where the distortions are, one of both.")
         key, places = ("angle_deg", self.angle_deg) if self.angle_deg else ("radius_mm", self.radius_mm or ())
         count = len(self.radial_um)
-        if len(places) != count or count < 2 or min(places) <= 0.0 or len(set(places)) < count:
-            raise WrongKey(key, f"must be {count} different positive places, one a value of radial_um.")
+        if len(places) != count or count < 2:
+            raise WrongKey(
+                key, f"has {len(places)} places for {count} values of radial_um: give one a value, two or more."
+            )
+        if min(places) <= 0.0 or len(set(places)) < count:
+            raise WrongKey(key, "must be positive, and every place another one.")
         if self.angle_deg and max(self.angle_deg) >= 90.0:
             raise WrongKey(key, "must lie below 90 degrees.")
         has_two = self.autocollimation_mm is not None or self.symmetry_mm is not None

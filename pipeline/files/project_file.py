@@ -30,8 +30,7 @@ from pipeline.files.project_tables import UNITS_MM, AdjustSettings, ProjectTable
 from pipeline.files.scan_files import FoundScans, add_cuts, as_named, find_scans
 from pipeline.files.target_table import TargetSettings, TieSettings, read_targets
 from pipeline.provenance import hash_content
-from pipeline.results.adjustment_file import covariance_path
-from pipeline.text.files import path_below
+from pipeline.text.files import covariance_path, no_such_file
 from pipeline.text.table_models import read_model
 from pipeline.text.tables import Table, read_toml
 from pipeline.text.wording import nearest
@@ -381,11 +380,7 @@ def _check_named(table: Table, objects: Table, camera: str, named: Mapping[str, 
     except InputError as error:
         raise table.error("camera", str(error)) from None
     keys |= {key: (objects, path) for key, path in named.items()}
-    missing = [
-        str(where.error(key, f"there is no such file. Looked for {path.resolve()}."))
-        for key, (where, path) in keys.items()
-        if not path.exists()
-    ]
+    missing = [str(where.error(key, no_such_file(path))) for key, (where, path) in keys.items() if not path.exists()]
     if missing:
         raise InputError("\n".join(missing))
 

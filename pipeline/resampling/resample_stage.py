@@ -325,8 +325,8 @@ def resample(
     ------
     InputError : nothing was measured, or the lens was not adjusted.
     """
-    check_writable(folder)
     tasks, results = resample_tasks(project, folder, pitch_um, with_lens, BEST if not fast else FAST)
+    check_writable(folder)
     with reporter.stage("resampled") as count, worker_pool(max(len(tasks), 1)) as workers:
         futures = {workers.submit(resampled, task): task for task in tasks}
         for done, future in enumerate(as_completed(futures), 1):

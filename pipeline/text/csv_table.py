@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import InputError
-from pipeline.text.files import LARGEST, SMALLEST_SIGMA, quote_value, read_bytes
+from pipeline.text.files import LARGEST, SMALLEST_SIGMA, no_such_file, quote_value, read_bytes
 from pipeline.text.wording import did_you_mean
 
 SEPARATORS = {";": "semicolons", "\t": "tabs"}
@@ -91,7 +91,7 @@ def read_csv(path: Path, required: Sequence[str], optional: Sequence[str] = ()) 
     try:
         data = read_bytes(path)
     except FileNotFoundError:
-        raise InputError(f"{path}: there is no such file. Looked for {path.resolve()}.") from None
+        raise InputError(f"{path}: {no_such_file(path)}") from None
     except IsADirectoryError:
         raise InputError(f"{path}: is a folder; a CSV file is needed here. Name one.") from None
     lines = _content_lines(data, path)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import InputError, WriteError, what_to_do
+from pipeline.text.wording import nearest
 
 MOST_MB = 200  # MB; a comparator file of 50,000 scans has 50
 SHOWN = 60  # characters of a wrong value quoted in a message
@@ -131,6 +132,17 @@ def check_writable(folder: Path) -> None:
     """Check before a long computation that its results can be written. Raises WriteError if not."""
     with _temporary_file(folder / f".writable.{os.getpid()}.part", folder) as temporary:
         temporary.touch()
+
+
+def no_such_file(path: Path) -> str:
+    """Sentence on a missing file, with the file of the same kind in its folder that was probably meant."""
+    try:
+        others = [other.stem for other in path.parent.iterdir() if other.suffix == path.suffix]
+    except OSError:
+        others = []
+    near = nearest(path.stem, others)
+    meant = f" Did you mean '{near}{path.suffix}'?" if near else ""
+    return f"there is no such file. Looked for {path.resolve()}.{meant}"
 
 
 SCAN_ENDINGS = (".tif", ".tiff", ".jpg", ".jpeg", ".jp2", ".j2k", ".png")

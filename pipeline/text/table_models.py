@@ -9,6 +9,7 @@ import math
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import cache, partial
+from itertools import groupby
 from pathlib import Path
 from types import GenericAlias, NoneType, UnionType
 from typing import (
@@ -37,6 +38,7 @@ from pipeline.text.wording import LISTED, did_you_mean, nearest
 Model = TypeVar("Model")
 
 FREE = "free"
+_MANY_KEYS = 3  # a file with more keys, and fewer that are known, is of another kind
 _UNITS = {"mm": "mm", "um": "µm", "deg": "°", "px": "px", "ppm": "ppm", "urad": "µrad", "dm": "dm"}
 _LONGEST_PATH, _LONGEST_NAME = 4000, 255  # bytes, limits of most file systems
 
@@ -303,7 +305,11 @@ _adapter: Callable[[Any], TypeAdapter[Any]] = cache(lambda model: TypeAdapter(_a
 
 
 def _message(root: Table, model: type, error: ValidationError) -> str:
-    """Message of the first wrong or missing value; else of all unknown keys."""
+    """Message of the first wrong or missing value; else of all unknown keys; of a file of another kind just that."""
+    given, known = [key for key in root.values if key in _keys(model)], sorted(_keys(model))
+    if not root.place and len(root.values) > _MANY_KEYS > len(given):
+        keys = list_words(list(root.values)[:LISTED])
+        return f"{root.file}: is a file of another kind, with the keys {keys}. Here it has {list_words(known)}."
     unknown: list[tuple[Table, type, str]] = []
     for each in error.errors(include_url=False, include_input=False):
         kind, (table, own, rest) = each["type"], _place(root, model, each["loc"])
@@ -319,7 +325,10 @@ def _message(root: Table, model: type, error: ValidationError) -> str:
         text = text.replace("{key}", key).replace("{table}", table.inside(key))
         return str(table.error(key, text)) if key else f"{root.file}: {text}. Correct the file."
     # Only what is shown: each message searches the file for its line.
-    lines = [line for table, own, key in unknown[:LISTED] for line in table.unknown_keys(_keys(own), [key])]
+    lines = list[str]()
+    for _, some in groupby(unknown[:LISTED], key=lambda each: each[0].place):
+        (table, own, first), *others = some
+        lines += table.unknown_keys(_keys(own), [first, *(key for _, _, key in others)])
     if len(unknown) > LISTED:
         lines.append(f"{root.file}: {len(unknown) - LISTED} more keys are not known.")
     return "\n".join(lines) or f"{root.file}: {error}"

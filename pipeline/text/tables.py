@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import InputError
-from pipeline.text.files import read_bytes
+from pipeline.text.files import no_such_file, read_bytes
 from pipeline.text.wording import did_you_mean
 
 MOST_MB = 4  # size of a camera file with marks learned from 12,000 scans
@@ -31,7 +31,7 @@ def _parse(path: Path) -> dict[str, Any]:
             raise InputError(f"{path}, line {line}: joins more names by points than any table here. Mend that line.")
         return tomllib.loads(text)
     except FileNotFoundError:
-        raise InputError(f"{path}: there is no such file. Looked for {path.resolve()}.") from None
+        raise InputError(f"{path}: {no_such_file(path)}") from None
     except IsADirectoryError:
         raise InputError(f"{path}: is a folder; a TOML file is needed here. {_toml_files_sentence(path)}") from None
     except UnicodeDecodeError:
@@ -94,13 +94,10 @@ class Table:
         return f"{self.place}.{key}" if self.place else key
 
     def unknown_keys(self, known: Collection[str], others: Collection[str] | None = None) -> list[str]:
-        """Messages on unknown keys: the given ones, or all that are not known."""
-        names = list_words(sorted(known))
-        return [
-            str(self.error(key, f"is no key of this table.{did_you_mean(key, known)} Known here: {names}."))
-            for key in (self.values if others is None else others)
-            if key not in known
-        ]
+        """Messages on unknown keys: the given ones, or all that are not known; the last one lists the known keys."""
+        unknown = [key for key in (self.values if others is None else others) if key not in known]
+        lines = [str(self.error(key, f"is no key of this table.{did_you_mean(key, known)}")) for key in unknown]
+        return [*lines[:-1], *(f"{line} Known here: {list_words(sorted(known))}." for line in lines[-1:])]
 
     def _line_number(self, key: str) -> int | None:
         """Line of the key or sub-table of that name in this table; line of this table if it is missing."""

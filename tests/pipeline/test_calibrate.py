@@ -343,7 +343,7 @@ def drawn_picture(seed: int) -> Array:
     for mark in named_scan("").frame.marks:
         col, row = (round(float(at) / 10.0) for at in present(mark.center_px))
         picture[max(row - 1, 0) : row + 2, max(col - 1, 0) : col + 2] = 255.0
-    return np.clip(picture, 1.0, None)
+    return np.asarray(np.clip(picture, 1.0, None))
 
 
 @pytest.mark.parametrize("has_target", [True, False])

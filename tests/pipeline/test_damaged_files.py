@@ -74,7 +74,7 @@ def test_damaged_tables_and_calibrations(trials: int, seed: int, sound: Path, tm
         ("project.toml", "a = 1\n" + "b." * 200_000 + "c = 1", "line 3: joins more names by points than any table"),
         ("project.toml", 'output = "a\\u0000b"', r"output: 'a\x00b' can be no file's name"),
         ("project.toml", f'scans = ["{"s/" * 3000}*.tif"]', "scans: 's/s/s/"),
-        ("project.toml", "".join(f"[t{i}]\n" for i in range(10_000)), "9992 more keys are not known"),
+        ("project.toml", "".join(f"[t{i}]\n" for i in range(10_000)), "is a file of another kind"),
         ("project.toml", "#" * 5_000_000, "has more than 4 MB"),
         ("points.csv", "point,X,Y,Z\n" + "x" * 200_000 + ",1,2,3\n", "line 2: is no line of CSV (field larger than"),
         ("points.csv", "point,X,Y,Z\n\x1b[31mred,1,2,3\n", r"line 2, column point: '\x1b[31mred' can be no name"),

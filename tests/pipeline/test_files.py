@@ -195,6 +195,13 @@ def test_what_is_missing_for_a_camera_or_a_project_is_reported(tmp_path: Path) -
     refused(read_camera, alike, ["all its pixels are alike"])
     path = written(tmp_path, "camera.toml", 'name = "K"\nprincipal_distance_mm = 60.0\n')
     refused(read_project, path, ['is a camera file. Give the project file, which names it: camera = "camera'])
+    path = written(
+        tmp_path, "project.toml", "\n".join(f"{key} = 1" for key in ("scans", "output", "exclude", "camera"))
+    )
+    refused(read_camera, path, [f"{path}: is a file of another kind, with the keys 'scans', 'output'", "'frame_mm'"])
+    refused(read_toml, tmp_path / "poject.toml", ["there is no such file", "Did you mean 'project.toml'?"])
+    two = written(tmp_path, "camera.toml", CAMERA.replace('name = "C"', 'name = "C"\nlens = 1\nfilm = 2'))
+    refused(read_camera, two, ["lens: is no key of this table.\n", "film: is no key of this table. Known"])
     missing = tmp_path / "no.toml"
     for read in (read_toml, read_points):
         refused(read, missing, [str(missing.resolve())])

@@ -154,7 +154,9 @@ def test_what_is_no_store_is_refused(path: Path, tmp_path: Path) -> None:
         with pytest.raises(InputError, match=words):
             Store(path)
     with Store(tmp_path / "a.db") as store:
-        for name, words in (("b.db", "there is no such results database"), ("a.db", "joined into")):
+        (tmp_path / "camera.toml").write_text("name = 1", encoding="utf-8")
+        others = {"b.db": "there is no such results", "camera.toml": "is no results", "a.db": "joined into"}
+        for name, words in others.items():
             with pytest.raises(InputError, match=words):
                 merge(store, [tmp_path / name])
 
