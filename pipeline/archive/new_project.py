@@ -27,7 +27,7 @@ from pipeline.files.camera_file import read_camera
 from pipeline.files.library import PREFIX, camera_words, library_path, read_library
 from pipeline.progress import Reporter
 from pipeline.text.csv_table import csv_line
-from pipeline.text.files import image_name, names_below, write_atomically
+from pipeline.text.files import check_writable, image_name, names_below, write_atomically
 from pipeline.text.wording import count_sentence, counted, listed, quoted
 from pipeline.workers import worker_pool
 
@@ -193,11 +193,13 @@ class NewProject:
 def init_project(given: Sequence[Path], folder: Path, reporter: Reporter, max_pixels: int | None = None) -> NewProject:
     """Examine all files' heads, identify cameras from samples of each group, and write project.toml and images.csv.
 
-    Raises InputError where one of these files exists, or no scan is found.
+    Raises InputError, before a scan is opened, where one of these files exists or none can be written; where no scan is
+    found.
     """
     for path in (folder / "project.toml", folder / "images.csv"):
         if path.exists():
             raise InputError(f"{path} is there already, and init writes over nothing. Give another folder by --out.")
+    check_writable(next(place for place in (folder, *folder.absolute().parents) if place.exists()))
     given = [path for one in given for path in _given_paths(one)]
     for path in given:
         if not isinstance(path, Address) and not path.exists():

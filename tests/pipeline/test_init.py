@@ -225,6 +225,9 @@ def test_what_holds_no_scan_is_reported(given: str, said: str, tmp_path: Path, r
     (tmp_path / "only" / "a.tif").write_bytes(b"no scan")
     assert said in refusal("init", tmp_path / given, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+    assert "only/a.tif is a file, and a folder is needed there" in refusal(  # before any scan is opened
+        "init", tmp_path / given, "--out", tmp_path / "only" / "a.tif"
+    )
 
 
 def photograph(path: Path, size: tuple[int, int] = (640, 480), board: tuple[int, int] | None = None) -> Path:
