@@ -6,8 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.archive.results_database import Store
+from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.provenance import FileStates, Identity, fingerprint, hash_text, parts_hash
+from pipeline.results.adjustment_file import covariance_path, read_adjustment, read_own_covariance
+from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.comparator_file import ComparatorPoint
 
 MadeFrom = dict[str, str]
@@ -62,6 +65,26 @@ def measured_from(project: Project) -> MadeFrom:
             for image, path in project.scans.items()
         },
     }
+
+
+def current_adjustment(project: Project, marks: Sequence[ComparatorPoint]) -> AdjustmentRecord | None:
+    """Read the adjustment of a project; None where none converged.
+
+    Raises InputError for a stale one, made from other inputs, and for a file that was changed since it was written.
+    """
+    path = project.adjustment_path
+    if not path.exists():
+        return None
+    adjustment = read_adjustment(path)
+    if not adjustment.converged:
+        return None
+    made_from = adjustment.made_from
+    changed = differing(made_from, adjusted_from(project, marks)) if made_from else []
+    if changed:
+        raise InputError(f"{path}: is of other {', '.join(changed)} than there are now. Run `reseau adjust` again.")
+    if covariance_path(path).exists():
+        read_own_covariance(path)
+    return adjustment
 
 
 def adjusted_from(project: Project, marks: Sequence[ComparatorPoint]) -> MadeFrom:

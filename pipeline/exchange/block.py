@@ -13,13 +13,13 @@ from adjust.functional_model.projection import ImageModel, LineOfSight
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.scanner import NO_BEND
 from pipeline.adjusting.picture_turn import NOT_TURNED, Turn, picture_turn, turned_back
-from pipeline.archive.made_from import adjusted_from, differing
+from pipeline.archive.made_from import current_adjustment
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.files.project_tables import UNITS_MM
 from pipeline.resampling.canvas import FrameChain, image_chain
-from pipeline.results.adjustment_file import Covariance, read_adjustment, read_own_covariance
+from pipeline.results.adjustment_file import Covariance, read_own_covariance
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.comparator_file import ComparatorPoint, pixel_from_comparator, read_comparator, read_pitches
 from pipeline.types import Array
@@ -231,23 +231,6 @@ def read_block(project: Project) -> Block:
         for image, own in sorted(by_image.items())
     ]
     return Block(project, tuple(frames), adjustment)
-
-
-def current_adjustment(project: Project, marks: tuple[ComparatorPoint, ...]) -> AdjustmentRecord | None:
-    """Read the adjustment; None where none converged. Raises InputError for a stale one, made from other inputs."""
-    path = project.adjustment_path
-    if not path.exists():
-        return None
-    adjustment = read_adjustment(path)
-    if not adjustment.converged:
-        return None
-    made_from = adjustment.made_from
-    changed = differing(made_from, adjusted_from(project, marks)) if made_from else []
-    if changed:
-        raise InputError(
-            f"{path}: is of other {', '.join(changed)} than there are now. Run `reseau adjust` again before the export."
-        )
-    return adjustment
 
 
 def _frame(

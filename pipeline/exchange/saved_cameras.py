@@ -15,8 +15,8 @@ import numpy as np
 
 from adjust.functional_model.lens import Prior
 from adjust.problem.parameter import Parameter
+from pipeline.archive.made_from import current_adjustment
 from pipeline.errors import InputError
-from pipeline.exchange.block import current_adjustment
 from pipeline.files.camera_file import CameraFile, camera_text, read_camera
 from pipeline.files.camera_tables import Source
 from pipeline.files.earlier_calibration import EarlierCalibration

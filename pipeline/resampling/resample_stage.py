@@ -29,6 +29,7 @@ from measure.scans.remote import scan_path
 from measure.scans.scan import Scan
 from pipeline.adjusting.picture_turn import picture_turn
 from pipeline.archive.checked_results import read_measurement
+from pipeline.archive.made_from import current_adjustment
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
@@ -42,8 +43,8 @@ from pipeline.resampling.canvas import (
     outline_canvas,
     scan_places,
 )
-from pipeline.results.adjustment_file import read_adjustment
 from pipeline.results.adjustment_record import AdjustmentRecord
+from pipeline.results.comparator_file import read_comparator
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.files import atomic_path, check_writable, path_below
 from pipeline.types import Array, Mask, Samples
@@ -339,12 +340,15 @@ def resample_tasks(
     project: Project, folder: Path, pitch_um: float | None, with_lens: bool, degree: Degree
 ) -> tuple[list[ResampleTask], list[Resampled]]:
     """Tasks of a project, and the failures of scans that cannot be resampled."""
-    adjustment = read_adjustment(project.adjustment_path) if project.adjustment_path.exists() else None
-    if with_lens and (adjustment is None or not adjustment.converged):
+    scans = read_measurement(project.measurement_path)
+    adjustment = None
+    if project.comparator.exists():
+        adjustment = current_adjustment(project, read_comparator(project.comparator, project.list_pitch_um))
+    if with_lens and adjustment is None:
         raise InputError("--lens needs an adjusted lens. Run `reseau adjust` first, or resample without it.")
     tasks: dict[str, ResampleTask] = {}
     failed = []
-    for measured in read_measurement(project.measurement_path):
+    for measured in scans:
         image = measured.frame.image
         frame = project.image_frame(image)
         taking_lens = None if project.lens is None else project.lens.lens
@@ -379,7 +383,7 @@ def _chain(
 ) -> FrameChain | str:
     """Adjusted chain of an image, or the chain from its fiducials, or the reason why there is none."""
     image = measured.frame.image
-    if adjustment is not None and adjustment.converged and image in adjustment.images:
+    if adjustment is not None and image in adjustment.images:
         return image_chain(image, adjustment, measured.pitch_um, middle_mm(measured), with_lens)
     if with_lens:
         return "it has no part in the adjustment, so its lens is not known: resample it without --lens"

@@ -31,6 +31,7 @@ from projects import (
     adjusted_project,
     camera_mm,
     command,
+    copied,
     frame_px,
     ideal_mm,
     make_project,
@@ -284,6 +285,12 @@ def test_what_cannot_go_out_is_refused_with_its_reason(project: Path, tmp_path: 
     (tmp_path / "mine.txt").write_text("mine", encoding="utf-8")
     assert "holds something that is no export" in refusal("export", project, "csv", tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+    moved = copied(project.parent, tmp_path / "moved")
+    adjusted = tmp_path / "moved" / "out" / "adjustment.json"
+    content = json.loads(adjusted.read_text(encoding="utf-8"))
+    content["cameras"]["K"]["principal_distance_mm"]["value"] += 1.0
+    adjusted.write_text(json.dumps(content), encoding="utf-8")
+    assert "is of another adjustment than" in refusal("export", moved, "opencv", tmp_path / "a")
 
 
 def test_a_strong_lens_is_refused_unless_requested(tmp_path: Path, refusal: Refusal) -> None:
