@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from adjust.problem.parameter import Parameter
-from pipeline.errors import missing_extra
+from pipeline.errors import InputError, missing_extra
 from pipeline.exchange.block import Block, OutFrame
 from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.results.adjustment_record import AdjustmentRecord, Quantity
@@ -168,6 +168,8 @@ BINGO = Convention(
 def write_bingo(block: Block, options: ExportOptions) -> Written:
     """Write bingo.txt with the corrected coordinates of every point of every adjusted image."""
     block.needs_orientation("bingo")
+    _check_words(frame.image for frame in block.frames)
+    _check_words(mark.point for frame in block.frames for mark in frame.observed(fiducials=False))
     unknown = (scan.image for scan in block.frames if scan.model is None)
     left_out = [f"{image}: it has no part in the adjustment, so its film is not known." for image in unknown]
     texts, interior = [], dict[str, str]()
@@ -192,6 +194,15 @@ def write_bingo(block: Block, options: ExportOptions) -> Written:
         "fiducial marks",
     )
     return Written({"bingo.txt": "\n".join(texts)}, lost, tuple(interior.values()), tuple(left_out))
+
+
+def _check_words(names: Iterable[str]) -> None:
+    """Raise InputError where two names of images or of points become one word."""
+    words = dict[str, str]()
+    for name in names:
+        if (other := words.setdefault(_word(name), name)) != name:
+            both = f"{other!r} and {name!r} would both be {_word(name)!r}"
+            raise InputError(f"bingo: {both}, since blanks separate words there. Rename one of them.")
 
 
 def _word(name: str) -> str:

@@ -137,12 +137,12 @@ def check_writable(folder: Path) -> None:
 def no_such_file(path: Path) -> str:
     """Sentence on a missing file, with the file of the same kind in its folder that was probably meant."""
     try:
-        others = [other.stem for other in path.parent.iterdir() if other.suffix == path.suffix]
+        others = [other.stem for other in path.parent.iterdir() if other.suffix == path.suffix and other != path]
     except OSError:
         others = []
     near = nearest(path.stem, others)
     meant = f" Did you mean '{near}{path.suffix}'?" if near else ""
-    return f"there is no such file. Looked for {path.resolve()}.{meant}"
+    return f"there is no such file. Looked for {os.path.abspath(path)}.{meant}"
 
 
 SCAN_ENDINGS = (".tif", ".tiff", ".jpg", ".jpeg", ".jp2", ".j2k", ".png")

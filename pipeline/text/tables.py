@@ -47,7 +47,14 @@ def _mending(text: str, error: str) -> str:
     if re.search("Unescaped|hex value", error):
         return "Mend that line (a path has / in the place of \\)."
     place = re.search(r"at line (\d+)", error)
-    found = _BARE.match(text.splitlines()[int(place[1]) - 1]) if place else None
+    line = text.splitlines()[int(place[1]) - 1] if place else ""
+    found = _BARE.match(line)
+    if re.search("[“”„’]", line):
+        return 'Quotes are straight here: "...".'
+    if "overwrite" in error:
+        return "This key or table is given twice: remove one."
+    if re.search(r"=\s*-?\d+,\d", line):
+        return "Numbers have a decimal point: 60.5, not 60,5."
     if found and found["word"]:
         return f'Text stands in quotes: {found["key"]} = "{found["word"]}".'
     if found:

@@ -43,12 +43,13 @@ from projects import (
 )
 
 from adjust import LineOfSight
-from pipeline import read_project
+from pipeline import InputError, read_project
 from pipeline.cli import DONE, LOOK, WRONG_INPUT
 from pipeline.exchange import micmac_format, pinhole
 from pipeline.exchange.block import read_block
 from pipeline.exchange.formats import FORMATS
 from pipeline.exchange.geojson_format import lon_lat
+from pipeline.exchange.tables import _check_words
 
 Array = NDArray[np.float64]
 
@@ -291,6 +292,8 @@ def test_what_cannot_go_out_is_refused_with_its_reason(project: Path, tmp_path: 
     content["cameras"]["K"]["principal_distance_mm"]["value"] += 1.0
     adjusted.write_text(json.dumps(content), encoding="utf-8")
     assert "is of another adjustment than" in refusal("export", moved, "opencv", tmp_path / "a")
+    with pytest.raises(InputError, match=r"'a b' and 'a_b' would both be 'a_b'"):
+        _check_words(["a b", "c", "a b", "a_b"])
 
 
 def test_a_strong_lens_is_refused_unless_requested(tmp_path: Path, refusal: Refusal) -> None:

@@ -200,6 +200,8 @@ def test_what_is_missing_for_a_camera_or_a_project_is_reported(tmp_path: Path) -
     )
     refused(read_camera, path, [f"{path}: is a file of another kind, with the keys 'scans', 'output'", "'frame_mm'"])
     refused(read_toml, tmp_path / "poject.toml", ["there is no such file", "Did you mean 'project.toml'?"])
+    (tmp_path / "loop.toml").symlink_to("loop.toml")
+    refused(read_toml, tmp_path / "loop.toml", ["loop.toml"])
     two = written(tmp_path, "camera.toml", CAMERA.replace('name = "C"', 'name = "C"\nlens = 1\nfilm = 2'))
     refused(read_camera, two, ["lens: is no key of this table.\n", "film: is no key of this table. Known"])
     missing = tmp_path / "no.toml"
@@ -352,6 +354,9 @@ TONE = 'camera = "camera.toml"\n[measure]\ntone = '
         (read_project, f'{TONE}"2.2"', ["tone", "linear", "A number above 0, without quotes"]),
         (read_project, f"{TONE}-1.0", ["tone", "greater than 0"]),
         (read_toml, "k3 = free", ['Text stands in quotes: k3 = "free".']),
+        (read_toml, "unit = “m”", ['Quotes are straight here: "...".']),
+        (read_toml, "k3 = 1\nk3 = 2", ["given twice: remove one"]),
+        (read_toml, "c_mm = 60,5", ["decimal point: 60.5, not 60,5"]),
         (read_toml, "kind = ring-cross  # of the RC8", ['Text stands in quotes: kind = "ring-cross".']),
         (read_toml, "pitch_um = 5 um", ["A number stands without its unit, which the key names: pitch_um = 5."]),
         (read_toml, "frame_mm = [228.0, 228.0", ["Mend that line."]),
