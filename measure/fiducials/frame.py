@@ -23,7 +23,8 @@ from measure.tone.estimate import FrameTone
 MANY = 6  # inliers from which the predicted place of a faint mark is reliable
 CLEAR_DAMAGE = 0.25  # fraction of a mark: with more of it damaged, the rest may belong to something else
 _CLEAR_SNR = 3.0  # contrast over the noise of a pixel: with less a mark is weak,
-_CLEAR_SIGNIFICANCE = 10.0  # unless its contrast has this many standard deviations: texture alone reaches 4.5
+_CLEAR_SIGNIFICANCE = 10.0  # unless its contrast has this many standard deviations
+LEAST_SIGNIFICANCE = 4.5  # standard deviations of the contrast: texture alone stays below it
 _AGREEING, _AGREEING_SHARE = 3, 0.3  # least inliers; fraction of the marks in the scan; two fit any similarity
 _CHECKED = 4  # inliers from which an affine transformation has redundancy
 WRONG_PX = 0.5  # px, an error that a mark with status measured must not have
@@ -210,6 +211,11 @@ class Frame:
         return self.agrees and len(self.clear_fits) >= self.least
 
     @property
+    def is_faint(self) -> bool:
+        """Whether all its marks together decide on it: none of them need be clear."""
+        return self.placement.surroundings.robust or not self.accepted
+
+    @property
     def unblemished(self) -> list[int]:
         """Indices of the marks with status measured that agree with the others."""
         near = self.inliers & (self.misfit_mm <= _FAR * max(self.scatter_mm, _LEAST_SCATTER_MM))
@@ -271,6 +277,9 @@ class Frame:
             reasons.append(Reason(f"it correlates with its drawing by only {fit.likeness:.2f}", Code.LIKENESS))
         if fit.snr < _CLEAR_SNR and fit.significance < _CLEAR_SIGNIFICANCE:
             reasons.append(Reason(f"its contrast is only {fit.snr:.1f} times the noise", Code.CONTRAST))
+        elif fit.significance < LEAST_SIGNIFICANCE:
+            texture = f"its contrast is only {fit.significance:.1f} standard deviations of the texture"
+            reasons.append(Reason(texture, Code.CONTRAST))
         if fit.damaged_fraction > CLEAR_DAMAGE + min(self._usual_damage, _MOST_UNLIKE):
             reasons.append(Reason(f"{fit.damaged_fraction:.0%} of it is damaged", Code.COVERED))
         elif fit.lost_fraction > _MOST_LOST:

@@ -18,7 +18,7 @@ from measure.detection.localisation import MarkPrediction, highest_peak
 from measure.fiducials.consistency import gross_errors
 from measure.fiducials.constellation import NARROW, Placement
 from measure.fiducials.faint_marks import detect_faint_marks, faint_reach_px
-from measure.fiducials.frame import MANY, REDUCED_PX, Frame
+from measure.fiducials.frame import LEAST_SIGNIFICANCE, MANY, REDUCED_PX, Frame
 from measure.fiducials.interior_orientation import fit_frame
 from measure.fiducials.mark_comparison import (
     SharedBlur,
@@ -45,7 +45,6 @@ from measure.tone.estimate import FrameTone, MarkTone
 from measure.tone.sharpening import FEWEST_MARKS, Sharpening, estimate_sharpening
 
 LEAST_LIKENESS = 0.35  # correlation with the drawing: below it texture, text and scratches are as similar
-_LEAST_SIGNIFICANCE = 4.5  # standard deviations of the contrast: texture alone stays below it
 _FAINT_SIGNIFICANCE = 2.0  # the same where noise hardly gives such a peak: there is contrast, at 95 %
 _MARGIN_PX = 4.0  # width of the background around a mark, used to estimate its offset and slopes
 _BLUR_PX = 0.8  # blur of a mark's image, the initial value of a match
@@ -205,11 +204,16 @@ def _detect(frame: Frame, indices: Iterable[int], search_px: float) -> Frame:
 
 
 def _detection(frame: Frame, expected: MarkPrediction) -> Detection:
-    """Detect one mark; a fit that texture could give is dropped, unless faint marks together decide on the frame."""
+    """Detect one mark; a fit that texture could give is dropped, unless all marks together decide on the frame.
+
+    Faint marks of a frame of many are detected later, where the others predict them.
+    """
     detection = detect_mark(frame.scan, expected, replace(frame.options.match, tells_sharpening=True))
     fit, closer = detection.fit, frame.placement.surroundings.robust
-    sure = closer and detection.false_alarms <= FAINT_MARK_BY_NOISE
-    likeness, significance = (0.0, _FAINT_SIGNIFICANCE) if sure else (LEAST_LIKENESS, _LEAST_SIGNIFICANCE)
+    sure = detection.false_alarms <= FAINT_MARK_BY_NOISE
+    likeness = 0.0 if sure and closer else LEAST_LIKENESS
+    is_faint = sure and (closer or len(frame.detections) <= MANY)
+    significance = _FAINT_SIGNIFICANCE if is_faint else LEAST_SIGNIFICANCE
     if fit is not None and (fit.likeness < likeness or fit.significance < significance):
         return Detection(detection.predicted_px, True, None, not_found(expected.search_px))
     return detection
@@ -283,7 +287,7 @@ def _detect_closer(frame: Frame) -> Frame:
         expected = replace(frame.prediction(index, frame.gate_px), surroundings=CLOSE)
         detection = detect_mark(frame.scan, expected, frame.options.match)
         fit, is_sure = detection.fit, detection.false_alarms <= TEXTURE_LIKE_A_FAINT_MARK
-        if is_sure and fit and fit.is_clear and fit.significance >= _LEAST_SIGNIFICANCE:
+        if is_sure and fit and fit.is_clear and fit.significance >= LEAST_SIGNIFICANCE:
             changed[index] = replace(detection, closer=True)
     return frame.replace_detections(changed)
 

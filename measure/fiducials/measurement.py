@@ -28,6 +28,7 @@ from measure.scans.remote import Window
 from measure.scans.scan import Scan
 
 _SET = ("set in the project.",)
+_FAINT = Reason("the frame was found only by its faint marks together", Code.FAINT_FRAME)
 _UNSURE = Reason("No mark passed all checks: the frame may lie elsewhere.", Code.CHANCE)
 _OBLIQUE = Reason(
     "only a perspective fits its marks: the film was photographed obliquely. Set transformation = "
@@ -96,6 +97,7 @@ def _search_frame(
     if frame is None:
         absent = absent_frame(scan, layout, found.misfit, options.rotation_deg, pitch_um)
         return replace(absent, writing=_read(scan, layout, None)) if options.writing == "all" else absent
+    is_faint = frame.is_faint
     lines = _read(scan, layout, frame) if options.writing == "all" else None
     pose, against = Pose(options.pose, True, _SET), NO_REASON
     if options.pose == "auto":
@@ -106,14 +108,15 @@ def _search_frame(
         frame, pose = _rename(frame, pose)
     else:
         against = _against_the_set_pose(frame, lines or ())
-    chance = doubt_frame(result, frame)
+    # A faint frame is not tested again: it was accepted only if significant.
+    chance = NO_REASON if is_faint else doubt_frame(result, frame)
     problems = [each.reword(f"{each}.") for each in (*_rivals(result, frame), chance, against) if each]
     doubts = problems if frame.measured_count else [_UNSURE, *problems]
     if doubts and options.pose == "auto":
         pose = replace(pose, decided=False, evidence=(*pose.evidence, *doubts))
     if frame.options.film_model != options.film_model:
         problems.append(_OBLIQUE)
-    return replace(present_frame(frame, pose, pitch_um, problems, chance), writing=lines)
+    return replace(present_frame(frame, pose, pitch_um, problems, _FAINT if is_faint else chance), writing=lines)
 
 
 def _rename(frame: Frame, pose: Pose) -> tuple[Frame, Pose]:
@@ -187,7 +190,7 @@ def _rivals(result: SearchResult, frame: Frame) -> list[Reason]:
         else:
             sentence = (
                 f"the constellation fits nearly as well shifted by {shift_mm}, on {other.supported} marks against "
-                f"{best.supported}: the marks' names are ambiguous"
+                f"{best.supported}: the marks' names are ambiguous, all may be wrong: click three in `reseau review`"
             )
             problems.append(Reason(sentence, Code.AMBIGUOUS))
     return problems[:3]

@@ -19,7 +19,6 @@ from measure.scans.scan import Scan
 _LEAST_MARKS = 3  # with two, a false one yields a wrong pitch
 _REACH_PX = 20.0  # around a mark of unknown size: that of a disk or crossing of a test field, with its background
 _PLAIN_PX = 3.0  # px across the finest line of a mark: both edges and the inside are resolved
-_FAINT = Reason("the frame was found only by the search for faint marks", Code.FAINT_FRAME)
 _ASSUMED = Reason(
     "the frame's pose is only assumed, and another of the learned marks would have its origin elsewhere", Code.POSE
 )
@@ -92,19 +91,19 @@ def present_frame(
     ----------
     pitch_um : given pixel pitch in x and y; None: pixels are taken as square.
     problems : sentences on why the frame may lie elsewhere, in addition to the problems that its marks show.
-    chance : why the frame may be a false alarm; empty if it is significant.
+    chance : why the frame may be a false alarm, or that its marks are faint; empty otherwise.
 
     Notes
     -----
-    Measured marks become weak if the frame may be a false alarm, if its names are ambiguous, or if it was found only by
-    the search for faint marks. If the frame is more likely a false alarm than not, no mark is an observation.
+    Measured marks become weak if the frame may be a false alarm or is faint, or if its names are ambiguous. If the
+    frame is more likely a false alarm than not, no mark is an observation.
     """
     if Code.NO_FRAME in chance.codes:
         places = zip(frame.layout.marks, frame.detections, frame.predicted_px, strict=True)
         marks = tuple(_unmeasured(mark.id, each, place, chance) for mark, each, place in places)
         return FrameMeasurement(frame.scan.name, marks, pose, problems=tuple(problems), weights=frame.weights)
     unnamed = next((problem for problem in problems if Code.AMBIGUOUS in problem.codes), NO_REASON)
-    weak = chance or unnamed or (_FAINT if frame.placement.surroundings.robust else NO_REASON)
+    weak = chance or unnamed
     marks = tuple(_row(mark, index, frame, pose, weak) for index, mark in enumerate(frame.layout.marks))
     problems = (*problems, *_problems(frame, pitch_um))
     tone = replace(frame.tone, tone=frame.tone.tone.without_priors)

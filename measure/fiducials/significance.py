@@ -137,13 +137,8 @@ def doubt_frame(result: SearchResult, frame: Frame) -> Reason:
     -------
     Reason
         Empty if the frame is significant. Contains the code no-frame if it is more likely a false alarm than not.
-
-    Notes
-    -----
-    Frames found by the search for faint marks are not tested again: they were accepted only if significant, although
-    none of their marks may be clear.
     """
-    if frame.placement.surroundings.robust or len(frame.inlier_fits) >= _SURE:
+    if len(frame.inlier_fits) >= _SURE:
         return NO_REASON
     inside = [index for index, detection in enumerate(frame.detections) if detection.inside]
     # A mark searched only where the others predict it is no independent evidence.

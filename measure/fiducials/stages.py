@@ -85,7 +85,8 @@ class Stage:
         if self.kind == "oblique":
             # Weak marks do not count as missing: a perspective displaces marks, but leaves their quality unchanged.
             return frame is not None and frame.inside - len(frame.inlier_fits) < max(_GAINED, _LACKED * frame.inside)
-        return self.kind == "pitch" and frame is not None and not doubt_frame(found.result, frame)
+        is_found = frame is not None and (frame.is_faint or not doubt_frame(found.result, frame))
+        return self.kind == "pitch" and is_found
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,9 +182,9 @@ def measure_stage(
 ) -> list[Evaluated]:
     """Measure the frame in the likely placements, and estimate the expected number of false frames as good.
 
-    An accepted frame of the prior belief needs no such test. Under another pitch or film model only unblemished marks
-    count, since the additional freedom yields false frames too; a perspective has to fit nearly all marks. Faint marks
-    need not be clear, only agree: `tried`, the number of hypotheses so far, limits which placements are measured.
+    An accepted frame of the prior belief needs no such test. A perspective has to fit nearly all marks, and only
+    unblemished ones count. Under another pitch, and of faint marks, the significance of the frame decides: its marks
+    need not be clear, only agree. `tried`, the number of hypotheses so far, limits which placements are measured.
     Placements under another tone curve or pitch are measured only if some marks are clear there.
     """
     kind, options, found = stage.kind, stage.options, result.placements
@@ -200,14 +201,13 @@ def measure_stage(
     if stage.is_given:
         frame = best_frame(measured, max((each.supported for each in places), default=0), result)
         return [] if frame is None else [(0.0 if frame.accepted else np.inf, frame)]
-    if kind == "faint":
-        faint = (_evaluate_faint(each, result, tried) for each in measured)
-        return sorted((each for each in faint if each is not None), key=itemgetter(0))
-    frames = [frame for frame in measured if frame.accepted]
     if kind == "oblique":
-        frames = [frame for frame in frames if frame.measured_count >= max(least[0], frame.inside - least[1])]
-    expected = [(tried * false_frames(result, frame, frame.unblemished), frame) for frame in frames]
-    return sorted(expected, key=itemgetter(0))
+        frames = (frame for frame in measured if frame.accepted)
+        frames = (frame for frame in frames if frame.measured_count >= max(least[0], frame.inside - least[1]))
+        evaluated = [(tried * false_frames(result, frame, frame.unblemished), frame) for frame in frames]
+    else:
+        evaluated = [each for frame in measured if (each := _evaluate(frame, result, tried))]
+    return sorted(evaluated, key=itemgetter(0))
 
 
 def best_frame(measured: Iterable[Frame], most_supported: int, result: SearchResult) -> Frame | None:
@@ -234,8 +234,8 @@ def _preference(frame: Frame) -> tuple[int, ...]:
     return (1, 0) if frame.accepted else (0, bool(frame.failed_fits), int(frame.inliers.sum()))
 
 
-def _evaluate_faint(frame: Frame, result: SearchResult, tried: int) -> Evaluated | None:
-    """Evaluate a faint frame, also in its likeliest pose: names of other poses would hide its marks."""
+def _evaluate(frame: Frame, result: SearchResult, tried: int) -> Evaluated | None:
+    """Evaluate a frame, also in its likeliest pose: names of other poses would hide its marks."""
     placement, frames = frame.placement, [frame]
     if frame.options.pose == "auto" and frame.inliers.any():
         pose = decide_pose(frame).name

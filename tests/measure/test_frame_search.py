@@ -151,7 +151,7 @@ class Stand:
 
     def __init__(self, name: str) -> None:
         self.name, self.is_complete, self.accepted, self.measured_count = name, False, False, 0
-        self.is_sure, self.agrees, self.scan = False, False, SCAN
+        self.is_sure, self.agrees, self.is_faint, self.scan = False, False, False, SCAN
         self.failed_fits: list[int] = []
         self.inliers, self.pixel_from_camera = np.ones(3, bool), np.eye(2, 3)
 
@@ -212,6 +212,20 @@ def test_attempts_under_the_given_pitch_are_tested_by_themselves(monkeypatch: py
     assert "another pitch does not separate them; click the visible marks in `reseau review`" in found.misfit
     found, _ = search_attempts(monkeypatch, np.inf, 1.0, 0.3, at_given=2)
     assert found.misfit == "not 0"  # chance makes more than one
+
+
+def test_under_another_pitch_the_marks_together_decide_on_a_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    """None of them is clear, and fewer than 0.001 such placements are expected by chance."""
+    frame = cast(Any, Stand("faint"))
+    frame.agrees, frame.accepted, frame.options, frame.inlier_fits = True, False, FiducialOptions(pose="0"), {}
+    frame.placement = Placement("0", np.eye(2, 3), 1.0, 3, 1, 1, (0.05, 0.05))
+    for function, value in (("measure_frame", frame), ("false_placements", 1e-4), ("false_frames", 0.5)):
+        monkeypatch.setattr(stages, function, lambda *_, value=value: value)
+    monkeypatch.setattr(stages, "shows_marks", lambda *_: True)
+    stage = Stage("pitch", [GIVEN], FiducialOptions())
+    ((expected, found),) = stages.measure_stage(SCAN, ALIKE, stage, SearchResult((frame.placement,)), 5)
+    assert found is frame
+    assert expected == pytest.approx(1e-3)  # two criteria, five hypotheses
 
 
 def test_where_nothing_was_detected_the_reason_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
