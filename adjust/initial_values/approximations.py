@@ -122,7 +122,7 @@ def _initial_values(network: Network) -> Approximations:
     if network.has_parts:
         return _joined_values(network)
     films = _film_transformations(network)
-    transformation, mirrored = _by_image(films)
+    transformation, mirrored = _film_parameters(films)
     frames = camera_frames(network, transformation, mirrored)
     used = [camera for camera in network.cameras if camera.name not in network.idle_cameras]
     resected = dict[str, Pose]()
@@ -151,7 +151,7 @@ def _joined_values(network: Network) -> Approximations:
     films |= _film_transformations(network)
     whole = whole_frames(network, films)
     found = _initial_values(whole) if whole.images else Approximations({}, {}, {}, {})
-    transformation, mirrored = _by_image(films)
+    transformation, mirrored = _film_parameters(films)
     return replace(
         found,
         exterior={image.name: found.exterior[image.frame] for image in network.images if image.frame in found.exterior},
@@ -161,7 +161,7 @@ def _joined_values(network: Network) -> Approximations:
     )
 
 
-def _by_image(films: Mapping[str, FilmFit]) -> tuple[dict[str, Array], frozenset[str]]:
+def _film_parameters(films: Mapping[str, FilmFit]) -> tuple[dict[str, Array], frozenset[str]]:
     """Parameters by image, and the names of the mirrored scans."""
     mirrored = frozenset(name for name, (_, is_mirrored) in films.items() if is_mirrored)
     return {name: parameters for name, (parameters, _) in films.items()}, mirrored
@@ -485,7 +485,7 @@ def whole_frames(network: Network, films: Mapping[str, FilmFit]) -> Network:
     for image in network.images:
         if image.name not in network.objectless_images:
             first.setdefault(image.frame, image)
-    frames, observations = camera_frames(network, *_by_image(films)), network.observations
+    frames, observations = camera_frames(network, *_film_parameters(films)), network.observations
     xy_mm = network.straight_xy_mm.copy()
     xy_mm[frames.rows] = frames.xy_mm
     frame_of = {image.name: image.frame for image in network.images}

@@ -262,7 +262,7 @@ class ProjectionField:
         if self._film is not None:
             keys = [Parameter.fiducial(camera.name, id, axis) for id in camera.fiducials for axis in "xy"]
             self.calibration += keys
-            design = _by_film(self._film, estimates.values_of(keys).reshape(-1, 2)).reshape(len(keys), -1)
+            design = _film_derivatives(self._film, estimates.values_of(keys).reshape(-1, 2)).reshape(len(keys), -1)
             sizes = np.linalg.norm(design, axis=0)
             # (q, 2 f) effect of changed marks on the interior orientation of a scan, by least squares
             self._film_by_marks = np.linalg.pinv(design / sizes).astype(np.float64) / sizes[:, None]
@@ -288,7 +288,9 @@ class ProjectionField:
             right = right + weighted @ by.reshape(-1, by.shape[2])
             film_names = film_parameter_names(image.transformation)
             self.films += [Parameter.film(image.name, name) for name in film_names]
-            by_films.append(-weighted @ _by_film(model.film, places[-1]).reshape(2 * len(rows), len(film_names)))
+            by_films.append(
+                -weighted @ _film_derivatives(model.film, places[-1]).reshape(2 * len(rows), len(film_names))
+            )
         scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), np.finfo(float).tiny))
         self._orientation = np.linalg.pinv(normal * np.outer(scale, scale), rcond=RANK, hermitian=True)
         self._orientation *= np.outer(scale, scale)
@@ -327,7 +329,7 @@ class ProjectionField:
         at = self._lens.equations(xy_mm, ray)
         by = np.asarray(-np.linalg.solve(at.xy_jacobian, at.quantity_jacobian), dtype=np.float64)
         if self._film is not None:
-            by = np.concatenate([by, -_by_film(self._film, xy_mm)], axis=2)
+            by = np.concatenate([by, -_film_derivatives(self._film, xy_mm)], axis=2)
         orientation = ray_by_orientation(ray, inverse_depth)
         return by, np.asarray(-np.linalg.solve(at.xy_jacobian, at.ray_jacobian @ orientation), dtype=np.float64)
 
@@ -340,7 +342,7 @@ def frame_grid(corners_mm: Sequence[Sequence[float]] | Array, longer: int) -> Ar
     return np.stack(np.meshgrid(x, y), axis=-1)
 
 
-def _by_film(film: Film, xy_mm: Array) -> Array:
+def _film_derivatives(film: Film, xy_mm: Array) -> Array:
     """(n, 2, q) derivatives of camera points by the parameters of an image's film transformation."""
     return film.design(film.comparator_from_camera(xy_mm)[0])
 

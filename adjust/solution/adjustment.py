@@ -188,7 +188,7 @@ class _Solver:
         except AdjustmentError:
             return None
 
-    def without(self, network: Network, reasons: Mapping[str, str]) -> tuple[Network, Approximations] | None:
+    def remainder(self, network: Network, reasons: Mapping[str, str]) -> tuple[Network, Approximations] | None:
         """Leave out some frames; return the rest with its own approximations, None where too little is left."""
         rest = leave_out(network, reasons) if reasons else None
         start = None if rest is None else self.own_start(rest)
@@ -208,7 +208,7 @@ class _Solver:
         try:
             return part, self.initial_values(part), misnumbered
         except UnorientedError as error:
-            rest, reasons = self.without(part, error.reasons), error.reasons
+            rest, reasons = self.remainder(part, error.reasons), error.reasons
         except AdjustmentError:
             return part, None, misnumbered
         return (part, None, misnumbered) if rest is None else (*rest, misnumbered | reasons)
@@ -225,11 +225,11 @@ class _Solver:
         try:
             result = self.check_whole(part, None, start)
         except NoImageError as error:
-            if (rest := self.without(part, error.reasons)) is None:
+            if (rest := self.remainder(part, error.reasons)) is None:
                 raise
             return self.leave_out_blind(*rest, left_out | error.reasons)
         reasons = contradicting_image(result) if result.termination not in ("converged", "singular") else {}
-        if (rest := self.without(part, reasons)) is None:
+        if (rest := self.remainder(part, reasons)) is None:
             return result, left_out
         without, more = self.leave_out_blind(*rest, left_out | reasons)
         return (without, more) if without.converged else (result, left_out)

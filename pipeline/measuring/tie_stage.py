@@ -64,7 +64,7 @@ def _join_parts(
     parts = sorted(parts, key=lambda scan: scan.frame.image)
     frames = []
     for scan in parts:
-        marks = _taken([mark for mark in scan.frame.marks if mark.kind == "fiducial"])
+        marks = _occupied_places([mark for mark in scan.frame.marks if mark.kind == "fiducial"])
         frames.append(TieFrame(scan.frame.image, scan_path(scan.scan), np.eye(2, 3), None, marks, project.max_pixels))
     joins = measure_joins(frames, workers=workers)
     problems = {image: (problem,) for image, problem in joins.problems.items()}
@@ -79,7 +79,7 @@ def _add_marks(
     return scan.changed((*scan.frame.marks, *marks.get(image, ())), problems.get(image, ()))
 
 
-def _taken(marks: Sequence[MarkMeasurement]) -> Array:
+def _occupied_places(marks: Sequence[MarkMeasurement]) -> Array:
     """(n, 3) column, row and size of the places where no natural point is sought."""
     places = [
         (*mark.center_px, max(mark.quality.get("size_px", 0.0), _LEAST_MARK_PX))
@@ -215,7 +215,11 @@ def _tie_frame(project: Project, scan: MeasuredScan) -> TieFrame | None:
         middle = np.array([scan.width_px - 1, scan.height_px - 1]) / 2
         pixel_from_camera = np.column_stack([np.diag([1000.0, -1000.0] / np.array(scan.pitch_um)), middle])
         frame_mm = None
-    path, marks, frame = scan_path(scan.scan), _taken(scan.frame.marks), project.scanned_frame(scan.frame.image)
+    path, marks, frame = (
+        scan_path(scan.scan),
+        _occupied_places(scan.frame.marks),
+        project.scanned_frame(scan.frame.image),
+    )
     return TieFrame(scan.frame.image, path, pixel_from_camera, frame_mm, marks, project.max_pixels, frame)
 
 

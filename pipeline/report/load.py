@@ -98,7 +98,7 @@ class FrameTotals:
         for center in centers_px(frame):
             self.centers_px.extend(center.tolist())
 
-    def add_plain(self, stored: Judging, camera_of: Callable[[str], str]) -> None:
+    def add_plain(self, stored: Judging, image_camera: Callable[[str], str]) -> None:
         """Add the stored frames without problems."""
         counts = {result: Counter[str]() for _, _, result in stored.plain}
         for result, kind, status, col_px, row_px in stored.plain_marks():
@@ -109,7 +109,7 @@ class FrameTotals:
                 self.centers_px.extend((col_px, row_px))
         alike = dict[frozenset[tuple[str, int]], Counter[str]]()  # one object for all frames with equal counts
         for image, uri, result in stored.plain:
-            self.verdicts[camera_of(image), _ending(uri)][Verdict.GOOD] += 1
+            self.verdicts[image_camera(image), _ending(uri)][Verdict.GOOD] += 1
             count = counts[result]
             self.marks[image] = alike.setdefault(frozenset(count.items()), count)
 
@@ -117,7 +117,7 @@ class FrameTotals:
 def reduced(
     data: ReportData,
     scans: Iterable[MeasuredScan],
-    camera_of: Callable[[str], str],
+    image_camera: Callable[[str], str],
     stored: Judging | None = None,
 ) -> ReportData:
     """Reduce the data to the totals of all frames and the worst of the frames that need a look.
@@ -130,7 +130,7 @@ def reduced(
     """
     totals = FrameTotals()
     if stored is not None:
-        totals.add_plain(stored, camera_of)
+        totals.add_plain(stored, image_camera)
     suspect = {row.image for row in suspect_rows(data.adjustment)} if data.adjustment else set[str]()
 
     def frames_to_show() -> Iterator[tuple[tuple[float, float], ReportData]]:
@@ -138,7 +138,7 @@ def reduced(
         for one in _one_by_one(data, scans):
             (frame,) = frames(one)
             verdict, problems = frame.verdict, list(single_frame_problems(frame))
-            kind = camera_of(frame.image), _ending(frame.scan.scan) if frame.scan else "given"
+            kind = image_camera(frame.image), _ending(frame.scan.scan) if frame.scan else "given"
             totals.add(frame, kind, verdict, problems)
             if problems or verdict.needs_review or frame.image in suspect:
                 largest_w = max((abs(mark.w or 0.0) for mark in frame.marks), default=0.0)
@@ -303,19 +303,19 @@ def unread_scans(data: ReportData, path: Path, images: Collection[str] | None = 
 def report_data(project: Project, at: At, most_frames: int = MOST_FRAMES) -> ReportData:
     """Load all data of a report. With more than most_frames frames: totals, and the frames that need a look."""
 
-    def camera_of(image: str) -> str:
+    def image_camera(image: str) -> str:
         return project.image_camera(image).name
 
     with _stored(project, at) as stored:
         if stored is not None and len(stored.names) > most_frames:
             needed = stored.names - {image for image, _, _ in stored.plain}
             data = measured_data(project, at, rows=list(stored.points(needed)))
-            return reduced(data, stored.scans(needed), camera_of, stored)
+            return reduced(data, stored.scans(needed), image_camera, stored)
     data = adjusted_data(project, at, most_frames)
     return (
         data
         if _frame_count(data) <= most_frames
-        else reduced(data, unread_scans(data, project.measurement_path), camera_of)
+        else reduced(data, unread_scans(data, project.measurement_path), image_camera)
     )
 
 
