@@ -37,7 +37,13 @@ from adjust.quality.run import UM_PER_MM, GrossError, Run, residuals
 from adjust.quality.tested import Probabilities
 from adjust.quality.variance_components import added_variance
 from adjust.rank_defect.diagnosis import singular_directions
-from adjust.solution.model_hypotheses import ModelHypothesis, camera_hypotheses, estimate, separate_lenses
+from adjust.solution.model_hypotheses import (
+    ModelHypothesis,
+    camera_hypotheses,
+    estimate,
+    film_deformations,
+    separate_lenses,
+)
 from adjust.solution.object_hypotheses import object_hypotheses
 from adjust.solution.reweighting import again
 
@@ -203,10 +209,11 @@ def _best(model: _Model) -> tuple[list[_Model], bool]:
     """Models with the best significant hypotheses, several where these are not distinguished."""
     # Also returns whether gross errors of single observations explain the residuals as well.
     # Errors of a real board's points are part of the noise that is fitted: none of them is told but the worst.
-    most_points = len(model.run.problem.network.points) if model.exceeds(SUSPECTED) or model.gross_errors else 0
-    most_points = 1 if model.is_noise_fitted else most_points
+    is_suspicious = model.exceeds(SUSPECTED) or bool(model.gross_errors)
+    most_points = 1 if model.is_noise_fitted else len(model.run.problem.network.points) * is_suspicious
     tested = {board.name for board in model.run.problem.network.boards}
-    rows = chain(camera_hypotheses(model.run), object_hypotheses(model.run, most_points))
+    of_films = film_deformations(model.run) if is_suspicious else ()
+    rows = chain(camera_hypotheses(model.run), of_films, object_hypotheses(model.run, most_points))
     falls = [(_first_order_fall(model.run, each.problem), each) for each in rows if each.name not in tested]
     level = LEVEL / max(len(falls), 1)
     worth = WORTH * max((fall for fall, _ in falls), default=0.0)

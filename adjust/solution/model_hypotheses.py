@@ -16,9 +16,10 @@ from adjust.functional_model.correction import AFFINITY_TERMS, ZERO, PolynomialT
 from adjust.functional_model.families import family
 from adjust.functional_model.lens import INTERIOR_NAMES, Prior
 from adjust.functional_model.scanner import is_left
+from adjust.functional_model.transformation import LATTICE, film_kind, fit_transformation
 from adjust.problem.camera import Camera
 from adjust.problem.condition_equations import in_camera, object_displacements
-from adjust.problem.network import Approximations, Board, Network, Scanner
+from adjust.problem.network import Approximations, Board, Network, Scanner, Transformation
 from adjust.problem.parameter import shortened
 from adjust.problem.problem import Problem, number
 from adjust.quality.cofactor import free_cofactor
@@ -102,13 +103,20 @@ def continued(run: Run, network: Network, like: Mapping[str, str] | None = None)
     """Number a network with additional unknowns; start where an adjustment ended, in its datum."""
     # like: cameras that share distortion and fiducial marks with another one and start with its interior orientation.
     old, values, like, count = run.problem.unknowns, run.end.state.values, like or {}, len(INTERIOR_NAMES)
+    mirrored = run.problem.mirrored
     interior = {name: values[at[:count]] for name, at in old.camera.items()}
+    before = {image.name: image.transformation for image in run.problem.network.images}
     state = Approximations(
         interior=interior | {name: interior[other] for name, other in like.items()},
         exterior={image.name: values[old.exterior[image.name]] for image in network.images},
-        transformation={image.name: values[old.transformation[image.name]] for image in network.images},
+        transformation={
+            image.name: _in_kind(
+                image.transformation, before[image.name], values[old.transformation[image.name]], image.name in mirrored
+            )
+            for image in network.images
+        },
         points={id_: values[at] for id_, at in old.point.items()},
-        mirrored=run.problem.mirrored,
+        mirrored=mirrored,
         joins={key: values[at] for key, at in old.join.items()},
     )
     problem = number(network, state, run.problem.by_elements)
@@ -130,6 +138,13 @@ def continued(run: Run, network: Network, like: Mapping[str, str] | None = None)
                 fiducial[name, id_] = fiducial[other, id_]
     shared = replace(unknowns, given=given, sigma=sigma, start=start, camera=camera, fiducial=fiducial)
     return replace(problem, unknowns=shared)
+
+
+def _in_kind(kind: Transformation, old: Transformation, parameters: Array, is_mirrored: bool) -> Array:
+    """Parameters of a film transformation in a kind that contains it."""
+    if kind == old:
+        return parameters
+    return fit_transformation(kind, LATTICE, film_kind(old, is_mirrored).apply(parameters, LATTICE))[0]
 
 
 OTHERS = " (other images)"  # suffix of a camera's name for the images with a different interior orientation
@@ -157,6 +172,7 @@ def _lens_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
     """
     of, network, who = family(camera.distortion.family), run.problem.network, f"camera {camera.name}"
     free = {name for name, prior in camera.distortion.parameters.items() if prior.sigma > 0.0}
+    held = {name for name, prior in camera.distortion.parameters.items() if prior.value} - free
     groups = {name: dict(of.groups).get(name, ()) for name in ("radial", "decentering", "affinity")}
     images = [image for image in network.images if image.camera == camera.name]
     half_mm = camera.distortion.half_mm[0] or max(network.extent_by_image[image.name].half_mm for image in images)
@@ -174,7 +190,9 @@ def _lens_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
             remedy = (
                 "Choose a distortion family with more terms, legendre(5) say; `reseau adjust --choose` compares some."
             )
-        cause = f"The lens model of {who} is too simple: the residuals have {what}"
+        wrong = [name for name in groups[group] if name in held]
+        doubt = f", or what is given as exact, {', '.join(wrong)}, is wrong" if wrong else ""
+        cause = f"The lens model of {who} is too simple{doubt}: the residuals have {what}"
         return lambda found: (f"{cause}, {found.rms_um:.2g} µm rms", remedy)
 
     def bowed(found: Estimate) -> tuple[str, str]:
@@ -291,6 +309,34 @@ def _scanner_pixels(run: Run) -> Iterator[ModelHypothesis]:
     problem = continued(run, replace(network, images=images, scanners=(scanner,)))
     words = _pixel_words(films[0].camera, 2.0 / half_mm)
     yield ModelHypothesis("pixels", words, problem, problem.unknowns.scanner[scanner.name])
+
+
+RICHER: dict[Transformation, tuple[Transformation, ...]] = {
+    "congruent": ("similarity", "affine"),
+    "similarity": ("affine", "projective"),
+    "affine": ("projective", "polynomial(2)"),
+}
+
+
+def film_deformations(run: Run) -> Iterator[ModelHypothesis]:
+    """Films that are deformed, each in its own way, by more than their transformation takes up."""
+    network = run.problem.network
+    given = {image.transformation for image in network.images} - {"none"}
+    for kind in RICHER.get(min(given), ()) if len(given) == 1 else ():
+        films = [image.name for image in network.images if image.transformation in given]
+        images = tuple(replace(each, transformation=kind) if each.name in films else each for each in network.images)
+        problem = continued(run, replace(network, images=images))
+        count = len(run.problem.unknowns.transformation[films[0]])
+        added = np.concatenate([problem.unknowns.transformation[name][count:] for name in films])
+
+        def words(found: Estimate, kind: Transformation = kind) -> tuple[str, str]:
+            return (
+                f"The {min(given)} film transformation is too simple: the films are deformed, each in its own way, by "
+                f"{found.rms_um:.2g} µm rms that {kind} ones take up",
+                f'Give transformation = "{kind}" under [adjust].',
+            )
+
+        yield ModelHypothesis("film", words, problem, added)
 
 
 def _wrong_interior_orientation(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:

@@ -11,6 +11,7 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
+from scipy.special import chdtrc
 
 from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.families import family
@@ -33,7 +34,10 @@ GROSS = 20.0  # in a-priori standard deviations: a larger residual may come from
 NEARER = 0.25  # fraction of the distance of two marks: largest offset of one from the other's expected place
 NAMED = 5  # images named in a warning
 UNCHECKED = 1e-6  # redundancy of all targets of an image below which its orientation is unchecked
-WORSE = 2.0  # ratio of standard deviations with decentering free and held at 0 above which it is told
+# Ratios of standard deviations with decentering free and held at 0, above which it is told: where the images suggest
+# decentering, and always.
+WORSE, MUCH_WORSE = 2.0, 5.0
+SUGGESTED = 0.05  # p-value of decentering distortion that the images suggest
 CORRELATED = 0.9  # correlation of a principal point with a distortion parameter above which its valley is followed
 FAR = 5.0  # standard deviations by which it is moved
 FILM_SCALE = 1.5e-3  # film keeps its size better than that, most scanners too
@@ -218,11 +222,11 @@ def held_decentering_notes(run: Run, cofactor: Cofactor) -> Iterator[str]:
             continue
         if (at := run.linearised(continued_with(run, added))) is None:
             continue
-        variances = np.full(2, np.inf)
+        variances, p = np.full(2, np.inf), 0.0
         if not singular_directions(at.rows.numbering, at.state, at.factor):
-            variances = free_cofactor(at).variances[point]
+            variances, p = free_cofactor(at).variances[point], chdtrc(len(added), at.factor.length() ** 2)
         ratio = np.sqrt(variances / cofactor.variances[point])
-        if ratio.max() > WORSE:
+        if ratio.max() > (WORSE if p < SUGGESTED else MUCH_WORSE):
             many = f"{ratio.max():.2g} times as large" if np.isfinite(ratio.max()) else "infinite"
             yield (
                 f"The images of camera {camera.name} hardly tell its principal point from decentering distortion, "

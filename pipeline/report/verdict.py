@@ -223,13 +223,9 @@ def _too_large(adjustment: AdjustmentRecord) -> Iterator[Problem]:
         return
     is_calibrated = any(camera.is_calibrated for camera in adjustment.cameras.values())
     model = "add distortion parameters" if is_calibrated else "choose a richer film transformation"
-    is_rigid = any(image.transformation.kind in ("congruent", "similarity") for image in adjustment.images.values())
-    step = f"Reject gross errors first; then {model}, or state film_sigma_um. All σ are already multiplied by σ₀."
     yield Problem(
         f"{size} ({_group_sigmas(adjustment)}).",
-        'Try transformation = "affine" first: uneven shrinkage of films has the effect of gross errors.'
-        if is_rigid
-        else step,
+        f"Reject gross errors first; then {model}, or state film_sigma_um. All σ are already multiplied by σ₀.",
         section="reliability",
     )
 

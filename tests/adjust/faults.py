@@ -26,6 +26,7 @@ from networks import (
     orient,
     quarters,
     set_camera,
+    set_images,
     set_observations,
     simulated,
     vertical,
@@ -437,6 +438,9 @@ BLUNDERS = {
     "names of two frames exchanged, approximate orientations": Blunder(
         APPROXIMATE, lambda n: exchanged(n, with_fiducials=True), ("their names are exchanged",)
     ),
+    "sheared films held rigid": Blunder(
+        None, lambda n: set_images(n, transformation="similarity"), ("similarity film transformation is too simple",)
+    ),
     "one point": Blunder(None, one_point, ("Control point 0 is not where it is given",)),
     "nothing": Blunder(None, lambda n: n, ()),
     "nothing, approximate orientations": Blunder(APPROXIMATE, lambda n: n, ()),
@@ -449,7 +453,8 @@ def blunder_sentences(spoilt: Network) -> list[str]:
         result = adjust(spoilt)
     except AdjustmentError as error:
         return [str(error)]
-    return [*result.warnings, *(f"{each.tested.name} is suspect" for each in result.suspects)]
+    causes = (each.cause for each in result.explanations)
+    return [*causes, *result.warnings, *(f"{each.tested.name} is suspect" for each in result.suspects)]
 
 
 WHOLE = ("exchanged", "wrong", "points down", "times too", "principal distance of camera")
@@ -496,6 +501,8 @@ class Effects:
     b2: float = 0.0
     bow: float = 0.0
     radial: float = 0.0
+    k1: float = 0.0
+    c: float = 0.0
     tangential: float = 0.0
     zoom: float = 0.0
     crop: float = 0.0
@@ -525,8 +532,8 @@ class Effects:
 class Misfit:
     """A misfit: its effect of size 1, the free parameters of the lens, how many unknowns its test has, the words.
 
-    boards, fields: which of them; sized: whether it has a size; c_given, stations_given, frame_given: what else the
-    network knows.
+    held: what is given as exact; boards, fields: which of them; sized: whether it has a size; c_given, stations_given,
+    frame_given: what else the network knows.
     """
 
     effect: Callable[[float], Effects]
@@ -543,6 +550,7 @@ class Misfit:
     disk_radius: float | None = 0.0
     sigma: float = 1.0
     point_held: bool = False
+    held: tuple[str, ...] = ()
 
 
 def scene(seed: int, flat: bool) -> Scene:
@@ -580,8 +588,9 @@ def misfit_network(made: Scene, effects: Effects, kind: Misfit, rng: np.random.G
         xy_mm = xy_mm + rng.normal(0.0, SIGMA_MM * kind.sigma * effects.noise, xy_mm.shape)
     xy_mm = effects.pitch * xy_mm * [1.0, -1.0 if effects.y_down else 1.0]
     given = {name: Prior(0.0, np.inf) for name in kind.free}
+    given |= {name: Prior(kind.lens[name], 0.0) for name in kind.held if name != "c"}
     middle = effects.pitch * MIDDLE_MM * [1.0, -1.0 if effects.y_down else 1.0]
-    c = Prior(C_MM, 0.005) if kind.c_given else None
+    c = Prior(C_MM, 0.0 if "c" in kind.held else 0.005) if kind.c_given or "c" in kind.held else None
     frame = (float(2.0 * HALF_MM[0]), float(2.0 * HALF_MM[1])) if kind.frame_given else (0.0, 0.0)
     x0, y0 = (Prior(float(value) + 0.3, 0.0) if kind.point_held else None for value in middle)
     camera = Camera("cam", c, x0, y0, Distortion("opencv", given), {}, (float(middle[0]), float(middle[1])), frame)
@@ -619,7 +628,7 @@ def _projected(made: Scene, effects: Effects, kind: Misfit, image: int, rotation
 
     def imaged(places: Array) -> Array:
         u, v, w = np.moveaxis((places - station) @ rotation.T, -1, 0)
-        return _through_lens(effects, kind, -u / w, v / w, C_MM + zoom_mm)
+        return _through_lens(effects, kind, -u / w, v / w, C_MM + effects.c + zoom_mm)
 
     own = float(made.groups[image])
     order = image / (len(made.stations) - 1) - 0.5
@@ -642,7 +651,7 @@ def _through_lens(effects: Effects, kind: Misfit, x: Array, y: Array, c: float) 
     """Places (..., 2) of rays in mm from the principal point, y up."""
     lens = dict.fromkeys(("k1", "k2", "p1", "p2", "k3"), 0.0) | kind.lens
     r2 = x**2 + y**2
-    radial = 1.0 + lens["k1"] * r2 + lens["k2"] * r2**2 + lens["k3"] * r2**3 + effects.radial * r2**2
+    radial = 1.0 + (lens["k1"] + effects.k1) * r2 + lens["k2"] * r2**2 + lens["k3"] * r2**3 + effects.radial * r2**2
     p1, p2 = lens["p1"] + effects.tangential, lens["p2"] - effects.tangential
     xd = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x**2)
     yd = y * radial + p1 * (r2 + 2.0 * y**2) + 2.0 * p2 * x * y
@@ -672,6 +681,13 @@ MISFITS = {
     ),
     "principal point held wrong": Misfit(
         lambda e: Effects(), ("camera cam as exact is not that of the images",), sized=False, point_held=True
+    ),
+    "c held wrong": Misfit(
+        lambda e: Effects(c=0.05 * e), ("camera cam as exact is not that of the images",), held=("c",)
+    ),
+    "k1 held wrong": Misfit(
+        lambda e: Effects(k1=0.01 * e), ("or what is given as exact, k1, is wrong",), free=("k2", "p1", "p2"),
+        held=("k1",)
     ),
     "a group of images mirrored, frame_mm": Misfit(
         lambda e: Effects(group_mirrored=True), ("are mirrored",), sized=False, frame_given=True

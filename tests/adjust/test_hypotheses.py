@@ -48,6 +48,7 @@ QUICK = (
     "half the board shifted",
     "numbers of a third of the images one off",
     "principal point held wrong",
+    "k1 held wrong",
     "sizes: cropped and enlarged",
     "Y in another unit",
     "Z in feet",
@@ -362,6 +363,7 @@ FAST = (
     "mm for m, approximate orientations",
     "names of two frames exchanged, approximate orientations",
     "nothing, approximate orientations",
+    "sheared films held rigid",
 )
 
 
@@ -428,6 +430,13 @@ def test_no_principal_point_of_straight_views_is_claimed_that_images_do_not_tell
         assert is_reported or abs(result.value("IO.cam.y0") - y0_mm) < 4.5 * result.sigma("IO.cam.y0")
         reported += is_reported
     assert reported
+
+
+@pytest.mark.parametrize("seed", [4, 6])
+def test_no_decentering_is_noted_that_neither_images_nor_standard_deviations_suggest(seed: int) -> None:
+    truth = Truth(distortion={"k3": 2e-8})
+    given, _ = simulated(np.random.default_rng(seed), truth, point_sigma=0.05, fiducial_sigma=0.01)
+    assert not any("decentering" in note for note in adjust(given).notes)
 
 
 def test_another_unit_of_the_fiducials_is_noted_with_what_it_does_to_c() -> None:

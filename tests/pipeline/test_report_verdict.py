@@ -77,21 +77,6 @@ def test_what_the_adjustment_finds_is_a_problem(adjusted_data: ReportData, value
     assert "gross errors" not in text or "explanations" not in values
 
 
-SIMILAR = {"p": Quantity(1.0, 0.0), "q": Quantity(0.0, 0.0)}
-
-
-def test_films_that_may_shrink_unevenly_come_before_gross_errors(adjusted_data: ReportData) -> None:
-    assert adjusted_data.adjustment is not None
-    images = {
-        name: replace(image, transformation=replace(film, kind="similarity", parameters={**film.parameters, **SIMILAR}))
-        for name, image in adjusted_data.adjustment.images.items()
-        for film in (image.transformation,)
-    }
-    text = describe(changed(adjusted_data, images=images, sigma0=1.6))
-    assert 'Try transformation = "affine" first' in text
-    assert "Reject gross errors" not in text
-
-
 def suspect(**values: Any) -> tuple[SuspectRecord]:
     numbers = (86.5, 2, 20.0, -9.3, -9.3, 4.0)
     row = SuspectRecord("target 1 in image f2", "target", "f2", "1", ("x", "y"), *numbers, (0.03, 0.0), (), False)
