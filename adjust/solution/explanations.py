@@ -11,8 +11,8 @@ the level LEVEL. Hypotheses are compared with each other, and with gross errors 
 twice the unknowns and the logarithm of the choices (Akaike); those within TOLD_APART of the best are reported with it.
 
 What is left may be noise that is larger than given: residuals of equal variance in all images and independent of their
-neighbours, where a standard deviation added to that of all marks, of targets alone or of fiducials alone makes every
-group of observations agree.
+neighbours, where a standard deviation added to that of all marks, of targets alone or of fiducials alone, or a factor
+on those of the given points, makes every group of observations agree, and explains more than gross errors do.
 
 Nothing is reported unless all that is reported removes more than half of the excess of v'Pv over its redundancy.
 
@@ -35,7 +35,7 @@ from adjust.problem.problem import Problem
 from adjust.quality.reliability import TOLD_APART, Snooping
 from adjust.quality.run import UM_PER_MM, GrossError, Run, residuals
 from adjust.quality.tested import Probabilities
-from adjust.quality.variance_components import added_variance
+from adjust.quality.variance_components import added_variance, refined_factors
 from adjust.rank_defect.diagnosis import singular_directions
 from adjust.solution.model_hypotheses import (
     ModelHypothesis,
@@ -54,9 +54,10 @@ ROUNDS = 3  # rounds of explanations, each in addition to those before
 MOST_ADJUSTED = 4  # hypotheses adjusted per round
 LEFT = 0.5  # fraction of the excess of v'Pv over its redundancy that may remain
 WORTH = 0.3  # fraction of the largest first-order decrease above which a hypothesis is adjusted
-STEPS = 20
+STEPS = 40  # images of another pitch need about 20
 GROUP_SHARE = 0.5  # of v'Pv; curled edges of real boards remove up to 0.3 as points beside a line
 LEAST_SHARE = 0.05  # of v'Pv; further lens terms remove up to 0.02 on real boards
+TURNS = 8  # adjustments, each with the variance of the one before
 FEWEST = 30  # coordinates needed to test the distribution of residuals
 CHANCE = 0.001  # significance level of each test of the noise hypothesis
 NEIGHBOURS = 8  # nearest neighbours searched for one in the same, or in another, image
@@ -106,11 +107,13 @@ def explain(
         last = following or alike[0]
         if following is None:
             break
-    if last.exceeds(LEVEL) and not last.gross_errors and (noise := _added_noise(last.run, last.redundancy)):
-        words, with_noise = noise
+    noises = (_added_noise(last.run, last.redundancy), _wide_control(last.run)) if last.exceeds(LEVEL) else ()
+    for words, with_noise, widened in filter(None, noises):
         noisy = replace(last, run=with_noise)
-        found.append(_explanation("noise", words, float(chdtrc(last.redundancy, last.vpv)), last, noisy))
-        last = noisy
+        if not last.gross_errors or (not noisy.gross_errors and noisy.vpv + widened < last.criterion(1.0)):
+            found.append(_explanation("noise", words, float(chdtrc(last.redundancy, last.vpv)), last, noisy))
+            last = noisy
+            break
     explains = not last.exceeds(LEVEL) or last.variance - 1.0 < LEFT * (first.variance - 1.0)
     return (tuple(found), last.run) if found and explains else ((), run)
 
@@ -271,9 +274,12 @@ def _explanation(kind: str, words: tuple[str, str], p: float, without: _Model, l
 KINDS = (("marks", ("target", "tie", "fiducial")), ("targets", ("target", "tie")), ("fiducials", ("fiducial",)))
 
 
-def _added_noise(run: Run, redundancy: int) -> tuple[tuple[str, str], Run] | None:
+# Cause and remedy, the adjustment with it, and the change of minus twice the logarithm of the likelihood beside v'Pv.
+Noise = tuple[tuple[str, str], Run, float]
+
+
+def _added_noise(run: Run, redundancy: int) -> Noise | None:
     """Adjust with a standard deviation added to those of marks that explains all residuals; None where none does."""
-    # Also returns cause and remedy.
     if not _is_noise(run):
         return None
     network, v_mm = run.problem.network, run.end.v_mm
@@ -293,8 +299,32 @@ def _added_noise(run: Run, redundancy: int) -> tuple[tuple[str, str], Run] | Non
         problem = replace(run.problem, network=replace(network, observations=observations))
         noisy = again(replace(run, problem=problem), run.weighting, STEPS, run.end.state)
         if noisy.converged and noisy.is_tested and _groups_agree(noisy):
-            return _noise_words(marks, UM_PER_MM * float(np.sqrt(added)), covariance), noisy
+            share = run.redundancies[: len(v_mm)][members].mean()
+            widened = float(share * np.log1p(added / variances[members]).sum())
+            return _noise_words(marks, UM_PER_MM * float(np.sqrt(added)), covariance), noisy, widened
     return None
+
+
+def _wide_control(run: Run) -> Noise | None:
+    """Adjust with larger standard deviations of the given points that explain all residuals; None where none do."""
+    vpv, freedom = run.group_sums((run.units.groups == "control") & run.weighting.used)
+    if run.weighting.factors or freedom < CHECKED or chdtrc(freedom, vpv) > CHANCE:
+        return None
+    wide = replace(run, weighting=replace(run.weighting, factors={"control": 1.0}))
+    for _ in range(TURNS):
+        wide = again(wide, refined_factors(wide), STEPS)
+        if not (wide.converged and wide.is_tested):
+            return None
+    if not (_is_noise(wide) and _groups_agree(wide)):
+        return None
+    factor = wide.weighting.factors["control"]
+    words = (
+        "The standard deviations given to the object points are too small everywhere, by a factor of "
+        f"{np.sqrt(factor):.2g}: the marks agree with each other, and the points' "
+        "differences from them are plain noise",
+        "Give sX, sY and sZ as the points have them, or variance_components = true under [adjust].",
+    )
+    return words, wide, freedom * float(np.log(factor))
 
 
 def _noise_words(marks: str, added_um: float, covariance_mm2: Array) -> tuple[str, str]:

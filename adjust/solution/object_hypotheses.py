@@ -42,33 +42,34 @@ def _deformations(run: Run) -> Iterator[ModelHypothesis]:
     if not _is_given(network):
         return
 
-    def bent(found: Estimate) -> tuple[str, str]:
-        (x, y), (x_sigma, y_sigma) = found.value, found.sigma
-        return (
-            f"The board of the given points is not flat: its middle stands {x:.3g} ± {x_sigma:.1g} off along its first "
-            f"axis and {y:.3g} ± {y_sigma:.1g} along its second ({INDEPENDENT})",
-            'Put it on a flat plate, or let its bend be adjusted: board_bend = "free" under [object] in project.toml.',
-        )
-
-    def twisted(found: Estimate) -> tuple[str, str]:
-        return (
-            f"The board of the given points is twisted: two opposite corners stand {abs(found.value[0]):.3g} ± "
-            f"{found.sigma[0]:.1g} above its plane, the others as much below it ({INDEPENDENT})",
-            "Put it on a flat plate.",
-        )
-
     form = _flat_form(network)
     axes = np.eye(3) if form is None else form.axes
     strain = strain_directions(np.array(list(network.known_places.values())), axes)
     rows: list[tuple[str, Words, Array]] = [("strain", lambda found: _strain_words(len(axes), found), strain)]
     if form is not None:
         is_bent = any(board.by_observation is None for board in network.boards)
-        rows += [] if is_bent else [("bend", bent, form.bend_directions)]
-        rows += [("twist", twisted, form.twist_directions)]
+        bends = [form.twist_directions] if is_bent else [form.bend_directions, form.twist_directions]
+        rows += [("bend", _bend_words, np.concatenate(bends, axis=1))]
     for name, words, directions in rows:
         by_point = dict(zip(network.known_places, directions, strict=True))
         yield displaced(run, name, "board", words, _of_targets(run, by_point))
     yield from _disks(run)
+
+
+def _bend_words(found: Estimate) -> tuple[str, str]:
+    """Describe bends along the two axes of a board, where these are not adjusted anyway, and a twist."""
+    (*bends, twist), (*bend_sigmas, twist_sigma) = found.value, found.sigma
+    remedy = "Put it on a flat plate."
+    twisted = f"two opposite corners stand {abs(twist):.3g} ± {twist_sigma:.1g} above its plane, the others below it"
+    if all(abs(v) < CLEAR * s for v, s in zip(bends, bend_sigmas, strict=True)):
+        return f"The board of the given points is twisted: {twisted} ({INDEPENDENT})", remedy
+    (x, y), (x_sigma, y_sigma) = bends, bend_sigmas
+    further = f"; it is twisted, too, {twisted}" if abs(twist) > CLEAR * twist_sigma else ""
+    return (
+        f"The board of the given points is not flat: its middle stands {x:.3g} ± {x_sigma:.1g} off along its first "
+        f"axis and {y:.3g} ± {y_sigma:.1g} along its second{further} ({INDEPENDENT})",
+        f'{remedy} Or let its bend be adjusted: board_bend = "free" under [object] in project.toml.',
+    )
 
 
 def _strain_words(count: int, found: Estimate) -> tuple[str, str]:

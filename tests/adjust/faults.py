@@ -401,6 +401,13 @@ def one_point(given: Network) -> Network:
     return shift_given(given, f"PT.{given.points[0].id}.X", 200.0)
 
 
+def inaccurate_points(given: Network, sigma: float) -> Network:
+    """With further errors of the given points' coordinates."""
+    rng = np.random.default_rng(len(given.points))
+    moved = {f"PT.{point.id}.{axis}": float(rng.normal(0.0, sigma)) for point in given.points for axis in "XYZ"}
+    return map_priors(given, lambda name, prior: replace(prior, value=prior.value + moved.get(name, 0.0)))
+
+
 @dataclass(frozen=True)
 class Blunder:
     """A slip: how the network is otherwise given, how it is spoilt, and what has to be said of it."""
@@ -440,6 +447,9 @@ BLUNDERS = {
     ),
     "sheared films held rigid": Blunder(
         None, lambda n: set_images(n, transformation="similarity"), ("similarity film transformation is too simple",)
+    ),
+    "standard deviations of the points ten times too small": Blunder(
+        None, lambda n: inaccurate_points(n, 0.5), ("given to the object points are too small everywhere",)
     ),
     "one point": Blunder(None, one_point, ("Control point 0 is not where it is given",)),
     "nothing": Blunder(None, lambda n: n, ()),
@@ -513,6 +523,7 @@ class Effects:
     height: float = 0.0
     disk: float = 0.0
     twist: float = 0.0
+    cylinder: float = 0.0
     drift: float = 0.0
     breathing: float = 0.0
     row: float = 0.0
@@ -616,6 +627,7 @@ def _projected(made: Scene, effects: Effects, kind: Misfit, image: int, rotation
     low, high = points.min(axis=0), points.max(axis=0)
     relative = (2.0 * points - low - high)[:, :2] / (high - low)[:2]
     points[:, 2] += effects.bend * (1.0 - relative[:, 0] ** 2) + effects.twist * relative[:, 0] * relative[:, 1]
+    points[:, 2] += effects.cylinder * (1.0 - relative.sum(axis=1) ** 2 / 2.0)
     lines = np.unique(made.points[:, 1])
     points[made.points[:, 1] == lines[1 % len(lines)], 0] -= effects.row
     points[made.points[:, 1] > lines[len(lines) // 2], 1] -= effects.side
@@ -715,7 +727,7 @@ MISFITS = {
         lambda e: Effects(tangential=5e-4 * e), ("have a tangential pattern",), free=("k1", "k2"),
         lens={"k1": -0.2, "k2": 0.1}, size=2
     ),
-    "board bent": Misfit(lambda e: Effects(bend=0.5 * e), ("is not flat",), size=2, fields=False),
+    "board bent": Misfit(lambda e: Effects(bend=0.5 * e), ("is not flat",), size=3, fields=False),
     "board stretched": Misfit(
         lambda e: Effects(stretch=1e-3 * e), ("has another shape than given",), size=2, fields=False
     ),
@@ -735,7 +747,12 @@ MISFITS = {
         lambda e: Effects(disk=50.0 * abs(e)), ("points are centres of dots",), fields=False, disk_radius=None,
         sigma=0.1
     ),
-    "board twisted": Misfit(lambda e: Effects(twist=0.5 * e), ("board of the given points is twisted",), fields=False),
+    "board twisted": Misfit(
+        lambda e: Effects(twist=0.5 * e), ("board of the given points is twisted",), size=3, fields=False
+    ),
+    "board bent over a diagonal": Misfit(
+        lambda e: Effects(cylinder=0.5 * e), ("two opposite corners stand",), size=3, fields=False
+    ),
     "focus drifts": Misfit(lambda e: Effects(drift=0.05 * e), ("from the first image to the last",)),
     "focus breathes with the distance": Misfit(
         lambda e: Effects(breathing=0.05 * e), ("from the farthest image to the nearest",)

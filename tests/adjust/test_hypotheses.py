@@ -41,7 +41,7 @@ QUICK = (
     "object stretched",
     "disks of another diameter",
     "dots of a diameter that nobody gave",
-    "board twisted",
+    "board bent over a diagonal",
     "focus drifts",
     "focus breathes with the distance",
     "a row of points shifted",
@@ -364,6 +364,7 @@ FAST = (
     "names of two frames exchanged, approximate orientations",
     "nothing, approximate orientations",
     "sheared films held rigid",
+    "standard deviations of the points ten times too small",
 )
 
 
