@@ -49,7 +49,6 @@ QUICK = (
     "numbers of a third of the images one off",
     "principal point held wrong",
     "k1 held wrong",
-    "sizes: cropped and enlarged",
     "Y in another unit",
     "Z in feet",
     "a point is elsewhere",
