@@ -301,7 +301,7 @@ class _Solver:
         if result.termination == "singular" or (result.converged and agrees):
             return result
         if slips := self._slips(network, start):
-            return replace(result, slips=tuple(slip.sentence for slip in slips))
+            return replace(result, slips={slip.name: slip.sentence for slip in slips})
         return result if result.converged else replace(result, remarks=(*result.remarks, *_few_points(network)))
 
     def solve(

@@ -397,7 +397,7 @@ def check_plausibility(result: Adjustment, trials: Trials) -> Adjustment:
     views = _views(result)
     outside = sorted(row for view in views for row in view.outside)
     remarks, misread = list(_marks_outside(result, outside, trials)), tuple(_both_sides(result, trials))
-    if result.converged and not outside:
+    if result.converged and not outside and not result.slips:
         remarks += [each for view in views for each in _principal_point(view, result, trials.family)]
     return replace(result, misread=misread, remarks=(*result.remarks, *remarks))
 

@@ -81,7 +81,8 @@ class Adjustment(Estimates, PlottedResult):
     weights : (n,) factors of robust estimation on the weights of the observations; 1 without it.
     variance_factors : estimated variance factors by group.
     remarks : remarks on how the result was obtained; listed first among the warnings.
-    slips : sentences on coordinate blunders of given points that prevent agreement or a solution.
+    slips : by given point, a sentence on the coordinate blunder that prevents agreement or a solution; other suspects
+        are then consequences of these.
     left_out : reasons by name of the images without an orientation; `network` has the others.
     misread : sentences on mirrored images; other contradictions are then consequences of these.
     unused : notes on input that is not used; listed first among the notes.
@@ -101,7 +102,7 @@ class Adjustment(Estimates, PlottedResult):
     weights: Array = field(default_factory=lambda: np.empty(0))
     variance_factors: Mapping[str, float] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
-    slips: tuple[str, ...] = ()
+    slips: Mapping[str, str] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
     misread: tuple[str, ...] = ()
     unused: tuple[str, ...] = ()
@@ -235,7 +236,9 @@ class Adjustment(Estimates, PlottedResult):
         if run is not self.run:
             variance = variance_factor(run, _redundancy(run, self.cofactor))
             tested = reliability(run, variance, self.probabilities)
-        return Snooping(run, self.probabilities).suspects(tested, round(variance.redundancy)) if tested else ()
+        found = Snooping(run, self.probabilities).suspects(tested, round(variance.redundancy)) if tested else ()
+        is_told = not self.slips or self.run.removed
+        return tuple(each for each in found if is_told or each.tested.point in self.slips)
 
     @cached_property
     def explanations(self) -> tuple[Explanation, ...]:
@@ -251,7 +254,7 @@ class Adjustment(Estimates, PlottedResult):
         left_out = (f"Left out of the adjustment: {reason}" for reason in dict.fromkeys(self.left_out.values()))
         own = () if self.slips and not self.converged else run_warnings(self.scaled, self.cofactor, self.residuals)
         curved = curved_valley_warnings(self.run, self.cofactor) if self.converged else ()
-        return (*self.misread, *self.slips, *left_out, *self.remarks, *own, *curved)
+        return (*self.misread, *self.slips.values(), *left_out, *self.remarks, *own, *curved)
 
     @cached_property
     def notes(self) -> tuple[str, ...]:

@@ -295,6 +295,7 @@ def test_a_slip_with_a_wrong_minimum_is_named_alike(offset: float) -> None:
     assert result.warnings[0].startswith(f"Control point {WRONG} is not where it is given")
     assert place(result.warnings[0]) == pytest.approx(xyz[WRONG], abs=0.5)
     assert f"control point {WRONG} X" in [suspect.tested.name for suspect in result.suspects]
+    assert {suspect.tested.point for suspect in result.suspects} == {str(WRONG)}
 
 
 @pytest.mark.usefixtures("one_by_one")
@@ -338,7 +339,7 @@ def test_what_is_wrong_with_all_points_is_no_slip_of_one() -> None:
     shifted = adjust_network(
         set_given(network, {row: each + np.array([500.0, -300.0, 20.0]) for row, each in enumerate(xyz)})
     )
-    assert shifted.slips == ()
+    assert shifted.slips == {}
     assert shifted.converged
 
 
@@ -349,7 +350,7 @@ def test_four_points_do_not_tell_which_is_wrong() -> None:
     few = free_points(network, [point.id for point in network.points[4:]])
     result = adjust_network(set_given(few, {1: xyz[1][[1, 0, 2]]}), iteration_limit=STOPPED)
     assert not result.converged
-    assert result.slips == ()
+    assert result.slips == {}
     assert "The points 0, 1, 2, 3 alone are given" in result.warnings[0]
     with pytest.raises(AdjustmentError, match="four points do not tell which of them is wrong"):
         adjust_network(set_given(few, {1: xyz[1] + [300.0, 0.0, 0.0]}))
