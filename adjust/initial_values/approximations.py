@@ -257,11 +257,13 @@ def _sights(camera: Camera, frames: Frames, interior: Array) -> dict[str, Sight]
             radius_mm = float(np.linalg.norm(frames.xy_mm[frames.part(i)][folded] - interior[1:], axis=1).min())
             given = [name for name in lens.quantities if name in known and known[name].value]
             values = ", ".join(f"{name} = {known[name].value:g}" for name in given)
+            is_wide = camera.distortion.family == "opencv_fisheye"
+            wide = " What lies 90 degrees and more off the axis has no image here: leave it out." if is_wide else ""
             raise AdjustmentError(
                 f"camera {camera.name}: the distortion that is given ({values or 'all 0'}) folds the image over: from "
                 f"{radius_mm:.3g} mm off the principal point on, what lies farther out would appear farther in, and "
                 f"{folded.sum()} of the {len(folded)} points of an image were measured there. Correct the signs, the "
-                "units or the family of these values, the principal point or c, or begin with 0."
+                f"units or the family of these values, the principal point or c, or begin with 0.{wide}"
             )
     return frames.sights(camera.name, lens)
 
