@@ -331,8 +331,8 @@ def film_deformations(run: Run) -> Iterator[ModelHypothesis]:
 
         def words(found: Estimate, kind: Transformation = kind) -> tuple[str, str]:
             return (
-                f"The {min(given)} film transformation is too simple: the films are deformed, each in its own way, by "
-                f"{found.rms_um:.2g} µm rms that {kind} ones take up",
+                f"The film deformation model, {min(given)}, is too simple: the films are deformed, each in its own "
+                f"way; a {kind} one explains {found.rms_um:.2g} µm rms",
                 f'Give transformation = "{kind}" under [adjust].',
             )
 

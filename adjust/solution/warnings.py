@@ -224,7 +224,7 @@ def held_decentering_notes(run: Run, cofactor: Cofactor) -> Iterator[str]:
             continue
         variances, p = np.full(2, np.inf), 0.0
         if not singular_directions(at.rows.numbering, at.state, at.factor):
-            variances, p = free_cofactor(at).variances[point], chdtrc(len(added), at.factor.length() ** 2)
+            variances, p = free_cofactor(at).variances[point], float(chdtrc(len(added), at.factor.length() ** 2))
         ratio = np.sqrt(variances / cofactor.variances[point])
         if ratio.max() > (WORSE if p < SUGGESTED else MUCH_WORSE):
             many = f"{ratio.max():.2g} times as large" if np.isfinite(ratio.max()) else "infinite"
