@@ -446,7 +446,9 @@ BLUNDERS = {
         APPROXIMATE, lambda n: exchanged(n, with_fiducials=True), ("their names are exchanged",)
     ),
     "sheared films held rigid": Blunder(
-        None, lambda n: set_images(n, transformation="similarity"), ("film deformation model, similarity, is too simple",)
+        None,
+        lambda n: set_images(n, transformation="similarity"),
+        ("film deformation model, similarity, is too simple",),
     ),
     "standard deviations of the points ten times too small": Blunder(
         None, lambda n: inaccurate_points(n, 0.5), ("given to the object points are too small everywhere",)
