@@ -34,6 +34,8 @@ MISSING = (
 _DETECTION, _RECOGNITION = "ch_PP-OCRv4_det_infer.onnx", "ch_PP-OCRv4_rec_infer.onnx"
 _CHARACTERS = b"\x0a\x09character\x12"  # entry of an ONNX file's metadata: its key, and the tag of its value
 _MULTIPLE_PX = 32  # the network needs sides that are multiples of this
+_PART_PX = 640  # width of the parts in which text is detected: 45 MiB less than a strip of 1800 px at once
+_CONTEXT_PX = 160  # read beside a part; the lines of seven aerial scans read as in whole strips
 _WRITTEN = 0.3  # threshold of the probability of a text pixel
 _SURE = 0.5  # least mean probability of a line
 _LEAST_PX = 4.0  # least height of a detected region, which is less than half of the line's height
@@ -141,6 +143,16 @@ def find_writing(picture: Bytes, networks: Networks) -> list[Place]:
 
 
 def _probability(picture: Bytes, networks: Networks) -> NDArray[np.float32]:
+    """Probability of text for each pixel, computed in parts that lie beside one another."""
+    parts, width = [], picture.shape[1]
+    for start in range(0, width, _PART_PX):
+        first = max(start - _CONTEXT_PX, 0)
+        part = _part_probability(picture[:, first : start + _PART_PX + _CONTEXT_PX], networks)
+        parts.append(part[:, start - first :][:, :_PART_PX].copy())
+    return np.concatenate(parts, axis=1)
+
+
+def _part_probability(picture: Bytes, networks: Networks) -> NDArray[np.float32]:
     height, width = picture.shape
     below, right = -height % _MULTIPLE_PX, -width % _MULTIPLE_PX
     padded = cv2.copyMakeBorder(picture, 0, below, 0, right, cv2.BORDER_REPLICATE)

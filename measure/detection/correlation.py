@@ -57,8 +57,9 @@ class Surroundings:
             variance = (SIGMA_OF_DEVIATION * _median(np.abs(detail), coarse_px)) ** 2
         else:
             variance = _smoothed(detail**2, 2 * coarse_px)
-        contrast = np.sqrt(variance + faint_dn**2)
-        return np.asarray(np.clip(detail / contrast, -_CLIP, _CLIP), np.float32)
+        variance += faint_dn**2  # in place, here and below: a map of a whole scan is large
+        detail /= np.sqrt(variance, out=variance)
+        return np.clip(detail, -_CLIP, _CLIP, out=detail)
 
     def pattern(self, template: Array, detail_px: float, image: Map) -> tuple[Map, Map]:
         """Convert a template to the zero-mean pattern correlated with a flattened image, and its mask; nan pixels of

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.array_types import Array, Mask
+from measure.array_types import Array, Mask, Single
 from measure.detection.localisation import MarkPrediction
 from measure.fiducials.frame import Frame
 from measure.fiducials.mark_fit import Detection
@@ -100,7 +100,7 @@ def detect_faint_marks(frame: Frame, reach_px: float) -> Frame:
     # Darkest and lightest grey values around the marks, which are spread over the scan; and those that light and dark
     # inliers have, which may exceed them.
     around = [_surrounding_grey(frame, each.mark, each.pixel_from_mark, _SURROUND) for each in predictions]
-    extremes = np.percentile(np.concatenate(around), _EXTREMES)
+    extremes = np.percentile(np.concatenate(around), _EXTREMES, overwrite_input=True)  # spares a copy of much of a scan
     usual: dict[int, list[float]] = {}
     for index, fit in list(fits.items())[:_TYPICAL]:
         grey, sign = _surrounding_grey(frame, marks[index].mark, fit.pixel_from_mark), 1 if fit.contrast_dn > 0 else -1
@@ -120,13 +120,13 @@ def detect_faint_marks(frame: Frame, reach_px: float) -> Frame:
     return replace(frame.replace_detections(detections), certain=certain)
 
 
-def _surrounding_grey(frame: Frame, mark: Mark, pixel_from_mark: Array, times: float = 1.0) -> Array:
+def _surrounding_grey(frame: Frame, mark: Mark, pixel_from_mark: Array, times: float = 1.0) -> Single:
     """(n,) grey values in a mark's bounding rectangle, enlarged by a factor."""
     center = pixel_from_mark[:, 2]
     least, greatest = (center + times * (corner - center) for corner in extent_px(mark, pixel_from_mark))
     low, size = np.floor(least).astype(int), np.ceil(greatest - least).astype(int) + 1
     window = frame.scan.window(int(low[0]), int(low[1]), int(size[0]), int(size[1]), frame.weights)
-    return np.asarray(window, dtype=float).ravel()
+    return np.asarray(window, np.float32).ravel()
 
 
 def _decide(frame: Frame, index: int, mark: FaintMark | None, why_not: Reason) -> tuple[Detection, bool]:

@@ -82,6 +82,15 @@ def test_the_outline_lies_about_the_letters() -> None:
         assert line.center_px == pytest.approx(drawn.mean(axis=0), abs=5)
 
 
+def test_a_line_across_two_parts_of_a_long_strip_is_one_line_where_it_is_drawn() -> None:
+    strip = np.zeros((64, 960), np.uint8)
+    cv2.putText(strip, TITLE, (520, 42), cv2.FONT_HERSHEY_SIMPLEX, 0.9, 255, 2, cv2.LINE_AA)
+    (place,) = networks_module.find_writing(strip, required())
+    col, row, width, _ = cv2.boundingRect(strip)
+    assert np.abs(place.outline_px()[:2, 0] - (col, col + width)).max() < 10
+    assert row < place.center_px[1] < 42
+
+
 def test_a_number_that_is_the_same_upside_down_does_not_tell_its_turn() -> None:
     letters = np.zeros((60, SIZE_PX), np.uint8)
     (half, _), _ = cv2.getTextSize("608", cv2.FONT_HERSHEY_SIMPLEX, 0.9, 2)
