@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from benchmarks.harness import Row
 from benchmarks.search import OUTCOMES, POSE_OUTCOMES, counts, judge_case
 from benchmarks.search_frames import Case
-from measure.geometry import POSES, up_from_camera
+from measure.geometry import POSES, UP_FROM_CAMERA
 from measure.marks.shapes import FiducialLayout, LayoutMark
 from measure.marks.templates import cut, learn_template
 from measure.scans.cache import WholePicture
@@ -62,7 +62,7 @@ def draw_case(camera: Path, index: int, turn: int) -> Case:
     learned_dn, view_dn = LANDSCAPES_DN[turn % len(LANDSCAPES_DN)]
     round_, pose = index // len(LANDSCAPES_DN), POSES[(3 * index + turn) % len(POSES)]
     grey, places = composed(cut_crops(camera), np.random.default_rng([index, 1]), view_dn)
-    up, origins = up_from_camera(pose), origins_px(round_)
+    up, origins = UP_FROM_CAMERA[pose], origins_px(round_)
     centers = {side: FLIP @ up @ FLIP @ (places[side] + origins[side] - MIDDLE_PX) + MIDDLE_PX for side in SIDES}
     return Case(
         kind=camera.name,

@@ -26,8 +26,7 @@ from adjust.functional_model.transformation import film_kind, fit_transformation
 from benchmarks.harness import Row, rms
 from benchmarks.measured_marks import CONTRAST, GROUND, draw_mark, measure_mark, start_off
 from measure.boards.corners import junctions
-from measure.fiducials.consistency import gross_errors
-from measure.fiducials.misfit_model import FrameMarks, Scatter
+from measure.fiducials.consistency import FrameMarks, Scatter, gross_errors
 from measure.noise.robust_estimation import _opened, robust_scale
 from measure.targets.detection import DiskSearch, disk_candidates
 

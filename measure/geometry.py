@@ -1,7 +1,7 @@
 """Affine transformations, and the eight scan orientations: four quarter turns, with and without mirroring."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
 from typing import TypeVar
 
 import numpy as np
@@ -61,20 +61,23 @@ def linear_scale(matrix: Array) -> float:
     return float(np.sqrt(abs(np.linalg.det(matrix[:, :2]))))
 
 
-@cache
-def up_from_camera(pose: str) -> Array:
-    """(2, 2) rotation, preceded by mirroring if any, from the camera's (x', y') to the scan's (right, up)."""
+def _up_from_camera(pose: str) -> Array:
     c, s = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(pose.removesuffix("m")) // 90]
     up = np.array([[c, -s], [s, c]]) @ np.diag([-1.0 if pose.endswith("m") else 1.0, 1.0])
-    up.flags.writeable = False  # the cached array is shared
+    up.flags.writeable = False  # the array is shared
     return up
+
+
+# By scan orientation, the (2, 2) rotation, preceded by mirroring if any, from the camera's (x', y') to the scan's
+# (right, up).
+UP_FROM_CAMERA: Mapping[str, Array] = {pose: _up_from_camera(pose) for pose in POSES}
 
 
 def pose_in_camera(seen: str, frame: str) -> str:
     """Orientation, in the camera's frame, of an object that appears in the scan in orientation seen, if the scan
     orientation of the frame is frame."""
-    own = up_from_camera(frame).T @ up_from_camera(seen)
-    return next(pose for pose in POSES if np.array_equal(up_from_camera(pose), np.rint(own)))
+    own = UP_FROM_CAMERA[frame].T @ UP_FROM_CAMERA[seen]
+    return next(pose for pose in POSES if np.array_equal(UP_FROM_CAMERA[pose], np.rint(own)))
 
 
 def turn_by_quarters(image: Grid, turn: Array) -> Grid:

@@ -16,7 +16,7 @@ from difflib import SequenceMatcher
 import numpy as np
 
 from measure.array_types import Array
-from measure.geometry import pose_in_camera, up_from_camera
+from measure.geometry import UP_FROM_CAMERA, pose_in_camera
 from measure.marks.shapes import Side, WrittenPlace
 
 _ALIKE = 0.75  # least ratio of equal characters of one line in two readings
@@ -297,7 +297,7 @@ def _placed(line: Line) -> float:
 
 def side_in_camera(side: Side, pose: str) -> Side:
     """Side of the camera's drawing at a side of a scan with the given orientation."""
-    direction = up_from_camera(pose).T @ _DIRECTIONS[side]
+    direction = UP_FROM_CAMERA[pose].T @ _DIRECTIONS[side]
     return next(name for name, other in _DIRECTIONS.items() if np.allclose(direction, other))
 
 

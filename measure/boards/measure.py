@@ -206,7 +206,7 @@ def _fit_found(scan: Scan, found: Mapping[str, FoundCorner], spec: BoardSpec) ->
     def read(col: int, row: int, side: int) -> ScanWindow:
         place_px = col, row, side, side
         # The place of a crossing does not depend on clipping.
-        sides = clipped_sides(scan, *place_px, None) if stands_alone else None
+        sides = clipped_sides(scan.samples(*place_px), scan.full_scale_dn) if stands_alone else None
         return ScanWindow(scan.window(*place_px), (col, row), scan.inside(*place_px, is_read=True), sides)
 
     surface: Surface = quarter if stands_alone else crossing

@@ -12,9 +12,8 @@ from scipy.special import ndtr
 from measure.array_types import Array, Single
 from measure.detection.correlation import WIDE, Surroundings, correlation, highest_about
 from measure.flags import NOISE_LIKE_A_MARK
-from measure.marks.rendering import detail_px, extent_px, known_picture
+from measure.marks.rendering import detail_px, extent_px, known_picture, mark_window
 from measure.marks.shapes import Mark
-from measure.matching.match import mark_window
 from measure.matching.window import FAINT
 from measure.scans.scan import Scan
 

@@ -17,7 +17,7 @@ from measure.array_types import Array, Mask
 from measure.detection.correlation import WIDE, Map, Surroundings, correlation, highest_about, local_maxima, variation
 from measure.geometry import linear_scale, turn_by_quarters
 from measure.marks.rendering import detail_px, extent_px, known_picture
-from measure.marks.shapes import Bar, Mark, MarkShape, MarkTemplate, thinnest_mm
+from measure.marks.shapes import Bar, Mark, MarkShape, MarkTemplate
 from measure.matching.window import FAINT
 from measure.scans.parallel import map_in_threads
 from measure.scans.scan import SINGLE_CHANNELS, Scan
@@ -142,7 +142,7 @@ def _search_reduction(scan: Scan, views: Sequence[MarkView]) -> int:
     limits = []
     for view in views:
         least, greatest = extent_px(view.mark, np.column_stack([view.linear, np.zeros(2)]))
-        thinnest_px = linear_scale(view.linear) * thinnest_mm(view.mark)
+        thinnest_px = linear_scale(view.linear) * view.mark.thinnest_mm
         limits.append(min((greatest - least).max() / _EXTENT_PX, thinnest_px / _THINNEST_PX))
     needed = max(scan.width_px, scan.height_px) / _LARGEST_PX
     return min(max(1, int(min(limits)), int(np.ceil(needed))), scan.width_px, scan.height_px)

@@ -14,14 +14,13 @@ from scipy.spatial.distance import pdist
 from scipy.special import chdtrc, chdtri, fdtrc
 
 from measure.array_types import Array
-from measure.fiducials.consistency import NAMED, Hypothesis
+from measure.fiducials.consistency import NAMED, FrameMarks, Hypothesis
 from measure.fiducials.frame import may_be_wrong
 from measure.fiducials.mark_comparison import check_own_figures
-from measure.fiducials.misfit_model import FrameMarks
 from measure.fiducials.misfits import Explanation, FrameMisfit, Frames, Pattern, explain, explain_by_pattern
 from measure.fiducials.options import ANY_FILM, BelievedFilm
 from measure.flags import FALSE_DOUBT, NO_REASON, Cause, Code, Reason, Status
-from measure.geometry import up_from_camera
+from measure.geometry import UP_FROM_CAMERA
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
 from measure.noise.robust_estimation import MEDIAN_EFFICIENCY
 from measure.results import FrameMeasurement, MarkMeasurement
@@ -141,7 +140,7 @@ def _explain_together(frames: Frames, layout: FiducialLayout, film_mm: float) ->
 
 def _scan_sites(frames: Frames) -> Array:
     """(m, 2) sites of the marks of all frames, in the scan's axes."""
-    places = [each.marks.given_mm @ up_from_camera(each.pose).T for each in frames.values()]
+    places = [each.marks.given_mm @ UP_FROM_CAMERA[each.pose].T for each in frames.values()]
     near = _SAME_SITE * min(float(pdist(own).min()) for own in places)
     sites = list[Array]()
     for place in np.unique(np.round(np.concatenate(places), 6), axis=0):
@@ -152,7 +151,7 @@ def _scan_sites(frames: Frames) -> Array:
 
 def _in_scan_axes(frame: FrameMisfit, sites: Array, given_mm: Array) -> FrameMisfit:
     """Transform a frame to the scan's axes and nearest sites (m, 2), with the variances of its given places added."""
-    marks = frame.marks.widen(given_mm[frame.sites] ** 2).rotate(up_from_camera(frame.pose))
+    marks = frame.marks.widen(given_mm[frame.sites] ** 2).rotate(UP_FROM_CAMERA[frame.pose])
     nearest = np.hypot(*np.moveaxis(marks.given_mm[:, None] - sites[None], -1, 0)).argmin(axis=1)
     return replace(frame, marks=marks, sites=nearest)
 

@@ -11,7 +11,7 @@ from measure.fiducials.frame import Frame
 from measure.fiducials.measure_frame import measure_frame
 from measure.fiducials.options import CLICK_SIGMA_PX, Click, FiducialOptions
 from measure.flags import NO_REASON, Cause, Code, Reason, Status
-from measure.geometry import POSES, linear_scale, up_from_camera
+from measure.geometry import POSES, UP_FROM_CAMERA, linear_scale
 from measure.marks.shapes import FiducialLayout
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
 from measure.scans.scan import Scan
@@ -102,18 +102,18 @@ def _clicked_pose(camera: Array, up_mm: Array, poses: Sequence[str]) -> tuple[st
 
 def _similarity(camera: Array, up_mm: Array, pose: str) -> tuple[Array, float]:
     """Similarity (2, 3) from camera mm to mm right and up in a scan orientation; largest residual, mm."""
-    turned = camera @ up_from_camera(pose).T
+    turned = camera @ UP_FROM_CAMERA[pose].T
     own, observed = turned @ (1.0, 1j), up_mm @ (1.0, 1j)
     design = np.column_stack([own, np.ones(len(own))])
     (scale, shift), *_ = np.linalg.lstsq(design, observed, rcond=None)
-    linear = np.array([[scale.real, -scale.imag], [scale.imag, scale.real]]) @ up_from_camera(pose)
+    linear = np.array([[scale.real, -scale.imag], [scale.imag, scale.real]]) @ UP_FROM_CAMERA[pose]
     left = float(np.abs(design @ (scale, shift) - observed).max())
     return np.column_stack([linear, [shift.real, shift.imag]]), left
 
 
 def _turn_rad(up_from_mm: Array, pose: str) -> float:
     """Rotation of the frame relative to a scan orientation."""
-    own = up_from_mm[:, :2] @ np.linalg.inv(up_from_camera(pose))
+    own = up_from_mm[:, :2] @ np.linalg.inv(UP_FROM_CAMERA[pose])
     return float(np.arctan2(own[1, 0], own[0, 0]))
 
 

@@ -17,7 +17,7 @@ from measure.detection.correlation import WIDE, Surroundings
 from measure.detection.responses import LEAST_TOLERANCE_PX, Key, Responses, narrow_tolerance_px
 from measure.fiducials.interior_orientation import FilmFit
 from measure.fiducials.options import TakingLens
-from measure.geometry import Affine, linear_scale, up_from_camera
+from measure.geometry import UP_FROM_CAMERA, Affine, linear_scale
 from measure.marks.shapes import LayoutMark, Mark
 
 Complex = NDArray[np.complex128]
@@ -118,9 +118,9 @@ class Placement:
         The marks get other names. A similarity corrects for the differences of the given coordinates camera_mm (n, 2)
         between the old and new marks at the same places.
         """
-        turn = np.linalg.inv(up_from_camera(self.pose)) @ up_from_camera(pose)
+        turn = np.linalg.inv(UP_FROM_CAMERA[self.pose]) @ UP_FROM_CAMERA[pose]
         linear, shift = self.pixel_from_camera[:, :2] @ turn, self.pixel_from_camera[:, 2]
-        film = None if self.film is None else replace(self.film, turn=up_from_camera(pose))
+        film = None if self.film is None else replace(self.film, turn=UP_FROM_CAMERA[pose])
         renamed = replace(self, pose=pose, pixel_from_camera=np.column_stack([linear, shift]), film=film)
         names = renamed.names(self.places_px(camera_mm), camera_mm)
         if film is not None or np.any(names < 0):
@@ -174,7 +174,7 @@ def same_picture(
 ) -> bool:
     """Whether two poses have equal marks at equal places. first, second: pose and kind of template of every mark."""
     xy = np.array([mark.xy_mm for mark in marks])
-    of_first, of_second = (xy @ up_from_camera(pose).T for pose, _ in (first, second))
+    of_first, of_second = (xy @ UP_FROM_CAMERA[pose].T for pose, _ in (first, second))
     distance = np.hypot(*np.moveaxis(of_first[:, None] - of_second[None], -1, 0))
     nearest = distance.argmin(axis=1)
     close = bool((distance.min(axis=1) < within_mm).all())
@@ -269,11 +269,11 @@ class _Constellation:
 
     def __init__(self, search: PlacementSearch, pose: str, keys: Sequence[Key]) -> None:
         self.search, self.pose, self.keys, self.responses = search, pose, keys, search.responses
-        self.camera: Complex = np.asarray(search.camera_mm @ up_from_camera(pose).T @ (1.0, 1.0j), complex)
+        self.camera: Complex = np.asarray(search.camera_mm @ UP_FROM_CAMERA[pose].T @ (1.0, 1.0j), complex)
 
     def placements(self, polarity: int) -> list[Placement]:
         """Score the hypotheses, and refine the best ones."""
-        search, turn = self.search, up_from_camera(self.pose)
+        search, turn = self.search, UP_FROM_CAMERA[self.pose]
         scale, offset = self._hypotheses()
         if len(scale) == 0:
             return []
@@ -293,7 +293,7 @@ class _Constellation:
 
     def _step_along_lattice(self, scale: Complex, offset: Complex) -> tuple[Complex, Complex]:
         """Shift the best hypotheses of a lattice step by step while the score increases: they may be many steps off."""
-        turned = self.search.steps_mm @ up_from_camera(self.pose).T
+        turned = self.search.steps_mm @ UP_FROM_CAMERA[self.pose].T
         steps = np.append(0.0, turned @ [1.0, 1.0j])
         best = np.full(len(scale) if len(steps) > 1 else 0, -1)
         while best.any():

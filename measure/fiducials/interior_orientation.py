@@ -1,16 +1,49 @@
 """Interior orientation by weighted least squares: a similarity, an affinity with a prior, and the terms of the film
-model."""
+deformation model."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 from measure.array_types import Array
-from measure.fiducials.options import AFFINITY_SIGMA, film_terms
 
+AFFINITY_SIGMA = 5e-3  # relative stretch: a few parts in ten thousand by film, several thousandths by an office scanner
 _LINEAR = [0, 1, 4, 5]  # indices of the unknowns of the affine model without the shift
 _FREE = 0.03  # fraction of the frame's radius: prior standard deviation of free stretch, shear and film terms
 _INVERSIONS = 6  # iterations of the inversion of a perspective, each correction a fiftieth of the one before
+
+
+def interleaved(*columns: tuple[Array, Array]) -> Array:
+    """(2n, k) design matrix from k columns, each given as (n,) in x and (n,) in y; rows x1, y1, x2, ..."""
+    return np.stack([np.stack(each, axis=1).ravel() for each in columns], axis=1)
+
+
+def film_terms(model: str, places: Array, measured: Array | None = None) -> Array:
+    """Columns (2n, k) of a film model's design matrix in addition to an affine transformation.
+
+    Parameters
+    ----------
+    model : projective, bilinear, conformal(n) or polynomial(n); any other has no further terms.
+    places : (n, 2) given places.
+    measured : (n, 2) measured places, with which the equations of a projective transformation are linear (DLT). None:
+        it is linearised.
+    """
+    x, y = places.T
+    u, v = places.T if measured is None else measured.T
+    none = np.zeros_like(x)
+    name, _, order = model.rstrip(")").partition("(")
+    powers = range(2, int(order) + 1) if order.isdigit() else range(0)
+    if name == "projective":
+        return interleaved((u * x, v * x), (u * y, v * y))
+    if name == "bilinear":
+        return interleaved((x * y, none), (none, x * y))
+    if name == "conformal" and powers:
+        z = [(x + 1j * y) ** power for power in powers]
+        return interleaved(*[(each.real, each.imag) for each in z], *[(-each.imag, each.real) for each in z])
+    if name == "polynomial" and powers:
+        terms = [x ** (degree - q) * y**q for degree in powers for q in range(degree + 1)]
+        return interleaved(*[(each, none) for each in terms], *[(none, each) for each in terms])
+    return np.zeros((2 * len(places), 0))
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,9 +27,8 @@ from measure.flags import (
     Status,
 )
 from measure.geometry import linear_scale
-from measure.marks.rendering import picture, reach_px
+from measure.marks.rendering import mark_window, picture, reach_px
 from measure.marks.shapes import Bar, Disk, Mark, MarkShape, Ring
-from measure.matching.match import mark_window
 from measure.matching.models import PIXEL_VARIANCE_PX2, background_planes
 from measure.matching.window import ScanWindow, read_window
 from measure.results import FrameMeasurement, MarkFit, MarkMeasurement

@@ -8,10 +8,10 @@ import numpy as np
 from measure.array_types import Array
 from measure.detection.localisation import MarkPrediction, localise
 from measure.flags import NO_REASON, Cause, Code, Reason
-from measure.marks.rendering import extent_px
+from measure.marks.rendering import extent_px, mark_window
 from measure.marks.shapes import FrameCorner, Mark, MarkShape, MarkTemplate
 from measure.matching.frame_edge import fit_frame_corner
-from measure.matching.match import MatchOptions, mark_window, match
+from measure.matching.match import MatchOptions, match
 from measure.matching.window import FAINT, pixels_beyond_edge, read_window
 from measure.noise.grain import BESIDE_PX
 from measure.results import MarkFit
@@ -106,11 +106,11 @@ def detect_mark(
     reason = _unlike(fit, expected, scan.full_scale_dn) if fit.converged else fit.reason
     if reason:
         return Detection(predicted, True, None, reason)
-    loss = covariance_of_compression(scan.rounding_step_dn, fit.stored_contrast_dn)
-    fit = replace(fit, place_covariance=fit.place_covariance.plus(Cause.COMPRESSION, loss))
     if fit.tone is not None:
         alike = tone_variance(scan.rounding_step_dn, fit.stored_contrast_dn)
         fit = replace(fit, tone=replace(fit.tone, information=replace(fit.tone.information, common_variance=alike)))
+    loss = covariance_of_compression(scan.rounding_step_dn, fit.stored_contrast_dn)
+    fit = replace(fit, place_covariance=fit.place_covariance.plus(Cause.COMPRESSION, loss))
     return Detection(predicted, True, fit, false_alarms=false_alarms)
 
 

@@ -15,11 +15,11 @@ import numpy as np
 from measure.array_types import Array
 from measure.detection.correlation import CLOSE
 from measure.detection.localisation import MarkPrediction, highest_peak
-from measure.fiducials.consistency import gross_errors
+from measure.fiducials.consistency import FrameMarks, Scatter, gross_errors
 from measure.fiducials.constellation import NARROW, Placement
 from measure.fiducials.faint_marks import detect_faint_marks, faint_reach_px
 from measure.fiducials.frame import LEAST_SIGNIFICANCE, MANY, REDUCED_PX, Frame
-from measure.fiducials.interior_orientation import fit_frame
+from measure.fiducials.interior_orientation import film_terms, fit_frame, interleaved
 from measure.fiducials.mark_comparison import (
     SharedBlur,
     compare_shapes,
@@ -28,13 +28,11 @@ from measure.fiducials.mark_comparison import (
     unlike_blur,
 )
 from measure.fiducials.mark_fit import Detection, detect_mark, not_found, strain_error_px
-from measure.fiducials.misfit_model import FrameMarks, Scatter
-from measure.fiducials.options import SCATTER_DEGREES, FiducialOptions, film_terms, interleaved
+from measure.fiducials.options import SCATTER_DEGREES, FiducialOptions
 from measure.flags import FAINT_MARK_BY_NOISE, TEXTURE_LIKE_A_FAINT_MARK, Cause
-from measure.geometry import up_from_camera
-from measure.marks.rendering import picture
+from measure.geometry import UP_FROM_CAMERA
+from measure.marks.rendering import mark_window, picture
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout, Mark, MarkShape, widen_lines
-from measure.matching.match import mark_window
 from measure.matching.models import PIXEL_VARIANCE_PX2, MatchOptions
 from measure.noise.noise_model import may_be_noise
 from measure.results import MarkFit
@@ -247,7 +245,7 @@ def orient_frame(frame: Frame) -> Frame:
     out &= ~known[index]
     inliers[index[out]] = False
     sigma = np.sqrt(np.trace(covariances, axis1=1, axis2=2) / 2 + film.sigma**2)
-    fit = fit_frame(camera[index[~out]], up[~out], sigma[~out], up_from_camera(frame.placement.pose), model)
+    fit = fit_frame(camera[index[~out]], up[~out], sigma[~out], UP_FROM_CAMERA[frame.placement.pose], model)
     pixel_from_camera = np.diag([1.0, -1.0]) @ fit.up_from_camera / frame.pitch_mm[:, None]
     return replace(
         frame, inliers=inliers, pixel_from_camera=pixel_from_camera, linear_sigma=fit.linear_sigma, film=fit.film

@@ -20,7 +20,7 @@ from measure.fiducials.search import SearchResult
 from measure.fiducials.significance import doubt_frame, false_placements
 from measure.fiducials.stages import find_frame
 from measure.flags import FRAMES_BY_CHANCE, NO_REASON, Code, Reason, Status
-from measure.geometry import up_from_camera
+from measure.geometry import UP_FROM_CAMERA
 from measure.marks.shapes import FiducialLayout, limit_to_crossings, limit_to_frame
 from measure.results import FrameMeasurement, Pose
 from measure.scans.opening import crop_scan
@@ -141,7 +141,7 @@ def _read(
         return read_writing(scan, nets)
     matrix = frame.pixel_from_camera
     frame_px = _corners_px(matrix, layout)
-    pixel_from_up = matrix[:, :2] @ up_from_camera(frame.placement.pose).T
+    pixel_from_up = matrix[:, :2] @ UP_FROM_CAMERA[frame.placement.pose].T
     for known in known_lines:
         outline_px = np.array(known.outline_mm) @ pixel_from_up.T + matrix[:, 2]
         lines = read_writing(scan, nets, frame_px, (known.side, outline_px))

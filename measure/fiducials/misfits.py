@@ -15,8 +15,16 @@ from scipy.optimize import brentq
 from scipy.special import chdtrc, chdtri
 
 from measure.array_types import Array, Mask
-from measure.fiducials.consistency import MOST_STRETCHED, Hypothesis, frame_consistency, frame_p_value
-from measure.fiducials.misfit_model import LONE_AFFINITY, Affinity, FrameMarks, Scatter
+from measure.fiducials.consistency import (
+    LONE_AFFINITY,
+    MOST_STRETCHED,
+    Affinity,
+    FrameMarks,
+    Hypothesis,
+    Scatter,
+    frame_consistency,
+    frame_p_value,
+)
 from measure.fiducials.options import SCATTER_DEGREES
 from measure.flags import FALSE_DOUBT
 

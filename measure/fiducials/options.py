@@ -1,4 +1,4 @@
-"""Options of the measurement of fiducials; priors and deformation models of the film."""
+"""Options of the measurement of fiducials; priors of the film."""
 
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
@@ -7,12 +7,12 @@ import numpy as np
 
 from measure.annotations.lines import KnownLine
 from measure.array_types import Array
+from measure.fiducials.interior_orientation import film_terms
 from measure.geometry import POSES
 from measure.marks.shapes import FiducialLayout
 from measure.matching.models import MatchOptions
 
 SCATTER_MM = 0.005  # mm, scatter of a mark along an axis by default; a project may state film_sigma_um
-AFFINITY_SIGMA = 5e-3  # relative stretch: a few parts in ten thousand by film, several thousandths by an office scanner
 SCATTER_DEGREES = 4.0  # degrees of freedom of the scatter: it is known to a third
 MOST_BENT_MM = 0.3  # mm, largest deviation from an affine transformation
 _PERSPECTIVE = 1.5e-5  # mm per mm2 of a frame's span: film photographed from 0.6 m at 5 degrees, less a similarity
@@ -134,36 +134,3 @@ class FiducialOptions:
         span_mm = float(np.hypot(*np.ptp(places, axis=0)))
         tilted_mm = _PERSPECTIVE * span_mm**2 if film_terms(self.film_model, places).shape[1] else 0.0
         return self.misfit_mm + self.affinity * span_mm + tilted_mm
-
-
-def interleaved(*columns: tuple[Array, Array]) -> Array:
-    """(2n, k) design matrix from k columns, each given as (n,) in x and (n,) in y; rows x1, y1, x2, ..."""
-    return np.stack([np.stack(each, axis=1).ravel() for each in columns], axis=1)
-
-
-def film_terms(model: str, places: Array, measured: Array | None = None) -> Array:
-    """Columns (2n, k) of a film model's design matrix in addition to an affine transformation.
-
-    Parameters
-    ----------
-    model : projective, bilinear, conformal(n) or polynomial(n); any other has no further terms.
-    places : (n, 2) given places.
-    measured : (n, 2) measured places, with which the equations of a projective transformation are linear (DLT). None:
-        it is linearised.
-    """
-    x, y = places.T
-    u, v = places.T if measured is None else measured.T
-    none = np.zeros_like(x)
-    name, _, order = model.rstrip(")").partition("(")
-    powers = range(2, int(order) + 1) if order.isdigit() else range(0)
-    if name == "projective":
-        return interleaved((u * x, v * x), (u * y, v * y))
-    if name == "bilinear":
-        return interleaved((x * y, none), (none, x * y))
-    if name == "conformal" and powers:
-        z = [(x + 1j * y) ** power for power in powers]
-        return interleaved(*[(each.real, each.imag) for each in z], *[(-each.imag, each.real) for each in z])
-    if name == "polynomial" and powers:
-        terms = [x ** (degree - q) * y**q for degree in powers for q in range(degree + 1)]
-        return interleaved(*[(each, none) for each in terms], *[(none, each) for each in terms])
-    return np.zeros((2 * len(places), 0))

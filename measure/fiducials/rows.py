@@ -8,8 +8,8 @@ from scipy.special import ndtri
 
 from measure.array_types import Array
 from measure.fiducials.frame import Frame
+from measure.fiducials.interior_orientation import AFFINITY_SIGMA
 from measure.fiducials.mark_fit import Detection
-from measure.fiducials.options import AFFINITY_SIGMA
 from measure.flags import NO_REASON, RIGHT_PITCH_REFUSED, Code, Reason, Status
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkTemplate, finest_detail_mm
 from measure.matching.covariance import honest_covariance

@@ -17,7 +17,7 @@ from measure.fiducials.frame import Frame
 from measure.fiducials.interior_orientation import fit_frame
 from measure.fiducials.options import SCATTER_DEGREES
 from measure.fiducials.orientation_pictures import Drawings, MarkSite, PosedMark
-from measure.geometry import POSES, pose_in_camera, up_from_camera
+from measure.geometry import POSES, UP_FROM_CAMERA, pose_in_camera
 from measure.marks.shapes import LEARNED_ORIGIN, Disk, FiducialLayout, LayoutMark, Mark, MarkShape, MarkTemplate
 from measure.results import MarkFit, Pose
 from measure.scans.parallel import map_in_threads
@@ -85,7 +85,7 @@ def decide_pose(frame: Frame, lines: Sequence[Line] = (), poses: Sequence[str] =
     hypotheses = [each for each in every if each is not None]
     if not hypotheses:
         return _decision([], layout, len(fits))
-    scan_from_up = frame.pixel_from_camera[:, :2] @ np.linalg.inv(up_from_camera(frame.placement.pose))
+    scan_from_up = frame.pixel_from_camera[:, :2] @ np.linalg.inv(UP_FROM_CAMERA[frame.placement.pose])
     blur_px = float(np.median([fit.blur_px for fit in fits]))
     drawings = Drawings([mark.mark for mark in layout.marks], scan_from_up, blur_px)
     # Sites without a mark take contrast and noise from a typical one: another orientation may predict a mark there.
@@ -95,7 +95,7 @@ def decide_pose(frame: Frame, lines: Sequence[Line] = (), poses: Sequence[str] =
 
     def site_likelihoods(index: int) -> Array:
         """(hypotheses,) log-likelihoods of the image at a site."""
-        names = [(each.names[index], up_from_camera(each.pose)) for each in hypotheses]
+        names = [(each.names[index], UP_FROM_CAMERA[each.pose]) for each in hypotheses]
         shown = [PosedMark(None if name < 0 else layout.marks[name].mark, turn) for name, turn in names]
         return MarkSite(frame.scan, *places[index], frame.weights, drawings, reach_px).likelihoods(shown)
 
@@ -134,7 +134,7 @@ def _name_sites(frame: Frame, pose: str, fits: Sequence[MarkFit], missed: Array)
     measured = np.array([fit.sigma_px for fit in fits])[found] * pitch.mean()
     sigma = np.sqrt(given**2 + measured**2 + options.film_sigma_mm**2)
     up = frame.up_mm(centers[: len(fits)][found])
-    fit = fit_frame(frame.camera_mm[own], up, sigma, up_from_camera(pose), options.film_model)
+    fit = fit_frame(frame.camera_mm[own], up, sigma, UP_FROM_CAMERA[pose], options.film_model)
     degrees = SCATTER_DEGREES + max(fit.redundancy, 0)
     coordinates = -degrees / 2 * float(np.log1p(fit.chi_square / SCATTER_DEGREES))
     return replace(hypothesis, coordinates=coordinates, chi_square=fit.chi_square)

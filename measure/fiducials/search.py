@@ -11,7 +11,7 @@ from measure.detection.correlation import WIDE, Surroundings
 from measure.detection.responses import Effort, MarkView, Responses, correlate_scan, correlate_windows
 from measure.fiducials.constellation import Bounds, Placement, PlacementSearch, lattice_steps_mm, mark_signs
 from measure.fiducials.options import FiducialOptions
-from measure.geometry import POSES, up_from_camera
+from measure.geometry import POSES, UP_FROM_CAMERA
 from measure.marks.shapes import FiducialLayout
 from measure.scans.scan import Scan
 
@@ -218,7 +218,7 @@ class FrameSearch:
         """Views of all marks, pose by pose."""
         linear = np.diag([1 / drawn_mm[0], -1 / drawn_mm[1]])  # from mm right and up to pixels across and down
         return [
-            MarkView(mark.mark, linear @ up_from_camera(pose)) for pose in self._poses for mark in self.layout.marks
+            MarkView(mark.mark, linear @ UP_FROM_CAMERA[pose]) for pose in self._poses for mark in self.layout.marks
         ]
 
     def _placements(self, options: FiducialOptions, hypotheses: Hypotheses, responses: Responses) -> SearchResult:

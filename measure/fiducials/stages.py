@@ -15,8 +15,9 @@ import numpy as np
 from measure.detection.correlation import CLOSE, GRAINY, WIDE, Surroundings
 from measure.fiducials.constellation import Placement, distinct_places
 from measure.fiducials.frame import Frame
+from measure.fiducials.interior_orientation import AFFINITY_SIGMA
 from measure.fiducials.measure_frame import measure_frame, rename_frame, shows_marks
-from measure.fiducials.options import AFFINITY_SIGMA, FiducialOptions
+from measure.fiducials.options import FiducialOptions
 from measure.fiducials.scan_orientation import decide_pose
 from measure.fiducials.search import (
     FrameSearch,

@@ -28,9 +28,7 @@ from measure.marks.shapes import (
     Polygon,
     Ring,
     drawn_outline_mm,
-    known_outline_mm,
     outline_mm,
-    thinnest_mm,
 )
 
 _DRAWINGS = 16  # cached drawings, more than a camera has kinds of marks
@@ -106,9 +104,17 @@ def extent_px(mark: Mark, pixel_from_mark: Array) -> tuple[Array, Array]:
     return points.min(axis=0), points.max(axis=0)
 
 
+def mark_window(mark: Mark, pixel_from_mark: Array, margin_px: float) -> tuple[int, int, int, int]:
+    """col0, row0, width, height of the window that holds the mark and margin_px around it."""
+    least, greatest = extent_px(mark, np.asarray(pixel_from_mark, dtype=float))
+    col0, row0 = np.floor(least - margin_px).astype(int)
+    col1, row1 = np.ceil(greatest + margin_px).astype(int)
+    return int(col0), int(row0), int(col1 - col0 + 1), int(row1 - row0 + 1)
+
+
 def detail_px(mark: Mark, linear: Array) -> float:
     """Width of the mark's finest detail in px, at least 1. linear (2, 2): px from mm."""
-    return max(linear_scale(linear) * thinnest_mm(mark), 1.0)
+    return max(linear_scale(linear) * mark.thinnest_mm, 1.0)
 
 
 def reach_px(mark: Mark, linear: Array) -> float:
@@ -120,7 +126,7 @@ def reach_px(mark: Mark, linear: Array) -> float:
 def _outline_mm(mark: Mark) -> Array:
     """(n, 2) corners of a region that contains the known part of the mark."""
     if not isinstance(mark, MarkTemplate):
-        return known_outline_mm(mark)
+        return mark.known_outline_mm
     rows, cols = mark.image.shape
     return _chip_from_mark(mark).inverse.apply(np.array([(0, 0), (cols - 1, 0), (cols - 1, rows - 1), (0, rows - 1)]))
 

@@ -88,6 +88,33 @@ class MarkShape:
         return np.asarray(places_mm / (1.0 + places_mm @ self.perspective)[:, None])
 
     @property
+    def thinnest_mm(self) -> float:
+        """Width of the thinnest line, estimated from the parts."""
+        widths = []
+        for part in self.parts:
+            if isinstance(part, Bar | Ring):
+                widths.append(part.line_mm)
+            elif isinstance(part, Disk):
+                widths.append(2 * part.radius_mm)
+            elif isinstance(part, Polygon):
+                vertices = np.asarray(part.vertices_mm)
+                widths.append(float(np.ptp(vertices, axis=0).min()) / 3)
+        return min(widths)
+
+    @property
+    def known_outline_mm(self) -> Array:
+        """(n, 2) corners of a region that contains the known part of the drawing."""
+        drawn = drawn_outline_mm(self)
+        if self.known_mm is None:
+            return drawn
+        least, greatest = np.add(self.known_mm, [[_EDGE_MM], [-_EDGE_MM]])
+        parts = [self.perspective_places(outline_mm(part)) for part in self.parts]
+        for axis in (0, 1):
+            parts = [_below(_below(part, axis, 1.0, greatest[axis]), axis, -1.0, -least[axis]) for part in parts]
+        known = np.concatenate(parts)
+        return known if len(known) else drawn
+
+    @property
     def is_round(self) -> bool:
         """Whether the mark is invariant under rotation."""
         centred = all(isinstance(part, Disk | Ring) and part.center_mm == (0.0, 0.0) for part in self.parts)
@@ -163,6 +190,11 @@ class MarkTemplate:
     steadiness: Array | None = None
     learned_mm: float = 0.0
     alike: tuple[str, ...] = ()
+
+    @property
+    def thinnest_mm(self) -> float:
+        """Width of the thinnest line; two pixels where it is unknown."""
+        return self.detail_mm or self.pitch_um / 1000 * 2
 
 
 Mark = MarkShape | MarkTemplate
@@ -311,28 +343,12 @@ def widen_lines(mark: MarkShape, ratio: float) -> MarkShape:
     return replace(mark, parts=tuple(widened))
 
 
-def thinnest_mm(mark: Mark) -> float:
-    """Width (mm) of the mark's thinnest line, estimated from its parts."""
-    if isinstance(mark, MarkTemplate):
-        return mark.detail_mm or mark.pitch_um / 1000 * 2
-    widths = []
-    for part in mark.parts:
-        if isinstance(part, Bar | Ring):
-            widths.append(part.line_mm)
-        elif isinstance(part, Disk):
-            widths.append(2 * part.radius_mm)
-        elif isinstance(part, Polygon):
-            vertices = np.asarray(part.vertices_mm)
-            widths.append(float(np.ptp(vertices, axis=0).min()) / 3)
-    return min(widths)
-
-
 def finest_detail_mm(mark: Mark) -> float:
     """Width of the mark's thinnest line, or length of the shortest straight edge between corners of its outline."""
     if isinstance(mark, MarkTemplate):
-        return thinnest_mm(mark)
+        return mark.thinnest_mm
     outlines = (np.asarray(part.vertices_mm) for part in mark.parts if isinstance(part, Polygon))
-    return min([thinnest_mm(mark), *(length for outline in outlines for length in _straight_edges_mm(outline))])
+    return min([mark.thinnest_mm, *(length for outline in outlines for length in _straight_edges_mm(outline))])
 
 
 def _straight_edges_mm(outline: Array) -> list[float]:
@@ -435,19 +451,6 @@ def outline_mm(part: Part) -> Array:
 def drawn_outline_mm(mark: MarkShape) -> Array:
     """(n, 2) corners of a region that contains the whole drawing."""
     return mark.perspective_places(np.concatenate([outline_mm(part) for part in mark.parts]))
-
-
-def known_outline_mm(mark: MarkShape) -> Array:
-    """(n, 2) corners of a region that contains the known part of the drawing."""
-    drawn = drawn_outline_mm(mark)
-    if mark.known_mm is None:
-        return drawn
-    least, greatest = np.add(mark.known_mm, [[_EDGE_MM], [-_EDGE_MM]])
-    parts = [mark.perspective_places(outline_mm(part)) for part in mark.parts]
-    for axis in (0, 1):
-        parts = [_below(_below(part, axis, 1.0, greatest[axis]), axis, -1.0, -least[axis]) for part in parts]
-    known = np.concatenate(parts)
-    return known if len(known) else drawn
 
 
 def _below(polygon: Array, axis: int, sign: float, limit: float) -> Array:

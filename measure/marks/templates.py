@@ -19,7 +19,7 @@ from scipy.fft import dctn, idctn
 from scipy.sparse.linalg import LinearOperator, lsmr
 
 from measure.array_types import Array, Mask, Single
-from measure.geometry import POSES, linear_scale, turn_by_quarters, up_from_camera
+from measure.geometry import POSES, UP_FROM_CAMERA, linear_scale, turn_by_quarters
 from measure.marks.shapes import MarkTemplate
 from measure.noise.robust_estimation import robust_scale, tukey_weights
 from measure.scans.scan import Scan
@@ -402,7 +402,7 @@ def share_origins(
     """
     count, rows, shifts, alike = len(templates), list[Array](), list[Array](), list[str]()
     for pose in (pose for pose in POSES[1:] if pose in poses):
-        turn = up_from_camera(pose)
+        turn = UP_FROM_CAMERA[pose]
         to = _partners(places_mm, turn, max(template.learned_mm for template in templates))
         pairs = [] if to is None else [_aligned_origin(templates[k], templates[to[k]], turn) for k in range(count)]
         found = [pair for pair in pairs if pair is not None]

@@ -14,7 +14,7 @@ import numpy as np
 
 from measure.array_types import Array, Mask
 from measure.flags import Cause
-from measure.marks.rendering import extent_px, frame_pixel_mask, known_mask, picture
+from measure.marks.rendering import frame_pixel_mask, known_mask, mark_window, picture
 from measure.marks.shapes import Mark, MarkShape, MarkTemplate, widen_lines
 from measure.matching.covariance import (
     Landscape,
@@ -47,7 +47,7 @@ from measure.results import Covariance, MarkFit
 from measure.tone.estimate import MarkTone
 from measure.tone.sharpening import SharpeningScore
 
-__all__ = ["MarkFit", "MatchOptions", "mark_window", "match"]
+__all__ = ["MarkFit", "MatchOptions", "match"]
 
 
 _WIDER = 1.05  # relative width of lines, step of the difference
@@ -95,14 +95,6 @@ def match(
             whole = _fit(window, mark, start, options, begun=begun) if fit.reason else fit
             fit = whole if _is_right(whole) else detail
     return _mark_fit(fit, window)
-
-
-def mark_window(mark: Mark, pixel_from_mark: Array, margin_px: float) -> tuple[int, int, int, int]:
-    """col0, row0, width, height of the window that holds the mark and margin_px around it."""
-    least, greatest = extent_px(mark, np.asarray(pixel_from_mark, dtype=float))
-    col0, row0 = np.floor(least - margin_px).astype(int)
-    col1, row1 = np.ceil(greatest + margin_px).astype(int)
-    return int(col0), int(row0), int(col1 - col0 + 1), int(row1 - row0 + 1)
 
 
 def _fit(

@@ -12,7 +12,7 @@ from measure.array_types import Array, Mask
 from measure.flags import NO_REASON, Code, Reason
 from measure.geometry import linear_scale
 from measure.marks.rendering import Rendering, chip_steadiness, reach_px, render
-from measure.marks.shapes import Mark, MarkTemplate, thinnest_mm
+from measure.marks.shapes import Mark, MarkTemplate
 from measure.matching.window import ScanWindow, censored, tells
 from measure.noise.noise_model import combined, factors
 
@@ -103,7 +103,7 @@ def smoothed_px2(mark: Mark) -> float:
 
 def background_px(mark: Mark, pixel_from_mark: Array) -> float:
     """Standard deviation (px) of a blur that removes the mark's lines, for background subtraction."""
-    return max(1.5 * linear_scale(pixel_from_mark) * thinnest_mm(mark), 1.0) + 1.0
+    return max(1.5 * linear_scale(pixel_from_mark) * mark.thinnest_mm, 1.0) + 1.0
 
 
 @dataclass(frozen=True, eq=False)

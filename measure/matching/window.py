@@ -129,11 +129,11 @@ def read_window(scan: Scan, place_px: tuple[int, int, int, int], weights: Sequen
     """Read the window at col0, row0, width, height of the scan, in light. weights: of the channels, as in
     `Scan.window`."""
     col0, row0, _, _ = place_px
-    grey = scan.light(*place_px, weights).astype(float)
+    samples, grey = scan.samples(*place_px), scan.light(*place_px, weights).astype(float)
+    inside = scan.inside(*place_px, is_read=True)
     stored = grey if scan.tone.is_identity else scan.window(*place_px, weights) if scan.channels == 1 else None
-    coding = Coding(stored, scan.tone, scan.full_scale_dn)
-    sides = clipped_sides(scan, *place_px, weights)
-    return ScanWindow(grey, (col0, row0), scan.inside(*place_px), sides, scan.is_lossy, coding)
+    sides = clipped_sides(samples, scan.full_scale_dn, weights)
+    return ScanWindow(grey, (col0, row0), inside, sides, scan.is_lossy, Coding(stored, scan.tone, scan.full_scale_dn))
 
 
 def pixels_beyond_edge(window: NDArray[np.floating], mark: Mark, pixel_from_mark: Array) -> Mask:
@@ -181,11 +181,12 @@ _CLEAR = 3.0  # noise standard deviations between the model and a clipping limit
 _TELLS = 0.5  # derivative of the residual above which it counts as an ordinary one
 
 
-def clipped_sides(scan: Scan, col0: int, row0: int, width: int, height: int, weights: Sequence[float] | None) -> Sides:
-    """Find the clipped grey values of a window.
+def clipped_sides(samples: Samples, full_scale_dn: float, weights: Sequence[float] | None = None) -> Sides:
+    """Find the clipped ones among stored values.
 
     Parameters
     ----------
+    samples : (height, width, channels)
     weights : of the channels of a colour scan. None is negative, so a clipped channel of positive weight bounds the
         weighted sum.
 
@@ -194,11 +195,6 @@ def clipped_sides(scan: Scan, col0: int, row0: int, width: int, height: int, wei
     (height, width) int8: 1 at the upper end of the scanner's range or where whites are clipped below it, -1 at the
     lower end, 0 elsewhere.
     """
-    return clipped_samples(scan.samples(col0, row0, width, height), scan.full_scale_dn, weights)
-
-
-def clipped_samples(samples: Samples, full_scale_dn: float, weights: Sequence[float] | None = None) -> Sides:
-    """Find the clipped ones among stored values (height, width, channels), as `clipped_sides`."""
     sides = np.zeros(samples.shape[:2], np.int8)
     for channel in range(samples.shape[2]):
         if weights is None or weights[channel] > 0:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from measure.array_types import Array, Single
-from measure.matching.window import Sides, clipped_samples
+from measure.matching.window import Sides, clipped_sides
 from measure.scans.metadata import Samples
 from measure.scans.parallel import map_in_threads
 from measure.scans.scan import Scan, means, weighted
@@ -63,7 +63,7 @@ class Block:
 
     @cached_property
     def _sides(self) -> Sides:
-        return clipped_samples(self.samples, self.scan.full_scale_dn)
+        return clipped_sides(self.samples, self.scan.full_scale_dn)
 
     def _index(self, corners: NDArray[np.intp], col: NDArray[np.intp], row: NDArray[np.intp]) -> NDArray[np.intp]:
         width, _ = self.size_px

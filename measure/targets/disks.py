@@ -9,8 +9,9 @@ from scipy.special import chdtrc, fdtrc
 from measure.array_types import Array
 from measure.flags import DISK_UNLIKE_THE_OTHERS, LARGE_ERROR, NO_REASON, Cause, Code, Reason
 from measure.geometry import linear_scale
+from measure.marks.rendering import mark_window
 from measure.marks.shapes import Disk, MarkShape
-from measure.matching.match import MatchOptions, mark_window, match
+from measure.matching.match import MatchOptions, match
 from measure.matching.models import GREY
 from measure.matching.window import read_window
 from measure.noise.grain import BESIDE_PX

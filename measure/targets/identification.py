@@ -12,7 +12,7 @@ from measure.array_types import Array, Integers
 from measure.detection.correlation import local_maxima
 from measure.flags import NO_REASON, Code, Reason, Status
 from measure.marks.rendering import extent_px, picture
-from measure.marks.shapes import MarkShape, Polarity, cross, thinnest_mm
+from measure.marks.shapes import MarkShape, Polarity, cross
 from measure.noise.robust_estimation import robust_scale
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
@@ -237,7 +237,7 @@ class _DiskSearch:
 def _correlation_peaks(scan: Scan, prediction: TargetPrediction, polarity: str, shape: MarkShape) -> list[Array]:
     """(2,) places of the NCC peaks within the search radius, the highest first."""
     shorter = prediction.half_axes_px[1]
-    factor = max(1, int(shorter * min(1.0 / _SEARCHED_RADIUS_PX, thinnest_mm(shape) / _THINNEST_PX)))
+    factor = max(1, int(shorter * min(1.0 / _SEARCHED_RADIUS_PX, shape.thinnest_mm / _THINNEST_PX)))
     template, compared = _template(prediction.pixel_from_disk / factor, shape)
     half = np.array(template.shape[::-1]) // 2
     reach = int(np.ceil(prediction.search_px / factor)) + 1

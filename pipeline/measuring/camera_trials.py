@@ -17,7 +17,7 @@ from measure.fiducials.options import FiducialOptions
 from measure.fiducials.search import Hypotheses, PitchHypothesis, longer, pitch_hypotheses
 from measure.flags import CAMERA_BY_CHANCE
 from measure.geometry import linear_scale
-from measure.marks.shapes import FiducialLayout, LayoutMark, finest_detail_mm, limit_to_frame, thinnest_mm
+from measure.marks.shapes import FiducialLayout, LayoutMark, finest_detail_mm, limit_to_frame
 from measure.scans.opening import open_scan, thumbnail
 from measure.scans.scan import Scan
 from pipeline.files.camera_file import CameraFile
@@ -159,7 +159,7 @@ def _boldest(layout: FiducialLayout) -> FiducialLayout:
     """The layout's most visible marks, if there are enough: solid ones, or else those with the widest lines."""
     groups: dict[float, list[LayoutMark]] = {}
     for mark in layout.marks:
-        groups.setdefault(np.inf if is_solid(mark) else thinnest_mm(mark.mark), []).append(mark)
+        groups.setdefault(np.inf if is_solid(mark) else mark.mark.thinnest_mm, []).append(mark)
     enough = [width for width, marks in groups.items() if len(marks) >= _BOLD]
     return replace(layout, marks=tuple(groups[max(enough)])) if enough else layout
 

@@ -15,7 +15,7 @@ from measure.errors import MeasurementError
 from measure.fiducials.clicked_frame import LEAST_CLICKS, are_collinear
 from measure.fiducials.interior_orientation import fit_frame
 from measure.fiducials.measurement import measure_fiducials
-from measure.geometry import POSES, Affine, linear_scale, up_from_camera
+from measure.geometry import POSES, UP_FROM_CAMERA, Affine, linear_scale
 from measure.marks import shapes
 from measure.marks.templates import cut, learn_template
 from measure.scans.parallel import map_items
@@ -163,7 +163,7 @@ def _central_frame(options: ScanOptions, scan: Scan) -> Array:
     """Placement of a frame in the centre of its scan, in the project's scan orientation."""
     pose = "0" if options.fiducials.pose == "auto" else options.fiducials.pose
     pitch = np.array(_pitch_mm(options, scan))
-    linear = np.diag([1.0, -1.0]) @ up_from_camera(pose) / pitch[:, None]
+    linear = np.diag([1.0, -1.0]) @ UP_FROM_CAMERA[pose] / pitch[:, None]
     return np.column_stack([linear, [(scan.width_px - 1) / 2, (scan.height_px - 1) / 2]])
 
 
@@ -193,7 +193,7 @@ def _through_clicks(options: ScanOptions, scan: Scan, px: Places) -> Array:
 def fit_clicks(xy_mm: Array, up_mm: Array, poses: Sequence[str]) -> Array:
     """(2, 3) transformation from camera coordinates to clicks (right, up); of the scan orientations the best-fitting
     one."""
-    fits = [fit_frame(xy_mm, up_mm, np.full(len(xy_mm), _CLICK_MM), up_from_camera(pose)) for pose in poses]
+    fits = [fit_frame(xy_mm, up_mm, np.full(len(xy_mm), _CLICK_MM), UP_FROM_CAMERA[pose]) for pose in poses]
     return min(fits, key=lambda fit: round(fit.chi_square, 6)).up_from_camera
 
 
@@ -217,4 +217,4 @@ def _start(
 def _pose(placement: Array) -> str:
     """Scan orientation nearest to a placement."""
     up = np.diag([1.0, -1.0]) @ placement[:, :2] / linear_scale(placement)  # from the camera's axes to (right, up)
-    return min(POSES, key=lambda name: float(np.abs(up_from_camera(name) - up).sum()))
+    return min(POSES, key=lambda name: float(np.abs(UP_FROM_CAMERA[name] - up).sum()))

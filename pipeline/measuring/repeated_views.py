@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from measure.flags import Code, Reason, Status
-from measure.geometry import up_from_camera
+from measure.geometry import UP_FROM_CAMERA
 from measure.results import Kind
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.types import Array
@@ -79,7 +79,7 @@ def check_repeated_views(scans: Sequence[MeasuredScan], is_board: bool, picture:
 
 def _up(scan: MeasuredScan) -> Array:
     """(2, 2) rotation from the camera's axes to the scan's (right, up)."""
-    return up_from_camera(scan.frame.pose.name) if scan.frame.pose else np.eye(2)
+    return UP_FROM_CAMERA[scan.frame.pose.name] if scan.frame.pose else np.eye(2)
 
 
 def _content(scan: MeasuredScan, places: Array, box: Box, picture: Picture) -> Array | None:

@@ -13,7 +13,7 @@ from measure.fiducials.across_frames import check_frames
 from measure.fiducials.options import BelievedFilm
 from measure.fiducials.scan_orientation import DECIDED, TOLD
 from measure.flags import Code, Reason, Status
-from measure.geometry import POSES, pose_in_camera, up_from_camera
+from measure.geometry import POSES, UP_FROM_CAMERA, pose_in_camera
 from measure.marks.shapes import WrittenPlace
 from measure.results import FrameMeasurement, Pose
 from pipeline.files.camera_file import CameraFile
@@ -116,7 +116,7 @@ def _known_line(frame: FrameMeasurement, line: Line) -> KnownLine | None:
     if frame.pixel_from_camera is None or frame.pose is None or len(letters) < _LEAST or not letters.strip("0"):
         return None
     matrix = frame.pixel_from_camera
-    up_from_pixel = np.linalg.inv(matrix[:, :2] @ up_from_camera(frame.pose.name).T)
+    up_from_pixel = np.linalg.inv(matrix[:, :2] @ UP_FROM_CAMERA[frame.pose.name].T)
     outline_mm = (np.array(line.outline_px) - matrix[:, 2]) @ up_from_pixel.T
     return KnownLine(line.text, line.pose, line.side, tuple((float(x), float(y)) for x, y in outline_mm))
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from measure.annotations.lines import Line
 from measure.flags import Status
-from measure.geometry import up_from_camera
+from measure.geometry import UP_FROM_CAMERA
 from measure.results import Covariance
 from pipeline.drawing import svg
 from pipeline.report import vectors
@@ -139,7 +139,7 @@ def _writing_line(line: Line, zoom: float, is_evidence: bool) -> Markup:
     outline = [(col * zoom, row * zoom) for col, row in line.outline_px]
     cols, rows = zip(*outline, strict=True)
     center = (sum(cols) / len(cols), sum(rows) / len(rows))
-    up = up_from_camera(line.pose)
+    up = UP_FROM_CAMERA[line.pose]
     sides = max(cols) - min(cols), max(rows) - min(rows)
     size = max(0.8 * min(sides), _LEAST_PX)
     # SVG and the glyphs have y down, `up` has y up: hence the signs.

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from measure.fiducials.clicked_frame import LEAST_CLICKS, are_collinear
-from measure.geometry import POSES, Affine, linear_scale, up_from_camera
+from measure.geometry import POSES, UP_FROM_CAMERA, Affine, linear_scale
 from measure.marks.shapes import MarkTemplate, Point
 from measure.marks.templates import cut, learn_template
 from measure.scans.scan import Scan
@@ -160,7 +160,7 @@ def place_frame(
         return FramePlacement(_FLIP @ up / pixel_mm[:, None], _pair(1000.0 * pixel_mm), source)
     if pitch_um is None:
         raise InputError(_NO_PITCH)
-    linear = _FLIP @ up_from_camera(drawing.pose) / (np.array(pitch_um)[:, None] / 1000.0)
+    linear = _FLIP @ UP_FROM_CAMERA[drawing.pose] / (np.array(pitch_um)[:, None] / 1000.0)
     places = np.array([one.px for one in drawing.marks], dtype=float).reshape(-1, 2)
     linear = linear @ rotation(_skew_rad(places @ np.linalg.inv(linear).T))
     camera = places @ np.linalg.inv(linear).T

@@ -11,11 +11,10 @@ from studies import parametrize_with_studies
 
 from measure import FiducialLayout, LayoutMark, MarkShape, cross
 from measure.fiducials.across_frames import CheckedFrames, check_frames
-from measure.fiducials.consistency import frame_p_value
-from measure.fiducials.misfit_model import FrameMarks
+from measure.fiducials.consistency import FrameMarks, frame_p_value
 from measure.fiducials.options import BelievedFilm
 from measure.flags import FALSE_DOUBT, Cause, Code, Reason, Status
-from measure.geometry import up_from_camera
+from measure.geometry import UP_FROM_CAMERA
 from measure.results import FrameMeasurement, Pose
 
 PX_PER_MM, SIGMA_PX, FILM_MM = 50.0, 0.02, 0.003
@@ -45,7 +44,7 @@ def make_frames(
     made += rng.normal(0.0, camera_mm, made.shape)
     frames = []
     for number in range(count):
-        pose, turn = poses[number % len(poses)], up_from_camera(poses[number % len(poses)])
+        pose, turn = poses[number % len(poses)], UP_FROM_CAMERA[poses[number % len(poses)]]
         linear = PX_PER_MM * (np.diag([1.0, -1.0]) + rng.normal(0.0, 1e-3, (2, 2))) @ turn
         matrix = np.column_stack([linear, rng.uniform(5000.0, 6000.0, 2)])
         scatter = np.hypot(SIGMA_PX, film_mm * PX_PER_MM)

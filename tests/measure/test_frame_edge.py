@@ -22,7 +22,6 @@ from measure.marks.shapes import (
     Point,
     Polygon,
     frame_corner,
-    known_outline_mm,
     limit_to_crossings,
     limit_to_frame,
     turned_part,
@@ -140,8 +139,8 @@ def test_what_is_known_of_a_drawing_ends_at_the_frame() -> None:
     inner = layout(((0.0, 0.0), (0.8, 0.3), (0.8, -0.3)), WEDGE_MM)
     assert isinstance(wedge.mark, MarkShape)
     assert isinstance(notch.mark, MarkShape)
-    assert known_outline_mm(wedge.mark)[:, 0].max() == pytest.approx(0.9)
-    assert known_outline_mm(notch.mark)[:, 0].min() == pytest.approx(0.1)
+    assert wedge.mark.known_outline_mm[:, 0].max() == pytest.approx(0.9)
+    assert notch.mark.known_outline_mm[:, 0].min() == pytest.approx(0.1)
     assert limit_to_frame(inner) == inner
 
 
@@ -288,7 +287,7 @@ def test_lines_that_run_on_are_known_about_their_crossings_only() -> None:
     (limited, *_) = limit_to_crossings(line_layout()).marks
     assert isinstance(limited.mark, MarkShape)
     assert limited.mark.known_mm == ((-1.0, -1.0), (1.0, 1.0))
-    assert np.abs(known_outline_mm(limited.mark)).max() <= 1.0
+    assert np.abs(limited.mark.known_outline_mm).max() <= 1.0
     assert limit_to_crossings(line_layout(2.0)) == line_layout(2.0)  # crosses with gaps between them
     dots = replace(
         line_layout(), marks=tuple(replace(m, mark=MarkShape((Disk((0.0, 0.0), 2.4),))) for m in line_layout().marks)

@@ -19,7 +19,7 @@ from measure.fiducials.rows import pitch_problem
 from measure.fiducials.search import PitchHypothesis, SearchResult
 from measure.fiducials.stages import Found, Kind, Stage, find_frame
 from measure.flags import FRAMES_BY_CHANCE, NO_REASON, Reason
-from measure.geometry import POSES, up_from_camera
+from measure.geometry import POSES, UP_FROM_CAMERA
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, dot
 from measure.results import FrameMeasurement
 from measure.tone.curve import Tone
@@ -49,7 +49,7 @@ def placements(pose: str, answers: Responses) -> list[Placement]:
 
 def view_marks(pose: str, scale: float = 1.015, angle: float = 0.03) -> NDArray[np.float64]:
     c, s = np.cos(angle), np.sin(angle)
-    up = np.array(PLACES) @ (scale * np.array([[c, -s], [s, c]]) @ up_from_camera(pose)).T
+    up = np.array(PLACES) @ (scale * np.array([[c, -s], [s, c]]) @ UP_FROM_CAMERA[pose]).T
     return np.asarray(up * (1, -1) / PITCH_MM + (265.0, 255.0))
 
 

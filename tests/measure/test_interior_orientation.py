@@ -9,21 +9,27 @@ from drawn import Array, brute_picture, lay_out, make_scan, measured_mark, paint
 from numpy.typing import NDArray
 
 from measure import Scan, Status
-from measure.fiducials import misfit_model
+from measure.fiducials import consistency
 from measure.fiducials.across_frames import check_frames
-from measure.fiducials.consistency import frame_consistency, frame_p_value, gross_errors
+from measure.fiducials.consistency import (
+    LONE_AFFINITY,
+    FrameMarks,
+    Scatter,
+    frame_consistency,
+    frame_p_value,
+    gross_errors,
+)
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
-from measure.fiducials.interior_orientation import fit_frame
+from measure.fiducials.interior_orientation import AFFINITY_SIGMA, fit_frame
 from measure.fiducials.measure_frame import measure_frame
-from measure.fiducials.misfit_model import LONE_AFFINITY, FrameMarks, Scatter
-from measure.fiducials.options import AFFINITY_SIGMA, FiducialOptions
+from measure.fiducials.options import FiducialOptions
 from measure.fiducials.orientation_pictures import SPOILT, MarkSite, PosedMark
 from measure.fiducials.rows import present_frame
 from measure.fiducials.scan_orientation import decide_pose
 from measure.fiducials.search import SearchResult
 from measure.fiducials.significance import doubt_frame
-from measure.geometry import POSES, up_from_camera
+from measure.geometry import POSES, UP_FROM_CAMERA
 from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, cross, dot
 from measure.marks.templates import cut, learn_template
 from measure.results import FrameMeasurement, Pose
@@ -39,7 +45,7 @@ def view_marks(camera: Array, turn: Array, scale: float = 1.01, angle: float = 0
 
 @pytest.mark.parametrize("pose", POSES)
 def test_a_similarity_is_found_without_residuals_in_every_pose(pose: str) -> None:
-    turn = up_from_camera(pose)
+    turn = UP_FROM_CAMERA[pose]
     fit = fit_frame(EIGHT, view_marks(EIGHT, turn), np.full(8, 0.005), turn)
     np.testing.assert_allclose(fit.residuals_mm, 0.0, atol=1e-9)
     assert fit.chi_square == pytest.approx(0.0, abs=1e-9)
@@ -48,14 +54,14 @@ def test_a_similarity_is_found_without_residuals_in_every_pose(pose: str) -> Non
 
 
 def test_a_pose_mirrors_first_and_then_turns() -> None:
-    np.testing.assert_allclose(up_from_camera("90m") @ (1.0, 0.0), (0.0, -1.0))
-    np.testing.assert_allclose(up_from_camera("90m") @ (0.0, 1.0), (-1.0, 0.0))
-    np.testing.assert_allclose(up_from_camera("90") @ (1.0, 0.0), (0.0, 1.0))
+    np.testing.assert_allclose(UP_FROM_CAMERA["90m"] @ (1.0, 0.0), (0.0, -1.0))
+    np.testing.assert_allclose(UP_FROM_CAMERA["90m"] @ (0.0, 1.0), (-1.0, 0.0))
+    np.testing.assert_allclose(UP_FROM_CAMERA["90"] @ (1.0, 0.0), (0.0, 1.0))
 
 
 def test_halving_a_marks_sigma_changes_its_share_of_the_residual() -> None:
     """Trap: a weight matrix that is the covariance instead of its inverse."""
-    turn, disturbed = up_from_camera("0"), view_marks(EIGHT, up_from_camera("0"))
+    turn, disturbed = UP_FROM_CAMERA["0"], view_marks(EIGHT, UP_FROM_CAMERA["0"])
     disturbed[0] += (0.05, 0.0)
     sizes = []
     for sigma in (0.02, 0.01, 0.005):
@@ -85,7 +91,7 @@ LARGE = np.array([(5.0 * i, 5.0 * j) for i in range(-4, 5) for j in range(-4, 5)
     ],
 )
 def test_gross_errors_are_found_and_no_others(camera: Array, off_mm: dict[int, tuple[float, float]]) -> None:
-    up = view_marks(camera, up_from_camera("180")) + np.random.default_rng(4).normal(0, 0.005, camera.shape)
+    up = view_marks(camera, UP_FROM_CAMERA["180"]) + np.random.default_rng(4).normal(0, 0.005, camera.shape)
     for mark, by in off_mm.items():
         up[mark] += by
     assert outlying(camera, up) == list(off_mm)
@@ -98,10 +104,10 @@ def test_many_marks_are_tested_without_a_matrix_of_all_of_them_as_by_one(
     rng, results = np.random.default_rng(5), []
     grid = np.array([(10.0 * i, 10.0 * j) for i in range(11) for j in range(11)])
     covariances = rng.uniform(1e-6, 4e-5, (121, 1, 1)) * np.array([[1.0, 0.4], [0.4, 0.7]])
-    up = view_marks(grid, up_from_camera("90")) + rng.normal(0.0, 0.006, grid.shape)
+    up = view_marks(grid, UP_FROM_CAMERA["90"]) + rng.normal(0.0, 0.006, grid.shape)
     up[7] += 0.05
     for dense in (100, 1000):
-        monkeypatch.setattr(misfit_model, "_DENSE", dense)
+        monkeypatch.setattr(consistency, "_DENSE", dense)
         marks = FrameMarks.from_places(grid, up, covariances, model)
         found, among = frame_consistency(marks), np.arange(121) < 9
         assert found.wrong_mark == 7
@@ -117,7 +123,7 @@ def test_many_marks_are_tested_without_a_matrix_of_all_of_them_as_by_one(
 
 def test_of_four_marks_on_one_frame_none_is_called_wrong_where_film_may_be_bent() -> None:
     """A mark 1 mm off, or film bent by 0.15 mm: either moves all four alike beside an affine transformation."""
-    four = view_marks(SQUARE, up_from_camera("0"))
+    four = view_marks(SQUARE, UP_FROM_CAMERA["0"])
     assert outlying(SQUARE, four + 0.15 * np.outer((1.0, -1.0, 1.0, -1.0), (0.6, 0.8))) == []
     four[1] += (1.0, 0.0)
     assert outlying(SQUARE, four) == []
@@ -126,7 +132,7 @@ def test_of_four_marks_on_one_frame_none_is_called_wrong_where_film_may_be_bent(
 @pytest.mark.parametrize("pose", POSES)
 def test_a_perspective_is_fitted_without_residuals(pose: str) -> None:
     """By the closed form of a pinhole 600 mm away, tilted by 5 degrees, in every scan orientation."""
-    turn, tilt = up_from_camera(pose), np.deg2rad(5.0)
+    turn, tilt = UP_FROM_CAMERA[pose], np.deg2rad(5.0)
     x, y = EIGHT.T
     pictured = np.column_stack([x * np.cos(tilt), y]) / (1 + x * np.sin(tilt) / 600.0)[:, None]
     up = view_marks(pictured, turn)
@@ -243,7 +249,7 @@ OPTIONS = FiducialOptions()
 
 
 def placement(pose: str) -> Placement:
-    linear = np.diag([PX_PER_MM, -PX_PER_MM]) @ up_from_camera(pose)
+    linear = np.diag([PX_PER_MM, -PX_PER_MM]) @ UP_FROM_CAMERA[pose]
     matrix = np.column_stack([linear, [190.3, 189.6]])
     return Placement(pose, matrix, 1.0, 4, 1, 1, (1 / PX_PER_MM, 1 / PX_PER_MM))
 

@@ -26,7 +26,7 @@ from measure.fiducials.measure_frame import detect_frame, measure_frame, orient_
 from measure.fiducials.rows import absent_frame
 from measure.fiducials.stages import explain_misfit
 from measure.flags import Cause, Status
-from measure.marks.shapes import MarkShape, cross, thinnest_mm
+from measure.marks.shapes import MarkShape, cross
 from measure.matching.gauss_newton import UNSETTLED
 from measure.results import Covariance
 from measure.tone.curve import LINEAR
@@ -65,7 +65,7 @@ def test_crosses_whose_lines_are_narrower_than_drawn_are_drawn_so_and_fitted() -
     frame = detect_frame(
         scan.replace_tone(LINEAR), given, Placement("0", matrix, 1.0, 4, 1, 1, (0.05, 0.05)), FiducialOptions("0")
     )
-    drawn_mm = {round(thinnest_mm(mark.mark), 3) for mark in frame.layout.marks}
+    drawn_mm = {round(mark.mark.thinnest_mm, 3) for mark in frame.layout.marks}
     assert len(drawn_mm) == 1
     assert min(drawn_mm) < 0.11
     for fit, mark in zip(frame.fits, given.marks, strict=True):

@@ -15,7 +15,7 @@ from measure.detection.recurrence import recurrence
 from measure.fiducials.across_frames import check_frames
 from measure.fiducials.mark_comparison import check_own_figures, measure_arms, unlike_blur, unlike_others
 from measure.flags import Cause, Code, Reason, Status
-from measure.geometry import POSES, up_from_camera
+from measure.geometry import POSES, UP_FROM_CAMERA
 from measure.marks.shapes import Bar, MarkShape, MarkTemplate, cross, polygon
 from measure.marks.templates import Chip, learn_template, share_origins
 from measure.matching.covariance import honest_covariance
@@ -172,7 +172,7 @@ def test_marks_that_are_each_turned_with_their_place_keep_what_nothing_tells() -
     """Half-wedges of a frame that looks alike turned by quarters: their origins come to lie alike, at no tips."""
     rng = np.random.default_rng(2)
     outline = np.array([(0.0, 0.0), (1.0, 0.1), (1.0, 0.9)])
-    quarters = [up_from_camera(pose) for pose in ("0", "270", "180", "90")]  # from one corner to the next
+    quarters = [UP_FROM_CAMERA[pose] for pose in ("0", "270", "180", "90")]  # from one corner to the next
     off = rng.normal(0, 0.1, (4, 2))
     shapes = [MarkShape(polygon(tuple(map(tuple, (outline @ turn.T).tolist())))) for turn in quarters]
     templates, moves = share_origins([clicked(*each, rng) for each in zip(shapes, off, strict=True)], PLACES, POSES)
