@@ -18,7 +18,7 @@ from measure.scans.jpeg import earlier_step_dn
 from measure.scans.metadata import Pitch, Samples
 from measure.scans.parallel import map_in_threads
 from measure.scans.remote import ScanPart, Window
-from measure.scans.tiff_segments import RawRows
+from measure.scans.tiff import RawRows
 from measure.tone.curve import LINEAR, Tone
 
 LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601: red, green, blue

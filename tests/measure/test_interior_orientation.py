@@ -24,9 +24,8 @@ from measure.fiducials.frame import Frame
 from measure.fiducials.interior_orientation import AFFINITY_SIGMA, fit_frame
 from measure.fiducials.measure_frame import measure_frame
 from measure.fiducials.options import FiducialOptions
-from measure.fiducials.orientation_pictures import SPOILT, MarkSite, PosedMark
 from measure.fiducials.rows import present_frame
-from measure.fiducials.scan_orientation import decide_pose
+from measure.fiducials.scan_orientation import SPOILT, MarkSite, PosedMark, decide_pose
 from measure.fiducials.search import SearchResult
 from measure.fiducials.significance import doubt_frame
 from measure.geometry import POSES, UP_FROM_CAMERA

@@ -27,7 +27,7 @@ from measure import FrameMeasurement, MatchOptions, ScanWindow, Status, match, m
 from measure.annotations.lines import KnownLine, Line, Reading, read_from_one_face, side_in_camera, writing_likelihoods
 from measure.fiducials.measure_frame import measure_frame, rename_frame
 from measure.fiducials.options import FiducialOptions, Reads
-from measure.fiducials.orientation_pictures import Drawings, MarkSite, PosedMark
+from measure.fiducials.scan_orientation import Drawings, MarkSite, PosedMark
 from measure.fiducials.search import FrameSearch, pitch_hypotheses
 from measure.geometry import POSES, pose_in_camera
 from measure.marks.shapes import (
