@@ -337,10 +337,14 @@ def fit_lines_and_sharpening(frame: Frame, fewest: int = 0) -> Frame:
             break
         last, before = before, found.damped(before, last) if last else found
         telling = telling[:_TELLING]
-        frame = _refit(_sharpened(drawn, before), dict.fromkeys(telling, options), orient=False)
+        frame = _refit(
+            _replace_tone(drawn, drawn.scan.tone.sharpened(before)), dict.fromkeys(telling, options), orient=False
+        )
     if frame is begun:
         return frame
-    return _refit(_sharpened(frame, found), dict.fromkeys({*plainest} - {*telling}, options))
+    return _refit(
+        _replace_tone(frame, frame.scan.tone.sharpened(found)), dict.fromkeys({*plainest} - {*telling}, options)
+    )
 
 
 def _widen_drawings(frame: Frame, among: Sequence[int]) -> Frame:
@@ -357,8 +361,9 @@ def _widen_drawings(frame: Frame, among: Sequence[int]) -> Frame:
     return replace(frame, layout=replace(frame.layout, marks=marks))
 
 
-def _sharpened(frame: Frame, sharpening: Sharpening) -> Frame:
-    return replace(frame, scan=frame.scan.replace_tone(frame.scan.tone.sharpened(sharpening)))
+def _replace_tone(frame: Frame, tone: Tone) -> Frame:
+    """Return the frame of the scan with another tone curve, or sharpening."""
+    return replace(frame, scan=frame.scan.replace_tone(tone))
 
 
 def refit_frame(frame: Frame) -> Frame:
@@ -422,7 +427,7 @@ def _refit_with_tone(frame: Frame) -> Frame:
         tone.sensitivity_px > best.clear_fits[index].sigma_px for index, tone in _mark_tones(best).items()
     )
     for power in _OTHER_STARTS if is_open else ():
-        start = replace(best, scan=best.scan.replace_tone(prior.shift_to_power(power)))
+        start = _replace_tone(best, prior.shift_to_power(power))
         start = _refit(start, dict.fromkeys(telling & _mark_tones(best).keys(), options))
         other = _settle_tone(start, prior, telling, frozenset())
         is_better = not other.tone.is_doubted and other.tone.disagreement < best.tone.disagreement
@@ -449,7 +454,7 @@ def _settle_tone(frame: Frame, prior: Tone, telling: Set[int], pending: Set[int]
         if not (changed and rounds_left):
             break
         if any(moves):
-            frame = replace(frame, scan=frame.scan.replace_tone(estimate.next_curve(frame.scan.tone)))
+            frame = _replace_tone(frame, estimate.next_curve(frame.scan.tone))
         frame, pending = _refit(frame, dict.fromkeys(changed, frame.options.match)), frozenset()
         if estimate.is_doubted:  # by the prior curve again, the marks would only lead to the same estimate
             break

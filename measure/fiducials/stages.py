@@ -141,9 +141,10 @@ def find_frame(
     scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
 ) -> Found:
     """Find the frame of a scan. pitch_um: given by the user or the file, None if unknown."""
+    stages = list_stages(scan, layout, pitch_um, options)
     search, result = FrameSearch(scan, layout, options), SearchResult()
     found, every, at_given = Found(), 0, 0
-    for stage in list_stages(scan, layout, pitch_um, options):
+    for stage in stages:
         if stage.is_unnecessary(found):
             continue
         if stage.tone is None:

@@ -8,7 +8,7 @@ from scipy.linalg import eigh
 from scipy.ndimage import gaussian_filter
 
 from measure.array_types import Array, Mask
-from measure.geometry import Affine, linear_scale
+from measure.geometry import linear_scale
 from measure.marks.rendering import render
 from measure.marks.shapes import MarkTemplate
 from measure.marks.templates import GRAIN_PX, SMOOTHED_PX2
@@ -397,7 +397,7 @@ def _slope_noise_factor(template: MarkTemplate, fit: MarkFit) -> Array:
     linear, blur_px2 = fit.pixel_from_mark[:, :2], SMOOTHED_PX2 + fit.blur_px**2
     px_per_sample = linear_scale(linear) * template.pitch_um / 1000
     side = int(np.ceil(len(template.image) * px_per_sample))
-    place = Affine.from_linear(linear, np.full(2, (side - 1) / 2)).matrix
+    place = np.column_stack([linear, np.full(2, (side - 1) / 2)])
     shown = render(template, place, side, side, float(np.sqrt(blur_px2)))
     slopes = np.stack([shown.by_col, shown.by_row]).astype(float)
     noise = template.slope_noise_dn / max(float(np.ptp(template.image)), 1e-9) / px_per_sample
@@ -411,7 +411,7 @@ def _covariance_of_noise(template: MarkTemplate, fit: MarkFit) -> Array:
     """(2, 2) covariance of the place from the template's slopes and noise, estimated with gain and offset, for grain of
     GRAIN_PX."""
     side = template.image.shape[0]
-    place = Affine.from_linear(fit.pixel_from_mark[:, :2], np.full(2, side / 2)).matrix
+    place = np.column_stack([fit.pixel_from_mark[:, :2], np.full(2, side / 2)])
     shown = render(template, place, side, side, 0.0)
     columns = [fit.contrast_dn * shown.by_col, fit.contrast_dn * shown.by_row, shown.value, np.ones_like(shown.value)]
     normal = products(np.stack(columns), np.stack(columns))
