@@ -70,21 +70,22 @@ def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, opti
 
 def detect_frame(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
     """Detect the marks of a frame, clear and faint ones, without the refit."""
-    frame = choose_channels(Frame.from_placement(scan, layout, placement, options))
+    frame = start_frame(scan, layout, placement, options)
     clear = orient_frame(_detect(frame, range(len(layout.marks)), frame.first_search_px))
     return detect_missing_marks(fit_lines_and_sharpening(clear, _FEWEST_SHARPENED))
 
 
-def choose_channels(frame: Frame) -> Frame:
-    """Choose the channel weights of a colour scan.
+def start_frame(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
+    """Start a frame from its placement, with the channel weights of a colour scan.
 
     Some marks are located, each in the channel (or the luminance) with the highest correlation peak. The weights are
     then estimated from these marks. Where channels do not coincide, only those count that do with one another.
     If no mark is drawn as light or dark, the weights also determine the polarity.
     """
-    if frame.scan.channels == 1:
+    frame = Frame.from_placement(scan, layout, placement, options)
+    if scan.channels == 1:
         return frame
-    marks = frame.layout.marks
+    marks = layout.marks
     tried = range(0, len(marks), max(1, len(marks) // _TRIALS))
     predictions = [frame.prediction(index, frame.first_search_px) for index in tried]
     peaks = [
@@ -549,7 +550,7 @@ def _fit_again(frame: Frame, index: int, options: MatchOptions, linear_sigma: fl
 
 def shows_marks(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> bool:
     """Whether any of some marks, spread over the frame, is clear in a placement."""
-    frame = choose_channels(Frame.from_placement(scan, layout, placement, options))
+    frame = start_frame(scan, layout, placement, options)
     some = range(0, len(layout.marks), max(1, len(layout.marks) // _TRIALS))
     return any(_detect(frame, [index], frame.first_search_px).detections[index].is_clear for index in some)
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from measure.annotations.lines import KnownLine, Line, bounded, line_score, masked_text
+from measure.annotations.lines import KnownLine, Line, masked_text
 from measure.boards.measure import one_definition
 from measure.fiducials.across_frames import check_frames
 from measure.fiducials.options import BelievedFilm
-from measure.fiducials.scan_orientation import DECIDED, TOLD
+from measure.fiducials.scan_orientation import DECIDED, TOLD, bounded, line_score
 from measure.flags import Code, Reason, Status
 from measure.geometry import POSES, UP_FROM_CAMERA, pose_in_camera
 from measure.marks.shapes import WrittenPlace

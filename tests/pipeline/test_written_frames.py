@@ -10,8 +10,9 @@ from projects import command, fiducial_tables, present
 from rich.console import Console
 
 from measure.annotations import text as networks_module
-from measure.annotations.lines import Line, Reading, side_in_camera, writing_likelihoods
+from measure.annotations.lines import Line, Reading
 from measure.fiducials.options import FiducialOptions, Reads
+from measure.fiducials.scan_orientation import side_in_camera, writing_likelihoods
 from measure.flags import Cause, Code, Reason, Status
 from measure.geometry import POSES, pose_in_camera
 from measure.marks.shapes import Side, WrittenPlace
