@@ -45,7 +45,8 @@ def resample(
     def line(result: Resampled) -> str:
         outcome = result.problem or f"{result.width_px} x {result.height_px} px{', as it was' if result.kept else ''}"
         clamped = f", {result.clamped} samples clamped to what can be stored" if result.clamped else ""
-        return f"{result.image}: {outcome}{clamped}"
+        doubt = f"; needs a look: {result.doubt}" if result.doubt else ""
+        return f"{result.image}: {outcome}{clamped}{doubt}"
 
     results = resample(read(project, max_pixels), out_dir, pitch_um, lens, fast, Reporter())
     show(as_json, lambda: resampled_json(results), lambda _: say(*map(line, results)))
@@ -54,7 +55,7 @@ def resample(
         as_json,
         command_step("export", project, "micmac", "DIR", *same, why="or metashape, ...: cameras of these frames"),
     )
-    return LOOK if any(result.problem for result in results) else DONE
+    return LOOK if any(result.problem or result.doubt for result in results) else DONE
 
 
 def export(

@@ -12,12 +12,13 @@ from concurrent.futures import as_completed
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
+from math import ceil
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates, maximum_filter, spline_filter
+from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, spline_filter
 from skimage.measure import find_contours
 from tifffile import TiffFile, TiffFileError, TiffWriter
 
@@ -30,6 +31,7 @@ from measure.scans.scan import Scan
 from pipeline.adjusting.picture_turn import picture_turn
 from pipeline.archive.checked_results import read_measurement
 from pipeline.archive.made_from import current_adjustment
+from pipeline.archive.verdicts import Verdict, has_problem, scan_doubt, scan_verdict
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
@@ -55,12 +57,15 @@ Degree = Literal[3, 5]
 
 
 MARGIN_PX = 16  # around a tile: there the prefilter of a spline of degree 5, with pole 0.43, has decayed to 1e-6
+_TRUNCATED = 3.0  # standard deviations of the smoothing
+_COARSER = 1.25  # px of the scan, step from which on it is smoothed
 _NODES = 129  # along the longer side of the frame; the seam is straight between them
 _SHOWN = 33  # points of a seam in the description
 TILE_PX = 512
 _REDUCTION = 4  # factor between a page and the next smaller one
 _SMALLEST_PX = 512
 _LARGEST_REDUCED_BYTES = 32 << 20  # largest size of the first reduced page, which is held in memory
+_MOST_LARGER = 100  # pixels of a frame over those of its scans: more hold nothing, and fill a disk
 _CLASSIC_BYTES = 3_900_000_000  # above it BigTIFF is written: classic TIFF has 32-bit offsets
 _REDUCED, _MASK = 1, 4  # TIFF 6.0, NewSubfileType
 BEST: Degree = 5  # of the spline
@@ -131,10 +136,11 @@ class Tile(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class Part:
     """An open partial scan, with its chain to the frame. inner: which of its edges (left, right, top, bottom) lie in
-    another scan."""
+    another scan; smoothing_px: see `interpolated`."""
 
     source: SampleSource
     chain: FrameChain
+    smoothing_px: float = 0.0
     inner: tuple[bool, ...] = (False,) * 4
 
 
@@ -271,6 +277,7 @@ class ResampleTask:
     Attributes
     ----------
     scans : one, named as the frame, or several partial ones.
+    doubt : why the transformation by its fiducials needs a look; otherwise empty.
     """
 
     image: str
@@ -281,6 +288,7 @@ class ResampleTask:
     max_pixels: int | None
     target: Path
     scans: tuple[FrameScan, ...]
+    doubt: str = ""
 
     @property
     def fingerprint(self) -> str:
@@ -300,6 +308,7 @@ class Resampled:
     clamped : number of samples clamped to the range of the type.
     kept : whether an existing file was up to date.
     problem : reason why there is no frame; otherwise empty.
+    doubt : why the frame needs a look; otherwise empty.
     """
 
     image: str
@@ -309,6 +318,7 @@ class Resampled:
     clamped: int = 0
     kept: bool = False
     problem: str = ""
+    doubt: str = ""
 
 
 def resample(
@@ -370,8 +380,15 @@ def resample_tasks(
             max_pixels=project.max_pixels,
             target=path_below(folder, frame, ".tif"),
             scans=(scan,),
+            doubt="" if adjustment is not None and image in adjustment.images else _frame_doubt(measured),
         )
     return list(tasks.values()), failed
+
+
+def _frame_doubt(measured: MeasuredScan) -> str:
+    """Why the frame of a scan needs a look, single marks left out; "" if it needs none."""
+    is_doubtful = has_problem(measured) or scan_verdict(measured) is Verdict.POOR
+    return scan_doubt(measured) if is_doubtful else ""
 
 
 def _chain(
@@ -409,14 +426,21 @@ def _resampled(task: ResampleTask) -> Resampled:
     with ExitStack() as opened:
         scans = [(opened.enter_context(open_scan(each.scan, task.max_pixels)), each.chain) for each in task.scans]
         canvas = outline_canvas([(chain, scan.part_px) for scan, chain in scans], task.pitch_mm)
-        done = Resampled(task.image, task.target, canvas.width_px, canvas.height_px)
+        done = Resampled(task.image, task.target, canvas.width_px, canvas.height_px, doubt=task.doubt)
+        scanned = sum(scan.width_px * scan.height_px for scan, _ in scans)
+        if canvas.width_px * canvas.height_px > _MOST_LARGER * scanned:
+            raise MeasurementError(
+                f"it would have {canvas.width_px} x {canvas.height_px} px at a pitch of {1000.0 * task.pitch_mm:g} µm, "
+                f"more than {_MOST_LARGER} times its scan's: set a coarser --pitch-um, or look at its transformation"
+            )
         if before is not None and before.get("fingerprint") == task.fingerprint:
             return replace(done, kept=True)
         task.target.parent.mkdir(parents=True, exist_ok=True)
         parts = []
         for scan, chain in scans:
             rows = _rows_at_a_time(chain, task.pitch_mm, canvas.width_px)
-            parts.append(Part(opened.enter_context(open_source(scan, rows, task.target.parent)), chain))
+            source = opened.enter_context(open_source(scan, rows, task.target.parent))
+            parts.append(Part(source, chain, _smoothing_px(chain, canvas)))
         parts = find_inner_edges(parts)
         described: dict[str, object] = {"image": task.image, "camera": task.camera, "pose": task.pose}
         described |= {"lens": task.scans[0].chain.lens is not None, "fingerprint": task.fingerprint}
@@ -429,6 +453,15 @@ def _resampled(task: ResampleTask) -> Resampled:
         source = parts[0].source
         clamped = write_frame(task.target, canvas, described, source.channels, source.dtype, make_tile)
     return replace(done, clamped=clamped)
+
+
+def _smoothing_px(chain: FrameChain, canvas: Canvas) -> float:
+    """Smoothing for a canvas: half of what a step in its middle exceeds a pixel of the scan by, as of scikit-image's
+    `resize`; 0 for steps of about a pixel."""
+    middle = np.array([canvas.width_px, canvas.height_px]) / 2.0
+    pixels, _ = chain.scan_from_frame(canvas.camera_from_pixel(middle + np.array([[0.0, 0.0], [1.0, 0.0]])))
+    step_px = float(np.hypot(*(pixels[1] - pixels[0])))
+    return (step_px - 1.0) / 2.0 if step_px > _COARSER else 0.0
 
 
 def _rows_at_a_time(chain: FrameChain, pitch_mm: float, width_px: int) -> int:
@@ -460,33 +493,38 @@ def open_source(scan: Scan, rows_at_a_time: int, scratch: Path) -> Iterator[Samp
         yield _Decoded(scan, file.fileno())
 
 
-def interpolated(source: SampleSource, columns: Array, rows: Array, degree: Degree) -> Tile:
-    """Interpolate the scan at places (side, side) by splines of the degree; 0 outside of the scan."""
+def interpolated(source: SampleSource, columns: Array, rows: Array, degree: Degree, smoothing_px: float = 0.0) -> Tile:
+    """Interpolate the scan at places (side, side) by splines of the degree; 0 outside of the scan. smoothing_px:
+    standard deviation of a Gaussian filter of the scan, without which coarse steps show finer detail as coarse one."""
     shape = columns.shape
     inside = (columns >= -0.5) & (columns <= source.width_px - 0.5) & (rows >= -0.5) & (rows <= source.height_px - 0.5)
     samples = np.zeros((*shape, source.channels), source.dtype)
     if not inside.any():
         return Tile(samples, inside, 0)
-    left, top = (int(np.floor(places[inside].min())) - MARGIN_PX for places in (columns, rows))
-    right, bottom = (int(np.ceil(places[inside].max())) + MARGIN_PX for places in (columns, rows))
+    margin_px = MARGIN_PX + ceil(_TRUNCATED * smoothing_px)
+    left, top = (int(np.floor(places[inside].min())) - margin_px for places in (columns, rows))
+    right, bottom = (int(np.ceil(places[inside].max())) + margin_px for places in (columns, rows))
     window = source.window(left, top, right - left + 1, bottom - top + 1)
     known = source.valid_mask(left, top, right - left + 1, bottom - top + 1)
     if not known.all():  # a sample is lost if its spline involves a lost pixel
-        lost = maximum_filter(~known, size=degree + 2)
+        lost = maximum_filter(~known, size=degree + 2 + 2 * ceil(_TRUNCATED * smoothing_px))
         at = np.rint([rows[inside] - top, columns[inside] - left]).astype(int)
         inside[inside] = ~lost[tuple(at)]
     is_whole, clamped = bool(inside.all()), 0
     at = np.stack([rows, columns]).reshape(2, -1) if is_whole else np.array([rows[inside], columns[inside]])
     at -= [[top], [left]]
     for channel in range(source.channels):
-        values, beyond = spline_samples(window[..., channel], at, degree, source.dtype)
+        picture = window[..., channel]
+        if smoothing_px:
+            picture = gaussian_filter(picture.astype(np.float32), smoothing_px, truncate=_TRUNCATED)
+        values, beyond = spline_samples(picture, at, degree, source.dtype)
         samples[..., channel][... if is_whole else inside] = values.reshape(shape) if is_whole else values
         clamped += beyond
     return Tile(samples, inside, clamped)
 
 
 def spline_samples(
-    picture: Samples, places: Array, degree: Degree, dtype: type[np.uint8] | type[np.uint16]
+    picture: Samples | NDArray[np.float32], places: Array, degree: Degree, dtype: type[np.uint8] | type[np.uint16]
 ) -> tuple[Samples, int]:
     """Evaluate a spline through an image (rows, columns), mirrored at its edges, at places (2, n), row and column.
 
@@ -533,14 +571,14 @@ def joined_tile(parts: Sequence[Part], canvas: Canvas, col0: int, row0: int, sid
     """Tile of the frame. A pixel that is lost in the preferred scan comes from another one that has it."""
     places = [scan_places(part.chain, canvas, col0, row0, side) for part in parts]
     if len(parts) == 1:
-        return interpolated(parts[0].source, *places[0], degree)
+        return interpolated(parts[0].source, *places[0], degree, parts[0].smoothing_px)
     depths = np.stack([_depth(part, *place) for part, place in zip(parts, places, strict=True)])
     result: Tile | None = None
     for k in np.argsort(-depths.reshape(len(parts), -1).max(axis=1)).tolist():
         deepest = depths[k] >= np.delete(depths, k, axis=0).max(axis=0)
         wanted = deepest if result is None else deepest | ~result.is_inside
         columns, rows = (np.where(wanted, axis, np.nan) for axis in places[k])
-        tile = interpolated(parts[k].source, columns, rows, degree)
+        tile = interpolated(parts[k].source, columns, rows, degree, parts[k].smoothing_px)
         result = tile if result is None else _over(result, tile)
     assert result is not None  # a frame has at least one scan
     return result

@@ -11,13 +11,24 @@ import numpy as np
 import pytest
 import tifffile
 from numpy.typing import NDArray
+from projects import made_record, write_tables
 
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.transformation import Film
-from measure import MeasurementError, open_scan
+from measure import MeasurementError, Pose, open_scan
+from measure.flags import Code, Reason
+from pipeline.files.project_file import read_project
 from pipeline.resampling.canvas import FrameChain, outline_canvas, scan_places
-from pipeline.resampling.resample_stage import BEST, FAST, FrameScan, ResampleTask, open_source, resampled
+from pipeline.resampling.resample_stage import (
+    BEST,
+    FAST,
+    FrameScan,
+    ResampleTask,
+    open_source,
+    resample_tasks,
+    resampled,
+)
 
 Array = NDArray[np.float64]
 
@@ -229,6 +240,39 @@ def test_a_scan_in_strips_that_lies_across_is_decoded_once_and_its_losses_are_kn
     is_lost = (rows >= 4 * 32) & (rows < 5 * 32)
     np.testing.assert_array_equal(known[:, 10:], np.repeat(~is_lost[:, None], 50, axis=1))
     assert known[:, :10].all()  # beyond the edge nothing is lost
+
+
+def test_detail_finer_than_a_coarse_pitch_does_not_appear_as_coarse_one(tmp_path: Path) -> None:
+    """An eighth of lines 3.1 px apart is left at a pitch of 3 px, at which they would be 93 px apart; of lines
+    40 px apart nearly all is."""
+    col = np.arange(WIDTH, dtype=float)
+    for period_px, least, most in ((3.1, 0.0, 0.15), (40.0, 0.9, 1.0)):
+        lines = 30000.0 + 20000.0 * np.sin(2 * np.pi * col / period_px)
+        tifffile.imwrite(tmp_path / "s.tif", np.tile(np.rint(lines).astype(np.uint16), (HEIGHT, 1)))
+        coarse = replace(task(tmp_path / "s.tif", tmp_path, FrameChain(PITCH_UM, film(0.0, False)[0])), pitch_mm=0.063)
+        resampled(coarse)
+        inner = tifffile.imread(tmp_path / "a.tif", key=0)[20:-20, 20:-20].astype(float)
+        assert least < np.ptp(inner) / 40000.0 < most
+
+
+def test_a_frame_of_far_more_pixels_than_its_scan_is_refused(scan: Path, tmp_path: Path) -> None:
+    """As of a pitch in mm for one in µm, before a disk is full."""
+    fine = replace(task(scan, tmp_path, FrameChain(PITCH_UM, film(0.4, False)[0])), pitch_mm=0.0001)
+    done = resampled(fine)
+    assert done.path is None
+    assert "at a pitch of 0.1 µm, more than 100 times its scan's" in done.problem
+    assert not list(tmp_path.glob("*.tif"))
+
+
+def test_a_frame_whose_place_in_the_scan_is_in_doubt_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Unless an adjustment has judged it."""
+    false_alarm = (Reason("chance finds as many with a probability of 1.00", Code.CHANCE),)
+    scans = [made_record(1), made_record(2, pose=Pose("90", False)), made_record(3, problems=false_alarm)]
+    monkeypatch.setattr("pipeline.resampling.resample_stage.read_measurement", lambda path: scans)
+    project = 'camera = "camera.toml"'
+    write_tables(tmp_path, project, camera='name = "K"\nframe_mm = [80.0, 80.0]', comparator="")
+    tasks, _ = resample_tasks(read_project(tmp_path / "project.toml"), tmp_path, None, False, BEST)
+    assert [task.doubt for task in tasks] == ["", "pose 90 is assumed", false_alarm[0]]
 
 
 def test_a_scan_that_is_gone_is_a_result(tmp_path: Path) -> None:
