@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.array_types import Array, Indices, Single
+from measure.array_types import Array, Indices, Integers, Mask, Single
 from measure.flags import NO_REASON, Code, Reason
 from measure.matching.gauss_newton import UNDETERMINED, UNSETTLED
 from measure.matching.models import PIXEL_VARIANCE_PX2
@@ -140,7 +140,8 @@ class Corner:
     noise_dn : standard deviation of one pixel's noise.
     blur_px : standard deviation of the blur.
     damaged_fraction : fraction of the area rejected as outliers.
-    misfit : root of the covariance of neighbouring residuals over the contrast, outliers included. Noise has none.
+    misfit : root of the covariance of neighbouring residuals over the contrast, outliers included: noise has none. Of a
+        crossing only what a half turn changes counts, which sharpening, tone curve and motion do not.
     moved_px : distance from the start of the fit.
     junction_px : (2,) from `junctions`; None where not found, and for corners other than crossings.
     """
@@ -171,6 +172,11 @@ class CornerStart:
         """Half size (px) of a square window that contains all grey values used, plus a margin."""
         along = np.abs(self.steps_px / np.hypot(*self.steps_px)) @ self.reach_px
         return int(np.ceil(along).max()) + _SPARE_PX
+
+
+def _half_turned(picture: NDArray[Any], shift: Integers) -> NDArray[Any]:
+    """A window turned by a half about its middle, then shifted by rows and columns."""
+    return np.roll(picture[::-1, ::-1], shift, axis=(0, 1))
 
 
 def fit_corners(
@@ -269,7 +275,7 @@ class _CornerFits:
             self._pictures(influence), self._pictures(residuals), self._pictures(used), self.unknowns
         )
         covariances = (covariances + covariances.swapaxes(1, 2)) / 2
-        shared_dn2 = covariance_along(self._pictures(residuals * (area > 0)), self._pictures(area > 0), 1)
+        shared_dn2 = self._structure_dn2(self._pictures(area > 0))
         fails = np.array([bool(reason) for reason in self.reasons]) | (used.sum(axis=1) <= self.unknowns)
         covariances[fails], noise_dn = np.inf, np.where(fails, np.nan, np.sqrt(variances))
         rounding_dn = np.finfo(np.float32).eps * np.abs(self.linear[:, 1])  # for a uniform window without noise
@@ -298,6 +304,17 @@ class _CornerFits:
             )
             for number, junction in enumerate(junctions_px)
         ]
+
+    def _structure_dn2(self, inside: Mask) -> Array:
+        """(n,) covariance of neighbouring residuals in (n, height, width)."""
+        left = self._pictures(self.residuals) * inside
+        if self.bends:
+            half = (np.array(self.shape) - 1) / 2
+            shifts = np.rint(2 * (self.center[:, ::-1] - half)).astype(int)
+            inside &= np.stack([_half_turned(*each) for each in zip(inside, shifts, strict=True)])
+            turned = np.stack([_half_turned(*each) for each in zip(left, shifts, strict=True)])
+            left = (left - turned) / np.sqrt(2) * inside  # noise stays as large
+        return covariance_along(left, inside, 1)
 
     def _pictures(self, values: NDArray[Any]) -> NDArray[Any]:
         """Scatter values (n, ..., p) of the corners' pixels to windows (n, ..., height, width), 0 elsewhere."""

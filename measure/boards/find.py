@@ -149,7 +149,7 @@ def _refined(picture: Bytes, grid: Array) -> Array:
 def _shorter_steps(grid: Array) -> Array:
     """(rows, columns) shorter one of the steps to the next column and the next row, px."""
     across, down = (np.hypot(*np.moveaxis(np.gradient(grid, axis=axis), 2, 0)) for axis in (1, 0))
-    return np.asarray(np.minimum(across, down))
+    return np.asarray(np.maximum(np.minimum(across, down), 1e-9))  # a detector may give a corner twice
 
 
 def find_chessboard(picture: Bytes, spec: ChessboardSpec, is_quick: bool = False) -> FoundBoard:

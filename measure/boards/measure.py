@@ -43,10 +43,7 @@ _MARKER_REACH = 0.8  # fraction of a marker's black border, or of the gap around
 _NEIGHBOURS = 4  # nearest crossings along the rows and columns
 _FEWEST_CROSSINGS = 30  # needed to distinguish coma from noise
 _WEAK_DAMAGE = 0.25  # fraction of the pixels around a corner: if more are rejected the corner is weak
-_WEAK_MISFIT = (
-    0.075  # structure left over, in contrasts: up to 0.065 on real boards; 0.07 to 0.4 where edges of shadows,
-)
-# lines or specks had moved a corner by more than five standard deviations
+_WEAK_MISFIT = 0.075  # misfit: up to 0.062 on real boards; from 0.09 where the edges of shadows or lines moved corners
 
 
 @dataclass(frozen=True)

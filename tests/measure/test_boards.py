@@ -24,6 +24,7 @@ from drawn import (
 )
 from numpy.typing import NDArray
 from real_data import DATA, needs
+from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 
 from measure import Status, open_scan
@@ -210,6 +211,14 @@ def test_corners_at_the_edges_of_shadows_are_not_measured(large_board: tuple[Arr
     assert {point for point, (column, _) in truth.items() if column > 140} <= measured
     assert max(off[point] for point in measured) < 0.2
     assert any("a shadow" in mark.reason for mark in board.marks)
+
+
+def test_strong_sharpening_makes_no_corner_weak(large_board: tuple[Array, dict[str, Array]]) -> None:
+    """As much is left unexplained as by a shadow, but alike on both sides."""
+    picture, truth = large_board
+    board = measure_board(make_scan(picture + 3.0 * (picture - gaussian_filter(picture, 1.5)) + 20000.0), LARGE)
+    assert all(mark.status is Status.MEASURED for mark in board.marks)
+    assert np.abs(errors_px(board, truth)).max() < 0.1
 
 
 @parametrize_with_studies("shown", [np.s_[80:, 150:], np.s_[:, 60:250], np.s_[80:, 60:250]])
