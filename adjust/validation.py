@@ -271,7 +271,8 @@ def _place_faults(network: Network) -> Faults:
 def _sigma_faults(network: Network) -> Faults:
     """Standard deviations of most marks that are a large part of the images: another unit."""
     sigma_mm = np.sqrt(np.trace(network.observations.covariance_mm2, axis1=1, axis2=2) / 2.0)
-    half_mm = np.array([network.extent_by_image[name].half_mm for name in network.observations.image])
+    by_image = np.array([network.extent_by_image[image.name].half_mm for image in network.images])
+    half_mm = by_image[network.image_numbers]
     if np.median(sigma_mm / half_mm) > LARGEST_SIGMA:
         yield (
             f"The standard deviations of the marks, {np.median(sigma_mm):.3g} mm in the middle, are "

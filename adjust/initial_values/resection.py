@@ -20,6 +20,7 @@ import numpy as np
 from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.projection import rays
+from adjust.initial_values.dlt import closed_form, linear_transformations
 from adjust.initial_values.pose import (
     KnownField,
     Pose,
@@ -40,9 +41,11 @@ EXACT = 1e-12  # largest squared residual of an exact solution for three points
 SAME_PLACE = 1e-4  # in extents of the points: poses nearer than this are the same
 LINE = 1e-5  # width over length of collinear points: the camera may rotate around their line
 POINTS_AT_ONCE = 20_000
+SOUND = 0.95  # least share of inliers without gross errors
 REWEIGHTINGS = 2  # largest number of estimates of a principal distance, each from the inliers of the one before
 GRID = np.geomspace(0.35, 16.0, 9)  # principal distances tried, in radii of the imaged field: 140 to 7 degrees
 FEWEST = 4  # known points of an image
+FEWEST_DIRECT = 3  # images that determine a principal distance by linear transformations
 COARSE_IMAGES, COARSE_POINTS = 4, 15  # images and points of each that choose a principal distance
 FINE_IMAGES = 50  # images that refine it
 LARGEST_RELATIVE_SIGMA, CLEAR_SIGMA = 0.15, 0.05  # of a principal distance that is used, and that ends the search
@@ -137,18 +140,22 @@ def resections(
         quick = [i for i, field in enumerate(fields) if len(field.xyz) >= FEWEST_QUICK]
         of_quick = dict(zip(quick, _resected([fields[i] for i in quick], c[quick], QUICK), strict=True))
         found = [of_quick.get(i) for i in range(len(fields))]
-    result = list(found)
+    result, again = list(found), _disagreeing(fields, c, found)
+    for i, each in zip(again, _resected([fields[i] for i in again], c[again], THOROUGH), strict=True):
+        result[i] = each
+    return result
+
+
+def _disagreeing(fields: Sequence[KnownField], c: Array, found: Sequence[Resection | None]) -> list[int]:
+    """Images, of at least four points, whose points do not agree on a pose."""
     sigmas = [each.sigma_mm / c[i] for i, each in enumerate(found) if each is not None]
     typical = float(np.median(sigmas)) if len(sigmas) >= TYPICAL else 0.0
     typical = typical if typical < LARGEST_TYPICAL else 0.0
-    again = [
+    return [
         i
         for i, (field, each) in enumerate(zip(fields, found, strict=True))
         if len(field.xyz) >= 4 and (each is None or each.sigma_mm > WORSE * max(field.sigma_mm, typical * c[i]))
     ]
-    for i, each in zip(again, _resected([fields[i] for i in again], c[again], THOROUGH), strict=True):
-        result[i] = each
-    return result
 
 
 def trial_misfits(fields: Sequence[KnownField], principal_distances_mm: Array) -> Array:
@@ -200,9 +207,43 @@ def distance_together(
     rotations = np.array([each.pose.rotation for each in known])
     centers = (np.array([each.pose.center for each in known]) - batch.origin) / batch.size[:, None]
     shifts = -np.einsum("kij,kj->ki", rotations, centers)
-    xy_mm, inliers = batch.tangents * principal_distance_mm, np.zeros_like(batch.present)
+    inliers = np.zeros_like(batch.present)
     inliers[batch.present] = np.concatenate([each.inliers for each in known])
-    c, floor_mm, every = principal_distance_mm, batch.floor * principal_distance_mm, np.arange(len(known))
+    together = _refined_together(batch, rotations, shifts, inliers)
+    if together is None:
+        return None
+    c, spread, refined = together
+    of_image = dict(zip(resected, refined, strict=True))
+    return c, spread, [of_image.get(i) for i in range(len(fields))]
+
+
+def distance_directly(fields: Sequence[KnownField]) -> tuple[float, float, list[Resection]] | None:
+    """Estimate a principal distance as `distance_together`, from linear transformations of all points.
+
+    Returns None where the linear transformations do not determine it, or not nearly all points agree: gross errors take
+    a search.
+    """
+    if len(fields) < FEWEST_DIRECT or min(len(field.xyz) for field in fields) < FEWEST_QUICK:
+        return None
+    batch = _Fields.from_fields(fields, np.ones(len(fields)))
+    start = closed_form(linear_transformations(batch.points, batch.tangents, batch.present))
+    if start is None or not GRID[0] < start[0] / _radius_mm(fields) < GRID[-1]:
+        return None
+    c, rotations, shifts = start
+    batch = replace(batch, tangents=batch.tangents / c, c=np.full(len(fields), c), floor=batch.floor / c)
+    together = _refined_together(batch, rotations, shifts, batch.present)
+    if together is None or _disagreeing(fields, np.full(len(fields), together[0]), together[2]):
+        return None
+    inlier_share = np.concatenate([each.inliers for each in together[2]]).mean()
+    return together if inlier_share > SOUND and together[1] < CLEAR_SIGMA else None
+
+
+def _refined_together(
+    batch: "_Fields", rotations: Array, shifts: Array, inliers: Mask
+) -> tuple[float, float, list[Resection]] | None:
+    """Principal distance, standard deviation of its logarithm and resections by least squares; None without them."""
+    c, floor_mm, every = float(batch.c[0]), batch.floor * batch.c, np.arange(len(rotations))
+    xy_mm = batch.tangents * c
     for _ in range(REWEIGHTINGS):
         try:
             c, spread, rotations, shifts, tangents = refined_distance(
@@ -210,13 +251,12 @@ def distance_together(
             )
         except np.linalg.LinAlgError:
             return None
-        batch = replace(batch, tangents=tangents, c=np.full(len(known), c), floor=floor_mm / c)
+        batch = replace(batch, tangents=tangents, c=np.full(len(rotations), c), floor=floor_mm / c)
         before = inliers
         sigma, inliers = batch.inliers(rotations, shifts, every)
         if (inliers == before).all():
             break
-    refined = dict(zip(resected, batch.resections(rotations, shifts, every, sigma, inliers), strict=True))
-    return c, spread, [refined.get(i) for i in range(len(fields))]
+    return c, spread, batch.resections(rotations, shifts, every, sigma, inliers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -382,13 +422,16 @@ def find_principal_distance(fields: Sequence[KnownField]) -> tuple[float | None,
 
     Notes
     -----
-    A few images are resected with principal distances on a logarithmic grid. The best one starts a least-squares
+    Without gross errors linear transformations start a least-squares estimate over many images. Otherwise a
+    few images are resected with principal distances on a logarithmic grid. The best one starts a least-squares
     estimate over many images. A standard deviation above 15 % counts as not determined: on a flat field parallel to the
     image, a change of the principal distance cannot be separated from a change of the height.
     """
     fields = _largest_fields(fields, FEWEST, FINE_IMAGES)
     if not fields:
         return None, {}
+    if (directly := distance_directly(fields)) is not None:
+        return directly[0], {field: each.pose for field, each in zip(fields, directly[2], strict=True)}
     tried = GRID * _radius_mm(fields)
     misfits = trial_misfits([_thin_field(each) for each in fields[:COARSE_IMAGES]], tried)
     c, sigma = float(tried[int(np.argmin(misfits))]), np.inf

@@ -25,6 +25,7 @@ from adjust.problem.problem import State
 
 STANDSTILL_SIGMAS = 1e-8  # in standard deviations: largest step at convergence
 FORESEEN = 0.1  # fraction of that: a next step predicted to be smaller, from the last ones, need not be taken
+NEGLIGIBLE_SIGMAS = 1e-7  # in standard deviations: steps that change derivatives by less than rounding errors
 ROUNDING_SIGMAS = 1e-5  # in standard deviations: smaller steps that no longer shrink are rounding errors
 VPV_ROUNDING = 1e-9  # relative increase of v'Pv that may be rounding
 FIRST_DAMPING = 1e-4
@@ -58,11 +59,12 @@ class Linearised:
     by_observation: Array  # (n, 2, 2) A, derivatives of the condition equations with respect to the observations
     rows: WhitenedRows  # whitened rows
     vpv: float  # v'Pv
+    factor_nearby: Factor | None = None  # at a state NEGLIGIBLE_SIGMAS away
 
     @cached_property
     def factor(self) -> Factor:
         """Square root of the undamped normal equations."""
-        return factorise(self.rows.numbering, self)
+        return self.factor_nearby or factorise(self.rows.numbering, self)
 
 
 @dataclass(frozen=True)
@@ -84,11 +86,16 @@ def linearise(numbering: Numbering, covariance_mm2: Array, state: State) -> Line
     v = computed.xy_mm - problem.network.observations.xy_mm
     at = derivatives(problem, state, computed)
     rows = whitened_rows(numbering, state.values, at, covariance_mm2, v)
+    return Linearised(state, computed.xy_mm, v, at.by_observation, rows, _vpv(rows, state))
+
+
+def _vpv(rows: WhitenedRows, state: State) -> float:
+    """v'Pv of observations and given values."""
+    problem = rows.numbering.problem
     sigma = problem.prior_sigma
     prior = (sigma > 0.0) & np.isfinite(sigma)
     normalised = prior_differences(problem, state)[prior] / sigma[prior]
-    vpv = float((rows.right**2).sum() + (normalised**2).sum()) + square_sum(problem.further, state.values)
-    return Linearised(state, computed.xy_mm, v, at.by_observation, rows, vpv)
+    return float((rows.right**2).sum() + (normalised**2).sum()) + square_sum(problem.further, state.values)
 
 
 def factorise(numbering: Numbering, at: Linearised, damping: float = 0.0, camera_priors: bool = True) -> Factor:
@@ -135,6 +142,8 @@ def iterate(
     history: list[Iteration] = []
     moved: _Moved | None = None
     while len(history) < limit:
+        if damping == 0.0 and (end := _end(at, history)) is not None:
+            return Solution(end, end.factor, "converged", (*history, Iteration(end.vpv, at.factor.length(), 0.0, 1)))
         moved = _step(numbering, covariance_mm2, at, damping, lately, moved)
         if moved is None:
             return Solution(at, None, "diverged", tuple(history))
@@ -144,6 +153,22 @@ def iterate(
             return Solution(at, at.factor, "converged", tuple(history))
         damping, lately = _eased(moved.damping, moved.gain), moved.damping or lately
     return Solution(at, at.factor, "iteration limit", tuple(history))
+
+
+def _end(at: Linearised, history: list[Iteration]) -> Linearised | None:
+    """State after a negligible step that ends the iteration, with the derivatives before it; None after others."""
+    problem, length = at.rows.numbering.problem, at.factor.length()
+    if length > NEGLIGIBLE_SIGMAS or not _stands_still([*history, Iteration(at.vpv, length, 0.0, 1)]):
+        return None
+    step = np.zeros(len(problem.unknowns))
+    step[at.rows.numbering.free] = at.factor.solution
+    state = problem.step_state(at.state, step)
+    computed_mm = computed_observations(problem, state)
+    if computed_mm is None:
+        return None
+    v_mm = computed_mm - problem.network.observations.xy_mm
+    rows = at.rows.replace_discrepancies(at.by_observation, v_mm)
+    return Linearised(state, computed_mm, v_mm, at.by_observation, rows, _vpv(rows, state), at.factor)
 
 
 def _stands_still(history: list[Iteration]) -> bool:

@@ -40,7 +40,6 @@ COMPILED_OWN = 3  # largest number of own unknowns per block in kernels.c
 CHEAP = 1e7  # rows times columns squared of the shared unknowns, up to which Householder QR is always used
 REFLECTED = 1e9  # the same, up to which it is used where normal equations would lose digits
 SAFE = 1e-6  # reciprocal condition of the shared triangle down to which normal equations suffice beyond that
-STEADY = 1e3  # norm of the triangles' inverses up to which no singular value of the design matrix is near 0
 
 
 @dataclass(frozen=True)
@@ -221,7 +220,6 @@ class SparseBlocks:
         return inverse
 
     def norm_of_inverse(self) -> float:
-        """Largest Frobenius norm of the scaled triangles' inverses; inf if one is singular."""
         if not np.einsum("bii->bi", self.triangle).all():
             return np.inf
         return float(np.sqrt((self._inverse**2).sum(axis=(1, 2)).max(initial=0.0)))
@@ -393,5 +391,4 @@ def _eliminate_normally(
         triangle, right = factorise_normal_equations(fronts, squares, right)
     except np.linalg.LinAlgError:
         return None
-    steady = lift == 0.0 and triangle.reciprocal_condition > TEN_DIGITS and blocks.norm_of_inverse() <= STEADY
-    return Factor(blocks, triangle, right, scale, steady)
+    return Factor(blocks, triangle, right, scale, lift)

@@ -11,9 +11,11 @@ from scipy.linalg import solve_triangular
 from scipy.sparse import csr_array
 
 from adjust.array_types import Array, Indices
-from adjust.linear_algebra.sparse_factor import Triangle
+from adjust.linear_algebra.sparse_factor import TEN_DIGITS, Triangle
 
 Number = TypeVar("Number", bound=np.generic)
+
+STEADY = 1e3  # norm of the triangles' inverses up to which no singular value of the design matrix is near 0
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,9 @@ class Eliminated(Protocol):
     def square_sum(self) -> float:
         """Sum of the squared right sides."""
 
+    def norm_of_inverse(self) -> float:
+        """Largest Frobenius norm of the scaled triangles' inverses; inf if one is singular."""
+
     def own_cofactors(self, triangle: Triangle) -> Iterator[tuple[Indices, Array]]:
         """Own unknowns (b, o), -1 for none, and their scaled cofactor matrices (b, o, o).
 
@@ -72,9 +77,19 @@ class DenseBlocks:
     def square_sum(self) -> float:
         return float(sum((block.right**2).sum() for block in self.blocks))
 
+    def norm_of_inverse(self) -> float:
+        if not all(np.einsum("bii->bi", block.triangle).all() for block in self.blocks):
+            return np.inf
+        norms = [np.linalg.norm(own, axis=(1, 2)).max(initial=0.0) for own in self._inverses]
+        return float(max(norms, default=0.0))
+
+    @cached_property
+    def _inverses(self) -> list[Array]:
+        """Inverses (b, o, o) of the triangles."""
+        return [np.asarray(np.linalg.inv(block.triangle), dtype=np.float64) for block in self.blocks]
+
     def own_cofactors(self, triangle: Triangle) -> Iterator[tuple[Indices, Array]]:
-        for block in self.blocks:
-            own = np.asarray(np.linalg.inv(block.triangle), dtype=np.float64)
+        for block, own in zip(self.blocks, self._inverses, strict=True):
             inner = triangle.through(block.border, block.shared) + np.eye(block.own.shape[1])
             yield block.own, own @ inner @ own.swapaxes(1, 2)
 
@@ -101,8 +116,14 @@ class Factor:
     triangle: Triangle
     right: Array
     scale: Array  # (n,) norms of the columns, priors included; the scaled unknowns are the unknowns times scale
-    # the inverses of the triangles are small, so that no singular value of the design matrix is near 0
-    steady: bool = False
+    lift: float = 0.0  # its square was added to the diagonal of the scaled normal equations of the shared unknowns
+
+    @cached_property
+    def is_steady(self) -> bool:
+        """Whether the triangles' inverses are small, so that no singular value of the design matrix is near 0."""
+        if self.lift or self.triangle.reciprocal_condition <= TEN_DIGITS:
+            return False
+        return self.eliminated.norm_of_inverse() <= STEADY
 
     @property
     def shared_count(self) -> int:

@@ -22,6 +22,7 @@ from adjust.linear_algebra.fronts import Front, Fronts
 WIDE = 500  # unknowns of a single front up to which roots of cofactor matrices keep all its columns
 SAFE = 1e-6  # reciprocal condition of a root down to which its square is accurate enough in a large network
 TEN_DIGITS = 1e-3  # and in a small one: variances keep ten digits
+NARROW = 50  # unknowns up to which singular values are computed in full
 ELEMENTS_AT_ONCE = 2_000_000  # elements of the roots in one batch
 POWERS = 20  # steps of the power iteration
 ROWS_PER_COLUMN = 4  # pending rows are factorised when they exceed this number per column
@@ -94,9 +95,12 @@ class Triangle:
 
     @cached_property
     def reciprocal_condition(self) -> float:
-        """Smallest over largest singular value, accurate to some tens of percent; 0 if R is singular."""
+        """Smallest over largest singular value, in a wide triangle to some tens of percent; 0 if R is singular."""
         if not all(np.diag(own).all() for own in self.own):
             return 0.0
+        if 0 < len(self) <= NARROW:
+            singular = np.linalg.svd(self.toarray(), compute_uv=False)
+            return float(singular[-1] / singular[0])
         smallest = self._singular(self.cofactor_times)
         return smallest / self.largest_singular if smallest > 0.0 else 1.0
 

@@ -160,7 +160,7 @@ OBJECT_AXES = ("X", "Y", "Z", "X0", "Y0", "Z0")  # positions of points and stati
 
 def singular_directions(numbering: Numbering, state: State, factor: Factor) -> tuple[NullDirection, ...]:
     """Null directions of the factor at a state; none where it is regular."""
-    if factor.steady:
+    if factor.is_steady:
         return ()
     blind, parameters = blind_blocks(factor), numbering.problem.unknowns.parameters
     null, _ = null_space(factor, blind, SINGULAR)

@@ -24,6 +24,7 @@ from scipy.special import chdtrc, chdtri
 
 from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.lens import Prior
+from adjust.initial_values.dlt import linear_transformations
 from adjust.problem.camera import Camera
 from adjust.problem.condition_equations import observed_in_camera
 from adjust.problem.estimates import adjusted_image, adjusted_places
@@ -43,11 +44,9 @@ ROUND = 0.05  # relative tolerance of these ratios
 FLAT = 1e-3  # relative thickness of a flat field, which is mirrored by mirroring the stations
 FEWEST = 8  # points of an image that tell by a linear transformation what is wrong with it
 FEWEST_IMAGES = 3  # images needed for a median misfit
-FLAT_FIELD = 0.05  # relative thickness of a field below which a linear transformation does not tell its depth
 WORSE, LARGE = 4.0, 0.01  # times the median misfit of the images, and misfit above which other numbers are tried
 BETTER, MUCH_BETTER = 3.0, 10.0  # ratio by which right numbers lower the misfit of an image worse than most, or alike
 MOST_OFF = 30  # largest shift of numbers tried
-LEAST_DEPTH = 1e-12  # of points in a field of size 1: nearer ones are imaged as far off as that
 MARGIN = 0.01  # fraction of the frame that a mark may lie outside: edge of the outermost pixel, rounded frame size
 NEARLY_ALL = 0.9  # fraction of marks outside the image above which the axes are wrong, not the marks
 FLAT_BOARD = 1e-2  # relief of given points over their extent below which they are flat
@@ -126,7 +125,7 @@ def _may_be_stretched(network: Network, given: Adjustment | None) -> bool:
         fits.append(bool(miss_mm > LARGE * np.ptp(observations.xy_mm)))
     for rows in _rows_of_given(network):
         xyz = np.array([[places[observations.point[row]] for row in rows]])
-        (misfit,) = linear_transformations(xyz, observations.xy_mm[rows][None])[1]
+        (misfit,) = linear_transformations(xyz, observations.xy_mm[rows][None]).misfit
         fits.append(bool(misfit < LARGE))
     return all(fits)
 
@@ -190,7 +189,7 @@ def _mirrored_images(network: Network) -> Iterator[NetworkHypothesis]:
         image = network.image_by_name[observations.image[rows[0]]]
         if image.transformation == "none":
             xyz = np.array([[network.known_places[observations.point[row]] for row in rows]])
-            (handedness,), _ = linear_transformations(xyz, observations.xy_mm[rows][None])
+            (handedness,) = linear_transformations(xyz, observations.xy_mm[rows][None]).handedness
             names += [image.name] if handedness > 0.0 else []
     if 0 < len(names) < len(network.images):
         who = f"image {names[0]} is" if len(names) == 1 else f"the images {shortened(names, NAMED)} are"
@@ -591,7 +590,7 @@ def misnumbered_images(network: Network) -> dict[str, str]:
     sizes = np.array([len(rows) for rows in rows_of])
     for size in np.unique(sizes):
         rows = np.array([each for each in rows_of if len(each) == size])
-        as_given[sizes == size] = linear_transformations(given[rows], observations.xy_mm[rows])[1]
+        as_given[sizes == size] = linear_transformations(given[rows], observations.xy_mm[rows]).misfit
     is_worse = as_given > WORSE * np.median(as_given)
     doubted = np.flatnonzero(is_worse | (as_given > LARGE))
     if not len(doubted):
@@ -604,7 +603,7 @@ def misnumbered_images(network: Network) -> dict[str, str]:
         numbers = [place_of[observations.point[row]] for row in rows]
         reordered = np.array([xyz[order[numbers]] for _, order in orders])
         xy_mm = np.broadcast_to(observations.xy_mm[rows], (*reordered.shape[:2], 2))
-        misfits = linear_transformations(reordered, xy_mm)[1]
+        misfits = linear_transformations(reordered, xy_mm).misfit
         best = int(np.argmin(misfits))
         if (BETTER if is_worse[image] else MUCH_BETTER) * misfits[best] < as_given[image]:
             frames[orders[best][0]].append(network.image_by_name[observations.image[rows[0]]].frame)
@@ -644,40 +643,3 @@ def _orders(xyz: Array) -> Iterator[tuple[str, Indices]]:
         turned = lines.copy()
         turned[1::2] = lines[1::2, ::-1]
         yield "these are numbered to and fro, or only here not", turned.ravel()
-
-
-def linear_transformations(xyz: Array, xy_mm: Array) -> tuple[Array, Array]:
-    """Handedness (m,) and misfit (m,) of direct linear transformations of points (m, n, 3) to images (m, n, 2).
-
-    Handedness: positive for a mirrored image, 0 for a flat field, whose mirror images are images. The misfit is the
-    median residual in units of the image's extent.
-    """
-    (points, extents, axes), (xy, _, _) = _normalised(xyz), _normalised(xy_mm)
-    is_flat = extents[:, -1] < FLAT_FIELD * extents[:, 0]
-    handedness, misfits = np.zeros(len(xyz)), np.zeros(len(xyz))
-    for flat in np.unique(is_flat):
-        own = is_flat == flat
-        of, to = points[own], xy[own]
-        at = of @ axes[own, :, :2] if flat else of
-        at = np.concatenate([at, np.ones((*at.shape[:2], 1))], axis=2)
-        none = np.zeros_like(at)
-        along = np.concatenate([at, none, -to[..., :1] * at], axis=2)
-        rows = np.concatenate([along, np.concatenate([none, at, -to[..., 1:] * at], axis=2)], axis=1)
-        normal = rows.swapaxes(1, 2) @ rows
-        projection = np.linalg.eigh(normal)[1][:, :, 0].reshape(len(at), 3, -1)
-        projected = at @ projection.swapaxes(1, 2)
-        depths = projected[..., 2]
-        off = projected[..., :2] / np.where(np.abs(depths) < LEAST_DEPTH, LEAST_DEPTH, depths)[..., None] - to
-        misfits[own] = np.median(np.linalg.norm(off, axis=2), axis=1)
-        if not flat:
-            handedness[own] = np.linalg.det(projection[..., :3]) * np.median(depths, axis=1)
-    return handedness, misfits
-
-
-def _normalised(places: Array) -> tuple[Array, Array, Array]:
-    """Places (m, n, k) about their centroid, of size 1, their extents (m, k) along their axes, and these (m, k, k)."""
-    centred = places - places.mean(axis=1, keepdims=True)
-    centred /= np.maximum(np.abs(centred).max(axis=(1, 2), keepdims=True), 1e-300)  # for the squares
-    squares, axes = np.linalg.eigh(centred.swapaxes(1, 2) @ centred)
-    extents = np.sqrt(np.maximum(squares[:, ::-1], 0.0))
-    return centred / np.maximum(extents[:, :1, None], 1e-300), extents, axes[..., ::-1]

@@ -356,7 +356,7 @@ def _scaled_run(last: Run, variance: VarianceFactor) -> Run:
     sigma = unknowns.sigma.copy()
     sigma[variance.positions] /= variance.sigma0
     numbering = Numbering(replace(last.numbering.problem, unknowns=replace(unknowns, sigma=sigma)))
-    end = replace(last.end, rows=replace(last.end.rows, numbering=numbering))
+    end = replace(last.end, rows=replace(last.end.rows, numbering=numbering), factor_nearby=None)
     return replace(last, solution=replace(last.solution, end=end))
 
 

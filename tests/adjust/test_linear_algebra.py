@@ -286,3 +286,16 @@ def test_variances_along_a_line_are_those_of_its_differences(
     np.testing.assert_allclose(factor.variances(), weight**-2 + 0.5 * np.arange(count), rtol=1e-9)
     (roots,) = row_roots(factor, blocks)
     np.testing.assert_allclose(roots @ roots.swapaxes(1, 2), np.full((count - 1, 2, 2), 0.5), atol=1e-9)
+
+
+def test_derivatives_before_a_negligible_last_step_give_the_standard_deviations() -> None:
+    network, start = simulated(np.random.default_rng(0), free={"k3": np.inf})
+    run = adjust(network, start).run
+    end, covariance = run.end, network.observations.covariance_mm2
+    assert end.factor_nearby is not None
+    fresh = linearise(run.numbering, covariance, end.state)
+    assert fresh is not None
+    np.testing.assert_allclose(end.v_mm, fresh.v_mm, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(end.factor.variances(), fresh.factor.variances(), rtol=1e-9)
+    assert fresh.factor.length() < 1e-9  # of the next step, in standard deviations
+    assert abs(end.vpv / fresh.vpv - 1.0) < 1e-9

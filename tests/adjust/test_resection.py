@@ -12,6 +12,7 @@ from adjust import AdjustmentError, Camera, Distortion, Network, Options, Prior,
 from adjust.initial_values.model_formation import absolute_orientation
 from adjust.initial_values.pose import KnownField, Pose, image_distances, intersect
 from adjust.initial_values.resection import (
+    distance_directly,
     find_principal_distance,
     resect,
     resections,
@@ -82,6 +83,24 @@ def test_images_are_oriented_by_those_of_their_points_that_agree(relief: float) 
         assert each is not None
         assert np.linalg.norm(each.pose.center - pose.center) < 2.0
     assert [each.inliers[:18].sum() for each in found if each is not None][3] == 0
+
+
+@pytest.mark.parametrize("relief", [0.0, 0.3])
+def test_linear_transformations_give_the_principal_distance_and_all_poses(relief: float) -> None:
+    given, poses = known_fields([30, 40, 25, 40], relief, 0.7, 0.0)
+    found = distance_directly(given)
+    assert found is not None
+    assert abs(found[0] - C_MM) < 1e-3
+    for each, pose in zip(found[2], poses, strict=True):
+        assert np.linalg.norm(each.pose.center - pose.center) < 0.02
+        np.testing.assert_allclose(each.pose.rotation, pose.rotation, atol=1e-5)
+
+
+def test_gross_errors_and_planes_parallel_to_the_images_take_a_search() -> None:
+    for given in (known_fields([40] * 12, 0.3, 0.7, SIGMA_MM)[0], known_fields([40] * 12, 0.0, 0.0, SIGMA_MM)[0]):
+        for field in given:
+            field.xy_mm[:4] += np.random.default_rng(1).uniform(-20.0, 20.0, (4, 2))
+        assert distance_directly(given) is None
 
 
 def test_a_plane_parallel_to_the_images_does_not_tell_the_principal_distance() -> None:

@@ -1,0 +1,141 @@
+"""Direct linear transformations (DLT) of known points to images, of many images at once.
+
+Points in a plane are imaged by a homography, others by a central projection with eleven parameters. The coefficients
+are the eigenvector of the least eigenvalue of linear equations in normalised coordinates (Hartley and Zisserman,
+Multiple View Geometry, algorithms 4.2 and 7.1). They tell wrong point numbers and mirrored images without a camera, and
+give the principal distance and all poses without a search where there are no gross errors.
+
+Arrays (m, n) hold n points of m images; `present` marks those that an image shows.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from adjust.array_types import Array, Mask
+
+FLAT_FIELD = 0.05  # relative thickness of a field below which a linear transformation does not tell its depth
+CLEAR = 5.0  # 1 / c² in its standard deviations, from which on it is determined
+LEAST_DEPTH = 1e-12  # of points in a field of size 1: nearer ones are imaged as far off as that
+
+
+@dataclass(frozen=True)
+class _Normalised:
+    """Places (m, n, k) about their centroid (m, k), of size (m,) 1; extents (m, k) along their axes (m, k, k)."""
+
+    places: Array
+    origin: Array
+    size: Array
+    extents: Array
+    axes: Array
+
+    @classmethod
+    def of(cls, places: Array, present: Mask) -> "_Normalised":
+        is_there = present[..., None]
+        origin = (places * is_there).sum(axis=1) / present.sum(axis=1)[:, None]
+        centred = (places - origin[:, None]) * is_there
+        largest = np.maximum(np.abs(centred).max(axis=(1, 2)), 1e-300)  # for the squares
+        centred /= largest[:, None, None]
+        squares, axes = np.linalg.eigh(centred.swapaxes(1, 2) @ centred)
+        extents = np.sqrt(np.maximum(squares[:, ::-1], 0.0))
+        size = np.maximum(extents[:, 0], 1e-300)
+        return cls(centred / size[:, None, None], origin, largest * size, extents, axes[..., ::-1])
+
+
+@dataclass(frozen=True)
+class LinearTransformations:
+    """Transformations of fields of points to images.
+
+    field, image: normalised points and images; present: (m, n); is_flat: (m,) mask of the flat fields.
+    coefficients: (m, 3, 4) homogeneous image coordinates from homogeneous object coordinates, both normalised; the
+    third is positive, and 0 along the normal of a flat field.
+    """
+
+    field: _Normalised
+    image: _Normalised
+    present: Mask
+    is_flat: Mask
+    coefficients: Array
+
+    @property
+    def handedness(self) -> Array:
+        """(m,) positive for a mirrored image, 0 for a flat field, whose mirror images are images."""
+        return np.where(self.is_flat, 0.0, np.linalg.det(self.coefficients[..., :3]))
+
+    @property
+    def misfit(self) -> Array:
+        """(m,) median residual in units of the image's extent."""
+        projected = self.field.places @ self.coefficients[..., :3].swapaxes(1, 2) + self.coefficients[:, None, :, 3]
+        depths = projected[..., 2:]
+        off = projected[..., :2] / np.where(np.abs(depths) < LEAST_DEPTH, LEAST_DEPTH, depths) - self.image.places
+        ordered = np.sort(np.where(self.present, np.linalg.norm(off, axis=2), np.inf), axis=1)
+        counts = self.present.sum(axis=1)
+        return np.asarray(ordered[np.arange(len(ordered)), [(counts - 1) // 2, counts // 2]].mean(axis=0))
+
+
+def linear_transformations(xyz: Array, xy_mm: Array, present: Mask | None = None) -> LinearTransformations:
+    """Transformations of points (m, n, 3) to images (m, n, 2) with the least algebraic residuals."""
+    present = np.ones(xyz.shape[:2], dtype=bool) if present is None else present
+    field, image = _Normalised.of(xyz, present), _Normalised.of(xy_mm, present)
+    is_flat, coefficients = field.extents[:, -1] < FLAT_FIELD * field.extents[:, 0], np.zeros((len(xyz), 3, 4))
+    for flat in np.unique(is_flat):
+        own = is_flat == flat
+        axes = field.axes[own, :, :2] if flat else np.eye(3)
+        at = np.concatenate([field.places[own] @ axes, present[own, :, None]], axis=2)
+        found = _least_eigenvectors(at, image.places[own])
+        coefficients[own] = np.concatenate([found[..., :-1] @ np.swapaxes(axes, -1, -2), found[..., -1:]], axis=2)
+    coefficients *= np.where(coefficients[:, 2:, 3:] < 0.0, -1.0, 1.0)  # the depth of the centroid
+    return LinearTransformations(field, image, present, is_flat, coefficients)
+
+
+def _least_eigenvectors(at: Array, to: Array) -> Array:
+    """Coefficients (m, 3, k) of transformations of homogeneous coordinates (m, n, k) to image coordinates (m, n, 2)."""
+    (count, _, width), (x, y) = at.shape, (to[..., :1], to[..., 1:])
+    normal = np.zeros((count, 3, width, 3, width))
+    across = at.swapaxes(1, 2)
+    normal[:, 0, :, 0] = normal[:, 1, :, 1] = across @ at
+    for axis, by in enumerate((x, y)):
+        normal[:, axis, :, 2] = normal[:, 2, :, axis] = -(across @ (by * at))
+    normal[:, 2, :, 2] = across @ ((x**2 + y**2) * at)
+    return np.linalg.eigh(normal.reshape(count, 3 * width, -1))[1][:, :, 0].reshape(count, 3, width)
+
+
+def closed_form(given: LinearTransformations) -> tuple[float, Array, Array] | None:
+    """Principal distance and poses of one camera without distortion, with coordinates about its principal point.
+
+    Returns
+    -------
+    Principal distance in mm, rotations (m, 3, 3) and shifts (m, 3), camera = R X + t; None where they are not
+    determined, or some image is mirrored.
+
+    Notes
+    -----
+    Of a flat field the images of two orthogonal axes determine the principal distance (Zhang 2000, A flexible new
+    technique for camera calibration), of another one the lengths of the projection's rows.
+    """
+    field, image, is_deep = given.field, given.image, ~given.is_flat
+    projection = given.coefficients.copy()
+    projection[:, :2] = image.size[:, None, None] * projection[:, :2] + image.origin[..., None] * projection[:, 2:]
+    matrix = projection[..., :3]
+    u, v = np.moveaxis(matrix @ field.axes[..., :2], 2, 0)  # images of the first two axes
+    products = np.stack([u * v, (u**2 - v**2) / 2.0], axis=1)  # of equal length, and at right angles
+    across, ahead = products[..., :2].sum(axis=2), products[..., 2]
+    lengths = (matrix**2).sum(axis=2)
+    size = lengths[:, :2].mean(axis=1, keepdims=True)
+    across[is_deep], ahead[is_deep] = size[is_deep] * [1.0, 0.0], -lengths[is_deep, 2:] * [1.0, 0.0]
+    across, ahead = across / size, ahead / size
+    weight = float((across**2).sum())
+    inverse_square = -float((across * ahead).sum()) / weight  # across / c² + ahead = 0
+    spread = np.sqrt(float(np.mean((across * inverse_square + ahead)[across != 0.0] ** 2)) / weight)
+    if not inverse_square > CLEAR * spread:
+        return None
+    c = inverse_square**-0.5
+    camera = projection * np.array([[1.0 / c], [1.0 / c], [-1.0]])
+    left, singular, right = np.linalg.svd(camera[..., :3])
+    sides = np.linalg.det(left) * np.linalg.det(right)
+    if (sides[is_deep] < 0.0).any():
+        return None
+    left[..., 2] *= sides[:, None]
+    rotations = left @ right
+    shifts = camera[..., 3] * (field.size / singular[:, :2].mean(axis=1))[:, None]
+    return c, rotations, shifts - (rotations @ field.origin[..., None])[..., 0]
