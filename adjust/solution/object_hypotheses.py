@@ -8,7 +8,7 @@ from itertools import combinations, product
 import numpy as np
 from scipy.spatial import KDTree
 
-from adjust.array_types import Array
+from adjust.array_types import Array, Mask
 from adjust.functional_model.board import BoardForm, board_form, disk_directions, strain_directions
 from adjust.problem.condition_equations import computed_observations
 from adjust.problem.network import Network
@@ -195,24 +195,27 @@ def diameter_notes(run: Run) -> Iterator[str]:
 
 
 def _wrong_points(run: Run, most: int) -> Iterator[ModelHypothesis]:
-    """Wrong coordinates of fixed points, each by itself, or of a line or a side of a regular field by one shift.
+    """Wrong coordinates of fixed points, heights alone, say, or of a line or a side of a regular field by one shift.
 
     Coordinates that are given with a standard deviation are observations, tested by data snooping.
     """
     network, unknowns = run.problem.network, run.problem.unknowns
     images = Counter(name for name, _ in set(zip(network.observations.point, network.observations.image, strict=True)))
-    names = tuple(
-        name
-        for name, at in unknowns.point.items()
-        if not unknowns.sigma[at].any() and images[name] >= FEWEST_IMAGES and name in network.known_places
-    )
-    if len(names) < FEWEST_GIVEN:
+    fixed = {
+        name: np.array([prior is not None and prior.sigma == 0.0 for prior in network.point_by_id[name].priors])
+        for name in unknowns.point
+        if images[name] >= FEWEST_IMAGES
+    }
+    fixed = {name: mask for name, mask in fixed.items() if mask.any()}
+    if len(fixed) < FEWEST_GIVEN:
         return
-    form, positions = _flat_form(network), np.concatenate([unknowns.point[name] for name in names])
+    positions = np.concatenate([unknowns.point[name][mask] for name, mask in fixed.items()])
+    form = _flat_form(network) if network.known_places else None
     axes = np.eye(3) if form is None else form.axes
-    for selection in displaced_points(run, axes, continued_with(run, positions), names, most):
-        added = np.concatenate([unknowns.point[name] for name in selection.names])
-        words = _point_words(selection, unknowns.given[added])
+    for selection in displaced_points(run, axes, continued_with(run, positions), fixed, most):
+        mask = np.array([fixed[name] for name in selection.names])
+        added = np.array([unknowns.point[name] for name in selection.names])[mask]
+        words = _point_words(selection, mask, unknowns.given[added])
         if selection.words:
             moved = _of_targets(run, dict.fromkeys(selection.names, np.eye(3)))
             found = displaced(run, "group", "point", words, moved)
@@ -221,13 +224,17 @@ def _wrong_points(run: Run, most: int) -> Iterator[ModelHypothesis]:
         yield replace(found, selection=selection)
 
 
-def _point_words(selection: Selection, given: Array) -> Words:
-    """Words on points that lie elsewhere than given (3 k,), or on a group with one shift."""
+def _point_words(selection: Selection, fixed: Mask, given: Array) -> Words:
+    """Words on points whose fixed coordinates (k, 3) are not those given (n,), or on a group with one shift."""
     names, remedy = selection.names, "Correct the coordinates of these points, or their numbers among the marks."
 
     def words(found: Estimate) -> tuple[str, str]:
-        offs = -found.value[None] if selection.words else (given - found.value).reshape(-1, 3)
-        by = [_shift_words(*each) for each in zip(offs, found.sigma.reshape(-1, 3), strict=True)]
+        offs, sigmas = np.zeros((2, *fixed.shape))
+        if selection.words:
+            offs, sigmas = -found.value[None], found.sigma[None]
+        else:
+            offs[fixed], sigmas[fixed] = given - found.value, found.sigma
+        by = [_shift_words(*each) for each in zip(offs, sigmas, strict=True)]
         some = shortened(names, MOST_NAMED)
         if selection.words:
             return (
@@ -252,4 +259,5 @@ def _point_words(selection: Selection, given: Array) -> Words:
 
 def _shift_words(off: Array, sigma: Array) -> str:
     digits = [max(0, -int(np.floor(np.log10(max(s, 1e-12))))) for s in sigma]
-    return ", ".join(f"{axis} by {d:+.{n}f} ± {s:.1g}" for axis, d, s, n in zip("XYZ", off, sigma, digits, strict=True))
+    rows = zip("XYZ", off, sigma, digits, strict=True)
+    return ", ".join(f"{axis} by {d:+.{n}f} ± {s:.1g}" for axis, d, s, n in rows if s > 0.0)

@@ -6,12 +6,13 @@ two-means, started from the best thresholds of these changes in some directions.
 or one shift of a line of a regular field or of all points beyond it, with the sums of their rows and columns of N.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
 
 import numpy as np
+from scipy.sparse import diags_array
 from scipy.special import chdtri, gammaln
 
 from adjust.array_types import Array, Mask
@@ -134,13 +135,16 @@ def _clearness(changes: Array, weight: Array) -> Array:
     return np.asarray(between.max(axis=1) / (weights * centred**2).sum(axis=1))
 
 
-def displaced_points(run: Run, axes: Array, problem: Problem, names: tuple[str, ...], most: int) -> Iterator[Selection]:
+def displaced_points(
+    run: Run, axes: Array, problem: Problem, fixed: Mapping[str, Mask], most: int
+) -> Iterator[Selection]:
     """Select the best single points and the best group with one shift among points.
 
-    axes (m, 3): of the field, along which points form lines; problem: the one in which the points `names` are free;
-    most: single points at most.
+    axes (m, 3): of the field, along which points form lines; fixed: (3,) by point, its fixed coordinates; problem: the
+    one in which these are free; most: single points at most.
     """
-    system = _point_equations(run, problem, names) if FEWEST <= len(names) <= MOST else None
+    names = tuple(fixed)
+    system = _point_equations(run, problem, fixed) if FEWEST <= len(names) <= MOST else None
     if system is None:
         return
     normal, right = system
@@ -150,7 +154,8 @@ def displaced_points(run: Run, axes: Array, problem: Problem, names: tuple[str, 
         count = len(names)
         choices = gammaln(count + 1) - gammaln(len(single) + 1) - gammaln(count - len(single) + 1)
         yield Selection(tuple(names[k] for k in single), "", float(choices), 3 * (count - 1))
-    groups = list(_lines(np.array([run.problem.network.known_places[name] for name in names]), axes))
+    places = run.problem.network.known_places
+    groups = list(_lines(np.array([places[name] for name in names]), axes)) if places.keys() >= fixed.keys() else []
     if groups:
         members = np.array([mask for _, mask in groups], dtype=float)
         of_groups = np.einsum("li,iajb,lj->lab", members, normal, members, optimize=True)
@@ -158,12 +163,14 @@ def displaced_points(run: Run, axes: Array, problem: Problem, names: tuple[str, 
         yield Selection(_some(names, mask), words, float(np.log(len(groups))))
 
 
-def _point_equations(run: Run, problem: Problem, names: tuple[str, ...]) -> tuple[Array, Array] | None:
-    """N (p, 3, p, 3) and g (p, 3) of points, the unknowns of the run eliminated."""
+def _point_equations(run: Run, problem: Problem, fixed: Mapping[str, Mask]) -> tuple[Array, Array] | None:
+    """N (p, 3, p, 3) and g (p, 3) of points, the unknowns of the run eliminated; 0 for coordinates that are not fixed."""
     if (at := run.linearised(problem)) is None:
         return None
-    positions, count = np.concatenate([problem.unknowns.point[name] for name in names]), len(names)
-    by_points = derivatives_by(problem, at.rows.matrix, positions)
+    positions, count = np.concatenate([problem.unknowns.point[name] for name in fixed]), len(fixed)
+    by_points = derivatives_by(problem, at.rows.matrix, positions) @ diags_array(
+        np.concatenate([*fixed.values()]) * 1.0
+    )
     across = (run.unit_functions[: by_points.shape[0]].T @ by_points).toarray()
     normal = (by_points.T @ by_points).toarray() - across.T @ run.factor.cofactor_times(across)
     return normal.reshape(count, 3, count, 3), (by_points.T @ at.rows.right.ravel()).reshape(count, 3)

@@ -23,8 +23,21 @@ from faults import (
     misfit_outcome,
     misfit_sentences,
     scene,
+    shift_given,
 )
-from networks import Truth, field_points, free_points, map_priors, set_camera, set_observations, simulated
+from networks import (
+    HEIGHTS,
+    LEVEL_STATIONS,
+    Setup,
+    Truth,
+    field_points,
+    free_points,
+    map_priors,
+    quarters,
+    set_camera,
+    set_observations,
+    simulated,
+)
 from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
@@ -180,6 +193,16 @@ def test_an_image_numbered_as_in_a_mirror_is_not_reported_to_agree_with_its_pict
     (sentence,) = adjust(set_observations(given, point=names)).misread
     assert sentence.startswith("Image im01 is mirrored, or numbered as in a mirror, or the flat board is transparent")
     assert "agree" not in sentence
+
+
+def test_a_wrong_height_is_named_where_heights_alone_are_given() -> None:
+    """Good given values, x0 and y0, had been suspects."""
+    setup = Setup(quarters(), LEVEL_STATIONS, relief=0.0, sigma=HEIGHTS, prior=1.0, noise=True)
+    given = shift_given(setup.network()[0], "PT.3.Z", 2.0)
+    result = adjust(given, options=Options(datum="minimal"))
+    (found,) = result.explanations
+    assert found.cause.startswith("Point 3 is not where it is given: its coordinates are off, Z by +2")
+    assert result.suspects == ()
 
 
 @pytest.mark.study
