@@ -164,7 +164,7 @@ def displaced_points(
 
 
 def _point_equations(run: Run, problem: Problem, fixed: Mapping[str, Mask]) -> tuple[Array, Array] | None:
-    """N (p, 3, p, 3) and g (p, 3) of points, the unknowns of the run eliminated; 0 for coordinates that are not fixed."""
+    """N (p, 3, p, 3) and g (p, 3) of points, the unknowns of the run eliminated; 0 for coordinates not fixed."""
     if (at := run.linearised(problem)) is None:
         return None
     positions, count = np.concatenate([problem.unknowns.point[name] for name in fixed]), len(fixed)
