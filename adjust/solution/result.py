@@ -237,8 +237,8 @@ class Adjustment(Estimates, PlottedResult):
             variance = variance_factor(run, _redundancy(run, self.cofactor))
             tested = reliability(run, variance, self.probabilities)
         found = Snooping(run, self.probabilities).suspects(tested, round(variance.redundancy)) if tested else ()
-        is_told = not self.slips or self.run.removed
-        return tuple(each for each in found if is_told or each.tested.point in self.slips)
+        is_warned = not self.slips or self.run.removed
+        return tuple(each for each in found if is_warned or each.tested.point in self.slips)
 
     @cached_property
     def explanations(self) -> tuple[Explanation, ...]:
