@@ -22,6 +22,7 @@ from pipeline.resampling.canvas import FrameChain, image_chain
 from pipeline.results.adjustment_file import Covariance, read_own_covariance
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.comparator_file import ComparatorPoint, pixel_from_comparator, read_comparator, read_pitches
+from pipeline.results.image_unit import FILM_UNIT, ImageUnit
 from pipeline.types import Array
 
 if TYPE_CHECKING:
@@ -163,7 +164,13 @@ class Block:
         """By camera, a sentence on the radius up to which its lens is known: beyond it, the exported lens is
         extrapolated."""
         lenses = self.adjustment.estimated_lenses() if self.adjustment else ()
-        return {name: known.sentence(name) for name, known in lenses if known.share < 1.0}
+        return {name: known.sentence(name, self._image_unit(name)) for name, known in lenses if known.share < 1.0}
+
+    def _image_unit(self, camera: str) -> ImageUnit:
+        """Pixels of a digital camera, whose pixel size may be no figure of its own; else mm and µm."""
+        digital = (each for each in self.frames if each.model and each.model.film.transformation == "none")
+        pitch_um = next((each.pitch_um for each in digital if each.camera == camera and each.pitch_um), None)
+        return FILM_UNIT if pitch_um is None else ImageUnit(min(pitch_um))
 
     def camera_file(self, name: str) -> CameraFile:
         """Camera file by the camera's name."""

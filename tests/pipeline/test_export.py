@@ -43,6 +43,7 @@ from projects import (
 )
 
 from adjust import LineOfSight
+from adjust.functional_model.transformation import Film
 from pipeline import InputError, read_project
 from pipeline.cli import DONE, LOOK, WRONG_INPUT
 from pipeline.exchange import micmac_format, pinhole
@@ -395,6 +396,11 @@ def test_how_far_out_an_estimated_lens_is_known_goes_out(tmp_path: Path) -> None
         readme = (folder / "README.txt").read_text(encoding="utf-8")
         assert words in readme
         assert f"{100.0 * known['share']:.0f} % of the way to the corner of the picture; beyond it" in readme
+    block = read_block(read_project(project))
+    plain = Film("none", np.empty(0), np.zeros(2))
+    digital = tuple(replace(each, model=replace(present(each.model), film=plain)) for each in block.frames)
+    in_px = f"known up to {known['radius_mm'] / PITCH_MM:.3g} px from the principal point"
+    assert in_px in replace(block, frames=digital).lens_reach["K"]
     text = (tmp_path / "opencv" / "f1.yml").read_text(encoding="utf-8")
     assert f"# {words}" in text
     storage: Any = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
