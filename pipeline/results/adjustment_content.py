@@ -179,7 +179,7 @@ def adjustment_record(
         points={
             point.id: _point(adjustment, point)
             for point in network.points
-            if point.id in adjustment.run.problem.unknowns.point
+            if adjustment.has(Parameter.point(point.id, "X"))
         },
         residuals=_residuals(adjustment),
         refraction=network.line_of_sight.refraction,
