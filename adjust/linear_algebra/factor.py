@@ -121,7 +121,8 @@ class Factor:
     @cached_property
     def is_steady(self) -> bool:
         """Whether the triangles' inverses are small, so that no singular value of the design matrix is near 0."""
-        if self.lift or self.triangle.reciprocal_condition <= TEN_DIGITS:
+        # Columns have a norm of 1: a lone shared unknown that the blocks take up has a condition of 1, and no length.
+        if self.lift or self.triangle.smallest_singular <= TEN_DIGITS:
             return False
         return self.eliminated.norm_of_inverse() <= STEADY
 

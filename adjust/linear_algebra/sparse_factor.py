@@ -90,19 +90,28 @@ class Triangle:
 
     @cached_property
     def largest_singular(self) -> float:
-        """Largest singular value by power iteration, accurate to a few percent."""
+        """Largest singular value, in a wide triangle to a few percent."""
+        if 0 < len(self) <= NARROW:
+            return float(self._singulars[0])
         return self._singular(lambda vector: self.transposed_times(self.times(vector)))
 
     @cached_property
-    def reciprocal_condition(self) -> float:
-        """Smallest over largest singular value, in a wide triangle to some tens of percent; 0 if R is singular."""
+    def smallest_singular(self) -> float:
+        """Smallest singular value, in a wide triangle to some tens of percent; 0 if R is singular, inf if empty."""
         if not all(np.diag(own).all() for own in self.own):
             return 0.0
-        if 0 < len(self) <= NARROW:
-            singular = np.linalg.svd(self.toarray(), compute_uv=False)
-            return float(singular[-1] / singular[0])
-        smallest = self._singular(self.cofactor_times)
-        return smallest / self.largest_singular if smallest > 0.0 else 1.0
+        if len(self) <= NARROW:
+            return float(self._singulars[-1]) if len(self) else np.inf
+        return self._singular(self.cofactor_times)
+
+    @property
+    def reciprocal_condition(self) -> float:
+        """Smallest over largest singular value; 1 if R is empty."""
+        return self.smallest_singular / self.largest_singular if len(self) else 1.0
+
+    @cached_property
+    def _singulars(self) -> Array:
+        return np.asarray(np.linalg.svd(self.toarray(), compute_uv=False), dtype=np.float64)
 
     def _singular(self, multiplied: Callable[[Array], Array]) -> float:
         """Singular value by power iteration; multiplied: the product with R'R (largest) or its inverse (smallest)."""
