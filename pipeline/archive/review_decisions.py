@@ -25,7 +25,7 @@ _MEASURED = (Choice.PLACE, Choice.POSE, Choice.UNDO)  # decisions that change th
 KeyOf = Callable[[ScanTask], str]
 PoseOf = Callable[[str], str | None]
 if TYPE_CHECKING:
-    from pipeline.archive.measure_archive import Work
+    from pipeline.archive.work import Work
 
 _INAPPLICABLE = "decisions that do not apply"
 _NAMED = 10

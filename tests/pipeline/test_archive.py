@@ -52,7 +52,7 @@ def counted_scan(task: ScanTask) -> MeasuredFile:
 @pytest.fixture(autouse=True)
 def counts(monkeypatch: pytest.MonkeyPatch) -> None:
     measured.clear()
-    monkeypatch.setattr("pipeline.archive.measure_archive.measure_file", counted_scan)
+    monkeypatch.setattr("pipeline.archive.work.measure_file", counted_scan)
 
 
 @pytest.fixture(scope="module")
@@ -265,9 +265,9 @@ def test_a_new_scan_has_its_own_lot_checked_again_and_no_other(folder: Path, mon
         lots.append({scan.frame.image for scan in scans})
         return check_scans(camera, scans, film)
 
-    monkeypatch.setattr("pipeline.archive.measure_archive.check_scans", note_lot)
+    monkeypatch.setattr("pipeline.archive.cross_scan_checks.check_scans", note_lot)
     # lots as of an archive of 2000 times as many scans
-    monkeypatch.setattr("pipeline.archive.measure_archive._TOGETHER", 1)
+    monkeypatch.setattr("pipeline.archive.cross_scan_checks._TOGETHER", 1)
     measure(folder, "--retry")
     assert lots == [{"a", "b", "c"}]  # by a hash of their names
     one_more(folder)
