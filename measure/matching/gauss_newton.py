@@ -238,6 +238,7 @@ class PictureFit:
         """Estimate from the current residuals how the noise grows with light, and set the steadiness."""
         model, coding = self.model, self.window.coding
         if not (coding.tone.is_identity or model.is_chip):
+            model.linearise(self.used)  # a refit has none of its drawings yet
             drawn, shown = model.drawn_light, np.abs(model.design[-GREY] / model.steadiness)
             ground = shown < _GROUND * shown.max()
             model.take_steadiness(steadiness(model.light - drawn, drawn / coding.full_scale_dn, ground, self.telling))

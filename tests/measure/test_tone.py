@@ -116,6 +116,20 @@ def test_the_tip_of_a_wedge_is_where_it_was_drawn_whatever_the_curve(curve: floa
     assert whitened_rms(errors, covariances) < 2.2  # of three scans, in fact: the tips of one are off together
 
 
+def test_a_refit_weighs_noise_that_grows_with_light_as_a_fit_from_scratch_does() -> None:
+    """Even noise of the stored grey values: in light it grows, most where it is light."""
+    rng, tone = np.random.default_rng(5), Tone(power(2.2))
+    mark = some_mark(KIND["cross"], 1.0, rng)
+    code = FULL * coded((DARK + (LIGHT - DARK) * mark.picture).astype(np.float32), 2.2)
+    scan = make_scan(code + rng.normal(0, 1500, code.shape)).replace_tone(tone)
+    window = read_window(scan, (0, 0, mark.size, mark.size))
+    options = options_for(mark.kind.shape, MatchOptions(linear_sigma=0.05), mark.kind.known)
+    fit = match(window, mark.kind.shape, mark.place, options)
+    again = match(window, mark.kind.shape, mark.place, options, before=fit)
+    assert again.covariance_px2 == pytest.approx(fit.covariance_px2, rel=0.05, abs=2e-5)
+    assert np.hypot(*(again.center_px - fit.center_px)) < 0.002
+
+
 def test_a_picture_that_contradicts_the_others_hardly_moves_the_curve() -> None:
     agreed = [mark_tone(np.eye(5)[0]).information] * 4
     alone, prior = mark_tone(-3 * np.ones(5)).information, Tone.unknown()
