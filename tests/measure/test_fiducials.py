@@ -138,13 +138,16 @@ def test_marks_places_decide_where_they_are_not_symmetric() -> None:
 
 def test_dark_marks_and_an_unknown_pitch() -> None:
     matrix = pixel_from_camera("0")
-    negative = 20000 - frame_picture(NUMBERED, matrix)
-    light = [replace(mark, mark=replace(mark.mark, polarity="light")) for mark in NUMBERED.marks]
-    lost = measure_grey(negative, replace(NUMBERED, marks=tuple(light)), pitch=False)
-    assert 'no negative of what the camera file draws (polarity = "auto" takes both)' in lost.problems[0]
-    result = measure_grey(negative, NUMBERED, pitch=False)
+    result = measure_grey(20000 - frame_picture(NUMBERED, matrix), NUMBERED, pitch=False)
     assert found_pose(result)[0] == "0"
     assert_right(result, NUMBERED, matrix)
+
+
+def test_a_negative_of_light_marks_is_told() -> None:
+    negative = 20000 - frame_picture(NUMBERED, pixel_from_camera("0"))
+    light = [replace(mark, mark=replace(mark.mark, polarity="light")) for mark in NUMBERED.marks]
+    lost = measure_grey(negative, replace(NUMBERED, marks=tuple(light)), FiducialOptions(pose="0"))
+    assert 'no negative of what the camera file draws (polarity = "auto" takes both)' in lost.problems[0]
 
 
 def test_zero_marks_give_no_silent_identity() -> None:
