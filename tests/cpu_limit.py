@@ -25,13 +25,14 @@ def cpu_s() -> float:
 
 
 def slowness() -> float:
-    """How many times as long as on a quiet machine this process takes now, at least 1."""
+    """How many times as long as on a quiet machine this process takes now, at least 1: the worst of five trials, for a
+    processor that was slow a moment ago may be fast again, and a sound test must not fail."""
     times = []
-    for _ in range(3):
+    for _ in range(5):
         before = time.process_time()
         sum(number * number % 7 for number in range(300_000))
         times.append(time.process_time() - before)
-    return max(1.0, sorted(times)[1] / YARDSTICK_S)
+    return max(1.0, max(times) / YARDSTICK_S)
 
 
 @pytest.hookimpl(tryfirst=True)

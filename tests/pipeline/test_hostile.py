@@ -140,7 +140,7 @@ def answers(folder: Path, server: Served, trials: int, seed: int) -> Counter[str
     return counted(trials, seed, trial)
 
 
-@parametrize_with_studies(("trials", "seed"), [(40, 1), (3000, 2)])
+@parametrize_with_studies(("trials", "seed"), [(25, 1), (3000, 2)])
 def test_changed_requests(trials: int, seed: int, folder: Path) -> None:
     with served(folder / "project.toml") as server:
         found = answers(folder, server, trials, seed)
