@@ -287,7 +287,7 @@ def block_picture(pose: str) -> tuple[Array, Array]:
 
 
 @parametrize_with_studies(
-    ("pose", "requested"), [("180", "auto"), ("180", "180"), ("90m", "auto"), ("90m", "90m")], quick=(0,)
+    ("pose", "requested"), [("180", "auto"), ("180", "180"), ("90m", "auto"), ("90m", "90m")], quick=(1,)
 )
 def test_blocks_at_the_border_are_measured_alike_with_their_pose_open_and_set(pose: str, requested: str) -> None:
     grey, matrix = block_picture(pose)
