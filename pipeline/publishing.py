@@ -36,6 +36,7 @@ class Unpublished:
         self._output, self._comparator = output, comparator
         self.folder = output / f".unfinished.{socket.gethostname()}.{os.getpid()}"
         self._removed: list[Path] = []
+        self._is_output_new = not output.exists()
 
     def place(self, path: Path) -> Path:
         """Temporary path of the result that will be published at `path`."""
@@ -85,8 +86,11 @@ class Unpublished:
         return text.replace(str(self.place(comparator)), str(comparator)).replace(f"{self.folder.name}{os.sep}", "")
 
     def discard(self) -> None:
-        """Delete everything that was not published."""
+        """Delete everything that was not published, and a new output folder that nothing was published to."""
         shutil.rmtree(self.folder, ignore_errors=True)
+        if self._is_output_new:
+            with suppress(OSError):  # it is not empty
+                self._output.rmdir()
         with suppress(OSError):
             self.place(self._comparator).unlink(missing_ok=True)
 

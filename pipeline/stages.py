@@ -17,7 +17,7 @@ from pipeline.adjusting.network import anything_to_adjust, check_transformation
 from pipeline.adjusting.picture_turn import picture_turn
 from pipeline.archive.checked_results import Judging, measured_scans, read_measurement, stored_judging
 from pipeline.archive.made_from import adjusted_from, differing
-from pipeline.archive.results_database import Merged, Store, merge
+from pipeline.archive.results_database import Merged, Store, check_mergeable, merge
 from pipeline.archive.schema import DamagedError
 from pipeline.archive.status import archive_status
 from pipeline.archive.thumbnails import Thumbnails, ThumbnailStore
@@ -99,6 +99,7 @@ def run_measure(project: Project, reporter: Reporter, work: WorkOptions | None =
 def run_merge(project: Project, stores: Sequence[Path], reporter: Reporter) -> tuple[list[Merged], Summary]:
     """Merge the stores of shards into that of the project; if they hold all its scans, run the cross-scan checks and
     write comparator.csv."""
+    check_mergeable(project.measurement_path, stores)
     with Store(project.measurement_path) as store, ThumbnailStore(store.path) as thumbnails:
         taken = merge(store, stores)
         thumbnails.take(stores)

@@ -33,6 +33,11 @@ TERMS_TOGETHER = 2  # radial terms tested jointly
 FEWEST_DRIFTING = 4  # images that tell a drift from their scatter
 LEAST_CHANGE = 0.05  # of the distance
 NAMED = 5  # images named in a message, and points with their errors
+RICHER: dict[Transformation, tuple[Transformation, ...]] = {  # film deformation models tried for a simpler one
+    "congruent": ("similarity", "affine"),
+    "similarity": ("affine", "projective"),
+    "affine": ("projective", "polynomial(2)"),
+}
 ALIKE = 7.0  # difference of chi-square plus twice the unknowns below which two readings are not distinguished
 
 
@@ -309,13 +314,6 @@ def _scanner_pixels(run: Run) -> Iterator[ModelHypothesis]:
     problem = continued(run, replace(network, images=images, scanners=(scanner,)))
     words = _pixel_words(films[0].camera, 2.0 / half_mm)
     yield ModelHypothesis("pixels", words, problem, problem.unknowns.scanner[scanner.name])
-
-
-RICHER: dict[Transformation, tuple[Transformation, ...]] = {
-    "congruent": ("similarity", "affine"),
-    "similarity": ("affine", "projective"),
-    "affine": ("projective", "polynomial(2)"),
-}
 
 
 def film_deformations(run: Run) -> Iterator[ModelHypothesis]:

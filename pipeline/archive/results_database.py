@@ -334,19 +334,22 @@ class Merged(NamedTuple):
     damaged: int
 
 
+def check_mergeable(path: Path, others: Sequence[Path]) -> None:
+    """Raise InputError for a file that is no store, or the store at `path` itself, before anything is written."""
+    for other in others:
+        if not other.is_file() or not _begins_with(other, _SQLITE):
+            what = "is no" if other.exists() else "there is no such"
+            raise InputError(f"{other}: {what} results database. Name the out/measurement.K-of-N.db of each part.")
+        if other.resolve() == path.resolve():
+            raise InputError(f"{other}: is the results database that the others are joined into. Name the others only.")
+        Store(other).close()
+
+
 def merge(store: Store, others: Sequence[Path]) -> list[Merged]:
-    """Import the results that other stores hold and this one lacks.
+    """Import the results that other stores hold and this one lacks, after `check_mergeable`.
 
     Each store is imported completely or not at all. The others are not changed, except for migration to this version.
-    Raises InputError for a file that is no store, before anything is imported.
     """
-    for path in others:
-        if not path.is_file() or not _begins_with(path, _SQLITE):
-            what = "is no" if path.exists() else "there is no such"
-            raise InputError(f"{path}: {what} results database. Name the out/measurement.K-of-N.db of each part.")
-        if path.resolve() == store.path.resolve():
-            raise InputError(f"{path}: is the results database that the others are joined into. Name the others only.")
-        Store(path).close()
     merged = []
     for path in others:
         store.connection.execute("attach ? as other", (str(path),))

@@ -46,6 +46,7 @@ from adjust.functional_model.rotation import rotation_from_angles
 from adjust.quality.tested import Probabilities
 from adjust.solution.adjustment import adjust_unmodelled
 from adjust.solution.explanations import explain
+from adjust.solution.model_hypotheses import film_deformations
 
 QUICK = (
     "lens: no radial term",
@@ -398,6 +399,13 @@ def test_what_is_wrong_with_all_is_named(name: str) -> None:
     kind = BLUNDERS[name]
     sentences = blunder_sentences(kind.spoil(blunder_network(0, kind.oriented)))
     assert blunder_outcome(kind, sentences) == "named", sentences
+
+
+def test_richer_film_models_cost_the_unknowns_that_they_add() -> None:
+    """Two of a film from a similarity to an affine transformation, four to a projective one."""
+    run = adjust(BLUNDERS["sheared films held rigid"].spoil(blunder_network(0))).run
+    films = len(run.problem.network.images)
+    assert [len(each.added) for each in film_deformations(run)] == [2 * films, 4 * films]
 
 
 @parametrize_with_studies("options", [Options(), Options(robust="igg3")], quick=(1,))

@@ -287,14 +287,27 @@ def test_what_cannot_go_out_is_refused_with_its_reason(project: Path, tmp_path: 
     (tmp_path / "mine.txt").write_text("mine", encoding="utf-8")
     assert "holds something that is no export" in refusal("export", project, "csv", tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+    with pytest.raises(InputError, match=r"'a b' and 'a_b' would both be 'a_b'"):
+        _check_words(["a b", "c", "a b", "a_b"])
+
+
+def test_an_altered_or_stale_adjustment_is_refused_for_exports_and_rectified_scans(
+    project: Path, tmp_path: Path, refusal: Refusal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.resampling.resample_stage.read_measurement", lambda path: [])
     moved = copied(project.parent, tmp_path / "moved")
     adjusted = tmp_path / "moved" / "out" / "adjustment.json"
     content = json.loads(adjusted.read_text(encoding="utf-8"))
     content["cameras"]["K"]["principal_distance_mm"]["value"] += 1.0
     adjusted.write_text(json.dumps(content), encoding="utf-8")
     assert "is of another adjustment than" in refusal("export", moved, "opencv", tmp_path / "a")
-    with pytest.raises(InputError, match=r"'a b' and 'a_b' would both be 'a_b'"):
-        _check_words(["a b", "c", "a b", "a_b"])
+    assert "is of another adjustment than" in refusal("resample", moved, tmp_path / "a")
+    stale = copied(project.parent, tmp_path / "stale")
+    points = tmp_path / "stale" / "points.csv"
+    points.write_text(re.sub(r"(\d)\n", r"\g<1>1\n", points.read_text(encoding="utf-8")), encoding="utf-8")
+    for command_words in (("export", stale, "opencv"), ("resample", stale)):
+        assert "Run `reseau adjust` again" in refusal(*command_words, tmp_path / "a")
+    assert not (tmp_path / "a").exists()
 
 
 def test_a_strong_lens_is_refused_unless_requested(tmp_path: Path, refusal: Refusal) -> None:

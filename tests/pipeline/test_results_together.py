@@ -283,6 +283,15 @@ def test_what_is_no_result_is_left_alone(project: Path, refusal: Refusal, name: 
     assert (project / name).read_text(encoding="utf-8") == content
 
 
+def test_a_refused_command_leaves_no_output_folder(project: Path, refusal: Refusal) -> None:
+    shutil.rmtree(project / "out")
+    with (project / "comparator.csv").open("a", encoding="utf-8") as file:
+        file.write("a,b\n")
+    assert "comparator.csv, line" in refusal("adjust", project / "project.toml")
+    assert "is no results database" in refusal("merge", project / "project.toml", project / "camera.toml")
+    assert not (project / "out").exists()
+
+
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [

@@ -16,7 +16,7 @@ from projects import FOLDER, changed, comparator_points, content, failed, kept_r
 from measure import Code, Reason, Status
 from pipeline import InputError
 from pipeline.archive.checked_results import CheckedResult, Judging, Lot, find_judging, judge, judge_lots, latest
-from pipeline.archive.results_database import Store, merge
+from pipeline.archive.results_database import Store, check_mergeable
 from pipeline.archive.schema import MEASUREMENTS, opened
 from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_verdict
 from pipeline.provenance import content_hash, file_state, hash_text, parts_hash, result_key, shard_number
@@ -153,12 +153,12 @@ def test_what_is_no_store_is_refused(path: Path, tmp_path: Path) -> None:
             db.execute(f"pragma user_version = {version}")
         with pytest.raises(InputError, match=words):
             Store(path)
-    with Store(tmp_path / "a.db") as store:
-        (tmp_path / "camera.toml").write_text("name = 1", encoding="utf-8")
-        others = {"b.db": "there is no such results", "camera.toml": "is no results", "a.db": "joined into"}
-        for name, words in others.items():
-            with pytest.raises(InputError, match=words):
-                merge(store, [tmp_path / name])
+    Store(tmp_path / "a.db").close()
+    (tmp_path / "camera.toml").write_text("name = 1", encoding="utf-8")
+    others = {"b.db": "there is no such results", "camera.toml": "is no results", "a.db": "joined into"}
+    for name, words in others.items():
+        with pytest.raises(InputError, match=words):
+            check_mergeable(tmp_path / "a.db", [tmp_path / name])
 
 
 WRITER = """
