@@ -35,10 +35,8 @@ def check_repeated_views(scans: Sequence[MeasuredScan], is_board: bool, picture:
     """
     weights = {"target": 1.0} if is_board else {"fiducial": 1.0, "target": _TARGET_WEIGHT}
     marks = dict.fromkeys((mark.kind, mark.point) for scan in scans for mark in scan.frame.marks)
-    points, weight = (
-        {mark: at for at, mark in enumerate(marks)},
-        np.array([weights.get(kind, 0.0) for kind, _ in marks]),
-    )
+    points = {mark: at for at, mark in enumerate(marks)}
+    weight = np.array([weights.get(kind, 0.0) for kind, _ in marks])
     is_target = np.array([kind == "target" for kind, _ in marks], dtype=bool)
     sides_px = np.array([max(scan.width_px, scan.height_px, 1) for scan in scans])
     places = np.full((len(scans), len(points), 2), np.nan)  # from the centre, in sides, along the camera's axes

@@ -26,6 +26,7 @@ from projects import (
     Refusal,
     command,
     fiducial_tables,
+    present,
     replace_text,
     result_file,
     write_network_project,
@@ -78,7 +79,7 @@ def test_reference_case_through_files(name: str, tmp_path: Path) -> None:
 def full_name(parameter: str) -> str:
     """The name that a parameter of a case has in the adjustment: EO2.X0 is EO.2.X0, FID3.x is FID.C.3.x."""
     owner, name = parameter.split(".")
-    kind, id = re.fullmatch(r"([A-Z]+)(.*)", owner).groups()  # type: ignore[union-attr]
+    kind, id = present(re.fullmatch(r"([A-Z]+)(.*)", owner)).groups()
     return ".".join([kind, *["C"] * (kind in ("IO", "FID")), *[id] * bool(id), name])
 
 
