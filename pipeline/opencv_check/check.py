@@ -363,7 +363,8 @@ def _compare(
     together = solved.inseparable(camera.name)
     rows = tuple(row for row in rows if not together or row.name not in OPENCV_RADIAL)
     known |= {"rms_opencv_um": opencv.rms_um, "rows": rows}
-    if pictures is not None and _is_digital(adjustment, problem):
+    is_digital = _is_digital(adjustment, problem)
+    if pictures is not None and is_digital:
         known["corners_px"] = compare_corners(problem.images, pictures, calibrated)
     if opencv.rms_um > WORSE_RMS * rms_um + ROUNDINGS * opencv.rounding_um:
         raise _NotPossible(
@@ -382,8 +383,9 @@ def _compare(
         verdict, reason = _judge_departure(reason, _departures(adjustment, solved, camera))
     if together:
         reason += f" {enumeration(together)} cannot be separated: the radial terms are not compared one by one."
-    rms = f"The residuals are {opencv.rms_um:.2f} µm rms a point in OpenCV, {rms_um:.2f} µm here."
-    return verdict, f"{reason} {rms} {_notes(problem, opencv, sigmas_tell)}"
+    if not is_digital:  # whose pixels may have no size
+        reason += f" The residuals are {opencv.rms_um:.2f} µm rms a point in OpenCV, {rms_um:.2f} µm here."
+    return verdict, f"{reason} {_notes(problem, opencv, sigmas_tell)}"
 
 
 def _is_digital(adjustment: Adjustment, problem: BareProblem) -> bool:

@@ -218,7 +218,12 @@ def test_a_folder_of_pictures_gives_intrinsics_in_pixels(result: dict[str, Any],
     assert (enlarged < 1.5).all()
     assert covariance[4, 5] < -0.5 * sigmas[4] * sigmas[5]  # k1 and k2 take one another's place
     assert "distortion_model: plumb_bob" in (out / "camera-ros.yaml").read_text(encoding="utf-8")
-    assert re.search(r"fx = 520\.\d+ ± 0\.\d+ px", (out / "out" / "report.html").read_text(encoding="utf-8"))
+    report = (out / "out" / "report.html").read_text(encoding="utf-8")
+    assert re.search(r"fx = 520\.\d+ ± 0\.\d+ px", report)
+    checked_cy = re.search(r"<td>cy</td><td[^>]*>px</td><td[^>]*>([^<]*)</td>", report)
+    assert abs(float(present(checked_cy)[1]) - CENTER_PX[1]) < 2.0  # rows count downward here, too
+    assert "µm rms" not in report  # the pixels have no size
+    assert "fiducial marks in the images" not in report
 
 
 def test_the_chosen_lens_is_printed(result: dict[str, Any], calibrations: list[Calibration]) -> None:
