@@ -95,16 +95,15 @@ def present_frame(
 
     Notes
     -----
-    Measured marks become weak if the frame may be a false alarm or is faint, or if its names are ambiguous. If the
-    frame is more likely a false alarm than not, no mark is an observation.
+    Measured marks become weak if the frame may be a false alarm or is faint. If its names are ambiguous, or it is more
+    likely a false alarm than not, no mark is an observation.
     """
     if Code.NO_FRAME in chance.codes:
         places = zip(frame.layout.marks, frame.detections, frame.predicted_px, strict=True)
         marks = tuple(_unmeasured(mark.id, each, place, chance) for mark, each, place in places)
         return FrameMeasurement(frame.scan.name, marks, pose, problems=tuple(problems), weights=frame.weights)
     unnamed = next((problem for problem in problems if Code.AMBIGUOUS in problem.codes), NO_REASON)
-    weak = chance or unnamed
-    marks = tuple(_row(mark, index, frame, pose, weak) for index, mark in enumerate(frame.layout.marks))
+    marks = tuple(_row(mark, index, frame, pose, chance, unnamed) for index, mark in enumerate(frame.layout.marks))
     problems = (*problems, *_problems(frame, pitch_um))
     tone = replace(frame.tone, tone=frame.tone.tone.without_priors)
     notes = (frame.channel_note,) if frame.channel_note else ()
@@ -151,8 +150,9 @@ def _stretch(scan: Scan, wide_um: float, tall_um: float, pitch_um: tuple[float, 
     )
 
 
-def _row(mark: LayoutMark, index: int, frame: Frame, pose: Pose, weak: Reason) -> MarkMeasurement:
-    """Row of a mark. weak: why no mark of the frame counts as measured; empty if they may."""
+def _row(mark: LayoutMark, index: int, frame: Frame, pose: Pose, weak: Reason, unnamed: Reason) -> MarkMeasurement:
+    """Row of a mark. weak, unnamed: why no mark of the frame counts as measured, or as an observation; empty if they
+    may."""
     detection = frame.detections[index]
     fit = detection.fit
     if fit is None:
@@ -172,6 +172,8 @@ def _row(mark: LayoutMark, index: int, frame: Frame, pose: Pose, weak: Reason) -
             weak = _ASSUMED  # under another name its origin lies elsewhere
     if status is Status.MEASURED and weak:
         status, reason = Status.WEAK, weak
+    if status.is_observation and unnamed:
+        status, reason = Status.REJECTED, unnamed
     return MarkMeasurement(mark.id, "fiducial", fit.center_px, covariance, status, reason, {**quality, **fit.figures})
 
 

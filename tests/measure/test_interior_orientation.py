@@ -28,6 +28,7 @@ from measure.fiducials.rows import present_frame
 from measure.fiducials.scan_orientation import SPOILT, MarkSite, PosedMark, decide_pose
 from measure.fiducials.search import SearchResult
 from measure.fiducials.significance import doubt_frame
+from measure.flags import NO_REASON, Code, Reason
 from measure.geometry import POSES, UP_FROM_CAMERA
 from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, cross, dot
 from measure.marks.templates import cut, learn_template
@@ -331,6 +332,18 @@ def test_a_frame_that_chance_is_likelier_to_have_made_than_not_gives_no_observat
     for mark, place in zip(result.marks, centers_px(DOTS, "0"), strict=True):
         assert mark.center_px == pytest.approx(place, abs=5.0)
     assert result.pixel_from_camera is None
+
+
+def test_a_frame_whose_names_are_ambiguous_gives_no_observation() -> None:
+    """Any of its marks may be another's; their places are kept for the review."""
+    frame = make_frame_chance(make_scan(picture(DOTS, "0")), DOTS)
+    shifted = Reason("the constellation fits nearly as well shifted", Code.AMBIGUOUS)
+    for problems, status in (((), Status.MEASURED), ((shifted,), Status.REJECTED)):
+        result = present_frame(frame, Pose("0", False), (50.0, 50.0), problems, NO_REASON)
+        assert [mark.status for mark in result.marks] == [status] * 4
+        for mark, place in zip(result.marks, centers_px(DOTS, "0"), strict=True):
+            assert mark.center_px == pytest.approx(place, abs=0.1)
+    assert {mark.reason for mark in result.marks} == {shifted}
 
 
 def test_one_mark_and_the_places_of_the_others_tell_the_pose() -> None:
