@@ -24,12 +24,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.array_types import Array, Indices, Integers, Mask, Single
-from measure.flags import NO_REASON, Code, Reason
+from measure.flags import NO_REASON, Cause, Code, Reason
 from measure.matching.gauss_newton import UNDETERMINED, UNSETTLED
 from measure.matching.models import PIXEL_VARIANCE_PX2
 from measure.matching.window import ScanWindow
 from measure.noise.noise_model import covariance_along, influence_covariances
 from measure.noise.robust_estimation import gauss_newton_step, robust_scale, tukey_weights
+from measure.results import Covariance
+from measure.scans.jpeg import covariances_of_rounding
 
 Surface = Callable[[Single, Single, Single], tuple[Single, Single, Single, Single]]
 
@@ -135,7 +137,7 @@ class Corner:
 
     Attributes
     ----------
-    center_px, covariance_px2 : (2,) and (2, 2), by least-squares matching.
+    center_px, covariance : (2,) and of it, by least-squares matching.
     contrast_dn : grey value between the two steps minus that outside, negative if dark between them.
     noise_dn : standard deviation of one pixel's noise.
     blur_px : standard deviation of the blur.
@@ -147,7 +149,7 @@ class Corner:
     """
 
     center_px: Array
-    covariance_px2: Array
+    covariance: Covariance
     contrast_dn: float
     noise_dn: float
     blur_px: float
@@ -180,23 +182,28 @@ def _half_turned(picture: NDArray[Any], shift: Integers) -> NDArray[Any]:
 
 
 def fit_corners(
-    read: Callable[[int, int, int], ScanWindow], starts: Sequence[CornerStart], surface: Surface
+    read: Callable[[int, int, int], ScanWindow],
+    starts: Sequence[CornerStart],
+    surface: Surface,
+    rounding_step_dn: float = 0.0,
 ) -> list[Corner]:
     """Fit all corners of a board at once. read: returns the square window with the given first column, first row and
-    side, px; surface: `crossing` or `quarter`."""
+    side, px; surface: `crossing` or `quarter`; rounding_step_dn: of the scan."""
     if not starts:
         return []
     half = max(start.half_px for start in starts)
     firsts = [np.round(start.center_px).astype(int) - half for start in starts]
     windows = [read(int(col), int(row), 2 * half + 1) for col, row in firsts]
-    return _CornerFits(windows, starts, surface).run()
+    return _CornerFits(windows, starts, surface, rounding_step_dn).run()
 
 
 class _CornerFits:
     """Adjustments of n corners in progress. Arrays over pixels are (n, p): p candidate pixels of each corner."""
 
-    def __init__(self, windows: Sequence[ScanWindow], starts: Sequence[CornerStart], surface: Surface) -> None:
-        self.windows, self.surface = windows, surface
+    def __init__(
+        self, windows: Sequence[ScanWindow], starts: Sequence[CornerStart], surface: Surface, rounding_step_dn: float
+    ) -> None:
+        self.windows, self.surface, self.rounding_step_dn = windows, surface, rounding_step_dn
         self.origin = np.array([window.origin_px for window in windows], float)
         self.start = np.array([start.center_px for start in starts], float) - self.origin
         self.reach = np.array([start.reach_px for start in starts], float)
@@ -270,13 +277,17 @@ class _CornerFits:
         used &= design[:, _SHAPE_UNKNOWNS + 1] != 0  # the offset's derivative is 0 for clipped pixels only
         weighted = design * self.weights[:, None]
         normal = (weighted @ design.swapaxes(1, 2)).astype(float)
-        influence = np.linalg.pinv(normal, hermitian=True)[:, :2].astype(np.float32) @ weighted
+        influence = self._pictures(np.linalg.pinv(normal, hermitian=True)[:, :2].astype(np.float32) @ weighted)
         covariances, variances = influence_covariances(
-            self._pictures(influence), self._pictures(residuals), self._pictures(used), self.unknowns
+            influence, self._pictures(residuals), self._pictures(used), self.unknowns
         )
         covariances = (covariances + covariances.swapaxes(1, 2)) / 2
         shared_dn2 = self._structure_dn2(self._pictures(area > 0))
         fails = np.array([bool(reason) for reason in self.reasons]) | (used.sum(axis=1) <= self.unknowns)
+        losses = np.zeros_like(covariances)
+        if self.rounding_step_dn:
+            fitted = self._pictures(self.grey - residuals)
+            losses = covariances_of_rounding(influence, fitted, self.origin, self.rounding_step_dn)
         covariances[fails], noise_dn = np.inf, np.where(fails, np.nan, np.sqrt(variances))
         rounding_dn = np.finfo(np.float32).eps * np.abs(self.linear[:, 1])  # for a uniform window without noise
         faint = ~fails & ~(np.abs(self.linear[:, 0]) > 2 * np.maximum(noise_dn, rounding_dn))
@@ -292,7 +303,7 @@ class _CornerFits:
         return [
             Corner(
                 center_px=self.center[number] + self.origin[number],
-                covariance_px2=covariances[number],
+                covariance=Covariance.from_noise(covariances[number]).plus(Cause.COMPRESSION, losses[number]),
                 contrast_dn=2 * float(self.linear[number, 0]),
                 noise_dn=float(noise_dn[number]),
                 blur_px=float(np.sqrt(max(self.variance[number] - PIXEL_VARIANCE_PX2, 0.0))),

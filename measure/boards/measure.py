@@ -207,7 +207,7 @@ def _fit_found(scan: Scan, found: Mapping[str, FoundCorner], spec: BoardSpec) ->
         return ScanWindow(scan.window(*place_px), (col, row), scan.inside(*place_px, is_read=True), sides)
 
     surface: Surface = quarter if stands_alone else crossing
-    return dict(zip(found, fit_corners(read, starts, surface), strict=True))
+    return dict(zip(found, fit_corners(read, starts, surface, scan.rounding_step_dn), strict=True))
 
 
 def _reach_px(sides_px: Array, spec: BoardSpec, board_reach_px: float) -> Array:
@@ -281,9 +281,7 @@ def _corner_mark(name: str, corner: Corner | None, missing: Reason) -> MarkMeasu
         share = f"{100 * corner.misfit:.0f} % of its contrast"
         reason = Reason(f"a shadow, dirt or other edges about it: they leave {share} unexplained", Code.COVERED)
     status = Status.WEAK if reason else Status.MEASURED
-    return MarkMeasurement(
-        name, "target", corner.center_px, Covariance.from_noise(corner.covariance_px2), status, reason, quality
-    )
+    return MarkMeasurement(name, "target", corner.center_px, corner.covariance, status, reason, quality)
 
 
 def one_definition(pictures: Sequence[Sequence[MarkMeasurement]]) -> tuple[tuple[MarkMeasurement, ...], ...]:

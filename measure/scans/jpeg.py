@@ -32,11 +32,11 @@ import imagecodecs
 import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
-from scipy.fft import dct
+from scipy.fft import dct, dctn
 from scipy.special import ndtri, stdtrit
 from tifffile import TiffFile, TiffPage
 
-from measure.array_types import Array
+from measure.array_types import Array, Single
 from measure.errors import MeasurementError
 from measure.flags import JPEG_GRID, JPEG_STEP
 from measure.scans.cache import OpenedPicture, WholePicture
@@ -362,6 +362,37 @@ def covariance_of_compression(rounding_step_dn: float, contrast_dn: float) -> Ar
     """(2, 2) px2: what a scan's compression adds to the covariance of a mark of that contrast."""
     lost = min(_LOST_PX * (rounding_step_dn / max(abs(contrast_dn), 1e-9)) ** 2, _MOST_LOST_PX)
     return np.asarray(lost**2 * np.eye(2))
+
+
+def covariances_of_rounding(influences: Single, pictures: Single, origins_px: Array, rounding_step_dn: float) -> Array:
+    """What the rounding of cosine coefficients adds to covariances of linear estimates.
+
+    Where edges are sharp against the steps, its errors look like their shifts, so that residuals do not show them. An
+    error is uniform over a step; of smaller coefficients, which are rounded to 0, it is the coefficient.
+
+    Parameters
+    ----------
+    influences : (n, 2, height, width) derivatives of n estimates by their pixels.
+    pictures : (n, height, width) grey values.
+    origins_px : (n, 2) column and row of the first pixel, from where the blocks begin.
+    rounding_step_dn : mean step of coarse detail.
+
+    Returns
+    -------
+    (n, 2, 2) covariances.
+    """
+    images = np.concatenate([influences, pictures[:, None]], axis=1)
+    number, kinds, height, width = images.shape
+    blocks = -(-(max(height, width) + BLOCK_PX - 1) // BLOCK_PX)
+    padded = np.zeros((number, kinds, blocks * BLOCK_PX, blocks * BLOCK_PX), np.float32)
+    for own, image, (col, row) in zip(padded, images, origins_px.astype(int) % BLOCK_PX, strict=True):
+        own[:, row : row + height, col : col + width] = image
+    by_block = padded.reshape(number, kinds, blocks, BLOCK_PX, blocks, BLOCK_PX)
+    *along, pictured = np.moveaxis(dctn(by_block, axes=(3, 5), norm="ortho"), 1, 0)
+    errors = np.minimum(np.abs(pictured), rounding_step_dn / np.sqrt(12))
+    shifts = np.stack(along, axis=1) * errors[:, None]
+    flat = shifts.reshape(number, 2, -1)
+    return np.asarray(flat @ flat.swapaxes(1, 2), float)
 
 
 def tone_variance(rounding_step_dn: float, contrast_dn: float) -> float:

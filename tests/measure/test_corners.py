@@ -1,5 +1,6 @@
 """Corners against pictures drawn by brute force, and the closed form against scipy's bivariate normal."""
 
+import cv2
 import numpy as np
 import pytest
 from drawn import draw, transformed, whitened
@@ -11,6 +12,7 @@ from studies import parametrize_with_studies
 from measure import ScanWindow
 from measure.array_types import Single
 from measure.boards.corners import Corner, CornerStart, Surface, crossing, fit_corners, quarter
+from measure.scans.jpeg import rounding_step_dn
 
 Array = NDArray[np.float64]
 SIZE, NOISE, CONTRAST = 25, 4.0, 100.0
@@ -57,7 +59,7 @@ def square_picture(center: Array, steps: Array, blur_px: float, alone: bool) -> 
     return 50 + CONTRAST * draw(light, SIZE, SIZE, blur_px)
 
 
-def fit_mark(window: Array, start: Array, steps: Array, alone: bool) -> Corner:
+def fit_mark(window: Array, start: Array, steps: Array, alone: bool, rounding_step_dn: float = 0.0) -> Corner:
     outside = 4  # pixels that are none of the picture
     grey, valid = np.pad(window, outside), np.pad(np.ones(window.shape, bool), outside)
 
@@ -66,7 +68,7 @@ def fit_mark(window: Array, start: Array, steps: Array, alone: bool) -> Corner:
         return ScanWindow(grey[part], (col, row), valid[part])
 
     starts = [CornerStart(start, steps, np.array([6.0, 6.0]))]
-    return fit_corners(read, starts, quarter if alone else crossing)[0]
+    return fit_corners(read, starts, quarter if alone else crossing, rounding_step_dn)[0]
 
 
 @parametrize_with_studies(("blur_px", "alone"), [(0.5, False), (0.9, False), (1.5, False), (0.8, True)], quick=(1,))
@@ -80,10 +82,27 @@ def test_errors_are_as_large_as_their_sigmas_say(blur_px: float, alone: bool) ->
             noisy = clean + rng.normal(0, NOISE, clean.shape)
             corner = fit_mark(noisy, center + rng.normal(0, 0.3, 2), steps, alone)
             assert not corner.reason
-            errors.append(whitened(corner.center_px - center, corner.covariance_px2))
+            errors.append(whitened(corner.center_px - center, corner.covariance.px2))
             assert corner.noise_dn == pytest.approx(NOISE, rel=0.35)
     assert 0.83 < np.sqrt(np.mean(np.square(errors))) < 1.17  # 96 numbers: 7.2 % standard deviation
     assert np.abs(np.mean(errors, axis=0)).max() < 0.4  # 2.8 standard deviations
+
+
+@pytest.mark.parametrize(("quality", "alone"), [(5, False), (20, True)])
+def test_what_jpeg_does_to_edges_is_in_the_standard_deviations(quality: int, alone: bool) -> None:
+    """Residuals alone make them 2.5 and 2.3 times too small."""
+    rng, errors = np.random.default_rng(5), []
+    for _ in range(50):
+        center, steps = SIZE // 2 + rng.uniform(-4, 4, 2), board_steps(rng)
+        clean = square_picture(center, steps, 0.8, alone)
+        noisy = np.rint(clean + rng.normal(0, 1.0, clean.shape)).astype(np.uint8)
+        stored = cv2.imencode(".jpg", noisy, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+        grey = np.asarray(cv2.imdecode(stored, cv2.IMREAD_GRAYSCALE), float)
+        corner = fit_mark(grey, center, steps, alone, rounding_step_dn(stored.tobytes()))
+        if not corner.reason:
+            errors.append(whitened(corner.center_px - center, corner.covariance.px2))
+    assert len(errors) >= 45
+    assert 0.75 < np.sqrt(np.mean(np.square(errors))) < 1.25  # 90 numbers: 7.5 % standard deviation
 
 
 @pytest.mark.parametrize("blur_px", [0.5, 1.5])
