@@ -167,9 +167,10 @@ def absolute_orientation(model: Array, known: Array, stations: Array) -> Similar
 
     Notes
     -----
-    Scale and shift are linear for a given rotation; so the rotation is optimised from starts all over the rotation
-    group. A minimal datum, for example two points and the height of a third, has two solutions, rotated around the line
-    through the two points. The one with the cameras higher above the points is taken.
+    Where points are known whole, the rotation has a closed form (W. Kabsch 1976). Otherwise scale and shift are linear
+    for a given rotation; so the rotation is optimised from starts all over the rotation group. A minimal datum, for
+    example two points and the height of a third, has two solutions, rotated around the line through the two points. The
+    one with the cameras higher above the points is taken.
     """
     from scipy.optimize import least_squares  # takes longer to import than most adjustments
 
@@ -177,6 +178,9 @@ def absolute_orientation(model: Array, known: Array, stations: Array) -> Similar
     if given.sum() < 7 or not given.any(axis=0).all():
         return None
     target = _centred(known, given)
+    if (given.all(axis=1) == given.any(axis=1)).all():
+        rotation = _closed_rotation(_centred(model, given), target)
+        return None if rotation is None else _similarity(rotation, model, known, given)
     starts = Rotation.from_quat(np.random.default_rng(0).normal(size=(STARTS, 4))).as_matrix()  # uniform over SO(3)
     costs = np.array([(_misfit(start, model, target, given) ** 2).sum() for start in starts])
     found: list[tuple[float, bool, Array]] = []
@@ -242,6 +246,14 @@ def _centred(xyz: Array, given: Mask) -> Array:
     """Coordinates reduced by the mean of the given ones, axis by axis; 0 where not given."""
     mean = np.where(given, xyz, 0.0).sum(axis=0) / given.sum(axis=0)
     return np.where(given, xyz - mean, 0.0)
+
+
+def _closed_rotation(model: Array, target: Array) -> Array | None:
+    """Rotation (3, 3) from centred points of the model to the same in the object; None where these lie on a line."""
+    u, strength, vt = np.linalg.svd(target.T @ model)
+    proper = np.array([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)])
+    is_determined = proper[1:] @ strength[1:] > SINGULAR**2 * strength[0]
+    return (u * proper) @ vt if is_determined else None
 
 
 def _misfit(rotation: Array, model: Array, target: Array, given: Mask) -> Array:

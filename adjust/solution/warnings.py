@@ -63,8 +63,8 @@ def _termination(run: Run) -> Iterator[str]:
     termination = run.solution.termination
     if termination == "iteration limit":
         yield (
-            f"The iteration did not stand still within {len(run.solution.history)} steps: the values are not final. "
-            f"The largest residuals are those of {_largest_residuals(run)}."
+            f"The iteration did not stand still within {len(run.solution.history)} steps: the values are not final."
+            + (f" The largest residuals are those of {_largest_residuals(run)}." if _some_gross(run) else "")
         )
     if termination == "diverged":
         yield (
@@ -77,6 +77,11 @@ def _termination(run: Run) -> Iterator[str]:
             f"The weights did not settle within {ROUNDS} rounds of robust estimation, variance components or data "
             f"snooping."
         )
+
+
+def _some_gross(run: Run) -> bool:
+    # Along a flat valley an iteration does not end either: there small residuals would only mislead.
+    return bool(_is_gross(run.numbering.problem.network.observations, run.end.v_mm).any())
 
 
 def _largest_residuals(run: Run) -> str:

@@ -141,12 +141,12 @@ def measure_archive(
         input_hash = hash_inputs(tasks, work, copies, made)
         before = latest(store)
         if before is not None and before.input == input_hash:
-            tell_inapplicable(learned, before, work)
+            tell_inapplicable(learned, before, work.decisions, work.counting)
             return before
         share = partial(tie_scans, learned, reporter=reporter, executor=executor)
         lots = check_lots(learned, tasks, work, copies, share, input_hash)
         judging = judge_lots(store, made, input_hash, lots)
-        tell_inapplicable(learned, judging, work)
+        tell_inapplicable(learned, judging, work.decisions, work.counting)
         return judging
 
 

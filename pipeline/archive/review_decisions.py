@@ -5,7 +5,6 @@ import json
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,9 +23,6 @@ from pipeline.text.wording import did_you_mean
 _MEASURED = (Choice.PLACE, Choice.POSE, Choice.UNDO)  # decisions that change the measurement
 KeyOf = Callable[[ScanTask], str]
 PoseOf = Callable[[str], str | None]
-if TYPE_CHECKING:
-    from pipeline.archive.work import Work
-
 _INAPPLICABLE = "decisions that do not apply"
 _NAMED = 10
 
@@ -164,9 +160,15 @@ def _apply_to_mark(mark: MarkMeasurement, decision: Decision | None) -> MarkMeas
     return mark
 
 
-def tell_inapplicable(project: Project, judging: Judging, work: "Work") -> None:
-    """Store messages about the decisions that a judging could not apply."""
-    lines = sorted([*unknown_images(project), *_known_images(project, judging, work)])
+def tell_inapplicable(
+    project: Project,
+    judging: Judging,
+    decisions: Mapping[str, Sequence[Decision]],
+    counting: Mapping[str, Mapping[About, Decision]],
+) -> None:
+    """Store messages about the decisions that a judging could not apply. decisions, counting: by image, all, and those
+    in force."""
+    lines = sorted([*unknown_images(project), *_known_images(project, judging, decisions, counting)])
     messages = [f"line {number}: {why}" for number, why in lines]
     judging.store.remember(_INAPPLICABLE, {"digest": judging.digest, "lines": messages})
 
@@ -195,9 +197,14 @@ def unknown_images(project: Project) -> Iterator[tuple[int, str]]:
             yield one.line, f"the project has no image {one.image!r}.{hints.get(one.image, '')}"
 
 
-def _known_images(project: Project, judging: Judging, work: "Work") -> Iterator[tuple[int, str]]:
+def _known_images(
+    project: Project,
+    judging: Judging,
+    every: Mapping[str, Sequence[Decision]],
+    counting: Mapping[str, Mapping[About, Decision]],
+) -> Iterator[tuple[int, str]]:
     """Yield (line, message) for decisions about images of the project that have no effect."""
-    decisions = {image: own for image, own in work.decisions.items() if image in project.scans}
+    decisions = {image: own for image, own in every.items() if image in project.scans}
     marks = defaultdict[str, dict[tuple[str, str], bool]](dict)
     query = (
         "select image, point, kind, causes is not null from checked_mark "
@@ -207,7 +214,7 @@ def _known_images(project: Project, judging: Judging, work: "Work") -> Iterator[
     for image, *mark, is_measured in rows:
         marks[image][mark[0], mark[1]] = bool(is_measured)
     for image, own in decisions.items():
-        yield from _idle_lines(own, work.counting[image], marks[image])
+        yield from _idle_lines(own, counting[image], marks[image])
 
 
 def _idle_lines(

@@ -150,7 +150,8 @@ def _measure(task: ScanTask, scan: Scan, options: ScanOptions) -> MeasuredScan:
     if misplaced := misplaced_principal_point(options.camera, measured):
         measured = measured.changed(problems=[Reason(misplaced, Code.OFF_GIVEN)])
     registered = scan.replace_weights(frame.weights) if frame.weights and frame.notes else scan
-    measured = measure_targets(options, registered, measured)
+    if options.targets is not None:
+        measured = measure_targets(options.targets, options.camera, options.exterior, registered, measured)
     return replace(measured, frame=with_damage(scan, measured.frame))
 
 

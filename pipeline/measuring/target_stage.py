@@ -7,6 +7,7 @@ import numpy as np
 
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
+from adjust.problem.network import Exterior
 from measure.boards.measure import measure_board
 from measure.boards.specs import BoardSpec
 from measure.flags import Code, Reason
@@ -14,10 +15,10 @@ from measure.results import ON_FILM, MarkMeasurement
 from measure.scans.scan import Scan
 from measure.targets.identification import TargetPrediction
 from pipeline.errors import InputError
+from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
 from pipeline.measuring.coded_targets import CodedPoints, measure_coded_field, measure_sheet
-from pipeline.measuring.scan_task import ScanOptions
 from pipeline.measuring.target_field import (
     LEAST_DIAMETER_PX,
     Field,
@@ -100,19 +101,20 @@ def _check(project: Project, settings: TargetSettings, field: Field) -> None:
     check_spacing(project, field)
 
 
-def measure_targets(options: ScanOptions, scan: Scan, measured: MeasuredScan) -> MeasuredScan:
-    """Measure the targets of a scan, in addition to its fiducials: one mark for each target that could be in it."""
-    sought = options.targets
-    if sought is None:
-        return measured
+def measure_targets(
+    sought: SoughtTargets, camera: CameraFile, exterior: Exterior | None, scan: Scan, measured: MeasuredScan
+) -> MeasuredScan:
+    """Measure the targets of a scan, in addition to its fiducials: one mark for each target that could be in it.
+
+    exterior: approximate exterior orientation for the identification of targets.
+    """
     if sought.settings.board is not None:
         return _board(sought, sought.settings.board, scan, measured)
     if sought.coded is not None and sought.coded.is_flat:
         return replace_targets(measured, *measure_sheet(scan, sought.coded))
     if sought.coded is not None:
-        field, camera = sought.field, options.camera
-        return replace_targets(measured, *measure_coded_field(scan, sought.coded, field, camera, measured))
-    named, notes = _named(options, sought, scan, measured)
+        return replace_targets(measured, *measure_coded_field(scan, sought.coded, sought.field, camera, measured))
+    named, notes = _named(sought, camera, exterior, scan, measured)
     if isinstance(named, str):
         absent = absent_targets(sought.field.ids, named)
         return replace_targets(measured, absent, (*notes, f"No target has a name: {named}."))
@@ -146,16 +148,16 @@ def replace_targets(
 
 
 def _named(
-    options: ScanOptions, sought: SoughtTargets, scan: Scan, measured: MeasuredScan
+    sought: SoughtTargets, camera: CameraFile, exterior: Exterior | None, scan: Scan, measured: MeasuredScan
 ) -> tuple[NamedField | str, tuple[str, ...]]:
     """Identify the targets by the approximate orientation, else by the field's pattern, or tell why not; notes."""
-    camera, field, exterior, notes = options.camera, sought.field, options.exterior, tuple[str, ...]()
+    field, notes = sought.field, tuple[str, ...]()
     model = camera_model(camera, measured)
     if isinstance(model, str):
         return model, ()
     if exterior is not None and camera.principal_distance_mm is not None:
         approximate = replace(model, rotation=rotation_from_angles(exterior.values[3:]), station=exterior.center)
-        named = _named_by_orientation(approximate, options, sought, scan, measured)
+        named = _named_by_orientation(approximate, sought, camera, scan, measured)
         if isinstance(named, NamedField):
             return named, ()
         notes = (f"Its orientation in images.csv was not used to name the targets: {named}.",)
@@ -186,7 +188,7 @@ def _diameters_px(predictions: Sequence[TargetPrediction], measured: MeasuredSca
 
 
 def _named_by_orientation(
-    approximate: ImageModel, options: ScanOptions, sought: SoughtTargets, scan: Scan, measured: MeasuredScan
+    approximate: ImageModel, sought: SoughtTargets, camera: CameraFile, scan: Scan, measured: MeasuredScan
 ) -> NamedField | str:
     """Identify the targets by the pattern that an approximate orientation predicts; or the reason of the failure."""
     field = sought.field
@@ -199,7 +201,7 @@ def _named_by_orientation(
     row = {id: i for i, id in enumerate(field.ids)}
     pattern = recognise(predicted, found, float(np.hypot(measured.width_px, measured.height_px)) / 2.0)
     codes = {candidate: row[predictions[target].point] for candidate, target in pattern.items()}
-    named = name_field(field, approximate, options.camera, measured, strongest, codes) if codes else ""
+    named = name_field(field, approximate, camera, measured, strongest, codes) if codes else ""
     if isinstance(named, NamedField):
         return named
     chance = ", except for possible false alarms" if named else ""

@@ -2,11 +2,10 @@
 
 import math
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,9 +22,6 @@ from pipeline.results.measured_record import MeasuredScan
 from pipeline.results.stage_files import Check
 from pipeline.results.thumbnail import Thumbnail
 from pipeline.types import Array
-
-if TYPE_CHECKING:
-    from pipeline.report.load import FrameTotals
 
 MarkKey = tuple[str, str, str]  # image, kind, point
 _SENTENCE = re.compile(r"(?<=[.:]) (?=[A-Z])")
@@ -65,6 +61,26 @@ class Problem:
 
 
 @dataclass(frozen=True)
+class FrameTotals:
+    """Totals of all frames, for a report that does not show all of them.
+
+    Attributes
+    ----------
+    marks : number of marks by image and status.
+    of_targets : number of marks other than fiducials, by kind and status.
+    verdicts : number of frames by (camera, kind of file) and verdict.
+    problems : those of most frames first.
+    places_px : distinct positions of the observed marks by axis, see `frame_problems.places_px`.
+    """
+
+    marks: Mapping[str, Counter[str]]
+    of_targets: Mapping[tuple[str, str], int]
+    verdicts: Mapping[tuple[str, str], Counter[str]]
+    problems: tuple[Problem, ...]
+    places_px: Mapping[str, Array]
+
+
+@dataclass(frozen=True)
 class ReportData:
     """Input of a report.
 
@@ -95,7 +111,7 @@ class ReportData:
     made_from: Mapping[str, str] = field(default_factory=dict)
     unit: str = "m"
     given_by: Mapping[str, str] = field(default_factory=dict)
-    totals: "FrameTotals | None" = None
+    totals: FrameTotals | None = None
 
     @property
     def is_film_alone(self) -> bool:

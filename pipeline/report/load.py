@@ -5,7 +5,6 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from heapq import nsmallest
 from operator import itemgetter
 from pathlib import Path
@@ -31,7 +30,7 @@ from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.provenance import hash_file
 from pipeline.publishing import outside_note
-from pipeline.report.data import Frame, Problem, ReportData, frames
+from pipeline.report.data import Frame, FrameTotals, Problem, ReportData, frames
 from pipeline.report.frame_problems import (
     Gathered,
     centers_px,
@@ -54,7 +53,6 @@ from pipeline.results.comparator_file import (
 from pipeline.results.measured_record import FailureCode, MeasuredScan
 from pipeline.results.stage_files import read_check
 from pipeline.text.wording import counted, did_you_mean, listed
-from pipeline.types import Array
 
 MOST_FRAMES = 200  # largest number of frames shown with their marks
 _MOST_PROBLEMS = 50  # largest number of different problems listed
@@ -64,16 +62,8 @@ _OBSERVED = {str(status) for status in Status if status.is_observation}
 
 
 @dataclass
-class FrameTotals:
-    """Totals of all frames, for a report that does not show all of them.
-
-    Attributes
-    ----------
-    marks : number of marks by image and status.
-    of_targets : number of marks other than fiducials, by kind and status.
-    verdicts : number of frames by (camera, kind of file) and verdict.
-    centers_px : columns and rows of the observed marks.
-    """
+class _FrameCounts:
+    """Counts of frames for their `FrameTotals`. centers_px: columns and rows of the observed marks."""
 
     marks: dict[str, Counter[str]] = field(default_factory=dict)
     of_targets: Counter[tuple[str, str]] = field(default_factory=Counter)
@@ -81,14 +71,10 @@ class FrameTotals:
     gathered: Gathered = field(default_factory=dict)
     centers_px: "array[float]" = field(default_factory=lambda: array("d"))
 
-    @cached_property
-    def problems(self) -> tuple[Problem, ...]:
-        return tuple(_listed(self.gathered))
-
-    @cached_property
-    def places_px(self) -> Mapping[str, Array]:
-        """Distinct positions of the observed marks by axis, see `frame_problems.places_px`."""
-        return places_apart(np.array(self.centers_px))
+    @property
+    def totals(self) -> FrameTotals:
+        places = places_apart(np.array(self.centers_px))
+        return FrameTotals(self.marks, self.of_targets, self.verdicts, tuple(_listed(self.gathered)), places)
 
     def add(self, frame: Frame, kind: tuple[str, str], verdict: Verdict, problems: Iterable[Problem]) -> None:
         self.verdicts[kind][verdict] += 1
@@ -128,9 +114,9 @@ def reduced(
     stored : stored marks, of whose frames without problems only columns are read; data.comparator then holds all other
         frames.
     """
-    totals = FrameTotals()
+    counts = _FrameCounts()
     if stored is not None:
-        totals.add_plain(stored, image_camera)
+        counts.add_plain(stored, image_camera)
     suspect = {row.image for row in suspect_rows(data.adjustment)} if data.adjustment else set[str]()
 
     def frames_to_show() -> Iterator[tuple[tuple[float, float], ReportData]]:
@@ -139,7 +125,7 @@ def reduced(
             (frame,) = frames(one)
             verdict, problems = frame.verdict, list(single_frame_problems(frame))
             kind = image_camera(frame.image), _ending(frame.scan.scan) if frame.scan else "given"
-            totals.add(frame, kind, verdict, problems)
+            counts.add(frame, kind, verdict, problems)
             if problems or verdict.needs_review or frame.image in suspect:
                 largest_w = max((abs(mark.w or 0.0) for mark in frame.marks), default=0.0)
                 yield (-_BEST_FIRST.index(verdict), -largest_w), one
@@ -149,7 +135,7 @@ def reduced(
         data,
         comparator=[row for one in shown for row in one.comparator],
         measurement={name: scan for one in shown for name, scan in (one.measurement or {}).items()},
-        totals=totals,
+        totals=counts.totals,
     )
 
 

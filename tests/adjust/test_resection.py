@@ -122,7 +122,7 @@ def model_in_space(rng: np.random.Generator) -> tuple[Array, Array, Array, Array
     )
 
 
-@parametrize_with_studies("datum", ["all", "minimal", "planimetry and three heights"], quick=(1,))
+@parametrize_with_studies("datum", ["all", "minimal", "planimetry and three heights"], quick=(0, 1))
 def test_absolute_orientation_recovers_the_object_space(datum: str) -> None:
     rng = np.random.default_rng(6)
     for _ in range(4):
