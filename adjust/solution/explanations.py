@@ -17,14 +17,15 @@ on those of the given points, makes every group of observations agree, and expla
 Nothing is reported unless all that is reported removes more than half of the excess of v'Pv over its redundancy.
 
 Where a standard deviation of unmodelled errors was estimated from the residuals, v'Pv equals its redundancy whatever
-the model lacks, and errors are correlated within an image. A hypothesis then has to remove LEAST_SHARE of v'Pv, and two
-groups of images must be clearer than a normal scatter of the images' interior orientations makes them.
+the model lacks. A hypothesis then has to remove more than half of what is unmodelled; or, where errors are correlated
+within images, LEAST_SHARE of v'Pv, and groups of images must be clearer than a normal scatter of the images' interior
+orientations makes them, principal distances of their own scatter more than principal points.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import chain
+from itertools import chain, product
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -52,10 +53,9 @@ SUSPECTED = 0.05  # p-value of v'Pv below which wrong points are sought
 CHECKED = 10  # smallest redundancy for an explanation
 ROUNDS = 3  # rounds of explanations, each in addition to those before
 MOST_ADJUSTED = 4  # hypotheses adjusted per round
-LEFT = 0.5  # fraction of the excess of v'Pv over its redundancy that may remain
+LEFT = 0.5  # fraction of the excess of v'Pv over its redundancy, or of what is unmodelled, that may remain
 WORTH = 0.3  # fraction of the largest first-order decrease above which a hypothesis is adjusted
 STEPS = 40  # images of another pitch need about 20
-GROUP_SHARE = 0.5  # of v'Pv; curled edges of real boards remove up to 0.3 as points beside a line
 LEAST_SHARE = 0.05  # of v'Pv; further lens terms remove up to 0.02 on real boards
 TURNS = 8  # adjustments, each with the variance of the one before
 FEWEST = 30  # coordinates needed to test the distribution of residuals
@@ -85,16 +85,16 @@ class Explanation:
 
 
 def explain(
-    run: Run, redundancy: int, probabilities: Probabilities, is_noise_fitted: bool = False
+    run: Run, redundancy: int, probabilities: Probabilities, unmodelled: float = 0.0
 ) -> tuple[tuple[Explanation, ...], Run]:
     """Explanations of residuals larger than the given standard deviations, largest first, and a run that includes them.
 
-    There are none where the adjustment has no solution. is_noise_fitted: whether the standard deviation of unmodelled
-    errors was estimated from the residuals.
+    There are none where the adjustment has no solution. unmodelled: share of the variance of the marks that was
+    estimated from the residuals.
     """
     if not (run.converged and run.is_tested and redundancy >= CHECKED):
         return (), run
-    first = last = _Model(run, redundancy, probabilities, is_noise_fitted)
+    first = last = _Model(run, redundancy, probabilities, unmodelled)
     found: list[Explanation] = []
     for _ in range(ROUNDS):
         if found and not last.exceeds(probabilities.family):
@@ -122,14 +122,14 @@ def explain(
 class _Model:
     """An adjustment, and its agreement with the observations, with and without gross errors.
 
-    is_noise_fitted: see `explain`. has_suspects: whether to search for gross errors; not done where the simpler model
+    unmodelled: see `explain`. has_suspects: whether to search for gross errors; not done where the simpler model
     has none. hypothesis: addition to the simpler model; p: p-value of the decrease of v'Pv.
     """
 
     run: Run
     redundancy: int
     probabilities: Probabilities
-    is_noise_fitted: bool = False
+    unmodelled: float = 0.0
     has_suspects: bool = True
     hypothesis: ModelHypothesis | None = None
     p: float = 1.0
@@ -167,14 +167,24 @@ class _Model:
         return vpv / variance + 2.0 * (self.redundancy - redundancy + chosen_from)
 
     @property
+    def kind(self) -> str:
+        """Kind of the hypothesis, empty without one."""
+        return self.hypothesis.kind if self.hypothesis else ""
+
+    @property
     def costs(self) -> float:
         """Cost of the unknowns and the choice of the hypothesis."""
         return 2.0 * (len(self.hypothesis.added) + self.hypothesis.selection.choices) if self.hypothesis else 0.0
 
     def is_significant(self, hypothesis: ModelHypothesis, fall: float, level: float) -> bool:
         """Whether a decrease of v'Pv is significant, and larger than errors correlated within images cause."""
-        share = GROUP_SHARE if hypothesis.name == "group" else LEAST_SHARE
-        is_large = not self.is_noise_fitted or (fall > share * self.vpv and hypothesis.selection.p_scatter() < LEVEL)
+        by_chance = len(hypothesis.added) * self.variance
+        is_large = fall - by_chance > LEFT * self.unmodelled * self.vpv or (
+            # Curled edges of real boards remove up to 0.3 as points beside a line.
+            hypothesis.name != "group"
+            and fall - by_chance > LEAST_SHARE * self.vpv
+            and hypothesis.selection.p_scatter() < LEVEL
+        )
         return is_large and self.probability(hypothesis, fall) < level
 
     def probability(self, hypothesis: ModelHypothesis, fall: float) -> float:
@@ -205,7 +215,7 @@ class _Model:
             return None
         p = self.probability(hypothesis, self.vpv - run.end.vpv)
         left, has_suspects = self.redundancy - len(hypothesis.added), bool(self.gross_errors)
-        return _Model(run, left, self.probabilities, self.is_noise_fitted, has_suspects, hypothesis, p)
+        return _Model(run, left, self.probabilities, self.unmodelled, has_suspects, hypothesis, p)
 
 
 def _best(model: _Model) -> tuple[list[_Model], bool]:
@@ -213,7 +223,7 @@ def _best(model: _Model) -> tuple[list[_Model], bool]:
     # Also returns whether gross errors of single observations explain the residuals as well.
     # Errors of a real board's points are part of the noise that is fitted: none of them is told but the worst.
     is_suspicious = model.exceeds(SUSPECTED) or bool(model.gross_errors)
-    most_points = 1 if model.is_noise_fitted else len(model.run.problem.network.points) * is_suspicious
+    most_points = 1 if model.unmodelled else len(model.run.problem.network.points) * is_suspicious
     tested = {board.name for board in model.run.problem.network.boards}
     of_films = film_deformations(model.run) if is_suspicious else ()
     rows = chain(camera_hypotheses(model.run), of_films, object_hypotheses(model.run, most_points))
@@ -227,12 +237,25 @@ def _best(model: _Model) -> tuple[list[_Model], bool]:
     if not found:
         return [], False
     variance = max(1.0, min(each.rest[0] / each.rest[1] for each in (model, *found)))
+    found = _without_nested(found, variance)
     criteria = [each.criterion(variance) + each.costs for each in found]
     without = model.criterion(variance) - min(criteria) if model.gross_errors else np.inf
     if without < -TOLD_APART:
         return [], False
     alike = [each for each, own in zip(found, criteria, strict=True) if own < min(criteria) + TOLD_APART]
     return alike, bool(without < TOLD_APART)
+
+
+SPECIAL = ("drift", "groups")  # hypotheses that "distances" contains
+
+
+def _without_nested(found: list[_Model], variance: float) -> list[_Model]:
+    """Keep a drift and groups of images, or a distance of each image's own if it explains significantly more."""
+    pairs = [(one, other) for one, other in product(found, found) if one.kind == "distances" and other.kind in SPECIAL]
+    further = [(s.redundancy - g.redundancy, max(0.0, s.vpv - g.vpv) / variance) for g, s in pairs]
+    is_needless = any(chdtrc(count, fall) > LEVEL for count, fall in further)
+    dropped = ("distances",) if is_needless else SPECIAL if further else ()
+    return [each for each in found if each.kind not in dropped]
 
 
 def _first_order_fall(run: Run, problem: Problem) -> float:
@@ -244,9 +267,9 @@ def _first_order_fall(run: Run, problem: Problem) -> float:
 
 def _following(model: _Model) -> _Model | None:
     """Return the adjustment for the next round: groups of images get separate lenses; None without a solution."""
-    if model.hypothesis is None or model.hypothesis.kind != "groups":
+    if model.kind not in ("groups", "distances"):
         return model
-    problem = separate_lenses(model.run)
+    problem = separate_lenses(model.run) if model.kind == "groups" else None
     run = None if problem is None else model.adjusted(problem)
     if run is None:
         return None

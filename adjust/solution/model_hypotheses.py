@@ -6,6 +6,7 @@ Here those of the cameras: lens terms, pixels, interior orientations.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain
 from typing import NamedTuple
 
@@ -24,7 +25,7 @@ from adjust.problem.parameter import shortened
 from adjust.problem.problem import Problem, number
 from adjust.quality.cofactor import free_cofactor
 from adjust.quality.run import UM_PER_MM, Run, freed
-from adjust.solution.partitions import Selection, two_groups
+from adjust.solution.partitions import Selection, interior_equations, own_distances, two_groups
 
 FREE = Prior(0.0, np.inf)
 NONE = Selection()
@@ -104,12 +105,12 @@ def continued_with(run: Run, positions: Indices) -> Problem:
     return freed(continued(run, run.problem.network), positions)
 
 
-def continued(run: Run, network: Network, like: Mapping[str, str] | None = None) -> Problem:
+def continued(run: Run, network: Network, like: Mapping[str, str] | None = None, apart: int = 0) -> Problem:
     """Number a network with additional unknowns; start where an adjustment ended, in its datum."""
-    # like: cameras that share distortion and fiducial marks with another one and start with its interior orientation.
-    old, values, like, count = run.problem.unknowns, run.end.state.values, like or {}, len(INTERIOR_NAMES)
+    # like: cameras that share all but the first `apart` quantities, of c, x0, y0, with another one and start with its.
+    old, values, like = run.problem.unknowns, run.end.state.values, like or {}
     mirrored = run.problem.mirrored
-    interior = {name: values[at[:count]] for name, at in old.camera.items()}
+    interior = {name: values[at[: len(INTERIOR_NAMES)]] for name, at in old.camera.items()}
     before = {image.name: image.transformation for image in run.problem.network.images}
     state = Approximations(
         interior=interior | {name: interior[other] for name, other in like.items()},
@@ -133,10 +134,10 @@ def continued(run: Run, network: Network, like: Mapping[str, str] | None = None)
     given[new], sigma[new], start[new] = old.given[at], old.sigma[at], values[at]
     camera, fiducial = dict(unknowns.camera), dict(unknowns.fiducial)
     for name, other in like.items():
-        apart, own = camera[name][:count], camera[other]
-        given[apart], sigma[apart], start[apart] = np.nan, np.inf, start[own[:count]]
-        sigma[camera[name][count:]] = 0.0
-        camera[name] = np.concatenate([apart, own[count:]])
+        free, own = camera[name][:apart], camera[other]
+        given[free], sigma[free], start[free] = np.nan, np.inf, start[own[:apart]]
+        sigma[camera[name][apart:]] = 0.0
+        camera[name] = np.concatenate([free, own[apart:]])
         for (owner, id_), pair in unknowns.fiducial.items():
             if owner == name:
                 sigma[pair] = 0.0
@@ -161,7 +162,7 @@ def camera_hypotheses(run: Run) -> Iterator[ModelHypothesis]:
     used = run.problem.unknowns.camera.keys() - network.idle_cameras
     kinds = [_lens_terms, _drift, _wrong_interior_orientation]
     if not any(each.name.endswith(OTHERS) for each in network.cameras):
-        kinds.append(_second_interior_orientation)
+        kinds.append(_interior_orientations)
     of_cameras = (kind(run, camera) for kind in kinds for camera in network.cameras if camera.name in used)
     yield from chain(*of_cameras, _scanner_pixels(run))
 
@@ -253,6 +254,9 @@ def _pixel_words(camera: str, per_mm: float) -> Words:
     return words
 
 
+REFOCUSED = "Fix focus and zoom, switch autofocus and stabilisation off, and take the pictures again."
+
+
 def _drift(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
     """A principal distance that changes with the number of the image, or with the distance of the object."""
     problem, state = run.problem, run.end.state
@@ -269,7 +273,7 @@ def _drift(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
         return lambda found: (
             f"The principal distance of camera {camera.name} changes {along}, by {found.value[0]:+.3g} ± "
             f"{found.sigma[0]:.1g} mm: the focus drifts",
-            "Fix focus and zoom, switch autofocus and stabilisation off, and take the pictures again.",
+            REFOCUSED,
         )
 
     for name, by, along in (
@@ -356,21 +360,40 @@ def _wrong_interior_orientation(run: Run, camera: Camera) -> Iterator[ModelHypot
         yield ModelHypothesis("interior", words, continued_with(run, added), added)
 
 
-def _second_interior_orientation(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
-    """A different principal distance and principal point for some of the camera's images."""
-    network, groups = run.problem.network, two_groups(run, camera.name)
-    if groups is None:
-        return
-    others = replace(camera, name=camera.name + OTHERS)
-    images = tuple(replace(each, camera=others.name) if each.frame in groups.names else each for each in network.images)
-    apart = replace(network, images=images, cameras=(*network.cameras, others))
-    problem = continued(run, apart, {others.name: camera.name})
-    added, own = (problem.unknowns.camera[name][: len(INTERIOR_NAMES)] for name in (others.name, camera.name))
-    count = groups.contrasts // len(INTERIOR_NAMES) + 1
-    who = f"the images {shortened(groups.names, NAMED)} ({len(groups.names)} of {count}) of camera {camera.name}"
-    shown = np.concatenate([added, own])
-    yield ModelHypothesis(
-        "groups", lambda found: _group_words(who, found), problem, added, selection=groups, shown=shown
+def _interior_orientations(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
+    """Another interior orientation for some of the camera's images, or another principal distance for each."""
+    equations = interior_equations(run, camera.name)
+    if (groups := two_groups(run, camera.name, equations)) is not None:
+        who = f"the images {shortened(groups.names, NAMED)} ({len(groups.names)} of {len(equations.names)})"
+        problem, added = _apart(run, camera, dict.fromkeys(groups.names, camera.name + OTHERS), len(INTERIOR_NAMES))
+        shown = np.concatenate([added, problem.unknowns.camera[camera.name][: len(INTERIOR_NAMES)]])
+        words = partial(_group_words, f"{who} of camera {camera.name}")
+        yield ModelHypothesis("groups", words, problem, added, selection=groups, shown=shown)
+    if (images := own_distances(run, equations)) is not None:
+        others = {name: f"{camera.name}, {name}{OTHERS}" for name in images.names}
+        problem, added = _apart(run, camera, others, 1)
+        shown = np.append(problem.unknowns.camera[camera.name][:1], added)
+        words = partial(_distance_words, camera.name, equations.names)
+        yield ModelHypothesis("distances", words, problem, added, selection=images, shown=shown)
+
+
+def _apart(run: Run, camera: Camera, others: Mapping[str, str], count: int) -> tuple[Problem, Indices]:
+    """Give some frames cameras of other names that differ in the first `count` quantities; also return these."""
+    network, names = run.problem.network, dict.fromkeys(others.values(), camera.name)
+    images = tuple(replace(each, camera=others.get(each.frame, each.camera)) for each in network.images)
+    cameras = (*network.cameras, *(replace(camera, name=name) for name in names))
+    problem = continued(run, replace(network, images=images, cameras=cameras), names, count)
+    return problem, np.concatenate([problem.unknowns.camera[name][:count] for name in names])
+
+
+def _distance_words(camera: str, images: Sequence[str], found: Estimate) -> tuple[str, str]:
+    """Describe principal distances of the images by the shortest and the longest."""
+    ends = np.argsort(found.value)[[0, -1]]
+    shortest, longest = (f"{found.value[k]:.5g} ± {found.sigma[k]:.1g} mm in {images[k]}" for k in ends)
+    return (
+        f"The principal distance of camera {camera} differs from image to image, from {shortest} to {longest}: focus "
+        "or zoom changed",
+        REFOCUSED,
     )
 
 

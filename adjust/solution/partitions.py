@@ -10,10 +10,11 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import diags_array
-from scipy.special import chdtri, gammaln
+from scipy.special import chdtrc, chdtri, fdtrc, gammaln
 
 from adjust.array_types import Array, Mask
 from adjust.functional_model.lens import INTERIOR_NAMES
@@ -47,9 +48,37 @@ class Selection:
     p_scatter: Callable[[], float] = float
 
 
-def two_groups(run: Run, camera: str) -> Selection | None:
+class InteriorEquations(NamedTuple):
+    """Names of a camera's frames with targets, and normal equations (m, 3, 3), (m, 3) of c, x0' and y0' of each."""
+
+    names: tuple[str, ...]
+    normal: Array
+    right: Array
+
+
+def own_distances(run: Run, equations: InteriorEquations) -> Selection | None:
+    """Select all frames of a camera but the first for a principal distance of their own; None where they need none."""
+    names, normal, right = equations
+    count = len(names) - 1
+    of_distances, of_all = (_heterogeneity(normal[:, :k, :k], right[:, :k]) for k in (1, len(INTERIOR_NAMES)))
+    vpv, redundancy = run.group_sums(run.weighting.used)
+    variance = max(1.0, vpv / redundancy)
+    if count < 1 or chdtrc(count, of_distances / variance) > LEVEL:
+        return None
+    # Errors that are correlated within images make principal points scatter as well.
+    of_points = max((of_all - of_distances) / (2.0 * count), variance)
+    p = float(fdtrc(count, 2.0 * count, of_distances / count / of_points))
+    return Selection(names[1:], p_scatter=lambda: p)
+
+
+def _heterogeneity(normal: Array, right: Array) -> float:
+    """Decrease of v'Pv by changes of each image's own in place of common ones (Cochran's Q)."""
+    return float(quadratic(normal, right).sum() - quadratic(normal.sum(axis=0), right.sum(axis=0)))
+
+
+def two_groups(run: Run, camera: str, equations: InteriorEquations) -> Selection | None:
     """Select the smaller part of the best partition of a camera's frames; None with fewer than three frames."""
-    names, normal, right = _interior_equations(run, camera)
+    names, normal, right = equations
     if len(names) < 3:
         return None
     interior = run.end.state.values[run.problem.unknowns.camera[camera][: len(INTERIOR_NAMES)]]
@@ -71,8 +100,8 @@ def _some(names: tuple[str, ...], mask: Mask) -> tuple[str, ...]:
     return tuple(name for name, is_in in zip(names, mask, strict=True) if is_in)
 
 
-def _interior_equations(run: Run, camera: str) -> tuple[tuple[str, ...], Array, Array]:
-    """Names of a camera's frames with targets, and normal equations (m, 3, 3), (m, 3) of c, x0' and y0' of each."""
+def interior_equations(run: Run, camera: str) -> InteriorEquations:
+    """Equations of the interior orientations of a camera's frames, the exterior ones eliminated."""
     network, positions = run.problem.network, run.problem.unknowns.camera[camera][: len(INTERIOR_NAMES)]
     at = run.linearised(run.problem, run.end.state, positions)
     frames = tuple(dict.fromkeys(image.frame for image in network.images))
@@ -85,7 +114,7 @@ def _interior_equations(run: Run, camera: str) -> tuple[tuple[str, ...], Array, 
             names.append(frames[frame])
             normal.append(by_interior.T @ by_interior)
             right.append(by_interior.T @ discrepancies)
-    return tuple(names), np.array(normal).reshape(-1, 3, 3), np.array(right).reshape(-1, 3)
+    return InteriorEquations(tuple(names), np.array(normal).reshape(-1, 3, 3), np.array(right).reshape(-1, 3))
 
 
 def _threshold(normal: Array, right: Array, change: Array) -> Mask:

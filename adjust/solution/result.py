@@ -276,8 +276,16 @@ class Adjustment(Estimates, PlottedResult):
 
     @cached_property
     def _explanation_run(self) -> tuple[tuple[Explanation, ...], Run]:
-        is_noise_fitted = any(self.unmodelled_mm.values())
-        return explain(self.run, _redundancy(self.run, self.cofactor), self.probabilities, is_noise_fitted)
+        return explain(self.run, _redundancy(self.run, self.cofactor), self.probabilities, self._unmodelled_share)
+
+    @property
+    def _unmodelled_share(self) -> float:
+        """Mean share of the estimated standard deviation of unmodelled errors in the variance of targets."""
+        observations, images = self.network.observations, self.network.images
+        added = np.array([self.unmodelled_mm.get(image.camera, 0.0) for image in images])[self.network.image_numbers]
+        variance = np.trace(observations.covariance_mm2, axis1=1, axis2=2) / 2.0
+        targets = ~observations.is_fiducial
+        return float(np.mean((added**2 / variance)[targets])) if targets.any() else 0.0
 
     @property
     def _is_tested(self) -> bool:

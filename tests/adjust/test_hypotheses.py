@@ -103,17 +103,44 @@ def test_an_estimated_noise_does_not_hide_two_cameras_in_one(seed: int) -> None:
     some = [f"im{i:02d}" for i in np.flatnonzero(made.groups)]
     assert f"The images {', '.join(some)} ({len(some)} of {len(made.groups)})" in result.explanations[0].cause
     below = result.redundancy + 1  # v'Pv equals its redundancy then, but for rounding
-    explanations, _ = explain(result.run, below, Probabilities(), is_noise_fitted=True)
+    explanations, _ = explain(result.run, below, Probabilities(), unmodelled=1.0)
     assert explanations[0].kind == "groups"
 
 
+FITTED = replace(SOUND, sigma=0.1)  # standard deviations given ten times too small
+
+
 @pytest.mark.parametrize("seed", [4, 5, 6, 7])
-def test_errors_of_each_image_are_no_two_groups(seed: int) -> None:
+@pytest.mark.parametrize("noise", [1.0, 10.0])
+def test_each_image_with_a_principal_distance_of_its_own_is_no_two_groups(seed: int, noise: float) -> None:
+    made, rng = scene(seed, flat=True), np.random.default_rng(seed)
+    zooms = rng.normal(size=len(made.groups))
+    kind = SOUND if noise == 1.0 else FITTED
+    given = misfit_network(replace(made, groups=zooms), Effects(zoom=0.3, noise=noise), kind, rng)
+    result = adjust_unmodelled(given)
+    assert result.unmodelled_mm["cam"] > SIGMA_MM
+    assert [each.kind for each in result.explanations] == ["distances"]
+    cause = result.explanations[0].cause
+    assert f"mm in im{zooms.argmin():02d} to " in cause
+    assert f"mm in im{zooms.argmax():02d}: focus" in cause
+
+
+@pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.study)])
+def test_an_estimated_noise_of_the_size_of_that_given_does_not_hide_two_principal_distances(seed: int) -> None:
+    """These explain all that was estimated, though it is a tenth of the variance."""
+    given = misfit_network(scene(seed, flat=True), Effects(zoom=0.1), SOUND, np.random.default_rng(seed))
+    result = adjust_unmodelled(given)
+    assert 0.1 < result.unmodelled_mm["cam"] / SIGMA_MM < 0.6
+    assert [each.kind for each in result.explanations] == ["groups"]
+
+
+@pytest.mark.parametrize("seed", [4, 6])
+def test_principal_points_of_the_images_own_are_no_principal_distances(seed: int) -> None:
+    """As of errors that are correlated within images."""
     made, rng = scene(seed, flat=True), np.random.default_rng(seed)
     each_its_own = replace(made, groups=rng.normal(size=len(made.groups)))
-    result = adjust_unmodelled(misfit_network(each_its_own, Effects(zoom=0.3), SOUND, rng))
-    assert result.unmodelled_mm["cam"] > SIGMA_MM
-    assert result.explanations == ()
+    result = adjust_unmodelled(misfit_network(each_its_own, Effects(crop=0.02, zoom=0.03, noise=10.0), FITTED, rng))
+    assert "distances" not in [each.kind for each in result.explanations]
 
 
 def test_a_small_effect_is_no_fault_of_the_model_where_errors_of_an_image_are_correlated() -> None:
