@@ -89,6 +89,16 @@ def test_the_rooms_of_a_package_use_one_another_in_no_circle(package: str, user:
     TopologicalSorter(uses).prepare()
 
 
+@pytest.mark.parametrize("package", sorted(PACKAGES - {"reseau"}))
+def test_no_files_import_one_another_in_a_circle(package: str) -> None:
+    """Imports for types alone count, too: a file that needs its user's types belongs above it."""
+    modules = {".".join(file.relative_to(ROOT).with_suffix("").parts): file for file in (ROOT / package).rglob("*.py")}
+    uses = {name: {each.module for each in import_statements(file) if isinstance(each, ast.ImportFrom)} & modules.keys()
+            for name, file in modules.items()}  # fmt: skip
+    assert any(uses.values()) or package == "compiled"
+    TopologicalSorter(uses).prepare()
+
+
 def test_each_room_of_adjust_knows_only_those_below_it() -> None:
     rooms = [path for path in (ROOT / "adjust").iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()]
     assert {room.stem for room in rooms} == {*ADJUST_FROM_THE_GROUND_UP, "__init__"}
