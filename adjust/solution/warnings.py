@@ -11,7 +11,8 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
-from scipy.special import chdtrc
+from scipy.spatial import KDTree
+from scipy.special import chdtr, chdtrc
 
 from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.families import family
@@ -31,6 +32,7 @@ from adjust.solution.model_hypotheses import continued_with
 from adjust.solution.reweighting import ROUNDS, again
 
 GROSS = 20.0  # in a-priori standard deviations: a larger residual may come from a confused mark
+COPIED = 0.001  # significance level, for all pairs of images, of marks that lie too near to each other
 NEARER = 0.25  # fraction of the distance of two marks: largest offset of one from the other's expected place
 NAMED = 5  # images named in a warning
 UNCHECKED = 1e-6  # redundancy of all targets of an image below which its orientation is unchecked
@@ -53,7 +55,7 @@ def run_warnings(run: Run, cofactor: Cofactor, residuals: Residuals) -> list[str
         *_weak_parameters(run, cofactor),
         *_input(run.problem),
         *_swapped_numbers(run, residuals),
-        *_repeated_images(run.problem),
+        *_repeated_images(run),
         *_repeated_marks(run.problem.network.observations),
         *(_unchecked_orientations(run.problem, residuals) if run.converged else ()),
     ]
@@ -170,18 +172,35 @@ def _unchecked_orientations(problem: Problem, residuals: Residuals) -> Iterator[
             )
 
 
-def _repeated_images(problem: Problem) -> Iterator[str]:
-    """Warn of images with the same coordinates of all marks: the same picture under two names."""
-    observations, first, pairs = problem.network.observations, dict[bytes, str](), []
-    for name, rows in _rows_by_image(problem):
-        ordered = rows[np.argsort(np.array(observations.point)[rows], kind="stable")]
-        other = first.setdefault(observations.xy_mm[ordered].tobytes(), name)
-        if other != name:
-            pairs.append(f"{name} as {other}")
+def _repeated_images(run: Run) -> Iterator[str]:
+    """Warn of images whose marks lie nearer to each other than independent errors allow: one picture under two names.
+
+    The differences of their coordinates are compared with the variances of both, in the scale of the residuals. Fiducial
+    marks alone may lie alike in all frames: theirs have to be equal.
+    """
+    problem, observations = run.problem, run.problem.network.observations
+    point = np.array(observations.point)
+    images = [(name, rows[np.argsort(point[rows], kind="stable")]) for name, rows in _rows_by_image(problem)]
+    marks = run.weighting.used & (np.arange(len(run.units)) < len(observations))
+    vpv, redundancy = run.group_sums(marks) if run.converged and run.is_tested else (1.0, 1.0)
+    covariance = observations.covariance_mm2 * (vpv / redundancy if redundancy >= 1.0 else 1.0)
+    middles = np.array([observations.xy_mm[rows].mean(axis=0) for _, rows in images])
+    reach = 2.0 * float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).max(initial=0.0)))
+    pairs = []
+    for i, j in sorted(KDTree(middles).query_pairs(reach)) if len(images) else ():
+        (one, own), (other, others) = images[i], images[j]
+        if len(own) != len(others) or (point[own] != point[others]).any():
+            continue
+        apart = observations.xy_mm[own] - observations.xy_mm[others]
+        squares = np.einsum("ni,nij,nj->n", apart, np.linalg.inv(covariance[own] + covariance[others]), apart)
+        targets = ~problem.is_fiducial[own]
+        p = chdtr(2 * targets.sum(), squares[targets].sum()) if targets.any() else float(squares.any())
+        if p < COPIED / len(images) ** 2:
+            pairs.append(f"{other} as {one}")
     if pairs:
         yield (
-            f"All marks have the same coordinates in {shortened(pairs, NAMED)}: a picture under two names counts "
-            "twice, and standard deviations are too small. Leave one of them out."
+            f"All marks have the same coordinates, but for less than their errors, in {shortened(pairs, NAMED)}: a "
+            "picture under two names, or one view taken again, counts twice, and standard deviations are too small. Leave one of them out."
         )
 
 

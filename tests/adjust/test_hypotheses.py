@@ -41,7 +41,7 @@ from networks import (
 from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
-from adjust import Adjustment, AdjustmentError, Network, Options, Prior, adjust, approximate
+from adjust import Adjustment, AdjustmentError, Network, Observations, Options, Prior, adjust, approximate
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.quality.tested import Probabilities
 from adjust.solution.adjustment import adjust_unmodelled
@@ -190,14 +190,24 @@ def test_images_with_numbers_one_off_are_left_out_or_all_is_refused(flat: bool) 
         adjust(misfit_network(everywhere, Effects(numbers_off=-2), SOUND, rng))
 
 
-def test_one_picture_under_two_names_is_named() -> None:
-    given = misfit_network(scene(6, flat=True), Effects(), SOUND, np.random.default_rng(1))
+@pytest.mark.parametrize(("apart_um", "is_named"), [(0.0, True), (0.3, True), (0.7, True), (1.4, False)])
+def test_one_picture_under_two_names_is_named(apart_um: float, is_named: bool) -> None:
+    """Independent errors of 1 µm lie 1.4 µm apart."""
+    rng = np.random.default_rng(1)
+    given = misfit_network(scene(6, flat=True), Effects(), SOUND, rng)
     rows, observed = np.array([name == "im02" for name in given.observations.image]), given.observations
-    twice = observed.only(np.append(np.arange(len(observed)), np.flatnonzero(rows)))
-    names = (*observed.image, *["copy"] * int(rows.sum()))
+    again = observed.only(np.flatnonzero(rows))
+    again = replace(again, xy_mm=again.xy_mm + rng.normal(0.0, 1e-3 * apart_um, again.xy_mm.shape))
     images = (*given.images, replace(given.image_by_name["im02"], name="copy"))
-    result = adjust(replace(given, observations=replace(twice, image=names), images=images))
-    assert ["copy as im02" in each for each in result.warnings] == [True]
+    observations = Observations(
+        image=(*observed.image, *["copy"] * len(again)),
+        point=observed.point + again.point,
+        kind=observed.kind + again.kind,
+        xy_mm=np.concatenate([observed.xy_mm, again.xy_mm]),
+        covariance_mm2=np.concatenate([observed.covariance_mm2, again.covariance_mm2]),
+    )
+    result = adjust(replace(given, observations=observations, images=images))
+    assert ["copy as im02" in each for each in result.warnings] == [True] * is_named
 
 
 def test_standard_deviations_in_another_unit_are_refused() -> None:
