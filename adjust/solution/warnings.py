@@ -175,8 +175,8 @@ def _unchecked_orientations(problem: Problem, residuals: Residuals) -> Iterator[
 def _repeated_images(run: Run) -> Iterator[str]:
     """Warn of images whose marks lie nearer to each other than independent errors allow: one picture under two names.
 
-    The differences of their coordinates are compared with the variances of both, in the scale of the residuals. Fiducial
-    marks alone may lie alike in all frames: theirs have to be equal.
+    Differences of their coordinates are compared with the variances of both, in the scale of the residuals. Fiducial
+    marks alone may lie alike in all frames: they have to be equal.
     """
     problem, observations = run.problem, run.problem.network.observations
     point = np.array(observations.point)
@@ -200,7 +200,8 @@ def _repeated_images(run: Run) -> Iterator[str]:
     if pairs:
         yield (
             f"All marks have the same coordinates, but for less than their errors, in {shortened(pairs, NAMED)}: a "
-            "picture under two names, or one view taken again, counts twice, and standard deviations are too small. Leave one of them out."
+            "picture under two names, or one view taken again, counts twice, and standard deviations are too small. "
+            "Leave one of them out."
         )
 
 
