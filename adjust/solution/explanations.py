@@ -105,7 +105,7 @@ def explain(
             break
         following = _following(alike[0]) if len(alike) == 1 else None
         last = following or alike[0]
-        if following is None:
+        if following is None or last.kind in ("groups", "distances"):
             break
     noises = (_added_noise(last.run, last.redundancy), _wide_control(last.run)) if last.exceeds(LEVEL) else ()
     for words, with_noise, widened in filter(None, noises):
@@ -176,13 +176,13 @@ class _Model:
         """Cost of the unknowns and the choice of the hypothesis."""
         return 2.0 * (len(self.hypothesis.added) + self.hypothesis.selection.choices) if self.hypothesis else 0.0
 
-    def is_significant(self, hypothesis: ModelHypothesis, fall: float, level: float) -> bool:
-        """Whether a decrease of v'Pv is significant, and larger than errors correlated within images cause."""
-        by_chance = len(hypothesis.added) * self.variance
-        is_large = fall - by_chance > LEFT * self.unmodelled * self.vpv or (
+    def is_significant(self, hypothesis: ModelHypothesis, fall: float, level: float, share: float = 1.0) -> bool:
+        """Whether a decrease of v'Pv is significant, and of a share of what errors correlated within images cause."""
+        fall_beyond_chance = fall - len(hypothesis.added) * self.variance
+        is_large = fall_beyond_chance > share * LEFT * self.unmodelled * self.vpv or (
             # Curled edges of real boards remove up to 0.3 as points beside a line.
             hypothesis.name != "group"
-            and fall - by_chance > LEAST_SHARE * self.vpv
+            and fall_beyond_chance > LEAST_SHARE * self.vpv
             and hypothesis.selection.p_scatter() < LEVEL
         )
         return is_large and self.probability(hypothesis, fall) < level
@@ -201,6 +201,10 @@ class _Model:
             return 1.0
         variance = (self.vpv - fall) / left
         return float(fdtrc(count, left, fall / (count * variance)) if variance > 1.0 else chdtrc(count, fall))
+
+    def improves(self, simpler: "_Model", level: float) -> bool:
+        """Whether the hypothesis is significant in a simpler model by the actual decrease of v'Pv."""
+        return self.hypothesis is not None and simpler.is_significant(self.hypothesis, simpler.vpv - self.vpv, level)
 
     def adjusted(self, problem: Problem) -> Run | None:
         """Adjust a larger problem from its start with the same weights; None without a solution."""
@@ -230,10 +234,10 @@ def _best(model: _Model) -> tuple[list[_Model], bool]:
     falls = [(_first_order_fall(model.run, each.problem), each) for each in rows if each.name not in tested]
     level = LEVEL / max(len(falls), 1)
     worth = WORTH * max((fall for fall, _ in falls), default=0.0)
-    likely = [(fall, each) for fall, each in falls if fall > worth and model.is_significant(each, fall, level)]
+    likely = [(fall, each) for fall, each in falls if fall > worth and model.is_significant(each, fall, level, WORTH)]
     likely.sort(key=lambda each: -each[0])
     candidates = [model.extended(each) for _, each in likely[:MOST_ADJUSTED]]
-    found = [each for each in candidates if each is not None and each.p < level]
+    found = [each for each in candidates if each is not None and each.improves(model, level)]
     if not found:
         return [], False
     variance = max(1.0, min(each.rest[0] / each.rest[1] for each in (model, *found)))

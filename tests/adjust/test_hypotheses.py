@@ -190,6 +190,15 @@ def test_images_with_numbers_one_off_are_left_out_or_all_is_refused(flat: bool) 
         adjust(misfit_network(everywhere, Effects(numbers_off=-2), SOUND, rng))
 
 
+def test_a_picture_of_half_the_size_is_named_where_the_first_step_promises_a_third_of_what_it_explains() -> None:
+    given = misfit_network(scene(12, flat=True), Effects(), SOUND, np.random.default_rng(12))
+    rows = np.array([name == "im01" for name in given.observations.image])
+    xy_mm = given.observations.xy_mm * np.where(rows, 0.5, 1.0)[:, None]
+    (found,) = adjust_unmodelled(set_observations(given, xy_mm=xy_mm)).explanations
+    assert found.kind == "groups"
+    assert found.cause.startswith("The images im01 (1 of ")
+
+
 @pytest.mark.parametrize(("apart_um", "is_named"), [(0.0, True), (0.3, True), (0.7, True), (1.4, False)])
 def test_one_picture_under_two_names_is_named(apart_um: float, is_named: bool) -> None:
     """Independent errors of 1 µm lie 1.4 µm apart."""
