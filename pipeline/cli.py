@@ -78,7 +78,10 @@ def run(arguments: Sequence[str] | None = None) -> int:
             return _message(message, INTERRUPTED)
         return code if isinstance(code, int) else DONE
     except typer.TyperException as error:
-        return _message(error.format_message().replace("Value error, ", ""), WRONG_INPUT)
+        message, context = error.format_message().replace("Value error, ", ""), getattr(error, "ctx", None)
+        if message.startswith("Missing") and context is not None and context.parent is not None:
+            message += f" `reseau {context.info_name} --help` shows what it takes."
+        return _message(message, WRONG_INPUT)
     except (InputError, MeasurementError, AdjustmentError) as error:
         return _message(str(error), WRONG_INPUT)
     except BrokenExecutor:

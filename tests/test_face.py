@@ -26,6 +26,12 @@ def test_it_gives_every_name_of_the_three_faces() -> None:
         getattr(reseau, "measure_fiducial")  # noqa: B009
 
 
+@pytest.mark.parametrize("read", ["adjustment", "camera", "comparator", "images", "measurement", "points", "project"])
+def test_a_file_may_be_named_by_text(read: str, tmp_path: Path) -> None:
+    with pytest.raises(reseau.InputError, match="nowhere: there is no such file"):
+        getattr(reseau, f"read_{read}")(str(tmp_path / "nowhere"))
+
+
 def test_the_version_is_that_of_the_project() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert f"\nversion: {project['version']}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")

@@ -47,6 +47,7 @@ from pipeline.results.measured_record import (
     scan_detail,
     scan_location,
 )
+from pipeline.types import FilePath
 
 _AT_A_TIME = 500  # frames per transaction
 _WRITTEN = "comparator.csv"
@@ -387,12 +388,12 @@ def written_judging(path: Path, comparator: Path) -> Iterator[Judging | None]:
         yield None if damaged_frames(judging.store.connection, judging.row) else judging
 
 
-def read_measurement(path: Path, digest: str = "") -> tuple[MeasuredScan, ...]:
+def read_measurement(path: FilePath, digest: str = "") -> tuple[MeasuredScan, ...]:
     """Scans of a store after the cross-scan checks, sorted by name. digest: of the judging; "" for the latest.
 
     Raises InputError where there is no such store, or no judging in it.
     """
-    return tuple(measured_scans(path, digest))
+    return tuple(measured_scans(Path(path), digest))
 
 
 def measured_scans(path: Path, digest: str = "", images: Collection[str] | None = None) -> Iterator[MeasuredScan]:

@@ -37,6 +37,7 @@ from pipeline.stages import run_all, run_measure
 from pipeline.summary import Summary
 from pipeline.text.files import write_atomically
 from pipeline.text.wording import counted, did_you_mean, listed_by_reason
+from pipeline.types import FilePath
 from pipeline.workers import WorkOptions
 
 GENEROUS = 2.0  # factor on the unmodelled standard deviation, for lens models with larger misfit than the first
@@ -275,7 +276,7 @@ def _most_common(reasons: Iterable[str]) -> str:
 
 
 def calibrate(
-    pictures: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    pictures: FilePath | Sequence[FilePath],
     board: str,
     square: str,
     *,
@@ -287,7 +288,7 @@ def calibrate(
     lens: str = "auto",
     square_pixels: bool = False,
     pitch_um: float | None = None,
-    out: str | os.PathLike[str] = OUT,
+    out: FilePath = OUT,
     ros: bool = False,
     workers: int | None = None,
     reporter: Reporter | None = None,

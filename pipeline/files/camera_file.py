@@ -30,6 +30,7 @@ from pipeline.text.files import SMALLEST_SIGMA, image_name
 from pipeline.text.table_models import read_model
 from pipeline.text.tables import Table, list_words, read_toml
 from pipeline.text.wording import did_you_mean, table_lines
+from pipeline.types import FilePath
 
 FIELD_RATIO = 50.0  # largest half diagonal over principal distance, or frame over fiducials' extent: 178° field of view
 LONGEST_RATIO = 500.0  # largest principal distance over half the diagonal: small plates of astrographs with c = 10 m
@@ -204,7 +205,7 @@ class CameraFile:
         )
 
 
-def read_camera(path: Path) -> CameraFile:
+def read_camera(path: FilePath) -> CameraFile:
     """Read camera.toml. Raises InputError with file, line and key."""
     return parse_camera(read_toml(path))
 

@@ -18,6 +18,7 @@ from measure.scans.remote import Window
 from pipeline.errors import InputError
 from pipeline.text.csv_table import Row, read_csv
 from pipeline.text.files import image_name, read_bytes, write_atomically
+from pipeline.types import FilePath
 
 REQUIRED = ("point", "X", "Y", "Z")
 OPTIONAL = ("sX", "sY", "sZ", "nX", "nY", "nZ")
@@ -32,7 +33,7 @@ class GivenPoints:
     normals: Mapping[str, NDArray[np.float64]]
 
 
-def read_points(path: Path) -> GivenPoints:
+def read_points(path: FilePath) -> GivenPoints:
     """Read points.csv. Raises InputError with the line of a repeated point, a sigma without a value, or an invalid
     number."""
     points: dict[str, ObjectPoint] = {}
@@ -147,7 +148,7 @@ class GivenImages:
     cuts: Mapping[str, tuple[int | None, Window | None]] = field(default_factory=dict)
 
 
-def read_images(path: Path, antenna: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> GivenImages:
+def read_images(path: FilePath, antenna: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> GivenImages:
     """Read images.csv. Images may be named with or without the file's ending. Raises InputError with the line.
 
     antenna: offset of the point with the given X0, Y0, Z0 from the projection centre, as in `Exterior`.
@@ -172,7 +173,7 @@ def read_images(path: Path, antenna: tuple[float, float, float] = (0.0, 0.0, 0.0
         if turned := int(text or 0):
             turned_deg[name] = turned
         asks_writing = any(column in row.cells for column in WRITTEN)
-    _join(path, exterior, camera, part_of)
+    _join(Path(path), exterior, camera, part_of)
     return GivenImages(exterior, camera, scanner, asks_writing, turned_deg, part_of, cuts)
 
 

@@ -35,6 +35,7 @@ from pipeline.text.files import no_such_file, path_below
 from pipeline.text.table_models import read_model
 from pipeline.text.tables import Table, read_toml
 from pipeline.text.wording import nearest
+from pipeline.types import FilePath
 
 if TYPE_CHECKING:
     from measure.scans.scan import Scan
@@ -249,7 +250,7 @@ class Project:
         return (self.given_images.scanner.get(image, "") if self.given_images else "") or DEFAULT_SCANNER
 
 
-def read_project(path: Path) -> Project:
+def read_project(path: FilePath) -> Project:
     """Read project.toml and the camera, points, images and distances files that it names.
 
     Raises InputError with file, line and key; errors in the project file itself are reported first.

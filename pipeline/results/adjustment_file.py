@@ -21,7 +21,7 @@ from pipeline.results.adjustment_content import adjustment_record, covariance_ar
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.record_json import json_text, read_record
 from pipeline.text.files import MOST_MB, atomic_path, read_bytes
-from pipeline.types import Array
+from pipeline.types import Array, FilePath
 
 AGAIN = "Run `reseau adjust` again; it writes both files."
 
@@ -121,7 +121,7 @@ def observed_mm(path: Path, content: AdjustmentRecord, camera: str) -> Array:
     return places
 
 
-def read_adjustment(path: Path) -> AdjustmentRecord:
+def read_adjustment(path: FilePath) -> AdjustmentRecord:
     """Read `adjustment.json`.
 
     Raises
@@ -130,7 +130,7 @@ def read_adjustment(path: Path) -> AdjustmentRecord:
         If the file is missing, is not JSON, lacks a key, or has an invalid value.
     """
     try:
-        return read_record(AdjustmentRecord, path, AGAIN)
+        return read_record(AdjustmentRecord, Path(path), AGAIN)
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file. Run `reseau adjust` first.") from None
     except IsADirectoryError:

@@ -18,7 +18,7 @@ from measure.flags import Status
 from pipeline.errors import InputError
 from pipeline.text.csv_table import Row, csv_line, read_csv
 from pipeline.text.files import atomic_path, image_name, read_bytes
-from pipeline.types import Array
+from pipeline.types import Array, FilePath
 
 COLUMNS = (
     "image", "point", "kind", "x_mm", "y_mm", "sx_mm", "sy_mm", "rho", "col_px", "row_px", "status", "reason",
@@ -157,7 +157,7 @@ def read_pitches(path: Path) -> dict[str, tuple[float, float]]:
     return {image: (float(x), float(y)) for image, x, y in _PITCH.findall(text)}
 
 
-def read_comparator(path: Path, pitch_um: tuple[float, float] | None = None) -> tuple[ComparatorPoint, ...]:
+def read_comparator(path: FilePath, pitch_um: tuple[float, float] | None = None) -> tuple[ComparatorPoint, ...]:
     """Read comparator.csv.
 
     Parameters

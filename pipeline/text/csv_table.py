@@ -14,6 +14,7 @@ from pathlib import Path
 from pipeline.errors import InputError
 from pipeline.text.files import LARGEST, SMALLEST_SIGMA, no_such_file, quote_value, read_bytes
 from pipeline.text.wording import did_you_mean
+from pipeline.types import FilePath
 
 SEPARATORS = {";": "semicolons", "\t": "tabs"}
 
@@ -85,9 +86,10 @@ def _quoted(cell: str) -> str:
     return '"' + cell.replace('"', '""') + '"' if cell.startswith("#") or any(c in cell for c in ',"\n') else cell
 
 
-def read_csv(path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> Iterator[Row]:
+def read_csv(path: FilePath, required: Sequence[str], optional: Sequence[str] = ()) -> Iterator[Row]:
     """Yield the rows of a CSV file. Raises InputError for a missing file, a missing or unknown column, or an incomplete
     line."""
+    path = Path(path)
     try:
         data = read_bytes(path)
     except FileNotFoundError:

@@ -9,6 +9,7 @@ from typing import Any
 from pipeline.errors import InputError
 from pipeline.text.files import no_such_file, read_bytes
 from pipeline.text.wording import did_you_mean
+from pipeline.types import FilePath
 
 MOST_MB = 4  # size of a camera file with marks learned from 12,000 scans
 
@@ -18,8 +19,9 @@ _BARE = re.compile(
 )
 
 
-def read_toml(path: Path) -> "Table":
+def read_toml(path: FilePath) -> "Table":
     """Read the root table of a TOML file. Raises InputError for a missing file, invalid UTF-8, or a syntax error."""
+    path = Path(path)
     return Table(_parse(path), path, "")
 
 

@@ -215,6 +215,9 @@ def test_unknown_command_and_option_have_code_2_and_the_help_is_whole(printed: P
     assert command("mesure") == 2
     assert command("run", "--jason", "p.toml") == 2
     assert "Traceback" not in refusal("template", "cameras")
+    assert refusal("calibrate", "pictures") == (
+        "reseau: Missing option '--board'. `reseau calibrate --help` shows what it takes."
+    )
     text = printed("--help")
     titles = re.findall(r"^(\w+):$", text, flags=re.MULTILINE)
     assert titles == ["Options", "Measure", "Calibrate", "Archive", "Exchange", "Plan", "Tools"]

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -265,16 +266,21 @@ def test_a_frame_of_far_more_pixels_than_its_scan_is_refused(scan: Path, tmp_pat
 
 
 def test_a_frame_whose_place_in_the_scan_is_in_doubt_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Unless an adjustment has judged it."""
+    """Unless an adjustment has oriented it: one of fiducials alone fits any pose."""
     false_alarm = (Reason("chance finds as many with a probability of 1.00", Code.CHANCE),)
     scans = [made_record(1), made_record(2, pose=Pose("90", False)), made_record(3, problems=false_alarm)]
     monkeypatch.setattr("pipeline.resampling.resample_stage.read_measurement", lambda path: scans)
     project = 'camera = "camera.toml"'
-    write_tables(tmp_path, project, camera='name = "K"\nframe_mm = [80.0, 80.0]', comparator="")
+    write_tables(tmp_path, project, camera='name = "K"\nframe_mm = [80.0, 80.0]', comparator="image,point\n")
     written = read_project(tmp_path / "project.toml")
-    written.comparator.unlink()
-    tasks, _ = resample_tasks(written, tmp_path, None, False, BEST)
-    assert [task.doubt for task in tasks] == ["", "pose 90 is assumed", false_alarm[0]]
+    stage = "pipeline.resampling.resample_stage"
+    monkeypatch.setattr(f"{stage}.image_chain", lambda *given: FrameChain(PITCH_UM, film(0.4, False)[0]))
+    for is_oriented, doubt in ((None, "pose 90 is assumed"), (False, "pose 90 is assumed"), (True, "")):
+        record = SimpleNamespace(exterior=SimpleNamespace(is_oriented=is_oriented))
+        adjustment = None if is_oriented is None else SimpleNamespace(images={"2": record})
+        monkeypatch.setattr(f"{stage}.current_adjustment", lambda *given, adjustment=adjustment: adjustment)
+        tasks, _ = resample_tasks(written, tmp_path, None, False, BEST)
+        assert [task.doubt for task in tasks] == ["", doubt, false_alarm[0]]
 
 
 def test_a_scan_that_is_gone_is_a_result(tmp_path: Path) -> None:
