@@ -274,6 +274,7 @@ def test_a_frame_whose_place_in_the_scan_is_in_doubt_says_so(tmp_path: Path, mon
     write_tables(tmp_path, project, camera='name = "K"\nframe_mm = [80.0, 80.0]', comparator="image,point\n")
     written = read_project(tmp_path / "project.toml")
     stage = "pipeline.resampling.resample_stage"
+    monkeypatch.setattr(f"{stage}.read_comparator", lambda *given: ())
     monkeypatch.setattr(f"{stage}.image_chain", lambda *given: FrameChain(PITCH_UM, film(0.4, False)[0]))
     for is_oriented, doubt in ((None, "pose 90 is assumed"), (False, "pose 90 is assumed"), (True, "")):
         record = SimpleNamespace(exterior=SimpleNamespace(is_oriented=is_oriented))
