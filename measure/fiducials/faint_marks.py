@@ -296,6 +296,9 @@ class _Field:
         inverse, place = np.linalg.inv(bend) * self.step, center * self.step + self.origin
         lines = np.abs(response.template)
         lit = lines * self.room[patch]
+        detail = float(np.linalg.norm(self.detail[patch][lit > _LINE / 5 * lit.max()]))
+        if detail == 0.0:  # a patch of one grey value, painted over: the response is rounding
+            return None
         shown, drawn = lit > _LINE * lit.max(), lines > _LINE * lines.max()
         # The mark's own rotation and scale, for lines off to one side of its point, assumed at their centroid.
         rows, cols = np.indices(lit.shape) - self.half
@@ -322,7 +325,7 @@ class _Field:
             damaged_fraction=max(1 - float(shown.sum() / drawn.sum()), 0.0),
             redundancy=int((lit > 0).sum()) - 3,
             neighbour_correlation=float(np.asarray(np.corrcoef(neighbours))[0, 1]) if is_varied else 0.0,
-            likeness=min(height / float(np.linalg.norm(self.detail[patch][lit > _LINE / 5 * lit.max()])), 1.0),
+            likeness=min(height / detail, 1.0),
             significance=height / scatter,
         )
         # Expected number of maxima as strong in a circle, for a Gaussian field: Adler's expected Euler characteristic

@@ -29,6 +29,7 @@ from measure.fiducials.mark_comparison import (
 )
 from measure.fiducials.mark_fit import Detection, detect_mark, not_found, strain_error_px
 from measure.fiducials.options import SCATTER_DEGREES, FiducialOptions
+from measure.fiducials.significance import random_matches
 from measure.flags import FAINT_MARK_BY_NOISE, TEXTURE_LIKE_A_FAINT_MARK, Cause
 from measure.geometry import UP_FROM_CAMERA
 from measure.marks.rendering import mark_window, picture
@@ -194,15 +195,16 @@ def best_weights(
     return tuple(float(weight) for weight in weights / weights.sum()), best
 
 
-def _detect(frame: Frame, indices: Iterable[int], search_px: float) -> Frame:
+def _detect(frame: Frame, indices: Iterable[int], search_px: float, at_any_likeness: bool = False) -> Frame:
     """Detect marks again within search_px of their current predictions."""
     # From the bottom upwards: the search in windows ended there, and the rows read last are still decoded.
     upwards = sorted(indices, key=lambda index: -frame.predicted_px[index, 1])
-    detections = map_in_threads(lambda index: _detection(frame, frame.prediction(index, search_px)), upwards)
+    least = 0.0 if at_any_likeness else LEAST_LIKENESS
+    detections = map_in_threads(lambda index: _detection(frame, frame.prediction(index, search_px), least), upwards)
     return frame.replace_detections(dict(zip(upwards, detections, strict=True)))
 
 
-def _detection(frame: Frame, expected: MarkPrediction) -> Detection:
+def _detection(frame: Frame, expected: MarkPrediction, least_likeness: float = LEAST_LIKENESS) -> Detection:
     """Detect one mark; a fit that texture could give is dropped, unless all marks together decide on the frame.
 
     Faint marks of a frame of many are detected later, where the others predict them.
@@ -210,7 +212,7 @@ def _detection(frame: Frame, expected: MarkPrediction) -> Detection:
     detection = detect_mark(frame.scan, expected, replace(frame.options.match, tells_sharpening=True))
     fit, closer = detection.fit, frame.placement.surroundings.robust
     sure = detection.false_alarms <= FAINT_MARK_BY_NOISE
-    likeness = 0.0 if sure and closer else LEAST_LIKENESS
+    likeness = (0.0 if closer else least_likeness) if sure else LEAST_LIKENESS
     is_faint = sure and (closer or len(frame.detections) <= MANY)
     significance = _FAINT_SIGNIFICANCE if is_faint else LEAST_SIGNIFICANCE
     if fit is not None and (fit.likeness < likeness or fit.significance < significance):
@@ -292,14 +294,25 @@ def _detect_closer(frame: Frame) -> Frame:
 
 
 def _detect_elsewhere(frame: Frame) -> Frame:
-    """Detect unclear marks within the gate of their predictions, then farther off, where only clear fits count."""
+    """Detect unclear marks within the gate of their predictions, then farther off, where only clear fits count.
+
+    An unclear fit counts if no random place matches as well: halos, clipping and motion make a mark unlike its drawing.
+    """
     for index in [index for index, each in enumerate(frame.detections) if not each.is_clear]:
-        near = far = _detect(frame, [index], frame.gate_px)
+        near = far = _detect(frame, [index], frame.gate_px, at_any_likeness=True)
         far_px = _farthest_px(frame, index)
         if not near.detections[index].is_clear and far_px > frame.gate_px:
             far = _detect(frame, [index], far_px)
-        frame = far if far.detections[index].is_clear else near
+        frame = far if far.detections[index].is_clear else _without_texture(near, index)
     return frame
+
+
+def _without_texture(frame: Frame, index: int) -> Frame:
+    """Drop a mark that random places match as well."""
+    found = frame.detections[index]
+    if found.fit is None or not any(random_matches(frame, [index])[0].values()):
+        return frame
+    return frame.replace_detections({index: replace(found, fit=None, reason=not_found(frame.gate_px))})
 
 
 def _farthest_px(frame: Frame, index: int) -> float:

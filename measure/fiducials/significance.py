@@ -136,7 +136,7 @@ def doubt_frame(result: SearchResult, frame: Frame) -> Reason:
     Returns
     -------
     Reason
-        Empty if the frame is significant. Contains the code no-frame if it is more likely a false alarm than not.
+        Empty if the frame is significant. Contains the code no-frame if it is likely a false alarm.
     """
     if len(frame.inlier_fits) >= _SURE:
         return NO_REASON
@@ -158,20 +158,38 @@ def doubt_frame(result: SearchResult, frame: Frame) -> Reason:
 
 
 def _doubt_by_neighbourhood(frame: Frame, inside: Sequence[int], clear: Sequence[int]) -> Reason:
-    """Test a frame of which some marks were not found, by the correlation beside the marks (binomial)."""
-    found, radius_px = len(clear), frame.first_search_px
-    places = _neighbouring_places(frame, inside, radius_px)
-    fitted = ((index, frame.inlier_fits[index].center_px) for index in clear)
-    weakest = min((_response(frame, *each, _FITTED_PX) for each in fitted), default=0.0)
-    hits = sum(_response(frame, index, place, radius_px) >= weakest for index, place in places)
-    chance = float(bdtrc(found - _FREE - 1, len(inside) - _FREE, _share(hits, len(places))))
+    """Test a frame of which some marks were not found, by the correlation beside the marks (binomial).
+
+    Two marks fit any similarity: a frame in doubt needs more that no random place matches.
+    """
+    found = len(clear)
+    matches, places = random_matches(frame, clear)
+    hits = max(matches.values(), default=places)
+    chance = float(bdtrc(found - _FREE - 1, len(inside) - _FREE, _share(hits, places)))
     if chance <= FRAME_BY_CHANCE:
         return NO_REASON
+    unmatched = sum(each == 0 for each in matches.values())
     return Reason(
-        f"only {found} of {len(inside)} marks were found, and {hits} of {len(places)} random places match "
+        f"only {found} of {len(inside)} marks were found, and {hits} of {places} random places match "
         f"as well (p = {chance:.2f}): the frame may lie elsewhere",
-        *((Code.CHANCE, Code.NO_FRAME) if chance > NO_FRAME else (Code.CHANCE,)),
+        *((Code.CHANCE, Code.NO_FRAME) if chance > NO_FRAME or unmatched < frame.least else (Code.CHANCE,)),
     )
+
+
+def random_matches(frame: Frame, indices: Iterable[int]) -> tuple[dict[int, int], int]:
+    """Count the random places beside the marks that match as well as each of some marks, by index, where it was fitted.
+
+    Returns also the number of these places.
+    """
+    radius_px = frame.first_search_px
+    inside = [index for index, detection in enumerate(frame.detections) if detection.inside]
+    others = [_response(frame, *each, radius_px) for each in _neighbouring_places(frame, inside, radius_px)]
+    fitted = (
+        (index, _response(frame, index, fit.center_px, _FITTED_PX))
+        for index in indices
+        if (fit := frame.detections[index].fit)
+    )
+    return {index: sum(each >= own for each in others) for index, own in fitted}, len(others)
 
 
 def _response(frame: Frame, index: int, place: Array, radius_px: float) -> float:

@@ -114,6 +114,13 @@ def test_what_answers_at_the_edge_of_a_wide_search_is_placed_within_the_window()
         detect_faint(scan, MarkPrediction(wide, predicted, 38.2, -1), 0.0, 0.7)
 
 
+def test_a_mark_painted_over_with_one_grey_value_is_not_found() -> None:
+    grey, place = textured(0), places(0)[12]
+    col, row = np.rint(place).astype(int)
+    grey[row - 50 : row + 51, col - 50 : col + 51] = 20480.0
+    assert detect_marks(grey, place[None]) == [None]
+
+
 def test_where_the_ground_is_black_nothing_is_visible() -> None:
     black = np.zeros((SIDE_PX * STEP_PX,) * 2)
     assert all(found is None for found in detect_marks(black, places(1)[:3]))

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from real_data import DATA, needs
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, uniform_filter1d
 
 from measure import FiducialOptions, FrameMeasurement, Scan, Status, measure_fiducials, open_scan
-from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross
+from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross, ring_cross
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
 from measure.tone.curve import Tone
@@ -19,6 +19,7 @@ SCANS = DATA / "film_scans"
 pytestmark = needs("film_scans")
 
 RESEAU = MarkShape(cross(0.97, 0.05), "dark")
+RING_CROSS = ring_cross(0.8, 0.17, 1.75, 0.1, 0.08, 45.0)
 RESEAU_PITCH_UM = 27.4
 MIDDLE_PX = 1072  # a step of the lattice is 356
 
@@ -120,6 +121,23 @@ def test_handwriting_in_two_corners_is_not_taken_for_faint_crosses(change: str) 
     distance = np.hypot(*np.moveaxis(observed[:, None] - crosses[None], -1, 0))
     assert len(observed) == 3
     assert distance.min(axis=0).max() < 1.0
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("change", ["moved along columns", "stretched to black and white"])
+def test_marks_unlike_their_drawing_that_nothing_else_resembles_are_weak(change: str) -> None:
+    """Each time one of the ring-crosses, with lines of 0.8 px, had a residual as large as its own contrast."""
+    layout = square(MarkShape(RING_CROSS, "light"))
+    places = np.array([(198.6, 1776.5), (1871.9, 113.2), (207.6, 105.9), (1863.1, 1786.2)])  # seen by a person
+    with open_scan(SCANS / "aerial" / "08320661.jpeg") as opened:
+        grey = opened.window(0, 0, opened.width_px, opened.height_px)
+    grey = uniform_filter1d(grey, 3, axis=0) if change == "moved along columns" else (grey - 40) * (255 / 160)
+    stored = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+    scan = Scan(Path(change), WholePicture(stored[..., None]), NO_TAGS).replace_tone(Tone.unknown())
+    result = measure_fiducials(scan, layout, (127.0, 127.0))
+    observed = observations(result, layout)[1]
+    assert len(observed) == 4
+    assert np.hypot(*np.moveaxis(observed[:, None] - places[None], -1, 0)).min(axis=0).max() < 0.5
 
 
 @pytest.mark.study

@@ -315,6 +315,7 @@ def test_specks_that_lie_as_three_marks_of_four_are_doubted_with_numbers() -> No
     assert frame.inliers.tolist() == [False, True, True, True]
     sentence = doubt_frame(SearchResult(), frame)
     assert "only 3 of 4 marks were found, and 1 of 64 random places match as well (p = 0.06)" in sentence
+    assert Code.NO_FRAME in sentence.codes
 
 
 def test_a_frame_that_chance_is_likelier_to_have_made_than_not_gives_no_observation() -> None:
