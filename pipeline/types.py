@@ -1,6 +1,4 @@
-"""Types of arrays and paths shared by the modules."""
-
-import os
+"""Array types shared by the modules."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,5 +6,4 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
-FilePath = str | os.PathLike[str]
 Samples = NDArray[np.uint8 | np.uint16]

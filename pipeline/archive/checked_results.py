@@ -47,7 +47,7 @@ from pipeline.results.measured_record import (
     scan_detail,
     scan_location,
 )
-from pipeline.types import FilePath
+from pipeline.text.files import FilePath
 
 _AT_A_TIME = 500  # frames per transaction
 _WRITTEN = "comparator.csv"

@@ -35,9 +35,8 @@ from pipeline.results.comparator_file import ComparatorPoint, read_comparator
 from pipeline.results.stage_files import read_check
 from pipeline.stages import run_all, run_measure
 from pipeline.summary import Summary
-from pipeline.text.files import write_atomically
+from pipeline.text.files import FilePath, write_atomically
 from pipeline.text.wording import counted, did_you_mean, listed_by_reason
-from pipeline.types import FilePath
 from pipeline.workers import WorkOptions
 
 GENEROUS = 2.0  # factor on the unmodelled standard deviation, for lens models with larger misfit than the first

@@ -26,11 +26,10 @@ from pipeline.files.camera_tables import (
 )
 from pipeline.files.earlier_calibration import EarlierCalibration, read_calibration
 from pipeline.files.mark_table import Clicks, Drawing, LearnedFrom, SavePicture, read_marks, template_values
-from pipeline.text.files import SMALLEST_SIGMA, image_name
+from pipeline.text.files import SMALLEST_SIGMA, FilePath, image_name
 from pipeline.text.table_models import read_model
 from pipeline.text.tables import Table, list_words, read_toml
 from pipeline.text.wording import did_you_mean, table_lines
-from pipeline.types import FilePath
 
 FIELD_RATIO = 50.0  # largest half diagonal over principal distance, or frame over fiducials' extent: 178° field of view
 LONGEST_RATIO = 500.0  # largest principal distance over half the diagonal: small plates of astrographs with c = 10 m

@@ -17,8 +17,7 @@ from adjust.problem.observations import Distance
 from measure.scans.remote import Window
 from pipeline.errors import InputError
 from pipeline.text.csv_table import Row, read_csv
-from pipeline.text.files import image_name, read_bytes, write_atomically
-from pipeline.types import FilePath
+from pipeline.text.files import FilePath, image_name, read_bytes, write_atomically
 
 REQUIRED = ("point", "X", "Y", "Z")
 OPTIONAL = ("sX", "sY", "sZ", "nX", "nY", "nZ")

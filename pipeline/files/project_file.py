@@ -31,11 +31,10 @@ from pipeline.files.scan_files import FoundScans, add_cuts, as_named, find_scans
 from pipeline.files.target_table import TargetSettings, TieSettings, read_targets
 from pipeline.provenance import hash_content
 from pipeline.results.adjustment_file import covariance_path
-from pipeline.text.files import no_such_file, path_below
+from pipeline.text.files import FilePath, no_such_file, path_below
 from pipeline.text.table_models import read_model
 from pipeline.text.tables import Table, read_toml
 from pipeline.text.wording import nearest
-from pipeline.types import FilePath
 
 if TYPE_CHECKING:
     from measure.scans.scan import Scan

@@ -20,8 +20,8 @@ from pipeline.provenance import hash_file
 from pipeline.results.adjustment_content import adjustment_record, covariance_arrays
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.record_json import json_text, read_record
-from pipeline.text.files import MOST_MB, atomic_path, read_bytes
-from pipeline.types import Array, FilePath
+from pipeline.text.files import MOST_MB, FilePath, atomic_path, read_bytes
+from pipeline.types import Array
 
 AGAIN = "Run `reseau adjust` again; it writes both files."
 

@@ -17,8 +17,8 @@ from adjust.problem.observations import ObservationKind
 from measure.flags import Status
 from pipeline.errors import InputError
 from pipeline.text.csv_table import Row, csv_line, read_csv
-from pipeline.text.files import atomic_path, image_name, read_bytes
-from pipeline.types import Array, FilePath
+from pipeline.text.files import FilePath, atomic_path, image_name, read_bytes
+from pipeline.types import Array
 
 COLUMNS = (
     "image", "point", "kind", "x_mm", "y_mm", "sx_mm", "sy_mm", "rho", "col_px", "row_px", "status", "reason",

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import InputError
-from pipeline.text.files import LARGEST, SMALLEST_SIGMA, no_such_file, quote_value, read_bytes
+from pipeline.text.files import LARGEST, SMALLEST_SIGMA, FilePath, no_such_file, quote_value, read_bytes
 from pipeline.text.wording import did_you_mean
-from pipeline.types import FilePath
 
 SEPARATORS = {";": "semicolons", "\t": "tabs"}
 

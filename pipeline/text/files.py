@@ -22,6 +22,7 @@ _KINDS = {
     stat.S_ISSOCK: "a socket",
 }
 LARGEST = 1e15  # limit of coordinates, sizes and standard deviations, any unit: squares of larger ones lose precision
+FilePath = str | os.PathLike[str]
 SMALLEST_SIGMA = 1e-9  # limit of standard deviations, mm, m or degrees: weights of smaller ones dominate all others
 
 

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import InputError
-from pipeline.text.files import no_such_file, read_bytes
+from pipeline.text.files import FilePath, no_such_file, read_bytes
 from pipeline.text.wording import did_you_mean
-from pipeline.types import FilePath
 
 MOST_MB = 4  # size of a camera file with marks learned from 12,000 scans
 
