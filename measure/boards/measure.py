@@ -9,6 +9,7 @@ from scipy.spatial import KDTree
 
 from measure.array_types import Array
 from measure.boards.corners import Corner, CornerStart, Surface, crossing, fit_corners, quarter
+from measure.boards.edge_shift import without_edge_shift
 from measure.boards.find import find_board
 from measure.boards.lattice import Place, find_grid
 from measure.boards.specs import (
@@ -207,7 +208,10 @@ def _fit_found(scan: Scan, found: Mapping[str, FoundCorner], spec: BoardSpec) ->
         return ScanWindow(scan.window(*place_px), (col, row), scan.inside(*place_px, is_read=True), sides)
 
     surface: Surface = quarter if stands_alone else crossing
-    return dict(zip(found, fit_corners(read, starts, surface, scan.rounding_step_dn), strict=True))
+    fitted = dict(zip(found, fit_corners(read, starts, surface, scan.rounding_step_dn), strict=True))
+    if not stands_alone:
+        return fitted
+    return without_edge_shift(fitted, found, spec.object_points(), (scan.width_px, scan.height_px))
 
 
 def _reach_px(sides_px: Array, spec: BoardSpec, board_reach_px: float) -> Array:
