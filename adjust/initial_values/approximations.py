@@ -36,6 +36,7 @@ from adjust.validation import validate
 ON_A_LINE = 1e-6  # second extent of the known points over the first below which they lie on a line
 MOST_FOLDED = 0.05  # largest fraction of points outside the invertible range of the distortion (gross errors)
 CLEARLY_WORSE = 5.0  # ratio of the median residuals above which a resection replaces a given orientation
+MOST_UNMET = 0.25  # share of points whose rays may not meet: more have another cause than mismatches
 FEWEST_COMMON = 3  # common points of two parts: a mirrored similarity fits two points as well
 
 FilmFit = tuple[Array, bool]  # parameters, and whether the scan is mirrored
@@ -340,15 +341,25 @@ def _scale_by_distances(block: Block, distances: Sequence[Distance]) -> None:
 
 
 def _all_points(block: Block) -> dict[str, Array]:
-    """Coordinates of every point: known, else intersected, else the given approximation."""
+    """Coordinates of every point: known, else intersected, else the given approximation.
+
+    A few whose rays do not meet are placed on a ray, as far away as points are: the mismatches are found later.
+    """
     points = {**block.rough, **intersected(block, 0.0)}
     nowhere = np.isnan(np.array(list(points.values())).reshape(-1, 3)).any(axis=1)
     unknown = {name for name, is_nowhere in zip(points, nowhere, strict=True) if is_nowhere}
+    found = {name: xyz for name, xyz in points.items() if name not in unknown}
     for name in sorted(unknown):
         showing = [image for image in sorted(block.sights) if name in block.sights[image].points]
-        if showing:
+        if len(showing) == 1 or (showing and len(unknown) > MOST_UNMET * len(points)):
             raise AdjustmentError(_why_not_intersected(name, showing))
-    return {name: xyz for name, xyz in points.items() if name not in unknown}
+        if showing:
+            sight, pose = block.sights[showing[0]], block.poses[showing[0]]
+            ray = sight.rays[sight.points.index(name)] @ pose.rotation
+            seen = np.array([points[other] for other in sight.points if other not in unknown]).reshape(-1, 3)
+            away = float(np.median(np.linalg.norm(seen - pose.center, axis=1))) if len(seen) else 1.0
+            found[name] = pose.center + away * ray / np.linalg.norm(ray)
+    return found
 
 
 def _why_not_intersected(point: str, images: Sequence[str]) -> str:

@@ -17,14 +17,16 @@ from scipy.special import chdtrc
 from adjust.array_types import Array
 from adjust.errors import AdjustmentError, DatumError, NoImageError, UnorientedError
 from adjust.functional_model.families import parameter_names
-from adjust.functional_model.lens import Lens, Prior
-from adjust.initial_values.approximations import camera_frames, initial_values
-from adjust.initial_values.pose import Pose, Sight, image_distances, intersect
+from adjust.functional_model.lens import Prior
+from adjust.initial_values.approximations import initial_values
+from adjust.initial_values.mismatches import Mismatches, find_mismatches, started_rays
+from adjust.initial_values.pose import intersect
 from adjust.least_squares.malloc_tuning import keep_freed_memory, pause_cycle_search
 from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Network, ObjectPoint
-from adjust.problem.parameter import Parameter
+from adjust.problem.parameter import Parameter, shortened
 from adjust.problem.problem import Problem, number, number_reduced
+from adjust.problem.unknowns import Reduction
 from adjust.quality.variance_components import added_variance
 from adjust.rank_defect.datum import held_as_known
 from adjust.solution.blunder_hypotheses import (
@@ -45,6 +47,7 @@ TRIAL_STEPS = 6  # iterations of a trial adjustment, enough to test v'Pv, which 
 FITTING = 3.0  # in sigma0 of the others: largest rms standardised residual of an image that agrees with them
 CONTRADICTING = 0.5  # share of v'Pv above which one image explains why the iteration does not converge
 FEWEST_RAYS = 2  # rays needed for a point without priors
+NAMED = 5  # images named in a message
 ROUNDS = 6  # two or three suffice: nearly equal weights hardly change the residuals
 FIRST = 1e-3  # initial value, fraction of the frame's diagonal: above any lens misfit, below a blunder
 PLAUSIBLE = 3e-4  # fraction of the frame's diagonal that lens, board and processing may cause: 1.5 px of 5000 px
@@ -307,15 +310,29 @@ class _Solver:
     def solve(
         self, network: Network, start: Approximations, doubted_points: Iterable[str] = (), plain: bool = False
     ) -> Adjustment:
-        """Adjust a network in coordinates reduced to its centroid; the result is in its own coordinates.
+        """Adjust a network without mismatched rays of unknown points, or as it is where that does not converge.
 
         doubted_points: points whose given coordinates are left out at first. plain: with the weights as given.
         """
-        problem, reduction = number_reduced(network, start, self.options.method == "elements")
-        unknowns = problem.unknowns
-        doubted = [int(position) for name in doubted_points for position in unknowns.point[name]]
-        result = adjust_problem(problem, self.options.plain if plain else self.options, doubted=doubted)
-        return replace(result, network=network, values=reduction.unreduced_values(unknowns, result.values, network))
+        options, doubted = self.options.plain if plain else self.options, list(doubted_points)
+        given = numbered = number_reduced(network, start, options.method == "elements")
+        earlier, result = Mismatches({}, {}, {}), None
+        # Orientations that the worst mismatches have not spoilt show the smaller ones, and which rays meet after all.
+        for _ in range(ROUNDS):
+            problem, reduction = numbered
+            found = find_mismatches(problem)
+            if found.agrees(earlier):
+                break
+            places = {name: place + reduction.origin for name, place in found.places.items()}
+            start, (rest, mismatched) = replace(start, points={**start.points, **places}), _without(network, found)
+            result = _solve(rest, number_reduced(rest, start, problem.by_elements), options, doubted, mismatched)
+            if not result.converged:
+                return _solve(network, given, options, doubted, {})
+            start = replace(result.approximations, points={**start.points, **result.approximations.points})
+            numbered, earlier = number_reduced(network, start, problem.by_elements), found
+        if result is None:
+            return _solve(network, given, options, doubted, {})
+        return replace(result, unmet=_unmet_sentences(network, earlier))
 
     def solve_plainly(self, network: Network, start: Approximations | None) -> Adjustment | None:
         """Adjust a network in a few steps with the weights as given; None where the adjustment cannot start."""
@@ -377,6 +394,37 @@ class _Solver:
                 )
                 return replace(result, remarks=(warning, *result.remarks))
         return stopped
+
+
+def _solve(
+    network: Network,
+    numbered: tuple[Problem, Reduction],
+    options: Options,
+    doubted_points: Iterable[str],
+    mismatched: Mapping[int, tuple[int, ...]],
+) -> Adjustment:
+    """Adjust a network that is numbered in reduced coordinates; the result is in its own coordinates."""
+    problem, reduction = numbered
+    doubted = [int(position) for name in doubted_points for position in problem.unknowns.point[name]]
+    result = adjust_problem(problem, options, doubted=doubted, mismatched=mismatched)
+    values = reduction.unreduced_values(problem.unknowns, result.values, network)
+    return replace(result, network=network, values=values)
+
+
+def _without(network: Network, mismatches: Mismatches) -> tuple[Network, dict[int, tuple[int, ...]]]:
+    """Remove the points whose rays do not meet from a network; also return its doubted rows."""
+    out = np.concatenate([np.empty(0, dtype=np.intp), *mismatches.unmet.values()])
+    kept = np.setdiff1d(np.arange(len(network.observations)), out)
+    doubted = {
+        int(np.searchsorted(kept, row)): tuple(np.searchsorted(kept, others).tolist())
+        for row, others in mismatches.doubted.items()
+    }
+    if not len(out):
+        return network, doubted
+    points = tuple(point for point in network.points if point.id not in mismatches.unmet)
+    distances = tuple(each for each in network.distances if not {each.start, each.end} & mismatches.unmet.keys())
+    rest = replace(network, points=points, observations=network.observations.only(kept), distances=distances)
+    return rest, doubted
 
 
 def leave_out(network: Network, frames: Collection[str]) -> Network | None:
@@ -481,57 +529,25 @@ def _far_points(problem: Problem, family: float) -> list[_FarPoint]:
     Distributions, 1983). All points before the last such gap are far, if their rays meet. Empty where more than
     MOST_FAR of the points are far.
     """
-    sights = _sights(problem)
-    rays = {name: own for name, own in _rays_of_given(problem, sights).items() if len(own) >= FEWEST_IMAGES}
-    if not rays:
+    rays, unknowns, rows = started_rays(problem), problem.unknowns, defaultdict[str, list[int]](list)
+    given = {id_: unknowns.given[at] for id_, at in unknowns.point.items() if np.isfinite(unknowns.sigma[at]).all()}
+    for row in np.flatnonzero(rays.scale_mm > 0.0).tolist():
+        rows[problem.network.observations.point[row]].append(row)
+    shown = {name: np.array(rows[name]) for name in sorted(given) if len(rows[name]) >= FEWEST_IMAGES}
+    if not shown:
         return []
-    miss = {name: float(np.median(own[:, -1])) for name, own in rays.items()}
-    noise = float(np.median([sight.sigma_mm for sight in sights.values()]))
+    miss = {name: float(np.median(rays.misses_mm(own, given[name]))) for name, own in shown.items()}
     falling = sorted(miss, key=lambda name: (-miss[name], name))
-    limits = [max(miss[name], noise) / np.sqrt(family) for name in falling]  # for the points before each
+    limits = [max(miss[name], rays.sigma_mm) / np.sqrt(family) for name in falling]  # for the points before each
     gaps = [k for k in range(1, int(MOST_FAR * len(falling)) + 1) if miss[falling[k - 1]] > limits[k]]
     found = []
     for name in falling[: gaps[-1]] if gaps else ():
-        centers, directions, c_mm, _ = np.split(rays[name], [3, 6, 7], axis=1)
-        numbers = np.zeros(len(centers), dtype=np.intp)
-        (place,), _ = intersect(centers, directions, numbers, np.full((1, 3), np.nan))
-        along = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-        offsets = place - centers
-        depths = (offsets * along).sum(axis=1)
-        across_mm = c_mm[:, 0] * np.linalg.norm(offsets - depths[:, None] * along, axis=1)
-        if (depths > 0.0).all() and (across_mm < limits[gaps[-1]] * depths).all():
-            found.append(_FarPoint(name, len(centers), place, miss[name], miss[falling[gaps[-1]]]))
+        own = shown[name]
+        numbers = np.zeros(len(own), dtype=np.intp)
+        (place,), _ = intersect(rays.centers[own], rays.directions[own], numbers, np.full((1, 3), np.nan))
+        if (rays.misses_mm(own, place) < limits[gaps[-1]]).all():
+            found.append(_FarPoint(name, len(own), place, miss[name], miss[falling[gaps[-1]]]))
     return found
-
-
-def _rays_of_given(problem: Problem, sights: Mapping[str, Sight]) -> dict[str, Array]:
-    """Rays (m, 8) of every point given in X, Y and Z: station, direction, principal distance, and how far the projected
-    point misses its mark."""
-    unknowns, start = problem.unknowns, problem.start()
-    given = {id_: unknowns.given[at] for id_, at in unknowns.point.items() if np.isfinite(unknowns.sigma[at]).all()}
-    rays = dict[str, list[Array]]()
-    for image, rotation in zip(problem.network.images, start.rotations, strict=True):
-        if (sight := sights.get(image.name)) is None:
-            continue
-        center, c = start.values[unknowns.exterior[image.name][:3]], sight.principal_distance_mm
-        known = [row for row, name in enumerate(sight.points) if name in given]
-        xyz = np.array([given[sight.points[row]] for row in known]).reshape(-1, 3)
-        distances = image_distances(Pose(rotation, center), xyz, sight.xy_mm[known], c)
-        for row, distance in zip(known, distances, strict=True):
-            ray = np.array([*center, *(sight.rays[row] @ rotation), c, distance])
-            rays.setdefault(sight.points[row], []).append(ray)
-    return {name: np.array(own) for name, own in sorted(rays.items())}
-
-
-def _sights(problem: Problem) -> dict[str, Sight]:
-    """Image points by image name, for images with object points, corrected for the distortion known beforehand."""
-    network, unknowns = problem.network, problem.unknowns
-    transformation = {name: unknowns.start[at] for name, at in unknowns.transformation.items()}
-    frames, sights = camera_frames(network, transformation, problem.mirrored), dict[str, Sight]()
-    for name, at in unknowns.camera.items():
-        interior, known = np.split(unknowns.start[at], [3])
-        sights |= frames.sights(name, Lens(network.camera_by_name[name].distortion, interior, known))
-    return sights
 
 
 def _free_points(network: Network, start: Approximations, far: Sequence[_FarPoint]) -> tuple[Network, Approximations]:
@@ -596,6 +612,17 @@ def _sentence(
         f"point within {far.others_mm:.2g} mm.{guess} Correct its coordinates, or its number among the marks; with "
         f"snooping = true the adjustment does without them."
     )
+
+
+def _unmet_sentences(network: Network, mismatches: Mismatches) -> dict[str, str]:
+    """Describe the points whose rays do not meet, by point."""
+    images, sentences = network.observations.image, dict[str, str]()
+    for name, rows in mismatches.unmet.items():
+        where = shortened([images[row] for row in rows], NAMED)
+        sentences[name] = (
+            f"No two rays of point {name} meet, from the images {where}: the point is left out. Check its number there."
+        )
+    return sentences
 
 
 def _few_points(network: Network) -> list[str]:

@@ -84,6 +84,7 @@ class Adjustment(Estimates, PlottedResult):
     slips : by given point, a sentence on the coordinate blunder that prevents agreement or a solution; other suspects
         are then consequences of these.
     left_out : reasons by name of the images without an orientation; `network` has the others.
+    unmet : sentences by name of the points whose rays do not meet; `network` has the others.
     misread : sentences on mirrored images; other contradictions are then consequences of these.
     unused : notes on input that is not used; listed first among the notes.
     unmodelled_mm : by camera, the estimated standard deviation of unmodelled errors.
@@ -104,6 +105,7 @@ class Adjustment(Estimates, PlottedResult):
     remarks: tuple[str, ...] = ()
     slips: Mapping[str, str] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
+    unmet: Mapping[str, str] = field(default_factory=dict)
     misread: tuple[str, ...] = ()
     unused: tuple[str, ...] = ()
     unmodelled_mm: Mapping[str, float] = field(default_factory=dict)
@@ -151,8 +153,8 @@ class Adjustment(Estimates, PlottedResult):
 
     @property
     def start(self) -> Approximations | None:
-        """Initial values of a similar adjustment of all images; None without a solution or with images left out."""
-        return self.approximations if self.converged and not self.left_out else None
+        """Initial values of a similar adjustment; None without a solution or with images or points left out."""
+        return self.approximations if self.converged and not (self.left_out or self.unmet) else None
 
     def cluster_covariance_of(self, parameters: Sequence[Parameter]) -> Array | None:
         """Estimate the covariance (k, k) of quantities of cameras or boards by leaving out one image at a time.
@@ -254,7 +256,7 @@ class Adjustment(Estimates, PlottedResult):
         left_out = (f"Left out of the adjustment: {reason}" for reason in dict.fromkeys(self.left_out.values()))
         own = () if self.slips and not self.converged else run_warnings(self.scaled, self.cofactor, self.residuals)
         curved = curved_valley_warnings(self.run, self.cofactor) if self.converged else ()
-        return (*self.misread, *self.slips.values(), *left_out, *self.remarks, *own, *curved)
+        return (*self.misread, *self.slips.values(), *left_out, *self.unmet.values(), *self.remarks, *own, *curved)
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
@@ -390,16 +392,20 @@ def _redundancy(run: Run, cofactor: Cofactor) -> int:
 
 
 def adjust_problem(
-    problem: Problem, options: Options, held: Iterable[int] = (), doubted: Collection[int] = ()
+    problem: Problem,
+    options: Options,
+    held: Iterable[int] = (),
+    doubted: Collection[int] = (),
+    mismatched: Mapping[int, tuple[int, ...]] | None = None,
 ) -> Adjustment:
     """Adjust a network whose quantities are numbered.
 
     held: positions of quantities that stay at their start. doubted: positions of quantities whose given values are left
-    out at first (see `run`).
+    out at first; mismatched: rows of observations that are left out unless they agree with the rest (see `run`).
     """
     members = chosen_points(problem, options.datum_points)
     solved = settle_datum(problem, options)
-    solution = run(replace(solved, unknowns=solved.unknowns.fixed(held)), options, doubted)
+    solution = run(replace(solved, unknowns=solved.unknowns.fixed(held)), options, doubted, mismatched or {})
     if options.datum == "free":
         solution = _center_datum(problem, solution, members, options)
     result = _result(problem, solution, members if options.datum == "free" else None, options.probabilities)

@@ -1,7 +1,8 @@
 """Iterative reweighting: adjust repeatedly until the weights no longer change."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -24,26 +25,37 @@ ROUNDS = 30  # largest number of rounds of robust estimation, variance component
 ITERATIONS_A_ROUND = 8  # iterations per round of robust estimation, whose weights will change anyway
 
 
-def run(problem: Problem, options: Options, doubted: Collection[int] = ()) -> Run:
+def run(
+    problem: Problem,
+    options: Options,
+    doubted: Collection[int] = (),
+    mismatched: Mapping[int, tuple[int, ...]] = MappingProxyType({}),
+) -> Run:
     """Adjust a problem, whose datum is settled, from its start.
 
-    doubted: positions of quantities whose given values robust estimation and data snooping leave out at first; they
-    return where they agree with the rest. Raises NoImageError where a point has no image at the start.
+    doubted: positions of quantities whose given values robust estimation and data snooping leave out at first;
+    mismatched: rows of observations that every method leaves out at first, with those that could be wrong in their
+    place. They return where they agree with the rest. Raises NoImageError where a point has no image at the start.
     """
     units = TestedUnits(problem)
     alone = np.isin(units.positions[:, 0], list(doubted))
-    doubted_units = (len(units) - len(units.positions) + np.flatnonzero(alone)).tolist()
+    of_given = (len(units) - len(units.positions) + np.flatnonzero(alone)).tolist()
+    doubted_units = [*mismatched, *of_given]
     weights = np.ones(len(units))
     weights[doubted_units] = NO_WEIGHT
     factors = {group: 1.0 for group in options.groups if (units.groups == group).any()}
-    begun = Weighting(weights, {} if options.snooping else factors)
+    rejects = options.snooping or bool(mismatched and not options.robust)
+    begun = Weighting(weights, {} if rejects else factors)
     last = _run(problem, begun, problem.start(), options.iteration_limit)
-    if not options.snooping:
+    if not rejects:
         return _settle(last, options, doubted_units)
     # Variance components come second: those of contaminated groups would mask the outliers.
     if doubted_units and last.is_tested:
         tests = last.statistics
-        removed = (GrossError(unit, float(tests.statistic[unit]), 0.0, tests.error[unit]) for unit in doubted_units)
+        removed = (
+            GrossError(unit, float(tests.statistic[unit]), 0.0, tests.error[unit], mismatched.get(unit, ()))
+            for unit in doubted_units
+        )
         last = replace(last, removed=tuple(removed))
     last = _snoop_rounds(last, replace(options, variance_components=False))
     if not options.groups:
@@ -96,7 +108,7 @@ def _snoop_rounds(last: Run, options: Options) -> Run:
         search = Snooping(last, options.probabilities)
         limits = search.limits
         confirmed = [each for each in last.removed if last.statistics.statistic[each.unit] > limits[each.unit]]
-        removed = (*confirmed, *search.contradictions)
+        removed = (*confirmed, *(search.contradictions if options.snooping else ()))
         out = frozenset(each.unit for each in removed)
         if out == {each.unit for each in last.removed}:
             return last
