@@ -45,7 +45,8 @@ __all__ = ["Datum", "Method", "Options", "adjust", "adjust_unmodelled"]
 GUESSED = 0.1  # relative standard deviation of a principal distance above which the value is a guess
 TRIAL_STEPS = 6  # iterations of a trial adjustment, enough to test v'Pv, which decreases with each
 FITTING = 3.0  # in sigma0 of the others: largest rms standardised residual of an image that agrees with them
-CONTRADICTING = 0.5  # share of v'Pv above which one image explains why the iteration does not converge
+CONTRADICTING = 0.5  # share of v'Pv of a camera's images above which one of them explains what is wrong
+WHOLE = 3.0  # in given standard deviations: median residual of an image that contradicts the others as a whole
 FEWEST_RAYS = 2  # rays needed for a point without priors
 NAMED = 5  # images named in a message
 ROUNDS = 6  # two or three suffice: nearly equal weights hardly change the residuals
@@ -221,8 +222,9 @@ class _Solver:
     ) -> tuple[Adjustment, dict[str, str]]:
         """Adjust a network without the images that keep it from a solution; also return the reasons.
 
-        These are the images in which some point has no image at the start, and where the iteration does not converge
-        the one that contradicts the others most, if it converges without it. Raises NoImageError where too little would
+        These are the images in which some point has no image at the start, and where the iteration does not converge,
+        or observations contradict each other, the one that contradicts the others most, if all is well without it.
+        Raises NoImageError where too little would
         remain.
         """
         try:
@@ -231,11 +233,13 @@ class _Solver:
             if (rest := self.remainder(part, error.reasons)) is None:
                 raise
             return self.leave_out_blind(*rest, left_out | error.reasons)
-        reasons = contradicting_image(result) if result.termination not in ("converged", "singular") else {}
+        is_solved = result.termination == "singular" or (result.converged and self.trials.explains(result))
+        reasons = {} if is_solved else contradicting_image(result)
         if (rest := self.remainder(part, reasons)) is None:
             return result, left_out
         without, more = self.leave_out_blind(*rest, left_out | reasons)
-        return (without, more) if without.converged else (result, left_out)
+        is_better = self.trials.explains(without) if result.converged else without.converged
+        return (without, more) if is_better else (result, left_out)
 
     def try_again(self, network: Network, rest: Adjustment, left_out: dict[str, str]) -> Adjustment:
         """Adjust with those left-out images that fit once the lens is known."""
@@ -470,24 +474,33 @@ def fitting(result: Adjustment, frames: Collection[str], sigma0: float) -> set[s
 
 
 def contradicting_image(result: Adjustment) -> dict[str, str]:
-    """The frame that causes most of v'Pv in an adjustment without a solution, with the reason; empty if none does."""
-    image_numbers = result.network.image_numbers
-    frames = np.array([image.frame for image in result.network.images])[image_numbers]
+    """The frame that causes most of its camera's v'Pv, with the reason; empty if none does, or only by some marks."""
+    image_numbers, images = result.network.image_numbers, result.network.images
+    frames, cameras = np.array([(image.frame, image.camera) for image in images])[image_numbers].T
     # Without a solution there are no standardised residuals.
     variances = np.diagonal(result.network.observations.covariance_mm2, axis1=1, axis2=2)
     share = (result.residuals.v_mm**2 / variances).sum(axis=1)
     names, of_frame = np.unique(frames, return_inverse=True)
     sums = np.bincount(of_frame, share)
     worst = int(np.argmax(sums))
-    if len(names) < 2 or sums[worst] <= CONTRADICTING * sums.sum():
+    alike = cameras == cameras[np.argmax(of_frame == worst)]
+    if len(names) < 2 or sums[worst] <= CONTRADICTING * share[alike].sum():
         return {}
-    point = result.network.observations.point[int(np.argmax(np.where(of_frame == worst, share, -1.0)))]
-    return {
-        str(
-            names[worst]
-        ): f"with image {names[worst]} the iteration does not converge, without it it does. Its largest "
-        f"residual is that of {point}. Check the point numbers of this image."
-    }
+    name, own = str(names[worst]), np.where(of_frame == worst, share, -1.0)
+    if not result.converged:
+        point = result.network.observations.point[int(np.argmax(own))]
+        why = (
+            f"with image {name} the iteration does not converge, without it it does. Its largest residual is that of "
+            f"{point}. Check the point numbers of this image."
+        )
+        return {name: why}
+    if np.median(own[own >= 0.0]) < 2.0 * WHOLE**2:
+        return {}
+    why = (
+        f"all marks of image {name} contradict the other images, which agree without it. Check whether it is of "
+        "another size, pitch or camera than given, and its point numbers."
+    )
+    return {name: why}
 
 
 def _adopt_camera(camera: Camera, result: Adjustment) -> Camera:
