@@ -65,6 +65,10 @@ class BoardPictureFiles:
     cameras: tuple[CameraPictures, ...]
     unreadable: Mapping[str, str]
 
+    def with_camera(self, camera: CameraPictures) -> "BoardPictureFiles":
+        """Replace the camera of the same name."""
+        return replace(self, cameras=tuple(camera if each.name == camera.name else each for each in self.cameras))
+
 
 def find_pictures(given: Sequence[Path], out: Path) -> BoardPictureFiles:
     """Find the images among files and below folders, and group them by camera. Files below `out` are ignored.

@@ -27,17 +27,20 @@ from adjust import Approximations, Network, adjust
 from measure import Scan, open_scan
 from measure.boards.specs import ArucoSpec, BoardSpec, CharucoSpec, ChessboardSpec, CircleGridSpec, aruco_dictionary
 from measure.errors import MissingError
+from measure.flags import Status
 from pipeline import InputError
+from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.adjusting.picture_turn import turned_back
 from pipeline.calibration import calibrate_stage, intrinsics
 from pipeline.calibration.calibrate_stage import Calibration
 from pipeline.calibration.intrinsics import LensChoice, LensModel, choose_lens
-from pipeline.calibration.pictures import CameraPictures, find_pictures
-from pipeline.calibration.project_files import board_options
+from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures, find_pictures
+from pipeline.calibration.project_files import CalibrationOptions, board_options, write_project
 from pipeline.files.target_table import read_targets
 from pipeline.measuring.repeated_views import check_repeated_views
 from pipeline.opencv_check.check import BoardPictures, compare_corners, detector_name, find_points
 from pipeline.opencv_check.opencv_calibration import NAMES, Freedom, ImagePoints, OpenCvCalibration, calibrate
+from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.tables import Table
 
@@ -381,6 +384,29 @@ def test_a_scan_that_is_stored_twice_is_told_from_another_one_rectified_to_its_p
     targets = (replace(target, point="9", center_px=np.array(at)) for at in ((50.0, 80.0), (90.0, 80.0)))
     apart = [named_scan(name, marks=(*given, one)) for name, one in zip(("a", "b"), targets, strict=True)]
     assert not any(each.frame.problems for each in check_repeated_views(apart, False, lambda scan: drawn))
+
+
+@pytest.mark.parametrize("odd", [(), ("p3",)])
+def test_a_picture_of_another_print_is_named_and_no_other(odd: tuple[str, ...], tmp_path: Path) -> None:
+    """Its squares are 4 % wider; a lens, a drift and a bend of the board would have taken a part of that."""
+    options = CalibrationOptions(board_options("chessboard", "7x5", "20mm"))
+    images = tuple(f"p{number}" for number in range(len(TURNS)))
+    camera = CameraPictures("camera", *SIZE_PX, None, images)
+    for name in images:
+        (tmp_path / f"{name}.png").touch()
+    files = BoardPictureFiles({name: tmp_path / f"{name}.png" for name in images}, (camera,), {})
+    project = write_project(tmp_path, files, options, {"camera": "opencv4"})
+    rng, marks = np.random.default_rng(3), list[ComparatorPoint]()
+    for number, image in enumerate(images):
+        rotation, shift = pose(number)
+        shown = POINTS * (1.04 if image in odd else 1.0, 1.0, 1.0)
+        places = cv2.projectPoints(shown, cv2.Rodrigues(rotation)[0], shift, MATRIX, np.zeros(5))[0].reshape(-1, 2)
+        for point, place in zip(BOARD.object_points(), places + rng.normal(0.0, 0.02, places.shape), strict=True):
+            xy_mm, sigma_mm = place * [options.pixel_mm, -options.pixel_mm], np.full(2, 0.02 * options.pixel_mm)
+            marks.append(ComparatorPoint(image, point, "target", xy_mm, sigma_mm, 0.0, Status.MEASURED, ""))
+    found = calibrate_stage._odd_pictures(project, marks, camera, adjust_marks(project, marks), options.pixel_mm)
+    assert tuple(found) == odd
+    assert all("another print of the board" in why for why in found.values())
 
 
 def test_boards_as_project_files_have_them() -> None:
