@@ -42,6 +42,8 @@ _SMOOTHING = 1.5  # in blurs: noise is about 1.3 times that of the match, and th
 _LEAST_SMOOTHING_PX = 1.0  # px; with less smoothing the derivative is undersampled
 _WORST_CONDITION = 1e6  # of the normal matrix: beyond it a place in a small window has no significant digits
 _OWN = 0.9  # share of the image in rotation and scale above which the frame contributes little
+_SPLITS = 8  # directions of lines that divide a mark into halves
+_BY_HALVES = 0.25  # fraction of the squared residuals that a shift between halves explains; dust leaves less than 0.2
 _LEAST_SQUARES = 0.1  # lower bound of the mark's fraction of the squared slopes
 
 
@@ -97,6 +99,34 @@ class LinearFit:
         _, regions = cv2.connectedComponents(damaged.astype(np.uint8), connectivity=4)
         by_region = np.stack([np.bincount(regions.ravel(), each.ravel()) for each in about * self._uncut])[:, 1:]
         return np.asarray(by_region @ by_region.T / 3)  # 1/3: mean square of a uniform distribution from 0 to 1
+
+    def halves_px2(self, area: Mask, center_px: Array) -> Array:
+        """(2, 2) covariance of the place due to halves of the mark that contradict each other; 0 if none do.
+
+        Where one half was redrawn, or a joint displaced it, the match lies on the other half or between both, and what
+        it masks still shows the mark. The shift between halves is estimated from all pixels of the area (height, width)
+        around the mark, masked ones included. It counts where it explains much of the residuals.
+        """
+        if not np.any(area & ~self.used):
+            return np.zeros((2, 2))
+        (rows, cols), angles = np.indices(area.shape), np.arange(_SPLITS) * np.pi / _SPLITS
+        across = np.tensordot(
+            (np.cos(angles), np.sin(angles)), (cols - center_px[0], rows - center_px[1]), axes=((0,), (0,))
+        )
+        design = self.design * area
+        halves = (np.sign(across)[:, None] * design[:2]).reshape(-1, *area.shape)
+        images = np.concatenate([halves, (self.residuals * area)[None]])
+        by_design = products(images, design) @ np.linalg.pinv(products(design, design), hermitian=True)
+        left = images - combined(by_design, design)
+        squares = products(left, left)
+        best, shift = _BY_HALVES * float(squares[-1, -1]), np.asarray(np.zeros(2), float)
+        for split in range(0, len(halves), 2):
+            own = slice(split, split + 2)
+            if np.linalg.cond(squares[own, own]) < _WORST_CONDITION:
+                step = np.linalg.solve(squares[own, own], squares[own, -1])
+                if (explained := float(step @ squares[own, -1])) > best:
+                    best, shift = explained, np.asarray(step, float)
+        return np.asarray(shift @ shift * np.eye(2))  # masks and a free size turn its direction
 
     def texture_px2(self, area: Mask) -> Array:
         """(2, 2) covariance of the place due to texture inside or outside the mark in excess of the noise.

@@ -219,6 +219,8 @@ def _precision(fit: PictureFit, noise: NoiseModel, landscape: Landscape) -> dict
     place = place.plus(Cause.LANDSCAPE, landscape.covariance(by_grey[:2]))
     place = place.plus(Cause.UNLIKE_DRAWING, linear.unlike_drawing_px2(by_noise))
     place = place.plus(Cause.DAMAGE, linear.damage_px2(fit.area & ~fit.used))
+    halves = linear.halves_px2(fit.area & model.tells, fit.state.pixel_from_mark[:, 2])
+    place = place.plus(Cause.UNLIKE_DRAWING, halves)
     if not model.is_chip and model.background_px is None:
         place = place.plus(Cause.TEXTURE, linear.texture_px2(fit.area & model.tells))
     freedom, has_blur = model.options.freedom, model.blur is not None and not model.blur_is_at_limit

@@ -194,7 +194,7 @@ def test_a_mark_beyond_the_edge_is_absent() -> None:
     result = measure_grey(frame_picture(six, matrix), six)
     upper = [given.xy_mm[1] > 0 for given in six.marks]
     # Four marks of six lie as well on the other four: what is seen has no certain name.
-    assert [mark.status for mark in result.marks] == [Status.ABSENT if up else Status.WEAK for up in upper]
+    assert [mark.status for mark in result.marks] == [Status.ABSENT if up else Status.REJECTED for up in upper]
     assert "outside of the scan" in result.marks[upper.index(True)].reason
 
 

@@ -109,6 +109,28 @@ def test_dust_is_cut_out() -> None:
     assert 0.02 < np.mean(fractions) < 0.25
 
 
+@parametrize_with_studies("name", ["ring-cross", "ring-dot", "dot"], quick=(1,))
+def test_a_mark_half_of_which_was_redrawn_beside_it_says_so_in_its_sigma(name: str) -> None:
+    """The match lies between the halves, 0.5 px off each, and takes what is left of either for damage."""
+    rng = np.random.default_rng(19)
+    squares = []
+    for shown, place in draw_mark(name, 1.0):
+        angle = rng.uniform(0, 2 * np.pi)
+        beside = placed(SCALE, tuple(place[:, 2] + (np.cos(angle), np.sin(angle))), 0.03)
+        rows, cols = np.indices(shown.shape)
+        redrawn = brute_picture(MARKS[name], beside, SIZE, SIZE, 1.0)
+        halves = (
+            np.where(cols > place[0, 2], redrawn, shown)
+            if angle > np.pi
+            else np.where(rows > place[1, 2], redrawn, shown)
+        )
+        grey = GROUND + CONTRAST * halves + rng.normal(0, CONTRAST / 100, shown.shape)
+        fit = measure_picture(grey, MARKS[name], place, rng)
+        error = fit.center_px - place[:, 2]
+        squares.append(error @ np.linalg.solve(fit.covariance_px2, error))
+    assert np.sqrt(np.max(squares)) < 5.0
+
+
 @parametrize_with_studies("grain_px", [0.8, 1.3])
 def test_sigmas_hold_in_correlated_grain(grain_px: float) -> None:
     rng = np.random.default_rng(17)
