@@ -29,6 +29,7 @@ _OFF_SQUARES = 0.25  # in squares, largest distance of a corner from the place g
 _COMMON_DICTIONARIES = ("4X4_250", "5X5_250", "6X6_250", "7X7_250", "ARUCO_ORIGINAL", "APRILTAG_36h11")
 _FEWEST_TWICE = 2  # markers read at several places, from which on these are another board, no false readings
 _FEWEST_CORNERS = 4  # points needed for a homography
+_ALIKE, _MOST_ALIKE = 0.03, 0.8  # in sides, outlines of one size; fraction of the markers that agree on it
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +96,7 @@ def placed_markers(read: MarkerReadings, board: Markers) -> ReadMarkers:
     """Select the markers consistent with a board, in the order in which they were read."""
     readings = {number: places for number, places in read.outlines_px.items() if number in board}
     view = _view(readings, board, read.size_px, read.border / 2)
+    fitting_side = _fitting_side(readings, board, read.size_px) if view is None else None
     corners: dict[int, Array] = {}
     several = {number: len(places) for number, places in readings.items() if len(places) > 1}
     refused: dict[int, Reason] = {}
@@ -114,6 +116,10 @@ def placed_markers(read: MarkerReadings, board: Markers) -> ReadMarkers:
                 "there may be another such board",
                 Code.AMBIGUOUS,
             )
+        elif view is None and fitting_side is not None:
+            side = float(np.hypot(*(board[number][1] - board[number][0])))
+            message = f"marker {number} was read, but its side is about {fitting_side:.3g} mm against the distances, {side:.3g} mm"
+            refused[number] = Reason(f"{message} being described: measure both on the board", Code.SIZE)
         elif view is None:
             refused[number] = Reason(
                 f"marker {number} was read, but the board's markers do not agree on where the board lies: "
@@ -155,6 +161,36 @@ def _view(
         min(_off(view, board[number], place) for place in places) < 1.0 for number, places in readings.items()
     )
     return view if 2 * agreeing > len(readings) and np.median(misfits) < half_border else None
+
+
+def _fitting_side(readings: Mapping[int, list[Array]], board: Markers, size_px: tuple[int, int]) -> float | None:
+    """Side of the markers that fits the distances of their middles; None unless most of those read once agree on it."""
+    single = {number: places[0] for number, places in readings.items() if len(places) == 1}
+    if len(single) < _FEWEST_CORNERS:
+        return None
+    middles, middles_px = (
+        np.array([corners.mean(axis=0) for corners in each])
+        for each in ([board[number] for number in single], list(single.values()))
+    )
+    view = fit_view_robustly(middles, middles_px, size_px)
+    if view is None:
+        return None
+    ratios, alike = list[float](), 0
+    for number, place in single.items():
+        predicted = view.places_px(board[number])
+        ratios.append(float(np.sqrt(_area(place) / _area(predicted))))
+        scaled = ratios[-1] * (predicted - predicted.mean(axis=0))
+        off = (scaled - (place - place.mean(axis=0))) / _side_px(place)
+        alike += _off(view, board[number], place) < _OFF_SQUARES and np.sqrt((off**2).sum(axis=1).mean()) < _ALIKE
+    ratio, first = float(np.median(ratios)), next(iter(single))
+    spread = np.abs(np.array(ratios) / ratio - 1)
+    if min(alike, (spread < _ALIKE).sum()) < _MOST_ALIKE * len(single):
+        return None
+    return ratio * float(np.hypot(*(board[first][1] - board[first][0])))
+
+
+def _area(outline: Array) -> float:
+    return float(cv2.contourArea(np.asarray(outline, np.float32)))
 
 
 def _misfit(view: SheetView, corners: Array, image_px: Array) -> float:

@@ -1,5 +1,6 @@
 """Boards of markers: ChArUco, ArUco and AprilTag markers, Kalibr's AprilGrid, against their true places."""
 
+import re
 from dataclasses import replace
 
 import cv2
@@ -48,6 +49,19 @@ def generated(spec: CharucoSpec) -> NDArray[np.uint8]:
     size = (20 * (spec.columns + 2), 20 * (spec.rows + 2))
     picture = charuco_board(spec).generateImage(size, marginSize=20)
     return np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.7), np.uint8)
+
+
+def test_a_wrong_side_of_the_markers_is_named_with_the_right_one() -> None:
+    picture = np.full((280, 360), 255, np.uint8)
+    for row, column in np.ndindex(3, 4):
+        marker = cv2.aruco.generateImageMarker(aruco_dictionary("4X4_50"), 4 * row + column, 60)
+        picture[30 + 80 * row : 90 + 80 * row, 30 + 80 * column : 90 + 80 * column] = marker
+    assert len(find_aruco(picture, ArucoSpec("4X4_50", 4, 3, 30.0, 10.0)).corners) == 48
+    found = find_aruco(picture, ArucoSpec("4X4_50", 4, 3, 25.0, 15.0))
+    assert not found.corners
+    side = re.search(r"its side is about (\S+) mm against the distances, 25 mm being described", found.reason)
+    assert side is not None
+    assert float(side[1]) == pytest.approx(30.0, rel=0.03)  # read to a pixel of 60
 
 
 @pytest.mark.parametrize("legacy", [False, True])
