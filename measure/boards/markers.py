@@ -118,8 +118,9 @@ def placed_markers(read: MarkerReadings, board: Markers) -> ReadMarkers:
             )
         elif view is None and fitting_side is not None:
             side = float(np.hypot(*(board[number][1] - board[number][0])))
-            message = f"marker {number} was read, but its side is about {fitting_side:.3g} mm against the distances, {side:.3g} mm"
-            refused[number] = Reason(f"{message} being described: measure both on the board", Code.SIZE)
+            message = f"marker {number} was read, but its side is about {fitting_side:.3g} mm against the distances, "
+            message += f"{side:.3g} mm being described: measure both on the board"
+            refused[number] = Reason(message, Code.SIZE)
         elif view is None:
             refused[number] = Reason(
                 f"marker {number} was read, but the board's markers do not agree on where the board lies: "
