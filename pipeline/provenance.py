@@ -22,6 +22,7 @@ _PLAIN = {str, int, bool, type(None)}  # types of most values, tested first
 NO_FINGERPRINT = {"fingerprint": False}  # metadata of a field that is not part of a value's fingerprint
 Item = TypeVar("Item")
 
+_CHEAP_BYTES = 64_000_000  # largest file that is hashed whole without a request: 40 ms
 _PIECES, _PIECE = 8, 32768  # number and bytes of pieces of a file, spread evenly from its first byte to its last
 _PIECE_BYTES = 1 << 20
 
@@ -103,6 +104,16 @@ class FileState(NamedTuple):  # a tuple, since archives have many
     bytes: int
     mtime_ns: int = 0
     etag: str = ""
+
+    def is_touched(self, earlier: "FileState") -> bool:
+        """Whether time alone tells it from an earlier state, and the content is cheap to compare."""
+        is_alike = self._replace(mtime_ns=0) == earlier._replace(mtime_ns=0)
+        return is_alike and self.mtime_ns != earlier.mtime_ns and self.is_cheap
+
+    @property
+    def is_cheap(self) -> bool:
+        """Whether the whole file may be read to know its content."""
+        return 0 <= self.bytes <= _CHEAP_BYTES and not self.etag
 
 
 @dataclass(frozen=True)

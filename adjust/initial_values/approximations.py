@@ -356,8 +356,8 @@ def _all_points(block: Block) -> dict[str, Array]:
         if showing:
             sight, pose = block.sights[showing[0]], block.poses[showing[0]]
             ray = sight.rays[sight.points.index(name)] @ pose.rotation
-            seen = np.array([points[other] for other in sight.points if other not in unknown]).reshape(-1, 3)
-            away = float(np.median(np.linalg.norm(seen - pose.center, axis=1))) if len(seen) else 1.0
+            met = np.array([points[other] for other in sight.points if other not in unknown]).reshape(-1, 3)
+            away = float(np.median(np.linalg.norm(met - pose.center, axis=1))) if len(met) else 1.0
             found[name] = pose.center + away * ray / np.linalg.norm(ray)
     return found
 

@@ -82,8 +82,8 @@ def find_mismatches(problem: Problem) -> Mismatches:
     are doubted here, not rejected: the adjustment without them decides.
     """
     unknowns, is_unknown = problem.unknowns, np.zeros(len(problem.is_fiducial), dtype=bool)
-    is_seen = ~problem.is_fiducial & (problem.places[:, 2] >= 0)
-    is_unknown[is_seen] = ~np.isfinite(unknowns.sigma[problem.places[is_seen]]).all(axis=1)
+    has_place = ~problem.is_fiducial & (problem.places[:, 2] >= 0)
+    is_unknown[has_place] = ~np.isfinite(unknowns.sigma[problem.places[has_place]]).all(axis=1)
     rows = np.flatnonzero(is_unknown)
     doubted, places, unmet = dict[int, tuple[int, ...]](), dict[str, Array](), dict[str, Indices]()
     if not len(rows):

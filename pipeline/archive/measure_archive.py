@@ -51,6 +51,18 @@ def check_measurable(project: Project) -> tuple[str, ...]:
     return names
 
 
+def find_touched(store: Store, project: Project) -> dict[str, str]:
+    """Re-key the results of files of another time with the content that was measured; return {old fingerprint: new}."""
+    known, hashes = store.identities(), store.content_hashes()
+    files, keys = FileStates(project.path.resolve().parent), dict[str, str]()
+    for file in as_named(project.scans).values():
+        state = files.get(file)
+        earlier, content = known.get(state.uri), hashes.get(state.uri)
+        if earlier and content and state.is_touched(earlier.state) and content_hash(Path(file)) == content:
+            keys |= store.move(state.uri, Identity(state, earlier.parts_hash))
+    return keys
+
+
 def find_moved(store: Store, project: Project, reporter: Reporter) -> dict[str, str]:
     """Re-key the results of moved files by content hash and return {old fingerprint: new}.
 
@@ -79,16 +91,19 @@ def find_moved(store: Store, project: Project, reporter: Reporter) -> dict[str, 
     return keys
 
 
-def hash_contents(store: Store, tasks: Sequence[ScanTask], work: Work, reporter: Reporter) -> None:
-    """Hash the whole files of all scans without a content hash, so that they are recognised after a move."""
-    hashed = store.content_hashes()
-    left = {
-        work.state(task).uri: scan_path(task.scan) for task in tasks if task.scan and work.state(task).uri not in hashed
-    }
-    with reporter.stage("content hashed of") as count:
-        for done, (uri, path) in enumerate(left.items(), 1):
-            count(path.name, done, len(left))
-            store.set_content_hashes({uri: content_hash(path)})
+def hash_contents(store: Store, folder: Path, tasks: Sequence[ScanTask], work: Work, everywhere: bool) -> None:
+    """Hash the whole files of scans without a content hash, so that they are recognised when touched.
+
+    everywhere: those of any size, so that they are recognised after a move, too. folder: that of the project.
+    """
+    hashed, files, left = store.content_hashes(), FileStates(folder), dict[str, Path]()
+    for task in (task for task in tasks if task.scan):
+        state, path = work.state(task), scan_path(task.scan)
+        is_wanted = state.uri not in hashed and (everywhere or state.is_cheap)
+        if is_wanted and files.get(path) == state:  # else it was changed since it was measured
+            left[state.uri] = path
+    for uri, path in left.items():
+        store.set_content_hashes({uri: content_hash(path)})
 
 
 def measure_archive(
@@ -120,6 +135,7 @@ def measure_archive(
             reporter.say(f"{store.path}: {counted(lost, 'result')} stored there not as written: measured again")
         if options.retry:
             store.forget_failed()
+        thumbnails.rekey(find_touched(store, project))
         if options.moved:
             thumbnails.rekey(find_moved(store, project, reporter))
         work = Work(project, store, executor, options, thumbnails)
@@ -132,8 +148,7 @@ def measure_archive(
             work.complete([task for task in tasks if shard_number(task.name, parts) == part], reporter)
             return None
         work.complete(tasks, reporter)
-        if options.moved:
-            hash_contents(store, tasks, work, reporter)
+        hash_contents(store, project.path.resolve().parent, tasks, work, options.moved)
         if (failures := store.failures()) is not None:
             raise MeasurementError("\n".join(gathered(failures)))
         copies = find_copies(store, tasks, work)

@@ -26,7 +26,7 @@ from pipeline.archive.schema import is_sound
 from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_counts
 from pipeline.files.project_file import Project
 from pipeline.files.scan_files import as_named
-from pipeline.provenance import FileStates
+from pipeline.provenance import FileState, FileStates, content_hash
 from pipeline.results.measured_record import FailureCode
 
 NAMED = 20  # scans that a summary names
@@ -76,8 +76,10 @@ class ArchiveStatus:
 
 
 def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
-    """Status from the store and from the files' sizes and times; no scan is opened. path: of the store; None for the
-    project's."""
+    """Status from the store and the files' sizes and times; of files of another time the content is compared.
+
+    path: of the store; None for the project's.
+    """
     path = path or project.measurement_path
     rows, idle = {}, tuple[str, ...]()
     if path.exists():
@@ -90,11 +92,11 @@ def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
     for name, file in as_named(project.scans).items():
         state, camera = files.get(file), project.image_camera(name).path.name
         found = rows.get(state.uri)
-        if found is None or found[5] is None:
+        if found is None or found[6] is None:
             scans.append(ScanStatus(name, state.uri, camera, Verdict.WAITING))
             continue
-        _, bytes_, mtime_ns, etag, is_current, verdict, why, failure, seconds, finished, request, taken_in = found
-        is_same = is_current and (bytes_, mtime_ns, etag) == (state.bytes, state.mtime_ns, state.etag)
+        *earlier, content, is_current, verdict, why, failure, seconds, finished, request, taken_in = found
+        is_same = is_current and _is_same(state, FileState(*earlier), content, file)
         is_now = is_same and request in (None, request_hash(name))
         now = Verdict(verdict) if is_now else Verdict.OLD
         if is_now and taken_in is not None and taken_in != decisions_hash(decisions.get(name, ())):
@@ -104,6 +106,11 @@ def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
     return ArchiveStatus(tuple(sorted(scans)), tuple(dict.fromkeys((*unknown, *idle))))
 
 
+def _is_same(state: FileState, earlier: FileState, content: str, file: str | Path) -> bool:
+    """Whether a file is as it was measured: of that time, or of the content that was hashed."""
+    return state == earlier or bool(content and state.is_touched(earlier) and content_hash(Path(file)) == content)
+
+
 def _status_rows(store: Store, judging: Judging | None) -> Iterator[Sequence[Any]]:
     """Rows of the query; a damaged row is reported as a failure."""
     if judging is not None:
@@ -111,12 +118,13 @@ def _status_rows(store: Store, judging: Judging | None) -> Iterator[Sequence[Any
     why = "what is stored of it is not what was measured: `reseau measure --retry` measures it again"
     for *row, is_whole in store.connection.execute(_QUERY, (-1 if judging is None else judging.row,)):
         yield (
-            row if is_whole else (*row[:5], str(Verdict.FAILED), why, str(FailureCode.DAMAGED), None, "", row[10], None)
+            row if is_whole else (*row[:6], str(Verdict.FAILED), why, str(FailureCode.DAMAGED), None, "", row[11], None)
         )
 
 
 _QUERY = f"""
-select uri, bytes, mtime_ns, etag, is_current, coalesce(f.verdict, result.verdict), coalesce(f.why, result.why),
+select uri, bytes, mtime_ns, etag, content_hash, is_current,
+    coalesce(f.verdict, result.verdict), coalesce(f.why, result.why),
     case when result.verdict = '{Verdict.FAILED}' then result.detail ->> '$.failure.code' end,
     seconds, finished, asked, f.decisions,
     {is_sound("scan")} and (scan.result is null or {is_sound("result")} and result.scan = scan.id)

@@ -15,8 +15,9 @@ from adjust.problem.parameter import Parameter
 from pipeline.adjusting.compare_stage import calibrated_lens
 from pipeline.errors import InputError
 from pipeline.exchange.exchange_stage import check_folder, publish, readme
-from pipeline.files.camera_file import camera_text, read_camera
+from pipeline.files.camera_file import CameraFile, camera_text, read_camera
 from pipeline.files.mark_table import Picture, picture_file
+from pipeline.files.project_file import read_project
 from pipeline.provenance import hash_content
 from pipeline.results.adjustment_file import (
     Covariance,
@@ -207,7 +208,7 @@ def _camera_entry(camera: CameraRecord, source: Distortion, lens: ConvertedLens,
 
 def _converted_camera(path: Path, folder: Path, options: ConvertOptions) -> Conversion:
     """Convert the values and standard deviations of a camera file's lens."""
-    camera = read_camera(path)
+    camera = _read_camera(path)
     distance, point = camera.principal_distance_mm, camera.principal_point_mm
     if distance is None or point is None or camera.frame_mm is None:
         missing = "frame_mm" if camera.frame_mm is None else "principal distance or principal point"
@@ -248,6 +249,19 @@ def _converted_camera(path: Path, folder: Path, options: ConvertOptions) -> Conv
 
     files["camera.toml"] = camera_text(converted, save)
     return Conversion(found, sigmas, sentences, files)
+
+
+def _read_camera(path: Path) -> CameraFile:
+    """Read a camera file; for a project, raise InputError that names its own."""
+    try:
+        return read_camera(path)
+    except InputError as error:
+        try:
+            cameras = read_project(path).cameras.values()
+        except InputError:
+            raise error from None
+        files = listed([str(camera.path) for camera in cameras])
+        raise InputError(f"{path}: is a project, and a camera file or adjustment.json is converted: {files}.") from None
 
 
 def _sigmas(given: Array, source: Lens, found: ConvertedLens) -> Array:

@@ -113,7 +113,7 @@ class FittedLens:
 def nearest_lens(block: Block, frame: OutFrame, models: Sequence[Sequence[str]], options: ExportOptions) -> FittedLens:
     """Fit the lens of an image's camera in one of several models, each given by names of OpenCV's parameters.
 
-    The first model that is identical is taken; else the first that is close enough; else the last. If the lens
+    The first model that is identical is taken; else the first that is close enough; else the closest. If the lens
     distortion is removed from the frames, the result is a lens without distortion.
     """
     lens = frame.lens
@@ -122,11 +122,12 @@ def nearest_lens(block: Block, frame: OutFrame, models: Sequence[Sequence[str]],
     for names in models:
         if _has_only(lens, (*names, "b1")):
             return FittedLens(lens, 0.0)
+    fits, limit_mm = list[FittedLens](), options.largest_misfit_px * min(frame.known_pitch_um) / 1000.0
     for names in models:
-        fitted = _fit_opencv(block, frame, names)
-        if fitted.largest_mm <= options.largest_misfit_px * min(frame.known_pitch_um) / 1000.0:
-            break
-    return fitted
+        fits.append(_fit_opencv(block, frame, names))
+        if fits[-1].largest_mm <= limit_mm:
+            return fits[-1]
+    return min(fits, key=lambda each: each.largest_mm)
 
 
 def fisheye_lens(block: Block, frame: OutFrame, options: ExportOptions) -> FittedLens | None:

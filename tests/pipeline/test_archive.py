@@ -96,7 +96,7 @@ def one_more(folder: Path) -> None:
 
 CHANGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "nothing": (lambda p: None, ""),
-    "touched": (lambda p: os.utime(p / "b.tif", ns=(1, 1)), "b"),
+    "touched": (lambda p: os.utime(p / "b.tif", ns=(1, 1)), ""),
     "one pixel changed": (lambda p: change_pixel(p / "b.tif"), "b"),
     "renamed": (lambda p: (p / "b.tif").rename(p / "e.tif"), "e"),
     "one more": (one_more, "d"),
@@ -112,7 +112,7 @@ CHANGES: dict[str, tuple[Callable[[Path], object], str]] = {
 }  # fmt: skip
 
 
-@parametrize_with_studies("change", CHANGES, quick=(0, 2, 5, 6, 9, 10, 12))
+@parametrize_with_studies("change", CHANGES, quick=(1, 2, 5, 6, 9, 10, 12))
 def test_exactly_what_changed_is_measured_again(folder: Path, change: str) -> None:
     act, again = CHANGES[change]
     act(folder)
@@ -280,7 +280,8 @@ def test_status_tells_what_changed_outside(folder: Path, printed: Printed) -> No
     project = str(folder / "project.toml")
     assert command("status", project) == 0
     one_more(folder)
-    os.utime(folder / "a.tif", ns=(1, 1))
+    change_pixel(folder / "a.tif")
+    os.utime(folder / "b.tif", ns=(1, 1))  # as in a copy
     (folder / "c.tif").unlink()
     assert verdicts(folder) == {"a": "old", "b": "good", "d": "waiting"}
     output = json.loads(printed("status", project, "--json", code=1))

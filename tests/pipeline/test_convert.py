@@ -119,6 +119,12 @@ def test_what_does_not_fit_is_reported(tmp_path: Path, printed: Printed, refusal
         ).lower().replace("\n", " ")
     camera.write_text(CAMERA.replace("frame_mm = [36.0, 24.0]\n", ""), encoding="utf-8")
     assert "has no frame_mm" in refusal("convert", camera, "opencv", tmp_path / "out")
+    project = tmp_path / "project.toml"
+    project.write_text('camera = "camera.toml"\n', encoding="utf-8")
+    (tmp_path / "comparator.csv").write_text("image,point,kind,x_mm,y_mm\na,1,target,1.0,1.0\n", encoding="utf-8")
+    message = refusal("convert", project, "opencv", tmp_path / "out")
+    assert "is a project" in message
+    assert str(camera) in message
 
 
 SVG = "{http://www.w3.org/2000/svg}"

@@ -321,6 +321,16 @@ def test_a_strong_lens_is_refused_unless_requested(tmp_path: Path, refusal: Refu
     assert off.max() < 1.05 * stated_px
 
 
+def test_the_nearest_of_several_models_is_told(tmp_path: Path, refusal: Refusal) -> None:
+    """The last of OpenCV's models cannot be fitted to this lens."""
+    project = adjusted_project(
+        tmp_path, replace(TRUTH, family="ebner", distortion={"b1": 0.01, "b3": 0.005, "b7": 0.004})
+    )
+    message = refusal("export", project, "opencv", tmp_path / "a")
+    assert float(message.split("off by up to ")[1].split()[0]) < 0.1
+    exported(project, "opencv", tmp_path, "--misfit-px", "0.1")
+
+
 def test_an_export_is_replaced_whole(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = exported(project, "opencv", tmp_path)
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
