@@ -366,7 +366,9 @@ def _name_cameras(
     if not grouped.groups:
         raise InputError("\n".join(grouped.unread.values()))
     show(as_json, grouped.as_json, lambda console: print_groups(grouped, console))
-    print_next(as_json, command_step("init", *given, why="writes a project with these cameras"))
+    is_any_named = any(group.camera for group in grouped.groups)
+    step = command_step("init", *given, why="writes a project with these cameras") if is_any_named else LIBRARY_STEP
+    print_next(as_json, step)
     return DONE if grouped.all_named else LOOK
 
 

@@ -314,6 +314,16 @@ def test_photographs_are_known_by_their_exif_and_not_tried_on_the_library(tmp_pa
     assert group.digital == "taken by Canon EOS 80D, 35 mm"
 
 
+def test_no_project_is_offered_with_cameras_where_none_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Printed
+) -> None:
+    monkeypatch.setattr("pipeline.files.library.read_library", dict)
+    scan(tmp_path / "a.tif")
+    text = printed("cameras", "--scan", tmp_path, code=1)
+    assert "reseau template camera" in text
+    assert "reseau init" not in text
+
+
 def test_scans_that_were_all_tried_have_each_its_own_camera(tmp_path: Path) -> None:
     """Two scans of one size by different cameras are no group that shows none."""
     cameras = {scan(tmp_path / f"{name}.tif"): name for name in ("wild-rc5-153", "zeiss-rmk-a-153")}
