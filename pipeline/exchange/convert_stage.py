@@ -135,6 +135,11 @@ def _convert(
     half = np.abs(corners_mm).max(axis=0) if family(options.family).needs == "half_mm" else np.zeros(2)
     into = Distortion(options.family, r0_mm=options.r0_mm, half_mm=(float(half[0]), float(half[1])))
     found = convert_lens(lens, into, corners_mm, options.parameters or None, uncertain)
+    if not math.isfinite(found.largest_mm):
+        raise InputError(
+            f"{options.family} cannot take this lens ({lens.distortion.family}): the nearest one folds the image over "
+            f"within the frame. Convert it into another family, or for a smaller frame_mm."
+        )
     size = "{:.4g} x {:.4g} mm".format(*(corners_mm[1] - corners_mm[0]))
     sentence = (
         f"{lens.distortion.family} and {options.family} mean the same here: what is left over {size} is rounding."

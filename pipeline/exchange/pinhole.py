@@ -163,12 +163,15 @@ def sheared_lens(block: Block, frame: OutFrame, at_ideal: bool) -> FittedLens:
 
 
 def frame_corners_mm(block: Block, frame: OutFrame) -> Array:
-    """(2, 2) opposite corners of the exposed frame, camera mm: from the camera file, or the extent of the
-    observations."""
+    """(2, 2) opposite corners of the exposed frame or the picture, camera mm: from the camera file, or the extent of
+    the observations."""
     camera = block.camera_file(frame.camera)
-    if camera.fiducials and camera.frame_mm is not None:
-        half = np.array(camera.frame_mm) / 2.0
-        return np.array([-half, half])
+    if camera.frame_mm is not None:
+        size = np.array(camera.frame_mm)
+        if camera.fiducials:
+            return np.array([-size, size]) / 2.0
+        left, top = np.array(frame.known_pitch_um) / 2000.0 * (-1.0, 1.0)  # the edge of the first pixel
+        return np.array([[left, top - size[1]], [left + size[0], top]])
     places = [
         each.camera_mm(each.marks)
         for each in block.frames

@@ -119,6 +119,11 @@ def test_what_does_not_fit_is_reported(tmp_path: Path, printed: Printed, refusal
         ).lower().replace("\n", " ")
     camera.write_text(CAMERA.replace("frame_mm = [36.0, 24.0]\n", ""), encoding="utf-8")
     assert "has no frame_mm" in refusal("convert", camera, "opencv", tmp_path / "out")
+    wide = CAMERA.split("[distortion]")[0].replace("28.8", "15.0")
+    lens = '[distortion]\nfamily = "opencv_fisheye"\nvalue = {k1 = 0.03, k2 = -0.01, k3 = 0.002}\n'
+    (tmp_path / "wide.toml").write_text(wide + lens, encoding="utf-8")
+    assert "folds the image over" in refusal("convert", tmp_path / "wide.toml", "opencv", tmp_path / "wide")
+    assert not (tmp_path / "wide").exists()
     project = tmp_path / "project.toml"
     project.write_text('camera = "camera.toml"\n', encoding="utf-8")
     (tmp_path / "comparator.csv").write_text("image,point,kind,x_mm,y_mm\na,1,target,1.0,1.0\n", encoding="utf-8")

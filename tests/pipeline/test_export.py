@@ -50,6 +50,7 @@ from pipeline.exchange import micmac_format, pinhole
 from pipeline.exchange.block import read_block
 from pipeline.exchange.formats import FORMATS
 from pipeline.exchange.geojson_format import lon_lat
+from pipeline.exchange.pinhole import frame_corners_mm
 from pipeline.exchange.tables import _check_words
 
 Array = NDArray[np.float64]
@@ -389,6 +390,9 @@ def test_a_turned_picture_goes_out_turned_back(tmp_path: Path, monkeypatch: pyte
     camera = next(tmp_path.glob("camera*.toml"))
     camera.write_text(re.sub("frame_mm = .*\n", size_mm, camera.read_text(encoding="utf-8")), encoding="utf-8")
     assert command("adjust", project) in (DONE, LOOK)
+    block = read_block(read_project(project))
+    corners_mm = frame_corners_mm(block, block.frames[1])  # of the picture, not of the marks in it
+    np.testing.assert_allclose(corners_mm, [[-0.05, -239.95], [249.95, 0.05]], atol=1e-9)
     for format, reader in PINHOLES.items():
         folder = exported(project, format, tmp_path)
         off = np.linalg.norm(reader(folder, "f1", POINTS) - pixels, axis=1)
