@@ -418,7 +418,7 @@ def _misfit(
     marks = [mark for mark in _observed_fiducials(frame) if mark.point in number]
     sites = np.array([number[mark.point] for mark in marks], dtype=np.intp)
     given = np.array([layout.marks[place].xy_mm for place in sites]).reshape(-1, 2)
-    if frame.pixel_from_camera is None or np.linalg.matrix_rank(given - given.mean(axis=0)) < 2:
+    if frame.pixel_from_camera is None or np.linalg.matrix_rank(given[1:] - given[:1]) < 2:
         return None
     mm = np.diag([pitch_um[0], -pitch_um[1]]) / 1000
     places = np.array([mark.center_px for mark in marks])

@@ -345,6 +345,8 @@ def test_a_frame_whose_names_are_ambiguous_gives_no_observation() -> None:
         for mark, place in zip(result.marks, centers_px(DOTS, "0"), strict=True):
             assert mark.center_px == pytest.approx(place, abs=0.1)
     assert {mark.reason for mark in result.marks} == {shifted}
+    (checked,) = check_frames([result], DOTS, [(50.0, 50.0)]).frames
+    assert {mark.status for mark in checked.marks} == {Status.REJECTED}
 
 
 def test_one_mark_and_the_places_of_the_others_tell_the_pose() -> None:
