@@ -22,7 +22,7 @@ Kind = Literal["fiducial", "target", "tie", "join"]
 ON_FILM: tuple[Kind, ...] = ("fiducial", "join")  # kinds that are points of the film, not of the object
 # Stored results are reused only if this is unchanged. Increase it whenever measurements would change:
 # tests/measure/test_revision.py fails if that was forgotten.
-MEASURE_REVISION = 36
+MEASURE_REVISION = 37
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -333,6 +333,11 @@ class MarkFit:
     sharpening: SharpeningScore | None = None
     covariance: Array | None = None
     figures: Mapping[str, float] = field(default_factory=dict)
+
+    def shifted(self, offset_px: Array) -> "MarkFit":
+        """Shift the place by (2,) column and row."""
+        place = self.pixel_from_mark + np.column_stack([np.zeros((2, 2)), offset_px])
+        return replace(self, center_px=place[:, 2], pixel_from_mark=place)
 
     @property
     def is_clear(self) -> bool:

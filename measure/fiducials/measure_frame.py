@@ -6,7 +6,7 @@ of the lines, sharpening, tone curve and blur.
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import permutations
 
@@ -59,7 +59,6 @@ _TONE_ROUNDS = 5  # largest number of refits with an improved tone curve
 _OTHER_STARTS, _AGREED = (2.2, 1.0), 0.1  # gammas of further initial curves; disagreement up to which none is tried
 _TELLING = 8  # most significant marks, refitted until widths, sharpening and tone curve are settled: more cost time
 _SHARED_ROUNDS = 8  # largest number of refits with improved widths and sharpening
-_MOVED = 0.3  # fraction of a mark's standard deviation: smaller shifts by a better curve are ignored
 _UNCHECKED = 3  # marks, which an affine transformation fits without residuals
 _REFIT_PX = 1.5  # search range around a mark that was fitted already
 
@@ -339,7 +338,7 @@ def fit_lines_and_sharpening(frame: Frame, fewest: int = 0) -> Frame:
     """
     begun, plainest = frame, _by_significance(frame)
     options, telling = replace(frame.options.match, tells_sharpening=True), plainest
-    last = before = frame.scan.tone.sharpening
+    before, last = frame.scan.tone.sharpening, None
     for _ in range(_SHARED_ROUNDS):
         drawn = _widen_drawings(frame, telling)
         fits = (frame.detections[index].fit for index in telling)
@@ -349,7 +348,7 @@ def fit_lines_and_sharpening(frame: Frame, fewest: int = 0) -> Frame:
             found = estimate_sharpening(before, scores, len(frame.scan.tone.mean)) or Sharpening()
         if drawn is frame and found.is_as(before):
             break
-        last, before = before, found.damped(before, last) if last else found
+        last, before = (before, found), found.accelerated(before, last)
         telling = telling[:_TELLING]
         frame = _refit(
             _replace_tone(drawn, drawn.scan.tone.sharpened(before)), dict.fromkeys(telling, options), orient=False
@@ -388,7 +387,7 @@ def refit_frame(frame: Frame) -> Frame:
     from all marks. Marks whose blur is poorly determined take that of the others.
     """
     if len(frame.inlier_fits) >= 2:
-        frame = _refit_with_blur(_refit_with_tone(frame))
+        frame = orient_frame(shift_to_curve(_refit_with_blur(_refit_with_tone(frame))))
     return compare_shapes(_add_common_covariances(frame))
 
 
@@ -419,7 +418,7 @@ def _refit_with_blur(frame: Frame) -> Frame:
         figures = {"blur_ratio": ratio, "blur_sigma": blur_sigma} if np.isfinite(blur_sigma) else {}
         is_unlike = blur is not None and blur.differs and index not in faint
         amended[index] = matched.detections[index].amend(*[unlike_blur(ratio)] * is_unlike, figures=figures)
-    return orient_frame(matched.replace_detections(amended))
+    return matched.replace_detections(amended)
 
 
 def _is_better(before: MarkFit, fit: MarkFit, blur: SharedBlur | None) -> bool:
@@ -431,48 +430,48 @@ def _is_better(before: MarkFit, fit: MarkFit, blur: SharedBlur | None) -> bool:
 
 
 def _refit_with_tone(frame: Frame) -> Frame:
-    """Refit the marks with the tone curve estimated from the telling ones; if these disagree, from further curves."""
-    prior, begun, options = frame.scan.tone.prior, frame.scan.tone, frame.options.match
-    sigma = _linear_sigma(frame)
-    pending = {index for index, fit in frame.clear_fits.items() if _needs_frame(frame, index, fit, sigma)}
-    telling = {*_by_significance(frame)[:_TELLING]}
-    best = _settle_tone(frame, prior, telling, pending & telling)
-    is_open = best.tone.disagreement > _AGREED and any(
-        tone.sensitivity_px > best.clear_fits[index].sigma_px for index, tone in _mark_tones(best).items()
+    """Refit the marks with the tone curve estimated from all of them; if these disagree, from further curves."""
+    sigma, options = _linear_sigma(frame), frame.options.match
+    pending = [index for index, fit in frame.clear_fits.items() if _needs_frame(frame, index, fit, sigma)]
+    best = _settle_tone(_refit(frame, dict.fromkeys(pending, options)))
+    is_open = (
+        best.tone.is_told
+        and best.tone.disagreement > _AGREED
+        and any(tone.sensitivity_px > best.clear_fits[index].sigma_px for index, tone in _mark_tones(best).items())
     )
     for power in _OTHER_STARTS if is_open else ():
-        start = _replace_tone(best, prior.shift_to_power(power))
-        start = _refit(start, dict.fromkeys(telling & _mark_tones(best).keys(), options))
-        other = _settle_tone(start, prior, telling, frozenset())
+        start = _replace_tone(best, frame.scan.tone.prior.shift_to_power(power))
+        other = _settle_tone(_refit(start, dict.fromkeys(_mark_tones(best), options)))
         is_better = not other.tone.is_doubted and other.tone.disagreement < best.tone.disagreement
         best = other if is_better else best
-    rest = pending if best.scan.tone is begun else pending | {*_mark_tones(best)}
-    if rest <= telling:
-        return best
-    best = _refit(best, dict.fromkeys(rest - telling, options))
-    every = FrameTone.from_marks(prior, _mark_tones(best), best.scan.tone)
-    return best if best.tone.is_doubted else replace(best, tone=every)
+    return best
 
 
-def _settle_tone(frame: Frame, prior: Tone, telling: Set[int], pending: Set[int]) -> Frame:
-    """Refit marks and estimate the tone curve from the telling ones in turn.
-
-    prior: curve known before; pending: telling marks to be refitted with any curve.
-    """
+def _settle_tone(frame: Frame) -> Frame:
+    """Estimate the tone curve from the marks, and refit these with it as long as it moves any of them by much."""
     for rounds_left in range(_TONE_ROUNDS, -1, -1):
-        tones, fits = _mark_tones(frame, telling), frame.clear_fits
-        estimate = FrameTone.from_marks(prior, tones, frame.scan.tone)
+        tones, fits, before = _mark_tones(frame), frame.clear_fits, frame.scan.tone
+        estimate = FrameTone.from_marks(before.prior, tones, before)
         frame = replace(frame, tone=estimate)
-        moves = [estimate.shift_px(each, frame.scan.tone) > _MOVED * fits[n].sigma_px for n, each in tones.items()]
-        changed = pending | tones.keys() if any(moves) else pending
-        if not (changed and rounds_left):
+        is_moved = estimate.is_told and any(
+            estimate.moves(each, before, fits[n].covariance_px2) for n, each in tones.items()
+        )
+        if not (is_moved and rounds_left):
             break
-        if any(moves):
-            frame = _replace_tone(frame, estimate.next_curve(frame.scan.tone))
-        frame, pending = _refit(frame, dict.fromkeys(changed, frame.options.match)), frozenset()
+        frame = _replace_tone(frame, estimate.next_curve(before))
+        frame = _refit(frame, dict.fromkeys(tones, frame.options.match))
         if estimate.is_doubted:  # by the prior curve again, the marks would only lead to the same estimate
             break
     return frame
+
+
+def shift_to_curve(frame: Frame) -> Frame:
+    """Move the marks by the last step of the tone curve, which was too short for a refit, as the linearised fits do."""
+    fits = {index: each.fit for index, each in enumerate(frame.detections) if each.fit and each.fit.tone}
+    by_curve = frame.tone.tone.mean - frame.scan.tone.mean
+    return frame.replace_fits(
+        {index: fit.shifted(fit.tone.on_place @ by_curve) for index, fit in fits.items() if fit.tone}
+    )
 
 
 def _needs_frame(frame: Frame, index: int, fit: MarkFit, linear_sigma: float) -> bool:
@@ -484,10 +483,9 @@ def _needs_frame(frame: Frame, index: int, fit: MarkFit, linear_sigma: float) ->
     return mark.is_held_by_frame or error_px > _STRAINED * fit.sigma_px
 
 
-def _mark_tones(frame: Frame, among: Set[int] | None = None) -> dict[int, MarkTone]:
-    """Information of the clear marks, or of those among them, on the tone curve."""
-    fits = frame.clear_fits.items()
-    return {index: fit.tone for index, fit in fits if fit.tone is not None and (among is None or index in among)}
+def _mark_tones(frame: Frame) -> dict[int, MarkTone]:
+    """Information of the clear marks on the tone curve."""
+    return {index: fit.tone for index, fit in frame.clear_fits.items() if fit.tone is not None}
 
 
 def _add_common_covariances(frame: Frame) -> Frame:

@@ -9,6 +9,8 @@ from measure.array_types import Array
 from measure.tone.curve import Tone, ToneInformation
 
 _POWERS = 0.4, 3.0  # range of gamma; an estimate outside has a different cause
+_LINEAR = 0.3  # in standard deviations, shift of a mark for which its linearised fit serves
+_TELLING = 0.25  # trace of a mark's information, whose unit is that of the prior on one departure
 _LONGEST = 1.0  # in standard deviations, largest change of a departure per iteration
 
 
@@ -42,6 +44,8 @@ class FrameTone:
     least, greatest : range of codes of the marks, fractions of full scale.
     scatter : variance of each departure of the marks' own curves around it.
     apart : squared distance of the curve from the one used for matching.
+    is_told : whether half of the marks tell more of the curve than its prior. If not, a step from the prior is all that
+        they are good for: what they tell under the next curve is how their drawings are wrong.
     """
 
     tone: Tone
@@ -50,6 +54,7 @@ class FrameTone:
     greatest: float = 1.0
     scatter: float = 0.0
     apart: float = 0.0
+    is_told: bool = False
 
     @classmethod
     def from_marks(cls, prior: Tone, marks: Mapping[int, MarkTone], matched_by: Tone) -> "FrameTone":
@@ -62,13 +67,14 @@ class FrameTone:
         step, sharpening = tone.mean - matched_by.mean, matched_by.sharpening
         if prior.is_known:
             return cls(prior, None, *ends, scatter, float(step @ step))
+        is_told = float(np.median([np.trace(information.matrix) for information in each])) > _TELLING
         value = tone.equivalent_power(*ends)[0]
         if not _POWERS[0] <= value <= _POWERS[1]:
             off = tone.mean - prior.mean
-            return cls(prior.doubted(tone, value).sharpened(sharpening), None, *ends, 0.0, float(off @ off))
+            return cls(prior.doubted(tone, value).sharpened(sharpening), None, *ends, 0.0, float(off @ off), is_told)
         information = replace(ToneInformation.pooled(each, scatter), sharpening=sharpening)
         tone = replace(tone, before=prior).sharpened(sharpening)
-        return cls(tone, information, *ends, scatter, float(step @ step))
+        return cls(tone, information, *ends, scatter, float(step @ step), is_told)
 
     @property
     def is_doubted(self) -> bool:
@@ -87,9 +93,13 @@ class FrameTone:
         exact = f"{value:.2f}" if self.tone.is_known else f"{value:.2f} (σ {sigma:.2f})"
         return f"Scanner gamma: {exact}: {self.tone.source}. {self.tone.sharpening.note}".rstrip()
 
-    def shift_px(self, mark: MarkTone, before: Tone) -> float:
-        """Shift (px) of a mark's place from another curve to this one."""
-        return float(np.hypot(*(mark.on_place @ (self.tone.mean - before.mean))))
+    def moves(self, mark: MarkTone, before: Tone, covariance_px2: Array) -> bool:
+        """Whether it moves a mark, from its place under another curve, by so much that its fit has to be repeated.
+
+        covariance_px2: (2, 2) of the place, without the uncertainty of the curve.
+        """
+        variance_px2 = float(np.trace(covariance_px2 + self.covariance_px2(mark))) / 2
+        return bool(np.hypot(*(mark.on_place @ (self.tone.mean - before.mean))) > _LINEAR * np.sqrt(variance_px2))
 
     def covariance_px2(self, mark: MarkTone) -> Array:
         """(2, 2) covariance of a mark's place due to the uncertainty of the curve and the scatter of the marks' own

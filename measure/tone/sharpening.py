@@ -92,13 +92,16 @@ class Sharpening:
         radius_px = float(np.clip(self.radius_px * np.exp(step[1]), *_RADIUS_RANGE_PX))
         return replace(self, amount=amount, radius_px=radius_px, covariance=covariance)
 
-    def damped(self, before: "Sharpening", last: "Sharpening") -> "Sharpening":
-        """Halve the step from an earlier estimate, if it goes back towards the last one before: amount and radius are
-        correlated, and full steps alternate."""
-        if (self.values - before.values) @ ((before.values - last.values) / _LONGEST**2) >= 0:
+    def accelerated(self, before: "Sharpening", last: "tuple[Sharpening, Sharpening] | None") -> "Sharpening":
+        """Next sharpening by Anderson's method from two iterations: of this estimate, found with the one before, and of
+        the last two such. Amount and radius are correlated: full steps alternate."""
+        if last is None or not (before and last[0]):
             return self
-        amount, log_radius = (self.values + before.values) / 2
-        return replace(self, amount=float(amount), radius_px=float(np.exp(log_radius)))
+        (first, found), scale = (each.values for each in last), _LONGEST
+        step, change = self.values - before.values, self.values - found
+        bend = (step - (found - first)) / scale
+        share = float(bend @ (step / scale)) / max(float(bend @ bend), 1e-12)
+        return before.apply_step(step - share * change, self.covariance)
 
     def is_as(self, other: "Sharpening") -> bool:
         """Whether it differs from another one by little compared with its standard deviations."""
@@ -212,11 +215,12 @@ def _estimate_step(
     own = np.linalg.inv(matrices + prior)  # by each mark alone, without the prior's pull
     steps, variances = (own[:, first] * rights).sum(axis=1), own[:, first, first]
     middle = float(np.median(steps))
-    kept = np.abs(steps - middle) <= _ODD * np.sqrt(variances + np.median((steps - middle) ** 2))
-    matrix, right = matrices[kept].sum(axis=0), rights[kept].sum(axis=0)
-    covariance = np.linalg.inv(matrix + prior)[first:]
+    odd = (steps - middle) ** 2 / (_ODD**2 * (variances + np.median((steps - middle) ** 2)))
+    kept = 1 / (1 + odd) ** 2  # an outlier fades, without a limit at which it drops out
+    matrix, right = np.asarray(np.tensordot(kept, matrices, 1), float), np.asarray(kept @ rights, float)
+    covariance = np.asarray(np.linalg.inv(matrix + prior), float)[first:]
     step, covariance = covariance @ (right + pull), covariance[:, first:]
-    spread = float(np.sum((steps - step[0])[kept] ** 2 / variances[kept])) / max(int(kept.sum()) - 1, 1)
+    spread = float(np.sum(kept * (steps - step[0]) ** 2 / variances)) / max(float(kept.sum()) - 1, 1)
     covariance = covariance * max(spread, 1.0)
     explained = right @ np.linalg.solve(matrix + prior, right)
     explained -= right[:first] @ np.linalg.solve((matrix + prior)[:first, :first], right[:first])

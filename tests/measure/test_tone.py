@@ -1,5 +1,7 @@
 """Tone curves: what is believed of them, what pictures say of them, and marks measured through them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from drawn import ALIKE, frame_picture, make_scan, pixel_from_camera
@@ -9,8 +11,10 @@ from true_marks import KIND, Kind, TrueMark, some_mark, whitened_rms
 from measure import FiducialOptions, MarkFit, MarkShape, MatchOptions, match, polygon
 from measure.detection.localisation import MarkPrediction
 from measure.fiducials.constellation import Placement
-from measure.fiducials.mark_fit import detect_mark, options_for
-from measure.fiducials.measure_frame import measure_frame
+from measure.fiducials.frame import Frame
+from measure.fiducials.mark_fit import Detection, detect_mark, options_for
+from measure.fiducials.measure_frame import measure_frame, shift_to_curve
+from measure.marks.shapes import FiducialLayout, LayoutMark
 from measure.matching.window import read_window
 from measure.tone.curve import LINEAR, Tone, ToneInformation, power, sampled_curve, srgb
 from measure.tone.estimate import FrameTone, MarkTone, tone_score
@@ -240,3 +244,19 @@ def test_a_curve_far_from_the_first_one_is_reached_from_another_start() -> None:
     assert abs(power - 1 / 1.5) < 3 * sigma < 0.2
     for fit, given in zip(frame.inlier_fits.values(), ALIKE.marks, strict=True):
         assert np.hypot(*(fit.center_px - matrix @ (*given.xy_mm, 1.0))) < 4 * fit.sigma_px
+
+
+def test_the_last_step_of_the_curve_moves_a_mark_as_another_fit_does() -> None:
+    """A tip that moves by 0.3 px along its axis from a power of 1.6 to one of 2."""
+    mark, before = some_mark(TIP, 1.0, np.random.default_rng(2)), Tone.unknown()
+    after, code = before.shift_to_power(2.0), encode_mark(mark, 2.2, 30.0, np.random.default_rng(3))
+    fit, expected = (fit_mark(mark, code, tone) for tone in (before, after))
+    scan, placement = make_scan(code).replace_tone(before), Placement("0", mark.place, 1.0, 1, 1, 1, (0.1, 0.1))
+    layout = FiducialLayout((LayoutMark("1", (0.0, 0.0), (0.01, 0.01), TIP.shape),), (1.0, 1.0))
+    frame = Frame.from_placement(scan, layout, placement, FiducialOptions("0"))
+    frame = replace(frame, detections=(Detection(fit.center_px, True, fit),), tone=FrameTone(after))
+    (shifted,) = shift_to_curve(frame).detections
+    refitted = expected.center_px - fit.center_px
+    assert shifted.fit is not None
+    assert np.hypot(*refitted) > 0.2
+    np.testing.assert_allclose(shifted.fit.center_px - fit.center_px, refitted, atol=0.02)
