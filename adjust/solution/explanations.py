@@ -43,6 +43,7 @@ from adjust.solution.model_hypotheses import (
     camera_hypotheses,
     estimate,
     film_deformations,
+    image_jumps,
     separate_lenses,
 )
 from adjust.solution.object_hypotheses import object_hypotheses
@@ -230,7 +231,8 @@ def _best(model: _Model) -> tuple[list[_Model], bool]:
     most_points = 1 if model.unmodelled else len(model.run.problem.network.points) * is_suspicious
     tested = {board.name for board in model.run.problem.network.boards}
     of_films = film_deformations(model.run) if is_suspicious else ()
-    rows = chain(camera_hypotheses(model.run), of_films, object_hypotheses(model.run, most_points))
+    of_scans = image_jumps(model.run) if is_suspicious or model.unmodelled else ()
+    rows = chain(camera_hypotheses(model.run), of_films, of_scans, object_hypotheses(model.run, most_points))
     falls = [(_first_order_fall(model.run, each.problem), each) for each in rows if each.name not in tested]
     level = LEVEL / max(len(falls), 1)
     worth = WORTH * max((fall for fall, _ in falls), default=0.0)

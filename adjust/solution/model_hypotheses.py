@@ -25,12 +25,13 @@ from adjust.problem.parameter import shortened
 from adjust.problem.problem import Problem, number
 from adjust.quality.cofactor import free_cofactor
 from adjust.quality.run import UM_PER_MM, Run, freed
-from adjust.solution.partitions import Selection, interior_equations, own_distances, two_groups
+from adjust.solution.partitions import Selection, interior_equations, jumps, own_distances, two_groups
 
 FREE = Prior(0.0, np.inf)
 NONE = Selection()
 RADIAL_DEGREES = (3, 5, 7, 9, 11, 13)  # powers of the radius, as of k1 to k6
 TERMS_TOGETHER = 2  # radial terms tested jointly
+MOST_JUMPING = 100  # images in which a jump is sought
 FEWEST_DRIFTING = 4  # images that tell a drift from their scatter
 LEAST_CHANGE = 0.05  # of the distance
 NAMED = 5  # images named in a message, and points with their errors
@@ -318,6 +319,35 @@ def _scanner_pixels(run: Run) -> Iterator[ModelHypothesis]:
     problem = continued(run, replace(network, images=images, scanners=(scanner,)))
     words = _pixel_words(films[0].camera, 2.0 / half_mm)
     yield ModelHypothesis("pixels", words, problem, problem.unknowns.scanner[scanner.name])
+
+
+def image_jumps(run: Run) -> Iterator[ModelHypothesis]:
+    """Displacements of the marks beyond a row or column of digital images."""
+    used = run.problem.unknowns.camera.keys() - run.problem.network.idle_cameras
+    yield from chain(*(_jumps(run, camera) for camera in run.problem.network.cameras if camera.name in used))
+
+
+def _jumps(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
+    """A displacement of all marks beyond a row or column of one digital image, or of all: a jump of the scanner."""
+    rows = run.problem.targets_by_camera[camera.name]
+    images = {image.name: image for image in run.problem.network.images if image.camera == camera.name}
+    if len(images) > MOST_JUMPING or any(image.transformation != "none" for image in images.values()):
+        return
+    for jump in jumps(run, rows):
+        who = f"image {jump.image}" if jump.image else f"the images of camera {camera.name}"
+        where = f"{'above' if jump.axis else 'right of'} {'xy'[jump.axis]} = {jump.cut_mm:.4g} mm"
+
+        def words(found: Estimate, who: str = who, where: str = where) -> tuple[str, str]:
+            (x_um, y_um), sigma_um = UM_PER_MM * found.value, UM_PER_MM * found.sigma
+            return (
+                f"All marks of {who} {where} are displaced against the others, by ({x_um:+.3g}, {y_um:+.3g}) ± "
+                f"({sigma_um[0]:.1g}, {sigma_um[1]:.1g}) µm: the scanner or sensor jumps there",
+                "Scan or take the picture again, or look whether it was put together from parts.",
+            )
+
+        fields_mm = jump.beyond[:, None, None] * np.eye(2)
+        found = _displaced_images(run, f"jump {jump.image}", "jump", camera, words, fields_mm)
+        yield replace(found, selection=Selection(choices=jump.choices, contrasts=2 * len(rows)))
 
 
 def film_deformations(run: Run) -> Iterator[ModelHypothesis]:

@@ -13,10 +13,10 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import diags_array
+from scipy.sparse import csr_array, diags_array
 from scipy.special import chdtrc, chdtri, fdtrc, gammaln
 
-from adjust.array_types import Array, Mask
+from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.lens import INTERIOR_NAMES
 from adjust.problem.problem import Problem
 from adjust.quality.cofactor import image_equations
@@ -25,6 +25,8 @@ from adjust.quality.run import Run, derivatives_by
 FLAT = 1e-9  # fraction of the largest eigenvalue below which a direction is undetermined
 MOST_TURNS = 20  # iterations of two-means
 DRAWS = 4000  # simulated sets of images
+BINS = 10  # parts of the images at whose borders jumps are sought
+MOST_CUTS = 40  # jumps tried between two borders
 FEWEST, MOST = 5, 400  # given points: so many tell a wrong one; N is dense
 MOST_WRONG = 1 / 3  # fraction of the points
 SAME_LINE = 1e-3  # fraction of the field's extent by which the points of a line lie off it
@@ -162,6 +164,80 @@ def _clearness(changes: Array, weight: Array) -> Array:
     below = np.cumsum(weights, axis=1)[:, :-1]
     between = np.cumsum(weights * centred, axis=1)[:, :-1] ** 2 * (1.0 / below + 1.0 / (total - below))
     return np.asarray(between.max(axis=1) / (weights * centred**2).sum(axis=1))
+
+
+class Jump(NamedTuple):
+    """Marks beyond a row (axis 1) or column (0) of one image, or of all ("").
+
+    beyond: mask of the observations; cut_mm: in the comparator; choices: natural logarithm of the number of jumps that
+    it is the best of.
+    """
+
+    image: str
+    axis: int
+    cut_mm: float
+    beyond: Mask
+    choices: float
+
+
+def jumps(run: Run, rows: Indices) -> Iterator[Jump]:
+    """Select the row or column beyond which the targets (n,) of one image, and of all, are displaced most clearly."""
+    problem, places = run.problem, run.end.computed_mm
+    images, own = np.unique(problem.image_numbers[rows], return_inverse=True)
+    for of_image in (own, np.zeros_like(own)):
+        found = []
+        for axis in range(2):
+            along = places[rows, axis]
+            cuts = np.quantile(along, np.linspace(0.0, 1.0, BINS + 1)[1:-1])
+            falls = _jump_falls(run, rows, of_image, along, cuts)
+            image, at = (int(k) for k in np.unravel_index(np.argmax(falls), falls.shape))
+            members, ends = of_image == image, np.array([-np.inf, *cuts, np.inf])[[at, at + 2]]
+            found.append((*_exact_cut(run, rows[members], along[members], ends), axis, image))
+        _, cut_mm, axis, image = max(found)
+        beyond = np.zeros(len(places), dtype=bool)
+        beyond[rows] = (of_image == image) & (places[rows, axis] > cut_mm)
+        name = problem.network.images[images[image]].name if of_image is own else ""
+        yield Jump(name, axis, cut_mm, beyond, float(np.log(2.0 * len(rows))))
+
+
+def _exact_cut(run: Run, rows: Indices, along: Array, ends: Array) -> tuple[float, float]:
+    """Best decrease of v'Pv, and its cut, of those that part the targets of an image between two ends otherwise."""
+    while True:
+        near = np.unique(along[(along > ends[0]) & (along < ends[1])])
+        between = (near[1:] + near[:-1]) / 2.0 if len(near) > 1 else near
+        cuts = between[:: len(between) // MOST_CUTS + 1]
+        if not len(cuts):
+            return 0.0, 0.0
+        (falls,) = _jump_falls(run, rows, np.zeros_like(rows), along, cuts)
+        at = int(np.argmax(falls))
+        if len(cuts) == len(between):
+            return float(falls[at]), float(cuts[at])
+        ends = np.array([ends[0], *cuts, ends[1]])[[at, at + 2]]
+
+
+def _jump_falls(run: Run, rows: Indices, of_image: Indices, along: Array, cuts: Array) -> Array:
+    """(m, c) decreases of v'Pv by displacements, in x and y, of each image's marks beyond each cut."""
+    transform, right = run.misfits.transform[rows], run.misfits.residual[rows]
+    count, bins = int(of_image.max()) + 1, len(cuts) + 1
+    part = of_image * bins + np.searchsorted(cuts, along)
+    row, column = (each[..., None] * 2 + np.arange(2) for each in (rows, part))
+    entries = np.broadcast_to(row[:, :, None], transform.shape), np.broadcast_to(column[:, None], transform.shape)
+    shape = run.unit_functions.shape[0], 2 * count * bins
+    by_part = csr_array((transform.ravel(), (entries[0].ravel(), entries[1].ravel())), shape=shape)
+
+    def beyond(parts: Array) -> Array:
+        """Sums over the parts beyond each cut, by image and cut."""
+        return np.flip(np.cumsum(np.flip(parts.reshape(count, bins, *parts.shape[1:]), 1), axis=1), 1)[:, 1:]
+
+    across = (run.unit_functions.T @ by_part).toarray()
+    across = beyond(across.reshape(len(across), -1, 2).transpose(1, 2, 0))  # (m, c, 2, free)
+    own = np.zeros((count * bins, 2, 2))
+    np.add.at(own, part, transform.swapaxes(1, 2) @ transform)
+    slope = np.zeros((count * bins, 2))
+    np.add.at(slope, part, (transform.swapaxes(1, 2) @ right[..., None])[..., 0])
+    flat = across.reshape(-1, across.shape[-1])
+    taken_up = np.einsum("mcif,mcjf->mcij", across, run.factor.cofactor_times(flat.T).T.reshape(across.shape))
+    return quadratic(beyond(own) - taken_up, beyond(slope))
 
 
 def displaced_points(

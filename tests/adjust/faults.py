@@ -530,6 +530,8 @@ class Effects:
     breathing: float = 0.0
     row: float = 0.0
     side: float = 0.0
+    jump: float = 0.0
+    jumps: float = 0.0
     third: float = 0.0
     numbers_off: int = 0
     point: float = 0.0
@@ -656,6 +658,8 @@ def _projected(made: Scene, effects: Effects, kind: Misfit, image: int, rotation
         at += np.sign(effects.disk) * (center_of_gravity(imaged(points[:, None] + circle)) - imaged(points))
     at[:, 0] += own * effects.crop + effects.bow * (at[:, 1] - MIDDLE_MM[1]) ** 2
     at[:, 1] += 0.7 * own * effects.crop
+    jumped = effects.jumps + effects.jump * (image == int(np.argmax(made.groups)))
+    at[:, 0] += jumped * (at[:, 1] > MIDDLE_MM[1] + 1.0)
     if (effects.mirrored and image == int(np.argmax(made.groups))) or (effects.group_mirrored and own):
         at[:, 0] = 2.0 * MIDDLE_MM[0] - at[:, 0]
     return np.asarray(at * (1.0 + own * effects.scale))
@@ -765,6 +769,8 @@ MISFITS = {
     "half the board shifted": Misfit(
         lambda e: Effects(side=0.1 * e), ("all on one side of a line",), size=3, fields=False
     ),
+    "rows of an image jump": Misfit(lambda e: Effects(jump=0.01 * e), ("All marks of image im",), size=2),
+    "rows of all images jump": Misfit(lambda e: Effects(jumps=0.01 * e), ("All marks of the images of",), size=2),
     "a quarter of the points elsewhere": Misfit(
         lambda e: Effects(third=2.0), ("points are not where they are given",), sized=False
     ),

@@ -8,6 +8,7 @@ import pytest
 from faults import (
     BLUNDERS,
     C_MM,
+    MIDDLE_MM,
     MISFITS,
     NOTHING,
     SIGMA_MM,
@@ -58,6 +59,8 @@ QUICK = (
     "board bent over a diagonal",
     "focus drifts",
     "focus breathes with the distance",
+    "rows of an image jump",
+    "rows of all images jump",
     "a row of points shifted",
     "half the board shifted",
     "numbers of a third of the images one off",
@@ -91,6 +94,18 @@ def test_figures_are_those_that_were_planted() -> None:
     assert found.sigma0[0] == pytest.approx(result.sigma0)
     assert found.sigma0[1] == pytest.approx(1.0, abs=0.1)
     assert found.p < 1e-6
+
+
+def test_a_jump_is_found_where_it_is() -> None:
+    """Pixels that are not square, or a shear, had been blamed."""
+    made = scene(6, flat=True)
+    given = misfit_network(made, Effects(jumps=0.005), SOUND, np.random.default_rng(1))
+    (found,) = adjust_unmodelled(given).explanations
+    y_mm, by_um = (
+        float(found.cause.split(before)[1].split(after)[0]) for before, after in ((" y = ", " mm"), ("(", ","))
+    )
+    assert y_mm == pytest.approx(MIDDLE_MM[1] + 1.0, abs=0.1)
+    assert by_um == pytest.approx(5.0, abs=1.0)
 
 
 @pytest.mark.parametrize("seed", [4, 5, 6, 7])
