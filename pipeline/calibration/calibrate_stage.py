@@ -18,6 +18,8 @@ from adjust.display import CameraPlots, PlottedResult, data_frame
 from adjust.errors import AdjustmentError
 from adjust.solution.adjustment import PLAUSIBLE, adjust
 from adjust.solution.result import Adjustment
+from measure import MeasurementError, open_scan
+from measure.boards.find import recognise_board
 from pipeline.adjusting.adjust_stage import adjust_marks, adjustment_options
 from pipeline.calibration.intrinsics import (
     CameraIntrinsics,
@@ -318,10 +320,13 @@ def _nothing(pictures: BoardPictureFiles, left_out: Mapping[str, str], not_calib
     """Reason why no camera is calibrated."""
     number = sum(len(camera.images) for camera in pictures.cameras)
     if len(left_out) == number:
+        first, shown = pictures.cameras[0].images[0], ""
+        with suppress(MeasurementError), open_scan(pictures.files[first]) as scan:
+            shown = recognise_board(scan)
         return (
             f"the board was found in none of {counted(number, 'picture')}; of most: {_most_common(left_out.values())}. "
-            "Check --board (inner corners of a chessboard, not squares), --kind, --first-id, and that the board is in "
-            "the picture."
+            "Check --board (inner corners of a chessboard, not squares), --kind, --dictionary, --first-id, and that "
+            f"the board is in the picture{shown and f': {first} looks like {shown}'}."
         )
     return "; ".join(f"{camera}: {why}" for camera, why in not_calibrated.items()) + (
         f" Left out: {listed_by_reason(left_out)}." if left_out else ""

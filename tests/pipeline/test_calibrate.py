@@ -409,6 +409,13 @@ def test_a_picture_of_another_print_is_named_and_no_other(odd: tuple[str, ...], 
     assert all("another print of the board" in why for why in found.values())
 
 
+def test_where_no_board_is_found_it_is_told_what_the_first_picture_shows(folder: Path, tmp_path: Path) -> None:
+    pictures = find_pictures([folder], tmp_path)
+    images = [name for camera in pictures.cameras for name in camera.images]
+    message = calibrate_stage._nothing(pictures, dict.fromkeys(images, "no marker was read"), {})
+    assert message.endswith("that the board is in the picture: p0 looks like --board 7x5.")
+
+
 def test_boards_as_project_files_have_them() -> None:
     """OpenCV's asymmetric grid of 4 x 11; Kalibr's sizes, the gap three tenths of a tag where nobody says it."""
 
