@@ -204,8 +204,14 @@ class _Model:
         return float(fdtrc(count, left, fall / (count * variance)) if variance > 1.0 else chdtrc(count, fall))
 
     def improves(self, simpler: "_Model", level: float) -> bool:
-        """Whether the hypothesis is significant in a simpler model by the actual decrease of v'Pv."""
-        return self.hypothesis is not None and simpler.is_significant(self.hypothesis, simpler.vpv - self.vpv, level)
+        """Whether the hypothesis is significant in a simpler model by the actual decrease of v'Pv.
+
+        Beside gross errors that it leaves, it has to be so without them.
+        """
+        if self.hypothesis is None or not simpler.is_significant(self.hypothesis, simpler.vpv - self.vpv, level):
+            return False
+        is_rid = len(self.gross_errors) < len(simpler.gross_errors) or not simpler.gross_errors
+        return is_rid or simpler.probability(self.hypothesis, simpler.rest[0] - self.rest[0]) < level
 
     def adjusted(self, problem: Problem) -> Run | None:
         """Adjust a larger problem from its start with the same weights; None without a solution."""

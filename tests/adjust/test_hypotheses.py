@@ -8,6 +8,7 @@ import pytest
 from faults import (
     BLUNDERS,
     C_MM,
+    LENS,
     MIDDLE_MM,
     MISFITS,
     NOTHING,
@@ -94,6 +95,18 @@ def test_figures_are_those_that_were_planted() -> None:
     assert found.sigma0[0] == pytest.approx(result.sigma0)
     assert found.sigma0[1] == pytest.approx(1.0, abs=0.1)
     assert found.p < 1e-6
+
+
+@pytest.mark.parametrize("seed", [2, pytest.param(14, marks=pytest.mark.study)])
+def test_nothing_is_blamed_beside_a_stale_distortion(seed: int) -> None:
+    """A drift of focus had been, which explained nothing without the wrong k1."""
+    given = misfit_network(scene(seed, flat=True), Effects(), SOUND, np.random.default_rng(seed))
+    (camera,) = given.cameras
+    distortion = camera.distortion
+    stale = {**distortion.parameters, "k1": Prior(LENS["k1"] + 0.02, 0.002)}
+    result = adjust(set_camera(given, distortion=replace(distortion, parameters=stale)))
+    assert [each.tested.name for each in result.suspects] == ["given k1 (camera cam)"]
+    assert result.explanations == ()
 
 
 def test_a_jump_is_found_where_it_is() -> None:
