@@ -16,7 +16,8 @@ from adjust.initial_values.approximations import camera_frames
 from adjust.initial_values.pose import intersect
 from adjust.problem.problem import Problem
 
-APART = 5.0  # times the usual miss, or the standard deviation of rays, from which a ray is doubted
+APART = 5.0  # times the usual miss from which a ray is doubted
+GROSS = 20.0  # standard deviations below which residuals tell what is wrong
 MOST_PAIRS = 100  # pairs of rays of a point whose intersections are tried
 FEWEST = 2  # rays that meet
 USUAL = 0.75  # share of points, and of an image's rays, of which the largest miss is usual
@@ -93,7 +94,9 @@ def find_mismatches(problem: Problem) -> Mismatches:
     _, of_point = np.unique(problem.places[rows, 0], return_inverse=True)
     largest = _largest(missed, of_point)
     of_images = _usual_misses(missed, problem.image_numbers[rows])
-    usual = np.maximum(_largest(of_images, of_point), max(float(np.quantile(largest, USUAL)), rays.sigma_mm))
+    usual = np.maximum(
+        _largest(of_images, of_point), max(float(np.quantile(largest, USUAL)), GROSS / APART * rays.sigma_mm)
+    )
     for number in np.flatnonzero(largest > APART * usual):
         own = rows[of_point == number]
         met = _intersections(problem, rays, own)

@@ -304,8 +304,7 @@ class _Solver:
             raise
         if result.termination not in ("converged", "singular"):
             result = self._begin_anew(network, start, result)
-        agrees = result.redundancy < 1 or chdtrc(result.redundancy, result.vpv) > self.family
-        if result.termination == "singular" or (result.converged and agrees):
+        if result.termination == "singular" or (result.converged and self.agrees(result)):
             return result
         if slips := self._slips(network, start):
             return replace(result, slips={slip.name: slip.sentence for slip in slips})
@@ -320,23 +319,28 @@ class _Solver:
         """
         options, doubted = self.options.plain if plain else self.options, list(doubted_points)
         given = numbered = number_reduced(network, start, options.method == "elements")
-        earlier, result = Mismatches({}, {}, {}), None
+        found, result = find_mismatches(given[0]), None
         # Orientations that the worst mismatches have not spoilt show the smaller ones, and which rays meet after all.
         for _ in range(ROUNDS):
-            problem, reduction = numbered
-            found = find_mismatches(problem)
-            if found.agrees(earlier):
-                break
-            places = {name: place + reduction.origin for name, place in found.places.items()}
+            places = {name: place + numbered[1].origin for name, place in found.places.items()}
             start, (rest, mismatched) = replace(start, points={**start.points, **places}), _without(network, found)
-            result = _solve(rest, number_reduced(rest, start, problem.by_elements), options, doubted, mismatched)
-            if not result.converged:
-                return _solve(network, given, options, doubted, {})
+            parts = number_reduced(rest, start, given[0].by_elements) if places else numbered
+            now = _solve(rest, parts, options, doubted, mismatched)
+            if not now.converged:
+                return result or (_solve(network, given, options, doubted, {}) if places else now)
+            result = replace(now, unmet=_unmet_sentences(network, found))
+            if not places and self.agrees(result):
+                break
             start = replace(result.approximations, points={**start.points, **result.approximations.points})
-            numbered, earlier = number_reduced(network, start, problem.by_elements), found
-        if result is None:
-            return _solve(network, given, options, doubted, {})
-        return replace(result, unmet=_unmet_sentences(network, earlier))
+            numbered, earlier = number_reduced(network, start, given[0].by_elements), found
+            if (found := find_mismatches(numbered[0])).agrees(earlier):
+                break
+        assert result is not None
+        return result
+
+    def agrees(self, result: Adjustment) -> bool:
+        """Whether v'Pv is not significant."""
+        return result.redundancy < 1 or bool(chdtrc(result.redundancy, result.vpv) > self.family)
 
     def solve_plainly(self, network: Network, start: Approximations | None) -> Adjustment | None:
         """Adjust a network in a few steps with the weights as given; None where the adjustment cannot start."""

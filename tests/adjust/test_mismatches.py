@@ -4,19 +4,30 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from networks import drop_rows, field_points, free_points, observation_row, set_observations, simulated
+from networks import (
+    Truth,
+    add_errors,
+    drop_rows,
+    field_points,
+    free_points,
+    observation_row,
+    set_camera,
+    set_observations,
+    simulated,
+)
 
 from adjust import Adjustment, adjust
+from adjust.functional_model.lens import Distortion, Prior
 from adjust.problem.network import Network
 
 POINTS, KNOWN = 26, 8
 Spoilt = tuple[Network, set[tuple[str, str]]]  # with the rays (point, image) that are wrong
 
 
-def _network(seed: int) -> Network:
+def _network(seed: int, truth: Truth | None = None) -> Network:
     """Four films of a field, most points of which are unknown."""
     rng = np.random.default_rng([71, seed])
-    made, _ = simulated(rng, points=field_points(rng, POINTS), point_sigma=0.05, fiducial_sigma=0.01)
+    made, _ = simulated(rng, truth, points=field_points(rng, POINTS), point_sigma=0.05, fiducial_sigma=0.01)
     return free_points(made, {str(k) for k in range(KNOWN, POINTS)})
 
 
@@ -83,6 +94,16 @@ def test_one_of_two_pairs_of_rays_that_meet_is_told_to_be_like_the_other() -> No
     kept = {f"target 12 in image {image}" for image in {"f0", "f1", "f2", "f3"} - left_out}
     assert left_out in ({"f0", "f1"}, {"f2", "f3"})
     assert {*result.suspects[0].alike} == kept
+
+
+def test_mismatch_smaller_than_an_unknown_lens_bends_rays_is_found_once_that_is_known() -> None:
+    """At the start the lens, of 1 mm, hides an error of 0.7 mm."""
+    made = _network(1, Truth(distortion={"k3": 1e-6, "k5": -2e-11}))
+    unknown = Distortion("torlegard", dict.fromkeys(("k3", "k5"), Prior(0.0, np.inf)))
+    made = set_camera(made, distortion=unknown)
+    result = adjust(add_errors(made, {_at(made, "f2", "12"): np.array([0.5, -0.5])}))
+    _check(result)
+    assert [each.tested.name for each in result.suspects] == ["target 12 in image f2"]
 
 
 def _check(result: Adjustment) -> None:
