@@ -31,7 +31,6 @@ FREE = Prior(0.0, np.inf)
 NONE = Selection()
 RADIAL_DEGREES = (3, 5, 7, 9, 11, 13)  # powers of the radius, as of k1 to k6
 TERMS_TOGETHER = 2  # radial terms tested jointly
-MOST_JUMPING = 100  # images in which a jump is sought
 FEWEST_DRIFTING = 4  # images that tell a drift from their scatter
 LEAST_CHANGE = 0.05  # of the distance
 NAMED = 5  # images named in a message, and points with their errors
@@ -330,8 +329,7 @@ def image_jumps(run: Run) -> Iterator[ModelHypothesis]:
 def _jumps(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
     """A displacement of all marks beyond a row or column of one digital image, or of all: a jump of the scanner."""
     rows = run.problem.targets_by_camera[camera.name]
-    images = {image.name: image for image in run.problem.network.images if image.camera == camera.name}
-    if len(images) > MOST_JUMPING or any(image.transformation != "none" for image in images.values()):
+    if any(each.transformation != "none" for each in run.problem.network.images if each.camera == camera.name):
         return
     for jump in jumps(run, rows):
         who = f"image {jump.image}" if jump.image else f"the images of camera {camera.name}"

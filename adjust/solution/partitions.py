@@ -13,7 +13,7 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csr_array, diags_array
+from scipy.sparse import diags_array
 from scipy.special import chdtrc, chdtri, fdtrc, gammaln
 
 from adjust.array_types import Array, Indices, Mask
@@ -216,28 +216,15 @@ def _exact_cut(run: Run, rows: Indices, along: Array, ends: Array) -> tuple[floa
 
 
 def _jump_falls(run: Run, rows: Indices, of_image: Indices, along: Array, cuts: Array) -> Array:
-    """(m, c) decreases of v'Pv by displacements, in x and y, of each image's marks beyond each cut."""
-    transform, right = run.misfits.transform[rows], run.misfits.residual[rows]
+    """(m, c) decreases of v'Pv by displacements of each image's marks beyond each cut, all other unknowns held."""
+    transform, residual = run.misfits.transform[rows], run.misfits.residual[rows, :, None]
     count, bins = int(of_image.max()) + 1, len(cuts) + 1
     part = of_image * bins + np.searchsorted(cuts, along)
-    row, column = (each[..., None] * 2 + np.arange(2) for each in (rows, part))
-    entries = np.broadcast_to(row[:, :, None], transform.shape), np.broadcast_to(column[:, None], transform.shape)
-    shape = run.unit_functions.shape[0], 2 * count * bins
-    by_part = csr_array((transform.ravel(), (entries[0].ravel(), entries[1].ravel())), shape=shape)
-
-    def beyond(parts: Array) -> Array:
-        """Sums over the parts beyond each cut, by image and cut."""
-        return np.flip(np.cumsum(np.flip(parts.reshape(count, bins, *parts.shape[1:]), 1), axis=1), 1)[:, 1:]
-
-    across = (run.unit_functions.T @ by_part).toarray()
-    across = beyond(across.reshape(len(across), -1, 2).transpose(1, 2, 0))  # (m, c, 2, free)
-    own = np.zeros((count * bins, 2, 2))
-    np.add.at(own, part, transform.swapaxes(1, 2) @ transform)
-    slope = np.zeros((count * bins, 2))
-    np.add.at(slope, part, (transform.swapaxes(1, 2) @ right[..., None])[..., 0])
-    flat = across.reshape(-1, across.shape[-1])
-    taken_up = np.einsum("mcif,mcjf->mcij", across, run.factor.cofactor_times(flat.T).T.reshape(across.shape))
-    return quadratic(beyond(own) - taken_up, beyond(slope))
+    normal, right = np.zeros((count * bins, 2, 2)), np.zeros((count * bins, 2))
+    np.add.at(normal, part, transform.swapaxes(1, 2) @ transform)
+    np.add.at(right, part, (transform.swapaxes(1, 2) @ residual)[..., 0])
+    parts = normal.reshape(count, bins, 2, 2), right.reshape(count, bins, 2)
+    return quadratic(*(np.cumsum(each[:, :0:-1], axis=1)[:, ::-1] for each in parts))
 
 
 def displaced_points(
