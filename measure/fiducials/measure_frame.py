@@ -55,6 +55,7 @@ _SHRINK = 0.1  # shrinkage of the noise covariance towards a multiple of the uni
 _FEWEST_SHARPENED = 4  # clear marks for a first estimate of the sharpening: of three, one may be taken for halos
 _ROUNDS = 2  # of detecting faint marks: the first marks found improve the predictions of the others
 _STRAINED = 1 / 3  # fraction of a mark's standard deviation: a larger strain error raises it by more than a twentieth
+_BETTER_KNOWN = 2 / 3  # ratio of the standard deviations of rotation and scale after and before a refit for another one
 _TONE_ROUNDS = 5  # largest number of refits with an improved tone curve
 _OTHER_STARTS, _AGREED = (2.2, 1.0), 0.1  # gammas of further initial curves; disagreement up to which none is tried
 _TELLING = 8  # most significant marks, refitted until widths, sharpening and tone curve are settled: more cost time
@@ -433,7 +434,12 @@ def _refit_with_tone(frame: Frame) -> Frame:
     """Refit the marks with the tone curve estimated from all of them; if these disagree, from further curves."""
     sigma, options = _linear_sigma(frame), frame.options.match
     pending = [index for index, fit in frame.clear_fits.items() if _needs_frame(frame, index, fit, sigma)]
-    best = _settle_tone(_refit(frame, dict.fromkeys(pending, options)))
+    best = _refit(frame, dict.fromkeys(pending, options))
+    if (
+        _linear_sigma(best) < _BETTER_KNOWN * sigma
+    ):  # the places, far less certain before, had left the frame's scale open
+        best = _refit(best, dict.fromkeys(pending, options))
+    best = _settle_tone(best)
     is_open = (
         best.tone.is_told
         and best.tone.disagreement > _AGREED
