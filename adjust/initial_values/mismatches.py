@@ -73,7 +73,8 @@ def started_rays(problem: Problem) -> Rays:
             centers[rows] = start.values[unknowns.exterior[image][:3]]
             directions[rows] = sights[image].rays @ start.rotations[i]
             scale_mm[rows] = interior[0]
-    return Rays(centers, directions, scale_mm[:, 0], float(np.median(frames.sigma_mm[frames.sigma_mm > 0.0])))
+    sigmas_mm = frames.sigma_mm[frames.sigma_mm > 0.0]
+    return Rays(centers, directions, scale_mm[:, 0], float(np.median(sigmas_mm)) if len(sigmas_mm) else 0.0)
 
 
 def find_mismatches(problem: Problem) -> Mismatches:

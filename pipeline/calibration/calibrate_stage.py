@@ -326,7 +326,7 @@ def _nothing(pictures: BoardPictureFiles, left_out: Mapping[str, str], not_calib
         return (
             f"the board was found in none of {counted(number, 'picture')}; of most: {_most_common(left_out.values())}. "
             "Check --board (inner corners of a chessboard, not squares), --kind, --dictionary, --first-id, and that "
-            f"the board is in the picture{shown and f': {first} looks like {shown}'}."
+            f"the board is in the picture{shown and f': what {first} shows fits {shown}'}."
         )
     return "; ".join(f"{camera}: {why}" for camera, why in not_calibrated.items()) + (
         f" Left out: {listed_by_reason(left_out)}." if left_out else ""

@@ -413,7 +413,7 @@ def test_where_no_board_is_found_it_is_told_what_the_first_picture_shows(folder:
     pictures = find_pictures([folder], tmp_path)
     images = [name for camera in pictures.cameras for name in camera.images]
     message = calibrate_stage._nothing(pictures, dict.fromkeys(images, "no marker was read"), {})
-    assert message.endswith("that the board is in the picture: p0 looks like --board 7x5.")
+    assert message.endswith("that the board is in the picture: what p0 shows fits --board 7x5.")
 
 
 def test_boards_as_project_files_have_them() -> None:
