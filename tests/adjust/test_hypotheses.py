@@ -121,7 +121,7 @@ def test_a_jump_is_found_where_it_is() -> None:
     assert by_um == pytest.approx(5.0, abs=1.0)
 
 
-@pytest.mark.parametrize("seed", [4, 5, 6, 7])
+@parametrize_with_studies("seed", [4, 5, 6, 7], quick=(0, 3))
 def test_an_estimated_noise_does_not_hide_two_cameras_in_one(seed: int) -> None:
     made = scene(seed, flat=True)
     given = misfit_network(made, Effects(crop=0.5, zoom=0.2), SOUND, np.random.default_rng(seed))
@@ -138,7 +138,7 @@ def test_an_estimated_noise_does_not_hide_two_cameras_in_one(seed: int) -> None:
 FITTED = replace(SOUND, sigma=0.1)  # standard deviations given ten times too small
 
 
-@pytest.mark.parametrize("seed", [4, 5, 6, 7])
+@parametrize_with_studies("seed", [4, 5, 6, 7])
 @pytest.mark.parametrize("noise", [1.0, 10.0])
 def test_each_image_with_a_principal_distance_of_its_own_is_no_two_groups(seed: int, noise: float) -> None:
     made, rng = scene(seed, flat=True), np.random.default_rng(seed)
@@ -162,7 +162,7 @@ def test_an_estimated_noise_of_the_size_of_that_given_does_not_hide_two_principa
     assert [each.kind for each in result.explanations] == ["groups"]
 
 
-@pytest.mark.parametrize("seed", [4, 6])
+@parametrize_with_studies("seed", [4, 6])
 def test_principal_points_of_the_images_own_are_no_principal_distances(seed: int) -> None:
     """As of errors that are correlated within images."""
     made, rng = scene(seed, flat=True), np.random.default_rng(seed)
