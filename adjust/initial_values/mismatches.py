@@ -94,10 +94,9 @@ def find_mismatches(problem: Problem) -> Mismatches:
     missed = rays.misses_mm(rows, unknowns.start[problem.places[rows]])
     _, of_point = np.unique(problem.places[rows, 0], return_inverse=True)
     largest = _largest(missed, of_point)
-    of_images = _usual_misses(missed, problem.image_numbers[rows])
-    usual = np.maximum(
-        _largest(of_images, of_point), max(float(np.quantile(largest, USUAL)), GROSS / APART * rays.sigma_mm)
-    )
+    usual = np.full(len(largest), max(float(np.quantile(largest, USUAL)), GROSS / APART * rays.sigma_mm))
+    if np.any(largest > APART * usual):
+        usual = np.maximum(usual, _largest(_usual_misses(missed, problem.image_numbers[rows]), of_point))
     for number in np.flatnonzero(largest > APART * usual):
         own = rows[of_point == number]
         met = _intersections(problem, rays, own)
