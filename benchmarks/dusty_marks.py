@@ -14,7 +14,7 @@ from measure.flags import Status
 from measure.geometry import POSES
 from measure.marks.shapes import FiducialLayout, LayoutMark
 from measure.targets.identification import TargetPrediction, measure_disks
-from synthetic_images.optics import reach_px, seen_coverage
+from synthetic_images.optics import blurred_coverage, reach_px
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -61,7 +61,7 @@ def dusty(mark: TrueMark, grey: Array, share: float, rng: np.random.Generator) -
         col0, row0 = max(cols[pixel] - reach, 0), max(rows[pixel] - reach, 0)
         near = np.s_[row0 : rows[pixel] + reach, col0 : cols[pixel] + reach]
         height, width = speckled[near].shape
-        cover = seen_coverage(((outline,),), int(col0), int(row0), width, height, mark.blur_px)
+        cover = blurred_coverage(((outline,),), int(col0), int(row0), width, height, mark.blur_px)
         speckled[near] = speckled[near] * (1 - cover) + (GROUND - CONTRAST) * cover
         view[near] &= cover < 0.5 / DUST_SNR
     return speckled, view

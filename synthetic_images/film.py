@@ -66,10 +66,10 @@ class FrameGeometry:
 
     def camera_from_scan(self, pixels: Array) -> Array:
         """Convert column and row (n, 2) to camera coordinates (n, 2), the inverse of `pixel_from_camera`."""
-        lens, seen = self.scene.scanner.lens, pixels
+        lens, observed = self.scene.scanner.lens, pixels
         if lens is not None:
             for _ in range(LENS_STEPS):
-                pixels = pixels + seen - self._distort(lens, pixels)
+                pixels = pixels + observed - self._distort(lens, pixels)
         if self.bend.terms_um:
             pixels = self.bend.bed_from_scan(pixels / self._pixel_per_mm) * self._pixel_per_mm
         film = self.straight_camera_from_scan(pixels)

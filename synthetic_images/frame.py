@@ -219,9 +219,9 @@ def _object_paint(geometry: FrameGeometry, areas: tuple[tuple[Array, ...], ...],
     """Yield one paint for areas of outlines (n, 3) in object space; outlines that reach behind the camera are
     dropped."""
     pixels = [[geometry.pixel_from_object(outline) for outline in area] for area in areas]
-    seen = [tuple(outline for outline in area if np.isfinite(outline).all()) for area in pixels]
-    if any(seen):
-        yield AreaPaint(tuple(area for area in seen if area), tone, inside_frame=True)
+    shown = [tuple(outline for outline in area if np.isfinite(outline).all()) for area in pixels]
+    if any(shown):
+        yield AreaPaint(tuple(area for area in shown if area), tone, inside_frame=True)
 
 
 def _fiducial_paints(geometry: FrameGeometry) -> Iterator[Paint]:

@@ -19,7 +19,7 @@ def reach_px(blur_px: float) -> int:
     return int(np.ceil(REACH * blur_px))
 
 
-def seen_coverage(
+def blurred_coverage(
     areas: tuple[Area, ...], col0: int, row0: int, width: int, height: int, blur_px: float, fold: int = FOLD
 ) -> Cover:
     """(height, width) coverage of the pixels of a window by the union of areas, after a Gaussian blur.
@@ -28,15 +28,15 @@ def seen_coverage(
     """
     reach = reach_px(blur_px)
     plain = coverage(areas, col0 - reach, row0 - reach, width + 2 * reach, height + 2 * reach)
-    seen = plain[reach : reach + height, reach : reach + width].copy()
+    blurred = plain[reach : reach + height, reach : reach + width].copy()
     for top in range(0, height, BLOCK_PX):
         for left in range(0, width, BLOCK_PX):
             tall, wide = min(BLOCK_PX, height - top), min(BLOCK_PX, width - left)
             around = plain[top : top + tall + 2 * reach, left : left + wide + 2 * reach]
             if around.min() < around.max():
                 block = _fine(areas, col0 + left, row0 + top, wide, tall, blur_px, fold)
-                seen[top : top + tall, left : left + wide] = block
-    return seen
+                blurred[top : top + tall, left : left + wide] = block
+    return blurred
 
 
 def _fine(areas: tuple[Area, ...], col0: int, row0: int, width: int, height: int, blur_px: float, fold: int) -> Cover:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from synthetic_images.areas import Area, Cover, bounds
 from synthetic_images.film import FrameGeometry
-from synthetic_images.optics import reach_px, seen_coverage
+from synthetic_images.optics import blurred_coverage, reach_px
 from synthetic_images.scene import ChipMark
 
 Array = NDArray[np.float64]
@@ -35,7 +35,7 @@ class AreaPaint:
         if left >= right or upper >= lower:
             return None
         window = (slice(upper - row0, lower - row0), slice(left, right))
-        return window, seen_coverage(self.areas, left, upper, right - left, lower - upper, blur_px)
+        return window, blurred_coverage(self.areas, left, upper, right - left, lower - upper, blur_px)
 
     @cached_property
     def _bounds(self) -> tuple[int, int, int, int]:

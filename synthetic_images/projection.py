@@ -81,26 +81,26 @@ def ray_from_camera(camera: SceneCamera, exterior: tuple[float, ...], camera_mm:
 def _opencv_ideal(distortion: Distortion, tangents: Array) -> Array:
     """Inverse of `_opencv_distorted`, by OpenCV's iteration."""
     until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 4 * INVERSION_STEPS, 1e-14)
-    seen = np.linalg.solve(_axes(distortion), tangents.T).T.reshape(-1, 1, 2)
+    distorted = np.linalg.solve(_axes(distortion), tangents.T).T.reshape(-1, 1, 2)
     if distortion.family == "opencv_fisheye":
-        ideal = cv2.fisheye.undistortPoints(seen, np.eye(3), _coefficients(distortion), criteria=until)
+        ideal = cv2.fisheye.undistortPoints(distorted, np.eye(3), _coefficients(distortion), criteria=until)
     else:
-        ideal = cv2.undistortPoints(seen, np.eye(3), _coefficients(distortion), criteria=until)
+        ideal = cv2.undistortPoints(distorted, np.eye(3), _coefficients(distortion), criteria=until)
     return np.asarray(np.reshape(ideal, (-1, 2)) * [1.0, -1.0], np.float64)
 
 
 def _opencv_distorted(distortion: Distortion, tangents: Array) -> Array:
     """Distort by OpenCV's models, whose y axis points down."""
-    seen = np.isfinite(tangents).all(axis=1)
+    is_visible = np.isfinite(tangents).all(axis=1)
     result = np.full_like(tangents, np.nan)
-    if seen.any():
-        directions = np.column_stack([tangents[seen] * [1.0, -1.0], np.ones(seen.sum())])
+    if is_visible.any():
+        directions = np.column_stack([tangents[is_visible] * [1.0, -1.0], np.ones(is_visible.sum())])
         whole = (np.zeros(3), np.zeros(3), np.eye(3), _coefficients(distortion))
         if distortion.family == "opencv_fisheye":
             projected, _ = cv2.fisheye.projectPoints(directions[:, None], *whole)
         else:
             projected, _ = cv2.projectPoints(directions, *whole)
-        result[seen] = np.asarray(projected).reshape(-1, 2) @ _axes(distortion).T
+        result[is_visible] = np.asarray(projected).reshape(-1, 2) @ _axes(distortion).T
     return result
 
 

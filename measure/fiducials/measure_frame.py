@@ -441,7 +441,7 @@ def _refit_with_tone(frame: Frame) -> Frame:
         best = _refit(best, dict.fromkeys(pending, options))
     best = _settle_tone(best)
     is_open = (
-        best.tone.is_told
+        best.tone.is_determined
         and best.tone.disagreement > _AGREED
         and any(tone.sensitivity_px > best.clear_fits[index].sigma_px for index, tone in _mark_tones(best).items())
     )
@@ -459,7 +459,7 @@ def _settle_tone(frame: Frame) -> Frame:
         tones, fits, before = _mark_tones(frame), frame.clear_fits, frame.scan.tone
         estimate = FrameTone.from_marks(before.prior, tones, before)
         frame = replace(frame, tone=estimate)
-        is_moved = estimate.is_told and any(
+        is_moved = estimate.is_determined and any(
             estimate.moves(each, before, fits[n].covariance_px2) for n, each in tones.items()
         )
         if not (is_moved and rounds_left):

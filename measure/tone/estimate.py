@@ -44,8 +44,8 @@ class FrameTone:
     least, greatest : range of codes of the marks, fractions of full scale.
     scatter : variance of each departure of the marks' own curves around it.
     apart : squared distance of the curve from the one used for matching.
-    is_told : whether half of the marks tell more of the curve than its prior. If not, a step from the prior is all that
-        they are good for: what they tell under the next curve is how their drawings are wrong.
+    is_determined : whether half of the marks tell more of the curve than its prior. If not, one step from the prior is
+        taken: under the next curve they only tell how their drawings are wrong.
     """
 
     tone: Tone
@@ -54,7 +54,7 @@ class FrameTone:
     greatest: float = 1.0
     scatter: float = 0.0
     apart: float = 0.0
-    is_told: bool = False
+    is_determined: bool = False
 
     @classmethod
     def from_marks(cls, prior: Tone, marks: Mapping[int, MarkTone], matched_by: Tone) -> "FrameTone":
@@ -67,14 +67,16 @@ class FrameTone:
         step, sharpening = tone.mean - matched_by.mean, matched_by.sharpening
         if prior.is_known:
             return cls(prior, None, *ends, scatter, float(step @ step))
-        is_told = float(np.median([np.trace(information.matrix) for information in each])) > _TELLING
+        is_determined = float(np.median([np.trace(information.matrix) for information in each])) > _TELLING
         value = tone.equivalent_power(*ends)[0]
         if not _POWERS[0] <= value <= _POWERS[1]:
             off = tone.mean - prior.mean
-            return cls(prior.doubted(tone, value).sharpened(sharpening), None, *ends, 0.0, float(off @ off), is_told)
+            return cls(
+                prior.doubted(tone, value).sharpened(sharpening), None, *ends, 0.0, float(off @ off), is_determined
+            )
         information = replace(ToneInformation.pooled(each, scatter), sharpening=sharpening)
         tone = replace(tone, before=prior).sharpened(sharpening)
-        return cls(tone, information, *ends, scatter, float(step @ step), is_told)
+        return cls(tone, information, *ends, scatter, float(step @ step), is_determined)
 
     @property
     def is_doubted(self) -> bool:

@@ -357,7 +357,9 @@ def resample_tasks(
     if with_lens and adjustment is None:
         raise InputError("--lens needs an adjusted lens. Run `reseau adjust` first, or resample without it.")
     images = {} if adjustment is None else adjustment.images
-    judged = {image for image, record in images.items() if record.exterior.is_oriented}  # by what fiducials do not tell
+    oriented = {
+        image for image, record in images.items() if record.exterior.is_oriented
+    }  # by what fiducials do not tell
     tasks: dict[str, ResampleTask] = {}
     failed = []
     for measured in scans:
@@ -382,7 +384,7 @@ def resample_tasks(
             max_pixels=project.max_pixels,
             target=path_below(folder, frame, ".tif"),
             scans=(scan,),
-            doubt="" if image in judged else _frame_doubt(measured),
+            doubt="" if image in oriented else _frame_doubt(measured),
         )
     return list(tasks.values()), failed
 

@@ -98,7 +98,7 @@ def test_figures_are_those_that_were_planted() -> None:
 
 
 @pytest.mark.parametrize("seed", [2, pytest.param(14, marks=pytest.mark.study)])
-def test_nothing_is_blamed_beside_a_stale_distortion(seed: int) -> None:
+def test_nothing_else_is_blamed_with_a_stale_distortion(seed: int) -> None:
     """A drift of focus had been, which explained nothing without the wrong k1."""
     given = misfit_network(scene(seed, flat=True), Effects(), SOUND, np.random.default_rng(seed))
     (camera,) = given.cameras

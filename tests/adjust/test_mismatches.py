@@ -83,7 +83,7 @@ def test_point_without_two_rays_that_meet_is_left_out_and_named() -> None:
     assert not result.suspects
 
 
-def test_one_of_two_pairs_of_rays_that_meet_is_told_to_be_like_the_other() -> None:
+def test_one_of_two_pairs_of_rays_that_meet_is_not_distinguishable_from_the_other() -> None:
     """Of four rays of a point, two belong to another: nothing tells which point has the name."""
     made = _network(3)
     spoilt = _joined(_joined(made, "f2", "12", "20"), "f3", "12", "20")

@@ -143,7 +143,7 @@ def test_dark_marks_and_an_unknown_pitch() -> None:
     assert_right(result, NUMBERED, matrix)
 
 
-def test_a_negative_of_light_marks_is_told() -> None:
+def test_a_negative_of_light_marks_is_named() -> None:
     negative = 20000 - frame_picture(NUMBERED, pixel_from_camera("0"))
     light = [replace(mark, mark=replace(mark.mark, polarity="light")) for mark in NUMBERED.marks]
     lost = measure_grey(negative, replace(NUMBERED, marks=tuple(light)), FiducialOptions(pose="0"))

@@ -110,15 +110,15 @@ def test_dust_is_cut_out() -> None:
 
 
 @parametrize_with_studies("name", ["ring-cross", "ring-dot", "dot"], quick=(1,))
-def test_a_mark_half_of_which_was_redrawn_beside_it_says_so_in_its_sigma(name: str) -> None:
+def test_a_mark_half_of_which_was_redrawn_has_the_shift_in_its_sigma(name: str) -> None:
     """The match lies between the halves, 0.5 px off each, and takes what is left of either for damage."""
     rng = np.random.default_rng(19)
     squares = []
     for shown, place in draw_mark(name, 1.0):
         angle = rng.uniform(0, 2 * np.pi)
-        beside = placed(SCALE, tuple(place[:, 2] + (np.cos(angle), np.sin(angle))), 0.03)
+        shifted = placed(SCALE, tuple(place[:, 2] + (np.cos(angle), np.sin(angle))), 0.03)
         rows, cols = np.indices(shown.shape)
-        redrawn = brute_picture(MARKS[name], beside, SIZE, SIZE, 1.0)
+        redrawn = brute_picture(MARKS[name], shifted, SIZE, SIZE, 1.0)
         halves = (
             np.where(cols > place[0, 2], redrawn, shown)
             if angle > np.pi

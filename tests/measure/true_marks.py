@@ -12,7 +12,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from measure.marks.shapes import Bar, Disk, MarkShape, Part, Ring, cross, dot, polygon, ring_cross, ring_dot
 from synthetic_images import areas
-from synthetic_images.optics import reach_px, seen_coverage
+from synthetic_images.optics import blurred_coverage, reach_px
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -169,7 +169,7 @@ class TrueMark:
         col0, row0 = max(col0 - reach, 0), max(row0 - reach, 0)
         width, height = min(width + 2 * reach, self.size - col0), min(height + 2 * reach, self.size - row0)
         view = np.zeros((self.size, self.size))
-        shown = seen_coverage(outlines, col0, row0, width, height, blur_px, _FOLD)
+        shown = blurred_coverage(outlines, col0, row0, width, height, blur_px, _FOLD)
         view[row0 : row0 + height, col0 : col0 + width] = shown
         return view
 

@@ -355,7 +355,9 @@ def drawn_picture(seed: int) -> Array:
 
 
 @pytest.mark.parametrize("has_target", [True, False])
-def test_a_scan_that_is_stored_twice_is_told_from_another_one_rectified_to_its_places(has_target: bool) -> None:
+def test_a_scan_stored_twice_is_distinguished_from_another_one_rectified_to_its_places(
+    has_target: bool,
+) -> None:
     """In another format, and at twice the size and turned by a quarter; the next frame lies half a pixel elsewhere.
 
     Where targets do not tell them apart the pictures do: darker as a negative, and with another tone curve.
@@ -378,8 +380,8 @@ def test_a_scan_that_is_stored_twice_is_told_from_another_one_rectified_to_its_p
     assert counting(checked) == ({"first", "other"} if has_target else {*names})
     named = {each.frame.image: each.frame.problems[0] for each in checked if each.frame.problems}
     assert {*named} == {"again", "turned"} | (set() if has_target else {"and its copy"})
-    said = "count once. To use this one, name first in `exclude`" if has_target else "count twice. Name one of both"
-    assert said in named["turned"]
+    message = "count once. To use this one, name first in `exclude`" if has_target else "count twice. Name one of both"
+    assert message in named["turned"]
     assert has_target or "those of rectified do" in named["and its copy"]
     targets = (replace(target, point="9", center_px=np.array(at)) for at in ((50.0, 80.0), (90.0, 80.0)))
     apart = [named_scan(name, marks=(*given, one)) for name, one in zip(("a", "b"), targets, strict=True)]
@@ -409,7 +411,7 @@ def test_a_picture_of_another_print_is_named_and_no_other(odd: tuple[str, ...], 
     assert all("another print of the board" in why for why in found.values())
 
 
-def test_where_no_board_is_found_it_is_told_what_the_first_picture_shows(folder: Path, tmp_path: Path) -> None:
+def test_where_no_board_is_found_the_message_names_what_the_first_picture_shows(folder: Path, tmp_path: Path) -> None:
     pictures = find_pictures([folder], tmp_path)
     images = [name for camera in pictures.cameras for name in camera.images]
     message = calibrate_stage._nothing(pictures, dict.fromkeys(images, "no marker was read"), {})

@@ -322,7 +322,7 @@ def test_a_strong_lens_is_refused_unless_requested(tmp_path: Path, refusal: Refu
     assert off.max() < 1.05 * stated_px
 
 
-def test_the_nearest_of_several_models_is_told(tmp_path: Path, refusal: Refusal) -> None:
+def test_the_nearest_of_several_models_is_named(tmp_path: Path, refusal: Refusal) -> None:
     """The last of OpenCV's models cannot be fitted to this lens."""
     project = adjusted_project(
         tmp_path, replace(TRUTH, family="ebner", distortion={"b1": 0.01, "b3": 0.005, "b7": 0.004})

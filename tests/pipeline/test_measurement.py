@@ -212,7 +212,7 @@ TONE = FrameTone(
     0.7,
     1.9,
     0.4,
-    is_told=True,
+    is_determined=True,
 )
 LINE = Line(
     {"90m": Reading("RUN 7", 0.93, 4.6), "270m": Reading("L NNꓤ", 1 / 3, 1.1)},

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from synthetic_images.areas import bar, bounds, centroid, coverage, disk, polygon, ring, stroke
-from synthetic_images.optics import seen_coverage
+from synthetic_images.optics import blurred_coverage
 
 Array = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ def moments(cover: NDArray[np.float32], col0: int, row0: int) -> tuple[float, Ar
 def test_a_disk_keeps_its_centre_and_its_area(seed: int) -> None:
     generator = np.random.default_rng(seed)
     center, radius = generator.uniform((5, 12), (12, 18)), generator.uniform(1.0, 6.0)
-    cover = seen_coverage((disk((center[0], center[1]), radius),), -13, -5, 44, 40, 0.8)
+    cover = blurred_coverage((disk((center[0], center[1]), radius),), -13, -5, 44, 40, 0.8)
     total, middle = moments(cover, -13, -5)
     assert np.abs(middle - center).max() < 1e-3
     assert total == pytest.approx(np.pi * radius**2, rel=2e-4)
@@ -36,7 +36,7 @@ def test_optics_blur_before_pixels_average() -> None:
     sharp = (np.hypot(x[None, :] - 0.23, x[:, None] + 0.41) < 2.0).astype(float)
     expected = gaussian_filter(sharp, 0.6 * 40).reshape(20, 40, 20, 40).mean(axis=(1, 3))
     # The window's pixel (0, 0) is centred at -9.5 of the fine grid's axes.
-    view = seen_coverage((disk((9.5 + 0.23, 9.5 - 0.41), 2.0),), 0, 0, 20, 20, 0.6)
+    view = blurred_coverage((disk((9.5 + 0.23, 9.5 - 0.41), 2.0),), 0, 0, 20, 20, 0.6)
     assert np.abs(view - expected).max() < 2e-3
 
 
@@ -44,7 +44,7 @@ def test_optics_blur_before_pixels_average() -> None:
 def test_blocks_leave_no_seams(blur_px: float) -> None:
     """A great disk, block by block, against the same in one piece."""
     area = disk((101.3, 97.8), 80.4)
-    view = seen_coverage((area,), 3, 2, 150, 170, blur_px)
+    view = blurred_coverage((area,), 3, 2, 150, 170, blur_px)
     reach = 6
     fine = coverage((area,), 3 - reach, 2 - reach, 150 + 2 * reach, 170 + 2 * reach, 4).astype(np.float64)
     smooth = gaussian_filter(fine, 4 * blur_px, truncate=6.0) if blur_px else fine
