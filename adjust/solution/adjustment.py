@@ -224,8 +224,7 @@ class _Solver:
 
         These are the images in which some point has no image at the start, and where the iteration does not converge,
         or observations contradict each other, the one that contradicts the others most, if all is well without it.
-        Raises NoImageError where too little would
-        remain.
+        Raises NoImageError where too little would remain.
         """
         try:
             result = self.check_whole(part, None, start)

@@ -59,6 +59,7 @@ WORTH = 0.3  # fraction of the largest first-order decrease above which a hypoth
 STEPS = 40  # images of another pitch need about 20
 LEAST_SHARE = 0.05  # of v'Pv; further lens terms remove up to 0.02 on real boards
 TURNS = 8  # adjustments, each with the variance of the one before
+SPECIAL = ("drift", "groups")  # hypotheses that "distances" contains
 FEWEST = 30  # coordinates needed to test the distribution of residuals
 CHANCE = 0.001  # significance level of each test of the noise hypothesis
 NEIGHBOURS = 8  # nearest neighbours searched for one in the same, or in another, image
@@ -256,9 +257,6 @@ def _best(model: _Model) -> tuple[list[_Model], bool]:
         return [], False
     alike = [each for each, own in zip(found, criteria, strict=True) if own < min(criteria) + TOLD_APART]
     return alike, bool(without < TOLD_APART)
-
-
-SPECIAL = ("drift", "groups")  # hypotheses that "distances" contains
 
 
 def _without_nested(found: list[_Model], variance: float) -> list[_Model]:

@@ -29,6 +29,7 @@ from adjust.solution.partitions import Selection, interior_equations, jumps, own
 
 FREE = Prior(0.0, np.inf)
 NONE = Selection()
+REFOCUSED = "Fix focus and zoom, switch autofocus and stabilisation off, and take the pictures again."
 RADIAL_DEGREES = (3, 5, 7, 9, 11, 13)  # powers of the radius, as of k1 to k6
 TERMS_TOGETHER = 2  # radial terms tested jointly
 FEWEST_DRIFTING = 4  # images that tell a drift from their scatter
@@ -254,9 +255,6 @@ def _pixel_words(camera: str, per_mm: float) -> Words:
     return words
 
 
-REFOCUSED = "Fix focus and zoom, switch autofocus and stabilisation off, and take the pictures again."
-
-
 def _drift(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
     """A principal distance that changes with the number of the image, or with the distance of the object."""
     problem, state = run.problem, run.end.state
@@ -340,7 +338,7 @@ def _jumps(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
             return (
                 f"All marks of {who} {where} are displaced against the others, by ({x_um:+.3g}, {y_um:+.3g}) ± "
                 f"({sigma_um[0]:.1g}, {sigma_um[1]:.1g}) µm: the scanner or sensor jumps there",
-                "Scan or take the picture again, or look whether it was put together from parts.",
+                "Scan it or take the picture again, or check whether it was joined from parts.",
             )
 
         fields_mm = jump.beyond[:, None, None] * np.eye(2)
