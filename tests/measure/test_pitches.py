@@ -258,7 +258,7 @@ def test_learned_marks_are_cut_in_the_measured_channels() -> None:
 
 
 PLACES = {f"{x}{y}": (106.0 * x, 106.0 * y) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y}
-RADIUS_MM, OBLIQUE_FILM_PITCH_UM, FRAME_MM = 1.5, 150.0, (228.0, 228.0)
+RADIUS_MM, OBLIQUE_FILM_PITCH_UM, FRAME_MM = 1.5, 200.0, (228.0, 228.0)
 
 
 def test_balls_under_a_perspective_are_found_and_the_perspective_is_named(tmp_path: Path) -> None:
