@@ -186,7 +186,8 @@ def _camera_table(design: Design) -> PrintedTable:
             *((significant(value, 6), UNDETERMINED) if math.isinf(sigma) else value_and_sigma(value, sigma)),
         ]
         if expected.fiducials:
-            cells.append(_sigma(design.alone[parameter]) if sigma > 0.0 else "")
+            size = max(abs(value), sigma)  # what the value's power of ten comes from
+            cells.append(_sigma(design.alone[parameter], size if math.isfinite(size) else 0.0) if sigma > 0.0 else "")
         if several and name in layouts.mean:
             scale = UM_PER_MM if name in IN_UM else 1.0
             cells += [_sigma(layouts.mean[name] / scale), _sigma(layouts.spread[name] / scale)]
@@ -218,11 +219,11 @@ def _sweep_table(swept: Swept) -> PrintedTable:
     return f"Sigmas over {swept.quantity}" + (f", mean of {layouts} layouts" if layouts > 1 else ""), heads, rows
 
 
-def _sigma(sigma: float) -> str:
-    """Format a standard deviation with two digits."""
+def _sigma(sigma: float, size: float = 0.0) -> str:
+    """Format a standard deviation with two digits, and with the power of ten of a number of that size (0: its own)."""
     if sigma == 0.0:
         return "0"
-    return UNDETERMINED if math.isinf(sigma) else value_and_sigma(sigma, sigma)[1]
+    return UNDETERMINED if math.isinf(sigma) else value_and_sigma(sigma, sigma, size)[1]
 
 
 def _gain(percent: float) -> str:

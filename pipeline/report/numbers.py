@@ -21,8 +21,10 @@ def fixed_list(values: Iterable[float] | None, decimals: int, separator: str = "
     return NONE if values is None else separator.join(fixed(value, decimals, sign) for value in values)
 
 
-def value_and_sigma(value: float | None, sigma: float | None) -> tuple[str, str]:
+def value_and_sigma(value: float | None, sigma: float | None, size: float = 0.0) -> tuple[str, str]:
     """Format the value to the last digit that its sigma supports, and the sigma to two digits.
+
+    size: of the number whose power of ten both are written with; 0: the larger of the two.
 
     >>> value_and_sigma(153.66401, 0.00412)
     ('153.6640', '0.0041')
@@ -37,7 +39,7 @@ def value_and_sigma(value: float | None, sigma: float | None) -> tuple[str, str]
         return significant(value, 6), NONE
     if sigma == 0.0:
         return significant(value, 8), "fixed"
-    power = _power(max(abs(value), sigma))
+    power = _power(size or max(abs(value), sigma))
     scale = 10.0**power
     decimals = min(max(1 - math.floor(math.log10(sigma / scale)), 0), 12)
     return _scaled(value / scale, decimals, power), _scaled(sigma / scale, decimals, power)

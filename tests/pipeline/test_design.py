@@ -80,7 +80,7 @@ def test_what_would_help_is_tried(tmp_path: Path) -> None:
 
 def test_design_writes_what_it_found(tmp_path: Path, capsys: Capture, printed: Printed) -> None:
     swept = '[[design.sweep]]\nquantity = "design.transformation"\nvalues = ["similarity", "affine"]\n[[image]]'
-    scene = small(tmp_path, ("[[image]]", swept))
+    scene = small(tmp_path, ("[[image]]", swept), ('"torlegard", ', '"torlegard", value = {k3 = -6e-6}, '))
     assert command("design", scene, "--json") == DONE
     folder = tmp_path / "small-design"
     content = json.loads((folder / "design.json").read_text())
@@ -102,6 +102,8 @@ def test_design_writes_what_it_found(tmp_path: Path, capsys: Capture, printed: P
     drawn_words = {word.text for word in drawn.iter("{http://www.w3.org/2000/svg}text")}
     assert drawn_words >= {"similarity", "affine", "design.transformation", "c", "k3"}
     table = printed("design", scene, tmp_path / "there")
+    k3 = next(line for line in table.splitlines() if line.startswith("│ k3"))
+    assert k3.count("× 10⁻⁶") == 3  # value, sigma, and that of the photographs alone, by the value's power of ten
     assert "Smallest gross errors" in table
     assert "What would help" in table
     assert "Sigmas over design.transformation" in table
