@@ -1,7 +1,7 @@
 """The lists of docs/code.md, from the modules' own docstrings: python docs/make_code_map.py
 
-A line a module: its name and the first sentence of its docstring. The order on the page is that of the data's flow and
-is kept; a module that is new comes last in its folder's list, to be moved where it belongs, and one that is gone goes.
+Under a heading that ends with a folder, `measure/scans/`, stands a line for each module of that folder: its name and
+the first sentence of its docstring. The order of the page, that of the data flow, is kept; a new module comes last.
 """
 
 import re
@@ -9,53 +9,48 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "code.md"
-PACKAGES = ("measure", "adjust", "compiled", "pipeline", "synthetic_images", "benchmarks")
+PACKAGES = ("measure", "adjust", "pipeline", "synthetic_images", "benchmarks")
+_LINE = re.compile(r"- `([\w.]+)`: ")
 
 
-def first_sentences() -> dict[str, str]:
-    """Of every module, by its dotted name."""
-    files = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
-    return {
-        ".".join(path.relative_to(ROOT).with_suffix("").parts): _first_sentence(path)
-        for path in files
-        if path.name != "__init__.py"
-    }
+def first_sentences(folder: str) -> dict[str, str]:
+    """Of every module of a folder, by its dotted name."""
+    files = [file for file in sorted((ROOT / folder).glob("*.py")) if file.name != "__init__.py"]
+    return {".".join(file.relative_to(ROOT).with_suffix("").parts): _first_sentence(file) for file in files}
 
 
 def _first_sentence(path: Path) -> str:
     docstring = re.match(r'"""(.*?)"""', path.read_text(encoding="utf-8"), re.DOTALL)
     text = " ".join(docstring[1].split("\n\n")[0].split()) if docstring else ""
-    found = re.match(r".*?[.!?](?=\s|$)", text)
-    return found[0] if found else text
+    sentence = re.match(r".*?[.!?](?=\s|$)", text)
+    return sentence[0] if sentence else text
 
 
 def mapped(page: str) -> str:
-    """The page with its lists brought up to date. Raises ValueError for a module whose folder has no list."""
-    told, lines, listed = first_sentences(), [], set[str]()
-    for line in page.splitlines():
-        name = _listed(line)
-        if not name:
-            lines.append(line)
-        elif name in told and name not in listed:
-            lines.append(f"- `{name}`: {told[name]}")
-            listed.add(name)
-    for name in told.keys() - listed:
-        lines.insert(_end_of_list(lines, name), f"- `{name}`: {told[name]}")
-    return "\n".join(lines) + "\n"
+    """The page with its lists brought up to date. Raises ValueError for a folder without a heading."""
+    sections = re.split(r"^(?=##)", page, flags=re.MULTILINE)
+    folders = [_folder(section) for section in sections]
+    modules = [file for package in PACKAGES for file in (ROOT / package).rglob("*.py") if file.name != "__init__.py"]
+    missing = {file.parent.relative_to(ROOT).as_posix() for file in modules} - set(folders)
+    if missing:
+        raise ValueError(f"docs/code.md has no heading that ends with {', '.join(sorted(missing))}: write one.")
+    return "".join(map(_with_list, sections, folders)).rstrip() + "\n"
 
 
-def _listed(line: str) -> str:
-    found = re.match(r"- `([\w.]+)`: ", line)
-    return found[1] if found and found[1].startswith(PACKAGES) else ""
+def _folder(section: str) -> str:
+    heading = re.match(r"#+ .*`([\w/]+)/`$", section, re.MULTILINE)
+    return heading[1] if heading else ""
 
 
-def _end_of_list(lines: list[str], name: str) -> int:
-    """Behind the last module of the same folder."""
-    folder = name.rpartition(".")[0]
-    same = [i for i, line in enumerate(lines) if _listed(line).rpartition(".")[0] == folder]
-    if not same:
-        raise ValueError(f"docs/code.md has no list of {folder}: write a heading for it, and a line `- `{name}`: `.")
-    return same[-1] + 1
+def _with_list(section: str, folder: str) -> str:
+    """A folder's section: its text, then its modules, those that it has listed so far first."""
+    if not folder:
+        return section
+    sentences, lines = first_sentences(folder), section.splitlines()
+    listed = [match[1] for line in lines if (match := _LINE.match(line)) and match[1] in sentences]
+    names = dict.fromkeys([*listed, *sentences])
+    text = "\n".join(line for line in lines if not _LINE.match(line)).strip()
+    return "\n".join([text, "", *(f"- `{name}`: {sentences[name]}" for name in names), "", ""])
 
 
 if __name__ == "__main__":
