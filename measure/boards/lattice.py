@@ -176,9 +176,7 @@ class FoundGrid:
 def find_grid(points_px: Array, appearances: Array, spec: CircleGridSpec | SquareGridSpec, what: str) -> FoundGrid:
     """Find the grid formed by points. Of several orientations the most upright one in the scan is returned.
     points_px, appearances: as in `grid_places`; what: word for the points in messages."""
-    size, places = f"{spec.columns} x {spec.rows} {what}", spec.places()
-    if isinstance(spec, CircleGridSpec) and spec.asymmetric:  # its columns may be counted as dots or as places
-        size = f"{len(places)} {what} in {spec.rows} rows"
+    size, places = grid_size(spec, what), spec.places()
     assignments = grid_places(points_px, appearances, places)
     if not is_whole(assignments):
         message = f"no grid of {size} is whole in the scan; {len(points_px)} spots are candidates for {what}"
@@ -201,6 +199,13 @@ def find_grid(points_px: Array, appearances: Array, spec: CircleGridSpec | Squar
             return FoundGrid(assignment, tuple(others), notes[: len(assignments) - 1])
         found = list(further[0].values())
         others.append(points_px[left[found]].mean(axis=0))
+
+
+def grid_size(spec: CircleGridSpec | SquareGridSpec, what: str) -> str:
+    """Size of a grid for messages. what: word for its points."""
+    if isinstance(spec, CircleGridSpec) and spec.asymmetric:  # its columns may be counted as dots or as places
+        return f"{len(spec.places())} {what} in {spec.rows} rows"
+    return f"{spec.columns} x {spec.rows} {what}"
 
 
 def find_squares(picture: Bytes, spec: SquareGridSpec) -> FoundBoard:

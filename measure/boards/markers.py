@@ -124,7 +124,7 @@ def placed_markers(read: MarkerReadings, board: Markers) -> ReadMarkers:
         elif view is None:
             refused[number] = Reason(
                 f"marker {number} was read, but the board's markers do not agree on where the board lies: "
-                "there may be another such board",
+                "columns, rows or kind may be wrong, or there may be another such board",
                 Code.AMBIGUOUS,
             )
         else:
@@ -280,7 +280,7 @@ def _read_board(picture: Bytes, spec: Layout) -> tuple[ReadMarkers, Layout]:
 
 def _other_layouts(spec: Layout, read: MarkerReadings) -> Iterator[Layout]:
     """Variants of a specification that may be confused with it: the other layout, swapped counts, other first numbers,
-    and all of these at once, those with few changes first."""
+    and all of these at once, those with few changes first; then inner corners counted in place of squares."""
     is_aruco = isinstance(spec, ArucoSpec)
     first_key: str = "first_marker" if is_aruco else "first_id"
     firsts: list[int] = other_first_numbers(read, getattr(spec, first_key), len(_markers(spec)))
@@ -288,6 +288,9 @@ def _other_layouts(spec: Layout, read: MarkerReadings) -> Iterator[Layout]:
     swapped: Changes = {"columns": spec.rows, "rows": spec.columns}
     numbered: list[Changes] = [{first_key: first} for first in firsts]
     groups: tuple[list[Changes], ...] = [{}], [swapped], numbered, [swapped | each for each in numbered]
+    if not is_aruco:
+        larger: Changes = {"columns": spec.columns + 1, "rows": spec.rows + 1}
+        groups = *groups, [larger]
     for changes in groups:
         yield from (
             replace(layout, **change) for change, layout in product(changes, layouts) if change or layout != spec

@@ -11,7 +11,7 @@ from measure.array_types import Array
 from measure.boards.corners import Corner, CornerStart, Surface, crossing, fit_corners, quarter
 from measure.boards.edge_shift import without_edge_shift
 from measure.boards.find import find_board
-from measure.boards.lattice import Place, find_grid
+from measure.boards.lattice import Place, find_grid, grid_size
 from measure.boards.specs import (
     AprilGridSpec,
     ArucoSpec,
@@ -92,7 +92,7 @@ def _measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> BoardMeasurement:
     disks = {place: fit for place, fit in zip(starts, fits, strict=True) if fit.reason or _is_whole(scan, fit)}
     marks = [_dot_mark(name, disks.get(place), place in detected) for place, name in names.items()]
     measured = BoardMeasurement(tuple(marks), notes=grid.notes, is_mirrored=is_mirrored)
-    return _unless_alone(measured, f"grids of {spec.columns} x {spec.rows} dots", grid.others_px)
+    return _unless_alone(measured, f"grids of {grid_size(spec, 'dots')}", grid.others_px)
 
 
 def _appearances(patches: list[Candidate]) -> Array:
@@ -183,7 +183,7 @@ def _unless_alone(measured: BoardMeasurement, kind: str, others_px: Sequence[Arr
     middle = np.mean([mark.center_px for mark in measured.marks if mark.center_px is not None], axis=0)
     places = " and ".join(f"({column:.0f}, {row:.0f})" for column, row in (middle, *others_px))
     message = f"the scan shows {1 + len(others_px)} {kind}, about the pixels {places}, and nothing tells which is meant"
-    why = Reason(message, Code.AMBIGUOUS)
+    why = Reason(f"{message}: cover the others", Code.AMBIGUOUS)
     marks = tuple(
         replace(mark, status=Status.REJECTED, reason=why) if mark.status.is_observation else mark
         for mark in measured.marks

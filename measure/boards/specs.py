@@ -220,7 +220,8 @@ def aruco_dictionary(name: str) -> cv2.aruco.Dictionary:
     """OpenCV's predefined dictionary of that name, with or without the prefix DICT_."""
     code = getattr(cv2.aruco, "DICT_" + name.upper().removeprefix("DICT_"), None)
     if code is None:
-        known = ", ".join(sorted(known[5:] for known in dir(cv2.aruco) if known.startswith("DICT_")))
+        # OpenCV has some names twice: APRILTAG_36h11 and APRILTAG_36H11.
+        known = ", ".join(sorted({known[5:].replace("H", "h") for known in dir(cv2.aruco) if known[:5] == "DICT_"}))
         raise ValueError(f"dictionary is {name!r}; one of {known} is right")
     return cv2.aruco.getPredefinedDictionary(code)
 

@@ -3,6 +3,7 @@
 import math
 import os
 import re
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures
 from pipeline.errors import InputError
 from pipeline.files.opencv_file import COVARIANCE
 from pipeline.files.project_file import ASSUMED_PITCH_UM, Project, read_project
+from pipeline.files.target_table import TARGET_TABLES, BoardTable
 from pipeline.results.image_unit import CENTRE
 from pipeline.text.csv_table import csv_line
 from pipeline.text.files import write_atomically
@@ -109,13 +111,27 @@ def board_options(
         raise InputError(
             f"--kind {kind}: there is no such board; possible are {', '.join(kinds)}.{did_you_mean(kind, kinds)}"
         )
-    counts = re.fullmatch(r"(\d{1,3})[x×*](\d{1,3})", board.strip(), flags=re.IGNORECASE)
+    own = {"chessboard": (), "circle-grid": ("--marker",), "asymmetric-circle-grid": ("--marker",)}
+    options = {"--marker": marker, "--dictionary": dictionary, "--legacy": legacy, "--first-id": first_id}
+    for option, value in options.items():
+        if value and option not in own.get(kind, options):
+            raise InputError(
+                f"{option}: a {kind} has none. Leave it out, or name the board's kind: --kind charuco, say."
+            )
+    counts = re.fullmatch(r"(\d{1,3}) ?[x×*] ?(\d{1,3})", board.strip(), flags=re.IGNORECASE)
     if counts is None or not all(1 <= int(each) <= MOST for each in counts.groups()):
         raise InputError(f"--board {board}: must be two counts of 1 to {MOST}, COLUMNSxROWS, such as 9x6.")
     size_mm = None if marker is None else _length_mm("--marker", marker)
     columns, rows = map(int, counts.groups())
     spacing_mm = _length_mm("--square", square)
-    return BoardOptions(kinds[kind], columns, rows, spacing_mm, size_mm, dictionary, legacy, first_id)
+    found = BoardOptions(kinds[kind], columns, rows, spacing_mm, size_mm, dictionary, legacy, first_id)
+    table = TARGET_TABLES[kind](**tomllib.loads(found.table)["targets"])
+    try:
+        assert isinstance(table, BoardTable)
+        assert table.board
+    except ValueError as error:
+        raise InputError(f"--kind {kind} --board {board}: {error}.") from None
+    return found
 
 
 def _length_mm(option: str, text: str) -> float:

@@ -46,6 +46,7 @@ Array = NDArray[np.float64]
 CHESSBOARD = ChessboardSpec(6, 5, 24.0)
 SMALL_DOTS = CircleGridSpec(6, 5, 28.0, 13.0)
 SMALL_SQUARES = SquareGridSpec(6, 5, 16.0, 12.0)
+STAGGERED = CircleGridSpec(8, 6, 20.0, 13.0, asymmetric=True)
 
 
 def measure_picture(spec: BoardSpec, dark: Any, homography: Array) -> tuple[BoardMeasurement, Array]:
@@ -319,6 +320,7 @@ def test_corners_of_separate_squares(turn_deg: float, gap_mm: float) -> None:
         (CHESSBOARD, chessboard_dark(CHESSBOARD), "3 boards of 6 x 5 inner corners"),
         (SMALL_DOTS, circles_dark(SMALL_DOTS), "3 grids of 6 x 5 dots"),
         (SMALL_SQUARES, squares_dark(SMALL_SQUARES), "3 boards of 6 x 5 squares"),
+        (STAGGERED, circles_dark(STAGGERED), "3 grids of 24 dots in 6 rows"),
     ],
 )
 def test_of_boards_that_are_alike_none_is_observed(spec: BoardSpec, dark: Any, words: str) -> None:

@@ -97,6 +97,8 @@ def test_exchanged_counts_and_another_first_number_at_once() -> None:
     board = find_charuco(generated(spec), replace(spec, columns=5, rows=6, first_id=0))
     assert not board.corners
     assert "but as with columns = 6, rows = 5, first_id = 9." in board.reason
+    inner = find_charuco(generated(spec), replace(spec, columns=5, rows=4))
+    assert "but as with columns = 6, rows = 5." in inner.reason
     aruco = ArucoSpec("4X4_50", 4, 3, 20.0, 8.0, first_marker=5)
     picture = cv2.aruco.GridBoard((4, 3), 20.0, 8.0, aruco_dictionary("4X4_50"), np.arange(5, 17))
     drawing = np.asarray(picture.generateImage((344, 264), marginSize=20), np.uint8)

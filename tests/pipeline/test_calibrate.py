@@ -268,6 +268,15 @@ def test_a_calibration_is_plotted_and_shown_in_a_notebook(
         (("--board", "7x5", "--square", "20mm", "--kind", "charuco"), "--marker is missing"),
         (("--board", "7x5", "--square", "20mm", "--kind", "chess"), "possible are chessboard"),
         (("--board", "7x5", "--square", "20mm", "--lens", "fishey"), "Did you mean 'fisheye'?"),
+        (("--board", "7x5", "--square", "20mm", "--dictionary", "4X4_50"), "--dictionary: a chessboard has none"),
+        (
+            ("--board", "7x5", "--square", "20mm", "--kind", "charuco", "--marker", "1cm", "--dictionary", "36h11"),
+            "dictionary is '36h11'; one of 4X4_100",
+        ),
+        (
+            ("--board", "20x6", "--square", "2cm", "--kind", "charuco", "--marker", "1cm", "--dictionary", "4X4_50"),
+            "--board 20x6: the board needs markers 0 to 59",
+        ),
     ],
 )
 def test_a_wrong_option_is_named(options: tuple[str, ...], said: str, refusal: Refusal) -> None:
