@@ -1,6 +1,7 @@
 """Detection of a board's markers. A marker read at several places is resolved by the layout of the board."""
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain, product
 from typing import Any, TypeVar, cast
@@ -288,9 +289,11 @@ def _other_layouts(spec: Layout, read: MarkerReadings) -> Iterator[Layout]:
     swapped: Changes = {"columns": spec.rows, "rows": spec.columns}
     numbered: list[Changes] = [{first_key: first} for first in firsts]
     groups: tuple[list[Changes], ...] = [{}], [swapped], numbered, [swapped | each for each in numbered]
-    if not is_aruco:
-        larger: Changes = {"columns": spec.columns + 1, "rows": spec.rows + 1}
-        groups = *groups, [larger]
+    larger: Changes = {"columns": spec.columns + 1, "rows": spec.rows + 1}
+    if isinstance(spec, CharucoSpec):
+        with suppress(ValueError):  # raised where the dictionary has too few markers
+            replace(spec, **larger)
+            groups = *groups, [larger]
     for changes in groups:
         yield from (
             replace(layout, **change) for change, layout in product(changes, layouts) if change or layout != spec
