@@ -50,6 +50,11 @@ class Covariance:
         sigmas = {cause: float(np.sqrt(np.trace(self.parts[cause]) / 2)) for cause in Cause if cause in self.parts}
         return {cause: sigma for cause, sigma in sigmas.items() if sigma > 0}
 
+    @property
+    def largest(self) -> Cause:
+        """Cause of the largest part."""
+        return max(self.parts, key=lambda cause: float(np.trace(self.parts[cause])))
+
     def plus(self, cause: Cause, px2: Array) -> "Covariance":
         """Add the part (2, 2) of a cause; unchanged if it is zero."""
         if not np.any(px2):

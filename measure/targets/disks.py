@@ -291,7 +291,10 @@ def _dust_reason(disk: FittedDisk, off: Array, squares: float, count: int) -> Re
         )
     sigma = float(np.sqrt(np.linalg.eigvalsh(disk.covariance_px2)[-1]))
     if chdtrc(2, (_LARGE_PX / sigma) ** 2) > LARGE_ERROR:
-        return Reason(f"faint: good to {sigma:.2f} px only", Code.IMPRECISE)
+        message = (
+            f"its standard deviation is {sigma:.2f} px, the largest part from {disk.place_covariance.largest.shown}"
+        )
+        return Reason(message, Code.IMPRECISE)
     return NO_REASON
 
 

@@ -16,7 +16,7 @@ _LEAST_FIDUCIALS = 3  # two determine an interior orientation without any check
 class Verdict(MeaningfulWord):
     """Verdict on a scan: the worst of its marks and problems, ordered from the best to not yet known."""
 
-    GOOD = "good", "All marks are measured and passed all checks."
+    GOOD = "good", "All fiducials are measured and passed their checks; targets are tested by the adjustment."
     DECIDED = "decided", "Good after review decisions: nothing is open."
     LOOK = (
         "look",

@@ -228,20 +228,20 @@ def read_targets(table: Table) -> TargetSettings:
 class TieSettings:
     """The table [ties]."""
 
-    wanted: Annotated[int | None, "Natural points of an image; absent: 300."] = None
-    images: Annotated[int | None, "Images that a point is to be in; absent: 2."] = None
+    wanted: Annotated[int | None, whole(1), "Natural points in all; absent: 300."] = None
+    images: Annotated[
+        int | None,
+        whole(3),
+        "Scans that must show a point; absent: 3. Two rays cannot contradict each other along the epipolar line.",
+    ] = None
     height: Annotated[float | None, "Of flat ground, object units."] = None
     height_sigma: Annotated[NotNegative | None, "Its standard deviation, object units; goes with height."] = None
 
     def __post_init__(self) -> None:
-        """Raises WrongKey for a height without its standard deviation, or the reverse, and for impossible points."""
+        """Raises WrongKey for a height without its standard deviation, or the reverse."""
         for key, other in (("height", "height_sigma"), ("height_sigma", "height")):
             if getattr(self, key) is None and getattr(self, other) is not None:
                 raise WrongKey(key, "is missing. Add it.")
-        try:
-            _ = self.options
-        except ValueError as error:
-            raise WrongKey("wanted", f"these natural points are impossible: {error}.") from None
 
     @property
     def options(self) -> TieOptions:

@@ -93,8 +93,9 @@ class Entry:
 
     @property
     def is_left(self) -> bool:
-        """Whether an answer is needed. It is optional for a camera whose marks were learned from its scans."""
-        return self.question is not Question.CAMERA or self.marks == 0
+        """Whether an answer is needed. It is optional for a camera whose marks were learned from its scans, and for
+        marks of a scan whose verdict needs no review."""
+        return self.marks == 0 if self.question is Question.CAMERA else Verdict(self.verdict).needs_review
 
     @property
     def folder(self) -> str:
@@ -283,6 +284,7 @@ class Session:
                 "judging": self._judging,
                 "total": sum(entry.is_left for entry in self._by_key.values()),
                 "left": {"all": left.total(), **{str(question): left[question] for question in Question}},
+                "optional": sum(not entry.is_left for entry in self._by_key.values()),
                 "shown": len(shown),
                 "shown_left": len(open_places),
                 "next_left": next((at for at in open_places if at >= start), next(iter(open_places), -1)),

@@ -1,6 +1,7 @@
 """Targets against where the others put them, ring codes, sheets, dusty disks."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
 from measure import Scan, Status, TargetPrediction, measure_disks
-from measure.flags import NO_REASON
+from measure.flags import NO_REASON, Cause
 from measure.results import Covariance, SecondPlace
 from measure.targets.block_search import Candidate
 from measure.targets.consistency import TargetPlaces, compare_targets
@@ -19,6 +20,7 @@ from measure.targets.sheets import Dots, Naming, name_dots
 
 Array = NDArray[np.float64]
 SIZE_PX, NOISE_PX = (4000, 3000), 0.05
+UNIT_DISK_PX = 3 * np.eye(2)
 
 
 def field(rng: np.random.Generator, count: int, sigma_px: Array) -> tuple[TargetPlaces, Array]:
@@ -322,24 +324,33 @@ def test_targets_are_odd_by_more_than_noise_and_common_differences(share: float,
             shape, blur = 3 * (vectors * np.exp(values)) @ vectors.T, float(np.sqrt(max(1.5 + observation[4], 0.1)))
             contrast = float(np.exp(observation[3])) * CONTRAST
             sloping = SecondPlace(of_slope.normal(0, 0.1, 2), 0.01 * np.eye(2))
-            known = Covariance.from_noise(0.001 * np.eye(2))
             unknowns, figures = np.zeros((10, 10)), np.array([2, 3, 4, 6, 5])
             unknowns[np.ix_(figures, figures)] = noise * np.outer(per := np.array([1, 1, 1, contrast, 1]), per)
-            disks.append(
-                FittedDisk(
-                    converged=True,
-                    reason=NO_REASON,
-                    center_px=np.zeros(2),
-                    place_covariance=known,
-                    pixel_from_mark=np.column_stack([shape, np.zeros(2)]),
-                    contrast_dn=contrast,
-                    noise_dn=100.0,
-                    blur_px=blur,
-                    sloping=sloping,
-                    covariance=unknowns,
-                )
-            )
+            disks.append(make_disk(shape, contrast_dn=contrast, blur_px=blur, sloping=sloping, covariance=unknowns))
         weak += [bool(reason) for reason in dust_reasons(disks, [3 * np.eye(2)] * 25)]
         odd += is_odd.tolist()
     assert np.mean(np.array(weak)[~np.array(odd)]) < doubted
     assert np.all(np.array(weak)[odd])
+
+
+def test_a_weak_disk_names_the_cause_of_its_standard_deviation() -> None:
+    """Noise of 0.018 px, misfit of 0.65 px: no faint disk."""
+    misfit = Covariance({Cause.NOISE: 0.018**2 * np.eye(2), Cause.UNLIKE_DRAWING: 0.65**2 * np.eye(2)})
+    *reasons, weak = dust_reasons([*[make_disk()] * 8, make_disk(place_covariance=misfit)], [3 * np.eye(2)] * 9)
+    assert weak == "its standard deviation is 0.65 px, the largest part from model misfit"
+    assert not any(reasons)
+
+
+def make_disk(shape: Array = UNIT_DISK_PX, **figures: Any) -> FittedDisk:
+    """A fitted disk, precise unless figures say otherwise."""
+    known: dict[str, Any] = {
+        "place_covariance": Covariance.from_noise(0.001 * np.eye(2)),
+        "contrast_dn": CONTRAST,
+        "noise_dn": 100.0,
+        "blur_px": 1.2,
+        "covariance": 1e-4 * np.eye(10),
+    }
+    matrix = np.column_stack([shape, np.zeros(2)])
+    return FittedDisk(
+        converged=True, reason=NO_REASON, center_px=np.zeros(2), pixel_from_mark=matrix, **(known | figures)
+    )

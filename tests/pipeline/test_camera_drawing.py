@@ -297,7 +297,7 @@ def test_marks_are_shown_and_learned(project: Path, printed_line: Printed, refus
             )
         expect(page.locator("#tries figure")).to_have_count(12)
         page.keyboard.press("Enter")
-        expect(page.locator("#left")).to_have_text("Nothing is left. Run reseau measure.")
+        expect(page.locator("#left")).to_have_text("No open questions. Run reseau measure.")
     (one,) = decisions(project.parent)
     assert (one["decision"], one["image"], set(one["px"])) == ("learn", shown, set("1234"))
     assert "Decisions stand behind these marks: 1 of ann." in printed_line("measure", project)

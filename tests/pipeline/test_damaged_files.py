@@ -294,8 +294,8 @@ def set_status(first: str, others: str, columns: str) -> Changes:
         ("project.toml", setting('scanner = ["stretch"]'), ["'stretch', which the affine transformation of the films"]),
         ("project.toml", setting('scanner = "bend"\nscanner_sigma_um = 0.0'), ["would fix every term at 0"]),
         ("project.toml", {'"affine"': '"none"\nscanner = "bend"'}, ["a digital camera no scanner"]),
-        ("project.toml", {OBJECT: "[ties]\nimages = 2\n[object]\n"}, ["two prove nothing"]),
-        ("project.toml", {OBJECT: "[ties]\nwanted = 0\n[object]\n"}, ["at least 1"]),
+        ("project.toml", {OBJECT: "[ties]\nimages = 2\n[object]\n"}, ["images: must be", "at least 3, not 2"]),
+        ("project.toml", {OBJECT: "[ties]\nwanted = 0\n[object]\n"}, ["wanted: must be", "at least 1, not 0"]),
         ("project.toml", {OBJECT: "[ties]\nheight = 3.0\n[object]\n"}, ["height_sigma"]),
         ("project.toml", {OBJECT: "[ties]\nhight = 3.0\n[object]\n"}, ["hight"]),
         # targets, a camera that takes the scans

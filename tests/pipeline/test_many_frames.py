@@ -166,6 +166,21 @@ def test_natural_points_are_no_questions_to_a_reviewer(tmp_path: Path) -> None:
     assert [(one["point"], one["kind"]) for one in entries] == [("m1", "fiducial")]
 
 
+@pytest.mark.parametrize("is_good", [True, False])
+def test_a_weak_target_needs_an_answer_only_where_its_scan_needs_review(is_good: bool, tmp_path: Path) -> None:
+    project, scans = stored(tmp_path)
+    fiducial, *others, target = scans[1].frame.marks
+    weak: dict[str, Any] = {"status": Status.WEAK, "reason": Reason("its contrast is low", Code.CONTRAST)}
+    marks = (fiducial if is_good else replace(fiducial, **weak), *others, replace(target, **weak))
+    frame = replace(scans[1].frame, marks=marks)
+    digest = keep_scans(tmp_path / "out" / "measurement.db", [replace(scans[1], frame=frame)])
+    pitches = {frame.image: scans[1].pitch_um}
+    write_comparator(tmp_path / "comparator.csv", comparator_points([frame], pitches), pitches, digest)
+    page = Session(read_project(project), "bob").page(Filters())
+    assert {one["point"]: one["is_left"] for one in page["entries"]}[target.point] is not is_good
+    assert (page["left"]["all"], page["optional"]) == ((0, 1) if is_good else (2, 0))
+
+
 def test_frames_that_need_no_attention_are_counted_as_if_each_were_read(tmp_path: Path, monkeypatch: Any) -> None:
     project = read_project(stored(tmp_path)[0])
     every = report_data(project, lambda path: path)

@@ -131,7 +131,7 @@ def test_a_session_by_keyboard_alone_leads_to_the_right_marks(page: Page, measur
         expect(page.locator("#left")).not_to_contain_text(f"{2 - done} left")
         if done == 0:
             expect(page.locator("#title")).not_to_have_text(name)
-    expect(page.locator("#left")).to_have_text("Nothing is left. Run reseau measure.")
+    expect(page.locator("#left")).to_have_text("No open questions. Run reseau measure.")
     result = decisions(measured_folder)
     assert {(one["image"], one.get("point"), one["decision"]) for one in result} == {
         (BARE, "3", "absent"),

@@ -44,10 +44,12 @@ function take(page, keep = true) {
 }
 
 function showQueue() {
-  const { left, total, shown, shown_left: shownLeft, start } = state.page;
+  const { left, optional, total, shown, shown_left: shownLeft, start } = state.page;
   const kinds = [["camera", "cameras"], ["pose", "poses"], ["frame", "frames"], ["mark", "marks"]];
   const parts = kinds.filter(([one]) => left[one]).map(([one, many]) => `${left[one]} ${left[one] === 1 ? one : many}`);
-  by("left").textContent = left.all ? `${left.all} left: ${parts.join(", ")}` : total ? "Nothing is left. Run reseau measure." : "Nothing to decide yet.";
+  const done = total ? "No open questions. Run reseau measure." : optional ? "No question needs an answer" : "Nothing to decide yet.";
+  const more = optional ? `; ${optional} optional` : "";
+  by("left").textContent = (left.all ? `${left.all} left: ${parts.join(", ")}` : done) + more;
   by("progress").max = Math.max(total, 1);
   by("progress").value = total ? total - left.all : 1;
   const last = start + state.entries.length;
@@ -93,7 +95,7 @@ async function open(index) {
     const entry = state.entries[index];
     for (const id of VIEWS) by(id).hidden = true;
     by("note").value = "";
-    by("title").textContent = entry ? title(entry) : "Nothing is left";
+    by("title").textContent = entry ? title(entry) : "No open questions";
     by("reason").textContent = entry ? entry.reason : "";
     showAnswer(entry);
     if (!entry) return;
