@@ -365,11 +365,11 @@ def stations_elsewhere(network: Network, result: Adjustment) -> str:
         return ""
     names, (stations, depths, places) = list(given), _stations(result, given)
     off = np.flatnonzero(~_near(stations, places, depths))
-    if len(off) == 2 and _near(stations[off], places[off[::-1]], depths[off]).all():
-        one, other = (names[i] for i in off)
+    nearest = np.linalg.norm(stations[off, None] - places[off], axis=2).argmin(axis=1) if len(off) else off
+    if len(off) > 1 and len(set(nearest)) == len(off) and _near(stations[off], places[off[nearest]], depths[off]).all():
         return (
-            f"The frames {one} and {other} lie each where the other's orientation is given: their names "
-            f"are exchanged, in the scans or in images.csv."
+            f"The frames {shortened([names[i] for i in off], NAMED)} each lie where another's orientation is given: "
+            "their names are exchanged, in the scans or in images.csv."
         )
     if 2 * len(off) <= len(names):
         return ""

@@ -388,9 +388,9 @@ def shift_given(given: Network, name: str, off: float) -> Network:
     return map_priors(given, lambda each, prior: replace(prior, value=prior.value + off) if each == name else prior)
 
 
-def exchanged(given: Network, with_fiducials: bool = False) -> Network:
-    """The targets of f1 and f3, or all their marks, under each other's name."""
-    other = {"f1": "f3", "f3": "f1"}
+def exchanged(given: Network, with_fiducials: bool = False, frames: str = "13") -> Network:
+    """The targets of frames, or all their marks, under the next one's name, of the last under the first's."""
+    other = {f"f{one}": f"f{next_one}" for one, next_one in zip(frames, frames[1:] + frames[:1], strict=True)}
     observations = given.observations
     rows = zip(observations.image, observations.kind, strict=True)
     image = tuple(other.get(name, name) if with_fiducials or kind == "target" else name for name, kind in rows)
@@ -444,6 +444,9 @@ BLUNDERS = {
     ),
     "names of two frames exchanged, approximate orientations": Blunder(
         APPROXIMATE, lambda n: exchanged(n, with_fiducials=True), ("their names are exchanged",)
+    ),
+    "names shifted by a line, approximate orientations": Blunder(
+        APPROXIMATE, lambda n: exchanged(n, True, "".join(each.name[1:] for each in n.images)), ("where another's",)
     ),
     "sheared films held rigid": Blunder(
         None,

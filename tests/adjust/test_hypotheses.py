@@ -472,7 +472,7 @@ FAST = (
     "sign of Z, observed orientations",
     "y of the camera down",
     "mm for m, approximate orientations",
-    "names of two frames exchanged, approximate orientations",
+    "names shifted by a line, approximate orientations",
     "nothing, approximate orientations",
     "sheared films held rigid",
     "standard deviations of the points ten times too small",
