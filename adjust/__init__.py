@@ -1,6 +1,6 @@
 """Least-squares calibration from comparator coordinates: one adjustment of all unknowns, fiducial marks included.
 
-Enter by `adjust(network, approximate(network))`; the names below are imported on first use. docs/how-to/python.md has
+Enter by `adjust(network)`; the names below are imported on first use. docs/how-to/python.md has
 an example. docs/code.md lists the modules in the order of processing.
 """
 

@@ -1,4 +1,4 @@
-"""Design study: tables and figures of docs/how-to/plan-a-network.md.
+"""Design study: tables and figures of docs/validation/design-study.md.
 
 python -m benchmarks design_study [FOLDER]
 

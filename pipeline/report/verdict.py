@@ -296,7 +296,7 @@ def _solved(data: ReportData) -> AdjustmentRecord | None:
     return data.adjustment if data.adjustment and not any(_no_solution(data.adjustment)) else None
 
 
-# Checks that lead to exit code 1, by their names in docs/how-to/read-the-report.md.
+# Checks that lead to exit code 1, by their names in docs/reference/results.md.
 NEEDS_A_LOOK: dict[str, Evidence] = {
     "solution": lambda data, _: _no_solution(data.adjustment) if data.adjustment else (),
     "made from": lambda data, _: data.problems,
