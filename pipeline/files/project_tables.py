@@ -1,6 +1,10 @@
 """Tables of project.toml, among them [adjust], and all keys for the documentation."""
 
+import itertools
 import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from typing import Annotated, Any, Literal, get_args
 
 from adjust.functional_model.scanner import is_term
@@ -18,6 +22,7 @@ from pipeline.text.table_models import (
     FilePath,
     FilePaths,
     Key,
+    KeyRow,
     NotNegative,
     Positive,
     Sigma,
@@ -230,25 +235,37 @@ class ProjectTable:
 
 
 def keys_text() -> str:
-    """Tables of all keys of project.toml and camera.toml, in Markdown."""
-    tables: list[tuple[str, type]] = [
-        ("project.toml", ProjectTable),
-        ("[measure]", MeasureTable),
-        ("[scanner]", ScannerTable),
-        ("[object]", ObjectTable),
-        *((f'[targets], kind = "{kind}"', model) for kind, model in TARGET_TABLES.items()),
-        ("[ties]", TieSettings),
-        ("[adjust]", AdjustSettings),
-        ("camera.toml", CameraTable),
-        ("[sigma]", SigmaTable),
-        ("[distortion]", DistortionTable),
-        ("[[fiducial]]", FiducialTable),
-        *((f'[mark.NAME], kind = "{kind}"', model) for kind, model in MARK_TABLES.items()),
-        ("[source]", Source),
+    """Tables of all keys of project.toml and camera.toml, in Markdown; keys of most kinds of marks or targets once."""
+    tables: list[tuple[str, Iterable[KeyRow]]] = [
+        ("project.toml", key_rows(ProjectTable)),
+        ("[measure]", key_rows(MeasureTable)),
+        ("[scanner]", key_rows(ScannerTable)),
+        ("[object]", key_rows(ObjectTable)),
+        *_rows_by_kind("[targets]", TARGET_TABLES),
+        ("[ties]", key_rows(TieSettings)),
+        ("[adjust]", key_rows(AdjustSettings)),
+        ("camera.toml", key_rows(CameraTable)),
+        ("[sigma]", key_rows(SigmaTable)),
+        ("[distortion]", key_rows(DistortionTable)),
+        ("[[fiducial]]", key_rows(FiducialTable)),
+        *_rows_by_kind("[mark.NAME]", MARK_TABLES),
+        ("[source]", key_rows(Source)),
     ]
     lines = ["# Keys of project.toml and camera.toml", ""]
-    for title, model in tables:
+    for title, rows in tables:
         lines += [f"## {title}", "", "| key | type | unit | default | meaning |", "|---|---|---|---|---|"]
-        lines += [f"| `{r.name}` | {r.type} | {r.unit} | {r.default} | {r.meaning} |" for r in key_rows(model)]
+        lines += [f"| `{r.name}` | {r.type} | {r.unit} | {r.default} | {r.meaning} |" for r in rows]
         lines.append("")
     return "\n".join(lines)
+
+
+def _rows_by_kind(title: str, models: Mapping[str, type]) -> Iterator[tuple[str, list[KeyRow]]]:
+    """Yield the rows that most kinds have, and those of each kind alone."""
+    rows = {kind: list(key_rows(model)) for kind, model in models.items()}
+    counts = Counter(itertools.chain.from_iterable(rows.values()))
+    without = {row: [kind for kind in rows if row not in rows[kind]] for row in counts if 2 * counts[row] > len(rows)}
+    notes = {row: f" Not of {', '.join(kinds)}." if kinds else "" for row, kinds in without.items()}
+    yield f"{title}, every kind", [replace(row, meaning=row.meaning + notes[row]) for row in without]
+    for kind in rows:
+        if own := [row for row in rows[kind] if row not in without]:
+            yield f'{title}, kind = "{kind}"', own

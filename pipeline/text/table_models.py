@@ -389,7 +389,7 @@ def name_in_file(field: dataclasses.Field[Any]) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class KeyRow:
-    """Row of the table of keys in the documentation. default: "required" if the key must be given."""
+    """Row of the table of keys in the documentation. default: as in TOML; "required" if the key must be given."""
 
     name: str
     type: str
@@ -423,12 +423,12 @@ def _default_text(field: dataclasses.Field[Any]) -> str:
     default = field.default
     if default is dataclasses.MISSING:
         return "required" if field.default_factory is dataclasses.MISSING else ""
-    if default is None or default == ():
-        return "none"
-    if dataclasses.is_dataclass(default):  # a sub-table
+    if default is None or default == () or dataclasses.is_dataclass(default):  # absent, or a sub-table
         return ""
+    if isinstance(default, tuple):
+        return f"[{', '.join(f'{each:g}' for each in default)}]"
+    if default == math.inf:
+        return '"free"'
     if isinstance(default, bool):
         return str(default).lower()
-    return (
-        f'"{default}"' if isinstance(default, str) else f"{default:g}" if isinstance(default, float) else str(default)
-    )
+    return f'"{default}"' if isinstance(default, str) else f"{default:g}"
