@@ -19,6 +19,6 @@ def run_demo(folder: Path, reporter: Reporter) -> Summary:
     if folder.exists() and (not folder.is_dir() or (any(folder.iterdir()) and not (folder / TRUTH).exists())):
         raise InputError(f"{folder}: holds something that is no demonstration. Name another folder: reseau demo DIR")
     scene = resources.as_file(resources.files("synthetic_images").joinpath(*SCENE))
-    with scene as path, reporter.stage("rendering") as count:
+    with scene as path, reporter.stage("rendering strip") as count:
         render_project(path, folder, count)
     return run_all(read_project(folder / "project.toml"), reporter)

@@ -46,16 +46,16 @@ class Reporter:
         def show(what: str, done: int, total: int, /, left_s: float | None = None) -> None:
             nonlocal shown_s
             now_s = time.monotonic()
-            if left_s is None and done and now_s - started_s > _EVERY_S:
+            if left_s is None and done > 1 and now_s - started_s > _EVERY_S:
                 left_s = (now_s - started_s) / done * (total - done)
             count = f"{done} of {total}" if total > 1 else ""
             left = f", {time_left(left_s)}" if left_s is not None and done < total else ""
-            line = " ".join(filter(None, (title, count, what))) + left
+            line = ", ".join(filter(None, (f"{title} {count}", what))) if count else f"{title} {what}"
             if bar is not None:
-                bar.update(bar.task_ids[0], description=line, completed=done, total=total)
+                bar.update(bar.task_ids[0], description=line + left, completed=done, total=total)
             elif now_s - shown_s >= _EVERY_S or (done == total and total > 1):  # the first, the last, and at intervals
                 shown_s = now_s
-                self.say(line)
+                self.say(line + left)
 
         if self._console.is_terminal and not self._console.quiet:
             columns = TextColumn("{task.description}", markup=False), BarColumn()

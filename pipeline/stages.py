@@ -165,7 +165,7 @@ def run_plots(project: Project, folder: Path, reporter: Reporter) -> list[Path]:
 
 def run_frame_pages(project: Project, images: Sequence[str], reporter: Reporter) -> dict[str, Path]:
     """Write a page on each of some images; return {image: page}. Raises InputError for an unknown image."""
-    with _running(project, reporter) as run, reporter.stage("reporting") as count:
+    with _running(project, reporter) as run, reporter.stage("reporting frame") as count:
         run.comparator()
         data = frame_data(project, run.new.current_path, frozenset(images))
         pages = {image: project.frame_page_path(image) for image in images}

@@ -139,7 +139,7 @@ class _Rays:
                 values[columns] = np.where(effect_mm > _STEP * values[0], values[columns], 0.0)
                 return self._ended(lens.replaced_values(values), columns, estimated)
         raise AdjustmentError(
-            f"the lens cannot be brought to the family {into.family}: the fit finds no end. Name fewer of its "
+            f"the lens cannot be brought to the family {into.family}: the fit does not converge. Name fewer of its "
             "parameters, or a family of the same kind."
         )
 

@@ -297,10 +297,9 @@ def _solved(matrix: Array, right: Array) -> tuple[Array, Mask]:
     return solved(matrix, right, regular, of), regular
 
 
-POSSIBLE = (
-    "none, congruent, similarity, affine, projective, bilinear, conformal(n) and polynomial(n) with the order n from 1 "
-    f"to {HIGHEST_ORDER}"
-)
+FILM_NAMES = (
+    "none", "congruent", "similarity", "affine", "projective", "bilinear", "conformal(n)", "polynomial(n)",
+)  # fmt: skip
 
 
 @lru_cache
@@ -334,7 +333,8 @@ def _name_and_order(spelling: str) -> tuple[str, int]:
         why = f" its order must be from 1 to {HIGHEST_ORDER};"
     elif spelling in ("conformal", "polynomial"):
         why = f' it lacks its order, as in "{spelling}(2)";'
-    raise ValueError(f'there is no transformation "{spelling}":{why} possible are {POSSIBLE}')
+    possible = f"{', '.join(FILM_NAMES)}, with the order n from 1 to {HIGHEST_ORDER}"
+    raise ValueError(f"there is no transformation {spelling!r}:{why} possible are {possible}")
 
 
 def film_parameter_names(spelling: str) -> tuple[str, ...]:

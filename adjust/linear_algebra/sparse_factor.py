@@ -229,7 +229,7 @@ def _solved(triangle: Array, right: Array, transposed: bool = False) -> Array:
         return right
     solved, singular = dtrtrs(triangle, right, trans=transposed)
     if singular:
-        raise np.linalg.LinAlgError("a triangle is singular")
+        raise np.linalg.LinAlgError("the sparse factor is singular")
     return np.asarray(solved)
 
 

@@ -501,9 +501,7 @@ def nested_tests(candidates: Sequence[Candidate]) -> tuple[Nested, ...]:
 def verdict(given: Model, chosen: Candidate | None) -> str:
     if chosen is None:
         return "No model has a solution."
-    text = f"The data ask for {chosen.model.name}."
-    if chosen.model == given:
-        text += " That is the model as it is given."
+    text = f"Selected: {chosen.model.name}{', the given model' if chosen.model == given else ''}."
     low, high = (float(np.sqrt(chdtri(chosen.redundancy, above) / chosen.redundancy)) for above in (0.995, 0.005))
     if chosen.redundancy > 0 and not low <= chosen.sigma0 <= high:
         text += (
@@ -533,17 +531,16 @@ def _reason(other: Candidate, chosen: Candidate) -> str:
     name = other.model.name
     if other.problem:
         return f"{name} cannot be had: {other.problem}"
-    predicts = _prediction(other, chosen)
     if chosen.model.contains(other.model):
         test = f_test(other, chosen)
-        return f"{name} is too simple: {_f_words(test)}; {predicts}."
+        return f"{name} is too simple: {_f_words(test)}."
     if other.model.contains(chosen.model) and other.unknowns > chosen.unknowns:
         test = f_test(chosen, other)
         needless = "adds nothing that is significant" if test.p >= LEVEL else "fits significantly better"
-        return f"{name} {needless}: {_f_words(test)}; {predicts}."
+        return f"{name} {needless}: {_f_words(test)}."
     better = "higher" if other.aicc >= chosen.aicc else "lower"
     size = "richer" if other.unknowns > chosen.unknowns else "no richer"
-    return f"{name}, {size}, has an AICc {abs(other.aicc - chosen.aicc):.1f} {better}; {predicts}."
+    return f"{name}, {size}, has an AICc {abs(other.aicc - chosen.aicc):.1f} {better}."
 
 
 def _f_words(test: Nested) -> str:

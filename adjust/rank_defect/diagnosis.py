@@ -240,7 +240,10 @@ def undetermined(problem: Problem, state: State, variances: Array) -> str:
     statement = f"The observations say nothing about {shown}: their standard deviations stay as given"
     cameras = [name for name, positions in unknowns.camera.items() if np.isin(positions[:3], unobserved).any()]
     if not cameras:
-        return f"{statement}. What is given is all that places them: give it well, or fix what you do not need."
+        return (
+            f"{statement}. Only the given values determine them: give these with realistic standard deviations, or "
+            "fix what you do not need."
+        )
     field = field_geometry(problem, state, cameras[0])
     return f"{statement}, for {field.because}. To determine them, {field.remedy}."
 

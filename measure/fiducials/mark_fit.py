@@ -127,7 +127,7 @@ def _match(scan: Scan, expected: MarkPrediction, options: MatchOptions, before: 
 
 def not_found(search_px: float) -> Reason:
     """Reason for a mark that was not found."""
-    return Reason(f"nothing within {search_px:.0f} px of its place matches its drawing", Code.NOT_FOUND)
+    return Reason(f"no mark like its drawing within {search_px:.0f} px of the predicted position", Code.NOT_FOUND)
 
 
 def _unlike(fit: MarkFit, expected: MarkPrediction, full_scale_dn: float) -> Reason:

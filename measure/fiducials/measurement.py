@@ -247,8 +247,8 @@ def second_frame(scan: Scan, layout: FiducialLayout, frame: FrameMeasurement, op
             second = _outline(found, layout) + np.array(rest[:2] * 2)
             windows = f"{_words(scan, first)} and {_words(scan, second)}"
             return Reason(
-                f"The scan shows a second frame, {measured} marks of it found, and only one was measured. Name both in "
-                f"images.csv, each called as the scan with something behind, by the column window: {windows}.",
+                f"The scan shows a second frame, {measured} marks of it found, and only one was measured. List both in "
+                f"images.csv, with the scan's name and a suffix, and give the column window: {windows}.",
                 Code.SECOND_PICTURE,
             )
     return NO_REASON

@@ -199,8 +199,9 @@ class _DiskSearch:
                 why = why or index
             elif index not in found:
                 found.append(index)
-        none = Reason(f"nothing like it within {prediction.search_px:.0f} px of its place", Code.NOT_FOUND)
-        return found, NO_REASON if found else Reason.combine((none, why))
+        none = f"no target of the predicted size within {prediction.search_px:.0f} px of the predicted position"
+        best = why.reword(f"the best candidate: {why}") if why else why
+        return found, NO_REASON if found else Reason.combine((Reason(none, Code.NOT_FOUND), best))
 
     def _fit_spot(self, spot: Array, prediction: TargetPrediction) -> int | Reason:
         """Index of the disk at a correlation peak, fitted now or before; the reason if none has the right size."""
@@ -215,12 +216,12 @@ class _DiskSearch:
             if disk.reason:
                 return disk.reason
             if np.hypot(*(disk.center_px - prediction.center_px)) > prediction.search_px + 1:
-                return Reason("what was found lies farther off", Code.OFF_PLACE)
+                return Reason("its fit is farther off", Code.OFF_PLACE)
             self.disks.append(disk)
         areas = np.linalg.det([self.disks[index].pixel_from_disk, prediction.pixel_from_disk])
         ratio = float(np.sqrt(abs(areas[0] / areas[1])))
         if not 1 / self.options.size_tolerance < ratio < self.options.size_tolerance:
-            return Reason(f"what was found there has {ratio:.2f} times its radius", Code.SIZE)
+            return Reason(f"{ratio:.2f} times the predicted radius", Code.SIZE)
         return index
 
     def keep_common_polarity(self, near: Sequence[tuple[list[int], Reason]]) -> list[tuple[list[int], Reason]]:

@@ -252,7 +252,7 @@ def run_choose(project: Project, reporter: Reporter) -> tuple[Choice, dict[str, 
                 replace(own, network=name_scanners(project, own.network)),
                 adjustment_options(project.adjust),
                 half_mm,
-                lambda name, done: count(name, done, done + 1),
+                lambda name, _: count(name, 0, 1),
             )
         content = choice_content(choice, adjusted_from(project, marks))
         write_record(content, new.place(project.choice_path))

@@ -28,6 +28,7 @@ from pipeline.types import Array
 _LONGEST = 0.11  # length of the longest arrow or semi-axis, fraction of the frame's width
 _PANEL_PX = 520.0
 _MARGIN_PX = 74.0
+_TOO_ALIKE = 0.999  # p-value above which calibrations are not independent
 
 
 def run_compare(
@@ -57,7 +58,10 @@ def run_compare(
     halves = [np.abs(observed_mm(path, contents[path], name)).max(axis=0) for path, (name, _) in lenses.items()]
     half_x_mm, half_y_mm = np.min(halves, axis=0).tolist()
     comparison = compare(calibrations, (half_x_mm, half_y_mm), times, use)
-    record = comparison_record(comparison, _remarks(contents, [name for name, _ in lenses.values()]), level)
+    remarks = _remarks(contents, [name for name, _ in lenses.values()])
+    if comparison.same.probability > _TOO_ALIKE:
+        remarks += ("they agree better than independent calibrations can: were the same photographs adjusted?",)
+    record = comparison_record(comparison, remarks, level)
     if out is not None:
         check_writable(out)
         write_record(record, out / "compare.json")

@@ -64,7 +64,7 @@ def measure_again(
     if not visits:
         return None
     found = dict[str, tuple[MarkMeasurement, ...] | str]()
-    with executor() as workers, reporter.stage("second pass of") as count:
+    with executor() as workers, reporter.stage("second pass of scan") as count:
         for done, (visit, result) in enumerate(iterate_results(looked_again, visits, workers), 1):
             found[visit.image] = str(result) if isinstance(result, Exception) else result
             count(visit.image, done, len(visits))

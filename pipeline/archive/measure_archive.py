@@ -35,8 +35,8 @@ def check_measurable(project: Project) -> tuple[str, ...]:
     sought = [one for camera in project.cameras.values() for one in camera.fiducials if not one.passed_over]
     if not sought and project.targets is None and project.ties is None:
         raise InputError(
-            f"{project.path}: there is nothing to measure: {project.default_camera.path} has no fiducial that is not "
-            "passed over, and the project neither [targets] nor [ties]. Add what the scans show."
+            f"{project.path}: nothing to measure: all fiducials of {project.default_camera.path} have mark = "
+            '"none", and the project has no [targets] or [ties]. Draw the marks, or add one of the two tables.'
         )
     check_tie_names(project)
     for camera in project.cameras.values():
@@ -75,7 +75,7 @@ def find_moved(store: Store, project: Project, reporter: Reporter) -> dict[str, 
     free = {content: uri for uri, content in store.content_hashes().items() if uri not in taken}
     sizes = {known[uri].state.bytes for uri in free.values()}
     found, keys = 0, dict[str, str]()
-    with reporter.stage("searched in the results database") as count:
+    with reporter.stage("recognising scan") as count:
         for done, (name, state) in enumerate(unknown.items(), 1):
             count(name, done, len(unknown))
             path = project.scans[name]
@@ -132,7 +132,7 @@ def measure_archive(
         # After all checks that could prevent a new measurement.
         lost = store.forget_damaged() if options.retry or store.has_damaged_rows() else 0
         if lost:
-            reporter.say(f"{store.path}: {counted(lost, 'result')} stored there not as written: measured again")
+            reporter.say(f"{store.path}: {counted(lost, 'result')} damaged (digest differs): measured again")
         if options.retry:
             store.forget_failed()
         thumbnails.rekey(find_touched(store, project))

@@ -204,7 +204,7 @@ def init_project(given: Sequence[Path], folder: Path, reporter: Reporter, max_pi
     for path in given:
         if not isinstance(path, Address) and not path.exists():
             raise InputError(f"there is no {path} (searched at {path.absolute()}). Give folders with scans, or scans.")
-    with reporter.stage("examined") as count:
+    with reporter.stage("examining file") as count:
         try:
             found = catalogue(given, count, max_pixels)
         except MeasurementError as error:

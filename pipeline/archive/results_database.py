@@ -240,8 +240,8 @@ class Store(Database):
         row = self.connection.execute(f"select value, {is_sound('kept')} from kept where key = ?", (key,)).fetchone()
         if row is not None and not row[1]:
             raise DamagedError(
-                f"{self.path}: what is stored of {key.partition(' ')[0]} is not as it was written: the file was "
-                "changed or is damaged. Run `reseau measure --retry`, which makes it again."
+                f"{self.path}: stored result of {key.partition(' ')[0]} damaged (digest differs). Run `reseau measure "
+                "--retry`, which makes it again."
             )
         return None if row is None else json.loads(row[0])
 

@@ -243,7 +243,7 @@ def catalogue(given: Sequence[Path], count: Count, max_pixels: int | None = None
     number = 0
     for done, path in enumerate(files):
         if done % _EVERY == 0:
-            count("files", done, len(files))
+            count("", done, len(files))
         try:
             head = read_head(path, max_pixels)
         except MeasurementError as error:
@@ -288,9 +288,9 @@ def name_cameras(grouped: Catalogue, identified: Try, reporter: Reporter, worker
     tried first on the others.
     """
     total = sum(len(group.to_try) for group in grouped.groups)
-    of_groups = f"scans of {counted(len(grouped.groups), 'group')} on the camera library"
+    of_groups = counted(len(grouped.groups), "group")
     answers = dict[Path, Identification | str]()
-    with reporter.stage("tried") as count:
+    with reporter.stage("trying the camera library on scan") as count:
         for is_first in (True, False):
             samples: list[Sample] = [
                 (path, () if is_first or isinstance(found := answers[group.to_try[0]], str) else found.best_names())

@@ -225,14 +225,14 @@ class DamagedError(InputError):
 
 def damaged_result(image: str, path: object) -> DamagedError:
     return DamagedError(
-        f"{path}: what is stored of image {image!r} is not what was measured: the file was changed or is damaged. "
-        "This result is not used. Run `reseau measure --retry`, which measures the image again."
+        f"{path}: stored result of image {image!r} damaged (digest differs). It is not used. Run `reseau measure "
+        "--retry`, which measures the image again."
     )
 
 
 def damaged_judging(path: object) -> DamagedError:
     return DamagedError(
-        f"{path}: the list of checked images is not as it was written: the file was changed or is damaged. "
+        f"{path}: the list of checked images is damaged (digest differs). "
         "Run `reseau measure --retry`, which checks all images again."
     )
 

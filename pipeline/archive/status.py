@@ -100,7 +100,7 @@ def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
         is_now = is_same and request in (None, request_hash(name))
         now = Verdict(verdict) if is_now else Verdict.OLD
         if is_now and taken_in is not None and taken_in != decisions_hash(decisions.get(name, ())):
-            now, why = Verdict.OLD, "what is decided about it now is not taken in yet"
+            now, why = Verdict.OLD, "review decisions not applied yet"
         scans.append(ScanStatus(name, state.uri, camera, now, why or "", failure or "", seconds, finished))
     unknown = shortened([f"line {number}: {why}" for number, why in sorted(unknown_images(project))])
     return ArchiveStatus(tuple(sorted(scans)), tuple(dict.fromkeys((*unknown, *idle))))
@@ -115,7 +115,7 @@ def _status_rows(store: Store, judging: Judging | None) -> Iterator[Sequence[Any
     """Rows of the query; a damaged row is reported as a failure."""
     if judging is not None:
         judging.check()
-    why = "what is stored of it is not what was measured: `reseau measure --retry` measures it again"
+    why = "stored result damaged (digest differs): `reseau measure --retry` measures it again"
     for *row, is_whole in store.connection.execute(_QUERY, (-1 if judging is None else judging.row,)):
         yield (
             row if is_whole else (*row[:6], str(Verdict.FAILED), why, str(FailureCode.DAMAGED), None, "", row[11], None)

@@ -77,8 +77,8 @@ class Work:
         now = sum(row in self._now for row in known.values())  # measured for other scans in the steps before
         self._store.set_current({row: self._asked(name) for name, row in known.items()})
         if known or len(missing) > 1:
-            rest = {"in this run": now, "to measure": len(missing)}
-            reporter.say(count_sentence("measured in an earlier run", len(known) - now, len(tasks), rest))
+            rest = {"in earlier runs": len(known) - now, "in this run": now, "to go": len(missing)}
+            reporter.say(count_sentence("measured", len(known), len(tasks), rest))
         if missing:
             self._complete(missing, len(tasks), reporter)
 
@@ -142,7 +142,7 @@ class Work:
         kinds = {task.name: self._kind(task) for task in tasks}
         left, failed = Counter(kinds.values()), defaultdict[str, list[str]](list)
         seconds = defaultdict[tuple[str, str], list[float]](list)
-        with reporter.stage("measured") as count:
+        with reporter.stage("scans measured:") as count:
             for measured, (task, scan) in enumerate(self._measure(tasks, as_scans=True), scans - len(tasks) + 1):
                 kind = kinds[task.name]
                 left[kind] -= 1
@@ -156,7 +156,7 @@ class Work:
                 left_s = sum(number * fmean(seconds[each] or [usual_s]) for each, number in left.items())
                 groups = f"{list(left.values()).count(0)} of {counted(len(left), 'group')}"
                 failures = sum(map(len, failed.values()))
-                what = f"scans, {groups}{f', {failures} failed' if failures else ''}"
+                what = f"{groups}{f', {failures} failed' if failures else ''}"
                 count(what, measured, scans, left_s / self._at_a_time)
         for first, *others in failed.values():
             if others:

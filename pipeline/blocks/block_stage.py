@@ -288,7 +288,8 @@ def oriented_by_control(
     block = absolute_orientation(theirs[found], ours[found], np.array(list(stations.values())))
     if block is None:
         raise InputError(
-            "The control points that COLMAP's frames show do not determine how the block lies. Mark others."
+            "The control points that COLMAP's frames show do not determine how the block lies. "
+            "Mark control points that are not on one line, in two frames or more."
         )
     return {
         image: (np.asarray(Y_DOWN_Z_FORWARD @ rotation @ block.rotation.T), block.apply(stations[image]))
@@ -307,7 +308,10 @@ def run_block(
     """
     quiet_colmap()  # fails before the resampling, which takes far longer
     if not project.comparator.exists():
-        raise InputError(f"{project.comparator}: there is no such file. Run `reseau measure` first: films come by it.")
+        raise InputError(
+            f"{project.comparator}: there is no such file. Run `reseau measure` first: it gives the film "
+            "transformations."
+        )
     marks = read_comparator(project.comparator, project.list_pitch_um)
     pitch_um = pitch_um or coarse_pitch_um(project)
     seconds = dict[str, float]()
@@ -507,7 +511,10 @@ def _run_mapping(pictures: Sequence[BlockPicture], folder: Path) -> Mapped:
     sparse.mkdir(exist_ok=True)
     models = pycolmap.incremental_mapping(str(folder / "colmap.db"), str(folder / "pictures"), str(sparse), options)
     if not models:
-        raise InputError("COLMAP orients no two of these frames: they may not overlap, or show too little in common.")
+        raise InputError(
+            "COLMAP orients no two of these frames. Give frames that overlap by half or more, or orientations in "
+            "images.csv and `reseau run`."
+        )
     model = max(models.values(), key=lambda model: model.num_reg_images())
     return read_model(model, pycolmap.Database.open(str(folder / "colmap.db")), pictures)
 

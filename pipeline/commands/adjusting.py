@@ -64,7 +64,7 @@ def choose(project: ProjectFile, as_json: AsJson = False) -> int:
 def block(
     project: ProjectFile,
     out_dir: OutDir,
-    pitch_um: Annotated[float | None, pitch_option("Of the pictures; by default the scans'.")] = None,
+    pitch_um: Annotated[float | None, pitch_option("Pixel of the pictures; by default the scans'.")] = None,
     max_pixels: MaxPixels = None,
     as_json: AsJson = False,
 ) -> int:
@@ -86,7 +86,10 @@ def block(
 
 def compare(
     adjustments: Annotated[
-        list[Path], typer.Argument(metavar="A/adjustment.json B/adjustment.json...", show_default=False)
+        list[Path],
+        typer.Argument(
+            metavar="A/adjustment.json B/adjustment.json...", help="The calibrations' files.", show_default=False
+        ),
     ],
     camera: OfCamera = None,
     times: Annotated[str | None, typer.Option(metavar="T,T,...", help="When they were made: 1952,1958.5.")] = None,
@@ -155,7 +158,7 @@ def calibrate(
         str, typer.Option(help="chessboard, charuco, aprilgrid, aruco, circle-grid or asymmetric-circle-grid.")
     ] = "chessboard",
     marker: Annotated[str | None, typer.Option(metavar="18mm", help="Side of a marker, diameter of a circle.")] = None,
-    dictionary: Annotated[str | None, typer.Option(metavar="4X4_50", help="Of the markers.")] = None,
+    dictionary: Annotated[str | None, typer.Option(metavar="4X4_50", help="Dictionary of the markers.")] = None,
     legacy: Annotated[bool, typer.Option("--legacy", help="The older ChArUco layout; else both are tried.")] = False,
     first_id: Annotated[int, typer.Option(metavar="N", min=0, help="Number of the first marker.")] = 0,
     lens: Annotated[str, typer.Option(help="auto, opencv4, opencv5, opencv8, fisheye.")] = "auto",

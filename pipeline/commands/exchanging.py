@@ -27,6 +27,10 @@ from pipeline.exchange.formats import FORMATS, IMPORTED, LARGEST_MISFIT_PX, Expo
 from pipeline.text.wording import counted, did_you_mean
 
 TEMPLATES = ("project", "camera", "scene", "keys")
+FAMILIES = (  # `FAMILY_NAMES`, without numpy
+    "none", "torlegard", "brown", "australis", "aicon", "opencv", "opencv_fisheye", "juhl", "ebner", "gruen",
+    "legendre(n)", "fourier(n)",
+)  # fmt: skip
 
 
 def resample(
@@ -34,7 +38,7 @@ def resample(
     out_dir: OutDir,
     pitch_um: Annotated[float | None, pitch_option("The frames' pixel; by default the scan's.")] = None,
     lens: Annotated[bool, typer.Option("--lens", help="Take the distortion out, too.")] = False,
-    fast: Annotated[bool, typer.Option("--fast", help="Splines of degree 3 in place of 5: a tenth as true.")] = False,
+    fast: Annotated[bool, typer.Option("--fast", help="Splines of degree 3, not 5: faster, less exact.")] = False,
     max_pixels: MaxPixels = None,
     as_json: AsJson = False,
 ) -> int:
@@ -91,10 +95,14 @@ def export(
 
 def import_(
     format: Annotated[str, typer.Argument(metavar="FORMAT", help=choices_help(IMPORTED), show_default=False)],
-    paths: Annotated[list[Path], typer.Argument(metavar="FILE... OUT_DIR", show_default=False)],
+    paths: Annotated[
+        list[Path],
+        typer.Argument(metavar="FILE... OUT_DIR", help="Files to read, and where the results go.", show_default=False),
+    ],
     pitch_um: Annotated[float | None, pitch_option("A pixel of the pictures.")] = None,
     sigma_px: Annotated[
-        float | None, typer.Option("--sigma-px", metavar="PX", min=1e-6, help="Of marks that bring none.")
+        float | None,
+        typer.Option("--sigma-px", metavar="PX", min=1e-6, help="Standard deviation of marks that have none."),
     ] = None,
     from_middle: Annotated[
         bool, typer.Option("--from-middle", help="The principal point counts from the picture's middle.")
@@ -119,13 +127,18 @@ def import_(
 
 
 def convert(
-    file: Annotated[Path, typer.Argument(metavar="CAMERA.toml|adjustment.json", show_default=False)],
-    family: Annotated[str, typer.Argument(metavar="FAMILY", help="See docs/reference/lenses.md.", show_default=False)],
+    file: Annotated[Path, typer.Argument(metavar="CAMERA.toml|adjustment.json", help="The lens.", show_default=False)],
+    family: Annotated[str, typer.Argument(metavar="FAMILY", help=choices_help(FAMILIES), show_default=False)],
     out_dir: OutDir,
-    r0_mm: Annotated[float, typer.Option("--r0-mm", metavar="MM", min=0.0, help="Of torlegard, aicon, juhl.")] = 0.0,
+    r0_mm: Annotated[
+        float,
+        typer.Option(
+            "--r0-mm", metavar="MM", min=0.0, help="Second zero of the radial distortion (torlegard, aicon, juhl)."
+        ),
+    ] = 0.0,
     parameters: Annotated[
         str,
-        typer.Option(metavar="A,B,...", help="Those of the other family that are fitted; by default the usual ones."),
+        typer.Option(metavar="A,B,...", help="Parameters of the other family to fit; by default the usual ones."),
     ] = "",
     camera: OfCamera = None,
     misfit_um: Annotated[
@@ -149,7 +162,7 @@ def render(scene: SceneFile, out_dir: OutDir) -> int:
     from pipeline.progress import Reporter
     from pipeline.rendered.scene_file import render_project
 
-    with Reporter().stage("rendering") as count:
+    with Reporter().stage("rendering strip") as count:
         render_project(scene, out_dir, count)
     say(str(out_dir / "project.toml"))
     print_next(False, command_step("run", out_dir / "project.toml"))
@@ -160,7 +173,7 @@ def template(
     kind: Annotated[str, typer.Argument(metavar="KIND", help=choices_help(TEMPLATES), show_default=False)],
     marks: Annotated[
         str | None,
-        typer.Option(metavar="KIND[,KIND]", help="Of `camera`: its marks, in the corners and in the sides' middles."),
+        typer.Option(metavar="KIND[,KIND]", help="Kinds of the marks in corners and side middles (template camera)."),
     ] = None,
     square: Annotated[
         str | None, typer.Option(metavar="MM", help="Distance of the corner marks: 212, or 212x150.")
@@ -170,7 +183,7 @@ def template(
         str | None, typer.Option(metavar="MM", help="The exposed frame; by default as the marks say.")
     ] = None,
     distance: Annotated[float | None, typer.Option("--c", metavar="MM", min=1.0, help="Principal distance.")] = None,
-    name: Annotated[str, typer.Option(metavar="NAME", help="Of the camera.")] = "my camera",
+    name: Annotated[str, typer.Option(metavar="NAME", help="Name of the camera.")] = "my camera",
 ) -> int:
     """Print a commented file to start from, or all keys."""
     if kind not in TEMPLATES:

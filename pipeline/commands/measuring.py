@@ -33,6 +33,7 @@ from pipeline.commands.shared import (
 )
 from pipeline.errors import InputError, missing_extra
 from pipeline.terminal import PlainConsole, plain
+from pipeline.text.files import no_such_file
 from pipeline.text.wording import counted
 
 if TYPE_CHECKING:
@@ -89,9 +90,7 @@ Cluster = Annotated[
     str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, such as tcp://host:8786, or `local`.")
 ]
 Retry = Annotated[bool, typer.Option("--retry", help="Measure again the scans that failed.")]
-Moved = Annotated[
-    bool, typer.Option("--moved", help="Know moved or touched files by their content, which is read whole.")
-]
+Moved = Annotated[bool, typer.Option("--moved", help="Recognise moved files by a hash of their content.")]
 Workers = Annotated[
     int | None, typer.Option(metavar="N", min=1, max=1024, help="Processes that measure; by default one a core.")
 ]
@@ -130,6 +129,8 @@ def run(
     work, reporter = WorkOptions(_shard(shard), cluster, retry, moved, workers), Reporter(quiet=quiet)
     if out is not None and not project.is_dir():
         raise InputError(f"--out goes with a folder of scans, and {project} is none: its project file says `output`.")
+    if not project.exists():
+        raise InputError(f"{no_such_file(project)} Name project.toml, or a folder of scans.")
     file = (out or project) / PROJECT if project.is_dir() else project
     new = None
     if project.is_dir() and not file.exists():
@@ -174,7 +175,7 @@ def measure(
 def status(
     project: ProjectFile,
     verdict: Annotated[
-        Verdict | None, typer.Option(metavar="V", help=f"Name the scans of one: {', '.join(Verdict)}.")
+        Verdict | None, typer.Option(metavar="V", help=f"List the scans with this verdict: {', '.join(Verdict)}.")
     ] = None,
     as_csv: Annotated[bool, typer.Option("--csv", help="A line a scan, on stdout.")] = False,
     as_json: AsJson = False,
@@ -198,7 +199,9 @@ def status(
 
 def merge(
     project: ProjectFile,
-    stores: Annotated[list[Path], typer.Argument(metavar="DB...", help="Stores of shards.", show_default=False)],
+    stores: Annotated[
+        list[Path], typer.Argument(metavar="DB...", help="Results databases of the parts.", show_default=False)
+    ],
     as_json: AsJson = False,
 ) -> int:
     """Join the results of several machines."""
@@ -207,19 +210,19 @@ def merge(
 
     taken, summary = run_merge(read(project), stores, Reporter())
     if not as_json:
-        left_out = {one.path: f", {one.damaged} not as written and left out" if one.damaged else "" for one in taken}
+        left_out = {one.path: f", {one.damaged} damaged and left out" if one.damaged else "" for one in taken}
         say(*(f"{o.path}: {counted(o.results, 'result')}, {o.new} of them new{left_out[o.path]}" for o in taken))
     return finish(summary, as_json, project)
 
 
 def report(
     project: ProjectFile,
-    names: Annotated[
-        list[str] | None, typer.Argument(metavar="[NAME]...", help="After --frames: more images.", show_default=False)
-    ] = None,
+    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", hidden=True, show_default=False)] = None,
     frames: Annotated[
         list[str] | None,
-        typer.Option("--frames", metavar="NAME", help="Only pages of these images, in out/frames, with all marks."),
+        typer.Option(
+            "--frames", metavar="NAME", help="Only a page of this image, in out/frames, with all marks; repeatable."
+        ),
     ] = None,
     plots: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Write each camera's plots there as PNG and PDF (extra plots).")
@@ -235,14 +238,14 @@ def report(
         run_plots(read(project, max_pixels), plots, Reporter())
     if not frames:
         if names:
-            raise InputError("images are named after --frames: reseau report PROJECT.toml --frames NAME...")
+            raise InputError("images are named by --frames: reseau report PROJECT.toml --frames NAME --frames NAME")
         return run_stage(project, run_report, as_json, max_pixels)
     pages = run_frame_pages(read(project, max_pixels), list(dict.fromkeys([*frames, *(names or ())])), Reporter())
-    help_text = {image: str(path) for image, path in pages.items()}
+    page_by_image = {image: str(path) for image, path in pages.items()}
     show(
         as_json,
-        lambda: {"frames": help_text},
-        lambda _: say(*(f"{image}: {path}" for image, path in help_text.items())),
+        lambda: {"frames": page_by_image},
+        lambda _: say(*(f"{image}: {path}" for image, path in page_by_image.items())),
     )
     return DONE
 
@@ -254,7 +257,7 @@ def review(
             metavar="PROJECT.toml", help="The project file, or a folder of scans to draw a camera.", show_default=False
         ),
     ],
-    port: Annotated[int, typer.Option(metavar="N", min=0, max=65535, help="Of this machine; 0 takes any.")] = 0,
+    port: Annotated[int, typer.Option(metavar="N", min=0, max=65535, help="Port, on this machine; 0: any free.")] = 0,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address, and open no browser.")] = False,
     who: Annotated[str | None, typer.Option(metavar="NAME", help="Who decides; by default who is logged in.")] = None,
     max_pixels: MaxPixels = None,
@@ -288,7 +291,7 @@ def cameras(
     scan: Annotated[
         list[Path] | None,
         typer.Option(
-            "--scan", metavar="PATH", help="Try the cameras on a scan, or on some of a folder's, of each kind."
+            "--scan", metavar="PATH", help="Identify the camera of a scan, or of each scan group of a folder."
         ),
     ] = None,
     own: Annotated[
@@ -359,7 +362,7 @@ def _name_cameras(
         steps = [f'camera = "{PREFIX}{name}" in project.toml' for name in identification.names_by_plate()]
         print_next(as_json, *(steps or [LIBRARY_STEP]))
         return DONE if identification.best else LOOK
-    with reporter.stage("examined") as count:
+    with reporter.stage("examining file") as count:
         found = catalogue(given, count, max_pixels, by_folder=False)
     trial = partial(identify_sample, cameras=tried, pitch_um=pitch_um, max_pixels=max_pixels)
     grouped = name_cameras(found, trial, reporter, None)

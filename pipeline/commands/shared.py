@@ -37,7 +37,7 @@ MaxPixels = Annotated[
     typer.Option("--max-pixels", metavar="N", min=1, help="Read scans of up to N pixels, whatever their file's size."),
 ]
 OfCamera = Annotated[
-    str | None, typer.Option("--camera", metavar="NAME", help="Which one, where a file holds several.")
+    str | None, typer.Option("--camera", metavar="NAME", help="Name of the camera, where a file holds several.")
 ]
 
 

@@ -147,7 +147,8 @@ def _tables(design: Design) -> Iterator[PrintedTable]:
         (id, *(_sigma(UM_PER_MM * sigma) for sigma in (*map(plan.sigma, place), *(alone[each] for each in place))))
         for id, place in places.items()
     ]
-    yield "Fiducial marks, sigma", ("fiducial", "x', µm", "y', µm", "photographs alone: x', µm", "y', µm"), fiducials
+    without = ("x', without given values", "y', without given values")
+    yield "Fiducial marks, sigma in µm", ("fiducial", "x'", "y'", *without), fiducials
     bend = [(each.quantity, _sigma(UM_PER_MM * sigma)) for each, sigma in expected.scanner_sigmas.items()]
     yield "Bend of the scanner", ("term", "sigma, µm"), bend
     free = {axis: sigmas[sigmas > 0.0] for axis, sigmas in zip("XYZ", expected.point_sigmas.T, strict=True)}
@@ -157,16 +158,20 @@ def _tables(design: Design) -> Iterator[PrintedTable]:
     ]
     yield "Object points, sigma", ("coordinate", "rms", "largest"), points
     heads = ("kind", "coordinates", "redundancy", "median", "largest", "unchecked")
-    yield "Smallest gross errors that are found", heads, map(_reliability_row, expected.groups)
+    yield "Internal reliability: minimal detectable errors", heads, map(_reliability_row, expected.groups)
     # Outer reliability of the camera; of the fiducials only the worst is shown.
     marks = [one for one in expected.outer_effects if one.parameter.kind == "fiducial"]
     effects = [one for one in expected.outer_effects if one not in marks]
     effects += sorted(marks, key=lambda one: -one.in_sigmas)[:1]
     outer = [(one.parameter.label, f"{one.in_sigmas:.1f}", one.cause) for one in effects]
-    yield "What errors that are not found may do to the camera", ("parameter", "in its sigmas", "error in"), outer
+    yield (
+        "External reliability: largest effect of an undetected error",
+        ("parameter", "in its sigmas", "error in"),
+        outer,
+    )
     names = list(expected.camera_sigmas)
     gains = [(one.change, *(_gain(one.gain_percent[name]) for name in names)) for one in design.helpful]
-    title = "What would help: by how many percent the sigmas shrink"
+    title = "Improvements: decrease of sigma, %"
     first = ", of the first layout" if layouts.count > 1 else ""
     yield title + first, ("change", *(LABELS.get(name, name) for name in names)), gains
 
@@ -175,7 +180,7 @@ def _camera_table(design: Design) -> PrintedTable:
     """Expected precision of the camera; with fiducials also from the photographs alone, in their frame."""
     expected, layouts = design.expected, design.layouts
     several, rows = layouts.count > 1, []
-    heads = ["quantity", "value", "sigma", *(["photographs alone"] if expected.fiducials else [])]
+    heads = ["quantity", "value", "sigma", *(["without given values"] if expected.fiducials else [])]
     heads += [f"mean of {layouts.count} layouts", "spread"] if several else []
     labels = {"c": "principal distance, mm", "x0": "principal point x', mm", "y0": "principal point y', mm"}
     for name, label in {**labels, **{name: name for name in expected.family_parameters}}.items():

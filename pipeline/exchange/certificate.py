@@ -101,7 +101,7 @@ class Certificate:
             key = f"{self.refers_to}_principal_distance_mm"
             raise WrongKey(key, f"is missing: the table refers to the {self.refers_to} principal distance.")
         if (self.angle_deg is None) == (self.radius_mm is None):
-            raise WrongKey("angle_deg", "or radius_mm is needed: where the distortions are, one of both.")
+            raise WrongKey("angle_deg", "or radius_mm must be given, one of the two: the places of radial_um.")
         key, places = ("angle_deg", self.angle_deg) if self.angle_deg else ("radius_mm", self.radius_mm or ())
         count = len(self.radial_um)
         if len(places) != count or count < 2:
@@ -109,7 +109,7 @@ class Certificate:
                 key, f"has {len(places)} places for {count} values of radial_um: give one a value, two or more."
             )
         if min(places) <= 0.0 or len(set(places)) < count:
-            raise WrongKey(key, "must be positive, and every place another one.")
+            raise WrongKey(key, "must be positive and different.")
         if self.angle_deg and max(self.angle_deg) >= 90.0:
             raise WrongKey(key, "must lie below 90 degrees.")
         has_two = self.autocollimation_mm is not None or self.symmetry_mm is not None

@@ -371,10 +371,11 @@ def pinholes_written(
     elif worst > 0.0:
         notes = (f"The camera's model was fitted over the frame: it is off by {worst:.2g} px at most.", *notes)
     film: tuple[str, ...] = ("the film transformation (it is that of the resampled frames)",)
+    pictures = "The frames of these cameras: reseau resample PROJECT.toml DIR, with the options of this export."
     if any(frame.is_as_taken for frame in frames):
         film = ()
-        notes = ("The frames are the pictures as taken; of turned ones, the .tif of `reseau resample`.", *notes)
-    return Written(files, (*film, "all standard deviations", lost), notes, tuple(left_out))
+        pictures = "The frames are the pictures as taken; of turned ones, the .tif of `reseau resample`."
+    return Written(files, (*film, "all standard deviations", lost), (pictures, *notes), tuple(left_out))
 
 
 def write_asp(block: Block, options: ExportOptions) -> Written:

@@ -83,7 +83,9 @@ def save_cameras(projects: Sequence[Project], folder: Path) -> list[SavedCamera]
         raise InputError(f"several cameras have a file {repeated[0]}. Give their camera files names of their own.")
     for path in files.values():
         if path.exists() and not path.read_bytes().startswith(_HEAD.encode()):
-            raise InputError(f"{path}: is there already, and was not saved so. Name another folder with --out.")
+            raise InputError(
+                f"{path}: exists and was not written by `reseau cameras --save`. Name another folder with --out."
+            )
     return [_save(own, files[name]) for name, own in found.items()]
 
 

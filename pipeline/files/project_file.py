@@ -381,7 +381,12 @@ def _check_named(table: Table, objects: Table, camera: str, named: Mapping[str, 
     except InputError as error:
         raise table.error("camera", str(error)) from None
     keys |= {key: (objects, path) for key, path in named.items()}
-    missing = [str(where.error(key, no_such_file(path))) for key, (where, path) in keys.items() if not path.exists()]
+    hints = {"camera": " `reseau template camera` prints one to start from."}
+    missing = [
+        str(where.error(key, no_such_file(path) + hints.get(key, "")))
+        for key, (where, path) in keys.items()
+        if not path.exists()
+    ]
     if missing:
         raise InputError("\n".join(missing))
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Annotated, Any, Literal, get_args
 
 from adjust.functional_model.scanner import is_term
-from adjust.functional_model.transformation import film_kind
+from adjust.functional_model.transformation import FILM_NAMES, film_kind
 from adjust.problem.network import Transformation
 from adjust.quality.tested import PRIOR_GROUPS, WeightFunction
 from adjust.solution.options import MEASURED_KINDS
@@ -37,6 +37,7 @@ from pipeline.text.table_models import (
     text,
     texts,
 )
+from pipeline.text.wording import did_you_mean
 
 Datum = Literal["control", "minimal", "free"]
 Method = Literal["combined", "elements"]
@@ -71,7 +72,7 @@ def _transformation(value: Any) -> str:
     try:
         film_kind(text(value))
     except ValueError as error:
-        raise ValueError(f"{error}.") from None
+        raise ValueError(f"{error}.{did_you_mean(value, FILM_NAMES)}") from None
     return str(value)
 
 
@@ -168,7 +169,7 @@ class AdjustSettings:
 def _pitch(value: Any) -> tuple[float, float]:
     pitch = number_or_pair(value)
     if not all(0.0 < each < math.inf for each in pitch):
-        raise ValueError(f"must be positive, not {list(pitch)}.")
+        raise ValueError(f"must be positive, not {value}.")
     if min(pitch) < FINEST_PITCH_UM:
         raise ValueError(f"{min(pitch):g} µm is finer than any scanner. Give µm: 20.0, not 0.02.")
     if max(pitch) > _COARSEST_PITCH_UM:

@@ -198,7 +198,7 @@ def identify(
     given, search = its_pitch_um if pitch_um is None else (pitch_um, pitch_um), LayoutSearch(picture)
     layouts = {names: _limit_drawings(cameras[names[0]].layout()) for names in _alike(cameras)}
     pitch = None if given is None else (times * given[0], times * given[1])
-    with reporter.stage("trying") as count:
+    with reporter.stage("trying layout") as count:
         trials, tries = _first_that_stand_out(search, layouts, _layouts_like(layouts, likely), pitch, count)
     alike = _alike_in_scan(search, trials, tries, drawn_alike(layouts))
     del search, tries  # frees the correlation images
@@ -310,7 +310,7 @@ def _each(
 ) -> dict[Names, Tried]:
     tries = dict[Names, Tried]()
     for done, (names, layout) in enumerate(layouts.items()):
-        count(f"layouts of marks: {', '.join(names)}", done, 2 * len(layouts))
+        count(", ".join(names), done, len(layouts))
         tries[names] = tried(layout)
     return tries
 
@@ -342,7 +342,7 @@ def _trials(search: LayoutSearch, tries: Mapping[Names, Tried], count: Count) ->
             none = Trial(names, 0, drawn, 0.0, 0.0, 0.0, None, None, None, f"not measured: {why}", 0.0, expected)
             trials.append(none)
         else:
-            count(", ".join(names), done, 2 * len(ranked))
+            count(", ".join(names), done, len(ranked))
             trials.append(_trial(search, names, each, CLOSE * max((trial.score for trial in standing), default=0.0)))
     return trials
 

@@ -124,7 +124,7 @@ def _learned(
     names = [name for name in project.scans if project.image_camera(name).path == camera.path]
     if not names:
         return camera
-    with reporter.stage("learning marks of") as tell:
+    with reporter.stage("learning marks, step") as tell:
         tell(f"{camera.name}: their first pictures", 0, 3)
         start = first_pictures(camera, _tasks(project, camera, names), workers)
         tell(f"{camera.name}: sought in {len(names)} scans by these", 1, 3)
@@ -251,7 +251,7 @@ def collect_tones(
     samples = {kind: sample_names(kinds[kind], _SAMPLES) for kind, by_image in before.items() if by_image is None}
     tasks = [task.fiducials_alone(project.tone) for task in scan_tasks(project, list(chain(*samples.values())))]
     known = {name: read_plain(ToneInformation, one) for kept in before.values() for name, one in (kept or {}).items()}
-    with reporter.stage("tone curve estimated from") as tell:
+    with reporter.stage("tone curve from scan") as tell:
         for done, scan in enumerate(measure(tasks), 1):
             tell(scan.frame.image, done, len(tasks))
             if scan.frame.tone is not None and scan.frame.tone.information is not None:

@@ -77,7 +77,7 @@ def add_known_lines(
             rolls[camera] = [task for task in own if task.name in few]
     first = [task for own in rolls.values() for task in own]
     measured = dict[str, MeasuredScan]()
-    with reporter.stage("read the writing of") as count:
+    with reporter.stage("reading the writing of scan") as count:
         for done, scan in enumerate(measure(first) if first else (), 1):
             measured[scan.frame.image] = scan
             count(scan.frame.image, done, len(first))

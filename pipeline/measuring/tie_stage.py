@@ -230,10 +230,10 @@ def tie_scans(
     natural tie points."""
     together = check_sheet(project, [scan for scan in scans if not scan.failure])
     if project.has_parts:
-        with reporter.stage("parts joined of") as count:
+        with reporter.stage("joining parts of frame") as count:
             together = add_joins(project, together, count, executor)
     if project.ties is not None:
-        with reporter.stage("natural points sought in") as count:
+        with reporter.stage("natural points of scan") as count:
             together = add_ties(project, project.ties, together, count, executor)
     by_image = {scan.frame.image: scan for scan in together}
     return tuple(by_image.get(scan.frame.image, scan) for scan in scans)

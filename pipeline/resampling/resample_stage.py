@@ -338,7 +338,7 @@ def resample(
     """
     tasks, results = resample_tasks(project, folder, pitch_um, with_lens, BEST if not fast else FAST)
     check_writable(folder)
-    with reporter.stage("resampled") as count, worker_pool(max(len(tasks), 1)) as workers:
+    with reporter.stage("resampled frame") as count, worker_pool(max(len(tasks), 1)) as workers:
         futures = {workers.submit(resampled, task): task for task in tasks}
         for done, future in enumerate(as_completed(futures), 1):
             results.append(future.result())

@@ -41,7 +41,7 @@ class FailureCode(MeaningfulWord):
     PITCH = "pitch", "Neither the project nor the file says what a pixel measures, and no marks tell it."
     MEMORY = "memory", "The memory was full."
     ENDED = "ended", "The process that measured it was ended, most likely because the memory was full."
-    DAMAGED = "damaged", "What is stored of it was changed or is damaged, and is not used: `--retry`."
+    DAMAGED = "damaged", "Its stored result is damaged (digest differs) and is not used: `--retry`."
     FAULT = "fault", "A fault of the program itself."
 
 

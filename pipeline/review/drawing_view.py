@@ -244,7 +244,7 @@ def fit_drawing(drawing: CameraDrawing, placement: FramePlacement, scan: Scan) -
         start = _pixel_from_mark(placement, replace(one, turn_deg=0.0))
         found = _match(scan, fiducial.mark, start)
         if found.fit is None or found.fit.likeness < LEAST_LIKENESS:
-            reason = str(found.reason) or "nothing there matches its drawing"
+            reason = str(found.reason) or "no mark like its drawing there"
             reasons.append(f"{one.id}: {reason}")
             marks.append(replace(one, unfitted=reason))
             continue

@@ -44,7 +44,9 @@ class Row:
         if not value:
             raise self.error(column, "is empty; every line needs it.")
         if len(value) > _LONGEST_NAME or any(unicodedata.category(letter) in ("Cc", "Cs") for letter in value):
-            raise self.error(column, f"{quote_value(value)} can be no name: too long, or not all of it can be read.")
+            raise self.error(
+                column, f"{quote_value(value)} is not a valid name: at most {_LONGEST_NAME} printable characters."
+            )
         return value
 
     def number(self, column: str) -> float | None:
@@ -70,7 +72,7 @@ class Row:
         if sigma is not None and sigma < 0.0:
             raise self.error(column, f"is a standard deviation and cannot be negative ({sigma:g}).")
         if sigma is not None and 0.0 < sigma < SMALLEST_SIGMA:
-            raise self.error(column, f"nothing is known to {sigma:g}. Write 0 for what is to be fixed.")
+            raise self.error(column, f"a standard deviation of {sigma:g} is too small. Write 0 to fix the value.")
         return sigma
 
 
@@ -92,7 +94,7 @@ def read_csv(path: FilePath, required: Sequence[str], optional: Sequence[str] = 
     try:
         data = read_bytes(path)
     except FileNotFoundError:
-        raise InputError(f"{path}: {no_such_file(path)}") from None
+        raise InputError(no_such_file(path)) from None
     except IsADirectoryError:
         raise InputError(f"{path}: is a folder; a CSV file is needed here. Name one.") from None
     lines = _content_lines(data, path)

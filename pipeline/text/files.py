@@ -136,14 +136,15 @@ def check_writable(folder: Path) -> None:
 
 
 def no_such_file(path: Path) -> str:
-    """Sentence on a missing file, with the file of the same kind in its folder that was probably meant."""
+    """Message on a missing file, with the file of a similar name in its folder that was probably meant."""
     try:
-        others = [other.stem for other in path.parent.iterdir() if other.suffix == path.suffix and other != path]
+        others = {other.stem: other.name for other in path.parent.iterdir() if nearest(path.suffix, [other.suffix])}
     except OSError:
-        others = []
+        others = {}
     near = nearest(path.stem, others)
-    meant = f" Did you mean '{near}{path.suffix}'?" if near else ""
-    return f"there is no such file. Looked for {os.path.abspath(path)}.{meant}"
+    meant = f" Did you mean {others[near]!r}?" if near else ""
+    searched = "" if path.is_absolute() else f" (searched at {os.path.abspath(path)})"
+    return f"{path}: there is no such file{searched}.{meant}"
 
 
 SCAN_ENDINGS = (".tif", ".tiff", ".jpg", ".jpeg", ".jp2", ".j2k", ".png")

@@ -32,7 +32,7 @@ def _parse(path: Path) -> dict[str, Any]:
             raise InputError(f"{path}, line {line}: joins more names by points than any table here. Mend that line.")
         return tomllib.loads(text)
     except FileNotFoundError:
-        raise InputError(f"{path}: {no_such_file(path)}") from None
+        raise InputError(no_such_file(path)) from None
     except IsADirectoryError:
         raise InputError(f"{path}: is a folder; a TOML file is needed here. {_toml_files_sentence(path)}") from None
     except UnicodeDecodeError:

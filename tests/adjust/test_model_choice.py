@@ -82,7 +82,7 @@ def test_the_true_lens_is_chosen_and_the_simpler_ones_are_reported_to_be_too_sim
     choice = chosen(make_network(2, "k3 k5", "none", points=16))
     assert choice.chosen is not None
     assert choice.chosen.model == Model("none", "torlegard", ("k3", "k5"))
-    assert choice.verdict.startswith("The data ask for torlegard k3 k5.")
+    assert choice.verdict.startswith("Selected: torlegard k3 k5.")
     too_simple = {reason.split(" is too simple: ")[0] for reason in choice.reasons if "too simple" in reason}
     assert too_simple == {"no distortion", "torlegard k3"}
     assert {each.model.name for each in choice.candidates} >= {"ebner", "legendre(3)"}
@@ -97,7 +97,7 @@ def test_a_scanners_bend_is_chosen_and_not_taken_for_a_richer_film() -> None:
     assert choice.chosen is not None
     assert choice.chosen.model == Model("affine", bends=(("S", ("a20", "b11")),))
     assert choice.chosen.sigma0 == pytest.approx(1.0, abs=0.3)
-    assert choice.verdict.startswith("The data ask for affine, no distortion, bend of scanner S: a20 b11.")
+    assert choice.verdict.startswith("Selected: affine, no distortion, bend of scanner S: a20 b11.")
     assert any(reason.startswith("affine, no distortion is too simple: ") for reason in choice.reasons)
 
 

@@ -227,7 +227,7 @@ def test_a_mark_off_the_constellation_is_no_observation() -> None:
     result = measure_grey(frame_picture(moved, matrix), given)
     assert [mark.status for mark in result.marks[:5]] == [Status.MEASURED] * 5
     assert result.marks[5].status is Status.PREDICTED
-    assert "nothing within 6 px of its place" in result.marks[5].reason
+    assert "no mark like its drawing within 6 px" in result.marks[5].reason
     assert result.marks[5].center_px == pytest.approx(matrix @ (0.0, 7.0, 1.0), abs=0.1)
 
 

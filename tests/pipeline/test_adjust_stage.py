@@ -440,8 +440,8 @@ def test_the_project_is_reported_what_its_data_ask_for(given: str, tmp_path: Pat
     project = write_network_project(replace(network, cameras=(camera,)), tmp_path)
     assert command("choose", project) == (DONE if given == "none" else LOOK)
     shown = " ".join(capsys.readouterr().out.split())
-    assert "The data ask for no distortion." in shown
-    assert ("That is the model as it is given." in shown) is (given == "none")
+    assert "Selected: no distortion" in shown
+    assert ("the given model." in shown) is (given == "none")
     result = json.loads((tmp_path / "out" / "choose.json").read_text(encoding="utf-8"))
     assert result["chosen"] == {"transformation": "none", "family": "none", "parameters": [], "bends": {}}
     names = [each["name"] for each in result["candidates"]]

@@ -321,11 +321,11 @@ def test_the_tone_of_a_scanner_stays_when_scans_come_and_go(tmp_path: Path, caps
     mark = f'[mark.m]\nkind = "polygon"\nvertices_mm = {[*map(list, TIP_MM)]}\n'
     (folder / "camera.toml").write_text(CAMERA.split("[mark.m]")[0] + mark, encoding="utf-8")
     measure(folder)
-    assert "0 of 2 scans measured in an earlier run" in capsys.readouterr().err  # this call measured them for the curve
+    assert "2 of 2 scans measured (2 in this run)" in capsys.readouterr().err  # this call measured them for the curve
     measured.clear()
     measure(folder)
     assert not measured
-    assert "2 of 2 scans measured in an earlier run" in capsys.readouterr().err
+    assert "2 of 2 scans measured (2 in earlier runs)" in capsys.readouterr().err
     one_more(folder)
     (folder / "a.tif").unlink()
     measure(folder)
@@ -345,5 +345,5 @@ def test_scans_that_fail_alike_are_reported_once_and_all_scans_are_counted(tmp_p
     assert "reseau: 6 scans (s0, s1, s2, s3, s4, s5): pitch_um is missing in the project, and the file" in message
     assert message.count("reseau: ") == 1
     assert message.count("pitch_um is missing") == 2  # at the first that fails, and at the end
-    assert re.findall(r"measured (\d) of 6", message)[-1] == "6"
-    assert "measured 1 of 1 " not in message
+    assert re.findall(r"measured: (\d) of 6", message)[-1] == "6"
+    assert "measured: 1 of 1" not in message

@@ -161,7 +161,7 @@ def test_two_archives_are_joined_to_what_both_together_give(archives: Path, tmp_
 def test_what_cannot_be_saved_is_refused(archives: Path, tmp_path: Path) -> None:
     project = read_project(archives / "a" / "project.toml")
     (tmp_path / "camera.toml").write_text('name = "own"\n')
-    with pytest.raises(InputError, match="is there already, and was not saved so"):
+    with pytest.raises(InputError, match="exists and was not written by"):
         save_cameras([project], tmp_path)
     other = shutil.copytree(archives / "b", tmp_path / "b", ignore=shutil.ignore_patterns("out"))
     with pytest.raises(InputError, match="no adjustment that converged"):

@@ -98,7 +98,7 @@ NO_COORDINATES = "point,X,Y,Z,sX,sY,sZ\n101,1.0,2.0,0.5,,,\n102,,,,,,\n"
         (misspelt_key_and_no_file, ["project.toml, line 4", "comparater", "Did you mean 'comparator'?"]),
         (
             remove("camera.toml", "points.csv"),
-            ["line 2: camera: there is no such file", "line 12: [object] points: there is no such"],
+            ["line 2: camera: ", "camera.toml: there is no such", "line 12: [object] points: "],
         ),
         (change_project('output = "out"', 'output = "points.csv/out"'), ["cannot be written"]),
         (lambda folder: rewritten_scans(folder, "scans"), ["line 3: scans: 'scans' is a folder", "'scans/*.tif'"]),
@@ -111,7 +111,9 @@ NO_COORDINATES = "point,X,Y,Z,sX,sY,sZ\n101,1.0,2.0,0.5,,,\n102,,,,,,\n"
             change_camera('id = "1"', 'id = "1 "'),
             ["camera.toml, line", "text on one line without blanks at its ends, not '1 '"],
         ),
-        (nothing_to_measure, ["there is nothing to measure", "Add what the scans show"]),
+        (change_project("output =", "pitch_um = 0\noutput ="), ["line 5: pitch_um: must be positive, not 0."]),
+        (change_project('"camera.toml"', '"camera.tml"'), ["Did you mean 'camera.toml'? `reseau template camera`"]),
+        (nothing_to_measure, ["nothing to measure", 'have mark = "none"', "Draw the marks"]),
         (
             change_project(MARKS_FILE, 'comparator = "scans/../scans/frame2.tif"'),
             ["line 4: comparator:", "written over the scan frame2"],
@@ -295,19 +297,19 @@ def test_steps_counts_and_times_are_printed_in_one_form(capsys: Capture) -> None
 def lines(quiet: bool = False, terminal: bool = False) -> list[str]:
     text = io.StringIO()
     console = PlainConsole(file=text, width=200, force_terminal=terminal, quiet=quiet)
-    with Reporter(console).stage("measured") as count:
+    with Reporter(console).stage("scans measured:") as count:
         for done in range(1, 31):
-            count("scans, 2 of 5 groups", done, 30, left_s=200.0)
+            count("2 of 5 groups", done, 30, left_s=200.0)
     return text.getvalue().splitlines()
 
 
 def test_progress_is_two_lines_without_a_terminal_and_none_for_who_is_quiet() -> None:
     """The first and the last: between them lines come at intervals only."""
     assert lines() == [
-        "measured 1 of 30 scans, 2 of 5 groups, about 3 minutes left",
-        "measured 30 of 30 scans, 2 of 5 groups",
+        "scans measured: 1 of 30, 2 of 5 groups, about 3 minutes left",
+        "scans measured: 30 of 30, 2 of 5 groups",
     ]
-    assert any("measured 30 of 30 scans, 2 of 5 groups" in line for line in lines(terminal=True))
+    assert any("scans measured: 30 of 30, 2 of 5 groups" in line for line in lines(terminal=True))
     assert lines(quiet=True) == lines(quiet=True, terminal=True) == []
     assert Reporter(quiet=True)._console.quiet
     assert isinstance(Reporter()._console, Console)

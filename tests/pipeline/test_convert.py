@@ -12,11 +12,12 @@ import pytest
 from networks import lens_network
 from projects import Printed, Refusal, command, present, result_file, write_network_project
 
-from adjust.functional_model.families import parameter_names
+from adjust.functional_model.families import FAMILY_NAMES, parameter_names
 from adjust.functional_model.lens import Distortion, Lens
 from adjust.problem.parameter import Parameter
 from pipeline import read_adjustment, read_camera
 from pipeline.cli import DONE, LOOK
+from pipeline.commands.exchanging import FAMILIES
 from pipeline.exchange.saved_cameras import save_cameras
 from pipeline.files.project_file import read_project
 from pipeline.provenance import hash_file
@@ -35,6 +36,10 @@ r0_mm = 13.488
 value = {a1 = -1.1e-4, a2 = 1.5e-7}
 sigma = {a1 = 3e-7, a2 = "free"}
 """
+
+
+def test_the_help_lists_all_families() -> None:
+    assert FAMILIES == FAMILY_NAMES
 
 
 def test_a_camera_file_becomes_opencvs(tmp_path: Path, printed: Printed) -> None:
@@ -157,9 +162,11 @@ def test_an_unchanged_camera_and_a_changed_one(project: Path, printed: Printed, 
     assert output.startswith("no drift ")
     assert "same less out" in output
     assert "were adjusted from the same measured marks: they are not independent" in output
+    assert "they agree better than independent calibrations can" in output
     out = project / "compared"
     output = printed("compare", first, shift_parameter(project, "later", 0.5), "--out", out, code=1)
     assert output.startswith("drift\n")
+    assert "better than independent" not in output
     (largest,) = re.findall(r"Fiducial marks after a similarity: at most ([\d.]+) µm", output)
     assert float(largest) < 0.2  # of their 0.3 um: c and the marks are hardly tied
     drawn = ElementTree.parse(out / "compare.svg").getroot()

@@ -77,7 +77,7 @@ def test_damaged_tables_and_calibrations(trials: int, seed: int, sound: Path, tm
         ("project.toml", "".join(f"[t{i}]\n" for i in range(10_000)), "is a file of another kind"),
         ("project.toml", "#" * 5_000_000, "has more than 4 MB"),
         ("points.csv", "point,X,Y,Z\n" + "x" * 200_000 + ",1,2,3\n", "line 2: is no line of CSV (field larger than"),
-        ("points.csv", "point,X,Y,Z\n\x1b[31mred,1,2,3\n", r"line 2, column point: '\x1b[31mred' can be no name"),
+        ("points.csv", "point,X,Y,Z\n\x1b[31mred,1,2,3\n", r"line 2, column point: '\x1b[31mred' is not a valid name"),
         ("earlier/adjustment.json", "[" * 100_000, "is not valid JSON (maximum recursion depth"),
         ("earlier/adjustment.json", '{"sigma0": NaN}', "is not valid JSON (NaN is no number of JSON)"),
     ],
@@ -282,7 +282,7 @@ def set_status(first: str, others: str, columns: str) -> Changes:
         ("project.toml", setting('datum = "free"\ndatum_points = ["1", "P3"]'), ["P3", "not among the object points"]),
         ("project.toml", setting('datum = "minimal"\ndatum_coordinates = ["1X"]'), ["1X", "a dot and X, Y or Z"]),
         # film, weights, scanner, ties
-        ("project.toml", {'"affine"': '"afine"'}, ["line 7: [adjust] transformation", 'no transformation "afine"']),
+        ("project.toml", {'"affine"': '"afine"'}, ["line 7: [adjust] transformation", "Did you mean 'affine'?"]),
         ("project.toml", {'"affine"': '"polynomial"'}, ["lacks its order", 'as in "polynomial(2)"']),
         ("project.toml", {'"affine"': '"conformal(9)"'}, ["order must be from 1 to 5"]),
         ("project.toml", setting('robust = "tukey"'), ["possible are"]),

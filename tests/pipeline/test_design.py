@@ -104,8 +104,8 @@ def test_design_writes_what_it_found(tmp_path: Path, capsys: Capture, printed: P
     table = printed("design", scene, tmp_path / "there")
     k3 = next(line for line in table.splitlines() if line.startswith("│ k3"))
     assert k3.count("× 10⁻⁶") == 3  # value, sigma, and that of the photographs alone, by the value's power of ten
-    assert "Smallest gross errors" in table
-    assert "What would help" in table
+    assert "minimal detectable errors" in table
+    assert "Improvements: decrease of sigma" in table
     assert "Sigmas over design.transformation" in table
 
 
@@ -172,7 +172,7 @@ def test_a_wrong_quantity_is_reported_with_what_is_near(tmp_path: Path, quantity
     ("line", "words"),
     [
         ("layouts = 0", "layouts: must be a whole number of at least 1"),
-        ('transformation = "afine"', 'there is no transformation "afine"'),
+        ('transformation = "afine"', "Did you mean 'affine'?"),
         ('control_points = ["77"]', "the field has no target '77'"),
         ('[[design.sweep]]\nquantity = "images"\nvalues = [2]', "needs two different values"),
         ('[[design.sweep]]\nquantity = "design..x"\nvalues = [2, 3]', "write a dotted name"),

@@ -88,7 +88,7 @@ def test_a_frame_without_enough_targets_keeps_its_film_transformation(tmp_path: 
 
 def test_the_film_transformation_can_be_chosen(tmp_path: Path, printed_line: Printed) -> None:
     """No lens to choose, but the kind of film: these marks have two scales that differ by 0.2 %."""
-    assert "The data ask for affine, no distortion" in printed_line(
+    assert "Selected: affine, no distortion" in printed_line(
         "choose", write_fiducials_project(tmp_path, {"a": 5, "b": 5})
     )
 

@@ -287,7 +287,7 @@ def test_a_folder_is_measured(drawn_library: Path, capsys: Capture, monkeypatch:
     assert command("run", drawn_library, "--json", "--workers", "1") in (0, 1)  # the project that stands there
     again = capsys.readouterr()
     assert set(json.loads(again.out)["frames"]) == {"a"}
-    assert "1 of 1 scan measured in an earlier run" in again.err
+    assert "1 of 1 scan measured (1 in earlier runs)" in again.err
 
 
 def test_photographs_alone_are_refused(tmp_path: Path, refusal: Refusal) -> None:

@@ -276,7 +276,7 @@ def test_a_judging_that_is_lost_is_not_taken_for_none(change: str, path: Path) -
     with sqlite3.connect(path) as db:
         db.execute(change)
     with Store(path) as store:
-        with pytest.raises(InputError, match=r"list of checked images is not as it was written.*measure --retry"):
+        with pytest.raises(InputError, match=r"list of checked images is damaged.*measure --retry"):
             latest(store)
         store.forget_damaged()
         assert latest(store) is None
